@@ -1,0 +1,1 @@
+"""The simulated plant: pure models with exact dead time, and the process that serves them over CANopen."""

@@ -1,0 +1,1 @@
+"""The fieldbus contract: objects, EDS, buses, the device runtime and the tuner's client."""

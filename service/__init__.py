@@ -1,0 +1,1 @@
+"""The autotune service: loops, jobs, REST, CLI, rehearsal."""

@@ -1,0 +1,52 @@
+"""A loop as a plan sees it. Two fillings, one set of tests: `BusLoop` (live, over CANopen) and `RehearsedLoop` (in memory)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from tuning.gains import Gains
+from tuning.plan import Command, Mode, Sample
+
+
+@dataclass(frozen=True, slots=True)
+class LoopState:
+    """What a loop is and must come back to. MV and PV in the loop's units, limits as the controller holds them."""
+
+    mode: Mode
+    sp: float
+    pv: float
+    mv: float
+    gains: Gains
+    on_trial: bool
+    mv_low: float
+    mv_high: float
+    sample_time_s: float
+    reverse_acting: bool
+
+
+class Loop(Protocol):
+    """Pumped by one thread: the heartbeat and the lease go out from `step`, so a hung service loses the loop."""
+
+    def read(self) -> LoopState:
+        """The present state, read from the controller. Raises Failed(NODE_LOST | BUS_LOST)."""
+        ...
+
+    def begin(self) -> LoopState:
+        """Takes the lease: from here on the controller comes back by itself when we fall silent."""
+        ...
+
+    def step(self, commands: Sequence[Command]) -> Sample:
+        """Carries out the commands, then returns the next sample. Raises Failed when node, bus or samples are lost."""
+        ...
+
+    def restore(self, state: LoopState) -> LoopState:
+        """Ends the trial, brings back mode, set-point and gains of `state`, ends the lease, reads back."""
+        ...
+
+    def accept(self, gains: Gains) -> LoopState:
+        """Makes these gains the accepted set, bumplessly, and reads them back."""
+        ...
+
+    def close(self) -> None: ...

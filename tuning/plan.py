@@ -1,0 +1,108 @@
+"""A plan: an experiment as a generator. It receives one sample per sampling period and answers with commands.
+
+    def settle(...) -> Plan[Rest]:
+        sample = yield ()                      # nothing to command: just the next sample
+        sample = yield (SetMode(Mode.MANUAL),) # commands take effect before the next sample
+        return Rest(...)
+
+Rules of the house. A plan owns no clock, no bus and no thread: time is `Sample.t`. A command may take effect a few
+samples late (a live bus), so a plan looks at what the samples say (`mode`, `sp`) rather than counting. A plan never
+restores the loop: the runner does, on every way out. A plan that cannot go on raises `Refused` or `Failed` from
+`tuning.reasons`. What a plan wants to tell (stages, results) it yields among the commands, as events.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple, TypeVar
+
+from tuning.gains import Gains
+
+
+class Mode(IntEnum):
+    """What drives the MV; the numbers are those of the controller's object dictionary."""
+
+    OFF = 0
+    MANUAL = 1
+    AUTOMATIC = 2
+    EXPERIMENT = 3
+
+
+class Sample(NamedTuple):
+    """One sampling period: t in plant seconds; sp, pv in PV units; mv in MV units; the mode in effect."""
+
+    t: float
+    sp: float
+    pv: float
+    mv: float
+    mode: int
+
+
+@dataclass(frozen=True, slots=True)
+class SetMode:
+    mode: Mode
+
+
+@dataclass(frozen=True, slots=True)
+class SetGains:
+    """Put these gains on trial, all in one sample, bumplessly."""
+
+    gains: Gains
+
+
+@dataclass(frozen=True, slots=True)
+class SetSetpoint:
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
+class SetOutput:
+    """The output for manual mode, MV units."""
+
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
+class SetRelay:
+    """Arm and start the relay inside the controller (mode experiment).
+
+    u = working_output +- amplitude (switching on the action-signed error, with hysteresis) + parallel_gain * error.
+    """
+
+    amplitude: float
+    hysteresis: float
+    working_output: float
+    parallel_gain: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class StageStarted:
+    """expected_s: expected plant time of this stage; remaining_s: of all stages after it."""
+
+    stage: str
+    expected_s: float
+    remaining_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class StageDone:
+    """result: a frozen dataclass with plain fields (numbers, strings, tuples)."""
+
+    stage: str
+    result: object
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """Something worth telling the operator that is neither a stage's start nor its end."""
+
+    text: str
+
+
+Command = SetMode | SetGains | SetSetpoint | SetOutput | SetRelay
+Event = StageStarted | StageDone | Note
+
+T = TypeVar("T")
+Plan = Generator[Sequence[Command | Event], Sample, T]

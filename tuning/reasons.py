@@ -1,0 +1,113 @@
+"""Why a job did not end as proposed: a closed list, each with advice for the person who can act on it.
+
+    Refused   the loop or the data does not allow a trustworthy result; nothing is broken
+    Failed    something broke or ran out on the way (a node, the bus, time)
+    Aborted   someone asked for it to stop
+
+All three leave the loop as it was; the runner sees to that.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class Reason(StrEnum):
+    """The closed list. The value is what the API shows; `ADVICE` says what to do."""
+
+    # refused
+    NOT_AT_REST = "not_at_rest"
+    NOISE_TOO_HIGH = "noise_too_high"
+    SATURATED = "saturated"
+    WRONG_MODE = "wrong_mode"
+    WRONG_SIGN = "wrong_sign"
+    NO_RESPONSE = "no_response"
+    CANNOT_OSCILLATE = "cannot_oscillate"
+    SAMPLING_TOO_SLOW = "sampling_too_slow"
+    NO_BRACKET = "no_bracket"
+    NO_OVERSHOOT = "no_overshoot"
+    NOT_SELF_REGULATING = "not_self_regulating"
+    NOT_ROBUST = "not_robust"
+    NOT_CONFIRMED = "not_confirmed"
+    BAD_LIMITS = "bad_limits"
+    BAD_INPUT = "bad_input"
+    DEVICE_MISMATCH = "device_mismatch"
+    # failed
+    MV_LIMIT = "mv_limit"
+    PV_LIMIT = "pv_limit"
+    TIME_BUDGET = "time_budget"
+    BAD_SAMPLE = "bad_sample"
+    SAMPLES_LOST = "samples_lost"
+    PV_FROZEN = "pv_frozen"
+    SETPOINT_CHANGED = "setpoint_changed"
+    MODE_CHANGED = "mode_changed"
+    NODE_LOST = "node_lost"
+    BUS_LOST = "bus_lost"
+    DEVICE_WENT_BACK = "device_went_back"
+    RESTORE_UNCONFIRMED = "restore_unconfirmed"
+    INTERNAL = "internal"
+    # aborted, interrupted
+    OPERATOR = "operator"
+    SERVICE_STOPPED = "service_stopped"
+
+
+ADVICE: dict[Reason, str] = {
+    Reason.NOT_AT_REST: "Wait until PV and MV are steady (or put the loop in manual and let it settle), then retune.",
+    Reason.NOISE_TOO_HIGH: "Filter the measurement or permit a larger set-point deviation.",
+    Reason.SATURATED: "MV is at a limit: move the operating point or widen the limits, then retune.",
+    Reason.WRONG_MODE: "Put the loop in automatic with working gains before retuning.",
+    Reason.WRONG_SIGN: "Check the controller's action (direct/reverse) against the sign of the plant's gain.",
+    Reason.NO_RESPONSE: "PV did not answer MV: check the valve, the sensor and that the right loop is selected.",
+    Reason.CANNOT_OSCILLATE: "The plant has too little lag or dead time for an ultimate point; use a model-based rule.",
+    Reason.SAMPLING_TOO_SLOW: "Choose a sample time of at most a fiftieth of the ultimate period.",
+    Reason.NO_BRACKET: "The ultimate gain was not found within a factor 8 of the relay's estimate; "
+    "check for backlash, sticking or another loop acting on this one.",
+    Reason.NO_OVERSHOOT: "The overshoot never came into the window: the plant is outside the class of this procedure; "
+    "enter a model by hand or use another method.",
+    Reason.NOT_SELF_REGULATING: "The plant integrates: use a rule for integrating plants.",
+    Reason.NOT_ROBUST: "The best PI would not be robust on its own model; keep the present gains and enter a model.",
+    Reason.NOT_CONFIRMED: "The loop did not behave as its model predicts: keep the present gains, repeat the test quietly.",
+    Reason.BAD_LIMITS: "Correct the limits: low < present value < high, and enough room for the test on both sides.",
+    Reason.BAD_INPUT: "Correct the value named in the message.",
+    Reason.DEVICE_MISMATCH: "The device is not the one the configuration describes; check node ids and firmware.",
+    Reason.MV_LIMIT: "MV reached its limit during the test: permit more MV or a smaller set-point deviation.",
+    Reason.PV_LIMIT: "PV reached its limit during the test: permit less MV deviation, or widen the PV limits if it is safe.",
+    Reason.TIME_BUDGET: "The test took longer than its budget: check T95, or raise the budget.",
+    Reason.BAD_SAMPLE: "A sample was not a finite number: check the sensor and its scaling.",
+    Reason.SAMPLES_LOST: "Samples were lost on the way: check bus load, or run a simulated plant more slowly.",
+    Reason.PV_FROZEN: "PV did not change at all while MV did: check the sensor.",
+    Reason.SETPOINT_CHANGED: "Somebody else moved the set-point during the test; agree on the time and repeat.",
+    Reason.MODE_CHANGED: "Somebody else changed the controller's mode during the test; agree on the time and repeat.",
+    Reason.NODE_LOST: "The device stopped answering: check its power and cable; it returns to its accepted gains by itself.",
+    Reason.BUS_LOST: "The CAN bus is not there: check the interface; the device returns to its accepted gains by itself.",
+    Reason.DEVICE_WENT_BACK: "The controller ended the trial by itself (lease or heartbeat): check the machine's load.",
+    Reason.RESTORE_UNCONFIRMED: "The loop could not be read back after the test: look at the controller NOW.",
+    Reason.INTERNAL: "This is a defect of Loopwright; please report it with the job's events.",
+    Reason.OPERATOR: "Stopped on request.",
+    Reason.SERVICE_STOPPED: "The service was stopped during the test; start the retune again.",
+}
+
+
+class Ended(Exception):
+    """A plan or its runner ended early; `reason` from the closed list, `detail` with the numbers."""
+
+    def __init__(self, reason: Reason, detail: str) -> None:
+        super().__init__(f"{reason.value}: {detail}")
+        self.reason = reason
+        self.detail = detail
+
+    @property
+    def advice(self) -> str:
+        return ADVICE[self.reason]
+
+
+class Refused(Ended):
+    """No trustworthy result is to be had; nothing is broken."""
+
+
+class Failed(Ended):
+    """Something broke or ran out on the way."""
+
+
+class Aborted(Ended):
+    """Someone, or the service's own shutdown, asked for it to stop."""
