@@ -1,0 +1,42 @@
+# make demo    a loop is retuned before your eyes      make test    every test and every check
+# make setup   the Python environment in .venv         make check   types, style, import directions
+# make bench   the benchmarks of the criterion
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+DEBIAN := user-mode-linux tshark can-utils iproute2
+
+.PHONY: setup demo test check bench system clean
+
+setup: $(VENV)/.installed
+
+# Pinned in constraints.txt: the same versions tomorrow as today.
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Loopwright needs Python 3.11 or newer")'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+demo: setup
+	$(BIN)/loopwright demo
+
+# What the tests on a CAN bus need from the system. Root with apt-get: installed; others are told.
+system:
+	@sh tools/system-packages $(DEBIAN)
+
+# The quick tests run natively, those on a CAN bus where there is a CAN bus. Both run even if the first fails.
+test: setup system check
+	quick=0; $(BIN)/python -m pytest --ignore=tests/vcan --ignore=tests/e2e || quick=$$?; \
+	LOOPWRIGHT_REQUIRE_VCAN=1 tools/with-vcan --timeout 2400 -- $(BIN)/python -m pytest $(wildcard tests/vcan tests/e2e) && exit $$quick
+
+check: setup
+	$(BIN)/ruff check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: setup
+	$(BIN)/python -m benchmarks.criterion
+
+clean:
+	rm -rf $(VENV) *.egg-info
