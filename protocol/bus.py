@@ -1,0 +1,200 @@
+"""Opening a CAN bus. SocketCAN goes through a raw socket (two system calls per frame hop), the rest through python-can."""
+
+from __future__ import annotations
+
+import errno
+import select
+import socket
+import struct
+import time
+from collections.abc import Collection
+from typing import Any, Protocol
+
+import can
+
+Frame = tuple[int, bytes]
+
+_CAN_FRAME = struct.Struct("=IB3x8s")
+_ID_MASK = 0x1FFFFFFF
+_NOT_DATA = 0x60000000  # remote or error frame
+_RECEIVE_BUFFER = 4 << 20  # the default holds about 275 frames, then frames vanish without an error
+_SHORTEST_ARMED_S = 0.02  # SO_RCVTIMEO counts in kernel ticks (up to 10 ms): shorter waits go through poll
+_SEND_PATIENCE_S = 1.0
+SO_RCVBUFFORCE = 33
+
+
+class BusError(Exception):
+    """The bus is not there, or not up. The text says what to do."""
+
+
+class Bus(Protocol):
+    """One opening of a bus: standard identifiers, own frames are not returned. Not for use by two threads."""
+
+    def send(self, can_id: int, data: bytes) -> None: ...
+
+    def recv(self, timeout: float | None) -> Frame | None:
+        """Next frame; None after `timeout` seconds of wall time (None = wait for ever, 0 = do not wait)."""
+        ...
+
+    def set_filters(self, ids: Collection[int]) -> None:
+        """Only frames with these identifiers are received from now on; none given = none received."""
+        ...
+
+    def fileno(self) -> int: ...
+
+    def close(self) -> None: ...
+
+
+def open_bus(url: str) -> Bus:
+    """Opens `socketcan:vcan0`, `socketcand:HOST:PORT`, `virtual:NAME` or any `INTERFACE:CHANNEL` of python-can."""
+    interface, separator, rest = url.partition(":")
+    if not (interface and separator and rest):
+        raise BusError(f"{url!r} is not a bus; examples: socketcan:can0, socketcand:127.0.0.1:29536, virtual:demo")
+    if interface == "socketcan":
+        return RawBus(rest)
+    return LibraryBus(url, interface, rest)
+
+
+class RawBus:
+    """Linux SocketCAN without a library in between."""
+
+    def __init__(self, interface: str) -> None:
+        if not hasattr(socket, "AF_CAN"):
+            raise BusError("this system has no SocketCAN; use the loopback hub (socketcand:HOST:PORT)")
+        try:
+            self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        except OSError as error:
+            raise BusError(f"this kernel has no SocketCAN ({error.strerror})") from error
+        try:
+            _enlarge(self._socket)
+            self._socket.bind((interface,))
+        except OSError as error:
+            self._socket.close()
+            raise BusError(f"CAN interface {interface!r} cannot be opened: {error.strerror}") from error
+        self._interface = interface
+        self._armed: float | None = None
+        self._poll = select.poll()
+        self._poll.register(self._socket, select.POLLIN)
+        # Bound once: looked up twice per frame otherwise.
+        self._recv = self._socket.recv
+        self._send = self._socket.send
+
+    def send(self, can_id: int, data: bytes) -> None:
+        frame = _CAN_FRAME.pack(can_id, len(data), data)
+        try:
+            self._send(frame)
+        except OSError as error:
+            self._send_patiently(frame, error)
+
+    def _send_patiently(self, frame: bytes, error: OSError) -> None:
+        """A full transmit queue (ENOBUFS) empties by itself; poll does not wait for it, so we look again."""
+        give_up = time.monotonic() + _SEND_PATIENCE_S
+        while error.errno in (errno.ENOBUFS, errno.EAGAIN) and time.monotonic() < give_up:
+            time.sleep(0.001)
+            try:
+                self._send(frame)
+                return
+            except OSError as again:
+                error = again
+        raise BusError(f"cannot send on {self._interface!r}: {error.strerror}") from error
+
+    def recv(self, timeout: float | None) -> Frame | None:
+        try:
+            if timeout == self._armed:
+                raw = self._recv(16)
+            elif timeout is None or timeout >= _SHORTEST_ARMED_S:
+                self._arm(timeout)
+                raw = self._recv(16)
+            else:
+                if timeout > 0.0 and not self._poll.poll(timeout * 1000.0):
+                    return None
+                raw = self._recv(16, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return None
+        except OSError as error:
+            raise BusError(f"cannot receive on {self._interface!r}: {error.strerror}") from error
+        can_id, length, data = _CAN_FRAME.unpack(raw)
+        if can_id & _NOT_DATA:
+            return None
+        return can_id & _ID_MASK, data[:length] if length < 8 else data
+
+    def _arm(self, timeout: float | None) -> None:
+        """The kernel keeps the time-out, so that a receive with the same one as last time is one system call."""
+        seconds = 0.0 if timeout is None else timeout
+        whole = int(seconds)
+        value = struct.pack("@ll", whole, int((seconds - whole) * 1e6))
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)
+        self._armed = timeout
+
+    def set_filters(self, ids: Collection[int]) -> None:
+        mask = socket.CAN_SFF_MASK | socket.CAN_EFF_FLAG | socket.CAN_RTR_FLAG
+        filters = b"".join(struct.pack("=II", can_id, mask) for can_id in sorted(ids))
+        self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def _enlarge(sock: socket.socket) -> None:
+    """Beyond the system's limit when we may (CAP_NET_ADMIN), else up to it."""
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, _RECEIVE_BUFFER)
+    except OSError:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+
+
+class LibraryBus:
+    """Any interface of python-can; its message objects make it about four times slower than the raw socket."""
+
+    def __init__(self, url: str, interface: str, rest: str) -> None:
+        try:
+            self._bus = can.Bus(interface=interface, **_library_arguments(interface, rest))
+        except (OSError, ValueError, can.CanError) as error:
+            raise BusError(f"bus {url!r} cannot be opened: {error}") from error
+        self._url = url
+
+    def send(self, can_id: int, data: bytes) -> None:
+        try:
+            self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        except (OSError, can.CanError) as error:
+            raise BusError(f"cannot send on {self._url!r}: {error}") from error
+
+    def recv(self, timeout: float | None) -> Frame | None:
+        try:
+            message = self._bus.recv(timeout)
+        except (OSError, can.CanError) as error:
+            raise BusError(f"cannot receive on {self._url!r}: {error}") from error
+        if message is None or message.is_error_frame or message.is_remote_frame or message.is_extended_id:
+            return None
+        return message.arbitration_id, bytes(message.data)
+
+    def set_filters(self, ids: Collection[int]) -> None:
+        # An empty list means "everything" to python-can: an identifier that cannot occur stands for "nothing".
+        wanted = sorted(ids) or [0x20000000]
+        self._bus.set_filters([{"can_id": can_id, "can_mask": 0x3FFFFFFF, "extended": False} for can_id in wanted])
+
+    def fileno(self) -> int:
+        """-1 when the interface has no file descriptor."""
+        try:
+            return int(self._bus.fileno())
+        except NotImplementedError:
+            return -1
+
+    def close(self) -> None:
+        self._bus.shutdown()
+
+
+def _library_arguments(interface: str, rest: str) -> dict[str, Any]:
+    if interface != "socketcand":
+        return {"channel": rest}
+    address, _, channel = rest.partition("/")
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdigit():
+        raise ValueError("socketcand needs HOST:PORT or HOST:PORT/CHANNEL")
+    # The library asks again and again for 10 s when nobody listens; asking once first says so at once.
+    socket.create_connection((host, int(port)), timeout=5.0).close()
+    # Without tcp_tune, Nagle's algorithm holds back every second small frame until the first is acknowledged.
+    return {"channel": channel or "vcan0", "host": host, "port": int(port), "tcp_tune": True}

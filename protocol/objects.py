@@ -1,0 +1,242 @@
+"""The object dictionary of both devices as one table: the EDS files, the checks on writes and every look-up come from it.
+
+Own objects (2000h-5FFFh) are the manufacturer area; nothing there is claimed to be standard. 1000h-1FFFh follow CiA 301,
+6000h-9FFFh carry the index and meaning publicly known of CiA 404.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import Enum
+
+from protocol.profile import SYNC_COUNTER_OVERFLOW
+
+Value = int | float | str
+
+
+class Type(Enum):
+    """Data types by their CANopen number (CiA 301) and struct format."""
+
+    BOOLEAN = (0x1, "<B")
+    U8 = (0x5, "<B")
+    U16 = (0x6, "<H")
+    U32 = (0x7, "<I")
+    REAL32 = (0x8, "<f")
+    STRING = (0x9, "")
+
+    @property
+    def number(self) -> int:
+        return self.value[0]
+
+    @property
+    def format(self) -> str:
+        return self.value[1]
+
+    @property
+    def size(self) -> int:
+        """Bytes; 0 for strings."""
+        return struct.calcsize(self.value[1])
+
+    def encode(self, value: Value) -> bytes:
+        if isinstance(value, str):
+            return value.encode("ascii")
+        return struct.pack(self.format, value if self is Type.REAL32 else int(value))
+
+    def decode(self, data: bytes) -> Value:
+        """Raises struct.error when the length does not fit."""
+        if self is Type.STRING:
+            return data.decode("ascii", "replace")
+        value: int | float = struct.unpack(self.format, data)[0]
+        return value
+
+
+class Device(Enum):
+    PLANT = "plant"
+    CONTROLLER = "controller"
+    BOTH = "both"
+
+
+class Shape(Enum):
+    VAR = "var"
+    """One value at sub-index 0."""
+    CHANNELS = "channels"
+    """Sub-index k is channel k."""
+    ENTRIES = "entries"
+    """A fixed number of entries, `names` gives them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Object:
+    """One object: `low` and `high` are the EDS limits, which the devices enforce; `pdo` holds T (send) and R (receive)."""
+
+    name: str
+    index: int
+    type: Type
+    access: str
+    text: str
+    device: Device
+    shape: Shape = Shape.VAR
+    pdo: str = ""
+    default: Value = 0
+    low: float | None = None
+    high: float | None = None
+    unit: str = ""
+    held: bool = False
+    """Written only while the plant does not run (2011h = 0)."""
+    names: tuple[str, ...] = ()
+    is_record: bool = False
+
+    @property
+    def readable(self) -> bool:
+        return self.access != "wo"
+
+    @property
+    def writable(self) -> bool:
+        return self.access in ("rw", "wo")
+
+
+BOTH, PLANT, CONTROLLER = Device.BOTH, Device.PLANT, Device.CONTROLLER
+BOOLEAN, U8, U16, U32, REAL32, STRING = Type.BOOLEAN, Type.U8, Type.U16, Type.U32, Type.REAL32, Type.STRING
+VAR, CHANNELS, ENTRIES = Shape.VAR, Shape.CHANNELS, Shape.ENTRIES
+
+DEVICE_TYPE = {PLANT: 0x000A0194, CONTROLLER: 0x00100194}
+DEGREE_CELSIUS = 0x002D0000
+SECOND = 0x00030000
+_IDENTITY = ("Vendor-ID", "Product code", "Revision number", "Serial number")
+
+# Vendor-ID 0 is for tests; a real one is given out by CiA.
+_COMMUNICATION = (
+    Object("device_type", 0x1000, U32, "ro", "Device type", BOTH),
+    Object("error_register", 0x1001, U8, "ro", "Error register", BOTH, pdo="T"),
+    Object("error_field", 0x1003, U32, "ro", "Pre-defined error field", BOTH, ENTRIES,
+           names=("Error 1", "Error 2", "Error 3", "Error 4")),
+    Object("sync_cob_id", 0x1005, U32, "ro", "COB-ID SYNC", BOTH, default=0x80),
+    Object("sample_time", 0x1006, U32, "rw", "Communication cycle period", BOTH, default=100_000,
+           low=100, high=3_600_000_000, unit="us"),
+    Object("device_name", 0x1008, STRING, "const", "Manufacturer device name", BOTH),
+    Object("hardware_version", 0x1009, STRING, "const", "Manufacturer hardware version", BOTH, default="simulated"),
+    Object("software_version", 0x100A, STRING, "const", "Manufacturer software version", BOTH, default="0.1.0"),
+    Object("emcy_cob_id", 0x1014, U32, "ro", "COB-ID EMCY", BOTH),
+    Object("heartbeat_consumer", 0x1016, U32, "rw", "Consumer heartbeat time", BOTH, ENTRIES,
+           names=("Tuner", "Peer device")),
+    Object("heartbeat_producer", 0x1017, U16, "rw", "Producer heartbeat time", BOTH, unit="ms"),
+    Object("identity", 0x1018, U32, "ro", "Identity object", BOTH, ENTRIES, names=_IDENTITY, is_record=True),
+    Object("sync_counter_overflow", 0x1019, U8, "ro", "Synchronous counter overflow value", BOTH,
+           default=SYNC_COUNTER_OVERFLOW),
+    Object("sample_number", 0x2000, U32, "ro", "Sample number", BOTH, pdo="TR"),
+)
+
+_PLANT = (
+    Object("plant_output_sample_number", 0x2001, U32, "rw", "Sample number of the output received", PLANT, pdo="R"),
+    Object("plant_pace", 0x2010, REAL32, "rw", "Pace (0 as fast as possible, 1 real time)", PLANT, default=1.0,
+           low=0, high=1_000_000),
+    Object("plant_samples_to_run", 0x2011, U32, "rw", "Samples to run (0 hold, FFFFFFFFh without end)", PLANT),
+    Object("plant_missing_answers", 0x2012, U32, "ro", "Samples without an answer", PLANT, pdo="T"),
+    Object("plant_answer_timeout", 0x2013, U16, "rw", "Answer time-out", PLANT, default=100, low=1, unit="ms"),
+    Object("plant_on_missing_answer", 0x2014, U8, "rw", "On a missing answer (0 hold, 1 stop the run, 2 safe output)",
+           PLANT, low=0, high=2),
+    Object("plant_safe_output", 0x2015, REAL32, "rw", "Safe output", PLANT, CHANNELS, low=0, high=100, unit="%"),
+    Object("plant_disturbance", 0x2022, REAL32, "rw", "Load disturbance", PLANT, CHANNELS, pdo="R",
+           low=-1000, high=1000, unit="%"),
+    Object("plant_noise", 0x2023, REAL32, "rw", "Measurement noise, standard deviation", PLANT, CHANNELS, low=0,
+           held=True),
+    Object("plant_seed", 0x2024, U32, "rw", "Random seed", PLANT, default=1, held=True),
+    Object("plant_initialise", 0x2025, U8, "wo", "Initialise (1 = initial state, sample number 0)", PLANT,
+           low=1, high=1, held=True),
+    Object("plant_pv", 0x6130, REAL32, "ro", "AI input PV", PLANT, CHANNELS, pdo="T"),
+    Object("plant_pv_unit", 0x6131, U32, "ro", "AI physical unit PV", PLANT, CHANNELS, default=DEGREE_CELSIUS),
+    Object("plant_mv", 0x6300, REAL32, "rw", "AO output PV", PLANT, CHANNELS, pdo="R", low=0, high=100, unit="%"),
+)
+
+_SMALLEST_KP = 1e-9  # Kp is positive; the direction of action is an object of its own
+
+
+def _gains(first_index: int, access: str, prefix: str, text: str) -> tuple[Object, ...]:
+    """Kp, Ti, Td, Tf, b, c in the ISA form. Ti = 0 means no integral action."""
+    rows = (
+        ("kp", "Kp", "%", _SMALLEST_KP, 1.0),
+        ("ti", "Ti", "s", 0, 0.0),
+        ("td", "Td", "s", 0, 0.0),
+        ("tf", "Tf", "s", 0, 0.0),
+        ("b", "set point weight b", "", None, 1.0),
+        ("c", "set point weight c", "", None, 0.0),
+    )
+    return tuple(
+        Object(f"controller_{prefix}_{name}", first_index + offset, REAL32, access, f"{text} {label}", CONTROLLER,
+               CHANNELS, default=default, low=low, unit=unit)
+        for offset, (name, label, unit, low, default) in enumerate(rows)
+    )
+
+
+_CONTROLLER = (
+    Object("controller_mode_command", 0x2100, U8, "rw", "Mode command (0 off, 1 manual, 2 automatic, 3 experiment)",
+           CONTROLLER, CHANNELS, default=2, low=0, high=3),
+    Object("controller_mode", 0x2101, U8, "ro", "Mode in effect", CONTROLLER, CHANNELS, pdo="T"),
+    Object("controller_manual_output", 0x2102, REAL32, "rw", "Manual output", CONTROLLER, CHANNELS, pdo="R",
+           low=0, high=100, unit="%"),
+    Object("controller_mv_low", 0x2103, REAL32, "rw", "Output low limit", CONTROLLER, CHANNELS, low=0, high=100,
+           unit="%"),
+    Object("controller_mv_high", 0x2104, REAL32, "rw", "Output high limit", CONTROLLER, CHANNELS, default=100.0,
+           low=0, high=100, unit="%"),
+    Object("controller_received_pv", 0x2105, REAL32, "rw", "Received process value X", CONTROLLER, CHANNELS, pdo="R"),
+    Object("controller_safe_output", 0x2106, REAL32, "rw", "Safe output", CONTROLLER, CHANNELS, low=0, high=100,
+           unit="%"),
+    Object("controller_rate_limit", 0x2107, REAL32, "rw", "Output rate limit (0 none)", CONTROLLER, CHANNELS, low=0,
+           unit="%/s"),
+    Object("controller_pv_low", 0x2108, REAL32, "rw", "PV span low", CONTROLLER, CHANNELS),
+    Object("controller_pv_high", 0x2109, REAL32, "rw", "PV span high", CONTROLLER, CHANNELS, default=100.0),
+    Object("controller_action", 0x210A, U8, "rw", "Action (0 reverse, 1 direct)", CONTROLLER, CHANNELS, low=0, high=1),
+    *_gains(0x2110, "rw", "staged", "Staged"),
+    *_gains(0x2118, "ro", "accepted", "Accepted"),
+    Object("controller_parameter_command", 0x2120, U8, "wo",
+           "Parameter command (1 try staged, 2 accept, 3 go back)", CONTROLLER, CHANNELS, low=1, high=3),
+    Object("controller_on_trial", 0x2121, U8, "ro", "Set in effect (0 accepted, 1 on trial)", CONTROLLER, CHANNELS,
+           pdo="T"),
+    Object("controller_accept_count", 0x2122, U32, "ro", "Accept counter", CONTROLLER, CHANNELS),
+    Object("controller_lease", 0x2130, U32, "rw", "Lease, samples left (0 none)", CONTROLLER, CHANNELS),
+    Object("controller_cause", 0x2131, U8, "ro", "Cause of the last going back", CONTROLLER, CHANNELS),
+    Object("controller_experiment", 0x2140, U8, "rw", "Experiment (0 none, 1 relay)", CONTROLLER, CHANNELS,
+           low=0, high=1),
+    Object("controller_relay_amplitude", 0x2141, REAL32, "rw", "Relay amplitude", CONTROLLER, CHANNELS, default=5.0,
+           low=0, high=100, unit="%"),
+    Object("controller_relay_hysteresis", 0x2142, REAL32, "rw", "Relay hysteresis", CONTROLLER, CHANNELS, low=0),
+    Object("controller_relay_working_output", 0x2143, REAL32, "rw", "Working output", CONTROLLER, CHANNELS,
+           default=50.0, low=0, high=100, unit="%"),
+    Object("controller_relay_max_samples", 0x2144, U32, "rw", "Most samples an experiment may take", CONTROLLER,
+           CHANNELS, default=6000, low=1),
+    Object("controller_relay_pv_low", 0x2145, REAL32, "rw", "PV low limit of an experiment", CONTROLLER, CHANNELS),
+    Object("controller_relay_pv_high", 0x2146, REAL32, "rw", "PV high limit of an experiment", CONTROLLER, CHANNELS,
+           default=100.0),
+    Object("controller_experiment_state", 0x2147, U8, "ro", "Experiment state (0 idle, 1 running, 2 done, 3 limit)",
+           CONTROLLER, CHANNELS, pdo="T"),
+    Object("controller_relay_parallel_gain", 0x2148, REAL32, "rw", "Relay parallel gain", CONTROLLER, CHANNELS, low=0),
+    Object("controller_setpoint", 0x6402, REAL32, "rw", "CO set point W", CONTROLLER, CHANNELS, pdo="TR"),
+    Object("controller_pv_unit", 0x6406, U32, "ro", "CO physical unit XW", CONTROLLER, CHANNELS,
+           default=DEGREE_CELSIUS),
+    Object("controller_mv", 0x6410, REAL32, "ro", "CO effective controller output Y", CONTROLLER, CHANNELS, pdo="T",
+           unit="%"),
+    Object("controller_on", 0x6422, BOOLEAN, "rw", "CO controller on/off", CONTROLLER, CHANNELS),
+    Object("controller_proportional_band", 0x6450, REAL32, "ro", "CO proportional band Xp1", CONTROLLER, CHANNELS,
+           unit="%"),
+    Object("controller_ti", 0x6452, REAL32, "ro", "CO integral action time Tn1", CONTROLLER, CHANNELS, unit="s"),
+    Object("controller_td", 0x6454, REAL32, "ro", "CO derivative action time Tv1", CONTROLLER, CHANNELS, unit="s"),
+    Object("controller_cycle_time", 0x6456, REAL32, "ro", "CO cycle time T1", CONTROLLER, CHANNELS, unit="s"),
+    Object("controller_time_unit", 0x6458, U32, "ro", "CO physical unit of the times", CONTROLLER, CHANNELS,
+           default=SECOND),
+)
+
+OBJECTS: tuple[Object, ...] = _COMMUNICATION + _PLANT + _CONTROLLER
+
+BY_NAME: dict[str, Object] = {entry.name: entry for entry in OBJECTS}
+
+
+def lookup(name: str) -> Object:
+    """The object called `name`, for example "controller_mode_command". KeyError when there is none."""
+    return BY_NAME[name]
+
+
+def objects_of(device: Device) -> tuple[Object, ...]:
+    """What the plant or the controller has, by index."""
+    own = (entry for entry in OBJECTS if entry.device in (device, BOTH))
+    return tuple(sorted(own, key=lambda entry: entry.index))

@@ -1,0 +1,188 @@
+"""The fieldbus profile: node-IDs, COB-IDs, frame layouts and code lists shared by plant, controller and tuner.
+
+Little-endian as CANopen always is. PV in engineering units, MV in percent of the output range (0..100).
+Plant time is `sample number * sample time`; a PV and the MV that answers it carry the same sample number.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from functools import cache
+from struct import Struct
+from typing import NamedTuple
+
+PLANT_NODE = 0x10
+CONTROLLER_NODE = 0x20
+TUNER_NODE = 0x7D
+LISTENER_NODE = 0x7E
+MAX_CHANNELS = 199
+
+NMT_ID = 0x000
+SYNC_ID = 0x080
+SYNC_COUNTER_OVERFLOW = 240
+FOREVER = 0xFFFFFFFF
+"""Value of 2011h (samples to run) that means "without end"."""
+
+PV_FRAME = Struct("<fI")
+"""PV REAL32, sample number U32."""
+MV_FRAME = Struct("<fI")
+"""MV REAL32 (percent), number U32 of the sample it answers."""
+STATUS_FRAME = Struct("<BBf")
+"""Mode U8, set in effect U8 (0 accepted, 1 on trial), set point REAL32."""
+COMMAND_FRAME = Struct("<f")
+"""Set point REAL32."""
+SYNC_FRAME = Struct("<B")
+NMT_FRAME = Struct("<BB")
+"""Command U8, node-ID U8 (0 = all)."""
+HEARTBEAT_FRAME = Struct("<B")
+EMCY_FRAME = Struct("<HB5s")
+"""Error code U16, error register U8, five bytes of our own."""
+
+
+class Mode(IntEnum):
+    OFF = 0
+    MANUAL = 1
+    AUTOMATIC = 2
+    EXPERIMENT = 3
+
+
+class Cause(IntEnum):
+    """Why the controller last went back to its accepted set (2131h)."""
+
+    NONE = 0
+    HEARTBEAT = 1
+    LEASE = 2
+    PV_LIMIT = 3
+    COMMAND = 4
+    NMT = 5
+
+
+class ParameterCommand(IntEnum):
+    """2120h."""
+
+    TRY = 1
+    ACCEPT = 2
+    GO_BACK = 3
+
+
+class Experiment(IntEnum):
+    """2140h; only the relay is built."""
+
+    NONE = 0
+    RELAY = 1
+
+
+class ExperimentState(IntEnum):
+    """2147h."""
+
+    IDLE = 0
+    RUNNING = 1
+    DONE = 2
+    ENDED_BY_LIMIT = 3
+
+
+class OnMissingAnswer(IntEnum):
+    """2014h: what the plant does with a sample nobody answered."""
+
+    HOLD_OUTPUT = 0
+    STOP_RUN = 1
+    SAFE_OUTPUT = 2
+
+
+class NmtCommand(IntEnum):
+    START = 1
+    STOP = 2
+    PRE_OPERATIONAL = 128
+    RESET_NODE = 129
+    RESET_COMMUNICATION = 130
+
+
+class NmtState(IntEnum):
+    """As the heartbeat carries it."""
+
+    BOOT_UP = 0
+    STOPPED = 4
+    OPERATIONAL = 5
+    PRE_OPERATIONAL = 127
+
+
+class Emcy(IntEnum):
+    ERROR_GONE = 0x0000
+    HEARTBEAT_LOST = 0x8130
+    NO_PV = 0x8250
+    LEASE_USED_UP = 0xFF01
+    PV_LIMIT = 0xFF02
+    NO_ANSWER = 0xFF03
+
+
+EMCY_REGISTER = {
+    Emcy.ERROR_GONE: 0x00,
+    Emcy.HEARTBEAT_LOST: 0x11,
+    Emcy.NO_PV: 0x11,
+    Emcy.LEASE_USED_UP: 0x81,
+    Emcy.PV_LIMIT: 0x81,
+    Emcy.NO_ANSWER: 0x81,
+}
+"""Error register (1001h): bit 0 generic, bit 4 communication, bit 7 manufacturer."""
+
+
+class Abort(IntEnum):
+    """SDO abort codes the devices use."""
+
+    TOGGLE = 0x05030000
+    COMMAND = 0x05040001
+    OUT_OF_MEMORY = 0x05040005
+    WRITE_ONLY = 0x06010001
+    READ_ONLY = 0x06010002
+    NO_OBJECT = 0x06020000
+    LENGTH = 0x06070010
+    NO_SUBINDEX = 0x06090011
+    INVALID_VALUE = 0x06090030
+    TOO_HIGH = 0x06090031
+    TOO_LOW = 0x06090032
+    MAXIMUM_BELOW_MINIMUM = 0x06090036
+    GENERAL = 0x08000000
+    DEVICE_STATE = 0x08000022
+
+
+def emcy_id(node: int) -> int:
+    return 0x080 + node
+
+
+def sdo_request_id(node: int) -> int:
+    return 0x600 + node
+
+
+def sdo_response_id(node: int) -> int:
+    return 0x580 + node
+
+
+def heartbeat_id(node: int) -> int:
+    return 0x700 + node
+
+
+class ChannelIds(NamedTuple):
+    """COB-IDs of one loop."""
+
+    pv: int
+    mv: int
+    status: int
+    command: int
+
+
+@cache
+def channel_ids(channel: int, plant_node: int = PLANT_NODE, controller_node: int = CONTROLLER_NODE) -> ChannelIds:
+    """COB-IDs of channel 1..199.
+
+    Channel 1 has the default PDOs of its two nodes. The others are taken in channel order from 181h..57Fh without
+    those four: first all PV, then all MV, status, command, so that an ID depends on the channel alone and not on
+    how many there are, and a measurement wins arbitration over an output.
+    """
+    if not 1 <= channel <= MAX_CHANNELS:
+        raise ValueError(f"channel must be 1..{MAX_CHANNELS}, not {channel}")
+    first = ChannelIds(0x180 + plant_node, 0x280 + controller_node, 0x380 + controller_node, 0x300 + controller_node)
+    if channel == 1:
+        return first
+    free = [cob_id for cob_id in range(0x181, 0x580) if cob_id not in first]
+    per_direction = MAX_CHANNELS - 1
+    return ChannelIds(*(free[direction * per_direction + channel - 2] for direction in range(4)))
