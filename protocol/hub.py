@@ -1,0 +1,186 @@
+"""A CAN bus without CAN: a hub on 127.0.0.1 for systems that have no SocketCAN.
+
+Speaks the raw mode of the socketcand protocol, so python-can's own `socketcand` interface joins it
+(`open_bus("socketcand:127.0.0.1:29536")`). What one member sends, all others get, in one order, and TCP loses nothing.
+
+    server: < hi >      client: < open vcan0 >  server: < ok >     client: < rawmode >   server: < ok >
+    client: < send 190 8 0 0 48 42 1 0 0 0 >                       others get: < frame 190 12.345678 0000484201000000 >
+"""
+
+from __future__ import annotations
+
+import argparse
+import selectors
+import signal
+import socket
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+
+DEFAULT_PORT = 29536
+"""The port socketcand is known by."""
+
+_LONGEST_QUEUE = 32 << 20  # bytes waiting for one member; one that is hung must not take the hub's memory
+_LONGEST_MESSAGE = 200
+# python-can's client expects "< ok >" alone in one read; frames that come this soon after it wait.
+_JOINING_S = 0.05
+
+
+class _Member:
+    def __init__(self, connection: socket.socket) -> None:
+        self.connection = connection
+        self.received = b""
+        self.queue = bytearray()
+        self.raw_from: float | None = None  # monotonic time from which frames may follow; None: not in raw mode
+
+
+class Hub:
+    """One thread serves all members. `serve` returns after `stop`, which any thread or signal handler may call."""
+
+    def __init__(self, port: int = DEFAULT_PORT) -> None:
+        self._listener = socket.create_server(("127.0.0.1", port))
+        self.port: int = self._listener.getsockname()[1]
+        self._wake, self._woken = socket.socketpair()
+        self._selector = selectors.DefaultSelector()
+        self._members: set[_Member] = set()
+
+    @property
+    def url(self) -> str:
+        return f"socketcand:127.0.0.1:{self.port}"
+
+    def stop(self) -> None:
+        with suppress(OSError):
+            self._wake.send(b"x")
+
+    def serve(self) -> None:
+        for sock in (self._listener, self._woken):
+            sock.setblocking(False)
+            self._selector.register(sock, selectors.EVENT_READ)
+        try:
+            while True:
+                now = time.monotonic()
+                waiting = any(m.queue and m.raw_from is not None and m.raw_from > now for m in self._members)
+                for key, events in self._selector.select(_JOINING_S if waiting else None):
+                    if key.fileobj is self._woken:
+                        return
+                    if key.fileobj is self._listener:
+                        self._welcome()
+                    elif key.data in self._members and events & selectors.EVENT_READ:
+                        self._read(key.data)
+                for member in list(self._members):
+                    self._flush(member)
+        finally:
+            self._close()
+
+    def _welcome(self) -> None:
+        with suppress(OSError):
+            connection, _ = self._listener.accept()
+            connection.setblocking(False)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            member = _Member(connection)
+            self._members.add(member)
+            self._selector.register(connection, selectors.EVENT_READ, member)
+            connection.send(b"< hi >")
+
+    def _read(self, member: _Member) -> None:
+        try:
+            data = member.connection.recv(65536)
+            # Else the member's second small frame waits for our late acknowledgement.
+            if hasattr(socket, "TCP_QUICKACK"):
+                member.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._leave(member)
+            return
+        *messages, member.received = (member.received + data).split(b">")
+        if len(member.received) > _LONGEST_MESSAGE:
+            self._leave(member)
+            return
+        for message in messages:
+            self._answer(member, message.split()[1:])
+
+    def _answer(self, member: _Member, words: list[bytes]) -> None:
+        """`words`: a message without its brackets."""
+        if not words:
+            return
+        if words[0] == b"send" and member.raw_from is not None:
+            frame = _frame(words)
+            if frame is None:
+                member.queue += b"< error malformed frame >"
+                return
+            for other in self._members:
+                if other is not member and other.raw_from is not None:
+                    other.queue += frame
+        elif words[0] in (b"open", b"rawmode"):
+            with suppress(OSError):
+                member.connection.send(b"< ok >")
+            if words[0] == b"rawmode":
+                member.raw_from = time.monotonic() + _JOINING_S
+        elif words[0] == b"echo":
+            member.queue += b"< echo >"
+
+    def _flush(self, member: _Member) -> None:
+        if not member.queue or member not in self._members:
+            return
+        if member.raw_from is not None and time.monotonic() < member.raw_from:
+            return
+        try:
+            sent = member.connection.send(member.queue)
+            del member.queue[:sent]
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._leave(member)
+            return
+        if len(member.queue) > _LONGEST_QUEUE:
+            self._leave(member)
+            return
+        # A full connection wakes us when it has room again.
+        events = selectors.EVENT_READ | (selectors.EVENT_WRITE if member.queue else 0)
+        if self._selector.get_key(member.connection).events != events:
+            self._selector.modify(member.connection, events, member)
+
+    def _leave(self, member: _Member) -> None:
+        self._members.discard(member)
+        self._selector.unregister(member.connection)
+        member.connection.close()
+
+    def _close(self) -> None:
+        for member in list(self._members):
+            self._leave(member)
+        self._selector.close()
+        for sock in (self._listener, self._wake, self._woken):
+            sock.close()
+
+
+def _frame(words: list[bytes]) -> bytes | None:
+    """`send ID LENGTH BYTE...` as others receive it; None when it is no CAN frame."""
+    try:
+        can_id, length, values = words[1], int(words[2], 16), [int(word, 16) for word in words[3:]]
+        if len(can_id) not in (3, 8) or length != len(values) or length > 8:
+            return None
+        int(can_id, 16)
+        return b"< frame %s %.6f %s >" % (can_id, time.time(), bytes(values).hex().encode())
+    except (ValueError, IndexError):
+        return None
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m protocol.hub", description="A CAN bus on 127.0.0.1, without CAN.")
+    parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="0: any free one (default: %(default)s)")
+    try:
+        hub = Hub(parser.parse_args(argv).port)
+    except OSError as error:
+        parser.exit(1, f"hub: {error.strerror}\n")
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: hub.stop())
+    print(f"ready {hub.url}", flush=True)
+    hub.serve()
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,109 @@
+"""The hub, joined by python-can's own client of the protocol it speaks."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+
+import can
+import pytest
+
+from protocol.hub import Hub
+
+
+@pytest.fixture
+def hub() -> Iterator[Hub]:
+    hub = Hub(port=0)
+    thread = threading.Thread(target=hub.serve)
+    thread.start()
+    yield hub
+    hub.stop()
+    thread.join(5)
+    assert not thread.is_alive()
+
+
+@pytest.fixture
+def members(hub: Hub) -> Iterator[list[can.BusABC]]:
+    found = [can.Bus(interface="socketcand", channel="vcan0", host="127.0.0.1", port=hub.port) for _ in range(3)]
+    yield found
+    for member in found:
+        member.shutdown()
+
+
+def frame(number: int) -> can.Message:
+    return can.Message(arbitration_id=0x190, data=number.to_bytes(8, "little"), is_extended_id=False)
+
+
+def test_a_frame_reaches_all_others_and_not_its_sender(members: list[can.BusABC]) -> None:
+    members[0].send(frame(7))
+    for other in members[1:]:
+        got = other.recv(5)
+        assert got is not None
+        assert (got.arbitration_id, got.data, got.is_extended_id) == (0x190, bytearray([7, 0, 0, 0, 0, 0, 0, 0]), False)
+    assert members[0].recv(0.05) is None
+
+
+@pytest.mark.parametrize("data", [b"", b"\x00", b"\xff" * 8])
+@pytest.mark.parametrize(("can_id", "extended"), [(0, False), (0x7FF, False), (0x1FFFFFFF, True)])
+def test_every_kind_of_frame_passes(members: list[can.BusABC], data: bytes, can_id: int, extended: bool) -> None:
+    members[0].send(can.Message(arbitration_id=can_id, data=data, is_extended_id=extended))
+    got = members[1].recv(5)
+    assert got is not None
+    assert (got.arbitration_id, bytes(got.data), got.is_extended_id) == (can_id, data, extended)
+
+
+def test_nothing_is_lost_and_the_order_stays_when_a_member_reads_late(members: list[can.BusABC]) -> None:
+    for number in range(3000):
+        members[0].send(frame(number))
+    numbers = []
+    for _ in range(3000):
+        got = members[1].recv(5)
+        assert got is not None
+        numbers.append(int.from_bytes(got.data, "little"))
+    assert numbers == list(range(3000))
+
+
+def test_joining_while_the_bus_is_busy_succeeds(hub: Hub, members: list[can.BusABC]) -> None:
+    done = threading.Event()
+
+    def chatter() -> None:
+        while not done.wait(0.0005):
+            members[0].send(frame(1))
+
+    thread = threading.Thread(target=chatter)
+    thread.start()
+    try:
+        for _ in range(5):
+            late = can.Bus(interface="socketcand", channel="vcan0", host="127.0.0.1", port=hub.port)
+            assert late.recv(5) is not None
+            late.shutdown()
+    finally:
+        done.set()
+        thread.join()
+
+
+@pytest.mark.parametrize("rubbish", [b"< send 190 9 1 >", b"< send >", b"> > <", b"x" * 500, b"< send zzz 1 1 >"])
+def test_rubbish_harms_nobody_else(hub: Hub, members: list[can.BusABC], rubbish: bytes) -> None:
+    with socket.create_connection(("127.0.0.1", hub.port)) as bad:
+        bad.sendall(b"< open vcan0 >< rawmode >" + rubbish)
+        members[0].send(frame(5))
+        got = members[1].recv(5)
+        assert got is not None
+        assert got.data[0] == 5
+
+
+def test_only_this_machine_can_reach_it(hub: Hub) -> None:
+    assert hub._listener.getsockname()[0] == "127.0.0.1"
+
+
+def test_as_a_process_it_says_where_it_is_and_stops_when_asked() -> None:
+    command = [sys.executable, "-m", "protocol.hub", "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as hub:
+        assert hub.stdout is not None
+        assert hub.stdout.readline().startswith("ready socketcand:127.0.0.1:")
+        hub.send_signal(signal.SIGTERM)
+        assert hub.wait(10) == 0
