@@ -1,0 +1,300 @@
+"""The whole procedure in memory: the pure plant model and the pure controller algorithm behind the same `Loop`.
+
+This is the one module of the service that knows plantsim and controller, and only their pure parts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from controller.channel import Cause, Channel, Settings
+from controller.pid import Parameters
+from plantsim.plant import LinearPlant, Plant
+from service.loop import LoopState
+from service.runner import RunResult, Watch, run
+from tuning.five_stage import STAGES, Facts, Options, Proposal, five_stage
+from tuning.gains import Gains
+from tuning.margins import ultimate_point
+from tuning.models import TransferFunction
+from tuning.plan import (
+    Command,
+    Event,
+    Mode,
+    Sample,
+    SetGains,
+    SetMode,
+    SetOutput,
+    SetRelay,
+    SetSetpoint,
+    StageDone,
+)
+from tuning.reasons import Ended, Failed, Reason, Refused
+
+METHODS = ("five-stage",)
+LEASE_SAMPLES = 1_000_000
+
+
+class RehearsedLoop:
+    """A `Loop` in memory, as fast as the machine goes. Commands act on the next sample."""
+
+    def __init__(self, plant: Plant, channel: Channel, sample_time_s: float) -> None:
+        self._plant = plant
+        self._channel = channel
+        self._dt = sample_time_s
+        self._n = 0
+        self._pv = plant.pv
+
+    def read(self) -> LoopState:
+        channel = self._channel
+        return LoopState(
+            mode=Mode(channel.mode),
+            sp=channel.setpoint,
+            pv=self._pv,
+            mv=channel.mv,
+            gains=_gains(channel.in_effect),
+            on_trial=channel.on_trial,
+            mv_low=channel.settings.mv_low,
+            mv_high=channel.settings.mv_high,
+            sample_time_s=self._dt,
+            reverse_acting=channel.settings.reverse,
+        )
+
+    def begin(self) -> LoopState:
+        state = self.read()
+        self._channel.renew_lease(LEASE_SAMPLES)
+        return state
+
+    def step(self, commands: Sequence[Command]) -> Sample:
+        channel = self._channel
+        for command in commands:
+            self._carry_out(command)
+        if channel.lease < LEASE_SAMPLES // 2:
+            channel.renew_lease(LEASE_SAMPLES)
+        mv = channel.step(self._pv)
+        sample = Sample(self._n * self._dt, channel.setpoint, self._pv, mv, channel.mode)
+        self._pv = self._plant.step(mv)
+        self._n += 1
+        return sample
+
+    def _carry_out(self, command: Command) -> None:
+        channel = self._channel
+        match command:
+            case SetSetpoint(value):
+                channel.setpoint = value
+            case SetMode(mode):
+                if mode != channel.mode:
+                    channel.command_mode(int(mode))
+            case SetGains(gains):
+                channel.stage(_parameters(gains))
+                channel.try_staged()
+            case SetOutput(value):
+                channel.manual_output = value
+            case SetRelay(amplitude, hysteresis, working, parallel):
+                low, high = channel.settings.pv_low, channel.settings.pv_high
+                channel.start_relay(amplitude, hysteresis, working, parallel, 10**9, low, high)
+
+    def restore(self, state: LoopState) -> LoopState:
+        self._channel.go_back(Cause.COMMAND)
+        self._channel.setpoint = state.sp
+        return self.read()
+
+    def accept(self, gains: Gains) -> LoopState:
+        self._channel.stage(_parameters(gains))
+        self._channel.try_staged()
+        self._channel.accept()
+        return self.read()
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+
+def _parameters(gains: Gains) -> Parameters:
+    return Parameters(gains.Kp, gains.Ti, gains.Td, gains.Tf, gains.b, gains.c)
+
+
+def _gains(p: Parameters) -> Gains:
+    return Gains(p.Kp, p.Ti, p.Td, p.Tf, p.b, p.c)
+
+
+class PlantFile(BaseModel):
+    """A plant for `loopwright rehearse`, in deviation variables; what is left out is chosen and echoed."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    name: str = "plant"
+    num: list[float] = Field(min_length=1, max_length=12, description="numerator, highest power of s first")
+    den: list[float] = Field(min_length=1, max_length=12, description="denominator, highest power of s first")
+    dead_time_s: float = Field(0.0, ge=0)
+    sample_time_s: float | None = Field(None, gt=0)
+    t95_s: float | None = Field(None, gt=0)
+    noise_std: float = Field(0.0, ge=0, description="standard deviation of the measurement, PV units")
+    seed: int = Field(1, ge=0)
+    mv_limits: tuple[float, float] = (-0.5, 0.5)
+    sp_deviation: float | None = Field(None, gt=0)
+    gains: dict[str, float] | None = Field(None, description="present PI of the loop: Kp, Ti (s)")
+
+    @model_validator(mode="after")
+    def _proper(self) -> PlantFile:
+        if not any(self.den) or self.den[0] == 0:
+            raise ValueError("den must start with a coefficient other than 0")
+        if len(self.num) > len(self.den):
+            raise ValueError(f"num has order {len(self.num) - 1}, more than den's {len(self.den) - 1}: not proper")
+        if not any(self.num):
+            raise ValueError("num is zero: the plant does not answer MV")
+        if not self.mv_limits[0] < 0 < self.mv_limits[1]:
+            raise ValueError(f"mv_limits must be [low < 0, high > 0] around the operating point, not {self.mv_limits}")
+        return self
+
+
+def _nice(x: float) -> float:
+    """The largest 1, 2 or 5 times a power of ten that is not above x."""
+    power = 10.0 ** math.floor(math.log10(x))
+    return next(m * power for m in (5.0, 2.0, 1.0) if m * power <= x * (1 + 1e-9))
+
+
+def _complete(file: PlantFile) -> PlantFile:
+    """Chooses what was left out, from the model: T95, Ts (a 300th of Pu or less), step, present gains."""
+    poles = np.roots(file.den)
+    gain = file.num[-1] / file.den[-1] if file.den[-1] else math.inf
+    t95 = file.t95_s
+    if t95 is None:
+        if len(poles) and float(poles.real.max()) >= -1e-9:
+            slow = max((1 / abs(p) for p in poles if abs(p) > 1e-9), default=1.0)
+            t95 = file.dead_time_s * 4 + 3 * slow
+        else:
+            t95 = _t95(file)
+    model = TransferFunction(tuple(file.num), tuple(file.den), file.dead_time_s)
+    if file.sample_time_s is not None:
+        ts = file.sample_time_s
+    else:
+        try:
+            period = ultimate_point(model)[1]
+        except (Ended, ValueError, ArithmeticError):
+            period = math.nan
+        ts = _nice(period / 300 if math.isfinite(period) and period > 0 else t95 / 500)
+    room = min(-file.mv_limits[0], file.mv_limits[1])
+    step = file.sp_deviation or 0.2 * room * (abs(gain) if math.isfinite(gain) else 1.0)
+    gains = file.gains or {"Kp": 0.3 / abs(gain) if math.isfinite(gain) else 0.1, "Ti": t95 / 3}
+    return file.model_copy(update={"sample_time_s": ts, "t95_s": t95, "sp_deviation": step, "gains": gains})
+
+
+def _t95(file: PlantFile) -> float:
+    """When the plant's own step response has come within 5 % of its end for good, s."""
+    slowest = max((1 / abs(p.real) for p in np.roots(file.den)), default=1.0)
+    dt = max(slowest, file.dead_time_s) / 200
+    plant = LinearPlant(file.num, file.den, file.dead_time_s, dt)
+    y = np.array([plant.step(1.0) for _ in range(round((12 * slowest + file.dead_time_s) / dt))])
+    end = file.num[-1] / file.den[-1]
+    away = np.flatnonzero(np.abs(y - end) > 0.05 * abs(end))
+    return float(dt * (away[-1] + 2)) if len(away) else 10 * dt
+
+
+def rehearse(
+    spec: dict[str, Any], method: str = "five-stage", on_event: Callable[[Event], None] | None = None, **options: Any
+) -> dict[str, Any]:
+    """Preflight to verification on a model in memory. Returns the JSON object of `loopwright rehearse`.
+
+    spec: the fields of `PlantFile`.  options: those of `tuning.five_stage.Options`.
+    A spec that cannot be used gives outcome "refused", reason "bad_input".
+    """
+    results: dict[str, object] = {}
+
+    def listen(event: Event) -> None:
+        if isinstance(event, StageDone):
+            results[event.stage] = event.result
+        if on_event:
+            on_event(event)
+
+    try:
+        if method not in METHODS:
+            raise Refused(Reason.BAD_INPUT, f"method {method!r} is not one of {', '.join(METHODS)}")
+        file = _complete(PlantFile.model_validate(spec))
+        loop, facts = _loop(file)
+        outcome = run(five_stage(facts, Options(**options)), loop, watch=_watch(facts), on_event=listen)
+    except ValidationError as error:
+        lines = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'file'}: {e['msg']}" for e in error.errors())
+        return _answer(None, RunResult(ended=Refused(Reason.BAD_INPUT, lines)), results)
+    except Ended as ended:
+        return _answer(None, RunResult(ended=ended), results)
+    return _answer(file, outcome, results)
+
+
+def _loop(file: PlantFile) -> tuple[RehearsedLoop, Facts]:
+    ts, t95, step, gains = file.sample_time_s, file.t95_s, file.sp_deviation, file.gains
+    assert ts and t95 and step and gains
+    low, high = file.mv_limits
+    plant = LinearPlant(
+        file.num, file.den, file.dead_time_s, ts, noise_std=file.noise_std, seed=file.seed, mv_low=low, mv_high=high
+    )
+    positive = (file.num[-1] or file.num[0]) / (file.den[-1] or file.den[0]) > 0
+    span = 1e9
+    settings = Settings(mv_low=low, mv_high=high, safe_output=0.0, pv_low=-span, pv_high=span, reverse=positive)
+    present = Gains(Kp=gains["Kp"], Ti=gains.get("Ti", 0.0))
+    channel = Channel(ts, settings, _parameters(present), 0.0, int(Mode.AUTOMATIC), 0.0)
+    facts = Facts(ts, t95, low, high, step, present, positive)
+    return RehearsedLoop(plant, channel, ts), facts
+
+
+def _watch(facts: Facts) -> Watch:
+    return Watch(max_time_s=500 * facts.T95_s)
+
+
+def _answer(file: PlantFile | None, outcome: RunResult[Proposal], results: dict[str, object]) -> dict[str, Any]:
+    """The JSON object; what is not known is null."""
+    proposal, ended = outcome.value, outcome.ended
+    times = {stage: outcome.plant_time_s[stage] for stage in STAGES if stage in outcome.plant_time_s}
+    answer: dict[str, Any] = {
+        "name": file.name if file else None,
+        "method": "five-stage",
+        "outcome": "proposed" if proposal else "failed" if isinstance(ended, Failed) else "refused",
+        "reason": ended.reason.value if ended else None,
+        "detail": ended.detail if ended else None,
+        "advice": ended.advice if ended else None,
+        "ultimate": None,
+        "model": None,
+        "gains": None,
+        "predicted": None,
+        "measured": None,
+        "plant_time_s": {**times, "total": sum(times.values())},
+        "stages": {stage: _plain(result) for stage, result in results.items()},
+        "input": file.model_dump() if file else None,
+        "form": "ISA: u = Kp*(e + integral(e)/Ti + Td*de/dt); Kp in MV per PV unit, times in s",
+    }
+    ultimate = results.get("ultimate") or (proposal and proposal.ultimate)
+    if ultimate is not None:
+        answer["ultimate"] = {"Ku": ultimate.Ku, "Pu": ultimate.Pu_s}  # type: ignore[attr-defined]
+    if proposal:
+        model = proposal.model
+        answer["model"] = {"K": model.K, "T": model.T_s, "L": model.L_s, "k_source": model.k_source}
+        answer["gains"] = {"Kp": proposal.gains.Kp, "Ti": proposal.gains.Ti, "Td": proposal.gains.Td}
+        answer["predicted"] = asdict(proposal.predicted)
+        answer["measured"] = {
+            "before": asdict(proposal.baseline) if proposal.baseline else None,
+            "after": asdict(proposal.verification) if proposal.verification else None,
+        }
+        answer["notes"] = list(proposal.notes)
+    clean: dict[str, Any] = _finite(answer)
+    return clean
+
+
+def _plain(result: object) -> Any:
+    if isinstance(result, tuple):
+        return [_plain(item) for item in result]
+    return asdict(result) if hasattr(result, "__dataclass_fields__") else result  # type: ignore[call-overload]
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no nan or inf: null says that there is no number."""
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

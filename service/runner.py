@@ -1,0 +1,204 @@
+"""Pumps a plan through a loop, guards every sample, and always restores the loop: the safety contract's second clause.
+
+Whatever ends the run - the plan's result, a refusal, a limit, a lost node, an operator, a defect - the way out is one:
+restore mode, set-point and gains of the state found at the beginning, and read them back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Generic, TypeVar
+
+from service.loop import Loop, LoopState
+from tuning.plan import (
+    Command,
+    Event,
+    Mode,
+    Note,
+    Plan,
+    Sample,
+    SetGains,
+    SetMode,
+    SetOutput,
+    SetRelay,
+    SetSetpoint,
+    StageStarted,
+)
+from tuning.reasons import Aborted, Ended, Failed, Reason
+from tuning.stages.common import same
+
+T = TypeVar("T")
+CHUNK = 200
+GRACE = 50
+"""Samples that a command may take to show on a live bus before another's hand is suspected."""
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """PV limits (PV units), time budget (plant s), and how many samples in a row may be missing."""
+
+    pv_low: float = -math.inf
+    pv_high: float = math.inf
+    max_time_s: float = math.inf
+    max_gap_samples: int = 5
+    max_frozen_samples: int = 2000
+
+
+@dataclass(slots=True)
+class RunResult(Generic[T]):
+    """value: the plan's result, or ended: why there is none.  restored: the loop as read back, None if it could not be."""
+
+    value: T | None = None
+    ended: Ended | None = None
+    restored: LoopState | None = None
+    plant_time_s: dict[str, float] = field(default_factory=dict)
+
+
+class Guard:
+    """Checks each sample against the watch and against what the plan itself has commanded."""
+
+    def __init__(self, watch: Watch, state: LoopState) -> None:
+        self._watch = watch
+        self._dt = state.sample_time_s
+        self._sp = state.sp
+        self._mode = int(state.mode)
+        self._start: float | None = None
+        self._last = 0.0
+        self._grace = GRACE
+        self._pv = math.nan
+        self._mv = math.nan
+        self._frozen = 0
+        self._moved = False
+        self.foreign_setpoint: float | None = None
+
+    def commanded(self, commands: Sequence[Command]) -> None:
+        for command in commands:
+            if isinstance(command, SetSetpoint):
+                self._sp = command.value
+            elif isinstance(command, SetMode):
+                self._mode = int(command.mode)
+        self._grace = GRACE
+
+    def check(self, sample: Sample) -> None:
+        t, sp, pv, mv, mode = sample
+        watch = self._watch
+        if not (math.isfinite(pv) and math.isfinite(mv)):
+            raise Failed(Reason.BAD_SAMPLE, f"at {t:.3f} s PV is {pv}, MV is {mv}")
+        if self._start is None:
+            self._start = t
+        elif t - self._last > (watch.max_gap_samples + 1.5) * self._dt:
+            raise Failed(Reason.SAMPLES_LOST, f"{(t - self._last) / self._dt - 1:.0f} samples missing before {t:.3f} s")
+        self._last = t
+        if not watch.pv_low <= pv <= watch.pv_high:
+            raise Failed(Reason.PV_LIMIT, f"PV {pv:.5g} left {watch.pv_low:.5g} .. {watch.pv_high:.5g} at {t:.3f} s")
+        if t - self._start > watch.max_time_s:
+            raise Failed(Reason.TIME_BUDGET, f"{t - self._start:.0f} s of plant time are over the budget")
+        if self._grace:
+            self._grace -= 1
+            if mode == self._mode and same(sp, self._sp):
+                self._grace = 0
+        else:
+            if not same(sp, self._sp):
+                self.foreign_setpoint = sp
+                raise Aborted(Reason.SETPOINT_CHANGED, f"at {t:.3f} s the set-point is {sp:.6g}, not {self._sp:.6g}")
+            if mode != self._mode:
+                raise Aborted(
+                    Reason.MODE_CHANGED, f"at {t:.3f} s the mode is {_mode(mode)}, not {_mode(self._mode)}"
+                )
+        if pv == self._pv:
+            self._moved = self._moved or mv != self._mv
+            self._frozen += 1
+            if self._frozen > watch.max_frozen_samples and self._moved:
+                raise Failed(Reason.PV_FROZEN, f"PV is exactly {pv:.6g} for {self._frozen} samples while MV moved")
+        else:
+            self._frozen, self._moved, self._pv = 0, False, pv
+        self._mv = mv
+
+
+def _mode(number: int) -> str:
+    return Mode(number).name.lower() if number in Mode._value2member_map_ else str(number)
+
+
+def run(
+    plan: Plan[T],
+    loop: Loop,
+    *,
+    watch: Watch,
+    on_event: Callable[[Event], None] = lambda event: None,
+    on_samples: Callable[[list[Sample]], None] = lambda samples: None,
+    stop: Callable[[], Reason | None] = lambda: None,
+) -> RunResult[T]:
+    """Runs the plan to its end and restores the loop. Raises nothing that a loop or plan can cause; see `ended`.
+
+    stop is asked once a sample; what it returns ends the run as Aborted.
+    """
+    result: RunResult[T] = RunResult()
+    samples: list[Sample] = []
+    state: LoopState | None = None
+    guard: Guard | None = None
+    stage, since, now = "", 0.0, 0.0
+
+    def clock(next_stage: str) -> None:
+        nonlocal stage, since
+        if stage:
+            result.plant_time_s[stage] = result.plant_time_s.get(stage, 0.0) + now - since
+        stage, since = next_stage, now
+
+    try:
+        state = loop.begin()
+        guard = Guard(watch, state)
+        answer = next(plan)
+        commands: list[Command] = []
+        while True:
+            if answer:
+                commands = []
+                for item in answer:
+                    if isinstance(item, SetMode | SetGains | SetSetpoint | SetOutput | SetRelay):
+                        commands.append(item)
+                    else:
+                        if isinstance(item, StageStarted):
+                            clock(item.stage)
+                        on_event(item)
+                if commands:
+                    guard.commanded(commands)
+            elif commands:
+                commands = []
+            sample = loop.step(commands)
+            if not now:
+                since = sample.t - state.sample_time_s
+            now = sample.t
+            samples.append(sample)
+            if len(samples) >= CHUNK:
+                on_samples(samples)
+                samples = []
+            guard.check(sample)
+            reason = stop()
+            if reason is not None:
+                raise Aborted(reason, f"at {now:.3f} s of plant time, in stage {stage or 'start'}")
+            answer = plan.send(sample)
+    except StopIteration as end:
+        result.value = end.value
+    except Ended as ended:
+        result.ended = ended
+    except Exception as defect:
+        result.ended = Failed(Reason.INTERNAL, f"{type(defect).__name__}: {defect}")
+        on_event(Note(f"defect in stage {stage}: {defect!r}"))
+    finally:
+        plan.close()
+    clock("")
+    if state is not None:
+        home = state
+        if guard is not None and guard.foreign_setpoint is not None:
+            home = replace(state, sp=guard.foreign_setpoint)  # another's hand on the set-point has the last word
+        try:
+            result.restored = loop.restore(home)
+        except Ended as ended:
+            on_event(Note(f"restore: {ended}"))
+            if result.ended is None or result.ended.reason not in (Reason.NODE_LOST, Reason.BUS_LOST):
+                result.value, result.ended = None, ended
+    if samples:
+        on_samples(samples)
+    return result
+

@@ -1,0 +1,286 @@
+"""The five-stage procedure as one plan made of plans.
+
+    preflight - baseline - 1 relay - 2 ultimate gain - 3 ZN PI, overshoot - 4 FOPDT estimate - 5 optimisation - verify
+
+Source: Stopakevych et al., automatic re-tuning of PI controllers in poorly performing control loops. Stages 4 and 5 take no
+plant time. The procedure may be entered at any stage with values typed in by hand, as in the paper's manual mode.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from tuning.estimate import fopdt_from_overshoot
+from tuning.gains import Gains
+from tuning.margins import margins
+from tuning.models import FOPDT
+from tuning.plan import Mode, Plan, SetGains, SetMode, SetSetpoint, StageDone, StageStarted
+from tuning.reasons import Reason, Refused
+from tuning.response import step_figures
+from tuning.robust import optimise
+from tuning.stages.common import Facts, OperatingPoint, settle, to_rest
+from tuning.stages.preflight import preflight
+from tuning.stages.relay import relay_test
+from tuning.stages.step_test import StepResult, step_test
+from tuning.stages.ultimate import ultimate_gain
+from tuning.stages.zn_pi import allowed_step, zn_pi
+
+__all__ = ["STAGES", "Facts", "Options", "Proposal", "five_stage"]
+
+STAGES = ("preflight", "baseline", "relay", "ultimate", "zn_pi", "estimate", "optimise", "verify")
+MOST_Ms, LEAST_GM = 2.0, 2.0
+Entry = Literal["relay", "zn_pi", "estimate", "optimise"]
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """Where to enter, and what was typed in for that: zn_pi needs Ku, Pu_s; estimate needs Kp, Ti_s, overshoot_pct;
+    optimise needs model_K, model_T_s, model_L_s.
+
+    k_source: the gain that goes into the model, "k5" (formula 5) or "ke" (measured).
+    kp_step_factor: Stage 3 multiplies Kp by this instead of adding 0.1 (Ku - Kp).
+    """
+
+    start: Entry = "relay"
+    Ku: float | None = None
+    Pu_s: float | None = None
+    Kp: float | None = None
+    Ti_s: float | None = None
+    overshoot_pct: float | None = None
+    model_K: float | None = None
+    model_T_s: float | None = None
+    model_L_s: float | None = None
+    k_source: Literal["k5", "ke"] = "k5"
+    kp_step_factor: float | None = None
+    overshoot_window_pct: tuple[float, float] = (10.0, 50.0)
+    baseline: bool = True
+    verify: bool = True
+
+    def __post_init__(self) -> None:
+        needed = {
+            "relay": (),
+            "zn_pi": ("Ku", "Pu_s"),
+            "estimate": ("Kp", "Ti_s", "overshoot_pct"),
+            "optimise": ("model_K", "model_T_s", "model_L_s"),
+        }
+        for name in needed[self.start]:
+            value = getattr(self, name)
+            positive = name not in ("overshoot_pct", "model_K")
+            if value is None or not math.isfinite(value) or (positive and value <= 0) or value == 0:
+                raise Refused(Reason.BAD_INPUT, f"entering at {self.start} needs {name}, a number > 0, not {value!r}")
+        if self.kp_step_factor is not None and not 1 < self.kp_step_factor <= 2:
+            raise Refused(Reason.BAD_INPUT, f"kp_step_factor must be in (1, 2], not {self.kp_step_factor!r}")
+        low, high = self.overshoot_window_pct
+        if not 0 < low < high < 74:
+            raise Refused(Reason.BAD_INPUT, f"overshoot_window_pct must satisfy 0 < low < high < 74, not {low}, {high}")
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """FOPDT: K PV units per MV unit (signed), T_s, L_s; which gain it uses, and both candidates."""
+
+    K: float
+    T_s: float
+    L_s: float
+    k_source: str
+    k5: float | None = None
+    ke: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Predicted:
+    """Of the new gains on the estimated model: Ms, GM (ratio), PM (degrees), set-point step figures."""
+
+    Ms: float
+    GM: float
+    PM_deg: float
+    overshoot_pct: float
+    settling_s: float
+    IAE_per_unit: float
+
+
+@dataclass(frozen=True, slots=True)
+class Ultimate:
+    Ku: float
+    Pu_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """What the operator decides on. Gains in ISA form, MV per PV unit and seconds."""
+
+    model: Model
+    old_gains: Gains
+    gains: Gains
+    predicted: Predicted
+    ultimate: Ultimate | None
+    baseline: StepResult | None
+    verification: StepResult | None
+    notes: tuple[str, ...]
+
+
+def five_stage(facts: Facts, options: Options) -> Plan[Proposal]:
+    """The whole procedure on a loop in automatic and at rest. Raises Refused; restores nothing (the runner does)."""
+    T95 = facts.T95_s
+    pu_guess = options.Pu_s or T95 / 2
+    expected = {
+        "preflight": T95 / 2,
+        "baseline": 4 * T95,
+        "relay": 8 * pu_guess + T95,
+        "ultimate": 5 * (5 * pu_guess + T95),
+        "zn_pi": 4 * T95,
+        "estimate": 0.0,
+        "optimise": 0.0,
+        "verify": 4 * T95,
+    }
+    entered = STAGES.index(options.start)
+    todo = [s for i, s in enumerate(STAGES) if s == "preflight" or i >= entered or s == "baseline"]
+    if not options.baseline:
+        todo.remove("baseline")
+    if not options.verify:
+        todo.remove("verify")
+
+    def started(stage: str) -> tuple[StageStarted]:
+        after = todo[todo.index(stage) + 1 :]
+        return (StageStarted(stage, expected[stage], sum(expected[s] for s in after)),)
+
+    notes: list[str] = []
+    yield started("preflight")
+    point = yield from preflight(facts)
+    yield (StageDone("preflight", point),)
+
+    baseline: StepResult | None = None
+    if options.baseline:
+        yield started("baseline")
+        baseline = yield from _baseline(facts, point)
+        yield (StageDone("baseline", baseline),)
+        yield from to_rest(facts, point, 0.02 * facts.sp_deviation)
+    gain = baseline.static_gain if baseline else math.nan
+
+    ultimate: Ultimate | None = None
+    if options.start in ("relay", "zn_pi"):
+        if options.start == "relay":
+            yield started("relay")
+            rough = yield from relay_test(facts, point)
+            yield (StageDone("relay", rough),)
+            expected["ultimate"] = 5 * (5 * rough.Pu_a_s + T95)
+            yield started("ultimate")
+            found = yield from ultimate_gain(facts, point, rough)
+            yield (StageDone("ultimate", found),)
+            ultimate = Ultimate(found.Ku, found.Pu_s)
+            gain = gain if gain == gain else found.static_gain
+        else:
+            ultimate = Ultimate(_typed(options.Ku), _typed(options.Pu_s))
+        yield started("zn_pi")
+        zn = yield from zn_pi(
+            facts, point, ultimate.Ku, ultimate.Pu_s, gain, options.overshoot_window_pct, options.kp_step_factor
+        )
+        yield (StageDone("zn_pi", zn),)
+        Kp, Ti, overshoot, ke = zn.Kp, zn.Ti_s, zn.overshoot_pct, zn.static_gain
+    elif options.start == "estimate":
+        Kp, Ti, overshoot, ke = _typed(options.Kp), _typed(options.Ti_s), _typed(options.overshoot_pct), gain
+
+    if options.start == "optimise":
+        model = Model(_typed(options.model_K), _typed(options.model_T_s), _typed(options.model_L_s), "typed in")
+        if (model.K > 0) != facts.reverse:
+            raise Refused(
+                Reason.WRONG_SIGN,
+                f"the model's gain {model.K:g} does not go with a {'reverse' if facts.reverse else 'direct'} action",
+            )
+    else:
+        yield started("estimate")
+        model = _estimate(facts, Kp, Ti, overshoot, ke, options.k_source, notes)
+        yield (StageDone("estimate", model),)
+    yield started("optimise")
+    gains, predicted = _optimised(model, ultimate)
+    yield (StageDone("optimise", (gains, predicted)),)
+
+    verification: StepResult | None = None
+    if options.verify:
+        yield started("verify")
+        verification = yield from _verified(facts, point, gains, predicted, model)
+        yield (StageDone("verify", verification),)
+    return Proposal(model, facts.old_gains, gains, predicted, ultimate, baseline, verification, tuple(notes))
+
+
+def _typed(value: float | None) -> float:
+    assert value is not None  # Options has checked it
+    return value
+
+
+def _baseline(facts: Facts, point: OperatingPoint) -> Plan[StepResult]:
+    """The set-point step under the accepted gains, for the comparison, and a first look at gain and sign."""
+    step = allowed_step(facts, point, facts.old_gains.Kp, math.nan)
+    result = yield from step_test(
+        facts, point, step, band=0.05, most_s=5 * facts.T95_s, smooth_s=facts.T95_s / 12
+    )
+    wrong = result.static_gain == result.static_gain and (result.static_gain > 0) != facts.reverse
+    if wrong:
+        raise Refused(
+            Reason.WRONG_SIGN,
+            f"PV over MV gave a gain of {result.static_gain:.4g} with a "
+            f"{'reverse' if facts.reverse else 'direct'}-acting controller",
+        )
+    return result
+
+
+def _estimate(
+    facts: Facts, Kp: float, Ti: float, overshoot: float, ke: float, source: str, notes: list[str]
+) -> Model:
+    estimate = fopdt_from_overshoot(Kp, Ti, overshoot)
+    sign = 1.0 if facts.reverse else -1.0
+    k5 = sign * estimate.k5
+    known = ke == ke
+    if known and abs(k5 / ke - 1) > 0.2:
+        notes.append(
+            f"the gains k5 = {k5:.4g} and ke = {ke:.4g} differ by more than 20 %: "
+            "measurement noise, or a plant that is not FOPDT-like"
+        )
+    if source == "ke" and not known:
+        raise Refused(Reason.BAD_INPUT, 'k_source "ke" needs a measured static gain: enter at an earlier stage')
+    K = ke if source == "ke" else k5
+    return Model(K, estimate.T, estimate.L, source, k5, ke if known else None)
+
+
+def _optimised(model: Model, ultimate: Ultimate | None) -> tuple[Gains, Predicted]:
+    """Stage 5 and the refusal of what would not be robust on its own model, or at the measured ultimate point."""
+    plant = FOPDT(abs(model.K), model.T_s, model.L_s)
+    gains = optimise(plant).gains
+    m = margins(plant, gains)
+    figures = step_figures(plant, gains)
+    if not (m.Ms <= MOST_Ms and m.GM >= LEAST_GM):
+        raise Refused(
+            Reason.NOT_ROBUST, f"on the model Ms {m.Ms:.2f} (at most {MOST_Ms}), GM {m.GM:.2f} (at least {LEAST_GM})"
+        )
+    if ultimate:
+        loop = -gains.Kp / ultimate.Ku * (1 - 1j / (2 * math.pi / ultimate.Pu_s * gains.Ti))
+        if abs(1 + loop) < 0.45:
+            raise Refused(
+                Reason.NOT_ROBUST,
+                f"at the measured ultimate point the loop comes within {abs(1 + loop):.2f} of instability (least 0.45)",
+            )
+    return gains, Predicted(m.Ms, m.GM, m.PM_deg, figures.overshoot_pct, figures.settling_s, figures.IAE)
+
+
+def _verified(
+    facts: Facts, point: OperatingPoint, gains: Gains, predicted: Predicted, model: Model
+) -> Plan[StepResult]:
+    """The baseline's step again, under the new gains."""
+    step = min(
+        allowed_step(facts, point, gains.Kp, abs(model.K)), allowed_step(facts, point, facts.old_gains.Kp, math.nan)
+    )
+    commands = (SetGains(gains), SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp))
+    yield from settle(point.sp, 0.02 * step, facts.T95_s / 5, 3 * facts.T95_s, point.noise, commands)
+    result = yield from step_test(
+        facts, point, step, band=0.05, most_s=5 * facts.T95_s, smooth_s=model.L_s / 2
+    )
+    most = max(40.0, predicted.overshoot_pct + 25.0)
+    if not result.settled or result.overshoot_pct > most:
+        raise Refused(
+            Reason.NOT_CONFIRMED,
+            f"under the new gains the loop {'settled' if result.settled else 'did not settle'} with an overshoot of "
+            f"{result.overshoot_pct:.1f} % (predicted {predicted.overshoot_pct:.1f} %, at most {most:.0f} %)",
+        )
+    return result

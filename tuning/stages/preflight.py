@@ -1,0 +1,54 @@
+"""Preflight: is the loop fit to be tested? Listens only; refuses with the numbers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from tuning.plan import Mode, Plan
+from tuning.reasons import Reason, Refused
+from tuning.stages.common import Facts, OperatingPoint, record
+
+MOST_NOISE = 0.10
+"""Noise (standard deviation) as a share of the set-point step, above which no overshoot can be read."""
+LEAST_ROOM = 0.05
+"""Room for MV on both sides, as a share of its permitted range."""
+
+
+def preflight(facts: Facts) -> Plan[OperatingPoint]:
+    """Listens for half T95 (at least 60 samples) in automatic.
+
+    Raises Refused: WRONG_MODE, NOT_AT_REST, NOISE_TOO_HIGH, SATURATED.
+    """
+    trace = yield from record(max(facts.T95_s / 2, 60 * facts.sample_time_s))
+    sample = yield ()
+    if sample.mode != Mode.AUTOMATIC:
+        raise Refused(Reason.WRONG_MODE, f"the controller is in mode {Mode(sample.mode).name.lower()}, not automatic")
+    pv, mv = np.asarray(trace.pv), np.asarray(trace.mv)
+    step = facts.sp_deviation
+    if float(np.ptp(trace.sp)) > 0:
+        raise Refused(Reason.NOT_AT_REST, f"the set-point moved by {np.ptp(trace.sp):.4g} while listening")
+    x = np.linspace(-0.5, 0.5, len(pv))
+    drift = float(np.polyfit(x, pv, 1)[0])
+    noise = float(np.std(np.diff(pv))) / math.sqrt(2)
+    spread = float(np.std(pv - drift * x))
+    away = float(pv.mean()) - sample.sp
+    near = facts.mv_high - facts.mv_low
+    room = min(facts.mv_high - float(mv.mean()), float(mv.mean()) - facts.mv_low)
+    if room < LEAST_ROOM * near:
+        raise Refused(
+            Reason.SATURATED,
+            f"MV {mv.mean():.4g} leaves {room:.3g} of room within {facts.mv_low:.4g} .. {facts.mv_high:.4g}; "
+            f"at least {LEAST_ROOM * near:.3g} is needed",
+        )
+    slack = 4 * noise / math.sqrt(len(pv))
+    if noise > MOST_NOISE * step:
+        raise Refused(Reason.NOISE_TOO_HIGH, f"noise {noise:.3g} is above {MOST_NOISE:.0%} of the step {step:.3g}")
+    if abs(drift) > 0.05 * step + 4 * slack or abs(away) > 0.05 * step + slack or spread > 0.03 * step + 2 * noise:
+        raise Refused(
+            Reason.NOT_AT_REST,
+            f"within {trace.t[-1] - trace.t[0]:.3g} s PV drifted by {drift:+.3g}, is {away:+.3g} off the set-point and "
+            f"varies by {spread:.3g} (noise {noise:.3g}); the step would be {step:.3g}",
+        )
+    return OperatingPoint(sample.sp, float(pv.mean()), float(mv.mean()), noise, room)

@@ -1,0 +1,79 @@
+"""A set-point step on the live loop: up, until settled. Baseline, Stage 3 and verification are all made of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from tuning.plan import Plan, SetSetpoint
+from tuning.stages.common import Array, Facts, OperatingPoint, same, settle
+
+
+@dataclass(frozen=True, slots=True)
+class StepResult:
+    """Figures of one measured set-point step.
+
+    step: PV units.  overshoot_pct: of the step.  IAE: PV unit * s.  settling_s: into 5 % (or the noise) for good, s.
+    static_gain: PV units per MV unit, signed; nan when the step did not settle.  settled: within the time allowed.
+    """
+
+    step: float
+    overshoot_pct: float
+    IAE: float
+    settling_s: float
+    static_gain: float
+    mv_span: float
+    settled: bool
+    duration_s: float
+
+
+def step_test(
+    facts: Facts, point: OperatingPoint, step: float, *, band: float, most_s: float, smooth_s: float
+) -> Plan[StepResult]:
+    """Steps the set-point from rest by `step` and waits until PV stays within band * step for T95/5.
+
+    smooth_s: width of the parabola fitted around the peak (it must be shorter than the peak), s.
+    """
+    target = point.sp + step
+    sample = yield (SetSetpoint(target),)
+    while not same(sample.sp, target):
+        sample = yield ()
+    trace, settled = yield from settle(target, band * abs(step), facts.T95_s / 5, most_s, point.noise)
+    t, pv, mv = (np.asarray(column) for column in (trace.t, trace.pv, trace.mv))
+    t = t - t[0]
+    tail = trace.tail(facts.T95_s / 5)
+    change = float(mv[tail].mean()) - point.mv
+    error = (target - pv) / step
+    outside = np.flatnonzero(np.abs(error) > 0.05 + 3 * point.noise / abs(step))
+    return StepResult(
+        step=step,
+        overshoot_pct=100 * max(0.0, _peak(t, -error, smooth_s)),
+        IAE=float(np.trapezoid(np.abs(target - pv), t)),
+        settling_s=float(t[outside[-1]]) if len(outside) else 0.0,
+        static_gain=(float(pv[tail].mean()) - point.pv) / change if settled and change else math.nan,
+        mv_span=float(np.ptp(mv)),
+        settled=settled,
+        duration_s=float(t[-1]),
+    )
+
+
+def _peak(t: Array, y: Array, width: float) -> float:
+    """Height of the highest peak: a parabola by least squares around the highest moving average.
+
+    Reading off the largest sample would add two or three standard deviations of noise to every overshoot.
+    """
+    dt = t[1] - t[0] if len(t) > 1 else 1.0
+    half = int(width / dt / 2)
+    if half < 2:
+        return float(y.max())
+    kernel = np.ones(half) / half
+    middle = int(np.argmax(np.convolve(y, kernel, mode="same")[half:-half or None])) + half if len(y) > 4 * half else 0
+    part = slice(max(0, middle - half), middle + half + 1)
+    x = t[part] - t[middle]
+    c = np.polyfit(x, y[part], 2)
+    if c[0] >= 0:
+        return float(np.polyval(c, x).max())
+    top = min(max(-c[1] / (2 * c[0]), float(x[0])), float(x[-1]))
+    return float(np.polyval(c, top))
