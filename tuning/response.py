@@ -1,8 +1,8 @@
 """Time responses of a loop with dead time, and the figures engineers read from a step response.
 
-The plant is discretised exactly for an input that is linear between the steps, the dead time is a whole number of steps,
-the controller's integral is the trapezoidal rule: second order in the step throughout. A bi-proper plant passes the jumps
-of its input on, so every signal is kept just before and just after each step.
+The plant is discretised exactly for an input that is linear between the steps, the dead time is a whole number of
+steps, the controller's integral is the trapezoidal rule: second order in the step throughout. A bi-proper plant passes
+the jumps of its input on, so every signal is kept just before and just after each step.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ MAX_STEPS = 40_000
 class StepFigures:
     """Of a response to a step of the set-point (of the load: only IAE, ITAE, peak and settling mean something).
 
-    overshoot_pct: of the final change, not below 0.  settling_s: into 2 % of the final change for good (load: of the peak);
-    infinite if not within the record.  rise_s: 10 to 90 %; infinite if never.  IAE, ITAE: of the error to the set-point,
-    in PV units * s and PV units * s^2, for the step as made.  peak: largest change of PV along the step, PV units.
+    overshoot_pct: of the final change, not below 0.  settling_s: into 2 % of the final change (load: of the peak) for
+    good; infinite if not within the record.  rise_s: 10 to 90 %; infinite if never.  IAE, ITAE: of the error to the
+    set-point, in PV units * s and PV units * s^2, for the step as made.  peak: largest PV change along the step.
     """
 
     overshoot_pct: float
@@ -91,8 +91,8 @@ def step_response(
 def figures_of(t: Reals, y: Reals, step: float, y0: float) -> StepFigures:
     """Figures of a recorded set-point step of size `step` (PV units, either sign) made at t[0] from rest at y0.
 
-    Where measurement noise shows, overshoot, rise and settling are read from a moving mean over a tenth of the rise, and
-    the settling band is at least three times the noise left in it.
+    Where measurement noise shows, overshoot, rise and settling are read from a moving mean over a tenth of the rise,
+    and the settling band is at least three times the noise left in it.
     """
     time = np.asarray(t, dtype=float) - float(t[0])
     change = (np.asarray(y, dtype=float) - y0) / step
