@@ -1,0 +1,76 @@
+"""The control law: ISA PI(D) with two degrees of freedom, sampled.
+
+    e = SP - PV (reverse action) or PV - SP (direct action: both terms change sign)
+    u = Kp*(b*SP - PV) + I + D,   I' = Kp*e/Ti,   D = Kp*Td*s/(1 + Tf*s) * (c*SP - PV)
+
+I is summed forwards (the present error acts from the next sample on), D differs backwards, so Tf = 0 is allowed.
+With Ti = 0 nothing is summed and I is the bias of a P controller. Every change of the law re-bases I so that the output
+stays where it is; D starts anew then, for its history belongs to another law.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import astuple, dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """Kp > 0 in MV units per PV unit; Ti (0: no integral action), Td, Tf in s; set-point weights b and c."""
+
+    Kp: float
+    Ti: float = 0.0
+    Td: float = 0.0
+    Tf: float = 0.0
+    b: float = 1.0
+    c: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(value) for value in astuple(self)):
+            raise ValueError("controller parameters must be finite")
+        if self.Kp <= 0:
+            raise ValueError("Kp must be positive: the direction is set by the controller's action")
+        if min(self.Ti, self.Td, self.Tf) < 0:
+            raise ValueError("Ti, Td and Tf must not be negative")
+
+
+class Pid:
+    """One control law and its memory. `rebase` before the first `step`."""
+
+    __slots__ = ("_b", "_c", "_decay", "_derivative", "_gain", "_integral", "_kick", "_last", "_per_sample", "_track")
+
+    def __init__(self, sample_time_s: float, parameters: Parameters, reverse: bool) -> None:
+        if not (sample_time_s > 0 and math.isfinite(sample_time_s)):
+            raise ValueError("sample time must be finite and positive")
+        Ts, p = sample_time_s, parameters
+        self._gain = gain = p.Kp if reverse else -p.Kp
+        self._b = p.b
+        self._c = p.c
+        self._per_sample = gain * Ts / p.Ti if p.Ti else 0.0
+        # Back-calculation empties the integral with Ti, or the usual sqrt(Ti*Td) when there is a derivative; never
+        # faster than one sample. A bias is not an integral and cannot wind up: it is left alone.
+        tracking = math.sqrt(p.Ti * p.Td) if p.Td else p.Ti
+        self._track = Ts / max(tracking, Ts) if p.Ti else 0.0
+        self._decay = p.Tf / (p.Tf + Ts)
+        self._kick = gain * p.Td / (p.Tf + Ts)
+        self._integral = 0.0
+        self._derivative = 0.0
+        self._last = 0.0
+
+    def rebase(self, setpoint: float, pv: float, output: float) -> None:
+        """From here on the law continues at `output`."""
+        self._integral = output - self._gain * (self._b * setpoint - pv)
+        self._derivative = 0.0
+        self._last = self._c * setpoint - pv
+
+    def step(self, setpoint: float, pv: float, low: float, high: float) -> float:
+        """One sample: the output within low..high, which also keep the integral from winding up."""
+        wanted = self._integral + self._gain * (self._b * setpoint - pv)
+        if self._kick:
+            moved = self._c * setpoint - pv
+            self._derivative = self._decay * self._derivative + self._kick * (moved - self._last)
+            self._last = moved
+            wanted += self._derivative
+        output = low if wanted < low else high if wanted > high else wanted
+        self._integral += self._per_sample * (setpoint - pv) + self._track * (output - wanted)
+        return output

@@ -1,0 +1,155 @@
+"""Plants by name, with what is known of each: what the I/O device, the rehearsal and the benchmark pick from.
+
+model-1 .. model-50 are the test plants of Stopakevych et al. (Problemele Energeticii Regionale). Where a coefficient
+or the dead time is illegible in the print, the entry's confidence says so: a fixture then, not the paper's model.
+All linear plants work around 50 % and PV 50 with 100 % per unit of model input, so 0..100 % is u = -0.5..+0.5 and a
+gain on the bus is 100 times the gain of the model.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.resources import files
+
+from plantsim.plant import LinearPlant, Plant
+from plantsim.reactor import MV_NOMINAL, STEADY_STATE, Reactor
+
+Build = Callable[[float, float, int], Plant]
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """Ku, Pu_s: ultimate point of the continuous plant under P control, Ku in model units (None: there is none).
+
+    T95_s: time after which an open-loop step response stays within 5 % (None: the plant integrates).
+    reverse: the action its controller needs (False for a plant with negative gain).
+    """
+
+    description: str
+    Ku: float | None
+    Pu_s: float | None
+    T95_s: float | None
+    static_gain: float | None
+    reverse: bool = True
+    pv_unit: str = ""
+    mv_nominal_pct: float = 50.0
+    pv_nominal: float = 50.0
+    mv_per_unit: float = 100.0
+    confidence: str = "exact"
+
+    @property
+    def Ku_on_bus(self) -> float | None:
+        """Percent of MV per PV unit."""
+        return None if self.Ku is None else self.Ku * self.mv_per_unit
+
+
+@dataclass(frozen=True, slots=True)
+class TransferFunction:
+    """Coefficients from the highest power down, time in s."""
+
+    num: tuple[float, ...]
+    den: tuple[float, ...]
+    dead_time_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """`model` is None for plants that are not linear."""
+
+    name: str
+    facts: Facts
+    model: TransferFunction | None
+
+    def build(self, sample_time_s: float, noise_std: float = 0.0, seed: int = 1) -> Plant:
+        if self.model is None:
+            return Reactor(sample_time_s, noise_std=noise_std, seed=seed)
+        return LinearPlant(
+            self.model.num,
+            self.model.den,
+            self.model.dead_time_s,
+            sample_time_s,
+            mv_nominal=self.facts.mv_nominal_pct,
+            pv_nominal=self.facts.pv_nominal,
+            mv_per_unit=self.facts.mv_per_unit,
+            noise_std=noise_std,
+            seed=seed,
+            mv_low=0.0,
+            mv_high=100.0,
+        )
+
+
+def find(name: str) -> Entry:
+    """The entry of this name; KeyError with the names there are."""
+    if name not in CATALOGUE:
+        others = ", ".join(other for other in CATALOGUE if not other.startswith("model-"))
+        raise KeyError(f"no plant named {name!r}; there are model-1 to model-50, {others}")
+    return CATALOGUE[name]
+
+
+def _printed_models() -> list[Entry]:
+    data = json.loads(files("plantsim").joinpath("models-50.json").read_text(encoding="utf-8"))
+    entries = []
+    for row in data["models"]:
+        computed = row["computed"]
+        facts = Facts(
+            description=f"test plant No. {row['id']} of the five-stage procedure",
+            Ku=computed["Ku"],
+            Pu_s=computed["Pu"],
+            T95_s=computed["T95"],
+            static_gain=computed["static_gain"],
+            confidence=row["confidence"],
+        )
+        model = TransferFunction(tuple(row["num"]), tuple(row["den"]), row["delay"])
+        entries.append(Entry(f"model-{row['id']}", facts, model))
+    return entries
+
+
+_REACTOR = Entry(
+    "reactor",
+    Facts(
+        description="stirred reactor A + B -> C with inverse response and 10 s sensor delay",
+        Ku=1.5294,
+        Pu_s=42.53,
+        T95_s=31.8,
+        static_gain=0.7743,
+        pv_unit="mol/m3",
+        mv_nominal_pct=MV_NOMINAL,
+        pv_nominal=STEADY_STATE[2],
+        mv_per_unit=1.0,
+        confidence="high",
+    ),
+    model=None,
+)
+
+_NAMED = [
+    Entry("fopdt", Facts("first order, dead time 2 s", 8.5024, 7.442, 32.0, 1.0), TransferFunction((1,), (10, 1), 2.0)),
+    Entry(
+        "sopdt",
+        Facts("second order, dead time 1 s", 7.8757, 11.66, 37.8, 2.0),
+        TransferFunction((2,), (50, 15, 1), 1.0),
+    ),
+    Entry(
+        "five-lags",
+        Facts("five equal lags", 2.8854, 8.648, 9.2, 1.0),
+        TransferFunction((1,), (1, 5, 10, 10, 5, 1), 0.0),
+    ),
+    Entry(
+        "inverse-response",
+        Facts("right-half-plane zero", 3.1843, 16.19, 24.2, 1.0),
+        TransferFunction((-2, 1), (20, 9, 1), 1.0),
+    ),
+    Entry(
+        "integrating",
+        Facts("level-like: integrates, dead time 1 s", 15.708, 4.0, None, None),
+        TransferFunction((0.1,), (1, 0), 1.0),
+    ),
+    Entry(
+        "negative-gain",
+        Facts("PV falls as MV rises, dead time 2 s", 4.623, 7.325, 26.0, -1.5, reverse=False),
+        TransferFunction((-1.5,), (8, 1), 2.0),
+    ),
+]
+
+CATALOGUE: dict[str, Entry] = {entry.name: entry for entry in [*_printed_models(), _REACTOR, *_NAMED]}
