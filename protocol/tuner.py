@@ -1,0 +1,275 @@
+"""The tuner's side of the bus: parameters by SDO, samples from the PDOs of one loop, and our heartbeat.
+
+Blocking, one thread: whoever waits for an answer or a sample also sends the heartbeat meanwhile, so that a hung tuner
+falls silent. What arrives while an SDO waits is taken in order and handed out later.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections import deque
+from enum import StrEnum
+from typing import NamedTuple
+
+from protocol.bus import Bus, Frame, open_bus
+from protocol.objects import Device, Object, Shape, Type, Value, lookup
+from protocol.profile import (
+    EMCY_FRAME,
+    HEARTBEAT_FRAME,
+    MV_FRAME,
+    PLANT_NODE,
+    PV_FRAME,
+    STATUS_FRAME,
+    TUNER_NODE,
+    Abort,
+    NmtState,
+    channel_ids,
+    emcy_id,
+    heartbeat_id,
+    sdo_request_id,
+    sdo_response_id,
+)
+
+HEARTBEAT_S = 0.1
+_WAIT_S = 0.05  # one wait on the bus: short enough to beat in time; always the same, which RawBus makes cheap
+_ABORT = 0x80
+
+ABORT_TEXT = {
+    Abort.TOGGLE: "toggle bit not alternated",
+    Abort.COMMAND: "command not known",
+    Abort.OUT_OF_MEMORY: "out of memory",
+    Abort.WRITE_ONLY: "write only",
+    Abort.READ_ONLY: "read only",
+    Abort.NO_OBJECT: "no such object",
+    Abort.LENGTH: "wrong length",
+    Abort.NO_SUBINDEX: "no such sub-index",
+    Abort.INVALID_VALUE: "invalid value",
+    Abort.TOO_HIGH: "above the limit",
+    Abort.TOO_LOW: "below the limit",
+    Abort.MAXIMUM_BELOW_MINIMUM: "maximum below minimum",
+    Abort.GENERAL: "general error",
+    Abort.DEVICE_STATE: "not in the present state of the device",
+}
+
+
+class Kind(StrEnum):
+    TIMEOUT = "timeout"
+    ABORT = "abort"
+
+
+class TunerError(Exception):
+    """An SDO without success: no answer (TIMEOUT), or refused by the device with `code` (ABORT)."""
+
+    def __init__(self, kind: Kind, text: str, code: int = 0) -> None:
+        super().__init__(text)
+        self.kind = kind
+        self.code = code
+
+
+class BusSample(NamedTuple):
+    """One sample as seen on the bus: PV(n), the MV that answers it, and the status in effect then."""
+
+    n: int
+    pv: float
+    mv: float
+    mode: int
+    on_trial: bool
+    sp: float
+
+
+# The SDO server answers one request at a time, whoever asks: loops of one process on one node take turns.
+_turns: dict[tuple[str, int], threading.RLock] = {}
+_turns_guard = threading.Lock()
+
+
+def _turn(url: str, node: int) -> threading.RLock:
+    with _turns_guard:
+        return _turns.setdefault((url, node), threading.RLock())
+
+
+class Tuner:
+    """The client of one loop: one channel of a controller and of the plant I/O that feeds it."""
+
+    def __init__(
+        self,
+        url: str,
+        controller_node: int,
+        plant_node: int | None,
+        channel: int = 1,
+        *,
+        sdo_timeout_s: float = 0.25,
+        sdo_tries: int = 3,
+    ) -> None:
+        """plant_node None: a plant that offers no SDO; its PV frames are still expected from node 10h."""
+        ids = channel_ids(channel, plant_node or PLANT_NODE, controller_node)
+        nodes = [controller_node] if plant_node is None else [controller_node, plant_node]
+        self._url = url
+        self._controller = controller_node
+        self._plant = plant_node
+        self._channel = channel
+        self._sdo_timeout_s = sdo_timeout_s
+        self._sdo_tries = sdo_tries
+        self._pv_id, self._mv_id, self._status_id = ids.pv, ids.mv, ids.status
+        self._emcy_id, self._alive_id = emcy_id(controller_node), heartbeat_id(controller_node)
+        self._bus: Bus = open_bus(url)
+        self._bus.set_filters(
+            {self._pv_id, self._mv_id, self._status_id, self._emcy_id, self._alive_id, *map(sdo_response_id, nodes)}
+        )
+        self._answers: deque[Frame] = deque()
+        self._samples: deque[BusSample] = deque()
+        self._pv = (0.0, -1)
+        self._beat_at = 0.0
+        self.mode, self.on_trial, self.sp = 0, False, 0.0
+        self.emergencies: list[int] = []
+        """EMCY codes of the controller other than "error gone", until the owner clears them."""
+        self.restarted = False
+        """The controller sent a boot-up frame."""
+
+    def close(self) -> None:
+        self._bus.close()
+
+    # -- heartbeat and frames
+
+    def heartbeat(self) -> None:
+        """Sends our heartbeat when it is due."""
+        now = time.monotonic()
+        if now - self._beat_at >= HEARTBEAT_S:
+            self._bus.send(heartbeat_id(TUNER_NODE), HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL))
+            self._beat_at = now
+
+    def sample(self, timeout_s: float) -> BusSample | None:
+        """The next sample in order; None when none came within `timeout_s` of wall time."""
+        give_up = time.monotonic() + timeout_s
+        while not self._samples:
+            self.heartbeat()
+            if not self._receive(_WAIT_S) and time.monotonic() >= give_up:
+                return None
+        return self._samples.popleft()
+
+    def drain(self) -> None:
+        """Takes what has arrived and forgets its samples: the next sample is one from now on."""
+        while self._receive(0.0):
+            pass
+        self._samples.clear()
+
+    def _receive(self, timeout_s: float) -> bool:
+        frame = self._bus.recv(timeout_s)
+        if frame is None:
+            return False
+        can_id, data = frame
+        try:
+            if can_id == self._mv_id:
+                mv, n = MV_FRAME.unpack(data)
+                pv, answered = self._pv
+                if n == answered:
+                    self._samples.append(BusSample(n, pv, mv, self.mode, self.on_trial, self.sp))
+            elif can_id == self._pv_id:
+                self._pv = PV_FRAME.unpack(data)
+            elif can_id == self._status_id:
+                self.mode, on_trial, self.sp = STATUS_FRAME.unpack(data)
+                self.on_trial = bool(on_trial)
+            elif can_id == self._emcy_id:
+                code = EMCY_FRAME.unpack(data)[0]
+                if code:
+                    self.emergencies.append(code)
+            elif can_id == self._alive_id:
+                self.restarted |= data[:1] == bytes([NmtState.BOOT_UP])
+            else:
+                self._answers.append(frame)
+        except struct.error:
+            pass  # somebody else's frame with our identifier: it carries no sample
+        return True
+
+    # -- SDO
+
+    def read(self, name: str, sub: int | None = None, node: int | None = None) -> Value:
+        """The value of an object by name, of our channel unless `sub` says otherwise."""
+        entry, node, sub = self._address(name, sub, node)
+        with _turn(self._url, node):
+            data = self._request(entry, node, sub, 0x40, b"\0\0\0\0")
+            if data[0] & 0x02:
+                length = 4 - (data[0] >> 2 & 3) if data[0] & 0x01 else entry.type.size
+                raw = data[4 : 4 + length]
+            else:
+                raw = self._segments(entry, node)
+        try:
+            return entry.type.decode(raw)
+        except struct.error as error:
+            text = f"{name}: {len(raw)} bytes do not make a {entry.type.name}"
+            raise TunerError(Kind.ABORT, text, Abort.LENGTH) from error
+
+    def number(self, name: str, sub: int | None = None, node: int | None = None) -> float:
+        return float(self.read(name, sub, node))
+
+    def write(self, name: str, value: float, sub: int | None = None, node: int | None = None) -> None:
+        """Writes a number; every object the profile lets us write fits one frame."""
+        entry, node, sub = self._address(name, sub, node)
+        raw = entry.type.encode(value if entry.type is Type.REAL32 else int(value))
+        with _turn(self._url, node):
+            self._request(entry, node, sub, 0x23 | (4 - len(raw)) << 2, raw.ljust(4, b"\0"))
+
+    def _address(self, name: str, sub: int | None, node: int | None) -> tuple[Object, int, int]:
+        entry = lookup(name)
+        if node is None:
+            node = self._plant if entry.device is Device.PLANT else self._controller
+        if node is None:
+            raise TunerError(Kind.TIMEOUT, f"{name}: this loop's plant has no node")
+        if sub is None:
+            sub = self._channel if entry.shape is Shape.CHANNELS else 0
+        return entry, node, sub
+
+    def _request(self, entry: Object, node: int, sub: int, command: int, payload: bytes) -> bytes:
+        """The answer's 8 bytes. An answer names its object, so a late one to another request is passed over."""
+        address = struct.pack("<HB", entry.index, sub)
+        request = bytes([command]) + address + payload
+        expected = 0x40 if command == 0x40 else 0x60
+        while self._receive(0.0):
+            pass
+        self._answers.clear()
+        for _ in range(self._sdo_tries):
+            self._bus.send(sdo_request_id(node), request)
+            give_up = time.monotonic() + self._sdo_timeout_s
+            while (answer := self._answer(node, give_up)) is not None:
+                if answer[1:4] != address:
+                    continue
+                if answer[0] == _ABORT:
+                    raise _aborted(entry, answer)
+                if answer[0] & 0xE0 == expected:
+                    return answer
+        raise TunerError(Kind.TIMEOUT, f"node {node:02X}h does not answer ({entry.name})")
+
+    def _segments(self, entry: Object, node: int) -> bytes:
+        """The rest of a value longer than one frame: strings."""
+        value, toggle = b"", 0
+        while True:
+            self._bus.send(sdo_request_id(node), bytes([0x60 | toggle, 0, 0, 0, 0, 0, 0, 0]))
+            answer = self._answer(node, time.monotonic() + self._sdo_timeout_s)
+            if answer is None:
+                raise TunerError(Kind.TIMEOUT, f"node {node:02X}h stopped in the middle of {entry.name}")
+            if answer[0] == _ABORT:
+                raise _aborted(entry, answer)
+            if answer[0] & 0xF0 != toggle:
+                raise TunerError(Kind.ABORT, f"{entry.name}: segments out of order", Abort.TOGGLE)
+            value += answer[1 : 8 - (answer[0] >> 1 & 7)]
+            if answer[0] & 0x01:
+                return value
+            toggle ^= 0x10
+
+    def _answer(self, node: int, give_up: float) -> bytes | None:
+        wanted = sdo_response_id(node)
+        while True:
+            while self._answers:
+                can_id, data = self._answers.popleft()
+                if can_id == wanted and len(data) == 8:
+                    return data
+            self.heartbeat()
+            if not self._receive(_WAIT_S) and time.monotonic() >= give_up:
+                return None
+
+
+def _aborted(entry: Object, answer: bytes) -> TunerError:
+    code = int.from_bytes(answer[4:8], "little")
+    text = ABORT_TEXT.get(Abort(code)) if code in list(Abort) else None
+    return TunerError(Kind.ABORT, f"{entry.name}: {text or 'refused'} ({code:08X}h)", code)
