@@ -169,19 +169,20 @@ def _complete(file: PlantFile) -> PlantFile:
             t95 = file.dead_time_s * 4 + 3 * slow
         else:
             t95 = _t95(file)
-    model = TransferFunction(tuple(file.num), tuple(file.den), file.dead_time_s)
-    if file.sample_time_s is not None:
-        ts = file.sample_time_s
-    else:
-        try:
-            period = ultimate_point(model)[1]
-        except (Ended, ValueError, ArithmeticError):
-            period = math.nan
-        ts = _nice(period / 300 if math.isfinite(period) and period > 0 else t95 / 500)
+    ts = file.sample_time_s or _nice(max(_period(file, t95) / 300, t95 / 5000))
     room = min(-file.mv_limits[0], file.mv_limits[1])
     step = file.sp_deviation or 0.2 * room * (abs(gain) if math.isfinite(gain) else 1.0)
     gains = file.gains or {"Kp": 0.3 / abs(gain) if math.isfinite(gain) else 0.1, "Ti": t95 / 3}
     return file.model_copy(update={"sample_time_s": ts, "t95_s": t95, "sp_deviation": step, "gains": gains})
+
+
+def _period(file: PlantFile, t95: float) -> float:
+    """The ultimate period, s; for a plant without one, something short beside T95."""
+    try:
+        period = ultimate_point(TransferFunction(tuple(file.num), tuple(file.den), file.dead_time_s))[1]
+    except (ValueError, ArithmeticError):
+        return t95 / 2
+    return period if 0 < period < math.inf else t95 / 2
 
 
 def _t95(file: PlantFile) -> float:
@@ -242,7 +243,9 @@ def _loop(file: PlantFile) -> tuple[RehearsedLoop, Facts]:
 
 
 def _watch(facts: Facts) -> Watch:
-    return Watch(max_time_s=500 * facts.T95_s)
+    """Wide PV limits: an unstable plant must end, but the test takes PV to several steps on purpose."""
+    far = 100 * facts.sp_deviation
+    return Watch(pv_low=-far, pv_high=far, max_time_s=500 * facts.T95_s, max_frozen_s=3 * facts.T95_s)
 
 
 def _answer(file: PlantFile | None, outcome: RunResult[Proposal], results: dict[str, object]) -> dict[str, Any]:

@@ -37,13 +37,14 @@ GRACE = 50
 
 @dataclass(frozen=True, slots=True)
 class Watch:
-    """PV limits (PV units), time budget (plant s), and how many samples in a row may be missing."""
+    """PV limits (PV units), time budget (plant s), how many samples in a row may be missing, and for how long PV may
+    stay exactly the same while MV is away from where it was (plant s; longer than any dead time)."""
 
     pv_low: float = -math.inf
     pv_high: float = math.inf
     max_time_s: float = math.inf
     max_gap_samples: int = 5
-    max_frozen_samples: int = 2000
+    max_frozen_s: float = math.inf
 
 
 @dataclass(slots=True)
@@ -69,8 +70,8 @@ class Guard:
         self._grace = GRACE
         self._pv = math.nan
         self._mv = math.nan
-        self._frozen = 0
-        self._moved = False
+        self._frozen_at = 0.0
+        self._notable = 1e-3 * abs(state.mv_high - state.mv_low)
         self.foreign_setpoint: float | None = None
 
     def commanded(self, commands: Sequence[Command]) -> None:
@@ -107,14 +108,12 @@ class Guard:
                 raise Aborted(
                     Reason.MODE_CHANGED, f"at {t:.3f} s the mode is {_mode(mode)}, not {_mode(self._mode)}"
                 )
-        if pv == self._pv:
-            self._moved = self._moved or mv != self._mv
-            self._frozen += 1
-            if self._frozen > watch.max_frozen_samples and self._moved:
-                raise Failed(Reason.PV_FROZEN, f"PV is exactly {pv:.6g} for {self._frozen} samples while MV moved")
-        else:
-            self._frozen, self._moved, self._pv = 0, False, pv
-        self._mv = mv
+        if pv != self._pv:
+            self._frozen_at, self._pv, self._mv = t, pv, mv
+        elif abs(mv - self._mv) < self._notable:
+            self._frozen_at = t
+        elif t - self._frozen_at > watch.max_frozen_s:
+            raise Failed(Reason.PV_FROZEN, f"PV is exactly {pv:.6g} for {t - self._frozen_at:.3g} s while MV moved")
 
 
 def _mode(number: int) -> str:

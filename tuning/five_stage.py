@@ -31,6 +31,8 @@ __all__ = ["STAGES", "Facts", "Options", "Proposal", "five_stage"]
 
 STAGES = ("preflight", "baseline", "relay", "ultimate", "zn_pi", "estimate", "optimise", "verify")
 MOST_Ms, LEAST_GM = 2.0, 2.0
+MOST_GAIN = 60.0
+"""Ku * K of a FOPDT plant with L/T = 0.026, half the least that formula (2) was checked for."""
 Entry = Literal["relay", "zn_pi", "estimate", "optimise"]
 
 
@@ -165,6 +167,11 @@ def five_stage(facts: Facts, options: Options) -> Plan[Proposal]:
             yield started("relay")
             rough = yield from relay_test(facts, point)
             yield (StageDone("relay", rough),)
+            if gain == gain and abs(gain) * rough.Ku_a > MOST_GAIN:
+                raise Refused(
+                    Reason.CANNOT_OSCILLATE,
+                    f"Ku * K is about {abs(gain) * rough.Ku_a:.0f} (at most {MOST_GAIN:g}): next to no dead time",
+                )
             expected["ultimate"] = 5 * (5 * rough.Pu_a_s + T95)
             yield started("ultimate")
             found = yield from ultimate_gain(facts, point, rough)

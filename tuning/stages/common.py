@@ -134,7 +134,7 @@ def settle(
 
 def to_rest(facts: Facts, point: OperatingPoint, band: float) -> Plan[None]:
     """Manual at the nominal output, set-point back, until PV is home again (at most 2 T95, then it must be near)."""
-    home = (SetOutput(point.mv), SetMode(Mode.MANUAL), SetSetpoint(point.sp))
+    home = (SetMode(Mode.MANUAL), SetOutput(point.mv), SetSetpoint(point.sp))  # manual first: entering it is bumpless
     trace, rested = yield from settle(point.pv, band, facts.T95_s / 5, 2 * facts.T95_s, point.noise, home)
     if not rested:
         away = float(np.mean(trace.pv[trace.tail(facts.T95_s / 5)])) - point.pv

@@ -17,7 +17,7 @@ from tuning.reasons import Reason, Refused
 from tuning.stages.common import Facts, OperatingPoint, Trace, to_rest
 
 STEADY = 0.10
-LEAST_SAMPLES_PER_PERIOD = 12
+LEAST_SAMPLES_PER_PERIOD = 22
 
 
 @dataclass(frozen=True, slots=True)
