@@ -1,0 +1,177 @@
+"""The application: routes that translate between HTTP and the jobs, and nothing else."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib.metadata import version
+from typing import Annotated, Literal
+
+from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
+from fastapi.responses import PlainTextResponse, StreamingResponse
+
+from service.api import problems
+from service.api.stream import event_stream
+from service.api.views import (
+    Decision,
+    JobView,
+    LoopDetail,
+    LoopView,
+    SamplesView,
+    job_view,
+    live_view,
+    loop_view,
+)
+from service.jobs import Jobs
+from service.request import RetuneRequest
+from service.states import ACTIVE, JobState
+from service.store.tables import JobRow
+
+Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
+JobId = Annotated[str, Path(description="Id of the job", examples=["4f0c2a9be113"])]
+
+
+def create_app(jobs: Jobs) -> FastAPI:
+    """The API over these jobs; ends them when the server shuts down."""
+
+    @asynccontextmanager
+    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        yield
+        jobs.stop()
+
+    app = FastAPI(
+        title="Loopwright",
+        version=version("loopwright"),
+        description="Retunes PI loops by itself. Gains are in ISA form, MV in percent, times in plant seconds "
+        "unless they say wall. A retune ends as a proposal; the loop keeps its gains until it is accepted.",
+        lifespan=lifespan,
+    )
+    problems.install(app)
+
+    def view(row: JobRow) -> JobView:
+        return job_view(row, jobs.store.events(row.id), jobs.running(row.id))
+
+    @app.get("/loops", tags=["loops"], summary="The configured loops")
+    def loops() -> list[LoopView]:
+        return [LoopView(**loop_view(config, jobs.store.active(tag))) for tag, config in jobs.loops.items()]
+
+    @app.get(
+        "/loops/{tag}", tags=["loops"], summary="A loop and its present state", responses=problems.responses(404, 503)
+    )
+    def loop(tag: Tag) -> LoopDetail:
+        config = jobs.config(tag)
+        state, _ = jobs.live(tag)
+        return LoopDetail(**loop_view(config, jobs.store.active(tag)), live=live_view(state))
+
+    @app.post(
+        "/loops/{tag}/retune",
+        tags=["loops"],
+        summary="Start a retune",
+        status_code=202,
+        responses=problems.responses(404, 409, 422, 503),
+    )
+    def retune(tag: Tag, request: Request, response: Response, options: Annotated[RetuneRequest, Body()]) -> JobView:
+        row = jobs.start(tag, options)
+        response.headers["Location"] = str(request.url_for("job", job_id=row.id).path)
+        return view(row)
+
+    @app.get("/jobs", tags=["jobs"], summary="The latest jobs first", responses=problems.responses(422))
+    def job_list(
+        loop: Annotated[str | None, Query(description="Only of this loop", examples=["TIC-101"])] = None,
+        state: Annotated[JobState | None, Query(description="Only in this state")] = None,
+        limit: Annotated[int, Query(ge=1, le=1000, description="At most so many")] = 50,
+    ) -> list[JobView]:
+        return [view(row) for row in jobs.store.recent(loop, state, limit)]
+
+    @app.get("/jobs/{job_id}", tags=["jobs"], summary="A job", responses=problems.responses(404))
+    def job(job_id: JobId) -> JobView:
+        return view(jobs.store.get(job_id))
+
+    @app.get(
+        "/jobs/{job_id}/events",
+        tags=["jobs"],
+        summary="What happens in a job, as server-sent events",
+        response_class=StreamingResponse,
+        responses={
+            200: {
+                "content": {"text/event-stream": {}},
+                "description": "state, stage_started, stage_done, note, progress",
+            },
+            204: {"description": "The job is over and the client has seen everything: do not reconnect"},
+            **problems.responses(404, 422),
+        },
+    )
+    def events(
+        job_id: JobId,
+        last_event_id: Annotated[int, Header(ge=0, description="Only events after this one", examples=[7])] = 0,
+    ) -> Response:
+        row = jobs.store.get(job_id)
+        over = JobState(row.state) not in ACTIVE
+        if over and last_event_id and not jobs.store.events(job_id, last_event_id):
+            return Response(status_code=204)
+        stream = event_stream(jobs, job_id, last_event_id)
+        return StreamingResponse(stream, media_type="text/event-stream", headers={"Cache-Control": "no-cache"})
+
+    @app.get(
+        "/jobs/{job_id}/samples",
+        tags=["jobs"],
+        summary="The samples of a job",
+        response_model=SamplesView,
+        responses={
+            200: {"content": {"text/csv": {"example": "stage,t_s,sp,pv,mv,mode\nrelay,12.3,50,50.2,45,3\n"}}},
+            **problems.responses(404, 422),
+        },
+    )
+    def samples(
+        job_id: JobId,
+        stage: Annotated[str | None, Query(description="Only of this stage", examples=["baseline"])] = None,
+        format: Annotated[Literal["json", "csv"], Query(description="json: columns; csv: a row per sample")] = "json",
+    ) -> SamplesView | PlainTextResponse:
+        jobs.store.get(job_id)
+        blocks = jobs.store.samples(job_id, stage)
+        if format == "csv":
+            return PlainTextResponse(_csv(blocks), media_type="text/csv")
+        flat = [(name, *sample) for name, block in blocks for sample in block]
+        names, t, sp, pv, mv, mode = ([row[i] for row in flat] for i in range(6))
+        return SamplesView(job=job_id, stage=names, t_s=t, sp=sp, pv=pv, mv=mv, mode=mode)
+
+    @app.post(
+        "/jobs/{job_id}/abort",
+        tags=["jobs"],
+        summary="Stop a job; its loop is restored",
+        status_code=202,
+        responses=problems.responses(404, 409, 422),
+    )
+    def abort(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
+        return view(jobs.abort(job_id, (decision or Decision()).by))
+
+    @app.post(
+        "/jobs/{job_id}/accept",
+        tags=["jobs"],
+        summary="Put the proposed gains into the controller for good",
+        responses=problems.responses(404, 409, 422, 503),
+    )
+    def accept(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
+        return view(jobs.accept(job_id, (decision or Decision()).by))
+
+    @app.post(
+        "/jobs/{job_id}/rollback",
+        tags=["jobs"],
+        summary="Decline the proposal, or put the old gains back after accepting",
+        responses=problems.responses(404, 409, 422, 503),
+    )
+    def rollback(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
+        return view(jobs.rollback(job_id, (decision or Decision()).by))
+
+    return app
+
+
+def _csv(blocks: list[tuple[str, list[tuple[float, float, float, float, int]]]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["stage", "t_s", "sp", "pv", "mv", "mode"])
+    for name, block in blocks:
+        writer.writerows((name, *sample) for sample in block)
+    return text.getvalue()

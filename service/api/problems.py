@@ -1,0 +1,99 @@
+"""Every error of the API as application/problem+json (RFC 9457), with the reason and advice where there are some."""
+
+from __future__ import annotations
+
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, Field
+from starlette.exceptions import HTTPException
+
+from service.jobs import Conflict, Stopping, UnknownLoop
+from service.request import BadLimits
+from service.states import IllegalMove
+from service.store.store import Busy, NoSuchJob
+from tuning.reasons import ADVICE, Ended, Reason
+
+MEDIA_TYPE = "application/problem+json"
+
+
+class Problem(BaseModel):
+    """RFC 9457 problem details."""
+
+    type: str = Field(description="Kind of problem", examples=["about:blank"])
+    title: str = Field(description="The same for every problem of this kind", examples=["Conflict"])
+    status: int = Field(description="HTTP status", examples=[409])
+    detail: str = Field(description="What happened this time", examples=["loop TIC-101 is busy with job 4f0c2a9be113"])
+    reason: str | None = Field(default=None, description="From the closed list of reasons", examples=["node_lost"])
+    advice: str | None = Field(default=None, description="What to do about it")
+    job: str | None = Field(default=None, description="URL of the active job", examples=["/jobs/4f0c2a9be113"])
+    errors: list[dict[str, Any]] | None = Field(default=None, description="Each invalid value: where and why")
+
+
+def problem(
+    status: int, detail: str, *, reason: Reason | None = None, headers: dict[str, str] | None = None, **more: Any
+) -> JSONResponse:
+    body: dict[str, Any] = {
+        "type": "about:blank", "title": HTTPStatus(status).phrase, "status": status, "detail": detail,
+    }  # fmt: skip
+    if reason is not None:
+        body |= {"reason": reason.value, "advice": ADVICE[reason]}
+    return JSONResponse(body | more, status_code=status, media_type=MEDIA_TYPE, headers=headers)
+
+
+def install(app: FastAPI) -> None:
+    """Every exception that a route may let through becomes a problem."""
+
+    @app.exception_handler(RequestValidationError)
+    async def _invalid(_request: Request, error: RequestValidationError) -> JSONResponse:
+        # The input itself is left out: it may be NaN, which JSON cannot say.
+        errors = [{"where": ".".join(map(str, e["loc"])), "why": e["msg"]} for e in error.errors()]
+        detail = "; ".join(f"{e['where']}: {e['why']}" for e in errors)
+        return problem(422, detail, reason=Reason.BAD_INPUT, errors=errors)
+
+    @app.exception_handler(HTTPException)
+    async def _http(_request: Request, error: HTTPException) -> JSONResponse:
+        headers = dict(error.headers) if error.headers else None
+        return problem(error.status_code, str(error.detail), headers=headers)
+
+    @app.exception_handler(BadLimits)
+    async def _limits(_request: Request, error: BadLimits) -> JSONResponse:
+        return problem(422, str(error), reason=Reason.BAD_LIMITS)
+
+    @app.exception_handler(UnknownLoop)
+    @app.exception_handler(NoSuchJob)
+    async def _unknown(_request: Request, error: Exception) -> JSONResponse:
+        return problem(404, str(error))
+
+    @app.exception_handler(Busy)
+    async def _busy(_request: Request, error: Busy) -> JSONResponse:
+        url = f"/jobs/{error.job_id}"
+        return problem(409, str(error), job=url, headers={"Location": url})
+
+    @app.exception_handler(IllegalMove)
+    @app.exception_handler(Conflict)
+    async def _conflict(_request: Request, error: Exception) -> JSONResponse:
+        return problem(409, str(error))
+
+    @app.exception_handler(Stopping)
+    async def _stopping(_request: Request, error: Stopping) -> JSONResponse:
+        return problem(503, str(error), reason=Reason.SERVICE_STOPPED)
+
+    @app.exception_handler(Ended)
+    async def _ended(_request: Request, error: Ended) -> JSONResponse:
+        return problem(503, error.detail, reason=error.reason)
+
+    @app.exception_handler(Exception)
+    async def _defect(_request: Request, error: Exception) -> JSONResponse:
+        return problem(500, f"{type(error).__name__}: {error}", reason=Reason.INTERNAL)
+
+
+def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """What a route documents besides its success."""
+    content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    return {
+        status: {"model": Problem, "content": content, "description": HTTPStatus(status).phrase} for status in statuses
+    }

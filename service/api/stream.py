@@ -1,0 +1,55 @@
+"""A job's events as server-sent events. The id of an event is its number in the job, so a client that was cut off
+resumes with Last-Event-ID and misses nothing. `progress` events carry no id: they are not kept."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+
+from service.jobs import Jobs
+from service.states import ACTIVE, JobState
+
+_POLL_S = 0.2
+_KEEP_ALIVE_POLLS = 75  # 15 s: proxies close a silent connection after 30 s or more
+
+
+async def event_stream(jobs: Jobs, job_id: str, after: int) -> AsyncIterator[str]:
+    """Everything after event number `after`, then live until the job is no longer active."""
+    told = ""
+    silent = 0
+    while True:
+        # Asked before the events are read: an event written in between is then seen in the next round.
+        row = await asyncio.to_thread(jobs.store.get, job_id)
+        over = JobState(row.state) not in ACTIVE
+        for event in await asyncio.to_thread(jobs.store.events, job_id, after):
+            after, silent = event.seq, 0
+            data = {"at": event.at, "plant_time_s": event.plant_time_s, **event.data}
+            yield f"id: {event.seq}\nevent: {event.kind}\ndata: {json.dumps(data)}\n\n"
+        if over:
+            return
+        progress = _progress(jobs, job_id)
+        if progress and progress != told:
+            told, silent = progress, 0
+            yield f"event: progress\ndata: {progress}\n\n"
+        silent += 1
+        if silent % _KEEP_ALIVE_POLLS == 0:
+            yield ": alive\n\n"
+        await asyncio.sleep(_POLL_S)
+
+
+def _progress(jobs: Jobs, job_id: str) -> str:
+    running = jobs.running(job_id)
+    if running is None:
+        return ""
+    running.keep_time()
+    live = running.progress
+    remaining = live.remaining_s
+    return json.dumps(
+        {
+            "stage": live.stage,
+            "progress": round(live.fraction, 4),
+            "remaining_plant_time_s": None if remaining is None else round(remaining, 3),
+            "plant_time_s": round(live.plant_time_s, 3),
+        }
+    )

@@ -1,0 +1,222 @@
+"""What the API shows. Units are in the descriptions; times without "wall" are plant time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from pydantic import BaseModel, Field
+
+from service.config import Limits, LoopConfig
+from service.jobs import Running
+from service.loop import LoopState
+from service.states import JobState
+from service.store.tables import EventRow, JobRow
+from tuning.gains import Gains
+from tuning.reasons import ADVICE, Reason
+
+
+class GainsView(BaseModel):
+    """ISA (standard) form: u = Kp (b SP - PV + 1/Ti int(SP - PV) + Td d/dt(c SP - PV) / (1 + Tf s))."""
+
+    form: str = Field(default="ISA", description="Form of the controller")
+    Kp: float = Field(description="Proportional gain, MV percent per PV unit", examples=[0.75])
+    Ti: float = Field(description="Integral time, s; 0 means none", examples=[19.17])
+    Td: float = Field(description="Derivative time, s", examples=[0.0])
+    Tf: float = Field(description="Derivative filter time, s", examples=[0.0])
+    b: float = Field(description="Set-point weight of the proportional path", examples=[1.0])
+    c: float = Field(description="Set-point weight of the derivative path", examples=[0.0])
+
+
+class LoopView(BaseModel):
+    """A configured loop."""
+
+    tag: str = Field(description="Name of the loop", examples=["TIC-101"])
+    description: str = Field(examples=["Reactor outlet temperature"])
+    bus: str = Field(description="Where the devices are", examples=["socketcan:vcan0"])
+    controller_node: int = Field(description="CANopen node id of the controller", examples=[32])
+    plant_node: int | None = Field(description="CANopen node id of a simulated plant", examples=[16])
+    channel: int = Field(description="Channel of the controller, from 1", examples=[1])
+    pv_unit: str = Field(description="Unit of PV and SP", examples=["degC"])
+    mv_limits: Limits = Field(description="Permitted MV, percent")
+    pv_limits: Limits = Field(description="Permitted PV, PV units")
+    t95_s: float = Field(description="Time in which the plant covers 95 % of a step, s", examples=[9.1])
+    sp_deviation: float = Field(description="Permitted set-point step, PV units", examples=[2.0])
+    notes: str = Field(description="For the operator")
+    active_job: str | None = Field(description="URL of the job that has the loop", examples=["/jobs/4f0c2a9be113"])
+
+
+class LiveView(BaseModel):
+    """The present state, read from the controller or from the job that is using it."""
+
+    sp: float = Field(description="Set-point, PV units", examples=[50.0])
+    pv: float | None = Field(description="Process value, PV units", examples=[49.8])
+    mv: float | None = Field(description="Controller output, percent", examples=[41.2])
+    mode: str = Field(description="off, manual, automatic or experiment", examples=["automatic"])
+    gains: GainsView = Field(description="Gains in effect")
+    on_trial: bool = Field(description="True while gains are on trial under the tuner's lease")
+    mv_low: float = Field(description="The controller's own lower output limit, percent", examples=[0.0])
+    mv_high: float = Field(description="The controller's own upper output limit, percent", examples=[100.0])
+    sample_time_s: float = Field(description="Sampling period, s", examples=[0.1])
+    reverse_acting: bool = Field(description="True: MV falls as PV rises")
+
+
+class LoopDetail(LoopView):
+    live: LiveView
+
+
+class StageView(BaseModel):
+    stage: str = Field(examples=["relay"])
+    state: str = Field(description="running, done or ended", examples=["done"])
+    result: dict[str, Any] | None = Field(description="What the stage found; times in s, gains in ISA form")
+    plant_time_s: float | None = Field(description="Plant time the stage took, s", examples=[120.5])
+
+
+class JobView(BaseModel):
+    """A job: what was asked, how far it is, what came out."""
+
+    id: str = Field(examples=["4f0c2a9be113"])
+    url: str = Field(examples=["/jobs/4f0c2a9be113"])
+    loop: str = Field(examples=["TIC-101"])
+    state: JobState = Field(examples=["running"])
+    dry_run: bool
+    request: dict[str, Any] = Field(description="The options asked for")
+    requested_by: str = Field(examples=["night shift"])
+    created_at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
+    started_at: str | None = Field(description="UTC, ISO 8601, wall time")
+    ended_at: str | None = Field(description="UTC, ISO 8601, wall time")
+    stage: str | None = Field(description="The present or last stage", examples=["ultimate"])
+    progress: float = Field(ge=0, le=1, description="0 to 1, in expected plant time", examples=[0.42])
+    remaining_plant_time_s: float | None = Field(description="Expected plant time to the end, s", examples=[310.0])
+    plant_time_s: float = Field(description="Plant time so far, s", examples=[224.0])
+    stages: list[StageView]
+    ultimate: dict[str, Any] | None = Field(description="Ku, MV percent per PV unit; Pu, s")
+    model: dict[str, Any] | None = Field(description="FOPDT: K, PV units per MV percent; T, s; L, s")
+    old_gains: GainsView | None
+    new_gains: GainsView | None
+    predicted: dict[str, Any] | None = Field(
+        description="New gains on the model: GM (ratio), PM (degrees), Ms (ratio), overshoot (percent)"
+    )
+    before: dict[str, Any] | None = Field(
+        description="Set-point step with the old gains: IAE, PV units * s; overshoot, %"
+    )
+    after: dict[str, Any] | None = Field(description="The same step with the new gains")
+    notes: list[str]
+    reason: str | None = Field(description="Why there is no proposal, from the closed list", examples=["not_at_rest"])
+    detail: str | None = Field(description="The reason's numbers")
+    advice: str | None = Field(description="What to do about it")
+    restored: dict[str, Any] | None = Field(description="The loop as read back at the end")
+
+
+class SamplesView(BaseModel):
+    """Columns of equal length. float32 as on the bus."""
+
+    job: str
+    stage: list[str] = Field(description="Stage of each sample")
+    t_s: list[float] = Field(description="Plant time, s")
+    sp: list[float] = Field(description="PV units")
+    pv: list[float] = Field(description="PV units")
+    mv: list[float] = Field(description="Percent")
+    mode: list[int] = Field(description="0 off, 1 manual, 2 automatic, 3 experiment")
+
+
+class Decision(BaseModel):
+    """Who decides, for the record."""
+
+    by: str = Field(default="api", max_length=100, examples=["operator A"])
+
+
+def loop_view(config: LoopConfig, active: JobRow | None) -> dict[str, Any]:
+    fields = config.model_dump(exclude={"noise_std_hint"})
+    return fields | {"active_job": None if active is None else f"/jobs/{active.id}"}
+
+
+def live_view(state: LoopState) -> LiveView:
+    return LiveView(
+        sp=state.sp,
+        pv=_finite(state.pv),
+        mv=_finite(state.mv),
+        mode=state.mode.name.lower(),
+        gains=gains_view(state.gains),
+        on_trial=state.on_trial,
+        mv_low=state.mv_low,
+        mv_high=state.mv_high,
+        sample_time_s=state.sample_time_s,
+        reverse_acting=state.reverse_acting,
+    )
+
+
+def gains_view(gains: Gains) -> GainsView:
+    return GainsView(Kp=gains.Kp, Ti=gains.Ti, Td=gains.Td, Tf=gains.Tf, b=gains.b, c=gains.c)
+
+
+def job_view(row: JobRow, events: Sequence[EventRow], running: Running | None) -> JobView:
+    """The job from the store, and from its live part while it runs."""
+    state = JobState(row.state)
+    result = row.result or {}
+    progress, remaining, plant_time = _progress(state, row, running)
+    new = result.get("gains")
+    return JobView(
+        id=row.id,
+        url=f"/jobs/{row.id}",
+        loop=row.loop,
+        state=state,
+        dry_run=row.dry_run,
+        request=row.request,
+        requested_by=row.requested_by,
+        created_at=row.created_at,
+        started_at=row.started_at,
+        ended_at=row.ended_at,
+        stage=row.stage,
+        progress=progress,
+        remaining_plant_time_s=remaining,
+        plant_time_s=plant_time,
+        stages=_stages(events, row),
+        ultimate=result.get("ultimate"),
+        model=result.get("model"),
+        old_gains=_stored_gains(row.old_gains or result.get("old_gains")),
+        new_gains=_stored_gains(new),
+        predicted=result.get("predicted"),
+        before=result.get("baseline"),
+        after=result.get("verification"),
+        notes=[e.data["text"] for e in events if e.kind == "note"] + list(result.get("notes") or ()),
+        reason=row.reason,
+        detail=row.detail,
+        advice=ADVICE[Reason(row.reason)] if row.reason else None,
+        restored=row.restored,
+    )
+
+
+def _progress(state: JobState, row: JobRow, running: Running | None) -> tuple[float, float | None, float]:
+    if running is not None:
+        running.keep_time()
+        live = running.progress
+        return live.fraction, live.remaining_s, live.plant_time_s
+    ended = state not in (JobState.QUEUED, JobState.RUNNING)
+    return (1.0 if ended else 0.0), (0.0 if ended else None), row.plant_time_s
+
+
+def _stages(events: Sequence[EventRow], row: JobRow) -> list[StageView]:
+    over = row.ended_at is not None
+    times = row.stage_times_s or {}
+    stages: dict[str, StageView] = {}
+    for event in events:
+        name = event.data.get("stage")
+        if event.kind == "stage_started" and isinstance(name, str):
+            stages[name] = StageView(
+                stage=name, state="ended" if over else "running", result=None, plant_time_s=times.get(name)
+            )
+        elif event.kind == "stage_done" and name in stages:
+            stages[name].state, stages[name].result = "done", event.data.get("result")
+    return list(stages.values())
+
+
+def _stored_gains(data: dict[str, Any] | None) -> GainsView | None:
+    if not data:
+        return None
+    known = {name: value for name, value in data.items() if name in Gains.__dataclass_fields__ and value is not None}
+    return gains_view(Gains(**known))
+
+
+def _finite(value: float) -> float | None:
+    return value if value == value and abs(value) != float("inf") else None

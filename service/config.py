@@ -1,0 +1,124 @@
+"""loops.yaml: which loops there are, where they live on the bus, and what a retune may do to them.
+
+Everything wrong with a file is reported in one go: who edits it should not have to run it again for each mistake.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Node = Annotated[int, Field(ge=1, le=127)]
+
+_BUS_KINDS = ("socketcan", "socketcand", "virtual", "pcan", "kvaser", "ixxat", "vector", "slcan", "gs_usb")
+
+
+class ConfigError(Exception):
+    """The file cannot be used; `problems` holds every error found, one line each."""
+
+    def __init__(self, source: str, problems: Sequence[str]) -> None:
+        super().__init__("\n".join([f"{source}: {len(problems)} error(s)", *(f"  {p}" for p in problems)]))
+        self.problems = list(problems)
+
+
+class Limits(BaseModel):
+    """A permitted range, low < high."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    low: Finite
+    high: Finite
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if not self.low < self.high:
+            raise ValueError(f"low ({self.low:g}) must be less than high ({self.high:g})")
+        return self
+
+
+class LoopConfig(BaseModel):
+    """One loop. PV in `pv_unit`, MV in percent of the output range, times in plant seconds."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    tag: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")
+    description: str = ""
+    bus: str
+    controller_node: Node
+    plant_node: Node | None = None
+    channel: int = Field(default=1, ge=1, le=199)
+    pv_unit: str = Field(min_length=1)
+    mv_limits: Limits = Limits(low=0.0, high=100.0)
+    pv_limits: Limits
+    t95_s: Positive
+    sp_deviation: Positive
+    noise_std_hint: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    notes: str = ""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        kind, colon, rest = self.bus.partition(":")
+        if kind not in _BUS_KINDS or not colon or (not rest and kind != "virtual"):
+            raise ValueError(f"bus {self.bus!r} is not of the form KIND:ADDRESS, e.g. socketcan:vcan0")
+        if self.plant_node == self.controller_node:
+            raise ValueError(f"plant_node and controller_node are both {self.controller_node}")
+        if self.mv_limits.low < 0 or self.mv_limits.high > 100:
+            raise ValueError("mv_limits must lie within 0..100 percent")
+        if 2 * self.sp_deviation > self.pv_limits.high - self.pv_limits.low:
+            raise ValueError(f"sp_deviation {self.sp_deviation:g} needs at least twice that between the pv_limits")
+        return self
+
+
+def load_loops(path: Path) -> dict[str, LoopConfig]:
+    """The loops of a file by tag. Raises ConfigError with everything that is wrong with it."""
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(str(path), [error.strerror or str(error)]) from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(str(path), [f"not YAML: {error}"]) from error
+    return parse_loops(document, str(path))
+
+
+def parse_loops(document: Any, source: str) -> dict[str, LoopConfig]:
+    """The loops of a parsed document `{"loops": [...]}`."""
+    entries = document.get("loops") if isinstance(document, dict) else None
+    if not isinstance(entries, list) or not entries:
+        raise ConfigError(source, ["expected a list of loops under the key 'loops'"])
+    problems = [f"{key}: unknown key" for key in document if key != "loops"]
+    loops: list[LoopConfig] = []
+    for number, entry in enumerate(entries):
+        try:
+            loops.append(LoopConfig.model_validate(entry))
+        except ValidationError as error:
+            problems += [_line(number, entry, e["loc"], e["msg"]) for e in error.errors(include_url=False)]
+    problems += _repeated("tag", [_tag(entry) for entry in entries])
+    problems += _repeated(
+        "channel", [f"{loop.bus} node {loop.controller_node} channel {loop.channel}" for loop in loops]
+    )
+    if problems:
+        raise ConfigError(source, problems)
+    return {loop.tag: loop for loop in loops}
+
+
+def _tag(entry: Any) -> str | None:
+    tag = entry.get("tag") if isinstance(entry, dict) else None
+    return tag if isinstance(tag, str) else None
+
+
+def _line(number: int, entry: Any, where: tuple[int | str, ...], message: str) -> str:
+    name = ".".join([f"loops[{number}]", *map(str, where)])
+    tag = _tag(entry)
+    return f"{name}{f' ({tag})' if tag else ''}: {message.removeprefix('Value error, ')}"
+
+
+def _repeated(what: str, values: Sequence[str | None]) -> list[str]:
+    counts = Counter(value for value in values if value is not None)
+    return [f"{what} {value!r} is used by {n} loops" for value, n in counts.items() if n > 1]

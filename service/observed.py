@@ -1,0 +1,63 @@
+"""A loop that remembers what it last showed, so that the API can answer about a loop that a job is using."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from service.loop import Loop, LoopState
+from tuning.gains import Gains
+from tuning.plan import Command, Mode, Sample, SetGains
+
+
+class ObservedLoop:
+    """Passes everything on. `latest` is read by other threads: it is replaced whole, never changed."""
+
+    def __init__(self, loop: Loop) -> None:
+        self._loop = loop
+        self._state: LoopState | None = None
+        self._trial: Gains | None = None
+        self._sample: Sample | None = None
+
+    @property
+    def latest(self) -> LoopState | None:
+        """The last known state: read at the start, then kept up with every sample."""
+        state, sample, trial = self._state, self._sample, self._trial
+        if state is None or sample is None:
+            return state
+        gains = trial or state.gains
+        return replace(
+            state, mode=Mode(sample.mode), sp=sample.sp, pv=sample.pv, mv=sample.mv, gains=gains,
+            on_trial=trial is not None,
+        )  # fmt: skip
+
+    @property
+    def t_s(self) -> float | None:
+        """Plant time of the latest sample, s."""
+        return None if self._sample is None else self._sample.t
+
+    def read(self) -> LoopState:
+        self._state = self._loop.read()
+        return self._state
+
+    def begin(self) -> LoopState:
+        self._state = self._loop.begin()
+        return self._state
+
+    def step(self, commands: Sequence[Command]) -> Sample:
+        self._sample = sample = self._loop.step(commands)
+        for command in commands:
+            if isinstance(command, SetGains):
+                self._trial = command.gains
+        return sample
+
+    def restore(self, state: LoopState) -> LoopState:
+        home = self._loop.restore(state)
+        self._trial, self._sample, self._state = None, None, home
+        return home
+
+    def accept(self, gains: Gains) -> LoopState:
+        return self._loop.accept(gains)
+
+    def close(self) -> None:
+        self._loop.close()

@@ -1,0 +1,54 @@
+"""How far a job is, in plant time: what is done against what the plan still expects."""
+
+from __future__ import annotations
+
+from tuning.plan import StageStarted
+
+
+class Progress:
+    """Fed with stages and with plant time; answers a fraction that never falls, and the remaining plant seconds."""
+
+    def __init__(self) -> None:
+        self.stage: str | None = None
+        self._fraction = 0.0
+        self._start_s: float | None = None
+        self._now_s = 0.0
+        self._stage_start_s = 0.0
+        self._expected_s = 0.0
+        self._after_s = 0.0
+        self._known = False
+
+    def stage_started(self, event: StageStarted) -> None:
+        self.stage = event.stage
+        self._stage_start_s = self._now_s
+        self._expected_s, self._after_s = event.expected_s, event.remaining_s
+        self._known = True
+
+    def at(self, t_s: float) -> None:
+        """The plant time of the latest sample, s."""
+        if self._start_s is None:
+            self._start_s = self._now_s = self._stage_start_s = t_s
+        self._now_s = t_s
+
+    @property
+    def plant_time_s(self) -> float:
+        """Plant time since the job's first sample, s."""
+        return self._now_s - (self._start_s or 0.0)
+
+    @property
+    def remaining_s(self) -> float | None:
+        """Expected plant time to the end, s; None before the plan has said anything."""
+        if not self._known:
+            return None
+        # A stage that overruns its expectation is not "finished": a tenth of it is kept as remaining.
+        in_stage = max(self._expected_s - (self._now_s - self._stage_start_s), 0.1 * self._expected_s)
+        return in_stage + self._after_s
+
+    @property
+    def fraction(self) -> float:
+        """0 to 1; stays below 1 until the job has ended."""
+        remaining = self.remaining_s
+        if remaining is not None:
+            total = self.plant_time_s + remaining
+            self._fraction = max(self._fraction, min(0.99, self.plant_time_s / total if total > 0 else 0.0))
+        return self._fraction

@@ -1,0 +1,60 @@
+"""The life of a job as a table of moves. Everything about which state may follow which is here."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+from tuning.reasons import Aborted, Ended, Refused
+
+
+class JobState(StrEnum):
+    """The value is what the API shows and the database holds."""
+
+    QUEUED = "queued"
+    RUNNING = "running"
+    PROPOSED = "proposed"
+    ACCEPTED = "accepted"
+    ROLLED_BACK = "rolled_back"
+    REFUSED = "refused"
+    ABORTED = "aborted"
+    FAILED = "failed"
+    INTERRUPTED = "interrupted"
+
+
+_S = JobState
+MOVES: dict[JobState, frozenset[JobState]] = {
+    # A queued job may end at once: the loop cannot be read, or the service stops before its thread runs.
+    _S.QUEUED: frozenset({_S.RUNNING, _S.REFUSED, _S.ABORTED, _S.FAILED, _S.INTERRUPTED}),
+    _S.RUNNING: frozenset({_S.PROPOSED, _S.REFUSED, _S.ABORTED, _S.FAILED, _S.INTERRUPTED}),
+    _S.PROPOSED: frozenset({_S.ACCEPTED, _S.ROLLED_BACK}),
+    # An accepted change can still be taken back as long as nothing else changed the gains since.
+    _S.ACCEPTED: frozenset({_S.ROLLED_BACK}),
+    _S.ROLLED_BACK: frozenset(),
+    _S.REFUSED: frozenset(),
+    _S.ABORTED: frozenset(),
+    _S.FAILED: frozenset(),
+    _S.INTERRUPTED: frozenset(),
+}
+ACTIVE = frozenset({_S.QUEUED, _S.RUNNING})
+
+
+class IllegalMove(Exception):
+    """A move that the table does not have."""
+
+    def __init__(self, now: JobState, wanted: JobState) -> None:
+        super().__init__(f"a job that is {now.value} cannot become {wanted.value}")
+        self.now = now
+        self.wanted = wanted
+
+
+def check(now: JobState, wanted: JobState) -> None:
+    """Raises IllegalMove unless the table has it."""
+    if wanted not in MOVES[now]:
+        raise IllegalMove(now, wanted)
+
+
+def state_after(ended: Ended) -> JobState:
+    """The state of a job whose plan ended early."""
+    if isinstance(ended, Refused):
+        return JobState.REFUSED
+    return JobState.ABORTED if isinstance(ended, Aborted) else JobState.FAILED

@@ -1,0 +1,72 @@
+"""The tables. Times are UTC as ISO 8601 text; JSON columns hold plain objects without NaN."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import JSON, ForeignKey, Index, LargeBinary, text
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+
+class Base(DeclarativeBase):
+    type_annotation_map = {dict[str, Any]: JSON}
+
+
+class JobRow(Base):
+    __tablename__ = "jobs"
+    # The database itself, not only the service, keeps a loop from being tuned by two jobs at once.
+    # A dry run does not touch the loop and does not count.
+    __table_args__ = (
+        Index(
+            "one_active_job_per_loop",
+            "loop",
+            unique=True,
+            sqlite_where=text("state IN ('queued', 'running') AND dry_run = 0"),
+        ),
+        Index("jobs_by_loop", "loop", "number"),
+    )
+
+    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    id: Mapped[str] = mapped_column(unique=True)
+    loop: Mapped[str]
+    state: Mapped[str]
+    dry_run: Mapped[bool]
+    request: Mapped[dict[str, Any]]
+    requested_by: Mapped[str]
+    created_at: Mapped[str]
+    started_at: Mapped[str | None]
+    ended_at: Mapped[str | None]
+    stage: Mapped[str | None]
+    plant_time_s: Mapped[float] = mapped_column(default=0.0)
+    stage_times_s: Mapped[dict[str, Any] | None]
+    reason: Mapped[str | None]
+    detail: Mapped[str | None]
+    old_gains: Mapped[dict[str, Any] | None]
+    restored: Mapped[dict[str, Any] | None]
+    result: Mapped[dict[str, Any] | None]
+
+
+class EventRow(Base):
+    """One thing that happened in a job; seq counts from 1 within the job and is the id of the server-sent event."""
+
+    __tablename__ = "events"
+
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
+    seq: Mapped[int] = mapped_column(primary_key=True)
+    at: Mapped[str]
+    plant_time_s: Mapped[float]
+    kind: Mapped[str]
+    data: Mapped[dict[str, Any]]
+
+
+class ChunkRow(Base):
+    """A block of samples of one stage, see service.store.chunks for the layout of `data`."""
+
+    __tablename__ = "sample_chunks"
+
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
+    seq: Mapped[int] = mapped_column(primary_key=True)
+    stage: Mapped[str]
+    first_t_s: Mapped[float]
+    count: Mapped[int]
+    data: Mapped[bytes] = mapped_column(LargeBinary)

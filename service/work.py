@@ -1,0 +1,179 @@
+"""The two kinds of work a job can be: tuning the live loop, and rehearsing in memory. Injected into the jobs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any, Protocol, cast
+
+from service.config import LoopConfig
+from service.loop import Loop, LoopState
+from service.request import RetuneRequest
+from tuning.plan import Event, Sample
+from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
+
+TIME_BUDGET_T95 = 500.0
+FROZEN_T95 = 3.0
+_STOPPED = (Reason.OPERATOR, Reason.SERVICE_STOPPED)
+
+
+@dataclass(frozen=True)
+class Hooks:
+    """How work reports, and how it learns that it should stop."""
+
+    on_event: Callable[[Event], None]
+    on_samples: Callable[[list[Sample]], None]
+    stop: Callable[[], Reason | None]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How work ended: a result, or the reason why not. Plain JSON values; plant times in s per stage."""
+
+    result: dict[str, Any] | None
+    ended: Ended | None
+    restored: LoopState | None
+    plant_time_s: dict[str, float]
+
+
+class Tune(Protocol):
+    """Tunes a live loop whose present state is `state`; restores it on every way out."""
+
+    def __call__(
+        self, config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks
+    ) -> Outcome: ...
+
+
+class Rehearse(Protocol):
+    """Rehearses the same procedure on a model in memory."""
+
+    def __call__(self, config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome: ...
+
+
+def tune(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks) -> Outcome:
+    """The five stages on the live loop."""
+    from service.runner import Watch, run
+    from tuning.five_stage import Facts, Options, five_stage
+
+    facts = Facts(
+        sample_time_s=state.sample_time_s,
+        T95_s=config.t95_s,
+        mv_low=max(config.mv_limits.low, state.mv_low),
+        mv_high=min(config.mv_limits.high, state.mv_high),
+        sp_deviation=config.sp_deviation,
+        old_gains=state.gains,
+        reverse=state.reverse_acting,
+    )
+    options = Options(**_options(request))
+    watch = Watch(
+        pv_low=config.pv_limits.low,
+        pv_high=config.pv_limits.high,
+        max_time_s=request.max_time_s or TIME_BUDGET_T95 * config.t95_s,
+        max_frozen_s=FROZEN_T95 * config.t95_s,
+    )
+    ran = run(
+        five_stage(facts, options),
+        loop,
+        watch=watch,
+        on_event=hooks.on_event,
+        on_samples=hooks.on_samples,
+        stop=hooks.stop,
+    )
+    return Outcome(plain(ran.value), ran.ended, ran.restored, dict(ran.plant_time_s))
+
+
+def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:
+    """The five stages on a model in memory; answers as the live loop would."""
+    from service.rehearsal import rehearse as rehearse_spec
+
+    spec = rehearsal_spec(config, request)
+    # A model typed in for a dry run is the plant itself; the procedure still starts where the request says.
+    answer = rehearse_spec(spec, method=request.method, on_event=hooks.on_event, **_options(request))
+    times = {name: float(value) for name, value in (answer.get("plant_time_s") or {}).items() if name != "total"}
+    if answer["outcome"] == "proposed":
+        return Outcome(_as_proposal(answer), None, None, times)
+    reason = _reason(answer.get("reason"))
+    kind = Aborted if reason in _STOPPED else Refused if answer["outcome"] == "refused" else Failed
+    return Outcome(None, kind(reason, str(answer.get("detail") or "")), None, times)
+
+
+def _options(request: RetuneRequest) -> dict[str, Any]:
+    """The request in the words of tuning.five_stage.Options."""
+    model = request.model
+    return {
+        "start": request.start,
+        "Ku": request.Ku,
+        "Pu_s": request.Pu_s,
+        "Kp": request.Kp,
+        "Ti_s": request.Ti_s,
+        "overshoot_pct": request.overshoot_pct,
+        "model_K": model.K if model else None,
+        "model_T_s": model.T_s if model else None,
+        "model_L_s": model.L_s if model else None,
+        "k_source": request.k_source,
+        "kp_step_factor": request.kp_step_factor,
+        "baseline": request.baseline,
+        "verify": request.verify,
+    }
+
+
+def _as_proposal(answer: dict[str, Any]) -> dict[str, Any]:
+    """A rehearsal's answer under the names of a live job's result."""
+    ultimate, model, measured = (answer.get(key) or {} for key in ("ultimate", "model", "measured"))
+    return {
+        "ultimate": {"Ku": ultimate["Ku"], "Pu_s": ultimate["Pu"]} if ultimate else None,
+        "model": {"K": model.get("K"), "T_s": model.get("T"), "L_s": model.get("L"), "k_source": model.get("k_source")},
+        "old_gains": (answer.get("input") or {}).get("gains"),
+        "gains": answer.get("gains"),
+        "predicted": answer.get("predicted"),
+        "baseline": measured.get("before"),
+        "verification": measured.get("after"),
+        "notes": answer.get("notes") or [],
+        "input": answer.get("input"),
+    }
+
+
+def rehearsal_spec(config: LoopConfig, request: RetuneRequest) -> dict[str, Any]:
+    """The plant to rehearse on: the one given, else the model given, else a guess from the loop's configuration."""
+    middle = 0.5 * (config.mv_limits.low + config.mv_limits.high)
+    spec: dict[str, Any] = {
+        "name": config.tag,
+        "t95_s": config.t95_s,
+        "sp_deviation": config.sp_deviation,
+        "mv_limits": [config.mv_limits.low - middle, config.mv_limits.high - middle],
+        "noise_std": config.noise_std_hint or 0.0,
+        "seed": 1,
+    }
+    if request.plant is not None:
+        return spec | request.plant.model_dump(exclude_none=True)
+    if request.model is not None:
+        model = request.model
+        return spec | {"num": [model.K], "den": [model.T_s, 1.0], "dead_time_s": model.L_s}
+    # Nothing is known but T95 = L + 3 T (a FOPDT's 95 % time): a fifth of it as dead time is a typical loop, and a
+    # tenth of the MV range for the permitted set-point step is a loop that was sized sensibly.
+    dead_time = 0.2 * config.t95_s
+    gain = config.sp_deviation / (0.1 * (config.mv_limits.high - config.mv_limits.low))
+    return spec | {"num": [gain], "den": [(config.t95_s - dead_time) / 3.0, 1.0], "dead_time_s": dead_time}
+
+
+def plain(value: object) -> dict[str, Any] | None:
+    """A result (a dataclass with plain fields, or several) as a JSON object."""
+    if value is None:
+        return None
+    found = _plain(value)
+    return cast(dict[str, Any], found) if isinstance(found, dict) else {"value": found}
+
+
+def _plain(value: Any) -> Any:
+    """Dataclasses, tuples and numpy scalars become what JSON knows."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return _plain({f.name: getattr(value, f.name) for f in fields(value)})
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value.item() if hasattr(value, "item") else value
+
+
+def _reason(text: object) -> Reason:
+    return Reason(text) if isinstance(text, str) and text in set(Reason) else Reason.INTERNAL

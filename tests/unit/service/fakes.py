@@ -1,0 +1,151 @@
+"""A loop, a way of tuning it and a service around them, without a bus, a plant or waiting."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from service.config import LoopConfig, parse_loops
+from service.jobs import Jobs
+from service.loop import Loop, LoopState
+from service.request import RetuneRequest
+from service.store.store import Store
+from service.work import Hooks, Outcome
+from tuning.gains import Gains
+from tuning.plan import Command, Mode, Note, Sample, SetGains, SetSetpoint, StageDone, StageStarted
+from tuning.reasons import Aborted, Ended, Failed, Reason
+
+OLD, NEW = Gains(0.5, 2.0), Gains(0.75, 3.0)
+TAG = "TIC-101"
+
+
+def loop_entry(**changes: Any) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "tag": TAG, "bus": "virtual:test", "controller_node": 32, "plant_node": 16, "pv_unit": "degC",
+        "pv_limits": {"low": 0.0, "high": 100.0}, "t95_s": 9.0, "sp_deviation": 2.0,
+    }  # fmt: skip
+    return {**entry, **changes}
+
+
+class FakeController:
+    """What survives of a loop between two openings of it."""
+
+    def __init__(self) -> None:
+        self.state = LoopState(Mode.AUTOMATIC, 50.0, 50.0, 40.0, OLD, False, 0.0, 100.0, 0.1, True)
+        self.absent: Reason | None = None
+        self.open = 0
+
+
+class FakeLoop:
+    def __init__(self, controller: FakeController) -> None:
+        self._controller = controller
+        controller.open += 1
+        self._n = 0
+
+    def read(self) -> LoopState:
+        if self._controller.absent:
+            raise Failed(self._controller.absent, "node 32 does not answer")
+        return self._controller.state
+
+    def begin(self) -> LoopState:
+        return self.read()
+
+    def step(self, commands: Sequence[Command]) -> Sample:
+        self.read()
+        for command in commands:
+            if isinstance(command, SetSetpoint):
+                self._controller.state = replace(self._controller.state, sp=command.value)
+            elif isinstance(command, SetGains):
+                self._controller.state = replace(self._controller.state, gains=command.gains, on_trial=True)
+        self._n += 1
+        state = self._controller.state
+        return Sample(0.1 * self._n, state.sp, state.pv, state.mv, int(state.mode))
+
+    def restore(self, state: LoopState) -> LoopState:
+        self._controller.state = state
+        return state
+
+    def accept(self, gains: Gains) -> LoopState:
+        self._controller.state = replace(self._controller.state, gains=gains)
+        return self._controller.state
+
+    def close(self) -> None:
+        self._controller.open -= 1
+
+
+@dataclass(frozen=True)
+class Found:
+    Ku: float
+    Pu_s: float
+
+
+RESULT = {
+    "ultimate": asdict(Found(2.05, 3.32)), "model": {"K": 2.0, "T_s": 3.0, "L_s": 1.0},
+    "old_gains": asdict(OLD), "gains": asdict(NEW), "predicted": {"Ms": 1.6, "GM": 3.0, "PM_deg": 60.0},
+    "baseline": {"IAE": 9.0, "overshoot_pct": 40.0}, "verification": {"IAE": 4.0, "overshoot_pct": 5.0},
+    "notes": ["all quiet"],
+}  # fmt: skip
+
+
+class FakeTune:
+    """Two stages of 10 samples; `hold` keeps it in the first one until released, as a long experiment would."""
+
+    def __init__(self) -> None:
+        self.hold = threading.Event()
+        self.hold.set()
+        self.inside = threading.Event()
+        self.ends: Exception | None = None
+
+    def __call__(
+        self, config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks
+    ) -> Outcome:
+        ended: Ended | None = None
+        try:
+            for stage, remaining in (("preflight", 3.0), ("relay", 1.0)):
+                hooks.on_event(StageStarted(stage, 1.0, remaining))
+                samples = [loop.step((SetGains(NEW),) if n == 0 else ()) for n in range(10)]
+                hooks.on_samples(samples)
+                self.inside.set()
+                while not self.hold.wait(0.005):
+                    loop.step(())
+                    if reason := hooks.stop():
+                        raise Aborted(reason, "asked to stop")
+                hooks.on_event(StageDone(stage, Found(2.05, 3.32)))
+            hooks.on_event(Note("nearly there"))
+            if self.ends:
+                raise self.ends
+        except Ended as error:
+            ended = error
+        finally:
+            restored = loop.restore(state)
+        return Outcome(None if ended else RESULT, ended, restored, {"preflight": 1.0, "relay": 1.0})
+
+
+def fake_rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:
+    hooks.on_event(StageStarted("preflight", 1.0, 0.0))
+    hooks.on_event(StageDone("preflight", Found(2.05, 3.32)))
+    return Outcome(RESULT, None, None, {"preflight": 1.0})
+
+
+class Service:
+    """Everything of a service that a test wants to put a hand on."""
+
+    def __init__(self, folder: Path) -> None:
+        self.controller = FakeController()
+        self.tune = FakeTune()
+        self.store = Store(folder)
+        self.loops = parse_loops({"loops": [loop_entry(), loop_entry(tag="FIC-2", channel=2)]}, "test")
+        self.jobs = Jobs(self.loops, self.store, lambda config: FakeLoop(self.controller), self.tune, fake_rehearse)
+
+    def wait(self, job_id: str) -> None:
+        running = self.jobs.running(job_id)
+        if running and running.thread:
+            running.thread.join(10)
+
+    def close(self) -> None:
+        self.tune.hold.set()
+        self.jobs.stop()
+        self.store.close()

@@ -1,0 +1,222 @@
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from tests.unit.service.fakes import NEW, OLD, TAG, Service
+from tuning.reasons import ADVICE, Failed, Reason, Refused
+
+GOLDEN = Path(__file__).parents[2] / "golden" / "openapi.json"
+
+
+def start(client: TestClient, **options: Any) -> str:
+    answer = client.post(f"/loops/{TAG}/retune", json=options)
+    assert answer.status_code == 202, answer.text
+    assert answer.headers["location"] == f"/jobs/{answer.json()['id']}"
+    return str(answer.json()["id"])
+
+
+def finished(service: Service, client: TestClient, **options: Any) -> dict[str, Any]:
+    job_id = start(client, **options)
+    service.wait(job_id)
+    job: dict[str, Any] = client.get(f"/jobs/{job_id}").json()
+    return job
+
+
+def assert_problem(answer: Any, status: int) -> dict[str, Any]:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    body: dict[str, Any] = answer.json()
+    assert body["status"] == status and body["detail"] and body["title"]
+    return body
+
+
+def test_loops_and_live_state(client: TestClient) -> None:
+    assert [loop["tag"] for loop in client.get("/loops").json()] == [TAG, "FIC-2"]
+    loop = client.get(f"/loops/{TAG}").json()
+    assert loop["live"]["sp"] == 50.0 and loop["live"]["mode"] == "automatic"
+    assert loop["live"]["gains"]["Kp"] == OLD.Kp and loop["active_job"] is None
+
+
+def test_live_state_of_a_busy_loop_comes_from_its_job(service: Service, client: TestClient) -> None:
+    service.tune.hold.clear()
+    job_id = start(client)
+    service.tune.inside.wait(5)
+    loop = client.get(f"/loops/{TAG}").json()
+    assert loop["live"]["gains"]["Kp"] == NEW.Kp and loop["live"]["on_trial"] is True
+    assert loop["active_job"] == f"/jobs/{job_id}"
+    assert service.controller.open == 1
+
+
+def test_a_retune_ends_as_a_proposal(service: Service, client: TestClient) -> None:
+    job = finished(service, client, requested_by="me")
+    assert job["state"] == "proposed" and job["progress"] == 1.0 and job["requested_by"] == "me"
+    assert job["old_gains"]["Kp"] == OLD.Kp and job["new_gains"]["Kp"] == NEW.Kp
+    assert job["new_gains"]["form"] == "ISA"
+    assert [s["stage"] for s in job["stages"]] == ["preflight", "relay"]
+    assert job["stages"][0]["result"] == {"Ku": 2.05, "Pu_s": 3.32}
+    assert job["restored"]["gains"]["Kp"] == OLD.Kp and job["restored"]["mode"] == "automatic"
+    assert job["notes"] == ["nearly there", "all quiet"]
+    assert service.controller.state.gains == OLD
+    assert service.controller.open == 0
+
+
+def test_accept_then_roll_back(service: Service, client: TestClient) -> None:
+    url = finished(service, client)["url"]
+    assert client.post(f"{url}/accept", json={"by": "op"}).json()["state"] == "accepted"
+    assert service.controller.state.gains == NEW
+    assert_problem(client.post(f"{url}/accept"), 409)
+    assert client.post(f"{url}/rollback").json()["state"] == "rolled_back"
+    assert service.controller.state.gains == OLD
+
+
+def test_accept_refuses_when_the_gains_were_changed_since(service: Service, client: TestClient) -> None:
+    first, second = finished(service, client), finished(service, client)
+    assert client.post(f"{first['url']}/accept").status_code == 200
+    assert "changed" in assert_problem(client.post(f"{second['url']}/accept"), 409)["detail"]
+    assert client.post(f"{second['url']}/rollback").json()["state"] == "rolled_back"
+    assert service.controller.state.gains == NEW
+
+
+def test_busy_loop_answers_409_with_the_active_job(service: Service, client: TestClient) -> None:
+    done = finished(service, client)
+    service.tune.hold.clear()
+    job_id = start(client)
+    answer = client.post(f"/loops/{TAG}/retune", json={})
+    body = assert_problem(answer, 409)
+    assert body["job"] == f"/jobs/{job_id}" == answer.headers["location"]
+    assert assert_problem(client.post(f"{done['url']}/accept"), 409)["job"] == f"/jobs/{job_id}"
+    assert client.post("/loops/FIC-2/retune", json={}).status_code == 202
+
+
+def test_progress_and_abort(service: Service, client: TestClient) -> None:
+    service.tune.hold.clear()
+    job_id = start(client)
+    service.tune.inside.wait(5)
+    job = client.get(f"/jobs/{job_id}").json()
+    assert job["state"] == "running" and 0 <= job["progress"] < 1 and job["remaining_plant_time_s"] > 0
+    assert client.post(f"/jobs/{job_id}/abort").status_code == 202
+    service.wait(job_id)
+    job = client.get(f"/jobs/{job_id}").json()
+    assert job["state"] == "aborted" and job["reason"] == "operator"
+    assert service.controller.state.gains == OLD
+    assert_problem(client.post(f"/jobs/{job_id}/abort"), 409)
+
+
+@pytest.mark.parametrize(
+    ("ended", "state"),
+    [
+        (Refused(Reason.NOT_AT_REST, "PV drifts"), "refused"),
+        (Failed(Reason.NODE_LOST, "silent"), "failed"),
+        (ValueError("a defect"), "failed"),
+    ],
+)
+def test_every_other_end_has_reason_and_advice(
+    service: Service, client: TestClient, ended: Exception, state: str
+) -> None:
+    service.tune.ends = ended
+    job = finished(service, client)
+    reason = getattr(ended, "reason", Reason.INTERNAL)
+    assert (job["state"], job["reason"], job["advice"]) == (state, reason.value, ADVICE[reason])
+    assert str(getattr(ended, "detail", ended)) in job["detail"]
+    assert_problem(client.post(f"{job['url']}/accept"), 409)
+
+
+def test_absent_node(service: Service, client: TestClient) -> None:
+    service.controller.absent = Reason.NODE_LOST
+    assert assert_problem(client.get(f"/loops/{TAG}"), 503)["reason"] == "node_lost"
+    job = finished(service, client)
+    assert job["state"] == "failed" and job["reason"] == "node_lost"
+
+
+@pytest.mark.parametrize(
+    ("body", "reason", "words"),
+    [
+        ({"mv_low": 60, "mv_high": 40}, "bad_limits", "mv_low"),
+        ({"pv_low": -5}, "bad_limits", "wider"),
+        ({"sp_deviation": 3}, "bad_limits", "more than"),
+        ({"pv_low": 49, "pv_high": 51}, "bad_limits", "twice"),
+        ({"sp_deviation": -1}, "bad_input", "sp_deviation"),
+        ({"start": "zn_pi"}, "bad_input", "Ku, Pu_s"),
+        ({"sp_devation": 1}, "bad_input", "sp_devation"),
+        ({"plant": {"num": [1], "den": [1, 1]}}, "bad_input", "dry run"),
+    ],
+)
+def test_bad_requests(client: TestClient, body: dict[str, Any], reason: str, words: str) -> None:
+    problem = assert_problem(client.post(f"/loops/{TAG}/retune", json=body), 422)
+    assert problem["reason"] == reason and words in problem["detail"]
+    assert client.get("/jobs").json() == []
+
+
+@pytest.mark.parametrize("body", ['{"sp_deviation": NaN}', '{"mv_low": Infinity}', "{", "[]"])
+def test_nan_and_nonsense_are_problems(client: TestClient, body: str) -> None:
+    answer = client.post(f"/loops/{TAG}/retune", content=body, headers={"content-type": "application/json"})
+    assert_problem(answer, 422)
+
+
+@pytest.mark.parametrize("path", ["/loops/NONE", "/jobs/none", "/jobs/none/events", "/jobs/none/samples", "/nowhere"])
+def test_not_found(client: TestClient, path: str) -> None:
+    assert_problem(client.get(path), 404)
+
+
+def test_other_http_errors_are_problems(client: TestClient) -> None:
+    assert_problem(client.delete("/loops"), 405)
+    assert_problem(client.get("/jobs?limit=0"), 422)
+    assert_problem(client.post("/loops/NONE/retune", json={}), 404)
+
+
+def test_samples_as_columns_and_as_csv(service: Service, client: TestClient) -> None:
+    url = finished(service, client)["url"]
+    columns = client.get(f"{url}/samples").json()
+    assert columns["t_s"][:3] == [0.1, 0.2, 0.3] and columns["stage"] == ["preflight"] * 10 + ["relay"] * 10
+    only = client.get(f"{url}/samples?stage=relay&format=csv")
+    assert only.headers["content-type"].startswith("text/csv")
+    lines = only.text.splitlines()
+    assert lines[0] == "stage,t_s,sp,pv,mv,mode" and lines[1] == "relay,1.1,50.0,50.0,40.0,2" and len(lines) == 11
+
+
+def events(text: str) -> list[tuple[int, str, dict[str, Any]]]:
+    found = []
+    for block in text.strip().split("\n\n"):
+        fields = dict(line.split(": ", 1) for line in block.splitlines() if not line.startswith(":"))
+        found.append((int(fields.get("id", 0)), fields["event"], json.loads(fields["data"])))
+    return found
+
+
+def test_events_resume_after_the_last_one_seen(service: Service, client: TestClient) -> None:
+    url = finished(service, client)["url"]
+    everything = events(client.get(f"{url}/events").text)
+    assert [n for n, _, _ in everything] == list(range(1, len(everything) + 1))
+    assert [kind for _, kind, _ in everything] == [
+        "state", "state", "stage_started", "stage_done", "stage_started", "stage_done", "note", "state",
+    ]  # fmt: skip
+    assert everything[-1][2]["state"] == "proposed"
+    assert events(client.get(f"{url}/events", headers={"Last-Event-ID": "6"}).text) == everything[6:]
+    assert client.get(f"{url}/events", headers={"Last-Event-ID": "8"}).status_code == 204
+
+
+def test_a_dry_run_touches_nothing_and_does_not_block(service: Service, client: TestClient) -> None:
+    service.tune.hold.clear()
+    start(client)
+    job = finished(service, client, dry_run=True)
+    assert job["state"] == "proposed" and job["dry_run"] is True
+    assert_problem(client.post(f"{job['url']}/accept"), 409)
+
+
+def test_stopping_takes_no_new_work(service: Service, client: TestClient) -> None:
+    service.jobs.request_stop()
+    assert assert_problem(client.post(f"/loops/{TAG}/retune", json={}), 503)["reason"] == "service_stopped"
+
+
+def test_openapi_is_the_golden_one(client: TestClient) -> None:
+    document = client.get("/openapi.json").json()
+    document["info"]["version"] = "0"
+    text = json.dumps(document, indent=1, sort_keys=True) + "\n"
+    if os.environ.get("LOOPWRIGHT_WRITE_GOLDEN"):
+        GOLDEN.write_text(text)
+    assert text == GOLDEN.read_text(), "the API changed: LOOPWRIGHT_WRITE_GOLDEN=1 writes the new golden file"
