@@ -121,6 +121,8 @@ class Tuner:
         self._samples: deque[BusSample] = deque()
         self._pv = (0.0, -1)
         self._beat_at = 0.0
+        self.beating = False
+        """Only who holds the loop beats: a mere reader must not keep alive the trial of a tuner that died."""
         self.mode, self.on_trial, self.sp = 0, False, 0.0
         self.emergencies: list[int] = []
         """EMCY codes of the controller other than "error gone", until the owner clears them."""
@@ -134,6 +136,8 @@ class Tuner:
 
     def heartbeat(self) -> None:
         """Sends our heartbeat when it is due."""
+        if not self.beating:
+            return
         now = time.monotonic()
         if now - self._beat_at >= HEARTBEAT_S:
             self._bus.send(heartbeat_id(TUNER_NODE), HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL))

@@ -1,0 +1,377 @@
+"""The live loop: a controller and its plant on a CAN bus, as a plan sees it.
+
+Every wait in here also sends our heartbeat, and the lease is renewed from `step` alone: a service that hangs or dies
+loses the loop, and the controller goes back to its accepted set by itself.
+
+A simulated plant that runs as fast as the answers come (pace 0) is run in blocks of samples: no sample is lost however
+slow we are, and commands act between two blocks, so that equal seeds give equal runs.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+
+from protocol.bus import BusError
+from protocol.objects import DEVICE_TYPE, Device
+from protocol.profile import FOREVER, TUNER_NODE, Abort, Cause, Emcy, Experiment, ParameterCommand
+from protocol.tuner import BusSample, Kind, Tuner, TunerError
+from service.loop import LoopState
+from tuning.gains import Gains
+from tuning.plan import Command, Mode, Sample, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
+from tuning.reasons import Ended, Failed, Reason, Refused
+
+HEARTBEAT_WATCH_MS = 1000
+"""Wall time without our heartbeat after which the controller goes back by itself."""
+LEASE_WALL_S = 3.0
+LEFTOVER_S = LEASE_WALL_S + 1.0
+"""How long a session of another tuner may take to end before we begin."""
+SHORTEST_LEASE = 20
+SILENCE_S = 1.0
+"""Wall time without a sample (at least three sampling periods) after which the nodes are asked whether they live."""
+RESTORE_PATIENCE_S = 4.0
+RELAY_LONGEST = 1_000_000  # samples; plans end their relays, and so does the lease
+MAX_GAP = 5
+
+_PARAMETERS = ("kp", "ti", "td", "tf", "b", "c")
+_WENT_BACK = (Emcy.HEARTBEAT_LOST, Emcy.LEASE_USED_UP, Emcy.PV_LIMIT)
+_NOT_OURS = (Abort.NO_OBJECT, Abort.NO_SUBINDEX, Abort.LENGTH, Abort.READ_ONLY, Abort.WRITE_ONLY)
+
+# A plant that we run in blocks belongs to one job at a time, whatever its number of channels.
+_plants: dict[tuple[str, int], threading.Lock] = {}
+_plants_guard = threading.Lock()
+
+
+class BusLoop:
+    """One channel of a controller node. plant_node: the plant I/O, if it offers one to ask (a simulated one does).
+
+    block: samples per block of a plant at pace 0.  max_gap: samples in a row that may be missing.
+    """
+
+    def __init__(
+        self,
+        bus_url: str,
+        controller_node: int,
+        plant_node: int | None,
+        channel: int = 1,
+        *,
+        block: int = 10,
+        max_gap: int = MAX_GAP,
+    ) -> None:
+        self._url = bus_url
+        self._node = controller_node
+        self._plant = plant_node
+        self._channel = channel
+        self._block = block
+        self._max_gap = max_gap
+        self._tuner: Tuner | None = None
+        self._held: threading.Lock | None = None
+        self._in_blocks = False
+        self._left = 0  # samples of the present block still to come
+        self._commands: list[Command] = []
+        self._sample_time_s = 0.0
+        self._silence_s = SILENCE_S
+        self._lease = SHORTEST_LEASE
+        self._until_renewal = 0
+        self._first_n: int | None = None
+        self._last_n = 0
+
+    # -- what a Loop does
+
+    def read(self) -> LoopState:
+        with self._translated() as tuner:
+            return self._state(tuner)
+
+    def begin(self) -> LoopState:
+        try:
+            with self._translated() as tuner:
+                self._identify(tuner)
+                self._watch_us(tuner)
+                self._take_time(tuner)
+                state = self._state(tuner)
+                if state.mode is Mode.EXPERIMENT:
+                    raise Refused(Reason.WRONG_MODE, "an experiment is running in the controller")
+                self._plan_lease(tuner)
+                tuner.write("controller_lease", self._lease)
+                tuner.drain()
+                tuner.mode, tuner.on_trial, tuner.sp = state.mode, state.on_trial, state.sp
+                tuner.emergencies.clear()
+                tuner.restarted = False
+                self._until_renewal = self._lease // 3
+                self._first_n, self._left = None, 0
+                self._commands.clear()
+                return state
+        except BaseException:
+            self._release()
+            raise
+
+    def step(self, commands: Sequence[Command]) -> Sample:
+        with self._translated() as tuner:
+            self._commands += commands
+            if self._left <= 0:
+                for command in self._commands:
+                    self._carry_out(tuner, command)
+                self._commands.clear()
+                if self._until_renewal <= 0:
+                    self._renew(tuner)
+                if self._in_blocks:
+                    tuner.write("plant_samples_to_run", self._block)
+                    self._left = self._block
+            found = tuner.sample(self._silence_s)
+            if tuner.emergencies or tuner.restarted:
+                self._hear(tuner)
+            if found is None:
+                raise self._silent(tuner)
+            return self._count(found)
+
+    def restore(self, state: LoopState) -> LoopState:
+        give_up = time.monotonic() + RESTORE_PATIENCE_S
+        try:
+            while True:
+                try:
+                    return self._bring_back(state)
+                except Ended as ended:
+                    if time.monotonic() > give_up:
+                        raise Failed(Reason.RESTORE_UNCONFIRMED, ended.detail) from ended
+                    time.sleep(0.05)
+        finally:
+            self._release()
+
+    def accept(self, gains: Gains) -> LoopState:
+        with self._translated() as tuner:
+            held = tuner.beating
+            tuner.beating = True
+            tuner.heartbeat()
+            self._make_accepted(tuner, gains)
+            tuner.beating = held
+            state = self._state(tuner)
+            if state.on_trial or not _same_gains(state.gains, gains):
+                raise Failed(Reason.RESTORE_UNCONFIRMED, f"accepted {gains}, read back {state.gains}")
+            return state
+
+    def close(self) -> None:
+        self._release()
+        self._forget()
+
+    # -- the way in
+
+    def _identify(self, tuner: Tuner) -> None:
+        for node, device in ((self._node, Device.CONTROLLER), (self._plant, Device.PLANT)):
+            if node is None:
+                continue
+            found = int(tuner.number("device_type", node=node))
+            if found != DEVICE_TYPE[device]:
+                text = f"node {node:02X}h is of type {found:08X}h, not a {device.value} ({DEVICE_TYPE[device]:08X}h)"
+                raise Refused(Reason.DEVICE_MISMATCH, text)
+
+    def _watch_us(self, tuner: Tuner) -> None:
+        """Arms the watch on our heartbeat. A session that a dead tuner left ends first, for want of its heartbeat."""
+        give_up = time.monotonic() + LEFTOVER_S
+        while tuner.number("controller_lease"):
+            if time.monotonic() > give_up:
+                raise Refused(Reason.WRONG_MODE, "another tuner holds the lease of this loop")
+            time.sleep(0.05)
+        tuner.write("heartbeat_consumer", TUNER_NODE << 16 | HEARTBEAT_WATCH_MS, sub=1, node=self._node)
+        tuner.beating = True
+        tuner.heartbeat()
+        if tuner.number("controller_on_trial"):
+            tuner.write("controller_parameter_command", ParameterCommand.GO_BACK)
+
+    def _take_time(self, tuner: Tuner) -> None:
+        """Who drives the samples: the plant by its clock, or we in blocks."""
+        self._sample_time_s = tuner.number("sample_time", node=self._node) * 1e-6
+        pace = tuner.number("plant_pace") if self._plant is not None else 1.0
+        self._in_blocks = pace == 0.0
+        per_sample_s = self._sample_time_s / (pace or math.inf)
+        self._silence_s = max(SILENCE_S, 3.0 * per_sample_s)
+        if self._in_blocks and self._plant is not None:
+            with _plants_guard:
+                lock = _plants.setdefault((self._url, self._plant), threading.Lock())
+            lock.acquire()
+            self._held = lock
+            tuner.write("plant_samples_to_run", 0)
+            while tuner.sample(0.03) is not None:
+                pass
+        elif self._plant is not None and not tuner.number("plant_samples_to_run"):
+            tuner.write("plant_samples_to_run", FOREVER)
+
+    def _plan_lease(self, tuner: Tuner) -> None:
+        """Samples we pay for at a time: some seconds of wall time, or some blocks."""
+        if self._in_blocks:
+            self._lease = 60 * self._block
+            return
+        pace = tuner.number("plant_pace") if self._plant is not None else 1.0
+        self._lease = max(SHORTEST_LEASE, math.ceil(LEASE_WALL_S * pace / self._sample_time_s))
+
+    # -- on the way
+
+    def _carry_out(self, tuner: Tuner, command: Command) -> None:
+        match command:
+            case SetSetpoint(value):
+                tuner.write("controller_setpoint", value)
+            case SetMode(mode):
+                tuner.write("controller_mode_command", mode)
+            case SetGains(gains):
+                self._try(tuner, gains)
+            case SetOutput(value):
+                tuner.write("controller_manual_output", value)
+            case SetRelay(amplitude, hysteresis, working_output, parallel_gain):
+                tuner.write("controller_relay_amplitude", amplitude)
+                tuner.write("controller_relay_hysteresis", hysteresis)
+                tuner.write("controller_relay_working_output", working_output)
+                tuner.write("controller_relay_parallel_gain", parallel_gain)
+                tuner.write("controller_relay_max_samples", RELAY_LONGEST)
+                tuner.write("controller_relay_pv_low", tuner.number("controller_pv_low"))
+                tuner.write("controller_relay_pv_high", tuner.number("controller_pv_high"))
+                tuner.write("controller_experiment", Experiment.RELAY)
+                tuner.write("controller_mode_command", Mode.EXPERIMENT)
+
+    def _try(self, tuner: Tuner, gains: Gains) -> None:
+        values = (gains.Kp, gains.Ti, gains.Td, gains.Tf, gains.b, gains.c)
+        for name, value in zip(_PARAMETERS, values, strict=True):
+            tuner.write(f"controller_staged_{name}", value)
+        tuner.write("controller_parameter_command", ParameterCommand.TRY)
+
+    def _renew(self, tuner: Tuner) -> None:
+        """Looks before it pays: paying for a session that has ended would open another one."""
+        if not tuner.number("controller_lease"):
+            raise self._gone_back(tuner)
+        tuner.write("controller_lease", self._lease)
+        self._until_renewal = self._lease // 3
+
+    def _hear(self, tuner: Tuner) -> None:
+        """An emergency may concern another channel: our own lease tells."""
+        codes, tuner.emergencies = tuner.emergencies, []
+        if tuner.restarted:
+            tuner.restarted = False
+            raise Failed(Reason.NODE_LOST, f"controller node {self._node:02X}h restarted")
+        if any(code in _WENT_BACK for code in codes) and not tuner.number("controller_lease"):
+            raise self._gone_back(tuner)
+
+    def _gone_back(self, tuner: Tuner) -> Failed:
+        cause = Cause(int(tuner.number("controller_cause")))
+        if cause is Cause.PV_LIMIT:
+            return Failed(Reason.PV_LIMIT, "PV left its span during the experiment; the controller ended it")
+        name = cause.name.lower().replace("_", " ")
+        return Failed(Reason.DEVICE_WENT_BACK, f"the controller ended the trial by itself (cause: {name})")
+
+    def _silent(self, tuner: Tuner) -> Failed:
+        """No samples: who is it? A node that is gone raises by its time-out."""
+        tuner.number("controller_mode")
+        if self._plant is not None:
+            tuner.number("plant_samples_to_run")
+        if not tuner.number("controller_lease"):
+            return self._gone_back(tuner)
+        return Failed(Reason.SAMPLES_LOST, f"no sample for {self._silence_s:g} s although the nodes answer")
+
+    def _count(self, found: BusSample) -> Sample:
+        if self._first_n is None:
+            self._first_n, self._last_n = found.n, found.n - 1
+        passed = found.n - self._last_n
+        self._last_n = found.n
+        if passed < 1:
+            raise Failed(Reason.SAMPLES_LOST, f"the plant started anew: sample {found.n} after {found.n - passed}")
+        if passed > self._max_gap + 1:
+            raise Failed(Reason.SAMPLES_LOST, f"{passed - 1} samples missing before sample {found.n}")
+        self._left -= passed if self._in_blocks else 0
+        self._until_renewal -= passed
+        return Sample((found.n - self._first_n) * self._sample_time_s, found.sp, found.pv, found.mv, found.mode)
+
+    # -- the way out
+
+    def _bring_back(self, state: LoopState) -> LoopState:
+        with self._translated() as tuner:
+            tuner.write("controller_parameter_command", ParameterCommand.GO_BACK)
+            if not _same_gains(_gains(tuner, "accepted"), state.gains):
+                self._make_accepted(tuner, state.gains)
+            tuner.write("controller_setpoint", state.sp)
+            tuner.write("controller_mode_command", state.mode)
+            if state.mode is Mode.MANUAL:
+                tuner.write("controller_manual_output", state.mv)
+            tuner.write("controller_lease", 0)
+            found = self._state(tuner)
+        differences = [
+            f"{name} is {is_}, was {was}"
+            for name, is_, was, same in (
+                ("mode", found.mode.name, state.mode.name, found.mode is state.mode),
+                ("set-point", found.sp, state.sp, _same(found.sp, state.sp)),
+                ("gains", found.gains, state.gains, _same_gains(found.gains, state.gains)),
+                ("trial", found.on_trial, False, not found.on_trial),
+            )
+            if not same
+        ]
+        if differences:
+            raise Failed(Reason.RESTORE_UNCONFIRMED, "; ".join(differences))
+        return found
+
+    def _make_accepted(self, tuner: Tuner, gains: Gains) -> None:
+        self._try(tuner, gains)
+        tuner.write("controller_parameter_command", ParameterCommand.ACCEPT)
+
+    def _release(self) -> None:
+        """Our heartbeat ends; a plant that we ran in blocks runs on by itself, and others may take it."""
+        if self._tuner is not None:
+            self._tuner.beating = False
+        if self._held is None:
+            return
+        with suppress(Ended), self._translated() as tuner:
+            tuner.write("plant_samples_to_run", FOREVER)
+        self._held.release()
+        self._held = None
+
+    def _forget(self) -> None:
+        if self._tuner is not None:
+            self._tuner.close()
+            self._tuner = None
+
+    # -- common
+
+    @contextmanager
+    def _translated(self) -> Iterator[Tuner]:
+        """The tuner, opened when needed; what goes wrong on the bus becomes a reason of the closed list."""
+        try:
+            if self._tuner is None:
+                self._tuner = Tuner(self._url, self._node, self._plant, self._channel)
+            yield self._tuner
+        except BusError as error:
+            self._forget()
+            raise Failed(Reason.BUS_LOST, str(error)) from error
+        except TunerError as error:
+            if error.kind is Kind.TIMEOUT:
+                raise Failed(Reason.NODE_LOST, str(error)) from error
+            if error.code in _NOT_OURS:
+                raise Refused(Reason.DEVICE_MISMATCH, str(error)) from error
+            raise Refused(Reason.BAD_INPUT, f"the controller refused: {error}") from error
+
+    def _state(self, tuner: Tuner) -> LoopState:
+        """In or out of a trial: the gains in effect."""
+        on_trial = bool(tuner.number("controller_on_trial"))
+        return LoopState(
+            mode=Mode(int(tuner.number("controller_mode"))),
+            sp=tuner.number("controller_setpoint"),
+            pv=tuner.number("controller_received_pv"),
+            mv=tuner.number("controller_mv"),
+            gains=_gains(tuner, "staged" if on_trial else "accepted"),
+            on_trial=on_trial,
+            mv_low=tuner.number("controller_mv_low"),
+            mv_high=tuner.number("controller_mv_high"),
+            sample_time_s=tuner.number("sample_time", node=self._node) * 1e-6,
+            reverse_acting=tuner.number("controller_action") == 0,
+        )
+
+
+def _gains(tuner: Tuner, which: str) -> Gains:
+    return Gains(*(tuner.number(f"controller_{which}_{name}") for name in _PARAMETERS))
+
+
+def _same(a: float, b: float) -> bool:
+    """Equal as far as REAL32 can tell."""
+    return math.isclose(a, b, rel_tol=1e-6, abs_tol=1e-12)
+
+
+def _same_gains(a: Gains, b: Gains) -> bool:
+    pairs = ((a.Kp, b.Kp), (a.Ti, b.Ti), (a.Td, b.Td), (a.Tf, b.Tf), (a.b, b.b), (a.c, b.c))
+    return all(_same(one, other) for one, other in pairs)
