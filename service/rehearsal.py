@@ -180,7 +180,7 @@ def _period(file: PlantFile, t95: float) -> float:
     """The ultimate period, s; for a plant without one, something short beside T95."""
     try:
         period = ultimate_point(TransferFunction(tuple(file.num), tuple(file.den), file.dead_time_s))[1]
-    except (ValueError, ArithmeticError):
+    except (Ended, ValueError, ArithmeticError):
         return t95 / 2
     return period if 0 < period < math.inf else t95 / 2
 
@@ -217,7 +217,7 @@ def rehearse(
             raise Refused(Reason.BAD_INPUT, f"method {method!r} is not one of {', '.join(METHODS)}")
         file = _complete(PlantFile.model_validate(spec))
         loop, facts = _loop(file)
-        outcome = run(five_stage(facts, Options(**options)), loop, watch=_watch(facts), on_event=listen)
+        outcome = run(five_stage(facts, Options(**options)), loop, watch=_watch(facts, _reach(file)), on_event=listen)
     except ValidationError as error:
         lines = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'file'}: {e['msg']}" for e in error.errors())
         return _answer(None, RunResult(ended=Refused(Reason.BAD_INPUT, lines)), results)
@@ -242,10 +242,15 @@ def _loop(file: PlantFile) -> tuple[RehearsedLoop, Facts]:
     return RehearsedLoop(plant, channel, ts), facts
 
 
-def _watch(facts: Facts) -> Watch:
+def _watch(facts: Facts, reach: float) -> Watch:
     """Wide PV limits: an unstable plant must end, but the test takes PV to several steps on purpose."""
-    far = 100 * facts.sp_deviation
+    far = max(100 * facts.sp_deviation, 10 * reach)
     return Watch(pv_low=-far, pv_high=far, max_time_s=500 * facts.T95_s, max_frozen_s=3 * facts.T95_s)
+
+
+def _reach(file: PlantFile) -> float:
+    """How far PV goes when MV stays at a limit (0 for an integrating plant), PV units."""
+    return abs(file.num[-1] / file.den[-1]) * max(map(abs, file.mv_limits)) if file.den[-1] else 0.0
 
 
 def _answer(file: PlantFile | None, outcome: RunResult[Proposal], results: dict[str, object]) -> dict[str, Any]:

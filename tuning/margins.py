@@ -87,7 +87,7 @@ def margins(model: Model, gains: Gains) -> Margins:
         wc=wc,
         wpc=wpc,
         ws=ws,
-        stable=_stable(L),
+        stable=_stable(L, model.L > 0.0),
     )
 
 
@@ -129,9 +129,10 @@ def _least(f: Callable[[float], float], w: Reals, at: int) -> tuple[float, float
     return float(found.x), float(found.fun)
 
 
-def _stable(L: Complexes) -> bool:
+def _stable(L: Complexes, dead_time: bool) -> bool:
     """Nyquist for a stable plant and at most one integrator: 1+L ends on the branch of the angle it started from."""
-    if abs(L[-1]) >= 1.0:
+    if dead_time and abs(L[-1]) >= 1.0:
         return False
     turned = np.unwrap(np.angle(1.0 + L))
-    return bool(abs(turned[-1]) < math.pi)
+    # a dead time leaves the end anywhere within a right angle; a whole turn too many is far from that
+    return bool(abs(turned[-1]) < 0.75 * math.pi)

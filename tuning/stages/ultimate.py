@@ -26,8 +26,10 @@ EQUAL = 0.002
 SLOPE = 2.5
 """d ln(growth per period) / d ln K near Ku for a FOPDT plant with L/T = 0.5; a start value only."""
 MOST_RUNS = 16
-KICK = 0.25
-"""The step's first kick as a share of the room for MV: gains stay near Ku, so swings stay inside."""
+KICK, NOISY_KICK = 0.25, 0.45
+"""The step's first kick as a share of the room for MV: gains stay near Ku, so swings stay inside. Noise buys more."""
+UNCERTAIN = 0.05
+"""Noise as a share of the step, above which the oscillation feeds on noise and Ku is no longer sharp."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +58,10 @@ class UltimateResult:
 
 def ultimate_gain(facts: Facts, point: OperatingPoint, rough: RelayResult) -> Plan[UltimateResult]:
     """Raises Refused: NO_BRACKET, NOISE_TOO_HIGH."""
-    step = min(facts.sp_deviation, KICK * point.room / rough.Ku_a)
+    step = KICK * point.room / rough.Ku_a
+    step = min(facts.sp_deviation, step if point.noise < UNCERTAIN / 2 * step else NOISY_KICK / KICK * step)
+    if point.noise > UNCERTAIN * step:
+        yield (Note(f"noise {point.noise:.3g} is {point.noise / step:.0%} of the P runs' step: Ku will be uncertain"),)
     runs: list[Run] = []
     statics: list[float] = []
     low: Run | None = None
