@@ -1,0 +1,198 @@
+"""The tuner's client against the devices' own SDO server, joined by a bus that is a list."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection
+
+import pytest
+
+from protocol import tuner as tuner_module
+from protocol.dictionary import Dictionary
+from protocol.objects import Device
+from protocol.profile import (
+    EMCY_FRAME,
+    MV_FRAME,
+    PV_FRAME,
+    STATUS_FRAME,
+    TUNER_NODE,
+    Abort,
+    Emcy,
+    channel_ids,
+    emcy_id,
+    heartbeat_id,
+    sdo_request_id,
+    sdo_response_id,
+)
+from protocol.sdo import SdoServer
+from protocol.tuner import Kind, Tuner, TunerError
+
+NODE, PLANT = 0x20, 0x10
+IDS = channel_ids(1)
+
+
+class ListBus:
+    """Answers SDO at once, after `before` has been put in front of the answer; mute: not at all."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[int, bytes]] = []
+        self.incoming: deque[tuple[int, bytes]] = deque()
+        self.before: list[tuple[int, bytes]] = []
+        self.mute = 0
+        self.servers = {}
+        for device, node in ((Device.CONTROLLER, NODE), (Device.PLANT, PLANT)):
+            dictionary = Dictionary(device, 1)
+            self.servers[sdo_request_id(node)] = (sdo_response_id(node), SdoServer(dictionary.read, dictionary.write))
+
+    def send(self, can_id: int, data: bytes) -> None:
+        self.sent.append((can_id, data))
+        if can_id not in self.servers:
+            return
+        if self.mute:
+            self.mute -= 1
+            return
+        response_id, server = self.servers[can_id]
+        answer = server.answer(data)
+        assert answer is not None
+        self.incoming.extend([*self.before, (response_id, answer)])
+
+    def recv(self, timeout: float | None) -> tuple[int, bytes] | None:
+        return self.incoming.popleft() if self.incoming else None
+
+    def set_filters(self, ids: Collection[int]) -> None:
+        self.ids = ids
+
+    def fileno(self) -> int:
+        return -1
+
+    def close(self) -> None: ...
+
+
+@pytest.fixture
+def bus(monkeypatch: pytest.MonkeyPatch) -> ListBus:
+    bus = ListBus()
+    monkeypatch.setattr(tuner_module, "open_bus", lambda url: bus)
+    return bus
+
+
+@pytest.fixture
+def tuner(bus: ListBus) -> Tuner:
+    return Tuner("list", NODE, PLANT, sdo_timeout_s=0.01, sdo_tries=2)
+
+
+def sample(n: int, pv: float = 1.0, mv: float = 2.0) -> list[tuple[int, bytes]]:
+    return [(IDS.pv, PV_FRAME.pack(pv, n)), (IDS.mv, MV_FRAME.pack(mv, n))]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("controller_mode_command", 1),
+        ("controller_setpoint", 0.1),
+        ("plant_samples_to_run", 0xFFFFFFFF),
+        ("plant_pace", 0),
+    ],
+)
+def test_what_is_written_is_read_back(tuner: Tuner, name: str, value: float) -> None:
+    tuner.write(name, value)
+    assert tuner.number(name) == pytest.approx(value, rel=1e-7)
+
+
+def test_a_long_value_comes_in_segments(tuner: Tuner) -> None:
+    assert tuner.read("device_name") == "Loopwright controller"
+    assert tuner.read("device_name", node=PLANT) == "Loopwright plant"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "code"),
+    [
+        ("controller_mode_command", 9, Abort.TOO_HIGH),
+        ("controller_setpoint", float("nan"), Abort.INVALID_VALUE),
+        ("controller_mode", 1, Abort.READ_ONLY),
+    ],
+)
+def test_a_refusal_says_what_and_why(tuner: Tuner, name: str, value: float, code: Abort) -> None:
+    with pytest.raises(TunerError, match=name) as caught:
+        tuner.write(name, value)
+    assert (caught.value.kind, caught.value.code) == (Kind.ABORT, code)
+
+
+def test_a_lost_answer_is_asked_for_again(tuner: Tuner, bus: ListBus) -> None:
+    bus.mute = 1
+    assert tuner.number("controller_mode_command") == 2
+
+
+def test_a_silent_node_is_a_timeout(tuner: Tuner, bus: ListBus) -> None:
+    bus.mute = 100
+    with pytest.raises(TunerError, match="20h does not answer") as caught:
+        tuner.read("controller_mode")
+    assert caught.value.kind is Kind.TIMEOUT
+
+
+def test_an_answer_to_another_request_is_passed_over(tuner: Tuner, bus: ListBus) -> None:
+    stray = bytes([0x4F, 0x01, 0x21, 1, 3, 0, 0, 0])
+    bus.before = [(sdo_response_id(NODE), stray), (sdo_response_id(PLANT), stray)]
+    assert tuner.number("controller_mode_command") == 2
+
+
+def test_samples_pair_pv_with_the_mv_that_answers_it(tuner: Tuner, bus: ListBus) -> None:
+    bus.incoming.append((IDS.mv, MV_FRAME.pack(0.0, 4)))
+    bus.incoming.extend(sample(5, 20.0, 30.0))
+    found = tuner.sample(0.01)
+    assert found is not None
+    assert (found.n, found.pv, found.mv) == (5, 20.0, 30.0)
+
+
+def test_samples_that_arrive_while_an_sdo_waits_are_kept(tuner: Tuner, bus: ListBus) -> None:
+    bus.before = [*sample(1), *sample(2)]
+    tuner.read("controller_mode_command")
+    assert [tuner.sample(0.01), tuner.sample(0.01)][1].n == 2  # type: ignore[union-attr]
+
+
+def test_status_counts_from_the_sample_in_which_it_changed(tuner: Tuner, bus: ListBus) -> None:
+    status = (IDS.status, STATUS_FRAME.pack(3, 1, 7.5))
+    pv, mv = sample(2)
+    bus.incoming.extend([*sample(1), pv, status, mv])
+    first, second = tuner.sample(0.01), tuner.sample(0.01)
+    assert first is not None
+    assert second is not None
+    assert (first.mode, first.on_trial) == (0, False)
+    assert (second.mode, second.on_trial, second.sp) == (3, True, 7.5)
+
+
+def test_draining_forgets_the_past(tuner: Tuner, bus: ListBus) -> None:
+    bus.incoming.extend(sample(1))
+    tuner.drain()
+    assert tuner.sample(0.0) is None
+
+
+def test_emergencies_and_restarts_are_noted(tuner: Tuner, bus: ListBus) -> None:
+    for code in (Emcy.LEASE_USED_UP, Emcy.ERROR_GONE):
+        bus.incoming.append((emcy_id(NODE), EMCY_FRAME.pack(code, 0, b"")))
+    bus.incoming.append((heartbeat_id(NODE), b"\0"))
+    tuner.drain()
+    assert (tuner.emergencies, tuner.restarted) == ([Emcy.LEASE_USED_UP], True)
+
+
+@pytest.mark.parametrize(
+    "can_id", [IDS.pv, IDS.mv, IDS.status, emcy_id(NODE), heartbeat_id(NODE), sdo_response_id(NODE)]
+)
+def test_a_frame_of_the_wrong_length_does_no_harm(tuner: Tuner, bus: ListBus, can_id: int) -> None:
+    bus.incoming.append((can_id, b""))
+    bus.incoming.extend(sample(3))
+    assert tuner.number("controller_mode_command") == 2
+    assert tuner.sample(0.01) is not None
+
+
+def test_only_who_holds_the_loop_beats(tuner: Tuner, bus: ListBus) -> None:
+    tuner.sample(0.0)
+    assert not bus.sent
+    tuner.beating = True
+    tuner.sample(0.0)
+    tuner.sample(0.0)
+    assert [can_id for can_id, _ in bus.sent] == [heartbeat_id(TUNER_NODE)]
+
+
+def test_the_bus_is_asked_for_our_frames_only(tuner: Tuner, bus: ListBus) -> None:
+    assert set(IDS) - {IDS.command} <= set(bus.ids)
+    assert 0x080 not in bus.ids
