@@ -114,7 +114,7 @@ def within(loop: LoopConfig, request: RetuneRequest) -> LoopConfig:
         low, high = allowed.low if low is None else low, allowed.high if high is None else high
         if low < allowed.low or high > allowed.high:
             problems.append(
-                f"{name} limits {low:g}..{high:g} {unit} are wider than the configured {allowed.low:g}..{allowed.high:g}"
+                f"{name} limits {low:g}..{high:g} {unit} are wider than {allowed.low:g}..{allowed.high:g} as configured"
             )
         if not low < high:
             problems.append(f"{name}_low {low:g} must be less than {name}_high {high:g} {unit}")

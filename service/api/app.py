@@ -28,6 +28,7 @@ from service.jobs import Jobs
 from service.request import RetuneRequest
 from service.states import ACTIVE, JobState
 from service.store.tables import JobRow
+from tuning.plan import Sample
 
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 JobId = Annotated[str, Path(description="Id of the job", examples=["4f0c2a9be113"])]
@@ -133,9 +134,16 @@ def create_app(jobs: Jobs) -> FastAPI:
         blocks = jobs.store.samples(job_id, stage)
         if format == "csv":
             return PlainTextResponse(_csv(blocks), media_type="text/csv")
-        flat = [(name, *sample) for name, block in blocks for sample in block]
-        names, t, sp, pv, mv, mode = ([row[i] for row in flat] for i in range(6))
-        return SamplesView(job=job_id, stage=names, t_s=t, sp=sp, pv=pv, mv=mv, mode=mode)
+        flat = [sample for _, block in blocks for sample in block]
+        return SamplesView(
+            job=job_id,
+            stage=[name for name, block in blocks for _ in block],
+            t_s=[sample.t for sample in flat],
+            sp=[sample.sp for sample in flat],
+            pv=[sample.pv for sample in flat],
+            mv=[sample.mv for sample in flat],
+            mode=[sample.mode for sample in flat],
+        )
 
     @app.post(
         "/jobs/{job_id}/abort",
@@ -168,7 +176,7 @@ def create_app(jobs: Jobs) -> FastAPI:
     return app
 
 
-def _csv(blocks: list[tuple[str, list[tuple[float, float, float, float, int]]]]) -> str:
+def _csv(blocks: list[tuple[str, list[Sample]]]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["stage", "t_s", "sp", "pv", "mv", "mode"])

@@ -1,0 +1,229 @@
+"""The `loopwright` command: hands over to the processes, and is a client of the service's HTTP API."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from service.client import DEFAULT_URL, ApiError, Client
+
+app = typer.Typer(
+    help="Retunes PI loops by itself, over CANopen, and ends safe whatever fails.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+_HAND_OVER: dict[str, Any] = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+
+Url = Annotated[str, typer.Option("--url", envvar="LOOPWRIGHT_URL", help="Where the service is.")]
+AsJson = Annotated[bool, typer.Option("--json", help="JSON, for scripts.")]
+
+
+def main() -> None:
+    try:
+        app()
+    except ApiError as error:
+        print(f"loopwright: {error}", file=sys.stderr)
+        sys.exit(1)
+
+
+# The processes. Imported here and nowhere else in the service: they meet it on the bus only.
+@app.command(context_settings=_HAND_OVER, add_help_option=False)
+def plant(context: typer.Context) -> None:
+    """A simulated plant on the bus (see plant --help)."""
+    from plantsim.__main__ import main as run
+
+    sys.exit(run(context.args))
+
+
+@app.command(context_settings=_HAND_OVER, add_help_option=False)
+def controller(context: typer.Context) -> None:
+    """A PI(D) controller on the bus (see controller --help)."""
+    from controller.__main__ import main as run
+
+    sys.exit(run(context.args))
+
+
+@app.command(context_settings=_HAND_OVER, add_help_option=False)
+def hub(context: typer.Context) -> None:
+    """A CAN bus on 127.0.0.1 for systems without SocketCAN (see hub --help)."""
+    from protocol.hub import main as run
+
+    sys.exit(run(context.args))
+
+
+@app.command()
+def serve(
+    loops: Annotated[Path, typer.Option(help="The loops, YAML.")] = Path("loops.yaml"),
+    data: Annotated[Path, typer.Option(help="Folder for jobs and samples.")] = Path("data"),
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port to listen on; 0: any free one.")] = 8080,
+) -> None:
+    """The service: REST over jobs that retune live loops."""
+    from service.config import ConfigError
+    from service.serving import serve as run
+    from service.store.store import FolderInUse
+
+    try:
+        run(loops, data, host, port)
+    except (ConfigError, FolderInUse) as error:
+        _die(str(error), 2)
+    except OSError as error:
+        _die(f"cannot listen on {host}:{port} or write to {data}: {error.strerror or error}", 2)
+
+
+@app.command("loops")
+def list_loops(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
+    """The configured loops."""
+    from service import show
+
+    found = Client(url).get("/loops")
+    if as_json:
+        _print_json(found)
+        return
+    show.rows(
+        "loops",
+        ("tag", "description", "bus", "node", "unit", "T95 s", "job"),
+        (
+            (x["tag"], x["description"], x["bus"], x["controller_node"], x["pv_unit"], x["t95_s"], x["active_job"])
+            for x in found
+        ),
+    )
+
+
+@app.command()
+def retune(
+    loop: Annotated[str, typer.Argument(help="Tag of the loop.")],
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Rehearse in memory; the loop is not touched.")] = False,
+    sp_deviation: Annotated[float | None, typer.Option(help="Permitted set-point step, PV units.")] = None,
+    mv_low: Annotated[float | None, typer.Option(help="Lowest MV during the test, percent.")] = None,
+    mv_high: Annotated[float | None, typer.Option(help="Highest MV during the test, percent.")] = None,
+    wait: Annotated[bool, typer.Option(help="Show progress until the job is over.")] = True,
+    url: Url = DEFAULT_URL,
+    as_json: AsJson = False,
+) -> None:
+    """Retune a loop, with live progress. Exit 0: proposed, 3: it ended otherwise."""
+    from service import show
+
+    client = Client(url)
+    wishes = {"sp_deviation": sp_deviation, "mv_low": mv_low, "mv_high": mv_high, "dry_run": dry_run or None}
+    options = {name: value for name, value in wishes.items() if value is not None}
+    job = client.post(f"/loops/{loop}/retune", {**options, "requested_by": "cli"})
+    if wait and as_json:
+        for _ in client.events(job["url"]):
+            pass
+        job = client.get(job["url"])
+    elif wait:
+        job = show.follow(client, job["url"])
+    if as_json:
+        _print_json(job)
+    else:
+        show.job_report(job)
+    if wait and job["state"] != "proposed":
+        raise typer.Exit(3)
+
+
+@app.command("jobs")
+def list_jobs(
+    loop: Annotated[str | None, typer.Option(help="Only of this loop.")] = None,
+    url: Url = DEFAULT_URL,
+    as_json: AsJson = False,
+) -> None:
+    """The latest jobs."""
+    from service import show
+
+    found = Client(url).get("/jobs", loop=loop)
+    if as_json:
+        _print_json(found)
+        return
+    lines = ((x["id"], x["loop"], x["state"], x["stage"], x["progress"], x["reason"], x["created_at"]) for x in found)
+    show.rows("jobs", ("id", "loop", "state", "stage", "progress", "reason", "created"), lines)
+
+
+@app.command("job")
+def one_job(
+    job_id: Annotated[str, typer.Argument(metavar="ID", help="Id of the job.")],
+    follow: Annotated[bool, typer.Option("--follow", help="Show progress until it is over.")] = False,
+    abort: Annotated[bool, typer.Option("--abort", help="Stop it; its loop is restored.")] = False,
+    accept: Annotated[bool, typer.Option("--accept", help="Put the proposed gains into the controller.")] = False,
+    rollback: Annotated[bool, typer.Option("--rollback", help="Decline, or put the old gains back.")] = False,
+    url: Url = DEFAULT_URL,
+    as_json: AsJson = False,
+) -> None:
+    """A job; or a decision about it."""
+    from service import show
+
+    client = Client(url)
+    path = f"/jobs/{job_id}"
+    wishes = [name for name, wanted in (("abort", abort), ("accept", accept), ("rollback", rollback)) if wanted]
+    if len(wishes) > 1:
+        _die("one decision at a time", 2)
+    job = client.post(f"{path}/{wishes[0]}", {"by": "cli"}) if wishes else client.get(path)
+    if follow:
+        job = show.follow(client, path)
+    if as_json:
+        _print_json(job)
+    else:
+        show.job_report(job)
+
+
+@app.command("rehearse")
+def rehearse_file(
+    plant_file: Annotated[Path, typer.Argument(metavar="PLANT.json", help="The plant, see docs.")],
+    method: Annotated[str, typer.Option(help="Tuning procedure.")] = "five-stage",
+    as_json: AsJson = False,
+) -> None:
+    """The whole procedure on a plant model, in memory at full speed. Exits 0 whenever it answered."""
+    from service import show
+    from service.rehearsal import rehearse
+    from tuning.plan import Event, StageDone, StageStarted
+
+    try:
+        spec = json.loads(plant_file.read_text(encoding="utf-8"))
+    except OSError as error:
+        _die(f"{plant_file}: {error.strerror}", 2)
+    except ValueError as error:
+        _die(f"{plant_file}: not JSON: {error}", 2)
+    if not isinstance(spec, dict):
+        _die(f"{plant_file}: expected one JSON object", 2)
+
+    def tell(event: Event) -> None:
+        if isinstance(event, StageStarted | StageDone) and not as_json:
+            done = isinstance(event, StageDone)
+            show.console.print(f"  {event.stage:<10} {'done' if done else f'(about {event.expected_s:.0f} s)'}")
+
+    answer = rehearse(spec, method=method, on_event=tell)
+    if as_json:
+        _print_json(answer)
+    else:
+        show.console.print_json(data={k: v for k, v in answer.items() if k not in ("stages", "input")})
+
+
+@app.command()
+def demo(
+    folder: Annotated[
+        Path | None, typer.Option(help="Keep picture and data here; default: a new temporary folder.")
+    ] = None,
+    speed: Annotated[str, typer.Option(help="Speed of the plant: max, or a factor of real time.")] = "max",
+    hub_only: Annotated[bool, typer.Option("--hub", help="Use the loopback hub even if there is a vcan0.")] = False,
+) -> None:
+    """Retunes a badly tuned loop before your eyes: bus, plant, controller and service as processes."""
+    from service.demo import DemoFailed, run_demo
+
+    try:
+        run_demo(folder, speed, hub_only)
+    except DemoFailed as error:
+        _die(str(error), 1)
+
+
+def _print_json(value: object) -> None:
+    print(json.dumps(value, indent=2, allow_nan=False))
+
+
+def _die(text: str, status: int) -> NoReturn:
+    print(f"loopwright: {text}", file=sys.stderr)
+    raise typer.Exit(status)

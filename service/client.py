@@ -1,0 +1,74 @@
+"""The service's HTTP API as the command line uses it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+
+DEFAULT_URL = "http://127.0.0.1:8080"
+
+
+class ApiError(Exception):
+    """The service said no, or is not there; the text says which and what to do."""
+
+
+class Client:
+    """One service."""
+
+    def __init__(self, url: str) -> None:
+        self.url = url.rstrip("/")
+        self._http = httpx.Client(base_url=self.url, timeout=30.0, trust_env=False)
+
+    def get(self, path: str, **query: Any) -> Any:
+        return self._json("GET", path, params={k: v for k, v in query.items() if v is not None})
+
+    def post(self, path: str, body: dict[str, Any] | None = None) -> Any:
+        return self._json("POST", path, json=body or {})
+
+    def events(self, job_url: str) -> Iterator[tuple[str, dict[str, Any]]]:
+        """(kind, data) of each event of a job until it is over; resumes when the connection breaks."""
+        last, failures = "0", 0
+        while True:
+            try:
+                headers = {"Last-Event-ID": last}
+                timeout = httpx.Timeout(10.0, read=60.0)
+                with self._http.stream("GET", f"{job_url}/events", headers=headers, timeout=timeout) as answer:
+                    self._check(answer)
+                    fields: dict[str, str] = {}
+                    for line in answer.iter_lines():
+                        name, _, value = line.partition(": ")
+                        if line:
+                            fields[name] = value
+                        elif "event" in fields:
+                            last = fields.get("id", last)
+                            failures = 0
+                            yield fields["event"], json.loads(fields["data"])
+                            fields = {}
+                return
+            except httpx.TransportError as error:
+                failures += 1
+                if failures > 3:
+                    raise ApiError(f"{self.url}: {error}") from error
+
+    def _json(self, method: str, path: str, **more: Any) -> Any:
+        try:
+            answer = self._http.request(method, path, **more)
+        except httpx.TransportError as error:
+            raise ApiError(f"no service at {self.url} ({error}); start one with: loopwright serve") from error
+        self._check(answer)
+        return answer.json()
+
+    @staticmethod
+    def _check(answer: httpx.Response) -> None:
+        if answer.is_success:
+            return
+        answer.read()
+        try:
+            body = answer.json()
+        except ValueError:
+            raise ApiError(f"HTTP {answer.status_code}: {answer.text[:200]}") from None
+        lines = [body.get("detail") or body.get("title"), body.get("advice"), body.get("job")]
+        raise ApiError("\n".join(line for line in lines if line))

@@ -1,0 +1,92 @@
+"""Jobs and loops on a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from service.client import Client
+
+console = Console()
+
+
+def follow(client: Client, job_url: str) -> dict[str, Any]:
+    """Shows a job live until it is over; returns it."""
+    columns = (
+        TextColumn("{task.description:<11}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[left]}"),
+        TimeElapsedColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=console) as bars:
+        task = bars.add_task("queued", total=1.0, left="")
+        for kind, data in client.events(job_url):
+            if kind == "progress":
+                left = data["remaining_plant_time_s"]
+                text = "" if left is None else f"about {left:.0f} s of plant time left"
+                bars.update(task, completed=data["progress"], description=data["stage"] or "", left=text)
+            elif kind == "stage_done":
+                bars.console.print(f"  {data['stage']:<10} at {data['plant_time_s']:.1f} s  {brief(data['result'])}")
+            elif kind == "note":
+                bars.console.print(f"  note: {data['text']}")
+            elif kind == "state":
+                bars.update(task, description=data["state"], left="")
+        job: dict[str, Any] = client.get(job_url)
+        bars.update(task, completed=job["progress"])
+    return job
+
+
+def brief(result: dict[str, Any] | None) -> str:
+    """The numbers of a stage's result on one line."""
+    plain = {key: value for key, value in (result or {}).items() if isinstance(value, int | float | str)}
+    return ", ".join(f"{key} {number(value)}" for key, value in plain.items())
+
+
+def number(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def job_report(job: dict[str, Any], pv_unit: str = "PV unit") -> None:
+    """Everything a decision needs, as a table."""
+    table = Table(title=f"job {job['id']}: {job['loop']} {job['state']}", show_header=True)
+    for heading in ("", "before", "after", "unit"):
+        table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
+    old, new = job["old_gains"] or {}, job["new_gains"] or {}
+    per = f"% per {pv_unit}"
+    for name, unit in (("Kp", f"{per} (ISA)"), ("Ti", "s"), ("Td", "s")):
+        table.add_row(f"gain {name}", cell(old.get(name)), cell(new.get(name)), unit)
+    before, after = job["before"] or {}, job["after"] or {}
+    for label, name, unit in (
+        ("measured IAE", "IAE", f"{pv_unit} s"),
+        ("measured overshoot", "overshoot_pct", "%"),
+        ("measured settling", "settling_s", "s"),
+    ):
+        table.add_row(label, cell(before.get(name)), cell(after.get(name)), unit)
+    for label, name, unit in (
+        ("predicted GM", "GM", ""),
+        ("predicted PM", "PM_deg", "deg"),
+        ("predicted Ms", "Ms", ""),
+    ):
+        table.add_row(label, "", cell((job["predicted"] or {}).get(name)), unit)
+    model, ultimate = job["model"] or {}, job["ultimate"] or {}
+    table.add_row(
+        "model K, T, L", "", ", ".join(cell(model.get(n)) for n in ("K", "T_s", "L_s")), f"{pv_unit} per %, s, s"
+    )
+    table.add_row("ultimate Ku, Pu", "", ", ".join(cell(ultimate.get(n)) for n in ("Ku", "Pu_s")), f"{per}, s")
+    table.add_row("plant time", "", cell(job["plant_time_s"]), "s")
+    console.print(table)
+    if job["reason"]:
+        console.print(f"[bold]{job['reason']}[/bold]: {job['detail']}\n{job['advice']}", highlight=False)
+
+
+def cell(value: object) -> str:
+    return "-" if value is None else number(value)
+
+
+def rows(title: str, headings: Iterable[str], lines: Iterable[Iterable[object]]) -> None:
+    table = Table(*headings, title=title)
+    for line in lines:
+        table.add_row(*map(cell, line))
+    console.print(table)
