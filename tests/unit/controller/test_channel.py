@@ -102,8 +102,16 @@ def test_rate_limit_and_limits_hold_in_manual() -> None:
     u = [c.step(50.0) for _ in range(100)]
     assert u[:3] == pytest.approx([46, 47, 48])
     assert max(u) == 80
-    c.settings = Settings(mv_low=10, mv_high=30, rate_limit_per_s=10.0)
-    assert c.step(50.0) == 30
+
+
+@pytest.mark.parametrize(("wanted", "limits", "first"), [(0, (10, 30), 30), (100, (10, 30), 30), (100, (60, 90), 60)])
+def test_limits_moved_away_from_the_output_win_over_the_rate(
+    wanted: float, limits: tuple[float, float], first: float
+) -> None:
+    c = channel(mode=Mode.MANUAL, rate_limit_per_s=10.0)
+    c.manual_output = wanted
+    c.settings = Settings(mv_low=limits[0], mv_high=limits[1], rate_limit_per_s=10.0)
+    assert c.step(50.0) == first
 
 
 def test_a_set_point_change_acts_through_its_weight() -> None:
@@ -196,6 +204,17 @@ def test_closing_the_session_changes_nothing() -> None:
     for _ in range(200):
         c.step(49.2)
     assert (c.mode, c.setpoint, c.in_effect, c.lease, c.cause) == (Mode.MANUAL, 53.0, PI2, 0, Cause.NONE)
+
+
+def test_the_next_session_notes_the_loop_as_it_is_then() -> None:
+    c = channel(PI)
+    c.renew_lease(100)
+    c.setpoint = 52.0
+    c.renew_lease(0)
+    c.renew_lease(100)
+    c.setpoint = 53.0
+    c.go_back(Cause.COMMAND)
+    assert c.setpoint == 52.0
 
 
 def test_a_lease_runs_out_on_bad_measurements_too() -> None:

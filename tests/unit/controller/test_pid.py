@@ -90,6 +90,16 @@ def test_integral_does_not_wind_up() -> None:
     assert channel.step(55.0) == pytest.approx(95.0, abs=0.1)
 
 
+@pytest.mark.parametrize(("Td", "tracking_s"), [(0.0, 5.0), (0.8, 2.0)])
+def test_a_saturated_integral_rests_where_tracking_takes_away_what_the_error_adds(Td: float, tracking_s: float) -> None:
+    # A slow filter keeps the derivative's own answer to the last move out of sight.
+    channel = Channel(Ts, Settings(), Parameters(1.0, Ti=5.0, Td=Td, Tf=1e6), 50.0, Mode.AUTOMATIC, 50.0)
+    for _ in range(5000):
+        channel.step(30.0)
+    excess = 20.0 / 5.0 * tracking_s
+    assert channel.step(30.0 + excess + 1.0) == pytest.approx(99.0, abs=1e-3)
+
+
 def test_integral_does_not_wind_up_behind_the_rate_limit() -> None:
     channel = Channel(Ts, Settings(rate_limit_per_s=1.0), Parameters(1.0, Ti=5.0), 50.0, Mode.AUTOMATIC, 50.0)
     channel.step(50.0)
