@@ -1,4 +1,4 @@
-"""Opening a CAN bus. SocketCAN goes through a raw socket (two system calls per frame hop), the rest through python-can."""
+"""Opening a CAN bus: SocketCAN by a raw socket (two system calls per frame hop), the rest through python-can."""
 
 from __future__ import annotations
 

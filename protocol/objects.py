@@ -1,7 +1,7 @@
-"""The object dictionary of both devices as one table: the EDS files, the checks on writes and every look-up come from it.
+"""The object dictionary of both devices as one table: EDS files, checks on writes and every look-up come from it.
 
-Own objects (2000h-5FFFh) are the manufacturer area; nothing there is claimed to be standard. 1000h-1FFFh follow CiA 301,
-6000h-9FFFh carry the index and meaning publicly known of CiA 404.
+Own objects (2000h-5FFFh) are the manufacturer area; nothing there is claimed to be standard. 1000h-1FFFh follow
+CiA 301, 6000h-9FFFh carry the index and meaning publicly known of CiA 404.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Shape(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Object:
-    """One object: `low` and `high` are the EDS limits, which the devices enforce; `pdo` holds T (send) and R (receive)."""
+    """One object. `low`, `high`: EDS limits, enforced by the devices. `pdo`: T may be sent, R received in a PDO."""
 
     name: str
     index: int
@@ -85,7 +85,23 @@ class Object:
     held: bool = False
     """Written only while the plant does not run (2011h = 0)."""
     names: tuple[str, ...] = ()
+    """Names of the entries; the count is what sub-index 0 reads."""
+    types: tuple[Type, ...] = ()
+    """Types of the entries where they differ."""
+    defaults: tuple[Value, ...] = ()
+    relative: tuple[int, ...] = ()
+    """Sub-indices whose default moves with the node-ID (COB-IDs); the EDS says so."""
     is_record: bool = False
+
+    def type_of(self, sub: int) -> Type:
+        return self.types[sub - 1] if self.types and sub > 0 else self.type
+
+    def default_of(self, sub: int) -> Value:
+        return self.defaults[sub - 1] if self.defaults and sub > 0 else self.default
+
+    def count(self, channels: int) -> int:
+        """Highest sub-index of a device with that many channels."""
+        return {Shape.VAR: 0, Shape.CHANNELS: channels, Shape.ENTRIES: len(self.names)}[self.shape]
 
     @property
     def readable(self) -> bool:
@@ -117,10 +133,11 @@ _COMMUNICATION = (
     Object("device_name", 0x1008, STRING, "const", "Manufacturer device name", BOTH),
     Object("hardware_version", 0x1009, STRING, "const", "Manufacturer hardware version", BOTH, default="simulated"),
     Object("software_version", 0x100A, STRING, "const", "Manufacturer software version", BOTH, default="0.1.0"),
-    Object("emcy_cob_id", 0x1014, U32, "ro", "COB-ID EMCY", BOTH),
+    Object("emcy_cob_id", 0x1014, U32, "ro", "COB-ID EMCY", BOTH, default=0x80, relative=(0,)),
     Object("heartbeat_consumer", 0x1016, U32, "rw", "Consumer heartbeat time", BOTH, ENTRIES,
            names=("Tuner", "Peer device")),
-    Object("heartbeat_producer", 0x1017, U16, "rw", "Producer heartbeat time", BOTH, unit="ms"),
+    Object("heartbeat_producer", 0x1017, U16, "rw", "Producer heartbeat time", BOTH, default=500,
+           unit="ms"),
     Object("identity", 0x1018, U32, "ro", "Identity object", BOTH, ENTRIES, names=_IDENTITY, is_record=True),
     Object("sync_counter_overflow", 0x1019, U8, "ro", "Synchronous counter overflow value", BOTH,
            default=SYNC_COUNTER_OVERFLOW),
@@ -139,8 +156,7 @@ _PLANT = (
     Object("plant_safe_output", 0x2015, REAL32, "rw", "Safe output", PLANT, CHANNELS, low=0, high=100, unit="%"),
     Object("plant_disturbance", 0x2022, REAL32, "rw", "Load disturbance", PLANT, CHANNELS, pdo="R",
            low=-1000, high=1000, unit="%"),
-    Object("plant_noise", 0x2023, REAL32, "rw", "Measurement noise, standard deviation", PLANT, CHANNELS, low=0,
-           held=True),
+    Object("plant_noise", 0x2023, REAL32, "rw", "Measurement noise, standard deviation", PLANT, CHANNELS, low=0),
     Object("plant_seed", 0x2024, U32, "rw", "Random seed", PLANT, default=1, held=True),
     Object("plant_initialise", 0x2025, U8, "wo", "Initialise (1 = initial state, sample number 0)", PLANT,
            low=1, high=1, held=True),

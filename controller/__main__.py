@@ -1,0 +1,90 @@
+"""The controller process: python -m controller --bus socketcan:vcan0 --kp 2 --ti 10 --sp 50"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from controller.channel import Settings
+from controller.device import ControllerChannel, ControllerDevice
+from controller.pid import Parameters
+from protocol.process import ConfigError, node_id, read_channels, run_device
+from protocol.profile import CONTROLLER_NODE, PLANT_NODE, Mode
+
+_MODES = {"off": Mode.OFF, "manual": Mode.MANUAL, "automatic": Mode.AUTOMATIC}
+_NUMBERS = {
+    "kp": (1.0, "percent of output per PV unit"),
+    "ti": (0.0, "s; 0 = no integral action"),
+    "td": (0.0, "s"),
+    "tf": (0.0, "s"),
+    "b": (1.0, "set point weight of P"),
+    "c": (0.0, "set point weight of D"),
+    "sp": (50.0, "set point, PV units"),
+    "mv": (50.0, "first output, percent"),
+    "mv_low": (0.0, "percent"),
+    "mv_high": (100.0, "percent"),
+    "pv_low": (0.0, "PV span"),
+    "pv_high": (100.0, "PV span"),
+    "safe_output": (0.0, "percent, in mode off"),
+    "rate_limit": (0.0, "percent per s, 0 = none"),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    options = _parser().parse_args(argv)
+    common = {name: getattr(options, name) for name in (*_NUMBERS, "direct", "mode")}
+    try:
+        rows = read_channels(options.config, common) if options.config else [{}] * options.channels
+        channels = [_channel({**common, **row}) for row in rows]
+    except (ConfigError, KeyError, TypeError, ValueError) as error:
+        print(f"controller: {error.args[0]}", file=sys.stderr)
+        return 2
+    return run_device(
+        "controller",
+        options.bus,
+        lambda bus: ControllerDevice(bus, channels, options.ts, options.node, options.plant_node),
+        f"node {options.node:#04x} on {options.bus}: {len(channels)} channel(s), Ts {options.ts:g} s",
+    )
+
+
+def _channel(row: Mapping[str, Any]) -> ControllerChannel:
+    numbers = {name: float(row[name]) for name in _NUMBERS}
+    if row["mode"] not in _MODES:
+        raise ConfigError(f"mode {row['mode']!r} is unknown; there are {', '.join(_MODES)}")
+    return ControllerChannel(
+        Parameters(*(numbers[name] for name in ("kp", "ti", "td", "tf", "b", "c"))),
+        numbers["sp"],
+        Settings(
+            mv_low=numbers["mv_low"],
+            mv_high=numbers["mv_high"],
+            safe_output=numbers["safe_output"],
+            rate_limit_per_s=numbers["rate_limit"],
+            pv_low=numbers["pv_low"],
+            pv_high=numbers["pv_high"],
+            reverse=not row["direct"],
+        ),
+        _MODES[row["mode"]],
+        numbers["mv"],
+    )
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="controller", description="A PI(D) controller as a CANopen device.")
+    parser.add_argument("--bus", required=True, metavar="URL", help="socketcan:vcan0, socketcand:HOST:PORT, ...")
+    parser.add_argument("--channels", type=int, default=1, metavar="N", help="that many, all alike")
+    parser.add_argument("--config", metavar="FILE", help="YAML list of channels, with the names of these options (_)")
+    parser.add_argument("--ts", type=float, default=0.1, metavar="S", help="sample time, process seconds")
+    for name, (default, text) in _NUMBERS.items():
+        option = f"--{name.replace('_', '-')}"
+        parser.add_argument(option, type=float, default=default, metavar="X", help=f"{text} (default {default:g})")
+    parser.add_argument("--direct", action="store_true", help="MV rises as PV rises")
+    parser.add_argument("--mode", choices=_MODES, default="automatic")
+    parser.add_argument("--node", type=node_id, default=CONTROLLER_NODE)
+    parser.add_argument("--plant-node", type=node_id, default=PLANT_NODE)
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,74 @@
+"""The plant process: python -m plantsim --bus socketcan:vcan0 --model model-4 --ts 0.1 --speed max"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from plantsim.catalogue import find
+from plantsim.device import PlantChannel, PlantDevice
+from protocol.process import ConfigError, node_id, read_channels, run_device
+from protocol.profile import CONTROLLER_NODE, PLANT_NODE
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    options = _parser().parse_args(argv)
+    try:
+        rows = read_channels(options.config, ("model", "noise")) if options.config else []
+        rows += [{"model": name} for name in options.model]
+        channels = [_channel(row.get("model", ""), float(row.get("noise", options.noise))) for row in rows]
+        if not channels:
+            raise ConfigError("no plant given; use --model NAME or --config FILE")
+    except (ConfigError, KeyError, TypeError, ValueError) as error:
+        print(f"plantsim: {error.args[0]}", file=sys.stderr)
+        return 2
+    return run_device(
+        "plantsim",
+        options.bus,
+        lambda bus: PlantDevice(
+            bus, channels, options.ts, options.speed, seed=options.seed, node=options.node,
+            controller_node=options.controller_node,
+        ),
+        f"node {options.node:#04x} on {options.bus}: {len(channels)} channel(s), Ts {options.ts:g} s",
+    )
+
+
+def _channel(model: str, noise_std: float) -> PlantChannel:
+    entry = find(model)
+    return PlantChannel(entry.build, entry.facts.mv_nominal_pct, noise_std)
+
+
+def _speed(text: str) -> float:
+    """The pace object's value: 0 stands for "max"."""
+    if text == "max":
+        return 0.0
+    factor = float(text)
+    if not 0.0 < factor <= 1e6:
+        raise argparse.ArgumentTypeError("max, or a factor above 0")
+    return factor
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0.0001 <= value <= 3600.0:
+        raise argparse.ArgumentTypeError("a sample time is 0.0001 to 3600 s")
+    return value
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="plantsim", description="A simulated plant as a CANopen I/O device.")
+    parser.add_argument("--bus", required=True, metavar="URL", help="socketcan:vcan0, socketcand:HOST:PORT, ...")
+    parser.add_argument("--model", action="append", default=[], metavar="NAME", help="one channel each")
+    parser.add_argument("--config", metavar="FILE", help="YAML list of channels: model, noise")
+    parser.add_argument("--ts", type=_positive, default=0.1, metavar="S", help="sample time, process seconds")
+    parser.add_argument("--speed", type=_speed, default=1.0, metavar="FACTOR", help="times real time, or max")
+    parser.add_argument("--noise", type=float, default=0.0, metavar="STD", help="measurement noise, PV units")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--node", type=node_id, default=PLANT_NODE)
+    parser.add_argument("--controller-node", type=node_id, default=CONTROLLER_NODE)
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,96 @@
+"""The values behind a device's object dictionary, with the checks an SDO write must pass."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable
+from itertools import chain
+
+from protocol.objects import DEVICE_TYPE, Device, Object, Shape, Type, Value, objects_of
+from protocol.pdos import pdo_objects
+from protocol.profile import CONTROLLER_NODE, PLANT_NODE, Abort
+from protocol.sdo import SdoAbort
+
+Reader = Callable[[int], Value]
+"""Sub-index (the channel, for objects of a channel) to value."""
+Writer = Callable[[int, Value], None]
+"""Sub-index and checked value; raises SdoAbort to refuse. The value is stored afterwards."""
+
+
+class Dictionary:
+    """Values by name and sub-index. `on_read` and `on_write` connect an object with what the device really does."""
+
+    def __init__(
+        self, device: Device, channels: int, plant_node: int = PLANT_NODE, controller_node: int = CONTROLLER_NODE
+    ) -> None:
+        node = plant_node if device is Device.PLANT else controller_node
+        table = chain(objects_of(device), pdo_objects(device, channels, plant_node, controller_node))
+        self._by_index = {entry.index: entry for entry in table}
+        self.channels = channels
+        self.on_read: dict[str, Reader] = {}
+        self.on_write: dict[str, Writer] = {}
+        self._values: dict[tuple[str, int], Value] = {
+            (entry.name, sub): entry.default_of(sub)
+            for entry in self._by_index.values()
+            for sub in range(0 if entry.shape is Shape.VAR else 1, entry.count(channels) + 1)
+        }
+        self.set("device_type", DEVICE_TYPE[device])
+        self.set("device_name", f"Loopwright {device.value}")
+        self.set("emcy_cob_id", 0x80 + node)
+
+    def get(self, name: str, sub: int = 0) -> Value:
+        return self._values[name, sub]
+
+    def set(self, name: str, value: Value, sub: int = 0) -> None:
+        """From inside the device: no checks, no `on_write`."""
+        self._values[name, sub] = value
+
+    def read(self, index: int, sub: int) -> bytes:
+        """As an SDO upload sees it."""
+        entry = self._entry(index, sub)
+        if entry.shape is not Shape.VAR and sub == 0:
+            return Type.U8.encode(entry.count(self.channels))
+        if not entry.readable:
+            raise SdoAbort(Abort.WRITE_ONLY)
+        reader = self.on_read.get(entry.name)
+        value = reader(sub) if reader else self._values[entry.name, sub]
+        try:
+            return entry.type_of(sub).encode(value)
+        except OverflowError:  # a double beyond the range of a REAL32
+            return entry.type_of(sub).encode(math.copysign(math.inf, float(value)))
+
+    def write(self, index: int, sub: int, data: bytes) -> None:
+        """As an SDO download does it: access, length, finite, limits, then what the device itself says."""
+        entry = self._entry(index, sub)
+        if not entry.writable or (entry.shape is not Shape.VAR and sub == 0):
+            raise SdoAbort(Abort.READ_ONLY)
+        try:
+            value = entry.type_of(sub).decode(data)
+        except struct.error:
+            raise SdoAbort(Abort.LENGTH) from None
+        check_value(entry, value)
+        writer = self.on_write.get(entry.name)
+        if writer:
+            writer(sub, value)
+        self._values[entry.name, sub] = value
+
+    def _entry(self, index: int, sub: int) -> Object:
+        entry = self._by_index.get(index)
+        if entry is None:
+            raise SdoAbort(Abort.NO_OBJECT)
+        if sub > entry.count(self.channels):
+            raise SdoAbort(Abort.NO_SUBINDEX)
+        return entry
+
+
+def check_value(entry: Object, value: Value) -> None:
+    """Refuses what is not finite or beyond the limits of the table."""
+    if isinstance(value, str):
+        return
+    if not math.isfinite(value) or (entry.type is Type.BOOLEAN and value > 1):
+        raise SdoAbort(Abort.INVALID_VALUE)
+    if entry.high is not None and value > entry.high:
+        raise SdoAbort(Abort.TOO_HIGH)
+    if entry.low is not None and value < entry.low:
+        raise SdoAbort(Abort.TOO_LOW)

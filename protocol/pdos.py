@@ -1,0 +1,59 @@
+"""PDO parameters (1400h ff.) of both devices, per channel. The mapping is fixed: frames are packed by struct."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from protocol.objects import Device, Object, Shape, Type, lookup
+from protocol.profile import CONTROLLER_NODE, PLANT_NODE, channel_ids
+
+_ON_SYNC = 1
+_ON_ARRIVAL_OR_CHANGE = 255
+_RPDO, _TPDO = 0x1400, 0x1800
+
+
+def pdo_objects(
+    device: Device, channels: int, plant_node: int = PLANT_NODE, controller_node: int = CONTROLLER_NODE
+) -> Iterator[Object]:
+    """Communication and mapping parameters of every PDO of the device.
+
+    Channel 1 of the controller has RPDO1 PV, RPDO2 command, TPDO2 MV, TPDO3 status (TPDO1, analogue inputs in CiA 404,
+    is left out: the device measures nothing); channel k has RPDO 2k-1, 2k and TPDO 2k, 2k+1. Channel k of the plant has
+    RPDO k and TPDO k.
+    """
+    for channel in range(1, channels + 1):
+        ids = channel_ids(channel, plant_node, controller_node)
+        own = channel == 1
+        if device is Device.PLANT:
+            slot = channel - 1
+            yield from _pdo(_RPDO + slot, ids.mv, _ON_SYNC, channel, ("plant_mv", "plant_output_sample_number"), False)
+            yield from _pdo(_TPDO + slot, ids.pv, _ON_SYNC, channel, ("plant_pv", "sample_number"), own)
+        else:
+            slot = 2 * (channel - 1)
+            event = _ON_ARRIVAL_OR_CHANGE
+            yield from _pdo(_RPDO + slot, ids.pv, event, channel, ("controller_received_pv", "sample_number"), False)
+            yield from _pdo(_RPDO + slot + 1, ids.command, event, channel, ("controller_setpoint",), own)
+            yield from _pdo(_TPDO + slot + 1, ids.mv, event, channel, ("controller_mv", "sample_number"), own)
+            status = ("controller_mode", "controller_on_trial", "controller_setpoint")
+            yield from _pdo(_TPDO + slot + 2, ids.status, event, channel, status, own)
+
+
+def _pdo(index: int, cob_id: int, kind: int, channel: int, mapped: tuple[str, ...], own: bool) -> Iterator[Object]:
+    label = f"{'RPDO' if index < _TPDO else 'TPDO'}{(index & 0x1FF) + 1}"
+    owner = lookup(mapped[0]).device
+    yield Object(
+        f"{label.lower()}_communication", index, Type.U32, "ro", f"{label} communication parameter", owner,
+        Shape.ENTRIES, names=("COB-ID", "Transmission type"), types=(Type.U32, Type.U8), defaults=(cob_id, kind),
+        relative=(1,) if own else (), is_record=True,
+    )
+    yield Object(
+        f"{label.lower()}_mapping", index + 0x200, Type.U32, "ro", f"{label} mapping parameter", owner, Shape.ENTRIES,
+        names=tuple(f"Mapped object {number}" for number in range(1, len(mapped) + 1)),
+        defaults=tuple(_mapping(lookup(name), channel) for name in mapped), is_record=True,
+    )
+
+
+def _mapping(entry: Object, channel: int) -> int:
+    """Index, sub-index and length in bits as CiA 301 packs them."""
+    sub = channel if entry.shape is Shape.CHANNELS else 0
+    return entry.index << 16 | sub << 8 | 8 * entry.type.size

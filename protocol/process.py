@@ -1,0 +1,76 @@
+"""What plant and controller share as processes: the bus, signals, the line that says "ready", the config file."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from types import FrameType
+from typing import Any, Protocol
+
+import yaml
+
+from protocol.bus import Bus, BusError, open_bus
+from protocol.runtime import Runtime
+
+
+class ConfigError(Exception):
+    """The file or the options make no sense; the text says where."""
+
+
+class DeviceProcess(Protocol):
+    runtime: Runtime
+
+    def start(self) -> None: ...
+
+
+def node_id(text: str) -> int:
+    """1..127, decimal or 0x.."""
+    node = int(text, 0)
+    if not 1 <= node <= 127:
+        raise argparse.ArgumentTypeError("a node-ID is 1..127")
+    return node
+
+
+def read_channels(path: str, keys: Iterable[str]) -> list[dict[str, Any]]:
+    """The list of channels of a YAML file; what is not a known key is refused rather than ignored."""
+    try:
+        rows = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path}: {error}") from error
+    if not isinstance(rows, list) or not rows or not all(isinstance(row, dict) for row in rows):
+        raise ConfigError(f"{path}: a list of channels is expected")
+    known = set(keys)
+    for number, row in enumerate(rows, start=1):
+        for key in row:
+            if key not in known:
+                raise ConfigError(f"{path}: channel {number}: {key!r} is unknown; there are {', '.join(sorted(known))}")
+    return rows
+
+
+def run_device(name: str, bus_url: str, make: Callable[[Bus], DeviceProcess], description: str) -> int:
+    """Runs a device until SIGTERM or SIGINT. Exit status 0, or 1 when there is no bus."""
+    try:
+        bus = open_bus(bus_url)
+    except BusError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 1
+    try:
+        device = make(bus)
+
+        def end(number: int, frame: FrameType | None) -> None:
+            device.runtime.stop()
+
+        signal.signal(signal.SIGTERM, end)
+        signal.signal(signal.SIGINT, end)
+        device.start()
+        print(f"ready {name} {description}", flush=True)
+        device.runtime.run()
+    except BusError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 1
+    finally:
+        bus.close()
+    return 0
