@@ -34,8 +34,6 @@ from protocol.profile import (
 from protocol.runtime import Runtime
 from protocol.sdo import SdoAbort
 
-TUNER_HEARTBEAT_MS = 1000
-"""Default of 1016h:1: after this long without the tuner, what it tried is taken back."""
 _SHORTEST_PV_TIMEOUT_S = 1.0
 _PV_TIMEOUT_SAMPLES = 3
 
@@ -103,7 +101,6 @@ class ControllerDevice:
         runtime.on_heartbeat_lost = self._on_heartbeat_lost
         runtime.on_reset = self._on_reset
         dictionary.set("sample_time", round(sample_time_s * 1e6))
-        dictionary.set("heartbeat_consumer", TUNER_NODE << 16 | TUNER_HEARTBEAT_MS, 1)
         for at, each in enumerate(channels):
             dictionary.set("controller_relay_pv_low", each.settings.pv_low, at + 1)
             dictionary.set("controller_relay_pv_high", each.settings.pv_high, at + 1)

@@ -77,7 +77,6 @@ class PlantDevice:
         dictionary.set("sample_time", round(sample_time_s * 1e6))
         dictionary.set("plant_pace", pace)
         dictionary.set("plant_seed", seed)
-        dictionary.set("sync_cob_id", 0x40000000 | SYNC_ID)
         for at, channel in enumerate(channels):
             dictionary.set("plant_noise", channel.noise_std, at + 1)
             dictionary.set("plant_safe_output", channel.mv_nominal, at + 1)

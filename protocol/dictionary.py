@@ -7,7 +7,7 @@ import struct
 from collections.abc import Callable
 from itertools import chain
 
-from protocol.objects import DEVICE_TYPE, Device, Object, Shape, Type, Value, objects_of
+from protocol.objects import Device, Object, Shape, Type, Value, default_of, objects_of
 from protocol.pdos import pdo_objects
 from protocol.profile import CONTROLLER_NODE, PLANT_NODE, Abort
 from protocol.sdo import SdoAbort
@@ -31,12 +31,10 @@ class Dictionary:
         self.on_read: dict[str, Reader] = {}
         self.on_write: dict[str, Writer] = {}
         self._values: dict[tuple[str, int], Value] = {
-            (entry.name, sub): entry.default_of(sub)
+            (entry.name, sub): default_of(entry, sub, device)
             for entry in self._by_index.values()
             for sub in range(0 if entry.shape is Shape.VAR else 1, entry.count(channels) + 1)
         }
-        self.set("device_type", DEVICE_TYPE[device])
-        self.set("device_name", f"Loopwright {device.value}")
         self.set("emcy_cob_id", 0x80 + node)
 
     def get(self, name: str, sub: int = 0) -> Value:

@@ -10,7 +10,7 @@ import struct
 from dataclasses import dataclass
 from enum import Enum
 
-from protocol.profile import SYNC_COUNTER_OVERFLOW
+from protocol.profile import SYNC_COUNTER_OVERFLOW, SYNC_ID, TUNER_NODE
 
 Value = int | float | str
 
@@ -116,7 +116,6 @@ BOTH, PLANT, CONTROLLER = Device.BOTH, Device.PLANT, Device.CONTROLLER
 BOOLEAN, U8, U16, U32, REAL32, STRING = Type.BOOLEAN, Type.U8, Type.U16, Type.U32, Type.REAL32, Type.STRING
 VAR, CHANNELS, ENTRIES = Shape.VAR, Shape.CHANNELS, Shape.ENTRIES
 
-DEVICE_TYPE = {PLANT: 0x000A0194, CONTROLLER: 0x00100194}
 DEGREE_CELSIUS = 0x002D0000
 SECOND = 0x00030000
 _IDENTITY = ("Vendor-ID", "Product code", "Revision number", "Serial number")
@@ -242,6 +241,19 @@ _CONTROLLER = (
            default=SECOND),
 )
 
+TUNER_HEARTBEAT_MS = 1000
+"""Default of the controller's 1016h:1: after this long without the tuner, what it tried is taken back."""
+_SYNC_PRODUCER = 0x40000000
+
+_OWN_DEFAULTS: dict[tuple[Device, str, int], Value] = {
+    (PLANT, "device_type", 0): 0x000A0194,
+    (CONTROLLER, "device_type", 0): 0x00100194,
+    (PLANT, "device_name", 0): "Loopwright plant",
+    (CONTROLLER, "device_name", 0): "Loopwright controller",
+    (PLANT, "sync_cob_id", 0): _SYNC_PRODUCER | SYNC_ID,
+    (CONTROLLER, "heartbeat_consumer", 1): TUNER_NODE << 16 | TUNER_HEARTBEAT_MS,
+}
+
 OBJECTS: tuple[Object, ...] = _COMMUNICATION + _PLANT + _CONTROLLER
 
 BY_NAME: dict[str, Object] = {entry.name: entry for entry in OBJECTS}
@@ -250,6 +262,11 @@ BY_NAME: dict[str, Object] = {entry.name: entry for entry in OBJECTS}
 def lookup(name: str) -> Object:
     """The object called `name`, for example "controller_mode_command". KeyError when there is none."""
     return BY_NAME[name]
+
+
+def default_of(entry: Object, sub: int, device: Device) -> Value:
+    """Where both devices have an object, its default may be the device's own."""
+    return _OWN_DEFAULTS.get((device, entry.name, sub), entry.default_of(sub))
 
 
 def objects_of(device: Device) -> tuple[Object, ...]:

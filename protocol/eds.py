@@ -1,0 +1,152 @@
+"""EDS files (CiA 306) of both devices, written from the object table. The committed ones describe one channel.
+
+    python -m protocol.eds plant [CHANNELS]          prints one
+    python -m protocol.eds --write                   writes protocol/eds_files/
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
+from pathlib import Path
+
+from protocol.objects import Device, Object, Shape, Type, Value, default_of, objects_of
+from protocol.pdos import pdo_objects
+from protocol.profile import CONTROLLER_NODE, PLANT_NODE
+
+FILES = {Device.PLANT: "loopwright_plant.eds", Device.CONTROLLER: "loopwright_controller.eds"}
+FOLDER = Path(__file__).parent / "eds_files"
+
+_NODE = {Device.PLANT: PLANT_NODE, Device.CONTROLLER: CONTROLLER_NODE}
+_VAR, _ARRAY, _RECORD = 0x7, 0x8, 0x9
+_MANDATORY = (0x1000, 0x1001, 0x1018)
+_BIT_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
+
+
+def eds(device: Device, channels: int = 1) -> str:
+    """The file's text; equal tables give equal texts (no date of generation)."""
+    table = sorted(chain(objects_of(device), pdo_objects(device, channels)), key=lambda entry: entry.index)
+    mandatory = [entry for entry in table if entry.index in _MANDATORY]
+    manufacturer = [entry for entry in table if 0x2000 <= entry.index < 0x6000]
+    optional = [entry for entry in table if entry not in mandatory and entry not in manufacturer]
+    lines = list(_head(device, table))
+    for title, group in (("Mandatory", mandatory), ("Optional", optional), ("Manufacturer", manufacturer)):
+        lines += ["", f"[{title}Objects]", f"SupportedObjects={len(group)}"]
+        lines += [f"{number}=0x{entry.index:04X}" for number, entry in enumerate(group, start=1)]
+        for entry in group:
+            lines += _object(entry, device, channels)
+    return "\n".join(lines) + "\n"
+
+
+def _head(device: Device, table: Sequence[Object]) -> Iterator[str]:
+    receive = sum(1 for entry in table if 0x1400 <= entry.index < 0x1600)
+    transmit = sum(1 for entry in table if 0x1800 <= entry.index < 0x1A00)
+    yield from (
+        "[FileInfo]",
+        f"FileName={FILES[device]}",
+        "FileVersion=1",
+        "FileRevision=0",
+        "EDSVersion=4.0",
+        f"Description=Loopwright {device.value}",
+        "CreationTime=12:00AM",
+        "CreationDate=01-01-2026",
+        "CreatedBy=protocol.eds",
+        "",
+        "[DeviceInfo]",
+        "VendorName=Loopwright (vendor-ID 0 is for tests)",
+        "VendorNumber=0x0",
+        f"ProductName=Loopwright {device.value}",
+        "ProductNumber=0x0",
+        "RevisionNumber=0x0",
+        "OrderCode=",
+        *(f"BaudRate_{rate}=1" for rate in _BIT_RATES),
+        "SimpleBootUpMaster=0",
+        "SimpleBootUpSlave=1",
+        "Granularity=0",
+        "DynamicChannelsSupported=0",
+        "GroupMessaging=0",
+        f"NrOfRXPDO={receive}",
+        f"NrOfTXPDO={transmit}",
+        "LSS_Supported=0",
+        "",
+        "[DummyUsage]",
+        *(f"Dummy{number:04d}=0" for number in range(1, 8)),
+        "",
+        "[Comments]",
+        "Lines=0",
+    )
+
+
+def _object(entry: Object, device: Device, channels: int) -> Iterator[str]:
+    section = f"{entry.index:04X}"
+    if entry.shape is Shape.VAR:
+        yield from _variable(entry, section, entry.text, 0, device)
+        return
+    count = entry.count(channels)
+    kind = _RECORD if entry.is_record else _ARRAY
+    yield from ("", f"[{section}]", f"ParameterName={entry.text}", f"ObjectType=0x{kind:X}")
+    yield f"SubNumber=0x{count + 1:X}"
+    yield from (
+        "", f"[{section}sub0]", "ParameterName=Highest sub-index supported", f"ObjectType=0x{_VAR:X}",
+        f"DataType=0x{Type.U8.number:04X}", "AccessType=const", f"DefaultValue={count}", "PDOMapping=0",
+    )
+    for sub in range(1, count + 1):
+        name = entry.names[sub - 1] if entry.names else f"{entry.text} {sub}"
+        yield from _variable(entry, f"{section}sub{sub:X}", name, sub, device)
+
+
+def _variable(entry: Object, section: str, name: str, sub: int, device: Device) -> Iterator[str]:
+    data_type = entry.type_of(sub)
+    yield from ("", f"[{section}]", f"ParameterName={name}", f"ObjectType=0x{_VAR:X}")
+    yield f"DataType=0x{data_type.number:04X}"
+    yield f"AccessType={_access(entry)}"
+    yield f"DefaultValue={_default(entry, sub, device)}"
+    yield f"PDOMapping={int(bool(entry.pdo))}"
+    if entry.low is not None:
+        yield f"LowLimit={_number(entry.low)}"
+    if entry.high is not None:
+        yield f"HighLimit={_number(entry.high)}"
+    if entry.unit:
+        yield f"Unit={entry.unit}"
+
+
+def _access(entry: Object) -> str:
+    """`rww` and `rwr` say which PDOs a rw object may be mapped to, where that is only one kind."""
+    if entry.access == "rw" and entry.pdo == "R":
+        return "rww"
+    if entry.access == "rw" and entry.pdo == "T":
+        return "rwr"
+    return entry.access
+
+
+def _default(entry: Object, sub: int, device: Device) -> str:
+    value = default_of(entry, sub, device)
+    if sub in entry.relative:
+        base = int(value) if entry.shape is Shape.VAR else int(value) - _NODE[device]
+        return f"$NODEID+0x{base:X}"
+    if isinstance(value, int) and entry.type_of(sub) is Type.U32 and value > 0xFFFF:
+        return f"0x{value:X}"
+    return _number(value)
+
+
+def _number(value: Value) -> str:
+    """Whole numbers without a point: some readers of EDS files take nothing else as a limit."""
+    if isinstance(value, float):
+        return str(int(value)) if value.is_integer() else f"{value:.9g}"
+    return str(value)
+
+
+def main(arguments: Iterable[str]) -> None:
+    first, *rest = [*arguments, ""]
+    if first == "--write":
+        for device, name in FILES.items():
+            (FOLDER / name).write_text(eds(device), encoding="ascii", newline="\n")
+    elif first in (device.value for device in FILES):
+        print(eds(Device(first), int(rest[0] or 1)), end="")
+    else:
+        print(__doc__)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
