@@ -180,7 +180,7 @@ def rehearse_file(
     """The whole procedure on a plant model, in memory at full speed. Exits 0 whenever it answered."""
     from service import show
     from service.rehearsal import rehearse
-    from tuning.plan import Event, StageDone, StageStarted
+    from tuning.plan import Event, StageStarted
 
     try:
         spec = json.loads(plant_file.read_text(encoding="utf-8"))
@@ -192,11 +192,12 @@ def rehearse_file(
         _die(f"{plant_file}: expected one JSON object", 2)
 
     def tell(event: Event) -> None:
-        if isinstance(event, StageStarted | StageDone) and not as_json:
-            done = isinstance(event, StageDone)
-            show.console.print(f"  {event.stage:<10} {'done' if done else f'(about {event.expected_s:.0f} s)'}")
+        if isinstance(event, StageStarted):
+            show.console.print(f"  {event.stage:<10} about {event.expected_s:.0f} s")
 
-    answer = rehearse(spec, method=method, on_event=tell)
+    # With --json the answer is all there is on standard output.
+    listener = None if as_json else tell
+    answer = rehearse(spec, method=method, on_event=listener)
     if as_json:
         _print_json(answer)
     else:

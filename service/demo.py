@@ -94,7 +94,8 @@ def _start(stack: ExitStack, folder: Path, speed: str, hub_only: bool) -> Client
     plant = ["--bus", bus, "--model", "model-14", "--ts", ts, "--speed", speed]
     kp, ti = BAD_GAINS
     # The controller first: a plant at full speed does not wait for it to come.
-    process("controller", "controller", "--bus", bus, "--channels", "1", "--kp", kp, "--ti", ti, "--sp", "50")
+    tuning = ["--kp", kp, "--ti", ti, "--sp", "50", "--ts", ts]
+    process("controller", "controller", "--bus", bus, "--channels", "1", *tuning)
     process("plant", "plantsim", *plant)
     loops = folder / "loops.yaml"
     loops.write_text(loops_yaml(bus), encoding="utf-8")
@@ -124,6 +125,6 @@ def _tell(job: dict[str, Any], seconds: float, folder: Path, picture: Path) -> N
         f"picture          {picture}",
         f"jobs, samples    {folder / 'data' / 'loopwright.sqlite'}",
         f"configuration    {folder / 'loops.yaml'}",
-        "next             loopwright serve --loops loops.yaml, then http://127.0.0.1:8080/docs; docs/ in the repository",
+        "next             loopwright serve --loops loops.yaml, then http://127.0.0.1:8080/docs; and docs/",
     ]
     show.console.print("\n".join(lines), highlight=False, soft_wrap=True)

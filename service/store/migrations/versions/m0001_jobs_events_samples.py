@@ -25,7 +25,7 @@ def upgrade() -> None:
         sa.Column("started_at", sa.String),
         sa.Column("ended_at", sa.String),
         sa.Column("stage", sa.String),
-        sa.Column("plant_time_s", sa.Float, nullable=False),
+        sa.Column("plant_time_s", sa.Double, nullable=False),
         sa.Column("stage_times_s", sa.JSON),
         sa.Column("reason", sa.String),
         sa.Column("detail", sa.String),
@@ -46,7 +46,7 @@ def upgrade() -> None:
         sa.Column("job_id", sa.String, sa.ForeignKey("jobs.id"), primary_key=True),
         sa.Column("seq", sa.Integer, primary_key=True),
         sa.Column("at", sa.String, nullable=False),
-        sa.Column("plant_time_s", sa.Float, nullable=False),
+        sa.Column("plant_time_s", sa.Double, nullable=False),
         sa.Column("kind", sa.String, nullable=False),
         sa.Column("data", sa.JSON, nullable=False),
     )
@@ -55,7 +55,7 @@ def upgrade() -> None:
         sa.Column("job_id", sa.String, sa.ForeignKey("jobs.id"), primary_key=True),
         sa.Column("seq", sa.Integer, primary_key=True),
         sa.Column("stage", sa.String, nullable=False),
-        sa.Column("first_t_s", sa.Float, nullable=False),
+        sa.Column("first_t_s", sa.Double, nullable=False),
         sa.Column("count", sa.Integer, nullable=False),
         sa.Column("data", sa.LargeBinary, nullable=False),
     )

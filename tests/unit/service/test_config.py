@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from service.config import ConfigError, load_loops, parse_loops
+from service.demo import loops_yaml
+from tests.unit.service.fakes import loop_entry
+
+
+def test_a_good_file(tmp_path: Path) -> None:
+    file = tmp_path / "loops.yaml"
+    file.write_text(yaml.safe_dump({"loops": [loop_entry(), loop_entry(tag="B", channel=2, plant_node=None)]}))
+    loops = load_loops(file)
+    assert list(loops) == ["TIC-101", "B"]
+    assert loops["B"].plant_node is None and loops["B"].mv_limits.high == 100.0
+
+
+def test_the_demo_writes_a_good_file() -> None:
+    assert "TIC-101" in parse_loops(yaml.safe_load(loops_yaml("socketcan:vcan0")), "demo")
+
+
+def test_every_error_is_listed_at_once() -> None:
+    entries = [
+        loop_entry(t95_s=-1, colour="red"),
+        loop_entry(tag="B", bus="vcan0", channel=2),
+        loop_entry(tag="C", pv_limits={"low": 5, "high": 5}, channel=3),
+        loop_entry(tag="D", t95_s=float("nan"), controller_node=200, channel=4),
+        loop_entry(tag="E", plant_node=32, channel=5),
+        loop_entry(tag="F", sp_deviation=60.0, channel=6),
+        loop_entry(tag="G", mv_limits={"low": -10, "high": 50}, channel=7),
+        {"tag": "H"},
+        "nonsense",
+    ]
+    with pytest.raises(ConfigError) as caught:
+        parse_loops({"loops": entries, "extra": 1}, "loops.yaml")
+    text = str(caught.value)
+    for words in (
+        "loops[0].t95_s (TIC-101)", "loops[0].colour (TIC-101)", "socketcan:vcan0", "low (5) must be less than high (5)",
+        "loops[3].t95_s (D)", "loops[3].controller_node (D)", "are both 32", "twice", "0..100 percent",
+        "loops[7].pv_unit (H): Field required", "loops[8]", "extra: unknown key",
+    ):  # fmt: skip
+        assert words in text
+
+
+def test_two_loops_may_not_share_a_tag_or_a_channel() -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_loops({"loops": [loop_entry(), loop_entry()]}, "loops.yaml")
+    assert len(caught.value.problems) == 2
+
+
+@pytest.mark.parametrize("text", ["", "loops: {}", "loops: []", "- 1", "loops: [", "\x00"])
+def test_not_a_list_of_loops(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "loops.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError):
+        load_loops(file)
+
+
+def test_no_such_file(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="No such file"):
+        load_loops(tmp_path / "none.yaml")
