@@ -182,7 +182,7 @@ class BusLoop:
 
     def _take_time(self, tuner: Tuner) -> None:
         """Who drives the samples: the plant by its clock, or we in blocks."""
-        self._sample_time_s = tuner.number("sample_time", node=self._node) * 1e-6
+        self._sample_time_s = tuner.number("sample_time", node=self._node) / 1e6
         pace = tuner.number("plant_pace") if self._plant is not None else 1.0
         self._in_blocks = pace == 0.0
         per_sample_s = self._sample_time_s / (pace or math.inf)
@@ -212,6 +212,8 @@ class BusLoop:
         match command:
             case SetSetpoint(value):
                 tuner.write("controller_setpoint", value)
+            case SetMode(Mode.EXPERIMENT):
+                pass  # SetRelay has started it; commanded again it would start anew
             case SetMode(mode):
                 tuner.write("controller_mode_command", mode)
             case SetGains(gains):
@@ -358,7 +360,7 @@ class BusLoop:
             on_trial=on_trial,
             mv_low=tuner.number("controller_mv_low"),
             mv_high=tuner.number("controller_mv_high"),
-            sample_time_s=tuner.number("sample_time", node=self._node) * 1e-6,
+            sample_time_s=tuner.number("sample_time", node=self._node) / 1e6,
             reverse_acting=tuner.number("controller_action") == 0,
         )
 
