@@ -1,4 +1,4 @@
-"""A loop as a plan sees it. Two fillings, one set of tests: `BusLoop` (live, over CANopen) and `RehearsedLoop` (in memory)."""
+"""A loop as a plan sees it. Two fillings: `BusLoop` (live, over CANopen) and `RehearsedLoop` (in memory)."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ class RehearsedLoop:
             case SetSetpoint(value):
                 channel.setpoint = value
             case SetMode(mode):
-                if mode != channel.mode:
+                if int(mode) != int(channel.mode):
                     channel.command_mode(int(mode))
             case SetGains(gains):
                 channel.stage(_parameters(gains))

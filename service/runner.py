@@ -49,7 +49,9 @@ class Watch:
 
 @dataclass(slots=True)
 class RunResult(Generic[T]):
-    """value: the plan's result, or ended: why there is none.  restored: the loop as read back, None if it could not be."""
+    """value: the plan's result, or ended: why there is none.  restored: the loop as read back, None if it could not
+    be.
+    """
 
     value: T | None = None
     ended: Ended | None = None
@@ -105,9 +107,7 @@ class Guard:
                 self.foreign_setpoint = sp
                 raise Aborted(Reason.SETPOINT_CHANGED, f"at {t:.3f} s the set-point is {sp:.6g}, not {self._sp:.6g}")
             if mode != self._mode:
-                raise Aborted(
-                    Reason.MODE_CHANGED, f"at {t:.3f} s the mode is {_mode(mode)}, not {_mode(self._mode)}"
-                )
+                raise Aborted(Reason.MODE_CHANGED, f"at {t:.3f} s the mode is {_mode(mode)}, not {_mode(self._mode)}")
         if pv != self._pv:
             self._frozen_at, self._pv, self._mv = t, pv, mv
         elif abs(mv - self._mv) < self._notable:
@@ -200,4 +200,3 @@ def run(
     if samples:
         on_samples(samples)
     return result
-

@@ -2,8 +2,9 @@
 
     preflight - baseline - 1 relay - 2 ultimate gain - 3 ZN PI, overshoot - 4 FOPDT estimate - 5 optimisation - verify
 
-Source: Stopakevych et al., automatic re-tuning of PI controllers in poorly performing control loops. Stages 4 and 5 take no
-plant time. The procedure may be entered at any stage with values typed in by hand, as in the paper's manual mode.
+Source: Stopakevych et al., automatic re-tuning of PI controllers in poorly performing control loops. Stages 4 and 5
+take no plant time. The procedure may be entered at any stage with values typed in by hand, as in the paper's manual
+mode.
 """
 
 from __future__ import annotations
@@ -220,9 +221,7 @@ def _typed(value: float | None) -> float:
 def _baseline(facts: Facts, point: OperatingPoint) -> Plan[StepResult]:
     """The set-point step under the accepted gains, for the comparison, and a first look at gain and sign."""
     step = allowed_step(facts, point, facts.old_gains.Kp, math.nan)
-    result = yield from step_test(
-        facts, point, step, band=0.05, most_s=5 * facts.T95_s, smooth_s=facts.T95_s / 12
-    )
+    result = yield from step_test(facts, point, step, band=0.05, most_s=5 * facts.T95_s, smooth_s=facts.T95_s / 12)
     wrong = result.static_gain == result.static_gain and (result.static_gain > 0) != facts.reverse
     if wrong:
         raise Refused(
@@ -233,9 +232,7 @@ def _baseline(facts: Facts, point: OperatingPoint) -> Plan[StepResult]:
     return result
 
 
-def _estimate(
-    facts: Facts, Kp: float, Ti: float, overshoot: float, ke: float, source: str, notes: list[str]
-) -> Model:
+def _estimate(facts: Facts, Kp: float, Ti: float, overshoot: float, ke: float, source: str, notes: list[str]) -> Model:
     estimate = fopdt_from_overshoot(Kp, Ti, overshoot)
     sign = 1.0 if facts.reverse else -1.0
     k5 = sign * estimate.k5
@@ -280,9 +277,7 @@ def _verified(
     )
     commands = (SetGains(gains), SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp))
     yield from settle(point.sp, 0.02 * step, facts.T95_s / 5, 3 * facts.T95_s, point.noise, commands)
-    result = yield from step_test(
-        facts, point, step, band=0.05, most_s=5 * facts.T95_s, smooth_s=model.L_s / 2
-    )
+    result = yield from step_test(facts, point, step, band=0.05, most_s=5 * facts.T95_s, smooth_s=model.L_s / 2)
     most = max(40.0, predicted.overshoot_pct + 25.0)
     if not result.settled or result.overshoot_pct > most:
         raise Refused(

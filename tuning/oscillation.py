@@ -54,13 +54,17 @@ def fit_growth(t: Array, y: Array, period_guess: float) -> Growth:
         coefficients = np.linalg.lstsq(basis, y, rcond=None)[0]
         return coefficients, basis @ coefficients - y
 
-    best = least_squares(lambda p: solve(p)[1], np.array([0.0, 2 * math.pi]), method="lm", xtol=1e-9, max_nfev=60)
+    def residuals(p: Array) -> Array:
+        return solve(p)[1]
+
+    best = least_squares(residuals, np.array([0.0, 2 * math.pi]), method="lm", xtol=1e-9, max_nfev=60)
     coefficients, residual = solve(best.x)
     sigma, w = float(best.x[0]), abs(float(best.x[1]))
     freedom = max(1, len(y) - 7)
     variance = float(residual @ residual) / freedom
+    jacobian = np.asarray(best.jac, dtype=np.float64)
     try:
-        spread = math.sqrt(abs(variance * float(np.linalg.inv(best.jac.T @ best.jac)[0, 0])))
+        spread = math.sqrt(abs(variance * float(np.linalg.inv(jacobian.T @ jacobian)[0, 0])))
     except np.linalg.LinAlgError:
         spread = math.inf
     return Growth(
@@ -74,9 +78,8 @@ def fit_growth(t: Array, y: Array, period_guess: float) -> Growth:
 
 
 def harmonic(t: Array, y: Array, period: float) -> complex:
-    """First harmonic of y at this period (phasor, amplitude in y's unit), by least squares beside mean and slope."""
-    x = t - 0.5 * (t[0] + t[-1])
+    """First harmonic of y at this period (phasor, amplitude in y's unit), by least squares over whole periods."""
     w = 2 * math.pi / period
-    basis = np.stack([np.ones_like(x), x, np.cos(w * x), -np.sin(w * x)], axis=1)
+    basis = np.stack([np.ones_like(t), np.cos(w * t), -np.sin(w * t)], axis=1)
     c = np.linalg.lstsq(basis, y, rcond=None)[0]
-    return complex(c[2], c[3])
+    return complex(c[1], c[2])

@@ -141,5 +141,5 @@ def to_rest(facts: Facts, point: OperatingPoint, band: float) -> Plan[None]:
         if abs(away) > max(0.2 * facts.sp_deviation, 2 * band):
             raise Refused(
                 Reason.NOT_AT_REST,
-                f"held in manual at MV {point.mv:.4g}, PV stayed {away:+.4g} away from {point.pv:.4g}: the load has moved",
+                f"held in manual at MV {point.mv:.4g}, PV stayed {away:+.4g} off {point.pv:.4g}: the load has moved",
             )

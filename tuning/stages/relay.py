@@ -1,7 +1,7 @@
 """Stage 1: relay test, rough ultimate gain and period.
 
-The relay runs inside the controller, centred on the present output. Ku_a = |U1| / |Y1| from the first harmonics of MV and
-PV over the last cycles: with an ideal relay this is the describing function 4d/(pi a), and it stays right with the
+The relay runs inside the controller, centred on the present output. Ku_a = |U1| / |Y1| from the first harmonics of MV
+and PV over the last cycles: with an ideal relay this is the describing function 4d/(pi a), and it stays right with the
 parallel path, hysteresis and noise (the print's `max(P) - SP` does not).
 """
 

@@ -69,7 +69,9 @@ def _peak(t: Array, y: Array, width: float) -> float:
     if half < 2:
         return float(y.max())
     kernel = np.ones(half) / half
-    middle = int(np.argmax(np.convolve(y, kernel, mode="same")[half:-half or None])) + half if len(y) > 4 * half else 0
+    middle = (
+        int(np.argmax(np.convolve(y, kernel, mode="same")[half : -half or None])) + half if len(y) > 4 * half else 0
+    )
     part = slice(max(0, middle - half), middle + half + 1)
     x = t[part] - t[middle]
     c = np.polyfit(x, y[part], 2)

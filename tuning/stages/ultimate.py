@@ -1,9 +1,9 @@
 """Stage 2: ultimate gain and period by P control.
 
-A P controller, a set-point step, and the question whether the oscillation grows or dies. Each gain's growth per period is
-fitted (tuning.oscillation); the sign tables of the print become a bracket, and the next gain comes from the measured growth
-(false position on ln K, kept inside the bracket) instead of a sweep: the same end, a gap below 1 %, in about five runs,
-and without trying gains far above Ku on the plant.
+A P controller, a set-point step, and the question whether the oscillation grows or dies. Each gain's growth per period
+is fitted (tuning.oscillation); the sign tables of the print become a bracket, and the next gain comes from the
+measured growth (false position on ln K, kept inside the bracket) instead of a sweep: the same end, a gap below 1 %, in
+about five runs, and without trying gains far above Ku on the plant.
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class UltimateResult:
-    """Ku: MV units per PV unit.  Pu_s: s.  gap: width of the last bracket, relative.  static_gain: from the P offsets."""
+    """Ku: MV units per PV unit.  Pu_s: s.  gap: width of the last bracket, relative.  static_gain: from the P
+    offsets.
+    """
 
     Ku: float
     Pu_s: float
@@ -115,9 +117,7 @@ def _next_gain(runs: list[Run], low: Run | None, high: Run | None) -> float:
     return K
 
 
-def _p_run(
-    facts: Facts, point: OperatingPoint, K: float, step: float, period: float
-) -> Plan[tuple[Run, float]]:
+def _p_run(facts: Facts, point: OperatingPoint, K: float, step: float, period: float) -> Plan[tuple[Run, float]]:
     """One P run; ends as soon as the sign is clear twice in a row, at the latest after max(1.2 T95, 6 periods)."""
     target = point.sp + step
     sample = yield (SetGains(Gains(Kp=K)), SetMode(Mode.AUTOMATIC), SetSetpoint(target))
