@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 
 from protocol.bus import BusError
-from protocol.objects import DEVICE_TYPE, Device
+from protocol.objects import Device, default_of, lookup
 from protocol.profile import FOREVER, TUNER_NODE, Abort, Cause, Emcy, Experiment, ParameterCommand
 from protocol.tuner import BusSample, Kind, Tuner, TunerError
 from service.loop import LoopState
@@ -163,8 +163,9 @@ class BusLoop:
             if node is None:
                 continue
             found = int(tuner.number("device_type", node=node))
-            if found != DEVICE_TYPE[device]:
-                text = f"node {node:02X}h is of type {found:08X}h, not a {device.value} ({DEVICE_TYPE[device]:08X}h)"
+            expected = int(default_of(lookup("device_type"), 0, device))
+            if found != expected:
+                text = f"node {node:02X}h is of type {found:08X}h, not a {device.value} ({expected:08X}h)"
                 raise Refused(Reason.DEVICE_MISMATCH, text)
 
     def _watch_us(self, tuner: Tuner) -> None:
