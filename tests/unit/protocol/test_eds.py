@@ -75,5 +75,5 @@ def test_every_channel_has_its_own_identifiers(nodes: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize("channel", [0, MAX_CHANNELS + 1])
 def test_no_identifiers_beyond_the_channels(channel: int) -> None:
-    with pytest.raises(ValueError, match="1..199"):
+    with pytest.raises(ValueError, match="channel must be"):
         channel_ids(channel)
