@@ -8,6 +8,9 @@ from typing import Any
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+LEAD_IN = 20
+"""Samples shown before the step."""
+
 
 def before_after(path: Path, title: str, pv_unit: str, stages: dict[str, dict[str, Any]]) -> None:
     """stages: "before" and "after", each the columns of GET /jobs/{id}/samples?stage=..."""
@@ -16,13 +19,12 @@ def before_after(path: Path, title: str, pv_unit: str, stages: dict[str, dict[st
     top, bottom = figure.subplots(2, 1, sharex=True)
     figure.suptitle(title)
     for (label, columns), colour in zip(stages.items(), ("tab:red", "tab:blue"), strict=False):
-        t, sp = columns["t_s"], columns["sp"]
-        # Time 0 is the first change of the set-point in the stage.
-        start = next((i for i in range(1, len(sp)) if sp[i] != sp[i - 1]), 0)
-        shifted = [x - t[start] for x in t] if t else []
-        top.plot(shifted, columns["pv"], color=colour, label=f"PV {label}")
+        first, last = step_up(columns["sp"])
+        t, sp, pv, mv = (columns[name][max(first - LEAD_IN, 0) : last] for name in ("t_s", "sp", "pv", "mv"))
+        shifted = [x - columns["t_s"][first] for x in t]
+        top.plot(shifted, pv, color=colour, label=f"PV {label}")
         top.step(shifted, sp, color=colour, linestyle=":", linewidth=1, where="post")
-        bottom.step(shifted, columns["mv"], color=colour, label=f"MV {label}", where="post")
+        bottom.step(shifted, mv, color=colour, label=f"MV {label}", where="post")
     top.set_ylabel(f"PV, {pv_unit}")
     bottom.set_ylabel("MV, %")
     bottom.set_xlabel("plant time since the set-point step, s")
@@ -30,3 +32,11 @@ def before_after(path: Path, title: str, pv_unit: str, stages: dict[str, dict[st
         axes.legend(loc="lower right")
         axes.grid(alpha=0.3)
     canvas.print_figure(path, dpi=110)
+
+
+def step_up(sp: list[float]) -> tuple[int, int]:
+    """Where the last rise of the set-point begins and where it ends: the step that the figures are about."""
+    changes = [i for i in range(1, len(sp)) if sp[i] != sp[i - 1]]
+    rises = [i for i in changes if sp[i] > sp[i - 1]]
+    first = rises[-1] if rises else 0
+    return first, next((i for i in changes if i > first), len(sp))

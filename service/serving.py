@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 from pathlib import Path
 from types import FrameType
@@ -49,6 +50,8 @@ def serve(loops_file: Path, data: Path, host: str, port: int) -> None:
 
     Raises ConfigError, FolderInUse, OSError (the address cannot be had).
     """
+    # python-can's socketcand client warns of every frame that TCP splits, which is what TCP does.
+    logging.getLogger("can").setLevel(logging.ERROR)
     loops = load_loops(loops_file)
     # Bound before anything is started, so that a busy port is an error and not half a service.
     listener = socket.create_server((host, port), reuse_port=False)

@@ -28,7 +28,8 @@ def follow(client: Client, job_url: str) -> dict[str, Any]:
                 text = "" if left is None else f"about {left:.0f} s of plant time left"
                 bars.update(task, completed=data["progress"], description=data["stage"] or "", left=text)
             elif kind == "stage_done":
-                bars.console.print(f"  {data['stage']:<10} at {data['plant_time_s']:.1f} s  {brief(data['result'])}")
+                told = f"  {data['stage']:<10} at {data['plant_time_s']:.1f} s  {brief(data['result'])}"
+                bars.console.print(told, soft_wrap=True)
             elif kind == "note":
                 bars.console.print(f"  note: {data['text']}")
             elif kind == "state":

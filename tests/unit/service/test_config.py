@@ -38,7 +38,8 @@ def test_every_error_is_listed_at_once() -> None:
         parse_loops({"loops": entries, "extra": 1}, "loops.yaml")
     text = str(caught.value)
     for words in (
-        "loops[0].t95_s (TIC-101)", "loops[0].colour (TIC-101)", "socketcan:vcan0", "low (5) must be less than high (5)",
+        "loops[0].t95_s (TIC-101)", "loops[0].colour (TIC-101)", "socketcan:vcan0",
+        "low (5) must be less than high (5)",
         "loops[3].t95_s (D)", "loops[3].controller_node (D)", "are both 32", "twice", "0..100 percent",
         "loops[7].pv_unit (H): Field required", "loops[8]", "extra: unknown key",
     ):  # fmt: skip
