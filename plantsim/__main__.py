@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 
@@ -23,6 +24,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ConfigError, KeyError, TypeError, ValueError) as error:
         print(f"plantsim: {error.args[0]}", file=sys.stderr)
         return 2
+    if options.speed == 0.0:
+        os.nice(10)  # at full speed it would starve whoever shares its processor
     return run_device(
         "plantsim",
         options.bus,

@@ -93,14 +93,15 @@ def _start(stack: ExitStack, folder: Path, speed: str, hub_only: bool) -> Client
     ts = str(SAMPLE_TIME_S)
     plant = ["--bus", bus, "--model", "model-14", "--ts", ts, "--speed", speed]
     kp, ti = BAD_GAINS
-    # The controller first: a plant at full speed does not wait for it to come.
+    # The plant last: at full speed it waits for nobody, and takes what the processor gives.
     tuning = ["--kp", kp, "--ti", ti, "--sp", "50", "--ts", ts]
     process("controller", "controller", "--bus", bus, "--channels", "1", *tuning)
-    process("plant", "plantsim", *plant)
     loops = folder / "loops.yaml"
     loops.write_text(loops_yaml(bus), encoding="utf-8")
     serve = ("service", "serve", "--loops", str(loops), "--data", str(folder / "data"), "--port", "0")
-    return Client(process("service", *serve).split()[1])
+    url = process("service", *serve).split()[1]
+    process("plant", "plantsim", *plant)
+    return Client(url)
 
 
 def _retune(client: Client) -> tuple[dict[str, Any], float]:

@@ -42,7 +42,7 @@ class Process:
                     self._ready.set()
         self._ready.set()
 
-    def wait_ready(self, timeout_s: float = 30.0) -> str:
+    def wait_ready(self, timeout_s: float = 90.0) -> str:
         """The ready line. Raises NotReady."""
         if not self._ready.wait(timeout_s) or not self.ready:
             last = self._log.read_text(errors="replace").strip().splitlines()[-5:]
