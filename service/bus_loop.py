@@ -89,6 +89,7 @@ class BusLoop:
         try:
             with self._translated() as tuner:
                 self._identify(tuner)
+                self._compare_times(tuner)
                 self._watch_us(tuner)
                 self._take_time(tuner)
                 state = self._state(tuner)
@@ -167,6 +168,15 @@ class BusLoop:
             if found != expected:
                 text = f"node {node:02X}h is of type {found:08X}h, not a {device.value} ({expected:08X}h)"
                 raise Refused(Reason.DEVICE_MISMATCH, text)
+
+    def _compare_times(self, tuner: Tuner) -> None:
+        """A controller that reckons with another sample time than the plant's has other gains than it shows."""
+        if self._plant is None:
+            return
+        ours, theirs = (tuner.number("sample_time", node=node) / 1e6 for node in (self._node, self._plant))
+        if ours != theirs:
+            text = f"controller node {self._node:02X}h has a sample time of {ours:g} s"
+            raise Refused(Reason.DEVICE_MISMATCH, f"{text}, plant node {self._plant:02X}h one of {theirs:g} s")
 
     def _watch_us(self, tuner: Tuner) -> None:
         """Arms the watch on our heartbeat. A session that a dead tuner left ends first, for want of its heartbeat."""

@@ -10,6 +10,7 @@ from service.config import LoopConfig
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Percent = Annotated[float, Field(gt=0, lt=74, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
@@ -83,6 +84,11 @@ class RetuneRequest(BaseModel):
     kp_step_factor: Annotated[float, Field(gt=1, le=2, allow_inf_nan=False)] | None = Field(
         default=None, description="Factor by which Kp grows between attempts, over 1", examples=[1.5]
     )
+    overshoot_window_pct: tuple[Percent, Percent] = Field(
+        default=(10.0, 50.0),
+        description="Overshoot that the PI step must show, percent: low, high; 0 < low < high < 74",
+        examples=[[8.0, 50.0]],
+    )
     baseline: bool = Field(default=True, description="Record the set-point step with the old gains")
     verify: bool = Field(default=True, description="Record the set-point step with the new gains")
     plant: PlantModel | None = Field(default=None, description="Plant to rehearse on; only with dry_run")
@@ -99,6 +105,9 @@ class RetuneRequest(BaseModel):
         missing = [name for name in needed if getattr(self, name) is None]
         if missing:
             raise ValueError(f"start={self.start} needs {', '.join(missing)}")
+        low, high = self.overshoot_window_pct
+        if not low < high:
+            raise ValueError(f"overshoot_window_pct: {low:g} must be less than {high:g}")
         if self.plant is not None and not self.dry_run:
             raise ValueError("plant is for a dry run only")
         return self

@@ -112,6 +112,7 @@ def _options(request: RetuneRequest) -> dict[str, Any]:
         "model_L_s": model.L_s if model else None,
         "k_source": request.k_source,
         "kp_step_factor": request.kp_step_factor,
+        "overshoot_window_pct": request.overshoot_window_pct,
         "baseline": request.baseline,
         "verify": request.verify,
     }
