@@ -1,0 +1,155 @@
+"""The runner on a rehearsed loop: each way out ends with its reason, and the loop as it was."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import pytest
+
+from controller.channel import Channel, Settings
+from controller.pid import Parameters
+from plantsim.plant import LinearPlant
+from service.loop import LoopState
+from service.rehearsal import RehearsedLoop
+from service.runner import RunResult, Watch, run
+from tuning.gains import Gains
+from tuning.plan import Command, Mode, Plan, Sample, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint, StageStarted
+from tuning.reasons import Failed, Reason, Refused
+
+TS = 0.1
+OLD = Gains(Kp=0.15, Ti=5.0)
+
+
+class Meddled(RehearsedLoop):
+    """A rehearsed loop in which something happens at a given sample."""
+
+    def __init__(self, at: int = 10**9, change: Callable[[Sample], Sample] = lambda s: s) -> None:
+        settings = Settings(mv_low=-1.0, mv_high=1.0, safe_output=0.0, pv_low=-10.0, pv_high=10.0)
+        parameters = Parameters(OLD.Kp, OLD.Ti, 0.0, 0.0, 1.0, 0.0)
+        self.channel = Channel(TS, settings, parameters, 0.0, int(Mode.AUTOMATIC), 0.0)
+        super().__init__(LinearPlant([2.0], [5.0, 1.0], 1.0, TS), self.channel, TS)
+        self._at, self._change, self._count = at, change, 0
+
+    def step(self, commands: Sequence[Command]) -> Sample:
+        sample = super().step(commands)
+        self._count += 1
+        return self._change(sample) if self._count >= self._at else sample
+
+
+def trial(seconds: float = 60.0) -> Plan[str]:
+    """Leaves everything changed: gains, mode, set-point, output."""
+    sample = yield (StageStarted("trial", seconds, 0.0), SetGains(Gains(Kp=0.5, Ti=3.0)), SetSetpoint(0.3))
+    start = sample.t
+    while sample.t - start < seconds / 2:
+        sample = yield ()
+    sample = yield (SetMode(Mode.MANUAL), SetOutput(0.1))
+    while sample.t - start < seconds:
+        sample = yield ()
+    return "done"
+
+
+def relay() -> Plan[None]:
+    yield (SetRelay(0.5, 0.0, 0.0), SetMode(Mode.EXPERIMENT))
+    while True:
+        yield ()
+
+
+def assert_home(loop: Meddled, result: RunResult[Any], sp: float = 0.0) -> None:
+    state = loop.read()
+    assert result.restored == state
+    assert (state.mode, state.sp, state.gains, state.on_trial) == (Mode.AUTOMATIC, sp, OLD, False)
+    assert loop.channel.lease == 0
+
+
+def test_success_gives_the_value_and_the_stage_times() -> None:
+    loop = Meddled()
+    result = run(trial(), loop, watch=Watch())
+    assert (result.value, result.ended) == ("done", None)
+    assert result.plant_time_s == {"trial": pytest.approx(60.0, abs=3 * TS)}
+    assert_home(loop, result)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda s: s._replace(pv=math.nan), Reason.BAD_SAMPLE),
+        (lambda s: s._replace(mv=math.inf), Reason.BAD_SAMPLE),
+        (lambda s: s._replace(t=s.t + 1.0), Reason.SAMPLES_LOST),
+        (lambda s: s._replace(pv=5.0), Reason.PV_LIMIT),
+        (lambda s: s._replace(mode=int(Mode.OFF)), Reason.MODE_CHANGED),
+    ],
+)
+@pytest.mark.parametrize("plan", [trial, relay])
+def test_a_bad_sample_ends_the_run(
+    change: Callable[[Sample], Sample], reason: Reason, plan: Callable[[], Plan[Any]]
+) -> None:
+    loop = Meddled(100, change)
+    result = run(plan(), loop, watch=Watch(pv_low=-4.0, pv_high=4.0))
+    assert result.ended is not None
+    assert result.ended.reason is reason
+    assert_home(loop, result)
+
+
+def test_the_set_point_that_somebody_else_gave_stays() -> None:
+    loop = Meddled(100, lambda s: s._replace(sp=0.7))
+    result = run(trial(), loop, watch=Watch())
+    assert result.ended is not None
+    assert result.ended.reason is Reason.SETPOINT_CHANGED
+    assert_home(loop, result, sp=0.7)
+
+
+def test_a_frozen_pv_is_noticed_once_mv_has_moved() -> None:
+    result = run(trial(), loop := Meddled(100, lambda s: s._replace(pv=0.0)), watch=Watch(max_frozen_s=10.0))
+    assert result.ended is not None
+    assert result.ended.reason is Reason.PV_FROZEN
+    assert_home(loop, result)
+
+
+def test_the_time_budget_ends_the_run() -> None:
+    result = run(trial(), loop := Meddled(), watch=Watch(max_time_s=20.0))
+    assert result.ended is not None
+    assert result.ended.reason is Reason.TIME_BUDGET
+    assert_home(loop, result)
+
+
+def test_the_operator_ends_the_run_at_the_next_sample() -> None:
+    asked = iter([None] * 50)
+    result = run(trial(), loop := Meddled(), watch=Watch(), stop=lambda: next(asked, Reason.OPERATOR))
+    assert result.ended is not None
+    assert result.ended.reason is Reason.OPERATOR
+    assert_home(loop, result)
+
+
+@pytest.mark.parametrize("error", [Refused(Reason.NOT_ROBUST, "Ms 3"), Failed(Reason.NODE_LOST, "node 20h")])
+def test_what_a_plan_or_loop_raises_ends_the_run(error: Exception) -> None:
+    def plan() -> Plan[None]:
+        yield (SetSetpoint(0.2),)
+        raise error
+
+    result = run(plan(), loop := Meddled(), watch=Watch())
+    assert result.ended is error
+    assert_home(loop, result)
+
+
+def test_a_defect_in_a_plan_is_told_as_one_and_the_loop_is_restored() -> None:
+    def plan() -> Plan[float]:
+        yield (SetSetpoint(0.2),)
+        return 1 / 0
+
+    result = run(plan(), loop := Meddled(), watch=Watch())
+    assert result.ended is not None
+    assert (result.ended.reason, "ZeroDivisionError" in result.ended.detail) == (Reason.INTERNAL, True)
+    assert_home(loop, result)
+
+
+def test_a_result_without_a_confirmed_restore_is_no_result() -> None:
+    class Unrestorable(Meddled):
+        def restore(self, state: LoopState) -> LoopState:
+            raise Failed(Reason.RESTORE_UNCONFIRMED, "mode reads manual")
+
+    result = run(trial(), Unrestorable(), watch=Watch())
+    assert result.value is None
+    assert result.ended is not None
+    assert result.ended.reason is Reason.RESTORE_UNCONFIRMED
