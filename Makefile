@@ -1,6 +1,6 @@
 # make demo    a loop is retuned before your eyes      make test    every test and every check
 # make setup   the Python environment in .venv         make check   types, style, import directions
-# make bench   the benchmarks of the criterion
+# make bench   every benchmark, in one table
 
 PYTHON ?= python3
 VENV := .venv
@@ -36,7 +36,7 @@ check: setup
 	$(BIN)/lint-imports
 
 bench: setup
-	$(BIN)/python -m benchmarks.criterion
+	$(BIN)/python -m benchmarks
 
 clean:
 	rm -rf $(VENV) *.egg-info

@@ -1,0 +1,105 @@
+"""`make bench`: every benchmark in a process of its own, then one table in Markdown.
+
+    python -m benchmarks
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+from datetime import date
+from typing import Any
+
+WITH_VCAN = ("tools/with-vcan", "--timeout", "400", "--")
+BENCHMARKS = {"bus": WITH_VCAN, "rehearsal": (), "criterion": ()}
+
+
+def figures(name: str) -> dict[str, Any]:
+    """The JSON object a benchmark prints first. Raises CalledProcessError with its output shown."""
+    print(f"{name} ...", file=sys.stderr, flush=True)
+    command = [*BENCHMARKS[name], sys.executable, "-m", f"benchmarks.{name}"]
+    found = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+    if found.returncode:
+        print(found.stdout)
+        found.check_returncode()
+    answer: dict[str, Any] = json.JSONDecoder().raw_decode(found.stdout)[0]
+    return answer
+
+
+def table(bus: dict[str, Any], rehearsal: dict[str, Any], criterion: dict[str, Any]) -> list[str]:
+    def row(what: str, figure: str, goal: str = "", met: bool | None = None) -> str:
+        return f"| {what} | {figure} | {goal} | {'' if met is None else 'met' if met else '**missed**'} |"
+
+    def ratio(name: str) -> str:
+        low, high = bus[f"{name}_ratio_range"]
+        return f"{bus[f'{name}_per_s']:,.0f}/s, {bus[f'{name}_ratio']:.2f} of bare ({low:.2f} to {high:.2f})"
+
+    timed, speed = bus["real_time_100_loops"], bus["speed_factor"]
+    return [
+        "| what | figure | goal | |",
+        "| --- | --- | --- | --- |",
+        row("bare AF_CAN + struct, the same three frames", f"{bus['bare_per_s']:,.0f} samples/s"),
+        row("plant and controller devices, nobody listening", ratio("devices"), "0.5", bus["devices_ratio"] >= 0.5),
+        row("the same, a tuner takes every sample", ratio("listening"), "0.33", bus["listening_ratio"] >= 1 / 3),
+        row(
+            "the same, the live loop of a retune (plant in blocks)",
+            f"{bus['live_loop_per_s']:,.0f}/s, {bus['live_loop_ratio']:.2f} of bare",
+        ),
+        row(
+            f"times real time at Ts = 0.1 s with {'/'.join(speed)} loops",
+            "/".join(f"{each:.3g}" for each in speed.values()),
+        ),
+        row(
+            f"100 loops in real time, Ts = 0.1 s, {timed['samples']} samples: last MV late by",
+            f"{timed['late_median_ms']:.1f} ms (median), {timed['late_max_ms']:.1f} ms (worst), "
+            f"{timed['late_by_more_than_half_Ts']} samples by more than Ts/2",
+            "none by more than 50 ms",
+            timed["late_by_more_than_half_Ts"] == 0,
+        ),
+        row(
+            "the same, SYNC to last MV",
+            f"{timed['sync_to_last_mv_median_ms']:.1f} ms (median), {timed['sync_to_last_mv_max_ms']:.1f} ms (worst)",
+        ),
+        row(
+            f"rehearsal, {rehearsal['proposed']:.0f} of {rehearsal['models']} models proposed, Ts = 0.1 s",
+            f"{rehearsal['factor']:,.0f} times plant time "
+            f"({rehearsal['plant_s']:,.0f} s in {rehearsal['wall_s']:.1f} s)",
+            "2,000",
+            rehearsal["factor"] >= 2000,
+        ),
+        row("the same, peak memory", f"{rehearsal['peak_MB']:.0f} MB", "under 300 MB", rehearsal["peak_MB"] < 300),
+        row(
+            "criterion (7), one loop, against python-control + scipy",
+            f"{criterion['ratio']:.0f} times faster ({1e3 * criterion['ours_s']:.1f} ms, {criterion['plain_s']:.2f} s)",
+            "20",
+            criterion["ratio"] >= 20,
+        ),
+        row(
+            "the same, J of both results by our criterion",
+            f"{criterion['J_of_ours']:.3f} against {criterion['J_of_plain']:.3f}",
+            "the same or lower",
+            criterion["J_of_ours"] <= criterion["J_of_plain"] * (1 + 1e-4),
+        ),
+    ]
+
+
+def main() -> None:
+    loads = [os.getloadavg()[0]]
+    found = {}
+    for name in BENCHMARKS:
+        found[name] = figures(name)
+        loads.append(os.getloadavg()[0])
+    print(
+        f"{date.today()}, Python {platform.python_version()}, {platform.machine()}, {os.cpu_count()} processors, "
+        f"vcan by with-vcan ({found['bus']['vcan']}), load average before and after each part: "
+        f"{', '.join(f'{load:.1f}' for load in loads)}\n"
+    )
+    print("\n".join(table(found["bus"], found["rehearsal"], found["criterion"])))
+    print("\n" + json.dumps(found, indent=1), file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()
