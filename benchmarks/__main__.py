@@ -18,14 +18,14 @@ BENCHMARKS = {"bus": WITH_VCAN, "rehearsal": (), "criterion": ()}
 
 
 def figures(name: str) -> dict[str, Any]:
-    """The JSON object a benchmark prints first. Raises CalledProcessError with its output shown."""
+    """The JSON object a benchmark prints; under user-mode Linux its progress comes before it. Raises CalledProcessError with its output shown."""
     print(f"{name} ...", file=sys.stderr, flush=True)
     command = [*BENCHMARKS[name], sys.executable, "-m", f"benchmarks.{name}"]
     found = subprocess.run(command, stdout=subprocess.PIPE, text=True)
     if found.returncode:
         print(found.stdout)
         found.check_returncode()
-    answer: dict[str, Any] = json.JSONDecoder().raw_decode(found.stdout)[0]
+    answer: dict[str, Any] = json.JSONDecoder().raw_decode(found.stdout[found.stdout.index("{") :])[0]
     return answer
 
 
