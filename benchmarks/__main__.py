@@ -18,7 +18,10 @@ BENCHMARKS = {"bus": WITH_VCAN, "rehearsal": (), "criterion": ()}
 
 
 def figures(name: str) -> dict[str, Any]:
-    """The JSON object a benchmark prints; under user-mode Linux its progress comes before it. Raises CalledProcessError with its output shown."""
+    """The JSON object a benchmark prints; under user-mode Linux its progress comes before it.
+
+    Raises CalledProcessError with its output shown.
+    """
     print(f"{name} ...", file=sys.stderr, flush=True)
     command = [*BENCHMARKS[name], sys.executable, "-m", f"benchmarks.{name}"]
     found = subprocess.run(command, stdout=subprocess.PIPE, text=True)
