@@ -1,0 +1,231 @@
+"""Every way a retune can end early, on live processes on vcan0: its reason, and the loop as it was, read by SDO.
+
+The processes are shared; each test finds the loop at rest and the plant at PACE times real time, slow enough that
+"in the middle of a stage" is no race.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+
+from protocol.profile import FOREVER, Mode
+from protocol.tuner import Kind, TunerError
+from tests.e2e.plantsite import BUS, MODEL_14, NEEDS_VCAN, TAG, Plantsite
+
+pytestmark = NEEDS_VCAN
+
+PACE = 5.0
+BACK_WITHIN_S = 2.0
+"""1 s of heartbeat time, and what the device's tick and reading it all back by SDO take on a slow machine."""
+STAGES: dict[str, dict[str, Any]] = {
+    "baseline": {},
+    "relay": {"baseline": False},
+    "ultimate": {"baseline": False},
+    "zn_pi": {"baseline": False, "start": "zn_pi", "Ku": 205.0, "Pu_s": 3.32},
+    "verify": {"baseline": False, "start": "optimise", "model": {"K": 0.02, "T_s": 2.0, "L_s": 1.0}},
+}
+"""How to come to each stage soon."""
+MORE_LOOPS = (
+    {"tag": "NO-BUS", "bus": "socketcan:vcan9"},
+    {"tag": "ABSENT", "controller_node": 0x55},
+    {"tag": "OTHER-TIME", "controller_node": 0x21, "channel": 2},
+    {"tag": "DIRECT", "controller_node": 0x21, "plant_node": 0x11},
+)
+
+
+@pytest.fixture(scope="module")
+def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plantsite]:
+    with ExitStack() as stack:
+        yield Plantsite(stack, tmp_path_factory.mktemp("site"), MODEL_14, MORE_LOOPS)
+
+
+@pytest.fixture
+def here(processes: Plantsite) -> Plantsite:
+    """The shared processes, at rest."""
+    if processes.service.poll() is not None:
+        processes.serve()
+    for name, value in (
+        ("plant_noise", 0.0),
+        ("plant_disturbance", 0.0),
+        ("controller_setpoint", MODEL_14.sp),
+        ("plant_pace", 0.0),
+        ("plant_samples_to_run", FOREVER),
+    ):
+        processes.write(name, value)
+    deadline = time.monotonic() + 30
+    near = 0
+    while near < 5:
+        assert time.monotonic() < deadline, processes.state()
+        near = near + 1 if abs(processes.state().pv - MODEL_14.sp) < 2e-4 else 0
+        time.sleep(0.05)
+    processes.write("plant_pace", PACE)
+    assert processes.is_home()
+    return processes
+
+
+def in_stage(here: Plantsite, stage: str, **options: Any) -> str:
+    """A job in the middle of this stage: the loop is no longer as it was."""
+    url = here.retune(**options)
+    here.until(url, lambda job: job["stage"] == stage)
+    deadline = time.monotonic() + 10
+    while here.is_home() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    job = here.job(url)
+    assert (job["state"], job["stage"]) == ("running", stage)
+    return url
+
+
+def ended(here: Plantsite, url: str) -> tuple[str, str]:
+    job = here.finished(url)
+    assert job["advice"] and job["detail"]
+    return job["state"], job["reason"]
+
+
+def test_a_foreign_setpoint_stays(here: Plantsite) -> None:
+    url = in_stage(here, "baseline")
+    here.write("controller_setpoint", 50.03)
+    assert ended(here, url) == ("aborted", "setpoint_changed")
+    assert here.is_home(sp=50.03)
+
+
+def test_a_mode_changed_by_another(here: Plantsite) -> None:
+    url = in_stage(here, "baseline")
+    here.write("controller_mode_command", Mode.MANUAL)
+    assert ended(here, url) == ("aborted", "mode_changed")
+    assert here.is_home()
+
+
+def test_pv_at_its_limit(here: Plantsite) -> None:
+    assert ended(here, here.retune(pv_high=50.05)) == ("failed", "pv_limit")
+    assert here.is_home()
+
+
+def test_noise_too_high(here: Plantsite) -> None:
+    here.write("plant_noise", 0.05)
+    assert ended(here, here.retune()) == ("refused", "noise_too_high")
+    assert here.is_home()
+
+
+def test_not_at_rest(here: Plantsite) -> None:
+    here.write("plant_pace", 2.0)
+    url = here.retune()
+    here.until(url, lambda job: job["state"] == "running" and job["stage"] == "preflight")
+    here.write("plant_disturbance", 10.0)
+    assert ended(here, url) == ("refused", "not_at_rest")
+    assert here.is_home()
+
+
+def test_mv_without_room(here: Plantsite) -> None:
+    assert ended(here, here.retune(mv_low=49.9, mv_high=60)) == ("refused", "saturated")
+    assert here.is_home()
+
+
+def test_what_is_refused_at_once(here: Plantsite) -> None:
+    unknown = here.http.post("/loops/NOBODY/retune", json={})
+    contradicting = here.http.post(f"/loops/{TAG}/retune", json={"mv_low": 60, "mv_high": 40})
+    nan = here.http.post(
+        f"/loops/{TAG}/retune", content='{"sp_deviation": NaN}', headers={"content-type": "application/json"}
+    )
+    assert [answer.status_code for answer in (unknown, contradicting, nan)] == [404, 422, 422]
+    assert contradicting.json()["reason"] == "bad_limits" and nan.json()["reason"] == "bad_input"
+    assert {a.headers["content-type"] for a in (unknown, contradicting, nan)} == {"application/problem+json"}
+    assert here.is_home()
+
+
+def test_no_such_bus_and_no_such_node(here: Plantsite) -> None:
+    here.write("plant_samples_to_run", 0)  # the tuner's SDO time-out needs a gap of 50 ms between frames
+    jobs = here.retune("NO-BUS"), here.retune("ABSENT")
+    assert [ended(here, url) for url in jobs] == [("failed", "bus_lost"), ("failed", "node_lost")]
+    assert here.is_home()
+
+
+def test_nan_by_sdo_is_refused_and_the_loop_goes_on(here: Plantsite) -> None:
+    for name in ("controller_setpoint", "controller_staged_kp"):
+        with pytest.raises(TunerError) as refused:
+            here.write(name, math.nan)
+        assert refused.value.kind is Kind.ABORT and refused.value.code == 0x06090030
+    assert here.is_home()
+    before = here.read("sample_number")
+    time.sleep(0.5)
+    assert here.read("sample_number") > before and here.state().pv == pytest.approx(50.0, abs=1e-3)
+
+
+def test_a_plant_that_falls_silent(here: Plantsite) -> None:
+    url = in_stage(here, "baseline")
+    os.kill(here.plant.pid, signal.SIGSTOP)
+    try:
+        assert ended(here, url) == ("failed", "node_lost")
+        assert here.is_home()
+    finally:
+        os.kill(here.plant.pid, signal.SIGCONT)
+
+
+def test_busy_then_aborted_by_the_operator(here: Plantsite) -> None:
+    url = in_stage(here, "baseline")
+    busy = here.http.post(f"/loops/{TAG}/retune", json={})
+    assert busy.status_code == 409 and busy.json()["job"] == url
+    assert here.http.post(f"{url}/abort").status_code == 202
+    assert ended(here, url) == ("aborted", "operator")
+    assert here.is_home()
+
+
+def test_sigterm_of_the_service(here: Plantsite) -> None:
+    url = in_stage(here, "relay", **STAGES["relay"])
+    here.service.stop()
+    assert here.is_home()
+    here.serve()
+    assert ended(here, url) == ("aborted", "service_stopped")
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_kill_9_of_the_service_leaves_the_controller_to_itself(here: Plantsite, stage: str) -> None:
+    url = in_stage(here, stage, **STAGES[stage])
+    here.service.kill()
+    deadline = time.monotonic() + BACK_WITHIN_S
+    while not here.is_home() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert here.is_home()
+    here.serve()
+    assert ended(here, url) == ("interrupted", "service_stopped")
+
+
+def test_sample_times_that_differ_and_a_wrong_action(here: Plantsite) -> None:
+    """A second pair beside the first, whose plant is held."""
+    here.write("plant_samples_to_run", 0)
+    own = ("--bus", BUS, "--ts", "0.05", "--node")
+    controller = here.launch(
+        "direct", "controller", *own, "0x21", "--plant-node", "0x11", "--channels", "2",
+        "--kp", "80", "--ti", "1.2", "--direct",
+    )  # fmt: skip
+    controller.wait_ready()
+    plant = here.launch(
+        "plant2", "plantsim", *own, "0x11", "--controller-node", "0x21", "--model", MODEL_14.model, "--speed", "max"
+    )
+    plant.wait_ready()
+    try:
+        url = here.retune("OTHER-TIME")
+        assert ended(here, url) == ("refused", "device_mismatch")
+        detail = here.job(url)["detail"]
+        assert "0.02 s" in detail and "0.05 s" in detail
+        assert here.is_home()
+        url = here.retune("DIRECT", baseline=False)
+        assert ended(here, url) == ("refused", "wrong_sign")
+    finally:
+        plant.stop()
+        controller.stop()
+
+
+def test_a_controller_that_dies(here: Plantsite) -> None:
+    """The last one: there is no controller after it."""
+    url = in_stage(here, "baseline")
+    here.controller.kill()
+    state, reason = ended(here, url)
+    assert state == "failed" and reason in ("node_lost", "samples_lost")
