@@ -126,6 +126,6 @@ def _tell(job: dict[str, Any], seconds: float, folder: Path, picture: Path) -> N
         f"picture          {picture}",
         f"jobs, samples    {folder / 'data' / 'loopwright.sqlite'}",
         f"configuration    {folder / 'loops.yaml'}",
-        "next             loopwright serve --loops loops.yaml, then http://127.0.0.1:8080/docs; and docs/",
+        'next             README.md, "The service and its REST API": the same by hand; docs/one-job.md: how it works',
     ]
     show.console.print("\n".join(lines), highlight=False, soft_wrap=True)

@@ -39,14 +39,14 @@ class Reason(StrEnum):
     BAD_SAMPLE = "bad_sample"
     SAMPLES_LOST = "samples_lost"
     PV_FROZEN = "pv_frozen"
-    SETPOINT_CHANGED = "setpoint_changed"
-    MODE_CHANGED = "mode_changed"
     NODE_LOST = "node_lost"
     BUS_LOST = "bus_lost"
     DEVICE_WENT_BACK = "device_went_back"
     RESTORE_UNCONFIRMED = "restore_unconfirmed"
     INTERNAL = "internal"
-    # aborted, interrupted
+    # aborted: by another's hand on the loop, on request, or with the service
+    SETPOINT_CHANGED = "setpoint_changed"
+    MODE_CHANGED = "mode_changed"
     OPERATOR = "operator"
     SERVICE_STOPPED = "service_stopped"
 
@@ -58,7 +58,8 @@ ADVICE: dict[Reason, str] = {
     Reason.WRONG_MODE: "Put the loop in automatic with working gains before retuning.",
     Reason.WRONG_SIGN: "Check the controller's action (direct/reverse) against the sign of the plant's gain.",
     Reason.NO_RESPONSE: "PV did not answer MV: check the valve, the sensor and that the right loop is selected.",
-    Reason.CANNOT_OSCILLATE: "The plant has too little dead time for an ultimate point; use a model-based rule.",
+    Reason.CANNOT_OSCILLATE: "The plant has next to no dead time, or the sampling is too slow to see it "
+    "(22 samples a period at least): sample faster, or use a model-based rule.",
     Reason.SAMPLING_TOO_SLOW: "Choose a sample time of at most a fiftieth of the ultimate period.",
     Reason.NO_BRACKET: "The ultimate gain was not found within a factor 8 of the relay's estimate; "
     "check for backlash, sticking or another loop acting on this one.",

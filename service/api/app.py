@@ -73,8 +73,10 @@ def create_app(jobs: Jobs) -> FastAPI:
         status_code=202,
         responses=problems.responses(404, 409, 422, 503),
     )
-    def retune(tag: Tag, request: Request, response: Response, options: Annotated[RetuneRequest, Body()]) -> JobView:
-        row = jobs.start(tag, options)
+    def retune(
+        tag: Tag, request: Request, response: Response, options: Annotated[RetuneRequest | None, Body()] = None
+    ) -> JobView:
+        row = jobs.start(tag, options or RetuneRequest())
         response.headers["Location"] = str(request.url_for("job", job_id=row.id).path)
         return view(row)
 
