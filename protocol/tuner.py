@@ -148,7 +148,8 @@ class Tuner:
         give_up = time.monotonic() + timeout_s
         while not self._samples:
             self.heartbeat()
-            if not self._receive(_WAIT_S) and time.monotonic() >= give_up:
+            wait = _WAIT_S if time.monotonic() < give_up else 0.0  # then only what is here already
+            if not self._receive(wait) and time.monotonic() >= give_up:
                 return None
         return self._samples.popleft()
 
@@ -269,7 +270,8 @@ class Tuner:
                 if can_id == wanted and len(data) == 8:
                     return data
             self.heartbeat()
-            if not self._receive(_WAIT_S) and time.monotonic() >= give_up:
+            wait = _WAIT_S if time.monotonic() < give_up else 0.0  # then only what is here already
+            if not self._receive(wait) and time.monotonic() >= give_up:
                 return None
 
 
