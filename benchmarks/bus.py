@@ -58,9 +58,16 @@ def bare_controller() -> None:
 
 
 def bare_samples_per_s() -> float:
-    """This process is the plant: SYNC, PV, and wait for MV."""
+    """In a process of its own: it gives up priority as the plant device does at full speed, for good."""
+    command = [sys.executable, "-m", "benchmarks.bus", "bare-plant"]
+    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def bare_plant() -> float:
+    """SYNC, PV, and wait for MV; samples/s."""
     can = bare_socket(IDS.mv)
     with process("benchmarks.bus", "bare-controller"):
+        os.nice(10)
         number = 0
         start = now = time.perf_counter()
         while now - start < INTERVAL_S:
@@ -233,5 +240,7 @@ def run() -> dict[str, object]:
 if __name__ == "__main__":
     if sys.argv[1:] == ["bare-controller"]:
         bare_controller()
+    elif sys.argv[1:] == ["bare-plant"]:
+        print(bare_plant())
     else:
         print(json.dumps(run(), indent=1))

@@ -3,7 +3,7 @@
 A P controller, a set-point step, and the question whether the oscillation grows or dies. Each gain's growth per period
 is fitted (tuning.oscillation); the sign tables of the print become a bracket, and the next gain comes from the
 measured growth (false position on ln K, kept inside the bracket) instead of a sweep: the same end, a gap below 1 %, in
-about five runs, and without trying gains far above Ku on the plant.
+two to five runs, and without trying gains far above Ku on the plant.
 """
 
 from __future__ import annotations
