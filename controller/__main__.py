@@ -5,10 +5,14 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 from controller.channel import Settings
 from controller.device import ControllerChannel, ControllerDevice
+from controller.memory import KeptError, keep, remembered
 from controller.pid import Parameters
 from protocol.process import ConfigError, node_id, read_channels, run_device
 from protocol.profile import CONTROLLER_NODE, PLANT_NODE, Mode
@@ -38,14 +42,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         rows = read_channels(options.config, common) if options.config else [{}] * options.channels
         channels = [_channel({**common, **row}) for row in rows]
-    except (ConfigError, KeyError, TypeError, ValueError) as error:
+        kept = remembered(options.keep, len(channels)) if options.keep else None
+        if kept:
+            channels = [replace(one, parameters=own) for one, own in zip(channels, kept, strict=True)]
+    except (ConfigError, KeptError, KeyError, TypeError, ValueError) as error:
         print(f"controller: {error.args[0]}", file=sys.stderr)
         return 2
     return run_device(
         "controller",
         options.bus,
-        lambda bus: ControllerDevice(bus, channels, options.ts, options.node, options.plant_node),
-        f"node {options.node:#04x} on {options.bus}: {len(channels)} channel(s), Ts {options.ts:g} s",
+        lambda bus: ControllerDevice(
+            bus,
+            channels,
+            options.ts,
+            options.node,
+            options.plant_node,
+            keep=partial(keep, options.keep) if options.keep else lambda accepted: None,
+        ),
+        f"node {options.node:#04x} on {options.bus}: {len(channels)} channel(s), Ts {options.ts:g} s"
+        + (f", accepted gains from {options.keep}" if kept else ""),
     )
 
 
@@ -75,6 +90,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--bus", required=True, metavar="URL", help="socketcan:vcan0, socketcand:HOST:PORT, ...")
     parser.add_argument("--channels", type=int, default=1, metavar="N", help="that many, all alike")
     parser.add_argument("--config", metavar="FILE", help="YAML list of channels, with the names of these options (_)")
+    parser.add_argument("--keep", type=Path, metavar="FILE", help="keeps accepted gains over a restart")
     parser.add_argument("--ts", type=float, default=0.1, metavar="S", help="sample time, process seconds")
     for name, (default, text) in _NUMBERS.items():
         option = f"--{name.replace('_', '-')}"

@@ -212,7 +212,10 @@ class Channel:
         self.experiment_state = ExperimentState.RUNNING
 
     def renew_lease(self, samples: int) -> None:
-        """samples > 0: that many are paid for, and a session opens if none is open; 0 closes it without going back."""
+        """samples > 0: that many are paid for, and a session opens if none is open.
+
+        0 closes the session: trial and experiment end with it, mode, set-point and manual output stay as they are.
+        """
         if samples < 0:
             raise ValueError("a lease must not be negative")
         if samples and self._session is None:
@@ -220,6 +223,12 @@ class Channel:
             self._session = _Latched(mode, self._setpoint, self._manual_output)
         if not samples:
             self._session = None
+            if self._mode is Mode.EXPERIMENT:
+                self.experiment_state = ExperimentState.DONE
+                self._enter(self._mode_after_relay)
+            if self.on_trial:
+                self.on_trial = False
+                self._use(self.accepted)
         self._lease = samples
 
     def go_back(self, cause: Cause) -> None:

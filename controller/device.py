@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -63,7 +64,10 @@ _Status = tuple[Mode, bool, float]
 
 
 class ControllerDevice:
-    """pv_timeout_s: wall time without a PV after which EMCY 8250h is sent; default 3 samples, at least 1 s."""
+    """pv_timeout_s: wall time without a PV after which EMCY 8250h is sent; default 3 samples, at least 1 s.
+
+    keep: called with the accepted sets whenever one changes; what raises OSError there is not accepted.
+    """
 
     def __init__(
         self,
@@ -74,7 +78,9 @@ class ControllerDevice:
         plant_node: int = PLANT_NODE,
         pv_timeout_s: float | None = None,
         clock: Callable[[], float] = time.monotonic,
+        keep: Callable[[Sequence[Parameters]], None] = lambda accepted: None,
     ) -> None:
+        self._keep = keep
         count = len(channels)
         self._sample_time_s = sample_time_s
         self._pv_timeout_s = pv_timeout_s or max(_SHORTEST_PV_TIMEOUT_S, _PV_TIMEOUT_SAMPLES * sample_time_s)
@@ -284,6 +290,13 @@ class ControllerDevice:
         elif value == ParameterCommand.TRY:
             channel.try_staged()
         else:
+            sets = [each.accepted for each in self.channels]
+            sets[sub - 1] = channel.in_effect
+            try:
+                self._keep(sets)
+            except OSError as error:
+                print(f"controller: channel {sub} not accepted, it could not be kept: {error}", file=sys.stderr)
+                raise SdoAbort(Abort.NOT_STORED) from error
             channel.accept()
 
     def _write_lease(self, sub: int, value: Value) -> None:

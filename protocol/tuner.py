@@ -50,6 +50,7 @@ ABORT_TEXT = {
     Abort.TOO_LOW: "below the limit",
     Abort.MAXIMUM_BELOW_MINIMUM: "maximum below minimum",
     Abort.GENERAL: "general error",
+    Abort.NOT_STORED: "the device could not store it",
     Abort.DEVICE_STATE: "not in the present state of the device",
 }
 

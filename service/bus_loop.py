@@ -76,6 +76,7 @@ class BusLoop:
         self._silence_s = SILENCE_S
         self._lease = SHORTEST_LEASE
         self._until_renewal = 0
+        self._mode_found: Mode | None = None
         self._first_n: int | None = None
         self._last_n = 0
 
@@ -102,6 +103,7 @@ class BusLoop:
                 tuner.emergencies.clear()
                 tuner.restarted = False
                 self._until_renewal = self._lease // 3
+                self._mode_found = state.mode
                 self._first_n, self._left = None, 0
                 self._commands.clear()
                 return state
@@ -297,13 +299,13 @@ class BusLoop:
 
     def _bring_back(self, state: LoopState) -> LoopState:
         with self._translated() as tuner:
+            if state.mode is not self._mode_found and tuner.number("controller_mode") == state.mode:
+                tuner.write("controller_lease", 0)  # ends the trial; their mode and output stay
             tuner.write("controller_parameter_command", ParameterCommand.GO_BACK)
             if not _same_gains(_gains(tuner, "accepted"), state.gains):
                 self._make_accepted(tuner, state.gains)
             tuner.write("controller_setpoint", state.sp)
             tuner.write("controller_mode_command", state.mode)
-            if state.mode is Mode.MANUAL:
-                tuner.write("controller_manual_output", state.mv)
             tuner.write("controller_lease", 0)
             found = self._state(tuner)
         differences = [

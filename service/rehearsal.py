@@ -48,6 +48,7 @@ class RehearsedLoop:
         self._channel = channel
         self._dt = sample_time_s
         self._n = 0
+        self._mode_found: Mode | None = None
         self._pv = plant.pv
 
     def read(self) -> LoopState:
@@ -67,6 +68,7 @@ class RehearsedLoop:
 
     def begin(self) -> LoopState:
         state = self.read()
+        self._mode_found = state.mode
         self._channel.renew_lease(LEASE_SAMPLES)
         return state
 
@@ -100,8 +102,11 @@ class RehearsedLoop:
                 channel.start_relay(amplitude, hysteresis, working, parallel, 10**9, low, high)
 
     def restore(self, state: LoopState) -> LoopState:
+        if int(self._channel.mode) == state.mode != self._mode_found:
+            self._channel.renew_lease(0)
         self._channel.go_back(Cause.COMMAND)
         self._channel.setpoint = state.sp
+        self._channel.command_mode(int(state.mode))
         return self.read()
 
     def accept(self, gains: Gains) -> LoopState:

@@ -75,6 +75,7 @@ class Guard:
         self._frozen_at = 0.0
         self._notable = 1e-3 * abs(state.mv_high - state.mv_low)
         self.foreign_setpoint: float | None = None
+        self.foreign_mode: Mode | None = None
 
     def commanded(self, commands: Sequence[Command]) -> None:
         for command in commands:
@@ -107,6 +108,8 @@ class Guard:
                 self.foreign_setpoint = sp
                 raise Aborted(Reason.SETPOINT_CHANGED, f"at {t:.3f} s the set-point is {sp:.6g}, not {self._sp:.6g}")
             if mode != self._mode:
+                if mode in (Mode.OFF, Mode.MANUAL, Mode.AUTOMATIC):
+                    self.foreign_mode = Mode(mode)
                 raise Aborted(Reason.MODE_CHANGED, f"at {t:.3f} s the mode is {_mode(mode)}, not {_mode(self._mode)}")
         if pv != self._pv:
             self._frozen_at, self._pv, self._mv = t, pv, mv
@@ -189,8 +192,11 @@ def run(
     clock("")
     if state is not None:
         home = state
-        if guard is not None and guard.foreign_setpoint is not None:
-            home = replace(state, sp=guard.foreign_setpoint)  # another's hand on the set-point has the last word
+        if guard is not None:  # another's hand on the loop has the last word
+            if guard.foreign_setpoint is not None:
+                home = replace(home, sp=guard.foreign_setpoint)
+            if guard.foreign_mode is not None:
+                home = replace(home, mode=guard.foreign_mode)
         try:
             result.restored = loop.restore(home)
         except Ended as ended:

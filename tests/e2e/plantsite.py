@@ -49,7 +49,7 @@ class Case:
 
 MODEL_14 = Case("model-14", 0.02, 80.0, 1.2, 50.0, (49.0, 51.0), 9.1, 0.1, 205.0, 3.32)
 MODEL_41 = Case("model-41", 0.1, 20.0, 12.0, 50.0, (49.0, 51.0), 25.0, 0.1, 118.77, 17.719)
-REACTOR = Case("reactor", 0.25, 0.5, 30.0, 49.2838831323648137, (30.0, 70.0), 100.0, 1.0, 1.529, 42.5)
+REACTOR = Case("reactor", 0.25, 0.5, 30.0, 49.2838831323648137, (30.0, 70.0), 31.8, 1.0, 1.529, 42.5)
 
 
 class Plantsite:
@@ -59,13 +59,18 @@ class Plantsite:
         self.case = case
         self._stack, self._folder, self._more_loops = stack, folder, more_loops
         ts = str(case.ts)
-        gains = ("--kp", str(case.kp), "--ti", str(case.ti), "--sp", str(case.sp))
-        self.controller = self.launch("controller", "controller", "--bus", BUS, "--channels", "1", "--ts", ts, *gains)
+        self.start_controller()
         self._service = self._launch_service()
         self.controller.wait_ready()
         self.plant = self.launch("plant", "plantsim", "--bus", BUS, "--model", case.model, "--ts", ts, "--speed", "max")
         self.plant.wait_ready()
         self._connect()
+
+    def start_controller(self) -> None:
+        case = self.case
+        gains = ("--kp", str(case.kp), "--ti", str(case.ti), "--sp", str(case.sp))
+        kept = ("--keep", str(self._folder / "kept.json"))
+        self.controller = self.launch("controller", "controller", "--bus", BUS, "--ts", str(case.ts), *gains, *kept)
 
     def launch(self, name: str, *arguments: str) -> Process:
         """Starts a process and does not wait for it."""

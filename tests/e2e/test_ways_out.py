@@ -100,6 +100,11 @@ def test_a_mode_changed_by_another(here: Plantsite) -> None:
     url = in_stage(here, "baseline")
     here.write("controller_mode_command", Mode.MANUAL)
     assert ended(here, url) == ("aborted", "mode_changed")
+    state = here.state()
+    assert (state.mode, state.sp, state.on_trial) == (Mode.MANUAL, here.case.sp, False)
+    assert state.gains.Kp == here.case.kp
+    assert here.read("controller_mv") == here.read("controller_manual_output") == state.mv
+    here.write("controller_mode_command", Mode.AUTOMATIC)
     assert here.is_home()
 
 

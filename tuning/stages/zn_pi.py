@@ -46,7 +46,10 @@ def zn_pi(
     while True:
         gains = Gains(Kp=Kp, Ti=Ti)
         commands = (SetGains(gains), SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp))
-        yield from settle(point.sp, 0.02 * step, facts.T95_s / 5, 3 * facts.T95_s, point.noise, commands)
+        # a remnant of the last movement adds to the overshoot: a whole period of rest, whatever T95 was stated
+        stay_s = max(facts.T95_s / 5, Pu)
+        most_s = max(3 * facts.T95_s, 8 * Pu)
+        yield from settle(point.sp, 0.005 * step, stay_s, most_s, point.noise, commands)
         found = yield from step_test(
             facts, point, step, band=0.01, most_s=max(6 * facts.T95_s, 15 * Pu), smooth_s=Pu / 5
         )

@@ -196,14 +196,26 @@ def test_the_session_notes_the_loop_when_it_opens_not_when_it_is_renewed() -> No
     assert (c.mode, c.manual_output, c.step(49.0), c.cause) == (Mode.MANUAL, 45.0, 45.0, Cause.HEARTBEAT)
 
 
-def test_closing_the_session_changes_nothing() -> None:
+def test_closing_the_session_ends_the_trial_and_leaves_the_rest() -> None:
     c = channel(PI)
     c.renew_lease(100)
     trial(c)
+    mv = c.step(49.2)
     c.renew_lease(0)
     for _ in range(200):
-        c.step(49.2)
-    assert (c.mode, c.setpoint, c.in_effect, c.lease, c.cause) == (Mode.MANUAL, 53.0, PI2, 0, Cause.NONE)
+        assert c.step(49.2) == mv
+    assert (c.mode, c.setpoint, c.in_effect, c.lease, c.cause) == (Mode.MANUAL, 53.0, PI, 0, Cause.NONE)
+    assert not c.on_trial
+
+
+def test_closing_the_session_ends_an_experiment_without_a_bump() -> None:
+    c = channel(PI)
+    c.renew_lease(100)
+    relay(c)
+    mv = c.step(50.0)
+    c.renew_lease(0)
+    assert (c.mode, c.experiment_state) == (Mode.AUTOMATIC, ExperimentState.DONE)
+    assert c.step(50.0) == pytest.approx(mv)
 
 
 def test_the_next_session_notes_the_loop_as_it_is_then() -> None:

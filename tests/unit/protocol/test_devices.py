@@ -211,6 +211,18 @@ class TestSessions:
         assert rig.read("controller_accept_count") == 1
         assert rig.read("controller_on_trial") == 0
 
+    def test_what_cannot_be_kept_is_not_accepted(self, rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
+        def full(accepted: Sequence[Parameters]) -> None:
+            raise OSError("No space left on device")
+
+        rig.controller._keep = full
+        rig.run(1)
+        try_gains(rig)
+        assert rig.write("controller_parameter_command", ParameterCommand.ACCEPT) == Abort.NOT_STORED
+        assert (rig.read("controller_accepted_kp"), rig.read("controller_accept_count")) == (KP, 0)
+        assert rig.read("controller_on_trial") == 1
+        assert "No space left" in capsys.readouterr().err
+
     def test_a_lease_used_up(self, rig: Rig) -> None:
         rig.run(1)
         try_gains(rig, lease=5)

@@ -78,7 +78,6 @@ def test_success_gives_the_value_and_the_stage_times() -> None:
         (lambda s: s._replace(mv=math.inf), Reason.BAD_SAMPLE),
         (lambda s: s._replace(t=s.t + 1.0), Reason.SAMPLES_LOST),
         (lambda s: s._replace(pv=5.0), Reason.PV_LIMIT),
-        (lambda s: s._replace(mode=int(Mode.OFF)), Reason.MODE_CHANGED),
     ],
 )
 @pytest.mark.parametrize("plan", [trial, relay])
@@ -98,6 +97,24 @@ def test_the_set_point_that_somebody_else_gave_stays() -> None:
     assert result.ended is not None
     assert result.ended.reason is Reason.SETPOINT_CHANGED
     assert_home(loop, result, sp=0.7)
+
+
+@pytest.mark.parametrize("plan", [trial, relay])
+@pytest.mark.parametrize("mode", [Mode.OFF, Mode.MANUAL])
+def test_the_mode_that_somebody_else_chose_stays(mode: Mode, plan: Callable[[], Plan[Any]]) -> None:
+    def pressed(sample: Sample) -> Sample:
+        loop.channel.command_mode(int(mode))
+        return sample
+
+    loop = Meddled(100, pressed)
+    result = run(plan(), loop, watch=Watch())
+    assert result.ended is not None
+    assert result.ended.reason is Reason.MODE_CHANGED
+    state = loop.read()
+    assert result.restored == state
+    assert (state.mode, state.sp, state.gains, state.on_trial) == (mode, 0.0, OLD, False)
+    assert loop.channel.lease == 0
+    assert loop.step(()).mv == state.mv
 
 
 def test_a_frozen_pv_is_noticed_once_mv_has_moved() -> None:
