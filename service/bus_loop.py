@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
 from protocol.bus import BusError
@@ -22,7 +22,7 @@ from protocol.tuner import BusSample, Kind, Tuner, TunerError
 from service.loop import LoopState
 from tuning.gains import Gains
 from tuning.plan import Command, Mode, Sample, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
-from tuning.reasons import Ended, Failed, Reason, Refused
+from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 
 HEARTBEAT_WATCH_MS = 1000
 """Wall time without our heartbeat after which the controller goes back by itself."""
@@ -70,6 +70,7 @@ class BusLoop:
         self._tuner: Tuner | None = None
         self._held: threading.Lock | None = None
         self._in_blocks = False
+        self._pace = 1.0
         self._left = 0  # samples of the present block still to come
         self._commands: list[Command] = []
         self._sample_time_s = 0.0
@@ -86,17 +87,18 @@ class BusLoop:
         with self._translated() as tuner:
             return self._state(tuner)
 
-    def begin(self) -> LoopState:
+    def begin(self, stop: Callable[[], Reason | None] = lambda: None) -> LoopState:
         try:
             with self._translated() as tuner:
                 self._identify(tuner)
                 self._compare_times(tuner)
+                self._take_plant(tuner, stop)
                 self._watch_us(tuner)
                 self._take_time(tuner)
                 state = self._state(tuner)
                 if state.mode is Mode.EXPERIMENT:
                     raise Refused(Reason.WRONG_MODE, "an experiment is running in the controller")
-                self._plan_lease(tuner)
+                self._plan_lease()
                 tuner.write("controller_lease", self._lease)
                 tuner.drain()
                 tuner.mode, tuner.on_trial, tuner.sp = state.mode, state.on_trial, state.sp
@@ -193,31 +195,37 @@ class BusLoop:
         if tuner.number("controller_on_trial"):
             tuner.write("controller_parameter_command", ParameterCommand.GO_BACK)
 
+    def _take_plant(self, tuner: Tuner, stop: Callable[[], Reason | None]) -> None:
+        """Waits for its turn on a plant that is run in blocks; before anything of ours is armed in the controller."""
+        self._pace = tuner.number("plant_pace") if self._plant is not None else 1.0
+        self._in_blocks = self._pace == 0.0
+        if not self._in_blocks or self._plant is None:
+            return
+        with _plants_guard:
+            lock = _plants.setdefault((self._url, self._plant), threading.Lock())
+        while not lock.acquire(timeout=0.1):
+            if (reason := stop()) is not None:
+                raise Aborted(reason, f"while another test was using plant node {self._plant:02X}h")
+        self._held = lock
+
     def _take_time(self, tuner: Tuner) -> None:
         """Who drives the samples: the plant by its clock, or we in blocks."""
         self._sample_time_s = tuner.number("sample_time", node=self._node) / 1e6
-        pace = tuner.number("plant_pace") if self._plant is not None else 1.0
-        self._in_blocks = pace == 0.0
-        per_sample_s = self._sample_time_s / (pace or math.inf)
+        per_sample_s = self._sample_time_s / (self._pace or math.inf)
         self._silence_s = max(SILENCE_S, 3.0 * per_sample_s)
-        if self._in_blocks and self._plant is not None:
-            with _plants_guard:
-                lock = _plants.setdefault((self._url, self._plant), threading.Lock())
-            lock.acquire()
-            self._held = lock
+        if self._in_blocks:
             tuner.write("plant_samples_to_run", 0)
             while tuner.sample(0.03) is not None:
                 pass
         elif self._plant is not None and not tuner.number("plant_samples_to_run"):
             tuner.write("plant_samples_to_run", FOREVER)
 
-    def _plan_lease(self, tuner: Tuner) -> None:
+    def _plan_lease(self) -> None:
         """Samples we pay for at a time: some seconds of wall time, or some blocks."""
         if self._in_blocks:
             self._lease = 60 * self._block
             return
-        pace = tuner.number("plant_pace") if self._plant is not None else 1.0
-        self._lease = max(SHORTEST_LEASE, math.ceil(LEASE_WALL_S * pace / self._sample_time_s))
+        self._lease = max(SHORTEST_LEASE, math.ceil(LEASE_WALL_S * self._pace / self._sample_time_s))
 
     # -- on the way
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from tuning.gains import Gains
 from tuning.plan import Command, Mode, Sample
+from tuning.reasons import Reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +34,11 @@ class Loop(Protocol):
         """The present state, read from the controller. Raises Failed(NODE_LOST | BUS_LOST)."""
         ...
 
-    def begin(self) -> LoopState:
-        """Takes the lease: from here on the controller comes back by itself when we fall silent."""
+    def begin(self, stop: Callable[[], Reason | None] = lambda: None) -> LoopState:
+        """Takes the lease: from here on the controller comes back by itself when we fall silent.
+
+        stop: asked while another test holds the plant; what it returns ends the wait as Aborted.
+        """
         ...
 
     def step(self, commands: Sequence[Command]) -> Sample:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from service.loop import Loop, LoopState
 from tuning.gains import Gains
 from tuning.plan import Command, Mode, Sample, SetGains
+from tuning.reasons import Reason
 
 
 class ObservedLoop:
@@ -40,8 +41,8 @@ class ObservedLoop:
         self._state = self._loop.read()
         return self._state
 
-    def begin(self) -> LoopState:
-        self._state = self._loop.begin()
+    def begin(self, stop: Callable[[], Reason | None] = lambda: None) -> LoopState:
+        self._state = self._loop.begin(stop)
         return self._state
 
     def step(self, commands: Sequence[Command]) -> Sample:

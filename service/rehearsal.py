@@ -66,7 +66,7 @@ class RehearsedLoop:
             reverse_acting=channel.settings.reverse,
         )
 
-    def begin(self) -> LoopState:
+    def begin(self, stop: Callable[[], Reason | None] = lambda: None) -> LoopState:
         state = self.read()
         self._mode_found = state.mode
         self._channel.renew_lease(LEASE_SAMPLES)
@@ -250,7 +250,8 @@ def _loop(file: PlantFile) -> tuple[RehearsedLoop, Facts]:
 def _watch(facts: Facts, reach: float) -> Watch:
     """Wide PV limits: an unstable plant must end, but the test takes PV to several steps on purpose."""
     far = max(100 * facts.sp_deviation, 10 * reach)
-    return Watch(pv_low=-far, pv_high=far, max_time_s=500 * facts.T95_s, max_frozen_s=3 * facts.T95_s)
+    low, high = facts.mv_low, facts.mv_high
+    return Watch(-far, far, low, high, max_time_s=500 * facts.T95_s, max_frozen_s=3 * facts.T95_s)
 
 
 def _reach(file: PlantFile) -> float:

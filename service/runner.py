@@ -37,11 +37,14 @@ GRACE = 50
 
 @dataclass(frozen=True, slots=True)
 class Watch:
-    """PV limits (PV units), time budget (plant s), how many samples in a row may be missing, and for how long PV may
-    stay exactly the same while MV is away from where it was (plant s; longer than any dead time)."""
+    """PV limits (PV units), permitted MV (MV units, held from the first command on), time budget (plant s), how many
+    samples in a row may be missing, and for how long PV may stay exactly the same while MV is away from where it was
+    (plant s; longer than any dead time)."""
 
     pv_low: float = -math.inf
     pv_high: float = math.inf
+    mv_low: float = -math.inf
+    mv_high: float = math.inf
     max_time_s: float = math.inf
     max_gap_samples: int = 5
     max_frozen_s: float = math.inf
@@ -70,6 +73,8 @@ class Guard:
         self._start: float | None = None
         self._last = 0.0
         self._grace = GRACE
+        self._acting = False
+        self._slack = 0.01 * min(watch.mv_high - watch.mv_low, 1e300)
         self._pv = math.nan
         self._mv = math.nan
         self._frozen_at = 0.0
@@ -78,6 +83,7 @@ class Guard:
         self.foreign_mode: Mode | None = None
 
     def commanded(self, commands: Sequence[Command]) -> None:
+        self._acting = True
         for command in commands:
             if isinstance(command, SetSetpoint):
                 self._sp = command.value
@@ -97,6 +103,8 @@ class Guard:
         self._last = t
         if not watch.pv_low <= pv <= watch.pv_high:
             raise Failed(Reason.PV_LIMIT, f"PV {pv:.5g} left {watch.pv_low:.5g} .. {watch.pv_high:.5g} at {t:.3f} s")
+        if self._acting and not watch.mv_low - self._slack <= mv <= watch.mv_high + self._slack:
+            raise Failed(Reason.MV_LIMIT, f"MV {mv:.5g} left {watch.mv_low:.5g} .. {watch.mv_high:.5g} at {t:.3f} s")
         if t - self._start > watch.max_time_s:
             raise Failed(Reason.TIME_BUDGET, f"{t - self._start:.0f} s of plant time are over the budget")
         if self._grace:
@@ -149,7 +157,7 @@ def run(
         stage, since = next_stage, now
 
     try:
-        state = loop.begin()
+        state = loop.begin(stop)
         guard = Guard(watch, state)
         answer = next(plan)
         commands: list[Command] = []

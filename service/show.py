@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from rich.console import Console
@@ -41,8 +41,18 @@ def follow(client: Client, job_url: str) -> dict[str, Any]:
 
 def brief(result: dict[str, Any] | None) -> str:
     """The numbers of a stage's result on one line."""
-    plain = {key: value for key, value in (result or {}).items() if isinstance(value, int | float | str)}
-    return ", ".join(f"{key} {number(value)}" for key, value in plain.items())
+    return ", ".join(f"{key} {number(value)}" for key, value in _leaves(result or {}))
+
+
+def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, int | float | str]]:
+    if isinstance(value, dict):
+        for name, item in value.items():
+            yield from _leaves(item, name)
+    elif isinstance(value, list):
+        for item in value:
+            yield from _leaves(item, key)
+    elif isinstance(value, int | float | str):
+        yield key, value
 
 
 def number(value: object) -> str:

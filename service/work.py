@@ -68,6 +68,8 @@ def tune(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopStat
     watch = Watch(
         pv_low=config.pv_limits.low,
         pv_high=config.pv_limits.high,
+        mv_low=facts.mv_low,
+        mv_high=facts.mv_high,
         max_time_s=request.max_time_s or TIME_BUDGET_T95 * config.t95_s,
         max_frozen_s=FROZEN_T95 * config.t95_s,
     )

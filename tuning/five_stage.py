@@ -24,7 +24,7 @@ from tuning.robust import optimise
 from tuning.stages.common import Facts, OperatingPoint, settle, to_rest
 from tuning.stages.preflight import preflight
 from tuning.stages.relay import relay_test
-from tuning.stages.step_test import StepResult, step_test
+from tuning.stages.step_test import StepResult, step_test, unlimited
 from tuning.stages.ultimate import ultimate_gain
 from tuning.stages.zn_pi import allowed_step, zn_pi
 
@@ -136,7 +136,7 @@ def five_stage(facts: Facts, options: Options) -> Plan[Proposal]:
         "zn_pi": 4 * T95,
         "estimate": 0.0,
         "optimise": 0.0,
-        "verify": 4 * T95,
+        "verify": 6 * T95,
     }
     entered = STAGES.index(options.start)
     todo = [s for i, s in enumerate(STAGES) if s == "preflight" or i >= entered or s == "baseline"]
@@ -222,6 +222,11 @@ def _baseline(facts: Facts, point: OperatingPoint) -> Plan[StepResult]:
     """The set-point step under the accepted gains, for the comparison, and a first look at gain and sign."""
     step = allowed_step(facts, point, facts.old_gains.Kp, math.nan)
     result = yield from step_test(facts, point, step, band=0.05, most_s=5 * facts.T95_s, smooth_s=facts.T95_s / 12)
+    if abs(result.static_gain) * facts.old_gains.Kp > MOST_GAIN:
+        raise Refused(
+            Reason.NOT_SELF_REGULATING,
+            f"PV went {step:.4g} up and MV came back to where it was: that is a gain of {result.static_gain:.3g}",
+        )
     wrong = result.static_gain == result.static_gain and (result.static_gain > 0) != facts.reverse
     if wrong:
         raise Refused(
@@ -278,6 +283,7 @@ def _verified(
     commands = (SetGains(gains), SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp))
     yield from settle(point.sp, 0.02 * step, facts.T95_s / 5, 3 * facts.T95_s, point.noise, commands)
     result = yield from step_test(facts, point, step, band=0.05, most_s=5 * facts.T95_s, smooth_s=model.L_s / 2)
+    unlimited(facts, result, gains)
     most = max(40.0, predicted.overshoot_pct + 25.0)
     if not result.settled or result.overshoot_pct > most:
         raise Refused(
@@ -285,4 +291,6 @@ def _verified(
             f"under the new gains the loop {'settled' if result.settled else 'did not settle'} with an overshoot of "
             f"{result.overshoot_pct:.1f} % (predicted {predicted.overshoot_pct:.1f} %, at most {most:.0f} %)",
         )
+    # home under the new gains, so that the old ones take over a loop at rest
+    yield from settle(point.sp, 0.05 * step, facts.T95_s / 5, 3 * facts.T95_s, point.noise, (SetSetpoint(point.sp),))
     return result

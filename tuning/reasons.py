@@ -32,8 +32,8 @@ class Reason(StrEnum):
     BAD_LIMITS = "bad_limits"
     BAD_INPUT = "bad_input"
     DEVICE_MISMATCH = "device_mismatch"
-    # failed
     MV_LIMIT = "mv_limit"
+    # failed
     PV_LIMIT = "pv_limit"
     TIME_BUDGET = "time_budget"
     BAD_SAMPLE = "bad_sample"

@@ -63,17 +63,16 @@ def optimise(
     best: Reals = np.log(np.array([start.Kp, start.Ti]))
     while (J := cost(best)) >= UNSTABLE:
         best = best + np.array([math.log(0.7), 0.0])
-    size = 0.15
-    for _ in range(2):
-        # J has kinks where corners tie; a second, smaller simplex frees a search stuck on one
+    for size, xatol, fatol in ((0.15, 5e-4, 1e-5), (0.03, 5e-4, 1e-5), (0.004, 1e-5, 1e-8)):
+        # J has kinks where corners tie; a second, smaller simplex frees a search stuck on one, a third goes to its foot
         simplex = best + np.array([[0.0, 0.0], [size, 0.0], [0.0, size]])
         found = minimize(
             cost,
             best,
             method="Nelder-Mead",
-            options={"initial_simplex": simplex, "xatol": 5e-4, "fatol": 1e-5 * J, "maxfev": 200},
+            options={"initial_simplex": simplex, "xatol": xatol, "fatol": fatol * J, "maxfev": 200},
         )
-        best, J, size = np.asarray(found.x, dtype=float), float(found.fun), 0.03
+        best, J = np.asarray(found.x, dtype=float), float(found.fun)
     return Optimum(Gains(Kp=math.exp(best[0]), Ti=math.exp(best[1])), J, criterion.evaluations)
 
 

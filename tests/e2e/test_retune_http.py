@@ -39,7 +39,7 @@ def test_a_live_loop_is_retuned_and_the_change_taken_back(site: Callable[[Case],
     here.controller.kill()
     here.start_controller()
     here.controller.wait_ready()
-    assert here.state().gains.Kp == pytest.approx(job["new_gains"]["Kp"], rel=1e-6), "accepted gains outlive the process"
+    assert here.state().gains.Kp == pytest.approx(job["new_gains"]["Kp"], rel=1e-6)
     assert here.http.post(f"{url}/rollback").json()["state"] == "rolled_back"
     assert here.is_home()
 

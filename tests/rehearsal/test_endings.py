@@ -17,7 +17,8 @@ LAG = {"num": [2], "den": [5, 1], "dead_time_s": 1}
     [
         ({"num": [1], "den": [5, 1]}, "refused", {"cannot_oscillate"}),
         ({"num": [1], "den": [25, 10, 1]}, "refused", {"cannot_oscillate"}),
-        ({"num": [1], "den": [10, 0], "dead_time_s": 1}, "refused", {"not_at_rest", "not_self_regulating"}),
+        ({"num": [1], "den": [10, 0], "dead_time_s": 1}, "refused", {"not_self_regulating"}),
+        ({"num": [0.2], "den": [10, 1, 0], "dead_time_s": 3}, "refused", {"not_self_regulating"}),
         ({"num": [1], "den": [-5, 1], "dead_time_s": 1}, "failed", {"pv_limit"}),
         (LAG | {"noise_std": 0.1}, "refused", {"noise_too_high"}),
         (LAG | {"mv_limits": [-0.001, 0.5]}, "refused", {"saturated"}),

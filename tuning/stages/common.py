@@ -139,7 +139,9 @@ def to_rest(facts: Facts, point: OperatingPoint, band: float) -> Plan[None]:
     if not rested:
         away = float(np.mean(trace.pv[trace.tail(facts.T95_s / 5)])) - point.pv
         if abs(away) > max(0.2 * facts.sp_deviation, 2 * band):
-            raise Refused(
-                Reason.NOT_AT_REST,
-                f"held in manual at MV {point.mv:.4g}, PV stayed {away:+.4g} off {point.pv:.4g}: the load has moved",
-            )
+            moved = trace.pv[0] - point.pv
+            stayed = f"held in manual at MV {point.mv:.4g}, PV stayed {away:+.4g} off {point.pv:.4g}"
+            if away * moved > 0.5 * moved * moved > 0.5 * (0.2 * facts.sp_deviation) ** 2:
+                text = f"{stayed}, where the test had left it ({moved:+.4g}): it integrates, or the load has moved"
+                raise Refused(Reason.NOT_SELF_REGULATING, text)
+            raise Refused(Reason.NOT_AT_REST, f"{stayed}: the load has moved")

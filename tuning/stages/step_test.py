@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tuning.gains import Gains
 from tuning.plan import Plan, SetSetpoint
+from tuning.reasons import Reason, Refused
 from tuning.stages.common import Array, Facts, OperatingPoint, same, settle
 
 
@@ -16,7 +18,8 @@ class StepResult:
     """Figures of one measured set-point step.
 
     step: PV units.  overshoot_pct: of the step.  IAE: PV unit * s.  settling_s: into 5 % (or the noise) for good, s.
-    static_gain: PV units per MV unit, signed; nan when the step did not settle.  settled: within the time allowed.
+    static_gain: PV units per MV unit, signed; nan when the step did not settle, infinite when MV is back where it was.
+    mv_at_limit_s: how long MV was at the end of its permitted range.  settled: within the time allowed.
     """
 
     step: float
@@ -25,6 +28,7 @@ class StepResult:
     settling_s: float
     static_gain: float
     mv_span: float
+    mv_at_limit_s: float
     settled: bool
     duration_s: float
 
@@ -46,17 +50,36 @@ def step_test(
     tail = trace.tail(facts.T95_s / 5)
     change = float(mv[tail].mean()) - point.mv
     error = (target - pv) / step
+    hair = 1e-6 * (facts.mv_high - facts.mv_low)  # REAL32 on the bus
     outside = np.flatnonzero(np.abs(error) > 0.05 + 3 * point.noise / abs(step))
     return StepResult(
         step=step,
         overshoot_pct=100 * max(0.0, _peak(t, -error, smooth_s)),
         IAE=float(np.trapezoid(np.abs(target - pv), t)),
         settling_s=float(t[outside[-1]]) if len(outside) else 0.0,
-        static_gain=(float(pv[tail].mean()) - point.pv) / change if settled and change else math.nan,
+        static_gain=_ratio(float(pv[tail].mean()) - point.pv, change) if settled else math.nan,
         mv_span=float(np.ptp(mv)),
+        mv_at_limit_s=facts.sample_time_s * int(np.sum((mv <= facts.mv_low + hair) | (mv >= facts.mv_high - hair))),
         settled=settled,
         duration_s=float(t[-1]),
     )
+
+
+def unlimited(facts: Facts, result: StepResult, gains: Gains) -> None:
+    """Raises Refused when the limits of MV had a part in the response: it then says nothing about the loop.
+
+    A clipped kick of a sample or two leaves no mark on it.
+    """
+    if result.mv_at_limit_s > max(2.5 * facts.sample_time_s, 0.02 * gains.Ti):
+        raise Refused(
+            Reason.MV_LIMIT,
+            f"MV was at the end of its permitted range for {result.mv_at_limit_s:.3g} s of a set-point step of "
+            f"{result.step:.4g} with Kp {gains.Kp:.4g}",
+        )
+
+
+def _ratio(pv_change: float, mv_change: float) -> float:
+    return pv_change / mv_change if mv_change else math.inf
 
 
 def _peak(t: Array, y: Array, width: float) -> float:

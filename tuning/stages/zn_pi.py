@@ -11,7 +11,7 @@ from tuning.gains import Gains
 from tuning.plan import Mode, Note, Plan, SetGains, SetMode, SetSetpoint
 from tuning.reasons import Reason, Refused
 from tuning.stages.common import Facts, OperatingPoint, settle
-from tuning.stages.step_test import StepResult, step_test
+from tuning.stages.step_test import StepResult, step_test, unlimited
 
 MOST_STEPS = 12
 
@@ -53,6 +53,7 @@ def zn_pi(
         found = yield from step_test(
             facts, point, step, band=0.01, most_s=max(6 * facts.T95_s, 15 * Pu), smooth_s=Pu / 5
         )
+        unlimited(facts, found, gains)
         seen.append(found)
         tests += 1
         over = found.overshoot_pct

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -50,7 +50,7 @@ class FakeLoop:
             raise Failed(self._controller.absent, "node 32 does not answer")
         return self._controller.state
 
-    def begin(self) -> LoopState:
+    def begin(self, stop: Callable[[], Reason | None] = lambda: None) -> LoopState:
         return self.read()
 
     def step(self, commands: Sequence[Command]) -> Sample:

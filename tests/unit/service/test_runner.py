@@ -117,6 +117,21 @@ def test_the_mode_that_somebody_else_chose_stays(mode: Mode, plan: Callable[[], 
     assert loop.step(()).mv == state.mv
 
 
+def test_mv_beyond_what_the_job_permits_ends_the_run() -> None:
+    result = run(trial(), loop := Meddled(), watch=Watch(mv_low=-0.05, mv_high=0.08))
+    assert result.ended is not None
+    assert result.ended.reason is Reason.MV_LIMIT
+    assert_home(loop, result)
+
+
+def test_mv_is_not_judged_before_the_plan_has_commanded_anything() -> None:
+    def listen() -> Plan[str]:
+        yield ()
+        return "heard"
+
+    assert run(listen(), Meddled(), watch=Watch(mv_low=0.5, mv_high=0.6)).value == "heard"
+
+
 def test_a_frozen_pv_is_noticed_once_mv_has_moved() -> None:
     result = run(trial(), loop := Meddled(100, lambda s: s._replace(pv=0.0)), watch=Watch(max_frozen_s=10.0))
     assert result.ended is not None
