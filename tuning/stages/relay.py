@@ -1,8 +1,9 @@
 """Stage 1: relay test, rough ultimate gain and period.
 
 The relay runs inside the controller, centred on the present output. Ku_a = |U1| / |Y1| from the first harmonics of MV
-and PV over the last cycles: with an ideal relay this is the describing function 4d/(pi a), and it stays right with the
-parallel path, hysteresis and noise (the print's `max(P) - SP` does not).
+and PV over the last cycles: with an ideal relay this is the describing function 4d/(pi a), and it stays right with
+hysteresis and noise (the print's `max(P) - SP` does not). The print's parallel path, Ts/10 * e, is left out: its weight
+depends on the unit of PV, and on top of the relay it leaves the permitted range of MV.
 """
 
 from __future__ import annotations
@@ -36,8 +37,7 @@ def relay_test(facts: Facts, point: OperatingPoint) -> Plan[RelayResult]:
     """Raises Refused: WRONG_SIGN, NO_RESPONSE, CANNOT_OSCILLATE."""
     d = point.room
     hysteresis = 3 * point.noise
-    parallel = 0.2 * d * facts.sample_time_s  # the print: Ts/10, for a relay of +-0.5
-    sample = yield (SetRelay(d, hysteresis, point.mv, parallel), SetMode(Mode.EXPERIMENT))
+    sample = yield (SetRelay(d, hysteresis, point.mv), SetMode(Mode.EXPERIMENT))
     trace = Trace()
     start = sample.t
     ups: list[int] = []
