@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,8 +46,100 @@ class FOPDT:
 
 
 @dataclass(frozen=True, slots=True)
+class SOPDT:
+    """Second order plus dead time, K*exp(-L*s)/(T^2 s^2 + 2*zeta*T*s + 1); zeta < 1 has complex poles.
+
+    K: PV units per MV unit, either sign.  T: s, positive.  zeta: damping ratio, positive.  L: dead time, s, >= 0.
+    """
+
+    K: float
+    T: float
+    zeta: float
+    L: float
+
+    def __post_init__(self) -> None:
+        finite = bool(np.isfinite([self.K, self.T, self.zeta, self.L]).all())
+        if not (finite and self.K != 0.0 and self.T > 0.0 and self.zeta > 0.0 and self.L >= 0.0):
+            raise ValueError(f"not a model: K={self.K}, T={self.T} s, zeta={self.zeta}, L={self.L} s")
+
+    @classmethod
+    def of_time_constants(cls, K: float, T1: float, T2: float, L: float) -> SOPDT:
+        """K*exp(-L*s)/((T1*s + 1)(T2*s + 1)), both positive, s."""
+        if not (T1 > 0.0 and T2 > 0.0):
+            raise ValueError(f"time constants must be positive: T1={T1} s, T2={T2} s")
+        T = math.sqrt(T1 * T2)
+        return cls(K, T, (T1 + T2) / (2.0 * T), L)
+
+    @property
+    def T1(self) -> float:
+        """The larger real time constant, s; NaN for complex poles."""
+        return self._real(+1.0)
+
+    @property
+    def T2(self) -> float:
+        """The smaller real time constant, s; NaN for complex poles."""
+        return self._real(-1.0)
+
+    def _real(self, sign: float) -> float:
+        # two equal time constants give a zeta that is 1 but for rounding
+        root = self.zeta * self.zeta - 1.0
+        if root < -1e-12:
+            return math.nan
+        return self.T * (self.zeta + sign * math.sqrt(max(root, 0.0)))
+
+    @property
+    def num(self) -> tuple[float, ...]:
+        return (self.K,)
+
+    @property
+    def den(self) -> tuple[float, ...]:
+        return (self.T * self.T, 2.0 * self.zeta * self.T, 1.0)
+
+    @property
+    def static_gain(self) -> float:
+        return self.K
+
+    def frequency_response(self, w: Reals) -> Complexes:
+        """At angular frequencies w, rad/s."""
+        return _response(self.num, self.den, self.L, w)
+
+
+@dataclass(frozen=True, slots=True)
+class Integrating:
+    """K*exp(-L*s)/(s*(T*s + 1)): an integrating plant with dead time and perhaps a lag.
+
+    K: PV units per MV unit and second, either sign.  L: dead time, s, >= 0.  T: lag, s, >= 0.
+    """
+
+    K: float
+    L: float
+    T: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite([self.K, self.T, self.L]).all() and self.K != 0.0 and self.T >= 0.0 and self.L >= 0.0):
+            raise ValueError(f"not a model: K={self.K} per s, T={self.T} s, L={self.L} s")
+
+    @property
+    def num(self) -> tuple[float, ...]:
+        return (self.K,)
+
+    @property
+    def den(self) -> tuple[float, ...]:
+        return (self.T, 1.0, 0.0) if self.T > 0.0 else (1.0, 0.0)
+
+    @property
+    def static_gain(self) -> float:
+        """Infinite, with the sign of K."""
+        return math.copysign(math.inf, self.K)
+
+    def frequency_response(self, w: Reals) -> Complexes:
+        """At angular frequencies w > 0, rad/s."""
+        return _response(self.num, self.den, self.L, w)
+
+
+@dataclass(frozen=True, slots=True)
 class TransferFunction:
-    """num(s)/den(s)*exp(-L*s), coefficients from the highest power down; bi-proper allowed, static gain finite.
+    """num(s)/den(s)*exp(-L*s), coefficients from the highest power down; bi-proper and one pole at the origin allowed.
 
     L: dead time, s.
     """
@@ -61,22 +154,42 @@ class TransferFunction:
             object.__setattr__(self, name, tuple(float(c) for c in kept))
         if not self.num or len(self.den) < 2 or len(self.num) > len(self.den):
             raise ValueError("a transfer function needs a pole and a numerator no longer than its denominator")
-        if not (np.isfinite([*self.num, *self.den, self.L]).all() and self.den[-1] and self.num[-1] and self.L >= 0.0):
-            raise ValueError("coefficients must be finite, the static gain neither 0 nor infinite, the dead time >= 0")
+        finite = bool(np.isfinite([*self.num, *self.den, self.L]).all())
+        if not (finite and self.num[-1] and (self.den[-1] or self.den[-2]) and self.L >= 0.0):
+            raise ValueError("coefficients must be finite, num[-1] not 0, at most one pole at 0, the dead time >= 0")
 
     @property
     def static_gain(self) -> float:
+        """Infinite, with the sign of the slope, for a pole at the origin."""
+        if self.den[-1] == 0.0:
+            return math.copysign(math.inf, self.num[-1] * self.den[-2])
         return self.num[-1] / self.den[-1]
 
     def frequency_response(self, w: Reals) -> Complexes:
         """At angular frequencies w, rad/s."""
-        s = 1j * np.asarray(w, dtype=float)
-        return np.asarray(np.polyval(self.num, s) / np.polyval(self.den, s) * np.exp(-self.L * s))
+        return _response(self.num, self.den, self.L, w)
 
 
-Model = FOPDT | TransferFunction
+Model = FOPDT | SOPDT | Integrating | TransferFunction
 
 
 def time_constants(model: Model) -> Reals:
-    """1/|p| of every pole p, s."""
-    return np.asarray(1.0 / np.abs(np.roots(model.den)), dtype=float)
+    """1/|p| of every pole p but those at the origin, s."""
+    sizes = np.abs(np.roots(model.den))
+    return np.asarray(1.0 / sizes[sizes > 0.0], dtype=float)
+
+
+def integrators(model: Model) -> int:
+    """How many poles are at the origin."""
+    den = model.den
+    return len(den) - len(np.trim_zeros(np.asarray(den), "b"))
+
+
+def sign(model: Model) -> float:
+    """+1 when PV finally rises with MV, else -1."""
+    return math.copysign(1.0, model.num[-1] * np.trim_zeros(np.asarray(model.den), "b")[-1])
+
+
+def _response(num: tuple[float, ...], den: tuple[float, ...], L: float, w: Reals) -> Complexes:
+    s = 1j * np.asarray(w, dtype=float)
+    return np.asarray(np.polyval(num, s) / np.polyval(den, s) * np.exp(-L * s))

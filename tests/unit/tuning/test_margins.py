@@ -128,7 +128,7 @@ def test_against_python_control_without_dead_time() -> None:
         lambda: FOPDT(1.0, -1.0, 1.0),
         lambda: FOPDT(1.0, 1.0, math.nan),
         lambda: TransferFunction((1.0, 1.0, 1.0), (1.0, 1.0)),
-        lambda: TransferFunction((1.0,), (1.0, 0.0)),
+        lambda: TransferFunction((1.0,), (1.0, 0.0, 0.0)),
         lambda: TransferFunction((1.0,), (2.0,)),
     ],
 )
