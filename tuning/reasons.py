@@ -31,6 +31,7 @@ class Reason(StrEnum):
     NOT_CONFIRMED = "not_confirmed"
     BAD_LIMITS = "bad_limits"
     BAD_INPUT = "bad_input"
+    OUTSIDE_RANGE = "outside_range"
     DEVICE_MISMATCH = "device_mismatch"
     MV_LIMIT = "mv_limit"
     # failed
@@ -70,6 +71,8 @@ ADVICE: dict[Reason, str] = {
     Reason.NOT_CONFIRMED: "The loop did not behave as its model predicts: keep the present gains, and repeat.",
     Reason.BAD_LIMITS: "Correct the limits: low < present value < high, and enough room for the test on both sides.",
     Reason.BAD_INPUT: "Correct the value named in the message.",
+    Reason.OUTSIDE_RANGE: "The method is not made for this plant or value: choose another method, or what the message "
+    "says would be accepted.",
     Reason.DEVICE_MISMATCH: "The device is not the one the configuration describes; check node ids and firmware.",
     Reason.MV_LIMIT: "MV reached its limit during the test: permit more MV or a smaller set-point deviation.",
     Reason.PV_LIMIT: "PV reached its limit: permit less MV deviation, or widen the PV limits if it is safe.",

@@ -1,0 +1,134 @@
+"""The forms in which PID settings are written down, and the ISA form from each.
+
+    ISA          Kp (1 + 1/(Ti s) + Td s/(1 + Tf s))             `Gains`, used everywhere inside
+    parallel     Kp + Ki/s + Kd s/(1 + Tf s)                     the s-plane paper's C_i, see `of_ascending`
+    series       Kp (1 + 1/(Ti s)) (1 + Td s)/(1 + Tf s)         interacting; exists while both its zeros are real
+    reciprocal   Kp + 1/(Ti s)                                   the ME-PSO paper's PI: its Ti is 1/Ki, no time
+
+Set-point weights belong to the ISA controller; converted are the terms that act on the measurement.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from tuning.gains import Gains
+from tuning.reasons import Reason, Refused
+
+
+@dataclass(frozen=True, slots=True)
+class Parallel:
+    """Kp: MV per PV unit.  Ki: that per s.  Kd: that times s.  Tf: s."""
+
+    Kp: float
+    Ki: float = 0.0
+    Kd: float = 0.0
+    Tf: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Kp: MV per PV unit.  Ti, Td, Tf: s; Ti = 0: no integral action.  Td: the smaller of the two times."""
+
+    Kp: float
+    Ti: float = 0.0
+    Td: float = 0.0
+    Tf: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Reciprocal:
+    """Kp: MV per PV unit.  Ti: 1/Ki, PV unit * s per MV unit."""
+
+    Kp: float
+    Ti: float
+
+
+def to_parallel(gains: Gains) -> Parallel:
+    """Ki = Kp/Ti (0 for Ti = 0), Kd = Kp Td."""
+    _check_isa(gains)
+    Ki = gains.Kp / gains.Ti if gains.Ti > 0.0 else 0.0
+    return Parallel(gains.Kp, Ki, gains.Kp * gains.Td, gains.Tf)
+
+
+def of_parallel(form: Parallel) -> Gains:
+    """Ti = Kp/Ki, Td = Kd/Kp; refused for Kp = 0, which the ISA form cannot say."""
+    _check(positive={"Kp": form.Kp}, not_negative={"Ki": form.Ki, "Kd": form.Kd, "Tf": form.Tf})
+    return Gains(form.Kp, form.Kp / form.Ki if form.Ki > 0.0 else 0.0, form.Kd / form.Kp, form.Tf)
+
+
+def of_ascending(*C: float) -> Gains:
+    """The s-plane paper's coefficients: the numerator over s, (C0, C1) = (Kp, Ki), (C0, C1, C2) = (Kd, Kp, Ki)."""
+    if len(C) == 2:
+        return of_parallel(Parallel(C[0], C[1]))
+    if len(C) == 3:
+        return of_parallel(Parallel(C[1], C[2], C[0]))
+    raise Refused(Reason.BAD_INPUT, f"C must have 2 (PI) or 3 (PID) coefficients, not {len(C)}")
+
+
+def to_reciprocal(gains: Gains) -> Reciprocal:
+    """Ti/Kp; refused for a controller with derivative or without integral action."""
+    _check_isa(gains)
+    if gains.Td > 0.0 or gains.Ti == 0.0:
+        raise Refused(
+            Reason.BAD_INPUT, f"the reciprocal form is a PI: Ti > 0 and Td = 0, not {gains.Ti} s, {gains.Td} s"
+        )
+    return Reciprocal(gains.Kp, gains.Ti / gains.Kp)
+
+
+def of_reciprocal(form: Reciprocal) -> Gains:
+    """Ti = Kp times the form's Ti; refused for the pure integral controller Kp = 0."""
+    _check(positive={"Kp": form.Kp, "Ti": form.Ti})
+    return Gains(form.Kp, form.Kp * form.Ti)
+
+
+def to_series(gains: Gains) -> Series:
+    """The two times are the roots of x^2 - (Ti + Tf) x + Ti (Td + Tf); refused (outside_range) where they are complex,
+    without a filter for Ti < 4 Td."""
+    _check_isa(gains)
+    if gains.Td == 0.0 or gains.Ti == 0.0:
+        # without the integral the filter is one of the lead's two poles still: Kp (1 + (Td + Tf) s)/(1 + Tf s)
+        lead = gains.Td + gains.Tf if gains.Td > 0.0 else 0.0
+        return Series(gains.Kp, gains.Ti, lead, gains.Tf if gains.Td > 0.0 else 0.0)
+    total, product = gains.Ti + gains.Tf, gains.Ti * (gains.Td + gains.Tf)
+    root = total * total - 4.0 * product
+    if root < -1e-12 * total * total:
+        raise Refused(
+            Reason.OUTSIDE_RANGE,
+            f"no series form: its zeros are complex for Ti = {gains.Ti:g} s, Td = {gains.Td:g} s, Tf = {gains.Tf:g} s; "
+            "without a filter Ti >= 4 Td is accepted",
+        )
+    Ti = 0.5 * (total + math.sqrt(max(root, 0.0)))
+    return Series(gains.Kp * Ti / gains.Ti, Ti, product / Ti, gains.Tf)
+
+
+def of_series(form: Series) -> Gains:
+    """Ti + Td - Tf, (Ti - Tf)(Td - Tf)/(Ti + Td - Tf) and Kp (Ti + Td - Tf)/Ti; refused (outside_range) where a filter
+    too long leaves no setting."""
+    _check(positive={"Kp": form.Kp}, not_negative={"Ti": form.Ti, "Td": form.Td, "Tf": form.Tf})
+    if form.Ti == 0.0:
+        Kp, Ti, Td = form.Kp, 0.0, form.Td - form.Tf
+    else:
+        Ti = form.Ti + form.Td - form.Tf
+        Kp = form.Kp * Ti / form.Ti
+        Td = (form.Ti - form.Tf) * (form.Td - form.Tf) / Ti if Ti > 0.0 else -1.0
+    if Td < 0.0:
+        raise Refused(
+            Reason.OUTSIDE_RANGE,
+            f"no ISA form: Tf = {form.Tf:g} s must be shorter than Ti = {form.Ti:g} s and Td = {form.Td:g} s",
+        )
+    return Gains(Kp, Ti, Td, form.Tf)
+
+
+def _check_isa(gains: Gains) -> None:
+    _check(positive={"Kp": gains.Kp}, not_negative={"Ti": gains.Ti, "Td": gains.Td, "Tf": gains.Tf})
+
+
+def _check(positive: dict[str, float], not_negative: dict[str, float] | None = None) -> None:
+    for name, value in positive.items():
+        if not (math.isfinite(value) and value > 0.0):
+            raise Refused(Reason.BAD_INPUT, f"{name} must be a number > 0, not {value!r}")
+    for name, value in (not_negative or {}).items():
+        if not (math.isfinite(value) and value >= 0.0):
+            raise Refused(Reason.BAD_INPUT, f"{name} must be a number >= 0, not {value!r}")

@@ -1,0 +1,102 @@
+"""Skogestad's half rule: fewer lags, the rest as dead time.
+
+The largest lag that is left out is shared: one half goes to the smallest lag kept, the other to the dead time. The
+smaller lags, and the time constants of zeros in the right half-plane, go to the dead time whole. An integrator counts
+as the largest lag; what it would be given is nothing to it.
+
+Source: S. Skogestad, Simple analytic rules for model reduction and PID controller tuning, J. Process Control 13, 2003.
+The rule is for real poles. Zeros in the left half-plane are refused here: which lag they cancel is a choice.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import numpy as np
+
+from tuning.models import FOPDT, SOPDT, Complexes, Integrating, Model, TransferFunction
+from tuning.reasons import Reason, Refused
+
+REAL = 0.01
+"""A pole with |Im/p| below this is real: a pole of high multiplicity comes from its coefficients as a small ring."""
+
+
+def half_rule(model: Model, order: Literal[1, 2] = 1) -> FOPDT | SOPDT | Integrating:
+    """The model with `order` lags kept, an integrator being one of them; as it is if it has no more.
+
+    Refused (outside_range) for complex or unstable poles and for zeros in the left half-plane.
+    """
+    gain, integrates, lags, dead = _parts(model)
+    kept = order - 1 if integrates else order
+    if len(lags) > kept:
+        shared = lags[kept]
+        dead += 0.5 * shared + sum(lags[kept + 1 :])
+        lags = lags[:kept]
+        if lags:
+            lags[-1] += 0.5 * shared
+    if integrates:
+        return Integrating(gain, dead, lags[0] if lags else 0.0)
+    if len(lags) == 1:
+        return FOPDT(gain, lags[0], dead)
+    return SOPDT.of_time_constants(gain, lags[0], lags[1], dead)
+
+
+def exact(model: TransferFunction) -> Model:
+    """The same plant as FOPDT, SOPDT or Integrating where it is one, else as it is."""
+    if len(model.num) > 1 or len(model.den) > 3:
+        return model
+    a2, a1, a0 = (0.0,) * (3 - len(model.den)) + model.den
+    n = model.num[0]
+    if a0 == 0.0:
+        return Integrating(n / a1, model.L, a2 / a1) if a2 / a1 >= 0.0 else model
+    if a2 == 0.0:
+        return FOPDT(n / a0, a1 / a0, model.L) if a1 / a0 > 0.0 else model
+    if not (a2 / a0 > 0.0 and a1 / a0 > 0.0):
+        return model
+    T = math.sqrt(a2 / a0)
+    return SOPDT(n / a0, T, 0.5 * a1 / a0 / T, model.L)
+
+
+def _parts(model: Model) -> tuple[float, bool, list[float], float]:
+    """Gain (of an integrating plant, per s), whether it integrates, its lags from the largest down and its dead time,
+    s, with the zeros in it."""
+    if isinstance(model, FOPDT):
+        return model.K, False, [model.T], model.L
+    if isinstance(model, Integrating):
+        return model.K, True, [model.T] if model.T > 0.0 else [], model.L
+    if isinstance(model, SOPDT):
+        if math.isnan(model.T1):
+            raise _refused(f"the poles are complex (zeta = {model.zeta:.4g})")
+        return model.K, False, [model.T1, model.T2], model.L
+    integrates = model.den[-1] == 0.0
+    den = np.asarray(model.den[:-1] if integrates else model.den)
+    poles = np.roots(den)
+    if np.any(poles.real >= 0.0):
+        raise _refused("the plant is not stable")
+    if np.any(np.abs(poles.imag) > REAL * np.abs(poles)):
+        raise _refused("some poles are complex")
+    zeros = np.roots(model.num)
+    if np.any(zeros.real <= 0.0) or np.any(zeros.imag != 0.0):
+        raise _refused("some zeros are complex or in the left half-plane")
+    dead = model.L + float(np.sum(1.0 / zeros.real))
+    return model.num[-1] / float(den[-1]), integrates, _lags(np.asarray(poles, dtype=np.complex128)), dead
+
+
+def _lags(poles: Complexes) -> list[float]:
+    """-1/p from the largest down; the poles of a ring around a multiple pole all at its centre."""
+    lags = np.asarray(-1.0 / poles)
+    ring = np.zeros(len(lags), dtype=bool)
+    for i in np.flatnonzero(lags.imag > 0.0):
+        near = (np.abs(lags - lags[i]) < 3.0 * REAL * np.abs(lags[i])) & ~ring
+        if near[i]:
+            lags[near] = np.mean(lags[near].real)
+            ring |= near
+    return sorted((float(x) for x in lags.real), reverse=True)
+
+
+def _refused(why: str) -> Refused:
+    return Refused(
+        Reason.OUTSIDE_RANGE,
+        f"{why}: the half rule reduces plants with real stable poles and zeros in the right half-plane only",
+    )

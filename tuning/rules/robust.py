@@ -1,0 +1,19 @@
+"""The robust PI of the five-stage procedure as a rule: see `tuning.robust`, which says what is minimised."""
+
+from __future__ import annotations
+
+from tuning.models import FOPDT
+from tuning.robust import optimise
+from tuning.rules.common import needs_dead_time, positive, setting
+from tuning.setting import Setting
+
+
+def robust(model: FOPDT, *, horizon_s: float | None = None, scale_free: bool | None = None) -> Setting:
+    """horizon_s: length of the step response, s, by default 10 (T + L).  scale_free: by default for T < 5 s, where the
+    printed criterion depends on the unit of time."""
+    needs_dead_time(model, "the robust PI")
+    if horizon_s is None:
+        horizon_s = 10.0 * (model.T + model.L)
+    positive("horizon_s", horizon_s, "s")
+    found = optimise(model, horizon_s=horizon_s, scale_free=scale_free)
+    return setting(found.gains.Kp, found.gains.Ti, chosen={"horizon_s": horizon_s})

@@ -1,0 +1,40 @@
+"""Tyreus and Luyben: the ultimate cycle, well damped.
+
+    PI     Kp = Ku/3.2    Ti = 2.2 Pu
+    PID    Kp = Ku/2.2    Ti = 2.2 Pu    Td = Pu/6.3
+
+Sources: B. D. Tyreus, W. L. Luyben, Tuning PI controllers for integrator/dead time processes, Ind. Eng. Chem. Res. 31,
+1992; the PID: W. L. Luyben, M. L. Luyben, Essentials of process control, 1997. Made for plants that integrate or are
+dominated by their lag; the PI of variant "0.45", Ti = Pu/0.45, is what the ME-PSO paper's table was made with.
+"""
+
+from __future__ import annotations
+
+from tuning.margins import ultimate_point
+from tuning.models import Model
+from tuning.rules.common import one_of, positive, setting, stable_plant
+from tuning.setting import Setting
+
+CONTROLLERS = ("pi", "pid")
+VARIANTS = ("2.2", "0.45")
+
+
+def ultimate(Ku: float, Pu: float, *, controller: str = "pi", variant: str = "2.2") -> Setting:
+    """From the ultimate gain Ku (MV units per PV unit) and period Pu, s."""
+    one_of("controller", controller, CONTROLLERS)
+    one_of("variant", variant, VARIANTS)
+    positive("Ku", Ku, "MV units per PV unit")
+    positive("Pu", Pu, "s")
+    chosen = {"Ku": Ku, "Pu_s": Pu}
+    Ti = 2.2 * Pu if variant == "2.2" else Pu / 0.45
+    if controller == "pi":
+        return setting(Ku / 3.2, Ti, chosen=chosen)
+    return setting(Ku / 2.2, Ti, Pu / 6.3, chosen=chosen)
+
+
+def tyreus_luyben(model: Model, *, controller: str = "pi", variant: str = "2.2") -> Setting:
+    """From the model's own ultimate point; refused (cannot_oscillate) for a plant that has none."""
+    one_of("controller", controller, CONTROLLERS)
+    one_of("variant", variant, VARIANTS)
+    stable_plant(model, "Tyreus-Luyben")
+    return ultimate(*ultimate_point(model), controller=controller, variant=variant)

@@ -1,0 +1,28 @@
+"""The tangent at the steepest point of a step response: what the rules made on the reaction curve mean by L and T."""
+
+from __future__ import annotations
+
+import math
+
+from tuning.models import FOPDT, SOPDT
+from tuning.reasons import Reason, Refused
+
+
+def tangent(model: SOPDT) -> FOPDT:
+    """The tangent meets zero at L and the final value at L + T. Refused (outside_range) for complex poles, whose
+    response is no S.
+
+    With real T1 > T2 the steepest point is at t = T1 T2 ln(T1/T2)/(T1 - T2) after the dead time, T = T1 exp(t/T1), and
+    the area left, T1 + T2, gives L. Source: I. A. Polishchuk, 2023, its comparison methods.
+    """
+    T1, T2 = model.T1, model.T2
+    if math.isnan(T1):
+        raise Refused(
+            Reason.OUTSIDE_RANGE,
+            f"the poles are complex (zeta = {model.zeta:.4g}): a rule made on the reaction curve needs zeta >= 1",
+        )
+    x = T1 / T2 - 1.0
+    # ln(1 + x)/x by log1p: it goes to 1 smoothly as the lags become equal
+    t = T1 * (math.log1p(x) / x if x > 0.0 else 1.0)
+    T = T1 * math.exp(t / T1)
+    return FOPDT(model.K, T, model.L + t + T1 + T2 - T)
