@@ -30,7 +30,7 @@ TABLE = {
 }
 
 
-def chr_(
+def chien_hrones_reswick(
     model: FOPDT,
     *,
     controller: str = "pi",

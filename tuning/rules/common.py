@@ -33,6 +33,16 @@ def setting(
     return Setting(Gains(Kp=Kp, Ti=Ti, Td=Td, b=b, c=c), chosen or {}, notes)
 
 
+def in_words(model: FOPDT | SOPDT | Integrating) -> str:
+    """For a note on what a plant was reduced to; a SOPDT with real poles."""
+    if isinstance(model, FOPDT):
+        return f"first order with K = {model.K:.4g}, T = {model.T:.4g} s, L = {model.L:.4g} s"
+    if isinstance(model, SOPDT):
+        return f"second order with K = {model.K:.4g}, T1 = {model.T1:.4g} s, T2 = {model.T2:.4g} s, L = {model.L:.4g} s"
+    lag = f", T = {model.T:.4g} s" if model.T > 0.0 else ""
+    return f"an integrator with K = {model.K:.4g} per s{lag}, L = {model.L:.4g} s"
+
+
 def one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
         raise Refused(Reason.BAD_INPUT, f"{name} must be one of {', '.join(allowed)}, not {value!r}")

@@ -20,7 +20,7 @@ from tuning.forms import Series, of_series
 from tuning.half_rule import exact, half_rule
 from tuning.models import FOPDT, Integrating, Model, TransferFunction
 from tuning.reasons import Reason, Refused
-from tuning.rules.common import one_of, positive, setting
+from tuning.rules.common import in_words, one_of, positive, setting
 from tuning.setting import Setting
 
 CONTROLLERS = ("pi", "pid")
@@ -35,7 +35,9 @@ def simc(model: Model, *, controller: str = "pi", tau_c_s: float | None = None) 
     if isinstance(model, TransferFunction):
         model = exact(model)
     reduced = half_rule(model, 1 if controller == "pi" else 2)
-    notes: tuple[str, ...] = () if reduced == model else (f"Reduced by the half rule to {reduced}.",)
+    notes: tuple[str, ...] = ()
+    if reduced != model:
+        notes = (f"The model was reduced by the half rule to {in_words(reduced)}.",)
     L = reduced.L
     if tau_c_s is None:
         if L == 0.0:
