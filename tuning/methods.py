@@ -327,7 +327,7 @@ METHODS: dict[str, Method] = {
             "Robust PI",
             "Stopakevych et al., Problemele Energeticii Regionale, criterion (7)",
             "The best set-point answer that K, T and L may each be 20 % off for.",
-            "first order with dead time",
+            "first order with dead time, L/T from 0.02 to 20",
             (FOPDT,),
             robust,
             {

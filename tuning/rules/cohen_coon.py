@@ -10,15 +10,15 @@ Variant "tau", PI only, is the rewriting in tau = L/(L + T) that the ME-PSO pape
 
     PI     K Kp = 0.9 (1 + 0.92 r)/r    Ti = L (3.3 - 3 tau)/(1 + 1.2 tau)
 
-Its 0.92 is ten times the original's (1/12)/(9/10) = 0.0926, so its gain is far higher; its loop is unstable beyond
-r = 1.8 or so.
+Its 0.92 is ten times the original's (1/12)/(9/10) = 0.0926, so its gain is far higher; from r = 0.9 its loop is
+unstable, and refused.
 """
 
 from __future__ import annotations
 
 from tuning.models import FOPDT
 from tuning.reasons import Reason, Refused
-from tuning.rules.common import one_of, ratio_within, setting
+from tuning.rules.common import one_of, ratio_within, refuse_unstable, setting
 from tuning.setting import Setting
 
 CONTROLLERS = ("p", "pi", "pid")
@@ -38,7 +38,8 @@ def cohen_coon(
     L, r, K = model.L, model.L / model.T, abs(model.K)
     if variant == "tau":
         tau = L / (L + model.T)
-        return setting(0.9 * (1.0 + 0.92 * r) / r / K, L * (3.3 - 3.0 * tau) / (1.0 + 1.2 * tau), notes=notes)
+        found = setting(0.9 * (1.0 + 0.92 * r) / r / K, L * (3.3 - 3.0 * tau) / (1.0 + 1.2 * tau), notes=notes)
+        return refuse_unstable(model, found, "Cohen-Coon, variant tau,")
     if controller == "p":
         return setting((1.0 + r / 3.0) / r / K, notes=notes)
     if controller == "pi":

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from tuning.gains import Gains
+from tuning.margins import margins
 from tuning.models import FOPDT, SOPDT, Integrating, Model
 from tuning.reasons import Reason, Refused
 from tuning.setting import Setting
@@ -77,8 +78,17 @@ def stable_plant(model: Model, rule: str) -> None:
         )
 
 
-def ratio_within(model: FOPDT, low: float, high: float, rule: str, extrapolate: bool) -> tuple[str, ...]:
-    """Refused unless low <= L/T <= high; with `extrapolate` a note instead."""
+def refuse_unstable(model: Model, found: Setting, rule: str) -> Setting:
+    """The setting, if the loop of it and this self-regulating model is stable."""
+    if not margins(model, found.gains).stable:
+        raise Refused(Reason.OUTSIDE_RANGE, f"{rule} would make the loop of this model unstable; choose another method")
+    return found
+
+
+def ratio_within(
+    model: FOPDT, low: float, high: float, rule: str, extrapolate: bool | None = None
+) -> tuple[str, ...]:
+    """Refused unless low <= L/T <= high; with `extrapolate` a note instead (None: the rule has no such option)."""
     needs_dead_time(model, rule)
     ratio = model.L / model.T
     # a model made at the very edge must not fall off it by rounding
@@ -86,5 +96,6 @@ def ratio_within(model: FOPDT, low: float, high: float, rule: str, extrapolate: 
         return ()
     text = f"L/T = {ratio:.4g} is outside {low:g} to {high:g}, the range {rule} was made for"
     if not extrapolate:
-        raise Refused(Reason.OUTSIDE_RANGE, f"{text}; extrapolate = true uses it nevertheless")
+        way_out = "" if extrapolate is None else "; extrapolate = true uses it nevertheless"
+        raise Refused(Reason.OUTSIDE_RANGE, text + way_out)
     return (f"{text}.",)

@@ -35,8 +35,8 @@ FORMS = ("zero", "all-pass")
 SAFE = {"taylor": 0.5, "all-pass": 0.25, "zero": 0.8, "integrating": 2.0}
 UNSTABLE_ZERO = 0.1445307
 """Form "zero": GM = (lambda/L + 1/2)/0.6445307; x - atan(x/2) = pi/2 is its crossover."""
-LEAST_PSI = 2.5
-"""psi/L below this: the integral time gets so short that Ms passes 2 at lambda = 0.8 L."""
+LEAST_PSI = {"pi": 10.0, "pid": 2.5}
+"""Least psi/L: below it the integral time gets so short that Ms is well above 2 at the least safe lambda."""
 
 
 def imc_pi(
@@ -55,7 +55,7 @@ def imc_pi(
         L, K = model.L, abs(model.K)
         Ti = 2.0 * lambda_s + L
         return setting(Ti / (lambda_s + L) / (lambda_s + L) / K, Ti, chosen=chosen, notes=notes)
-    model, psi = _as_fopdt(model, psi_s)
+    model, psi = _as_fopdt(model, psi_s, "pi")
     lambda_s, chosen, notes = _filter(model, lambda_s, "taylor", extrapolate)
     Kp = model.T / (lambda_s + model.L) / abs(model.K)
     return setting(Kp, model.T, chosen=chosen | psi, notes=notes)
@@ -82,7 +82,7 @@ def imc_pid(
         Ti, half = 2.0 * lambda_s + L, lambda_s + 0.5 * L
         Td = L * (lambda_s + 0.25 * L) / Ti
         return setting(Ti / half / half / K, Ti, Td, c=1.0, chosen=chosen, notes=notes)
-    model, psi = _as_fopdt(model, psi_s)
+    model, psi = _as_fopdt(model, psi_s, "pid")
     lambda_s, chosen, notes = _filter(model, lambda_s, form, extrapolate)
     if form == "all-pass":
         notes += ("The all-pass form's own lag, lambda L/(2 (lambda + L)), is left out, as in the paper's (11).",)
@@ -122,18 +122,16 @@ def _filter(
     return lambda_s, chosen, (f"{text}.",)
 
 
-def _as_fopdt(model: FOPDT | Integrating, psi_s: float | None) -> tuple[FOPDT, dict[str, float]]:
+def _as_fopdt(model: FOPDT | Integrating, psi_s: float | None, controller: str) -> tuple[FOPDT, dict[str, float]]:
     """(30): an integrator as a lag of psi, s; a FOPDT as it is."""
     if isinstance(model, FOPDT):
         _only_for_integrating(psi_s)
         return model, {}
     no_lag(model, "IMC")
     psi = positive("psi_s", psi_s if psi_s is not None else math.nan, "s")
-    if psi < LEAST_PSI * model.L:
-        raise Refused(
-            Reason.OUTSIDE_RANGE,
-            f"psi_s = {psi:g} s is too short; from {LEAST_PSI:g} L = {LEAST_PSI * model.L:g} s up is accepted",
-        )
+    least = LEAST_PSI[controller] * model.L
+    if psi < least:
+        raise Refused(Reason.OUTSIDE_RANGE, f"psi_s = {psi:g} s is too short; from {least:g} s up is accepted")
     return FOPDT(model.K * psi, psi, model.L), {"psi_s": psi}
 
 

@@ -11,8 +11,8 @@ dominated by their lag; the PI of variant "0.45", Ti = Pu/0.45, is what the ME-P
 from __future__ import annotations
 
 from tuning.margins import ultimate_point
-from tuning.models import Model
-from tuning.rules.common import one_of, positive, setting, stable_plant
+from tuning.models import Model, integrators
+from tuning.rules.common import one_of, positive, refuse_unstable, setting, stable_plant
 from tuning.setting import Setting
 
 CONTROLLERS = ("pi", "pid")
@@ -33,8 +33,11 @@ def ultimate(Ku: float, Pu: float, *, controller: str = "pi", variant: str = "2.
 
 
 def tyreus_luyben(model: Model, *, controller: str = "pi", variant: str = "2.2") -> Setting:
-    """From the model's own ultimate point; refused (cannot_oscillate) for a plant that has none."""
+    """From the model's own ultimate point; refused (cannot_oscillate) for a plant that has none, and (outside_range)
+    where the loop would be unstable: the PID of a plant with L/T above 5."""
     one_of("controller", controller, CONTROLLERS)
     one_of("variant", variant, VARIANTS)
     stable_plant(model, "Tyreus-Luyben")
-    return ultimate(*ultimate_point(model), controller=controller, variant=variant)
+    found = ultimate(*ultimate_point(model), controller=controller, variant=variant)
+    # with much dead time the ideal derivative alone is too much
+    return found if integrators(model) else refuse_unstable(model, found, "Tyreus-Luyben")

@@ -14,8 +14,8 @@ is for L/T up to 1; below 0.1 the dead time is too short to be read from a step,
 from __future__ import annotations
 
 from tuning.margins import ultimate_point
-from tuning.models import FOPDT, Integrating, Model
-from tuning.rules.common import needs_dead_time, one_of, positive, ratio_within, setting, stable_plant
+from tuning.models import FOPDT, Integrating, Model, integrators
+from tuning.rules.common import needs_dead_time, one_of, positive, ratio_within, refuse_unstable, setting, stable_plant
 from tuning.setting import Setting
 
 CONTROLLERS = ("p", "pi", "pid")
@@ -36,10 +36,13 @@ def ultimate(Ku: float, Pu: float, *, controller: str = "pi") -> Setting:
 
 
 def zn_ultimate(model: Model, *, controller: str = "pi") -> Setting:
-    """From the model's own ultimate point; refused (cannot_oscillate) for a plant that has none."""
+    """From the model's own ultimate point; refused (cannot_oscillate) for a plant that has none, and (outside_range)
+    where the loop would be unstable: the PID of a plant with L/T from about 5."""
     one_of("controller", controller, CONTROLLERS)
     stable_plant(model, "Ziegler-Nichols")
-    return ultimate(*ultimate_point(model), controller=controller)
+    found = ultimate(*ultimate_point(model), controller=controller)
+    # with much dead time the ideal derivative alone is too much
+    return found if integrators(model) else refuse_unstable(model, found, "Ziegler-Nichols")
 
 
 def zn_step(model: FOPDT | Integrating, *, controller: str = "pi", extrapolate: bool = False) -> Setting:
