@@ -2,7 +2,8 @@
 
 The largest lag that is left out is shared: one half goes to the smallest lag kept, the other to the dead time. The
 smaller lags, and the time constants of zeros in the right half-plane, go to the dead time whole. An integrator counts
-as the largest lag; what it would be given is nothing to it.
+as the largest lag, but has no use for the half of another: that goes to the dead time as well, and the ramp that the
+plant answers a step with stays where it is.
 
 Source: S. Skogestad, Simple analytic rules for model reduction and PID controller tuning, J. Process Control 13, 2003.
 The rule is for real poles. Zeros in the left half-plane are refused here: which lag they cancel is a choice.
@@ -29,9 +30,11 @@ def half_rule(model: Model, order: Literal[1, 2] = 1) -> FOPDT | SOPDT | Integra
     """
     gain, integrates, lags, dead = _parts(model)
     kept = order - 1 if integrates else order
+    if len(lags) <= kept and not isinstance(model, TransferFunction):
+        return model
     if len(lags) > kept:
         shared = lags[kept]
-        dead += 0.5 * shared + sum(lags[kept + 1 :])
+        dead += (0.5 if kept else 1.0) * shared + sum(lags[kept + 1 :])
         lags = lags[:kept]
         if lags:
             lags[-1] += 0.5 * shared

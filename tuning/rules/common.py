@@ -85,9 +85,7 @@ def refuse_unstable(model: Model, found: Setting, rule: str) -> Setting:
     return found
 
 
-def ratio_within(
-    model: FOPDT, low: float, high: float, rule: str, extrapolate: bool | None = None
-) -> tuple[str, ...]:
+def ratio_within(model: FOPDT, low: float, high: float, rule: str, extrapolate: bool | None = None) -> tuple[str, ...]:
     """Refused unless low <= L/T <= high; with `extrapolate` a note instead (None: the rule has no such option)."""
     needs_dead_time(model, rule)
     ratio = model.L / model.T

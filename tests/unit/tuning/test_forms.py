@@ -67,7 +67,7 @@ def test_the_series_form_ends_at_a_quarter() -> None:
     """Without a filter: real zeros up to Td = Ti/4."""
     s = to_series(Gains(Kp=3.0, Ti=8.0, Td=2.0))
     assert [s.Kp, s.Ti, s.Td] == pytest.approx([1.5, 4.0, 4.0], rel=1e-9)
-    with pytest.raises(Refused, match="no series form.*Ti >= 4 Td") as caught:
+    with pytest.raises(Refused, match=r"no series form.*Ti >= 4 Td") as caught:
         to_series(Gains(Kp=3.0, Ti=8.0, Td=2.001))
     assert caught.value.reason is Reason.OUTSIDE_RANGE
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.unit.tuning.tables import EQUIPOLE5, TABLES
 from tests.unit.tuning.rules.tables import OBJECTS, plant, sopdt
+from tests.unit.tuning.tables import EQUIPOLE5, TABLES
 from tuning.half_rule import exact, half_rule
 from tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
 from tuning.reasons import Reason, Refused
@@ -37,25 +37,25 @@ def of_lags(gain: float, lags: list[float], zeros: list[float], L: float, origin
 def test_the_plants_of_the_me_pso_paper(name: str, T: float, L: float) -> None:
     found = half_rule(plant(name))
     assert isinstance(found, FOPDT)
-    assert [found.K, found.T, found.L] == pytest.approx([1.0, T, L], rel=1e-6)
+    assert pytest.approx([1.0, T, L], rel=1e-6) == [found.K, found.T, found.L]
 
 
 def test_table_1_of_the_five_stage_paper() -> None:
     row = next(r for r in TABLES["table1"]["rows"] if r["method"] == "Half rule")
     found = half_rule(EQUIPOLE5)
-    assert [found.K, found.T, found.L] == pytest.approx([1.0, row["printed"]["T"], row["printed"]["tau"]], rel=1e-6)
+    assert pytest.approx([1.0, row["printed"]["T"], row["printed"]["tau"]], rel=1e-6) == [found.K, found.T, found.L]
 
 
 def test_examples_of_skogestad() -> None:
     """Two of the plants of his paper, to the first and to the second order."""
     found = half_rule(of_lags(1.0, [1.0, 0.2], [], 0.0))
-    assert [found.K, found.T, found.L] == pytest.approx([1.0, 1.1, 0.1])
+    assert pytest.approx([1.0, 1.1, 0.1]) == [found.K, found.T, found.L]
     # (-0.3 s + 1)(0.08 s + 1)/((2 s + 1)(1 s + 1)(0.4 s + 1)(0.2 s + 1)(0.05 s + 1)^3), the zero at the left left out
     found = half_rule(of_lags(1.0, [2.0, 1.0, 0.4, 0.2, 0.05, 0.05, 0.05], [0.3], 0.0))
-    assert [found.T, found.L] == pytest.approx([2.5, 0.5 + 0.4 + 0.2 + 0.15 + 0.3], rel=1e-6)
+    assert pytest.approx([2.5, 0.5 + 0.4 + 0.2 + 0.15 + 0.3], rel=1e-6) == [found.T, found.L]
     second = half_rule(of_lags(1.0, [2.0, 1.0, 0.4, 0.2, 0.05, 0.05, 0.05], [0.3], 0.0), 2)
     assert isinstance(second, SOPDT)
-    assert [second.T1, second.T2, second.L] == pytest.approx([2.0, 1.2, 0.2 + 0.2 + 0.15 + 0.3], rel=1e-6)
+    assert pytest.approx([2.0, 1.2, 0.2 + 0.2 + 0.15 + 0.3], rel=1e-6) == [second.T1, second.T2, second.L]
 
 
 @pytest.mark.parametrize("order", [1, 2])
@@ -64,18 +64,25 @@ def test_the_mean_residence_time_stays(order: Any, lags: list[float], zeros: lis
     """The area between a step and the response to it, per unit of gain: sum of lags + dead time + zeros."""
     found = half_rule(of_lags(-2.0, lags, zeros, L), order)
     kept = found.T if isinstance(found, FOPDT) else 2.0 * found.zeta * found.T  # type: ignore[union-attr]
-    assert found.K == pytest.approx(-2.0)
+    assert pytest.approx(-2.0) == found.K
     assert kept + found.L == pytest.approx(sum(lags) + sum(zeros) + L, rel=1e-6)
 
 
 @given(lags=lags, L=st.floats(0.0, 10.0))
-def test_integrating(lags: list[float], L: float) -> None:
+def test_the_ramp_of_an_integrating_plant_stays(lags: list[float], L: float) -> None:
     found, second = (half_rule(of_lags(0.3, lags, [], L, origin=True), order) for order in (1, 2))
     assert isinstance(found, Integrating) and isinstance(second, Integrating)
-    largest = sorted(lags, reverse=True)
-    assert [found.K, found.T] == pytest.approx([0.3, 0.0])
-    assert found.L == pytest.approx(L + 0.5 * largest[0] + sum(largest[1:]), rel=0.02)
-    assert second.T + second.L == pytest.approx(L + sum(lags), rel=1e-6)
+    assert pytest.approx([0.3, 0.0]) == [found.K, found.T]
+    assert pytest.approx(L + sum(lags), rel=1e-6) == found.L
+    assert pytest.approx(L + sum(lags), rel=1e-6) == second.T + second.L
+
+
+@given(T=st.floats(0.1, 10.0), ratio=st.floats(0.01, 1.0))
+def test_a_model_of_that_order_is_left_alone(T: float, ratio: float) -> None:
+    for model, order in ((FOPDT(1.0, T, 1.0), 1), (Integrating(1.0, 1.0, T), 2)):
+        assert half_rule(model, order) is model
+    second = SOPDT.of_time_constants(1.0, T, ratio * T, 1.0)
+    assert half_rule(second, 2) is second
 
 
 @pytest.mark.parametrize(
@@ -120,16 +127,14 @@ def test_a_transfer_function_that_is_none_of_them(model: TransferFunction) -> No
 @pytest.mark.parametrize("name", OBJECTS)
 def test_tangents_of_the_direct_synthesis_paper(name: str) -> None:
     found = tangent(sopdt(name))
-    assert [found.T, found.L] == pytest.approx([OBJECTS[name]["tangent_T"], OBJECTS[name]["tangent_L"]], rel=1e-6)
+    assert pytest.approx([OBJECTS[name]["tangent_T"], OBJECTS[name]["tangent_L"]], rel=1e-6) == [found.T, found.L]
 
 
 @pytest.mark.parametrize("T2", [0.01, 0.5, 0.999999, 1.0])
 def test_the_tangent_of_a_response_differentiated(T2: float) -> None:
     t = np.linspace(0.0, 10.0, 200_001)
-    if T2 < 0.9:
-        y = 1.0 - (np.exp(-t) - T2 * np.exp(-t / T2)) / (1.0 - T2)
-    else:
-        y = 1.0 - (1.0 + t) * np.exp(-t)
+    equal = 1.0 - (1.0 + t) * np.exp(-t)
+    y = 1.0 - (np.exp(-t) - T2 * np.exp(-t / T2)) / (1.0 - T2) if T2 < 0.9 else equal
     slope = np.gradient(y, t)
     i = int(np.argmax(slope))
     found = tangent(SOPDT.of_time_constants(4.0, 1.0, T2, 0.3))

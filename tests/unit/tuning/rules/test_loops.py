@@ -39,7 +39,8 @@ def closed_loop(model: Model, gains: Gains, delay: tuple[Reals, Reals]) -> Reals
 
 def pade(L: float, order: int) -> tuple[Reals, Reals]:
     """The diagonal Pade approximation, highest power first."""
-    c = [math.comb(order, k) * math.factorial(2 * order - k) / math.factorial(2 * order) * L**k for k in range(order + 1)]
+    f = math.factorial
+    c = [math.comb(order, k) * f(2 * order - k) / f(2 * order) * L**k for k in range(order + 1)]
     return np.array([x * (-1.0) ** k for k, x in enumerate(c)][::-1]), np.array(c[::-1])
 
 
@@ -72,7 +73,7 @@ def test_the_papers_bound_is_not_safe() -> None:
     """(21) allows c = 1.9."""
     model = sopdt("P31")
     assert 1.9 * gain_range(model).paper / PAPER_C < gain_range(model).paper_stable
-    with pytest.raises(Refused, match="c = 1.9 is unstable; below pi/2"):
+    with pytest.raises(Refused, match="unstable; below pi/2"):
         direct_synthesis(model, c=1.9)
 
 

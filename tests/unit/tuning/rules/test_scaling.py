@@ -77,9 +77,7 @@ def test_other_units(name: str, data: Any, model: Model, time: float, gain: floa
 @pytest.mark.parametrize("name", [n for n in FREE if METHODS[n].options.keys() & {"lambda_s", "tau_c_s", "psi_s"}])
 @settings(max_examples=25, deadline=None)
 @given(data=st.data(), model=plants, time=st.floats(1e-2, 1e2), speed=st.floats(0.5, 5.0), psi=st.floats(5.0, 50.0))
-def test_times_that_the_user_gives(
-    name: str, data: Any, model: Model, time: float, speed: float, psi: float
-) -> None:
+def test_times_that_the_user_gives(name: str, data: Any, model: Model, time: float, speed: float, psi: float) -> None:
     known = METHODS[name].options.keys()
     given_s = {"lambda_s": speed * model.L, "tau_c_s": speed * model.L}
     if isinstance(model, Integrating) and data.draw(st.booleans()):
