@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.unit.tuning.isa import response
 from tuning.forms import (
     Parallel,
     Reciprocal,
@@ -22,7 +23,6 @@ from tuning.forms import (
     to_series,
 )
 from tuning.gains import Gains
-from tuning.margins import controller_response
 from tuning.reasons import Reason, Refused
 
 S = 1j * np.geomspace(1e-4, 1e4, 200)
@@ -32,8 +32,8 @@ perhaps = st.one_of(st.just(0.0), sizes)
 isa = st.builds(Gains, Kp=sizes, Ti=perhaps, Td=perhaps, Tf=perhaps)
 
 
-def same(gains: Gains, response: np.ndarray) -> None:
-    np.testing.assert_allclose(controller_response(gains, S.imag), response, rtol=1e-9)
+def same(gains: Gains, expected: np.ndarray) -> None:
+    np.testing.assert_allclose(response(gains, S), expected, rtol=1e-9)
 
 
 @given(isa)
@@ -60,7 +60,7 @@ def test_series(gains: Gains) -> None:
     back = of_series(s)
     assert back.Kp == pytest.approx(gains.Kp, rel=1e-9)
     assert back.Ti == pytest.approx(gains.Ti, rel=1e-9)
-    np.testing.assert_allclose(controller_response(back, S.imag), controller_response(gains, S.imag), rtol=1e-8)
+    np.testing.assert_allclose(response(back, S), response(gains, S), rtol=1e-8)
 
 
 def test_the_series_form_ends_at_a_quarter() -> None:

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scipy.special import lambertw
 
+from tests.unit.tuning.isa import response
 from tests.unit.tuning.rules.tables import OBJECTS, TABLES, sopdt
 from tuning.gains import Gains
-from tuning.margins import controller_response, margins
+from tuning.margins import margins
 from tuning.methods import tune
 from tuning.models import FOPDT, SOPDT, Integrating, Model, Reals
 from tuning.reasons import Refused
@@ -23,7 +24,7 @@ W = np.geomspace(1e-4, 1e2, 60_000)
 
 def peak_sensitivity(model: Model, gains: Gains) -> float:
     """Ms on a plain grid, for integrating plants too."""
-    loop = np.sign(model.num[-1]) * model.frequency_response(W) * controller_response(gains, W)
+    loop = np.sign(model.num[-1]) * model.frequency_response(W) * response(gains, 1j * W)
     return float(np.max(1.0 / np.abs(1.0 + loop)))
 
 
@@ -206,8 +207,8 @@ def test_margins_of_simc() -> None:
 def test_the_pid_of_simc_is_a_pi_and_a_cancelled_lag(model: SOPDT | Integrating) -> None:
     simpler = FOPDT(2.0, 30.0, 1.0) if isinstance(model, SOPDT) else Integrating(2.0, 1.0)
     pi, pid = tune("simc", simpler, tau_c_s=2.0).gains, tune("simc", model, controller="pid", tau_c_s=2.0).gains
-    loop = model.frequency_response(W) * controller_response(pid, W)
-    np.testing.assert_allclose(loop, simpler.frequency_response(W) * controller_response(pi, W), rtol=1e-9)
+    loop = model.frequency_response(W) * response(pid, 1j * W)
+    np.testing.assert_allclose(loop, simpler.frequency_response(W) * response(pi, 1j * W), rtol=1e-9)
 
 
 @pytest.mark.parametrize(
