@@ -94,13 +94,13 @@ class Model:
 
 @dataclass(frozen=True, slots=True)
 class Predicted:
-    """Of the new gains on the estimated model: Ms, GM (ratio), PM (degrees), set-point step figures."""
+    """Of the new gains on the estimated model: Ms, GM (ratio), PM (degrees), set-point step figures; None: none."""
 
     Ms: float
-    GM: float
-    PM_deg: float
+    GM: float | None
+    PM_deg: float | None
     overshoot_pct: float
-    settling_s: float
+    settling_s: float | None
     IAE_per_unit: float
 
 
@@ -259,9 +259,10 @@ def _optimised(model: Model, ultimate: Ultimate | None) -> tuple[Gains, Predicte
     gains = optimise(plant).gains
     m = margins(plant, gains)
     figures = step_figures(plant, gains)
-    if not (m.Ms <= MOST_Ms and m.GM >= LEAST_GM):
+    if m.GM is None or not (m.Ms <= MOST_Ms and m.GM >= LEAST_GM):
+        GM = "none" if m.GM is None else f"{m.GM:.2f}"
         raise Refused(
-            Reason.NOT_ROBUST, f"on the model Ms {m.Ms:.2f} (at most {MOST_Ms}), GM {m.GM:.2f} (at least {LEAST_GM})"
+            Reason.NOT_ROBUST, f"on the model Ms {m.Ms:.2f} (at most {MOST_Ms}), GM {GM} (at least {LEAST_GM})"
         )
     if ultimate:
         loop = -gains.Kp / ultimate.Ku * (1 - 1j / (2 * math.pi / ultimate.Pu_s * gains.Ti))

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize_scalar
 
 from tuning.gains import Gains
-from tuning.models import Complexes, Model, Reals, time_constants
+from tuning.models import Complexes, Model, Reals
 from tuning.reasons import Reason, Refused
+from tuning.stability import is_stable, open_loop
 
 POINTS_PER_DECADE = 600
 
@@ -25,88 +26,113 @@ POINTS_PER_DECADE = 600
 class Margins:
     """GM: ratio.  PM_deg: degrees.  Ms: peak of |1/(1+L)|.  Mt: peak of |L/(1+L)|.
 
-    wc: gain crossover, wpc: phase crossover, ws: where Ms is, all rad/s. A margin without its crossing is infinite, its
-    frequency NaN. `stable` is the Nyquist count of the loop (the plant itself must be stable); with stable false the
-    other figures describe the curve, not a margin.
+    GM is the least factor above one that takes a stable loop to its limit. wc: gain crossover, wpc: phase crossover,
+    ws: where Ms is, all rad/s.  bandwidth: where |L/(1+L)| first falls to 1/sqrt(2) of its value at rest, rad/s. A
+    margin without its crossing is None, and so is its frequency. `stable` is exact (see `tuning.stability`); with
+    stable false the other figures describe the curve, not a margin.
     """
 
-    GM: float
-    PM_deg: float
+    GM: float | None
+    PM_deg: float | None
     Ms: float
     Mt: float
-    wc: float
-    wpc: float
+    wc: float | None
+    wpc: float | None
     ws: float
+    bandwidth: float | None
     stable: bool
 
-
-def controller_response(gains: Gains, w: Reals) -> Complexes:
-    """The feedback path of the ISA controller (set-point weights play no part), at w rad/s."""
-    s = 1j * np.asarray(w, dtype=float)
-    c = np.ones_like(s)
-    if gains.Ti > 0.0:
-        c = c + 1.0 / (gains.Ti * s)
-    if gains.Td > 0.0:
-        c = c + gains.Td * s / (1.0 + gains.Tf * s)
-    return np.asarray(gains.Kp * c)
+    @property
+    def delay_margin_s(self) -> float | None:
+        """The dead time that the loop bears in addition at its gain crossover wc, s."""
+        if self.PM_deg is None or self.wc is None:
+            return None
+        return math.radians(self.PM_deg) / self.wc
 
 
 def margins(model: Model, gains: Gains) -> Margins:
-    """Margins of the loop of this model and these gains."""
-    sign = math.copysign(1.0, model.static_gain)
+    """Margins of the loop of this model and these gains; Tf = 0 is the ideal derivative.
+
+    Raises Refused, BAD_INPUT: gains that are none, or an ideal derivative on a bi-proper plant.
+    """
+    N, D = open_loop(model, gains)
+    stable = is_stable(model, gains)
 
     def loop(w: Reals) -> Complexes:
-        return np.asarray(sign * model.frequency_response(w) * controller_response(gains, w))
+        s = 1j * w
+        return np.asarray(np.polyval(N, s) / np.polyval(D, s) * np.exp(-model.L * s))
 
-    w = _grid(model, gains)
+    def at(w: float) -> complex:
+        return complex(loop(np.array([w]))[0])
+
+    w = _grid(model, N, D)
     L = loop(w)
     one_plus = np.abs(1.0 + L)
-    ws, least = _least(lambda x: float(abs(1.0 + loop(np.array([x]))[0])), w, int(np.argmin(one_plus)))
+    ws, least = _least(lambda x: abs(1.0 + at(x)), w, int(np.argmin(one_plus)))
     closed = np.abs(L) / one_plus
-    _, mt = _least(
-        lambda x: -float(abs(loop(np.array([x]))[0] / (1.0 + loop(np.array([x]))[0]))), w, int(np.argmax(closed))
-    )
+    _, mt = _least(lambda x: -abs(at(x) / (1.0 + at(x))), w, int(np.argmax(closed)))
 
-    wpc, inverse_gm = math.nan, 0.0
+    wpc, inverse_gm = None, 0.0
     for x in _crossings(lambda v: loop(v).imag, w, L.imag, (L.real < 0.0)):
-        size = float(abs(loop(np.array([x]))[0]))
-        if size > inverse_gm:
+        size = abs(at(x))
+        # a stable loop may cross beyond -1 as well (conditional stability): less gain, not more, ends it there
+        if size > inverse_gm and not (stable and size >= 1.0):
             wpc, inverse_gm = x, size
 
-    wc, pm = math.nan, math.inf
+    wc, pm = None, None
     for x in _crossings(lambda v: np.log(np.abs(loop(v))), w, np.log(np.abs(L)), np.ones(w.shape, dtype=bool)):
-        here = float(np.degrees(np.angle(-loop(np.array([x]))[0])))
-        if abs(here) < abs(pm):
-            wc, pm = x, abs(here)
+        here = abs(float(np.degrees(np.angle(-at(x)))))
+        if pm is None or here < pm:
+            wc, pm = x, here
 
     return Margins(
-        GM=1.0 / inverse_gm if inverse_gm > 0.0 else math.inf,
+        GM=1.0 / inverse_gm if inverse_gm > 0.0 else None,
         PM_deg=pm,
-        Ms=1.0 / least if least > 0.0 else math.inf,
+        Ms=1.0 / max(least, 1e-12),
         Mt=-mt,
         wc=wc,
         wpc=wpc,
         ws=ws,
-        stable=_stable(L, model.L > 0.0),
+        bandwidth=_bandwidth(loop, w, closed, N, D),
+        stable=stable,
     )
 
 
 def ultimate_point(model: Model) -> tuple[float, float]:
     """(Ku, Pu): the gain, positive, at which a P loop just oscillates, and the period of it in s."""
     found = margins(model, Gains(Kp=1.0))
-    if not math.isfinite(found.GM):
+    if found.GM is None or found.wpc is None:
         raise Refused(Reason.CANNOT_OSCILLATE, "the model's phase never reaches -180 degrees")
     return found.GM, 2.0 * math.pi / found.wpc
 
 
-def _grid(model: Model, gains: Gains) -> Reals:
-    """From well below the slowest to well above the fastest corner of the loop."""
-    corners = [float(1.0 / x) for x in time_constants(model)]
-    corners += [float(x) for x in np.abs(np.roots(model.num)) if x > 0.0]
-    corners += [1.0 / x for x in (gains.Ti, gains.Td, gains.Tf, model.L) if x > 0.0]
+def _grid(model: Model, N: Reals, D: Reals) -> Reals:
+    """From well below the slowest to well above the fastest corner of the loop, crossovers included."""
+    corners = [float(x) for x in np.abs(np.concatenate((np.roots(N), np.roots(D)))) if x > 0.0]
+    kept = np.trim_zeros(D, "b")
+    origin = len(D) - len(kept)
+    if origin:
+        # where the integrating part alone would cross
+        corners.append(float(abs(N[-1] / kept[-1]) ** (1.0 / origin)))
+    if model.L > 0.0:
+        corners.append(1.0 / model.L)
     low, high = 1e-3 * min(corners), 1e2 * max(corners)
     points = int(POINTS_PER_DECADE * math.log10(high / low)) + 1
     return np.asarray(np.geomspace(low, high, points))
+
+
+def _bandwidth(loop: Callable[[Reals], Complexes], w: Reals, closed: Reals, N: Reals, D: Reals) -> float | None:
+    level = abs(N[-1] / (N[-1] + D[-1])) / math.sqrt(2.0)
+    below = np.flatnonzero(closed < level)
+    if not len(below) or below[0] == 0:
+        return None
+    i = int(below[0])
+
+    def excess(x: float) -> float:
+        at = complex(loop(np.array([x]))[0])
+        return float(abs(at / (1.0 + at)) - level)
+
+    return float(brentq(excess, w[i - 1], w[i], xtol=1e-12 * float(w[i]), rtol=1e-12))
 
 
 def _crossings(f: Callable[[Reals], Reals], w: Reals, values: Reals, wanted: NDArray[np.bool_]) -> list[float]:
@@ -127,12 +153,3 @@ def _least(f: Callable[[float], float], w: Reals, at: int) -> tuple[float, float
         return float(w[at]), f(float(w[at]))
     found = minimize_scalar(f, bounds=(w[at - 1], w[at + 1]), method="bounded", options={"xatol": 1e-7 * float(w[at])})
     return float(found.x), float(found.fun)
-
-
-def _stable(L: Complexes, dead_time: bool) -> bool:
-    """Nyquist for a stable plant and at most one integrator: 1+L ends on the branch of the angle it started from."""
-    if dead_time and abs(L[-1]) >= 1.0:
-        return False
-    turned = np.unwrap(np.angle(1.0 + L))
-    # a dead time leaves the end anywhere within a right angle; a whole turn too many is far from that
-    return bool(abs(turned[-1]) < 0.75 * math.pi)

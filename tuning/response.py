@@ -1,8 +1,13 @@
-"""Time responses of a loop with dead time, and the figures engineers read from a step response.
+"""Time responses of a loop with exact dead time to a step of the set-point or of the load.
 
-The plant is discretised exactly for an input that is linear between the steps, the dead time is a whole number of
-steps, the controller's integral is the trapezoidal rule: second order in the step throughout. A bi-proper plant passes
-the jumps of its input on, so every signal is kept just before and just after each step.
+Plant and controller without the dead time are one linear system in state space. Its input, the measured PV, comes back
+a dead time later: PV over the next dead time follows from PV over the last one (method of steps). The system is
+discretised exactly for an input that is linear between the steps; a dead time is a whole number of steps, so every
+jump and kink of the response falls between two of its blocks, where it does no harm. Without dead time the closed loop
+itself is discretised, exactly.
+
+An ideal derivative (Tf = 0) is the exact one: it acts through a changed output of the plant's state, no filter is
+slipped in. The impulse that it puts into MV when the set-point steps (c > 0) reaches PV, but no figure of MV counts it.
 """
 
 from __future__ import annotations
@@ -11,35 +16,27 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.integrate import trapezoid
-from scipy.linalg import expm
+from scipy import fft
+from scipy.linalg import expm, matrix_balance, toeplitz
+from scipy.signal import lfilter
 
+from tuning.figures import StepFigures, response_figures
 from tuning.gains import Gains
-from tuning.models import Model, Reals, time_constants
+from tuning.models import Model, Reals, TransferFunction, integrators, sign, time_constants
+from tuning.reasons import Reason, Refused
+from tuning.stability import is_stable, open_loop
 
 MAX_STEPS = 40_000
-
-
-@dataclass(frozen=True, slots=True)
-class StepFigures:
-    """Of a response to a step of the set-point (of the load: only IAE, ITAE, peak and settling mean something).
-
-    overshoot_pct: of the final change, not below 0.  settling_s: into 2 % of the final change (load: of the peak) for
-    good; infinite if not within the record.  rise_s: 10 to 90 %; infinite if never.  IAE, ITAE: of the error to the
-    set-point, in PV units * s and PV units * s^2, for the step as made.  peak: largest PV change along the step.
-    """
-
-    overshoot_pct: float
-    settling_s: float
-    rise_s: float
-    IAE: float
-    ITAE: float
-    peak: float
+SMALL_BLOCK = 100
+"""States of a block up to which all blocks come from powers of one matrix instead of one convolution each."""
 
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """t: s.  y: PV change.  u: MV change. Values just after each instant."""
+    """t: s.  y: PV change, PV units.  u: MV change, MV units. The loop has positive gain whatever the model's sign.
+
+    t never decreases: an instant at which y or u jumps is there twice, just before and just after the jump.
+    """
 
     t: Reals
     y: Reals
@@ -47,20 +44,41 @@ class Response:
 
 
 def step_figures(
-    model: Model, gains: Gains, horizon: float | None = None, dt: float | None = None, load: bool = False
+    model: Model,
+    gains: Gains,
+    horizon: float | None = None,
+    dt: float | None = None,
+    load: bool = False,
+    band: float = 0.02,
 ) -> StepFigures:
     """Figures of the loop's answer to a unit set-point step (or a unit step at the plant's input).
 
-    horizon, dt: s; see `step_response` for the defaults. The loop must be stable for the figures to mean anything.
+    horizon, dt: s; see `step_response` for the defaults.  band: of settling, a fraction of the final change (load: of
+    the peak). Raises Refused: NOT_ROBUST for an unstable loop, BAD_INPUT as `step_response`.
     """
+    _require_stable(model, gains)
     response = step_response(model, gains, horizon, dt, load)
-    if load:
-        return _figures(response.t, response.y, final=0.0, reference=0.0, band=0.02 * float(np.max(np.abs(response.y))))
-    final = 1.0
-    if gains.Ti == 0.0:
-        k = gains.Kp * abs(model.static_gain)
-        final = gains.b * k / (1.0 + k)
-    return _figures(response.t, response.y, final=final, reference=1.0, band=0.02 * final)
+    final = final_value(model, gains, load)
+    most = float(np.max(np.abs(response.y))) if load else final
+    return response_figures(
+        response.t,
+        response.y,
+        response.u,
+        final=0.0 if load else final,
+        reference=0.0 if load else 1.0,
+        band=band * most,
+        final_u=_final_control(model, gains, load),
+    )
+
+
+def final_value(model: Model, gains: Gains, load: bool) -> float:
+    """Where PV of the stable loop ends after a unit step, PV units."""
+    if gains.Ti > 0.0:
+        return 0.0 if load else 1.0
+    if integrators(model):
+        return 1.0 / gains.Kp if load else gains.b
+    k = gains.Kp * abs(model.static_gain)
+    return abs(model.static_gain) / (1.0 + k) if load else gains.b * k / (1.0 + k)
 
 
 def step_response(
@@ -68,240 +86,254 @@ def step_response(
 ) -> Response:
     """The loop from rest under a unit step of the set-point, or (load) of the plant's input, at t = 0.
 
-    horizon: s, by default ten times the plant's lags and dead time together, longer for a sluggish loop.
-    dt: s, at most; by default a hundredth of the dead time or of the slowest lag, whichever is less.
+    horizon: s, by default until the response has come to rest.  dt: s, at most; by default a hundredth of the dead time
+    and a fiftieth of the crossover's radian, unless that is more than 40,000 steps. A dead time that would still be
+    less than four steps in twice that number is taken as its second-order Pade approximant.
+
+    Raises Refused: NOT_ROBUST for an unstable loop when no horizon is given, or when its response overflows; BAD_INPUT
+    for gains that are none or an ideal derivative on a bi-proper plant.
     """
+    for name, value in (("horizon", horizon), ("dt", dt)):
+        if value is not None and not (math.isfinite(value) and value > 0.0):
+            raise Refused(Reason.BAD_INPUT, f"{name} = {value} s: must be positive")
+    if horizon is not None:
+        return _simulated(model, gains, horizon, dt or _fine(model, gains, horizon), load)
+    _require_stable(model, gains)
+    final = final_value(model, gains, load)
     lags = time_constants(model)
-    if horizon is None:
-        horizon = 10.0 * (float(lags.sum()) + model.L)
-        if gains.Ti > 0.0:
-            horizon = max(horizon, 5.0 * gains.Ti * (1.0 + 1.0 / (gains.Kp * abs(model.static_gain))))
-    if dt is None:
-        dt = min(float(lags.max()), model.L if model.L > 0.0 else math.inf) / 100.0
-        dt = max(dt, horizon / MAX_STEPS)
-    delay = max(1, math.ceil(model.L / dt - 1e-9)) if model.L > 0.0 else 0
+    horizon = 10.0 * (float(lags.max(initial=0.0)) + model.L + 1.0 / _crossover(model, gains))
+    for _ in range(12):
+        found = _simulated(model, gains, horizon, dt or _fine(model, gains, horizon), load)
+        away = np.abs(found.y - final)
+        late = found.t >= 0.8 * horizon
+        if float(np.max(away[late])) <= 1e-4 * float(np.max(away)):
+            break
+        horizon *= 2.0
+    return found
+
+
+def _require_stable(model: Model, gains: Gains) -> None:
+    if not is_stable(model, gains):
+        raise Refused(Reason.NOT_ROBUST, f"the loop of Kp {gains.Kp:.4g}, Ti {gains.Ti:.4g} s is unstable")
+
+
+def _crossover(model: Model, gains: Gains) -> float:
+    """About the highest frequency at which the loop gain is one, rad/s; the fastest lag's where it never is."""
+    N, D = open_loop(model, gains)
+    corners = np.abs(np.concatenate((np.roots(N), np.roots(D), [1.0 / model.L if model.L > 0.0 else 0.0])))
+    corners = corners[corners > 0.0]
+    if not len(corners):
+        return abs(float(N[-1] / D[0]))
+    w = np.geomspace(1e-4 * float(corners.min()), 1e4 * float(corners.max()), 400)
+    above = np.abs(np.polyval(N, 1j * w) / np.polyval(D, 1j * w)) >= 1.0
+    # an ideal derivative may hold the gain above one for good
+    ends = np.flatnonzero(above[:-1] & ~above[1:])
+    return float(w[ends[-1]]) if len(ends) else float(corners.min())
+
+
+def _fine(model: Model, gains: Gains, horizon: float) -> float:
+    step = min(0.02 / _crossover(model, gains), horizon / 2000.0)
+    if model.L > 0.0:
+        step = min(step, model.L / 100.0)
+    return max(step, horizon / MAX_STEPS)
+
+
+def _final_control(model: Model, gains: Gains, load: bool) -> float:
+    """Where MV of the stable loop ends, MV units."""
+    if load and (gains.Ti > 0.0 or integrators(model)):
+        return -1.0
+    if integrators(model):
+        return 0.0
+    static = abs(model.static_gain)
+    return (final_value(model, gains, load) - (static if load else 0.0)) / static
+
+
+def _simulated(model: Model, gains: Gains, horizon: float, dt: float, load: bool) -> Response:
+    if 0.0 < model.L < 2.0 * horizon / MAX_STEPS:
+        model = _without_dead_time(model)
+    delay = max(4, math.ceil(model.L / dt - 1e-9)) if model.L > 0.0 else 0
     if delay:
         dt = model.L / delay
     steps = math.ceil(horizon / dt - 1e-9)
-    loop = _Loop(model, gains, dt)
-    y, u = loop.delayed(steps, delay, load) if delay else loop.immediate(steps, load)
-    return Response(np.arange(steps + 1, dtype=np.float64) * dt, y, u)
+    loop = _Loop(model, gains, load)
+    with np.errstate(over="ignore", invalid="ignore"):
+        blocks = loop.delayed(steps, delay, dt) if delay else loop.immediate(steps, dt)
+        found = _joined(blocks, _control(blocks, gains, dt, 0.0 if load else 1.0), dt, steps)
+    if not (np.isfinite(found.y).all() and np.isfinite(found.u).all()):
+        raise Refused(Reason.NOT_ROBUST, f"the response grows beyond all bounds within {horizon:g} s")
+    return found
 
 
-def figures_of(t: Reals, y: Reals, step: float, y0: float) -> StepFigures:
-    """Figures of a recorded set-point step of size `step` (PV units, either sign) made at t[0] from rest at y0.
-
-    Where measurement noise shows, overshoot, rise and settling are read from a moving mean over a tenth of the rise,
-    and the settling band is at least three times the noise left in it.
-    """
-    time = np.asarray(t, dtype=float) - float(t[0])
-    change = (np.asarray(y, dtype=float) - y0) / step
-    # differences over one sample hardly contain the response, so their median size is the noise's (sqrt 2 * 0.6745)
-    noise = float(np.median(np.abs(np.diff(change, 2)))) / (math.sqrt(6.0) * 0.6745)
-    smooth, band = change, 0.02
-    if noise > 0.002:
-        rough = _rise(time, _moving_mean(change, 5))
-        dt = (time[-1] - time[0]) / (len(time) - 1)
-        width = int(min(rough, float(time[-1]) / 5.0) / 10.0 / dt) | 1
-        smooth = _moving_mean(change, max(width, 5))
-        band = max(band, 3.0 * noise / math.sqrt(max(width, 5)))
-    found = _figures(time, smooth, final=1.0, reference=1.0, band=band)
-    error = np.abs(1.0 - change)
-    size = abs(step)
-    return StepFigures(
-        overshoot_pct=found.overshoot_pct,
-        settling_s=found.settling_s,
-        rise_s=found.rise_s,
-        IAE=size * float(trapezoid(error, time)),
-        ITAE=size * float(trapezoid(time * error, time)),
-        peak=size * found.peak,
+def _without_dead_time(model: Model) -> TransferFunction:
+    L = model.L
+    return TransferFunction(
+        tuple(np.polymul(model.num, [L * L / 12.0, -L / 2.0, 1.0])),
+        tuple(np.polymul(model.den, [L * L / 12.0, L / 2.0, 1.0])),
     )
-
-
-def _figures(t: Reals, y: Reals, *, final: float, reference: float, band: float) -> StepFigures:
-    error = np.abs(reference - y)
-    outside = np.flatnonzero(np.abs(y - final) > band)
-    if not len(outside):
-        settling = 0.0
-    elif outside[-1] == len(y) - 1:
-        settling = math.inf
-    else:
-        i = int(outside[-1])
-        a, b = abs(y[i] - final), abs(y[i + 1] - final)
-        settling = float(t[i] + (t[i + 1] - t[i]) * (a - band) / (a - b))
-    peak = float(np.max(y))
-    return StepFigures(
-        overshoot_pct=max(0.0, 100.0 * (peak / final - 1.0)) if final else 0.0,
-        settling_s=settling,
-        rise_s=_rise(t, y / final) if final else math.inf,
-        IAE=float(trapezoid(error, t)),
-        ITAE=float(trapezoid(t * error, t)),
-        peak=peak,
-    )
-
-
-def _rise(t: Reals, y: Reals) -> float:
-    """From 10 to 90 % of one, s."""
-    at = []
-    for level in (0.1, 0.9):
-        above = np.flatnonzero(y >= level)
-        if not len(above):
-            return math.inf
-        i = int(above[0])
-        at.append(float(t[0]) if i == 0 else float(np.interp(level, y[i - 1 : i + 1], t[i - 1 : i + 1])))
-    return at[1] - at[0]
-
-
-def _moving_mean(y: Reals, width: int) -> Reals:
-    """Centred, the ends held."""
-    half = width // 2
-    padded = np.pad(y, half, mode="edge")
-    return np.convolve(padded, np.full(2 * half + 1, 1.0 / (2 * half + 1)), "valid")
 
 
 class _Loop:
-    """One step of the loop: x' = A x + b0*u(just after n) + b1*u(just before n+1), y = c x + d*u."""
+    """x' = a x + b*y(measured), PV to be measured = c x + d*y(measured); the last state is the step itself, one."""
 
-    def __init__(self, model: Model, gains: Gains, dt: float) -> None:
-        self.dt, self.gains = dt, gains
-        sign = math.copysign(1.0, model.static_gain)
-        order = len(model.den) - 1
-        den = np.asarray(model.den) / model.den[0]
-        num = np.concatenate((np.zeros(len(den) - len(model.num)), model.num)) * sign / model.den[0]
-        # time in steps and balanced companion form keep the exponential well conditioned for lags far apart
-        scale = dt ** np.arange(order + 1)
-        den, num = den * scale, num * scale
-        self.d = float(num[0])
-        self.c = num[1:] - den[1:] * num[0]
-        a = np.zeros((order, order))
-        a[0] = -den[1:]
-        a[1:, :-1] = np.eye(order - 1)
-        weights = 1.0 / np.maximum(np.abs(_ramp(den, order)), 1e-300)
-        a = a * weights[:, None] / weights[None, :]
-        self.c = self.c / weights
+    def __init__(self, model: Model, gains: Gains, load: bool) -> None:
+        g = gains
+        open_loop(model, g)
+        A, B, C, D = _companion(model)
+        n = len(B)
+        filtered = g.Td > 0.0 and g.Tf > 0.0
+        order = n + 3
+        integral, lag, one = n, n + 1, n + 2
+        setpoint, extra = (0.0, 1.0) if load else (1.0, 0.0)
+        kd = g.Kp * g.Td / g.Tf if filtered else 0.0
+        # u = by_state x + by_y y(measured)
+        by_state, by_y = np.zeros(order), -g.Kp - kd
+        by_state[integral], by_state[lag] = 1.0, -kd
+        by_state[one] = (g.Kp * g.b + kd * g.c) * setpoint
+        into = by_state.copy()
+        into[one] += extra
+        self.a, self.b = np.zeros((order, order)), np.zeros(order)
+        self.a[:n, :n] = A
+        self.a[:n] += np.outer(B, into)
+        self.b[:n] = B * by_y
+        self.c, self.d = np.zeros(order), D * by_y
+        self.c[:n] = C
+        self.c += D * into
+        if g.Ti > 0.0:
+            self.a[integral, one], self.b[integral] = g.Kp / g.Ti * setpoint, -g.Kp / g.Ti
+        if filtered:
+            self.a[lag, lag], self.a[lag, one], self.b[lag] = -1.0 / g.Tf, g.c * setpoint / g.Tf, -1.0 / g.Tf
+        elif g.Td > 0.0:
+            # the plant's state less B*k*(c*r - y) has no derivative in its equation (D = 0: see open_loop)
+            k, moved = g.Kp * g.Td, A @ B
+            self.a[:n, one] += moved * k * g.c * setpoint
+            self.b[:n] -= moved * k
+            self.c[one] += float(C @ B) * k * g.c * setpoint
+            self.d -= float(C @ B) * k
+
+    def immediate(self, steps: int, dt: float) -> Reals:
+        """PV of one block of steps + 1 samples, shape (1, steps + 1): nothing is delayed."""
+        closed = self.c / (1.0 - self.d)
+        advance = expm((self.a + np.outer(self.b, closed)) * dt)
+        start = np.zeros(len(self.b))
+        start[-1] = 1.0
+        return np.asarray(closed @ _powers(advance, start, steps + 1))[None, :]
+
+    def delayed(self, steps: int, delay: int, dt: float) -> Reals:
+        """PV in blocks of a dead time, shape (blocks, delay + 1); both ends of a block belong to it."""
+        order = len(self.b)
         augmented = np.zeros((order + 2, order + 2))
-        augmented[:order, :order] = a
-        augmented[0, order] = weights[0]
+        augmented[:order, :order] = self.a * dt
+        augmented[:order, order] = self.b * dt
         augmented[order, order + 1] = 1.0
         full = expm(augmented)
-        self.a = full[:order, :order]
-        self.b1 = full[:order, order + 1]
-        self.b0 = full[:order, order] - self.b1
-
-    def delayed(self, steps: int, delay: int, load: bool) -> tuple[Reals, Reals]:
-        """The plant's input of the next `delay` steps is known: advance by whole dead times, one convolution each."""
-        order = len(self.b0)
-        free = np.empty((delay + 1, order))
-        free[0] = self.c
-        to_end0, to_end1 = np.empty((delay, order)), np.empty((delay, order))
-        x0, x1 = self.b0, self.b1
-        for k in range(delay):
-            to_end0[delay - 1 - k], to_end1[delay - 1 - k] = x0, x1
-            x0, x1 = self.a @ x0, self.a @ x1
-            free[k + 1] = free[k] @ self.a
-        impulse0, impulse1 = to_end0[::-1] @ self.c, to_end1[::-1] @ self.c
-        power = np.linalg.matrix_power(self.a, delay)
-
+        a = full[:order, :order]
+        b1 = full[:order, order + 1]
+        b0 = full[:order, order] - b1
+        # what the input at one sample has done k steps later
+        spread0, spread1 = _powers(a, b0, delay), _powers(a, b1, delay + 1)
+        free = _powers(a.T, self.c, delay + 1).T
+        kernel = self.c @ spread1
+        begun = kernel.copy()
+        kernel[0] += self.d
+        kernel[1:] += self.c @ spread0
+        # the state at the block's end
+        ends = np.zeros((order, delay + 1))
+        ends[:, :-1] += spread0[:, ::-1]
+        ends[:, 1:] += spread1[:, delay - 1 :: -1] if delay > 1 else spread1[:, :1]
+        whole = np.linalg.matrix_power(a, delay)
         blocks = math.ceil(steps / delay)
-        after, before = np.zeros(blocks * delay + 1), np.zeros(blocks * delay + 1)
-        y = np.zeros(blocks * delay + 1)
-        x = np.zeros(order)
-        controller = _Controller(self.gains, self.dt, 0.0 if load else 1.0)
-        extra = 1.0 if load else 0.0
-        past_after, past_before = np.zeros(delay), np.zeros(delay + 1)
-        for block in range(blocks):
-            here = slice(block * delay, (block + 1) * delay + 1)
-            driven = np.convolve(impulse0, past_after)[:delay] + np.convolve(impulse1, past_before[1:])[:delay]
-            out = free @ x
-            out[1:] += driven
-            y_after = out[:-1] + self.d * past_after
-            y_before = out[1:] + self.d * past_before[1:]
-            x = power @ x + past_after @ to_end0 + past_before[1:] @ to_end1
-            u_after, u_before = controller.advance(y_after, y_before)
-            y[here][:-1] = y_after
-            y[(block + 1) * delay] = y_before[-1]
-            after[here][:-1], before[here][1:] = u_after, u_before
-            past_after = u_after + extra
-            past_before = np.concatenate(([0.0], u_before + extra))
-        after[-1] = before[-1]
-        return y[: steps + 1], after[: steps + 1]
-
-    def immediate(self, steps: int, load: bool) -> tuple[Reals, Reals]:
-        """Without dead time input and output of one instant depend on each other: a linear equation each step."""
-        y, u = np.zeros(steps + 1), np.zeros(steps + 1)
-        controller = _Controller(self.gains, self.dt, 0.0 if load else 1.0)
-        extra = 1.0 if load else 0.0
-        x = np.zeros(len(self.b0))
-        offset, slope = controller.now()
-        # u = offset - slope*y and y = c x + d*(u + extra)
-        y[0] = self.d * (offset + extra) / (1.0 + self.d * slope)
-        u[0] = offset - slope * y[0]
-        through = float(self.c @ self.b1) + self.d
-        for n in range(steps):
-            x = self.a @ x + self.b0 * (u[n] + extra)
-            known = float(self.c @ x)
-            offset, slope = controller.ahead(float(y[n]))
-            y[n + 1] = (known + through * (offset + extra)) / (1.0 + through * slope)
-            u[n + 1] = offset - slope * y[n + 1]
-            x = x + self.b1 * (u[n + 1] + extra)
-            controller.commit(float(y[n]), float(y[n + 1]))
-        return y, u
+        state = np.zeros(order)
+        state[-1] = 1.0
+        if delay + 1 + order <= SMALL_BLOCK:
+            driven = toeplitz(kernel, np.zeros(delay + 1))
+            driven[:, 0] -= begun
+            advance = np.block([[driven, free], [ends, whole]])
+            return np.ascontiguousarray(_powers(advance, np.append(np.zeros(delay + 1), state), blocks)[: delay + 1].T)
+        y = np.zeros((blocks, delay + 1))
+        length = fft.next_fast_len(2 * delay + 1, real=True)
+        spectrum = fft.rfft(kernel, length)
+        for k in range(1, blocks):
+            last = y[k - 1]
+            driven = fft.irfft(fft.rfft(last, length) * spectrum, length)[: delay + 1]
+            y[k] = free @ state + driven - begun * last[0]
+            state = whole @ state + ends @ last
+        return y
 
 
-def _ramp(den: Reals, order: int) -> Reals:
-    """Sizes of the companion states at constant input: powers of the geometric mean of the poles."""
-    mean = max(abs(float(den[-1])), 1e-300) ** (1.0 / order)
-    return np.asarray(mean ** -np.arange(1.0, order + 1.0))
+def _companion(model: Model) -> tuple[Reals, Reals, Reals, float]:
+    """(A, B, C, D) of the model without dead time and with positive gain, balanced; time in s."""
+    den = np.asarray(model.den)
+    num = np.concatenate((np.zeros(len(den) - len(model.num)), model.num)) * sign(model) / den[0]
+    den = den / den[0]
+    lags = time_constants(model)
+    unit = float(np.exp(np.mean(np.log(lags)))) if len(lags) else 1.0
+    scale = unit ** np.arange(len(den))
+    den, num = den * scale, num * scale
+    order = len(den) - 1
+    A = np.zeros((order, order))
+    A[0] = -den[1:]
+    A[1:, :-1] = np.eye(order - 1)
+    C = num[1:] - den[1:] * num[0]
+    balanced, (weights, _) = matrix_balance(A, permute=False, separate=True)
+    B = np.zeros(order)
+    B[0] = 1.0 / weights[0]
+    return np.asarray(balanced, dtype=float) / unit, B / unit, C * weights, float(num[0])
 
 
-class _Controller:
-    """The ISA controller in continuous time, its signals linear between the steps; the set-point steps at t = 0."""
+def _powers(a: Reals, x: Reals, count: int) -> Reals:
+    """x, a x, a^2 x, ...: shape (len(x), count), by doubling."""
+    found = np.empty((len(x), count))
+    found[:, 0] = x
+    done = 1
+    while done < count:
+        more = min(done, count - done)
+        found[:, done : done + more] = a @ found[:, :more]
+        done += more
+        a = a @ a
+    return found
 
-    def __init__(self, gains: Gains, dt: float, setpoint: float) -> None:
-        self.gains, self.dt, self.sp = gains, dt, setpoint
-        self.integral = 0.0
-        self.per_step = gains.Kp / gains.Ti * dt if gains.Ti > 0.0 else 0.0
-        # a derivative without filter cannot be built: its filter is then one step
-        filter_steps = max(gains.Tf, dt) / dt
-        self.decay = math.exp(-1.0 / filter_steps)
-        self.w1 = 1.0 - filter_steps * (1.0 - self.decay)
-        self.w0 = 1.0 - self.decay - self.w1
-        self.kd = gains.Kp * gains.Td / (filter_steps * dt)
-        self.filtered = 0.0
 
-    def advance(self, y_after: Reals, y_before: Reals) -> tuple[Reals, Reals]:
-        """u just after each step and just before the next, for y just after each step and just before the next."""
-        g = self.gains
-        areas = self.per_step * (self.sp - 0.5 * (y_after + y_before))
-        sums = self.integral + np.cumsum(areas)
-        starts = np.concatenate(([self.integral], sums[:-1]))
-        self.integral = float(sums[-1])
-        u_after = g.Kp * (g.b * self.sp - y_after) + starts
-        u_before = g.Kp * (g.b * self.sp - y_before) + sums
-        if self.kd > 0.0:
-            for n in range(len(y_after)):
-                v, w = g.c * self.sp - float(y_after[n]), g.c * self.sp - float(y_before[n])
-                u_after[n] += self.kd * (v - self.filtered)
-                self.filtered = self.decay * self.filtered + self.w0 * v + self.w1 * w
-                u_before[n] += self.kd * (w - self.filtered)
-        return u_after, u_before
+def _control(y: Reals, gains: Gains, dt: float, setpoint: float) -> Reals:
+    """MV for PV in blocks; signals are linear between the samples of a block."""
+    g = gains
+    u = g.Kp * (g.b * setpoint - y)
+    if g.Ti > 0.0:
+        areas = (0.5 * dt) * (2.0 * setpoint - y[:, 1:] - y[:, :-1])
+        inside = np.cumsum(areas, axis=1)
+        before = np.concatenate(([0.0], np.cumsum(inside[:-1, -1])))
+        u += g.Kp / g.Ti * before[:, None]
+        u[:, 1:] += g.Kp / g.Ti * inside
+    if g.Td > 0.0 and g.Tf > 0.0:
+        v = g.c * setpoint - y
+        u += g.Kp * g.Td / g.Tf * (v - _lagged(v, g.Tf / dt))
+    elif g.Td > 0.0:
+        u -= g.Kp * g.Td * np.gradient(y, dt, axis=1, edge_order=2)
+    return u
 
-    def now(self) -> tuple[float, float]:
-        """(offset, slope) of u = offset - slope*y at this instant."""
-        g = self.gains
-        offset = g.Kp * g.b * self.sp + self.integral + self.kd * (g.c * self.sp - self.filtered)
-        return offset, g.Kp + self.kd
 
-    def ahead(self, y: float) -> tuple[float, float]:
-        """(offset, slope) of u = offset - slope*y(one step on), given y now."""
-        g = self.gains
-        integral = self.integral + self.per_step * (self.sp - 0.5 * y)
-        filtered = self.decay * self.filtered + self.w0 * (g.c * self.sp - y) + self.w1 * g.c * self.sp
-        offset = g.Kp * g.b * self.sp + integral + self.kd * (g.c * self.sp - filtered)
-        return offset, g.Kp + 0.5 * self.per_step + self.kd * (1.0 - self.w1)
+def _lagged(v: Reals, steps: float) -> Reals:
+    """v in blocks behind a first-order lag of so many steps, from rest."""
+    decay = math.exp(-1.0 / steps)
+    w1 = 1.0 - steps * (1.0 - decay)
+    w0 = 1.0 - decay - w1
+    found = np.zeros_like(v)
+    found[:, 1:] = lfilter([1.0], [1.0, -decay], w0 * v[:, :-1] + w1 * v[:, 1:], axis=1)
+    fading = decay ** np.arange(v.shape[1])
+    start = 0.0
+    for block in found:
+        block += start * fading
+        start = float(block[-1])
+    return found
 
-    def commit(self, y: float, y_next: float) -> None:
-        """One step on: what `ahead` assumed has happened."""
-        g = self.gains
-        self.integral += self.per_step * (self.sp - 0.5 * (y + y_next))
-        self.filtered = self.decay * self.filtered + self.w0 * (g.c * self.sp - y) + self.w1 * (g.c * self.sp - y_next)
+
+def _joined(y: Reals, u: Reals, dt: float, steps: int) -> Response:
+    """The blocks in a row; where one ends and the next begins without a jump, one sample of the two is left out."""
+    blocks, width = y.shape
+    t = (np.arange(blocks)[:, None] * (width - 1) + np.arange(width)) * dt
+    kept = np.ones((blocks, width), dtype=bool)
+    for signal in (y, u):
+        jump = np.abs(signal[1:, 0] - signal[:-1, -1]) > 1e-7 * float(np.max(np.abs(signal)))
+        kept[:-1, -1] &= ~jump
+    kept[:-1, -1] = ~kept[:-1, -1]
+    kept &= t <= (steps + 0.5) * dt
+    return Response(t[kept], y[kept], u[kept])

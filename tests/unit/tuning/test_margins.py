@@ -115,7 +115,8 @@ def test_against_python_control_without_dead_time() -> None:
         assert 1.0 / found.Ms == pytest.approx(nearest, rel=0.001), entry["id"]
         if math.isfinite(sm):
             assert 1.0 / found.Ms <= sm * 1.001, entry["id"]
-        if math.isfinite(gm) and math.isfinite(found.GM):
+        assert (found.GM is None) == math.isinf(gm), entry["id"]
+        if found.GM is not None:
             assert pytest.approx(gm, rel=0.001) == found.GM, entry["id"]
         checked += 1
     assert checked > 20

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import control
@@ -10,10 +9,11 @@ import numpy as np
 import pytest
 
 from tests.unit.tuning.tables import EQUIPOLE5, MODELS, TABLES, table4_model, transfer_function, ziegler_nichols
+from tuning.figures import figures_of
 from tuning.gains import Gains
 from tuning.margins import ultimate_point
 from tuning.models import FOPDT, TransferFunction
-from tuning.response import figures_of, step_figures, step_response
+from tuning.response import step_figures, step_response
 
 
 @pytest.mark.parametrize("row", TABLES["table2"]["rows"], ids=lambda r: r["model"])
@@ -62,7 +62,7 @@ def test_the_first_dead_times_in_closed_form() -> None:
 def test_p_control_is_measured_against_its_own_final_value() -> None:
     found = step_figures(FOPDT(2.0, 5.0, 1.0), Gains(Kp=1.0))
     assert found.overshoot_pct < 10.0
-    assert math.isfinite(found.settling_s)
+    assert found.settling_s is not None
 
 
 def test_negative_gain_gives_the_same_figures() -> None:
@@ -127,4 +127,4 @@ def test_noise_does_not_pass_for_overshoot() -> None:
     found = figures_of(response.t, response.y + 0.03 * rng.standard_normal(len(response.t)), 1.0, 0.0)
     assert found.overshoot_pct == pytest.approx(21.4, abs=3.0)
     assert found.rise_s == pytest.approx(2.43, rel=0.15)
-    assert math.isfinite(found.settling_s)
+    assert found.settling_s is not None

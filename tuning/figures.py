@@ -1,0 +1,153 @@
+"""The figures engineers read from a response to a step: of a simulated response or of a recorded one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import trapezoid
+
+from tuning.models import Reals
+
+
+@dataclass(frozen=True, slots=True)
+class StepFigures:
+    """Of a response to a step of the set-point, or of the load (for which overshoot is 0 and rise is None).
+
+    overshoot_pct: of the final change, not below 0.  settling_s: until within the band (2 % if not told otherwise) of
+    the final change (load: of the peak) for good, counted from the step; None if not within the record.  rise_s: 10 to
+    90 %; None if never.  peak: largest PV change along the step.
+
+    Of the error e to the set-point, over the record, for the step as made, in PV units * s^n: IAE integral of |e|, ISE
+    of e^2, ITAE of t|e|, ITSE of t*e^2.  MIE: mean of |e| until settled, PV units.
+
+    Of MV's change u, None where no MV was given: MIC mean of |u| until settled, effort integral of u^2 (of u less its
+    final value), TV total variation, all in MV units (* s); peak_u: largest |u|.
+
+    MIE and MIC are those of Romasevych et al., PI-controller tuning optimization via PSO-based technique (there with a
+    band of 5 %). A loop that does not settle within the record counts as settled at its end.
+    """
+
+    overshoot_pct: float
+    settling_s: float | None
+    rise_s: float | None
+    IAE: float
+    ISE: float
+    ITAE: float
+    ITSE: float
+    MIE: float
+    peak: float
+    MIC: float | None = None
+    effort: float | None = None
+    TV: float | None = None
+    peak_u: float | None = None
+
+
+def response_figures(
+    t: Reals, y: Reals, u: Reals | None, *, final: float, reference: float, band: float, final_u: float = 0.0
+) -> StepFigures:
+    """Figures of the change y, PV units, and u, MV units, over t, s, beginning with the step at t = 0.
+
+    An instant at which a signal jumps is there twice. final: where y ends; 0 is a load's.  band: in PV units.
+    """
+    return _figures(t, y, y, u, final=final, reference=reference, band=band, final_u=final_u)
+
+
+def figures_of(
+    t: Reals, y: Reals, step: float, y0: float, u: Reals | None = None, band: float = 0.02
+) -> StepFigures:
+    """Figures of a recorded set-point step of size `step` (PV units, either sign) made at t[0] from rest at y0.
+
+    u: MV, recorded at the same instants; its change is counted from u[0].  band: of the step. Where measurement noise
+    shows, overshoot, rise and settling are read from a moving mean over a tenth of the rise, and the settling band is
+    at least three times the noise left in it.
+    """
+    time = np.asarray(t, dtype=float) - float(t[0])
+    change = (np.asarray(y, dtype=float) - y0) / step
+    # differences over one sample hardly contain the response, so their median size is the noise's (sqrt 2 * 0.6745)
+    noise = float(np.median(np.abs(np.diff(change, 2)))) / (math.sqrt(6.0) * 0.6745)
+    smooth = change
+    if noise > 0.002:
+        rough = _rise(time, _moving_mean(change, 5))
+        dt = (time[-1] - time[0]) / (len(time) - 1)
+        width = int(min(math.inf if rough is None else rough, float(time[-1]) / 5.0) / 10.0 / dt) | 1
+        smooth = _moving_mean(change, max(width, 5))
+        band = max(band, 3.0 * noise / math.sqrt(max(width, 5)))
+    moved = None if u is None else np.asarray(u, dtype=float) - float(u[0])
+    size = abs(step)
+    return _figures(
+        time,
+        size * smooth,
+        size * change,
+        moved,
+        final=size,
+        reference=size,
+        band=size * band,
+        final_u=0.0 if moved is None else float(np.mean(moved[-max(len(moved) // 20, 1) :])),
+    )
+
+
+def _figures(
+    t: Reals, smooth: Reals, y: Reals, u: Reals | None, *, final: float, reference: float, band: float, final_u: float
+) -> StepFigures:
+    error = reference - y
+    settling = _settling(t, np.abs(smooth - final), band)
+    until = float(t[-1]) if settling is None or settling <= 0.0 else settling
+    peak = float(np.max(smooth))
+    return StepFigures(
+        overshoot_pct=max(0.0, 100.0 * (peak / final - 1.0)) if final else 0.0,
+        settling_s=settling,
+        rise_s=_rise(t, smooth / final) if final else None,
+        IAE=float(trapezoid(np.abs(error), t)),
+        ISE=float(trapezoid(error * error, t)),
+        ITAE=float(trapezoid(t * np.abs(error), t)),
+        ITSE=float(trapezoid(t * error * error, t)),
+        MIE=_mean_until(t, np.abs(error), until),
+        peak=peak,
+        MIC=None if u is None else _mean_until(t, np.abs(u), until),
+        effort=None if u is None else float(trapezoid((u - final_u) ** 2, t)),
+        TV=None if u is None else abs(float(u[0])) + float(np.sum(np.abs(np.diff(u)))),
+        peak_u=None if u is None else float(np.max(np.abs(u))),
+    )
+
+
+def _settling(t: Reals, distance: Reals, band: float) -> float | None:
+    """When the distance to the final value falls to the band for good, s."""
+    outside = np.flatnonzero(distance > band)
+    if not len(outside):
+        return 0.0
+    i = int(outside[-1])
+    if i == len(t) - 1:
+        return None
+    a, b = float(distance[i]), float(distance[i + 1])
+    return float(t[i] + (t[i + 1] - t[i]) * (a - band) / (a - b))
+
+
+def _rise(t: Reals, y: Reals) -> float | None:
+    """From 10 to 90 % of one, s."""
+    at = []
+    for level in (0.1, 0.9):
+        above = np.flatnonzero(y >= level)
+        if not len(above):
+            return None
+        i = int(above[0])
+        at.append(float(t[0]) if i == 0 else float(np.interp(level, y[i - 1 : i + 1], t[i - 1 : i + 1])))
+    return at[1] - at[0]
+
+
+def _mean_until(t: Reals, values: Reals, end: float) -> float:
+    last = int(np.searchsorted(t, end, side="right"))
+    kept, at = values[:last], t[:last]
+    area = float(trapezoid(kept, at))
+    if last < len(t):
+        there = float(np.interp(end, t[last - 1 : last + 1], values[last - 1 : last + 1]))
+        area += 0.5 * (float(kept[-1]) + there) * (end - float(at[-1]))
+    return area / end
+
+
+def _moving_mean(y: Reals, width: int) -> Reals:
+    """Centred, the ends held."""
+    half = width // 2
+    padded = np.pad(y, half, mode="edge")
+    return np.convolve(padded, np.full(2 * half + 1, 1.0 / (2 * half + 1)), "valid")
