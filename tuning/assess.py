@@ -33,6 +33,4 @@ def assess(model: Model, gains: Gains, band: float = 0.02) -> Assessment:
     found = margins(model, gains)
     if not found.stable:
         return Assessment(found, None, None)
-    return Assessment(
-        found, step_figures(model, gains, band=band), step_figures(model, gains, load=True, band=band)
-    )
+    return Assessment(found, step_figures(model, gains, band=band), step_figures(model, gains, load=True, band=band))

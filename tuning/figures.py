@@ -54,9 +54,7 @@ def response_figures(
     return _figures(t, y, y, u, final=final, reference=reference, band=band, final_u=final_u)
 
 
-def figures_of(
-    t: Reals, y: Reals, step: float, y0: float, u: Reals | None = None, band: float = 0.02
-) -> StepFigures:
+def figures_of(t: Reals, y: Reals, step: float, y0: float, u: Reals | None = None, band: float = 0.02) -> StepFigures:
     """Figures of a recorded set-point step of size `step` (PV units, either sign) made at t[0] from rest at y0.
 
     u: MV, recorded at the same instants; its change is counted from u[0].  band: of the step. Where measurement noise
