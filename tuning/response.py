@@ -87,7 +87,7 @@ def step_response(
     """The loop from rest under a unit step of the set-point, or (load) of the plant's input, at t = 0.
 
     horizon: s, by default until the response has come to rest.  dt: s, at most; by default a hundredth of the dead time
-    and a fiftieth of the crossover's radian, unless that is more than 40,000 steps. A dead time that would still be
+    and of the crossover's radian, unless that is more than 40,000 steps. A dead time that would still be
     less than four steps in twice that number is taken as its second-order Pade approximant.
 
     Raises Refused: NOT_ROBUST for an unstable loop when no horizon is given, or when its response overflows; BAD_INPUT
@@ -132,7 +132,7 @@ def _crossover(model: Model, gains: Gains) -> float:
 
 
 def _fine(model: Model, gains: Gains, horizon: float) -> float:
-    step = min(0.02 / _crossover(model, gains), horizon / 2000.0)
+    step = min(0.01 / _crossover(model, gains), horizon / 2000.0)
     if model.L > 0.0:
         step = min(step, model.L / 100.0)
     return max(step, horizon / MAX_STEPS)
