@@ -90,6 +90,12 @@ def _figures(
     t: Reals, smooth: Reals, y: Reals, u: Reals | None, *, final: float, reference: float, band: float, final_u: float
 ) -> StepFigures:
     error = reference - y
+    size, squared = np.abs(error), error * error
+    # of the trapezoidal rule
+    weights = np.zeros(len(t))
+    half = 0.5 * np.diff(t)
+    weights[:-1] += half
+    weights[1:] += half
     settling = _settling(t, np.abs(smooth - final), band)
     until = float(t[-1]) if settling is None or settling <= 0.0 else settling
     peak = float(np.max(smooth))
@@ -97,14 +103,14 @@ def _figures(
         overshoot_pct=max(0.0, 100.0 * (peak / final - 1.0)) if final else 0.0,
         settling_s=settling,
         rise_s=_rise(t, smooth / final) if final else None,
-        IAE=float(trapezoid(np.abs(error), t)),
-        ISE=float(trapezoid(error * error, t)),
-        ITAE=float(trapezoid(t * np.abs(error), t)),
-        ITSE=float(trapezoid(t * error * error, t)),
-        MIE=_mean_until(t, np.abs(error), until),
+        IAE=float(weights @ size),
+        ISE=float(weights @ squared),
+        ITAE=float(weights @ (t * size)),
+        ITSE=float(weights @ (t * squared)),
+        MIE=_mean_until(t, size, until),
         peak=peak,
         MIC=None if u is None else _mean_until(t, np.abs(u), until),
-        effort=None if u is None else float(trapezoid((u - final_u) ** 2, t)),
+        effort=None if u is None else float(weights @ (u - final_u) ** 2),
         TV=None if u is None else abs(float(u[0])) + float(np.sum(np.abs(np.diff(u)))),
         peak_u=None if u is None else float(np.max(np.abs(u))),
     )
@@ -126,10 +132,10 @@ def _rise(t: Reals, y: Reals) -> float | None:
     """From 10 to 90 % of one, s."""
     at = []
     for level in (0.1, 0.9):
-        above = np.flatnonzero(y >= level)
-        if not len(above):
+        above = y >= level
+        i = int(np.argmax(above))
+        if not above[i]:
             return None
-        i = int(above[0])
         at.append(float(t[0]) if i == 0 else float(np.interp(level, y[i - 1 : i + 1], t[i - 1 : i + 1])))
     return at[1] - at[0]
 

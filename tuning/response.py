@@ -16,7 +16,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft
+from scipy.fft import next_fast_len
 from scipy.linalg import matrix_balance, toeplitz
 from scipy.signal import lfilter
 
@@ -250,11 +250,11 @@ class _Loop:
             advance = np.block([[driven, free], [ends, whole]])
             return np.ascontiguousarray(_powers(advance, np.append(np.zeros(delay + 1), state), blocks)[: delay + 1].T)
         y = np.zeros((blocks, delay + 1))
-        length = fft.next_fast_len(2 * delay + 1, real=True)
-        spectrum = fft.rfft(kernel, length)
+        length = next_fast_len(2 * delay + 1, real=True)
+        spectrum = np.fft.rfft(kernel, length)
         for k in range(1, blocks):
             last = y[k - 1]
-            driven = fft.irfft(fft.rfft(last, length) * spectrum, length)[: delay + 1]
+            driven = np.fft.irfft(np.fft.rfft(last, length) * spectrum, length)[: delay + 1]
             y[k] = free @ state + driven - begun * last[0]
             state = whole @ state + ends @ last
         return y
@@ -344,11 +344,14 @@ def _lagged(v: Reals, steps: float) -> Reals:
 def _joined(y: Reals, u: Reals, dt: float, steps: int) -> Response:
     """The blocks in a row; where one ends and the next begins without a jump, one sample of the two is left out."""
     blocks, width = y.shape
-    t = (np.arange(blocks)[:, None] * (width - 1) + np.arange(width)) * dt
-    kept = np.ones((blocks, width), dtype=bool)
+    jumps = np.zeros(blocks - 1, dtype=bool)
     for signal in (y, u):
-        jump = np.abs(signal[1:, 0] - signal[:-1, -1]) > 1e-7 * float(np.max(np.abs(signal)))
-        kept[:-1, -1] &= ~jump
-    kept[:-1, -1] = ~kept[:-1, -1]
-    kept &= t <= (steps + 0.5) * dt
+        jumps |= np.abs(signal[1:, 0] - signal[:-1, -1]) > 1e-7 * max(float(np.max(signal)), -float(np.min(signal)))
+    count = steps + 1
+    if not jumps.any():
+        rows = [np.append(signal[:, :-1], signal[-1, -1])[:count] for signal in (y, u)]
+        return Response(np.arange(count, dtype=np.float64) * dt, *rows)
+    t = (np.arange(blocks)[:, None] * (width - 1) + np.arange(width)) * dt
+    kept = t <= (steps + 0.5) * dt
+    kept[:-1, -1] &= jumps
     return Response(t[kept], y[kept], u[kept])

@@ -32,19 +32,22 @@ def open_loop(model: Model, gains: Gains) -> tuple[Reals, Reals]:
             Reason.BAD_INPUT,
             f"Kp = {g.Kp}, Ti = {g.Ti} s, Td = {g.Td} s, Tf = {g.Tf} s: Kp must be positive, the times not negative",
         )
-    filtered = np.array([g.Tf, 1.0]) if g.Td > 0.0 and g.Tf > 0.0 else np.array([1.0])
-    num, den = np.polyadd(filtered, [g.Td, 0.0]), filtered
+    # from the lowest power up: the filter, then the controller's two polynomials
+    lag = [1.0, g.Tf] if g.Td > 0.0 and g.Tf > 0.0 else [1.0]
+    derived = [1.0, g.Td + (g.Tf if g.Td > 0.0 else 0.0)] if g.Td > 0.0 else [1.0]
+    num, den = derived, lag
     if g.Ti > 0.0:
-        num = np.polyadd(np.polymul(num, [g.Ti, 0.0]), filtered)
-        den = np.polymul(den, [g.Ti, 0.0])
-    N = np.trim_zeros(np.polymul(model.num, num) * (g.Kp * sign(model)), "f")
-    D = np.trim_zeros(np.polymul(model.den, den), "f")
+        num, den = np.convolve(derived, [0.0, g.Ti]).tolist(), [0.0, *(g.Ti * c for c in lag)]
+        for power, c in enumerate(lag):
+            num[power] += c
+    N = np.convolve(model.num, num[::-1]) * (g.Kp * sign(model))
+    D = np.convolve(model.den, den[::-1])
     if len(N) > len(D):
         raise Refused(
             Reason.BAD_INPUT,
             f"Td = {g.Td:g} s without a filter on a plant that passes jumps on: give Tf > 0 or Td = 0",
         )
-    return np.asarray(N, dtype=float), np.asarray(D, dtype=float)
+    return N, D
 
 
 def unstable_poles(model: Model, gains: Gains) -> int | None:
