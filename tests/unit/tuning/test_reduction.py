@@ -12,7 +12,7 @@ from tests.unit.tuning.tables import EQUIPOLE5, TABLES
 from tuning.gains import Gains
 from tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
 from tuning.reasons import Reason, Refused
-from tuning.recorded import fit_closed_loop, fit_step, moments_of, two_areas_of
+from tuning.recorded_step import fit_closed_loop, fit_step, moments_of, two_areas_of
 from tuning.reduction import half_rule, half_rule_second_order, moments, two_areas
 from tuning.response import step_response
 
