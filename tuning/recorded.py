@@ -1,0 +1,102 @@
+"""A recorded test of a loop, checked: what an identification can be asked to explain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tuning.models import Reals
+from tuning.reasons import Reason, Refused
+
+LEAST_SAMPLES = 20
+LEAST_AFTER_THE_FIRST_MOVE = 10
+# of the sample time, between one sample and the next
+UNEVEN = 0.2
+GAP = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """Ts: s.  y: PV, shape (N,).  u: MV that held from each sample to the next, shape (N,).  u_before: MV before it.
+
+    first_move: the first sample from which MV is not u_before.
+    """
+
+    Ts: float
+    u: Reals
+    y: Reals
+    u_before: float
+    first_move: int
+
+
+def recorded(t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | None = None) -> Recorded:
+    """Checks and puts together a record; t in s, evenly spaced, u and y of the same length.
+
+    u_before: the MV that had held before the record, by default its first value.
+    Raises Refused(BAD_INPUT), naming the sample, for what cannot be used.
+    """
+    time, mv, pv = (_column(name, values) for name, values in (("t", t), ("u", u), ("y", y)))
+    if not len(time) == len(mv) == len(pv):
+        raise _bad(f"t, u and y must be equally long; they have {len(time)}, {len(mv)} and {len(pv)} samples")
+    if len(time) < LEAST_SAMPLES:
+        raise _bad(f"too few samples: {len(time)}; at least {LEAST_SAMPLES} are needed")
+    Ts = _sample_time(time)
+    before = float(mv[0]) if u_before is None else float(u_before)
+    if not np.isfinite(before):
+        raise _bad(f"u_before must be a finite number, not {before}")
+    moved = np.flatnonzero(mv != before)
+    if not len(moved):
+        raise _bad(f"the input is constant at {before:g}: nothing can be learnt from it; MV must move at least once")
+    first = int(moved[0])
+    if len(time) - first - 1 < LEAST_AFTER_THE_FIRST_MOVE:
+        raise _bad(
+            f"only {len(time) - first - 1} samples follow the first move of the input (sample {first}); "
+            f"at least {LEAST_AFTER_THE_FIRST_MOVE} are needed"
+        )
+    if float(np.ptp(pv)) == 0.0:
+        raise Refused(Reason.NO_RESPONSE, f"PV is constant at {pv[0]:g} while MV moves")
+    return Recorded(Ts, mv, pv, before, first)
+
+
+def _column(name: str, values: ArrayLike) -> Reals:
+    try:
+        column = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise _bad(f"{name} must be a series of numbers") from None
+    if column.ndim != 1:
+        raise _bad(f"{name} must be one series of numbers, not {column.ndim}-dimensional")
+    wrong = np.flatnonzero(~np.isfinite(column))
+    if len(wrong):
+        at = int(wrong[0])
+        raise _bad(f"{name} must be finite everywhere; sample {at} is {column[at]} ({len(wrong)} in all)")
+    return column
+
+
+def _sample_time(t: Reals) -> float:
+    steps = np.diff(t)
+    back = np.flatnonzero(steps <= 0.0)
+    if len(back):
+        at = int(back[0]) + 1
+        raise _bad(f"t must increase; sample {at} has {t[at]:g} s after {t[at - 1]:g} s")
+    usual = float(np.median(steps))
+    gaps = np.flatnonzero(steps > GAP * usual)
+    if len(gaps):
+        at = int(gaps[0]) + 1
+        raise _bad(
+            f"gap in t: {steps[at - 1]:g} s before sample {at} where {usual:g} s is usual ({len(gaps)} in all); "
+            "use a part without gaps"
+        )
+    uneven = np.flatnonzero(np.abs(steps - usual) > UNEVEN * usual)
+    if len(uneven):
+        at = int(uneven[0]) + 1
+        raise _bad(
+            f"t must be evenly spaced within {100 * UNEVEN:.0f} %; sample {at} comes {steps[at - 1]:g} s after the last "
+            f"where {usual:g} s is usual"
+        )
+    return float((t[-1] - t[0]) / (len(t) - 1))
+
+
+def _bad(text: str) -> Refused:
+    return Refused(Reason.BAD_INPUT, text)

@@ -1,0 +1,82 @@
+"""Model structures that can be fitted to a record: what is searched for, and what follows from it linearly.
+
+A structure is stable by construction: the coefficients of its denominator are searched as logarithms, which covers two
+real poles, a double pole and a complex pair without a distinction of cases.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from tuning.models import FOPDT, SOPDT, Integrating, Reals
+from tuning.sampled import states
+
+Plant = FOPDT | SOPDT | Integrating
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """(b_z s^z + ... + b_0) * exp(-L*s) / den(s), den monic with `lags` searched coefficients, times s if integrating.
+
+    theta = (logs of the searched coefficients, highest power first; L), time in samples. The b are linear.
+    """
+
+    name: str
+    lags: int
+    integrating: bool = False
+    zeros: int = 0
+
+    @property
+    def order(self) -> int:
+        return self.lags + self.integrating
+
+    @property
+    def searched(self) -> int:
+        """How many numbers theta has."""
+        return self.lags + 1
+
+    @property
+    def inputs(self) -> int:
+        """How many linear coefficients belong to the plant's input."""
+        return self.zeros + 1
+
+    def monic(self, theta: Reals) -> Reals:
+        """The denominator without its leading 1, highest power first."""
+        searched = np.exp(theta[: self.lags])
+        return np.append(searched, 0.0) if self.integrating else searched
+
+    def regressors(self, theta: Reals, u: Reals, load_from: int | None) -> Reals:
+        """Columns of everything linear, shape (len(u), columns): the input's, the offset's, then a load step's.
+
+        load_from: sample at which a step of unknown size and place enters the plant, its dead time included; 0 stands
+        for a plant that was not at rest at the start; None for no load.
+        """
+        monic = self.monic(theta)
+        parts = [states(monic, float(theta[-1]), u, self.inputs), np.ones((len(u), 1))]
+        if load_from is not None:
+            parts.append(states(monic, 0.0, (np.arange(len(u)) >= load_from).astype(float), self.order))
+        return np.concatenate(parts, axis=1)
+
+    def plant(self, theta: Reals, b0: float, Ts: float) -> Plant:
+        """The model of these parameters, time in s again; b0 in PV units per MV unit (and sample^order)."""
+        L = max(float(theta[-1]), 0.0) * Ts
+        if self.integrating:
+            if not self.lags:
+                return Integrating(b0 / Ts, L)
+            a = math.exp(theta[0])
+            return Integrating(b0 / a / Ts, L, Ts / a)
+        if self.lags == 1:
+            a = math.exp(theta[0])
+            return FOPDT(b0 / a, Ts / a, L)
+        a1, a0 = math.exp(theta[0]), math.exp(theta[1])
+        return SOPDT(b0 / a0, Ts / math.sqrt(a0), 0.5 * a1 / math.sqrt(a0), L)
+
+
+FIRST = Structure("fopdt", 1)
+SECOND = Structure("sopdt", 2)
+INTEGRATOR = Structure("integrating", 0, integrating=True)
+LAGGED_INTEGRATOR = Structure("integrating with lag", 1, integrating=True)
+SECOND_WITH_ZERO = Structure("sopdt with zero", 2, zeros=1)
