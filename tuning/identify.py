@@ -32,10 +32,11 @@ FLOOR = 2e-4
 # rms of a residual, as a part of PV's span, of which it does not matter what it consists of
 UNIMPORTANT = 1.5e-3
 # differences of BIC: of a structure worth naming beside the best; by which PV must be better explained with MV than
-# without; by which a record must be better explained by a start that was not at rest
+# without
 RIVAL = 4.0
 VISIBLE = 10.0
-DISTURBED = 15.0
+# a start not at rest must leave less than this of the residual's rms: it can hide a little of a wrong structure
+DISTURBED = 0.8
 WHITE_ABOVE = 1e-3
 POORLY_KNOWN = 0.25
 LONGEST_LAG = 30.0  # in records
@@ -60,8 +61,8 @@ class Identified:
     fit_pct: 100*(1 - |y - fitted|/|y - mean y|) (NRMSE fit).  r2_pct: 100*(1 - the square of that ratio).
     noise_std: of what the model leaves unexplained, PV units.  standard_errors: of the model's parameters by their
     names, in their units.  whiteness: Ljung-Box p-value of the residual, below 0.001 not white noise.  explained: the
-    residual is white, or too small to matter (0.15 % of PV's span).  fitted: PV as modelled, PV units, shape (N,).  candidates: all
-    structures tried, best first.  notes: what the user should know, one sentence each.
+    residual is white, or too small to matter (0.15 % of PV's span).  fitted: PV as modelled, PV units, shape (N,).
+    candidates: all structures tried, best first.  notes: what the user should know, one sentence each.
     """
 
     model: Plant
@@ -95,7 +96,9 @@ def identify(t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | None = 
         if not other.explains:
             moving = [problem.fit(structure, 0) for structure in STRUCTURES]
             fits += moving
-            best = min((*moving, best), key=lambda fit: fit.bic + (0.0 if fit.load_from is None else DISTURBED))
+            of_moving = min(moving, key=_bic)
+            if of_moving.bic < best.bic and of_moving.rms < DISTURBED * best.rms:
+                best = of_moving
     problem.require_visible(best)
     return _result(problem, best, sorted(fits, key=_bic))
 
@@ -160,9 +163,9 @@ class _Problem:
             noise = self.pv_unit * math.sqrt(without.rss / self.samples)
             raise Refused(
                 Reason.NO_RESPONSE,
-                f"no response of PV to MV is visible: without MV the record is explained to within {noise:.3g} PV units, "
-                f"with it to within {self.pv_unit * fit.rms:.3g}; move MV further (it moved by {self.mv_unit:.3g}) "
-                "or record for longer",
+                f"no response of PV to MV is visible: without MV the record is explained to within {noise:.3g} "
+                f"PV units, with it to within {self.pv_unit * fit.rms:.3g}; move MV further (it moved by "
+                f"{self.mv_unit:.3g}) or record for longer",
             )
 
     def errors(self, fit: _Fit) -> dict[str, float]:
@@ -245,8 +248,8 @@ def _notes(problem: _Problem, best: _Fit, ranked: Sequence[_Fit], model: Plant, 
         notes.append("The plant was not at rest, or under a load, at the start of the record; this was allowed for.")
     if not best.explains:
         notes.append(
-            f"The residual is not white noise ({100.0 * best.rms:.2g} % of PV's span): the plant has another structure, "
-            "or something else moved PV."
+            f"The residual is not white noise ({100.0 * best.rms:.2g} % of PV's span): the plant has another "
+            "structure, or something else moved PV."
         )
     top = ranked[0]
     if top.structure.zeros and top.bic < best.bic - RIVAL:

@@ -92,8 +92,8 @@ def _sample_time(t: Reals) -> float:
     if len(uneven):
         at = int(uneven[0]) + 1
         raise _bad(
-            f"t must be evenly spaced within {100 * UNEVEN:.0f} %; sample {at} comes {steps[at - 1]:g} s after the last "
-            f"where {usual:g} s is usual"
+            f"t must be evenly spaced within {100 * UNEVEN:.0f} %; sample {at} comes {steps[at - 1]:g} s after the "
+            f"last where {usual:g} s is usual"
         )
     return float((t[-1] - t[0]) / (len(t) - 1))
 

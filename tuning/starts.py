@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.signal import correlate
+from scipy.fft import next_fast_len
 
 from tuning.models import Reals
 from tuning.sampled import states
@@ -26,7 +26,7 @@ def starts(structure: Structure, u: Reals, y: Reals, most_dead_time: int, nuisan
     found: list[tuple[float, Reals]] = []
     for logs in _denominators(structure, len(u)):
         monic = structure.monic(np.append(logs, 0.0))
-        response = states(monic, 0.0, u, 1)[:, 0]
+        response = states(monic, 0.0, u, structure.inputs)
         others = np.ones((len(u), 1))
         if nuisance:
             others = np.concatenate((others, states(monic, 0.0, np.ones(len(u)), structure.order)), axis=1)
@@ -61,20 +61,25 @@ def _denominators(structure: Structure, samples: int) -> list[Reals]:
     return real + [np.log([2.0 * zeta / T, 1.0 / T**2]) for T in within for zeta in DAMPING_RATIOS]
 
 
-def _of_all_shifts(x: Reals, y: Reals, others: Reals, most: int) -> Reals:
-    """Sum of squares that is left of y after a fit by x shifted by 0, 1, ... `most` samples and by the others."""
+def _of_all_shifts(responses: Reals, y: Reals, others: Reals, most: int) -> Reals:
+    """Sum of squares left of y by a fit of the columns, shifted by 0, 1, ... `most` samples, and of the others."""
+    columns = responses / np.maximum(np.sqrt(np.sum(responses**2, axis=0)), 1e-300)
     basis = np.linalg.qr(others)[0]
     rest = y - basis @ (basis.T @ y)
-    size = np.cumsum(x * x)[::-1][: most + 1].copy()
-    whole = size[0]
-    for column in basis.T:
-        size -= _shifted_products(column, x, most) ** 2
-    with_y = _shifted_products(rest, x, most)
-    seen = size > 1e-9 * whole
-    return np.asarray(rest @ rest - np.where(seen, with_y**2 / np.where(seen, size, 1.0), 0.0))
+    products = _shifted_products(np.column_stack((rest, basis)), columns, most)
+    with_y, with_basis = products[:, 0], products[:, 1:]
+    count = columns.shape[1]
+    gram = 1e-9 * np.eye(count) - np.einsum("mqi,mqj->mij", with_basis, with_basis)
+    for i in range(count):
+        for j in range(count):
+            # what is shifted out at the end is lost
+            gram[:, i, j] += np.cumsum(columns[:, i] * columns[:, j])[::-1][: most + 1]
+    weights = np.linalg.solve(gram, with_y[:, :, None])[:, :, 0]
+    return np.asarray(rest @ rest - np.sum(weights * with_y, axis=1))
 
 
-def _shifted_products(y: Reals, x: Reals, most: int) -> Reals:
-    """Sum over k of y[k]*x[k-m] for m = 0 ... most."""
-    full = correlate(y, x, mode="full", method="fft")
-    return np.asarray(full[len(x) - 1 : len(x) + most])
+def _shifted_products(fixed: Reals, shifted: Reals, most: int) -> Reals:
+    """Sum over k of fixed[k, q]*shifted[k-m, i] for m = 0 ... most, shape (most + 1, columns of each)."""
+    size = next_fast_len(2 * len(fixed), real=True)
+    spectrum = np.fft.rfft(fixed, size, axis=0)[:, :, None] * np.fft.rfft(shifted, size, axis=0).conj()[:, None, :]
+    return np.asarray(np.fft.irfft(spectrum, size, axis=0)[: most + 1])

@@ -14,7 +14,7 @@ import numpy as np
 from tuning.models import Reals
 
 MOST_STEPS = 60
-RELATIVE_DECREASE = 1e-9
+RELATIVE_DECREASE = 1e-7
 # directions weaker than this, in columns of unit length, are not seen in the data
 LEAST_SINGULAR = 1e-9
 
