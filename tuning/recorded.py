@@ -48,7 +48,10 @@ def recorded(t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | None = 
         raise _bad(f"u_before must be a finite number, not {before}")
     moved = np.flatnonzero(mv != before)
     if not len(moved):
-        raise _bad(f"the input is constant at {before:g}: nothing can be learnt from it; MV must move at least once")
+        raise _bad(
+            f"the input is constant at {before:g}: nothing can be learnt from it; MV must move at least "
+            "once (if it moved when the record began, say from where: u_before)"
+        )
     first = int(moved[0])
     if len(time) - first - 1 < LEAST_AFTER_THE_FIRST_MOVE:
         raise _bad(

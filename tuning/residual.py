@@ -1,0 +1,27 @@
+"""What is left of a record after a fit: is it noise?"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from tuning.models import Reals
+
+
+def whiteness(residual: Reals, searched: int) -> float:
+    """p-value of the Ljung-Box test (1978) on the residual's autocorrelation."""
+    n = len(residual)
+    lags = max(searched + 3, min(20, n // 5))
+    r = residual - residual.mean()
+    power = float(r @ r)
+    if power == 0.0:
+        return 1.0
+    correlations = np.array([float(r[k:] @ r[:-k]) for k in range(1, lags + 1)]) / power
+    q = n * (n + 2.0) * float(np.sum(correlations**2 / (n - np.arange(1.0, lags + 1.0))))
+    return float(chi2.sf(q, lags - searched))
+
+
+def colour(residual: Reals) -> float:
+    """How many times more the residual's slow part weighs than that of white noise of its differences; at least 1."""
+    fast = 0.5 * float(np.mean(np.diff(residual) ** 2))
+    return max(1.0, float(np.mean(residual**2)) / fast) if fast > 0.0 else 1.0
