@@ -1,0 +1,32 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.unit.tuning.recordings import COMPLEX_POLES, FIRST_ORDER, INVERSE_RESPONSE, Loop, moves, open_loop
+from tuning.starts import starts
+from tuning.structures import FIRST, SECOND, SECOND_WITH_ZERO, Structure
+from tuning.varpro import solve
+
+
+@pytest.mark.parametrize("nuisance", [False, True])
+@pytest.mark.parametrize(
+    ("structure", "tested"),
+    [(FIRST, FIRST_ORDER), (SECOND, COMPLEX_POLES), (SECOND_WITH_ZERO, INVERSE_RESPONSE)],
+    ids=lambda p: p.name if isinstance(p, Structure) else "",
+)
+def test_the_dead_time_is_the_best_of_all_tried_one_by_one(structure: Structure, tested: Loop, nuisance: bool) -> None:
+    change = moves(300)
+    y = open_loop(tested, change, noise=0.05)[2]
+    best = starts(structure, change, y, 60, nuisance, 1)[0]
+    load = 0 if nuisance else None
+    plain = [solve(structure.regressors(np.append(best[:-1], float(m)), change, load), y).rss for m in range(61)]
+    assert best[-1] == int(np.argmin(plain))
+
+
+def test_starts_differ() -> None:
+    found = starts(SECOND, moves(300), open_loop(COMPLEX_POLES, moves(300))[2], 60, False, 3)
+    assert len(found) == 3
+    for i in range(3):
+        for j in range(i):
+            assert np.abs(found[i] - found[j]).max() > 0.1
