@@ -13,7 +13,7 @@ import csv
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -145,6 +145,8 @@ def _is_date(cell: str) -> bool:
 
 def _seconds(cell: str) -> float:
     try:
-        return datetime.fromisoformat(cell.strip()).timestamp()
+        moment = datetime.fromisoformat(cell.strip())
     except ValueError:
         raise ValueError(f"is not a date and time: {cell.strip()!r}") from None
+    # without a zone it is a plain clock: this machine's zone and its summer time have no part in it
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()

@@ -23,6 +23,8 @@ COARSEST = 0.1
 WHITE_ABOVE = 1e-3
 # difference of BIC by which PV must be better explained with MV than without
 VISIBLE = 10.0
+# noise, as a part of the response's span, beyond which what is found may be a shape of the noise
+NOISIEST = 0.5
 STARTS = 3
 LONGEST_LAG = 30.0  # in records
 SHORTEST_LAG = 0.1  # in samples
@@ -48,6 +50,12 @@ class Fit:
     def rms(self) -> float:
         """Of the residual, in spans of PV."""
         return math.sqrt(self.linear.rss / len(self.linear.residual))
+
+    @property
+    def noise(self) -> float:
+        """The residual's rms as a part of the span of PV's response to MV."""
+        inputs = self.structure.inputs
+        return self.rms / float(np.ptp(self.columns[:, :inputs] @ self.linear.coefficients[:inputs]))
 
     @property
     def explains(self) -> bool:
@@ -97,7 +105,7 @@ class Problem:
         return Fit(structure, load_from, theta, columns, linear, bic, parameters, unimportant)
 
     def require_visible(self, fit: Fit) -> None:
-        """Refused unless the record is much less well explained without its input."""
+        """Refused unless PV answers MV: more than by chance, and above the noise."""
         inputs = fit.structure.inputs
         without = solve(fit.columns[:, inputs:], self.y)
         parameters = fit.parameters - inputs - fit.structure.searched
@@ -108,6 +116,13 @@ class Problem:
                 f"no response of PV to MV is visible: without MV the record is explained to within {noise:.3g} "
                 f"PV units, with it to within {self.pv_unit * fit.rms:.3g}; move MV further (it moved by "
                 f"{self.mv_unit:.3g}) or record for longer",
+            )
+        if fit.noise > NOISIEST:
+            raise Refused(
+                Reason.NOISE_TOO_HIGH,
+                f"the noise of PV, {self.pv_unit * fit.rms:.3g} PV units, is {100.0 * fit.noise:.0f} % of its response "
+                f"to MV; at most {100.0 * NOISIEST:.0f} % is accepted: move MV further (it moved by "
+                f"{self.mv_unit:.3g})",
             )
 
     def errors(self, fit: Fit) -> dict[str, float]:
@@ -149,8 +164,8 @@ class Problem:
         slow, fast = math.log(1.0 / (LONGEST_LAG * self.samples)), math.log(1.0 / SHORTEST_LAG)
         low, high = np.full(structure.lags, slow), np.full(structure.lags, fast)
         if structure.lags == 2:
-            # of the product of two rates
-            low[1], high[1] = 2.0 * slow, 2.0 * fast
+            # the product of two rates; a natural period under six samples is an alias
+            low[1], high[1] = 2.0 * slow, 0.0
         return np.append(low, 0.0), np.append(high, float(self.most_dead_time))
 
     def _bic(self, rss: float, parameters: int) -> float:

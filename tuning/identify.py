@@ -33,6 +33,8 @@ RIVAL = 4.0
 DISTURBED = 0.8
 POORLY_KNOWN = 0.25
 COARSE = 0.02
+# noise, as a part of the response's span, beyond which the errors are not small enough to be linear
+NOISY = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +77,9 @@ def identify(t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | None = 
 
     t: s, evenly spaced.  u: MV that holds from its sample to the next.  y: PV at the sample.  u_before: the MV that
     held before the record, by default u[0]; give it when the record begins with the move.
-    Raises Refused(BAD_INPUT) for a record that cannot be used and Refused(NO_RESPONSE) where PV does not answer MV
-    visibly. The plant must be stable or integrate once.
+    Raises Refused(BAD_INPUT) for a record that cannot be used, Refused(NO_RESPONSE) where PV does not answer MV
+    visibly and Refused(NOISE_TOO_HIGH) where the noise is more than half of the answer. The plant
+    must be stable or integrate once.
     """
     record = recorded(t, u, y, u_before)
     problem = Problem(record)
@@ -140,6 +143,9 @@ def _notes(problem: Problem, best: Fit, ranked: Sequence[Fit], model: Plant, err
     rivals.discard(best.structure.name)
     if rivals:
         notes.append(f"The record supports nearly as well: {', '.join(sorted(rivals))}.")
+    if best.noise > NOISY:
+        part = 100.0 * best.noise
+        notes.append(f"The noise is {part:.2g} % of PV's response to MV: the errors given may be too small.")
     poor = []
     for (name, error), value in zip(errors.items(), parameters_of(model).values(), strict=True):
         # a dead time within half a sample of zero is known well enough

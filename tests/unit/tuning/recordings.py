@@ -53,23 +53,23 @@ def moves(samples: int = 600, held: int = 30, seed: int = 1) -> Reals:
 
 
 def open_loop(
-    tested: Loop, change: Sequence[float] | Reals, Ts: float = 0.1, noise: float = 0.0, seed: int = 1
+    loop: Loop, change: Sequence[float] | Reals, Ts: float = 0.1, noise: float = 0.0, seed: int = 1
 ) -> tuple[Reals, Reals, Reals]:
     """(t, u, y) under these changes of MV."""
-    plant = tested.plant(Ts, noise, seed)
+    plant = loop.plant(Ts, noise, seed)
     u = MV + np.asarray(change, dtype=float)
     y = np.array([plant.pv, *(plant.step(float(mv)) for mv in u[:-1])])
     return np.arange(len(u)) * Ts, u, y
 
 
 def closed_loop(
-    tested: Loop, relay: bool = False, samples: int = 600, Ts: float = 0.1, noise: float = 0.0, seed: int = 1
+    loop: Loop, relay: bool = False, samples: int = 600, Ts: float = 0.1, noise: float = 0.0, seed: int = 1
 ) -> tuple[Reals, Reals, Reals]:
     """(t, u, y) of a set-point step of 1, or of a relay, after a time at rest."""
-    plant = tested.plant(Ts, noise, seed)
-    integrates = tested.den[-1] == 0.0
-    reverse = tested.num[-1] * tested.den[-2 if integrates else -1] > 0.0
-    channel = Channel(Ts, Settings(reverse=reverse), Parameters(tested.Kp, tested.Ti), PV, Mode.AUTOMATIC, MV)
+    plant = loop.plant(Ts, noise, seed)
+    integrates = loop.den[-1] == 0.0
+    reverse = loop.num[-1] * loop.den[-2 if integrates else -1] > 0.0
+    channel = Channel(Ts, Settings(reverse=reverse), Parameters(loop.Kp, loop.Ti), PV, Mode.AUTOMATIC, MV)
     u, y = [], []
     pv = plant.pv
     for k in range(samples):

@@ -11,13 +11,13 @@ from tuning.varpro import solve
 
 @pytest.mark.parametrize("nuisance", [False, True])
 @pytest.mark.parametrize(
-    ("structure", "tested"),
+    ("structure", "loop"),
     [(FIRST, FIRST_ORDER), (SECOND, COMPLEX_POLES), (SECOND_WITH_ZERO, INVERSE_RESPONSE)],
     ids=lambda p: p.name if isinstance(p, Structure) else "",
 )
-def test_the_dead_time_is_the_best_of_all_tried_one_by_one(structure: Structure, tested: Loop, nuisance: bool) -> None:
+def test_the_dead_time_is_the_best_of_all_tried_one_by_one(structure: Structure, loop: Loop, nuisance: bool) -> None:
     change = moves(300)
-    y = open_loop(tested, change, noise=0.05)[2]
+    y = open_loop(loop, change, noise=0.05)[2]
     best = starts(structure, change, y, 60, nuisance, 1)[0]
     load = 0 if nuisance else None
     plain = [solve(structure.regressors(np.append(best[:-1], float(m)), change, load), y).rss for m in range(61)]

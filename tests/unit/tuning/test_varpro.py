@@ -45,11 +45,11 @@ def test_a_minimum_on_a_bound_is_found_there() -> None:
         lambda theta: solve(two_exponentials(theta), y).residual,
         np.array([-1.5, 0.0]),
         np.full(2, -6.0),
-        np.array([6.0, 0.5]),
+        np.full(2, 0.5),
         np.full(2, 1.5),
         np.full(2, 1e-6),
     )
-    assert found[1] == 0.5
+    assert max(found) == 0.5
 
 
 def test_linear_fit_and_covariance_are_those_of_regression() -> None:
