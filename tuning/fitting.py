@@ -125,39 +125,40 @@ class Problem:
                 f"{self.mv_unit:.3g})",
             )
 
-    def errors(self, fit: Fit) -> dict[str, float]:
-        """Standard errors of the model's parameters by name, in their units; the residual's colour is allowed for."""
-        structure, theta = fit.structure, fit.theta
-        c = fit.linear.coefficients
-
-        def output(at: Reals) -> Reals:
-            return structure.regressors(at, self.u, fit.load_from) @ c
-
-        # half a sample for the dead time: a response has a corner there, not a derivative
+    def covariance(self, fit: Fit) -> Reals:
+        """Of theta and the linear coefficients, in this order, linearised; the residual's colour is allowed for."""
+        structure, theta, c = fit.structure, fit.theta, fit.linear.coefficients
         low, high = self._bounds(structure)
+        # half a sample for the dead time: a response has a corner there, not a derivative
         step = np.append(np.full(structure.lags, 1e-5), 0.5)
-        below, above = np.maximum(theta - step, low), np.minimum(theta + step, high)
         slopes = []
         for i in range(len(theta)):
-            a, b = theta.copy(), theta.copy()
-            a[i], b[i] = below[i], above[i]
-            slopes.append((output(b) - output(a)) / (b[i] - a[i]))
+            below, above = theta.copy(), theta.copy()
+            below[i], above[i] = max(theta[i] - step[i], low[i]), min(theta[i] + step[i], high[i])
+            outputs = (structure.regressors(at, self.u, fit.load_from) @ c for at in (above, below))
+            slopes.append((next(outputs) - next(outputs)) / (above[i] - below[i]))
         variance = fit.linear.rss / max(self.samples - fit.parameters, 1) * colour(fit.linear.residual)
-        cov = covariance(np.column_stack((*slopes, fit.columns)), variance)
-        kept = len(theta) + 1
-        p = np.append(theta, c[0])
+        return covariance(np.column_stack((*slopes, fit.columns)), variance)
+
+    def errors(self, fit: Fit) -> dict[str, float]:
+        """Standard errors of the model's parameters by name, in their units."""
+        at = np.append(fit.theta, fit.linear.coefficients[0])
+        model = parameters_of(self.model(fit))
 
         def parameters(at: Reals) -> Reals:
-            return np.array(list(parameters_of(self.plant_of(structure, at[:-1], float(at[-1]))).values()))
+            moved = parameters_of(self._plant(fit.structure, at[:-1], float(at[-1])))
+            return np.array([moved[name] for name in model])
 
-        scale = np.append(np.full(len(theta), 1e-6), 1e-6 * max(abs(float(c[0])), 1e-300))
-        turned = jacobian(parameters, p, parameters(p), np.full(kept, np.inf), scale)
-        spread = np.sqrt(np.maximum(np.diag(turned @ cov[:kept, :kept] @ turned.T), 0.0))
-        names = parameters_of(self.plant_of(structure, theta, float(c[0])))
-        return {name: float(value) for name, value in zip(names, spread, strict=True)}
+        step = 1e-6 * np.append(np.ones(len(fit.theta)), abs(at[-1]))
+        slopes = jacobian(parameters, at, parameters(at), np.full(len(at), np.inf), step)
+        spread = np.diag(slopes @ self.covariance(fit)[: len(at), : len(at)] @ slopes.T)
+        return {name: math.sqrt(max(float(value), 0.0)) for name, value in zip(model, spread, strict=True)}
 
-    def plant_of(self, structure: Structure, theta: Reals, b0: float) -> Plant:
-        """In s and the units of the record."""
+    def model(self, fit: Fit) -> Plant:
+        """In s and the units of the record; without the zeros, if the structure has any."""
+        return self._plant(fit.structure, fit.theta, float(fit.linear.coefficients[0]))
+
+    def _plant(self, structure: Structure, theta: Reals, b0: float) -> Plant:
         return structure.plant(theta, b0 * self.pv_unit / self.mv_unit, self.record.Ts)
 
     def _bounds(self, structure: Structure) -> tuple[Reals, Reals]:

@@ -76,7 +76,8 @@ def identify(t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | None = 
     """FOPDT, SOPDT (real or complex poles) or integrating model from a record.
 
     t: s, evenly spaced.  u: MV that holds from its sample to the next.  y: PV at the sample.  u_before: the MV that
-    held before the record, by default u[0]; give it when the record begins with the move.
+    held before the record, by default u[0]; give it when the record begins with the move. (A log that shows with each
+    sample the MV before it gives a dead time that is one sample too short.)
     Raises Refused(BAD_INPUT) for a record that cannot be used, Refused(NO_RESPONSE) where PV does not answer MV
     visibly and Refused(NOISE_TOO_HIGH) where the noise is more than half of the answer. The plant
     must be stable or integrate once.
@@ -101,7 +102,7 @@ def identify(t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | None = 
 
 def _result(problem: Problem, best: Fit, ranked: Sequence[Fit]) -> Identified:
     record, unit = problem.record, problem.pv_unit
-    model = problem.plant_of(best.structure, best.theta, float(best.linear.coefficients[0]))
+    model = problem.model(best)
     errors = problem.errors(best)
     residual = unit * best.linear.residual
     ratio = float(np.linalg.norm(residual) / np.linalg.norm(record.y - record.y.mean()))

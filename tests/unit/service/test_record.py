@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 from service.record import RecordError, load_record, parse_record
+from tests.unit.tuning.recordings import FIRST_ORDER, open_loop, step
+from tuning.identify import identify
+from tuning.models import FOPDT
 
 
 def values(column: np.ndarray | None) -> list[float]:
@@ -112,3 +115,14 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     binary.write_bytes(b"\xff\xfe\x00t")
     with pytest.raises(RecordError, match="not text in UTF-8"):
         load_record(binary)
+
+
+def test_from_the_file_to_the_model(tmp_path: Path) -> None:
+    t, u, y = open_loop(FIRST_ORDER, step())
+    file = tmp_path / "step.csv"
+    rows = "".join(f"{at:.2f};{mv:g};{pv:.4f}\n".replace(".", ",") for at, mv, pv in zip(t, u, y, strict=True))
+    file.write_text("t;mv;pv\n" + rows)
+    record = load_record(file)
+    found = identify(record.t, record.u, record.y)
+    assert isinstance(found.model, FOPDT)
+    assert pytest.approx((2.0, 10.0, 2.03), rel=1e-3) == (found.model.K, found.model.T, found.model.L)

@@ -1,0 +1,43 @@
+"""A step of the load that enters in the middle of a record, as the structures allow for it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.unit.tuning.recordings import NEGATIVE, moves, open_loop
+from tuning.fitting import Problem
+from tuning.models import FOPDT
+from tuning.recorded import recorded
+from tuning.structures import FIRST
+
+LOAD_AT = 300
+
+
+def with_load(noise: float) -> Problem:
+    """A load at MV is a move of MV that is not recorded."""
+    change = moves()
+    t, u, _ = open_loop(NEGATIVE, change)
+    loaded = change + np.where(np.arange(len(change)) >= LOAD_AT, 0.4, 0.0)
+    return Problem(recorded(t, u, open_loop(NEGATIVE, loaded, noise=noise)[2]))
+
+
+def test_a_load_step_at_the_right_sample_explains_the_record() -> None:
+    problem = with_load(0.0)
+    arrives = LOAD_AT + 20  # dead time 2 s, sampled at 0.1 s
+    found, without = problem.fit(FIRST, arrives), problem.fit(FIRST, None)
+    model = problem.model(found)
+    assert isinstance(model, FOPDT)
+    assert pytest.approx((-1.5, 8.0, 2.0), rel=1e-6) == (model.K, model.T, model.L)
+    assert found.rms < 1e-9 < 1e-2 < without.rms
+    assert found.explains and not without.explains
+    # the size of the load, by the plant's own static gain
+    monic = FIRST.monic(found.theta)[0]
+    size = found.linear.coefficients[2] / monic * problem.pv_unit
+    assert size == pytest.approx(-1.5 * 0.4, rel=1e-6)
+
+
+def test_a_load_step_at_another_sample_explains_less() -> None:
+    problem = with_load(0.005)
+    bic = [problem.fit(FIRST, at).bic for at in (310, 320, 330)]
+    assert bic[1] < min(bic[0], bic[2]) - 15.0
