@@ -25,6 +25,7 @@ from tuning.plan import (
     SetRelay,
     SetSetpoint,
     StageStarted,
+    Work,
 )
 from tuning.reasons import Aborted, Ended, Failed, Reason
 from tuning.stages.common import same
@@ -139,10 +140,12 @@ def run(
     on_event: Callable[[Event], None] = lambda event: None,
     on_samples: Callable[[list[Sample]], None] = lambda samples: None,
     stop: Callable[[], Reason | None] = lambda: None,
+    start_work: Callable[[Callable[[], None]], None] = lambda work: work(),
 ) -> RunResult[T]:
     """Runs the plan to its end and restores the loop. Raises nothing that a loop or plan can cause; see `ended`.
 
-    stop is asked once a sample; what it returns ends the run as Aborted.
+    stop is asked once a sample; what it returns ends the run as Aborted.  start_work starts a plan's long computation:
+    in a thread for a live loop, which must be pumped meanwhile; at once, as here, where nobody waits.
     """
     result: RunResult[T] = RunResult()
     samples: list[Sample] = []
@@ -167,6 +170,8 @@ def run(
                 for item in answer:
                     if isinstance(item, SetMode | SetGains | SetSetpoint | SetOutput | SetRelay):
                         commands.append(item)
+                    elif isinstance(item, Work):
+                        start_work(item.run)
                     else:
                         if isinstance(item, StageStarted):
                             clock(item.stage)

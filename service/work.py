@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, Protocol, cast
@@ -9,6 +10,7 @@ from typing import Any, Protocol, cast
 from service.config import LoopConfig
 from service.loop import Loop, LoopState
 from service.request import RetuneRequest
+from tuning.models import FOPDT
 from tuning.plan import Event, Sample
 from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 
@@ -80,6 +82,7 @@ def tune(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopStat
         on_event=hooks.on_event,
         on_samples=hooks.on_samples,
         stop=hooks.stop,
+        start_work=lambda work: threading.Thread(target=work, daemon=True, name="computation").start(),
     )
     return Outcome(plain(ran.value), ran.ended, ran.restored, dict(ran.plant_time_s))
 
@@ -109,9 +112,7 @@ def _options(request: RetuneRequest) -> dict[str, Any]:
         "Kp": request.Kp,
         "Ti_s": request.Ti_s,
         "overshoot_pct": request.overshoot_pct,
-        "model_K": model.K if model else None,
-        "model_T_s": model.T_s if model else None,
-        "model_L_s": model.L_s if model else None,
+        "model": FOPDT(model.K, model.T_s, model.L_s) if model else None,
         "k_source": request.k_source,
         "kp_step_factor": request.kp_step_factor,
         "overshoot_window_pct": request.overshoot_window_pct,

@@ -1,27 +1,29 @@
 """The five-stage procedure as one plan made of plans.
 
-    preflight - baseline - 1 relay - 2 ultimate gain - 3 ZN PI, overshoot - 4 FOPDT estimate - 5 optimisation - verify
+    preflight - baseline - 1 relay - 2 ultimate gain - 3 ZN PI, overshoot - 4 model - 5 gains - verify
 
 Source: Stopakevych et al., automatic re-tuning of PI controllers in poorly performing control loops. Stages 4 and 5
-take no plant time. The procedure may be entered at any stage with values typed in by hand, as in the paper's manual
-mode.
+take no plant time. The paper's Stage 5 minimises criterion (7); any other method of `tuning.methods` may take its
+place, on the paper's FOPDT estimate or on a model identified from the record of Stage 3. The procedure may be entered
+at any stage with values typed in by hand, as in the paper's manual mode.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
+from tuning.design import Designed, Predicted, Ultimate, design
 from tuning.estimate import fopdt_from_overshoot
 from tuning.gains import Gains
-from tuning.margins import margins
-from tuning.models import FOPDT
-from tuning.plan import Mode, Plan, SetGains, SetMode, SetSetpoint, StageDone, StageStarted
+from tuning.identify import identify
+from tuning.methods import METHODS
+from tuning.models import FOPDT, SOPDT, Integrating
+from tuning.plan import Mode, Plan, SetGains, SetMode, SetSetpoint, StageDone, StageStarted, worked
 from tuning.reasons import Reason, Refused
-from tuning.response import step_figures
-from tuning.robust import optimise
-from tuning.stages.common import Facts, OperatingPoint, settle, to_rest
+from tuning.stages.common import Facts, OperatingPoint, Trace, settle, to_rest
 from tuning.stages.preflight import preflight
 from tuning.stages.relay import relay_test
 from tuning.stages.step_test import StepResult, step_test, unlimited
@@ -31,7 +33,6 @@ from tuning.stages.zn_pi import allowed_step, zn_pi
 __all__ = ["STAGES", "Facts", "Options", "Proposal", "five_stage"]
 
 STAGES = ("preflight", "baseline", "relay", "ultimate", "zn_pi", "estimate", "optimise", "verify")
-MOST_Ms, LEAST_GM = 2.0, 2.0
 MOST_GAIN = 60.0
 """Ku * K of a FOPDT plant with L/T = 0.026, half the least that formula (2) was checked for."""
 Entry = Literal["relay", "zn_pi", "estimate", "optimise"]
@@ -40,9 +41,11 @@ Entry = Literal["relay", "zn_pi", "estimate", "optimise"]
 @dataclass(frozen=True, slots=True)
 class Options:
     """Where to enter, and what was typed in for that: zn_pi needs Ku, Pu_s; estimate needs Kp, Ti_s, overshoot_pct;
-    optimise needs model_K, model_T_s, model_L_s.
+    optimise needs model.
 
-    k_source: the gain that goes into the model, "k5" (formula 5) or "ke" (measured).
+    k_source: the gain that goes into the FOPDT estimate, "k5" (formula 5) or "ke" (measured).
+    method, method_options: which rule of `tuning.methods` gives the gains.  model_from: the model it gets, "overshoot"
+    (Stage 4 of the paper) or "record" (identified from the set-point step of Stage 3), by default the one it is for.
     kp_step_factor: Stage 3 multiplies Kp by this instead of adding 0.1 (Ku - Kp).
     """
 
@@ -52,27 +55,35 @@ class Options:
     Kp: float | None = None
     Ti_s: float | None = None
     overshoot_pct: float | None = None
-    model_K: float | None = None
-    model_T_s: float | None = None
-    model_L_s: float | None = None
+    model: FOPDT | SOPDT | None = None
     k_source: Literal["k5", "ke"] = "k5"
     kp_step_factor: float | None = None
     overshoot_window_pct: tuple[float, float] = (10.0, 50.0)
     baseline: bool = True
     verify: bool = True
+    method: str = "robust"
+    method_options: Mapping[str, object] = field(default_factory=dict)
+    model_from: Literal["overshoot", "record"] | None = None
 
     def __post_init__(self) -> None:
         needed = {
             "relay": (),
             "zn_pi": ("Ku", "Pu_s"),
             "estimate": ("Kp", "Ti_s", "overshoot_pct"),
-            "optimise": ("model_K", "model_T_s", "model_L_s"),
+            "optimise": (),
         }
         for name in needed[self.start]:
             value = getattr(self, name)
-            positive = name not in ("overshoot_pct", "model_K")
-            if value is None or not math.isfinite(value) or (positive and value <= 0) or value == 0:
+            if value is None or not math.isfinite(value) or value <= 0:
                 raise Refused(Reason.BAD_INPUT, f"entering at {self.start} needs {name}, a number > 0, not {value!r}")
+        if self.start == "optimise" and self.model is None:
+            raise Refused(Reason.BAD_INPUT, "entering at optimise needs a model")
+        rule = METHODS.get(self.method)
+        if rule is None:
+            raise Refused(Reason.BAD_INPUT, f"method must be one of {', '.join(METHODS)}, not {self.method!r}")
+        rule.checked(self.method_options)
+        if self.model_from == "record" and self.start in ("estimate", "optimise"):
+            raise Refused(Reason.BAD_INPUT, f'model_from "record" needs Stage 3; the start is {self.start}')
         if self.kp_step_factor is not None and not 1 < self.kp_step_factor <= 2:
             raise Refused(Reason.BAD_INPUT, f"kp_step_factor must be in (1, 2], not {self.kp_step_factor!r}")
         low, high = self.overshoot_window_pct
@@ -82,7 +93,11 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """FOPDT: K PV units per MV unit (signed), T_s, L_s; which gain it uses, and both candidates."""
+    """What the gains were made on: FOPDT, or SOPDT when zeta is given (T_s is then 1/(natural frequency)).
+
+    K: PV units per MV unit, signed.  k_source: "k5" or "ke" (the estimate with either gain), "record" or "typed in".
+    fit_pct: NRMSE fit to the record, where there was one.
+    """
 
     K: float
     T_s: float
@@ -90,30 +105,21 @@ class Model:
     k_source: str
     k5: float | None = None
     ke: float | None = None
+    zeta: float | None = None
+    fit_pct: float | None = None
 
-
-@dataclass(frozen=True, slots=True)
-class Predicted:
-    """Of the new gains on the estimated model: Ms, GM (ratio), PM (degrees), set-point step figures; None: none."""
-
-    Ms: float
-    GM: float | None
-    PM_deg: float | None
-    overshoot_pct: float
-    settling_s: float | None
-    IAE_per_unit: float
-
-
-@dataclass(frozen=True, slots=True)
-class Ultimate:
-    Ku: float
-    Pu_s: float
+    def plant(self) -> FOPDT | SOPDT:
+        if self.zeta is None:
+            return FOPDT(self.K, self.T_s, self.L_s)
+        return SOPDT(self.K, self.T_s, self.zeta, self.L_s)
 
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
     """What the operator decides on. Gains in ISA form, MV per PV unit and seconds."""
 
+    method: str
+    chosen: Mapping[str, float]
     model: Model
     old_gains: Gains
     gains: Gains
@@ -161,6 +167,7 @@ def five_stage(facts: Facts, options: Options) -> Plan[Proposal]:
         yield (StageDone("baseline", baseline),)
         yield from to_rest(facts, point, 0.02 * facts.sp_deviation)
     gain = baseline.static_gain if baseline else math.nan
+    step = Trace()
 
     ultimate: Ultimate | None = None
     if options.start in ("relay", "zn_pi"):
@@ -183,7 +190,7 @@ def five_stage(facts: Facts, options: Options) -> Plan[Proposal]:
             ultimate = Ultimate(_typed(options.Ku), _typed(options.Pu_s))
         yield started("zn_pi")
         zn = yield from zn_pi(
-            facts, point, ultimate.Ku, ultimate.Pu_s, gain, options.overshoot_window_pct, options.kp_step_factor
+            facts, point, ultimate.Ku, ultimate.Pu_s, gain, options.overshoot_window_pct, options.kp_step_factor, step
         )
         yield (StageDone("zn_pi", zn),)
         Kp, Ti, overshoot, ke = zn.Kp, zn.Ti_s, zn.overshoot_pct, zn.static_gain
@@ -191,26 +198,36 @@ def five_stage(facts: Facts, options: Options) -> Plan[Proposal]:
         Kp, Ti, overshoot, ke = _typed(options.Kp), _typed(options.Ti_s), _typed(options.overshoot_pct), gain
 
     if options.start == "optimise":
-        model = Model(_typed(options.model_K), _typed(options.model_T_s), _typed(options.model_L_s), "typed in")
-        if (model.K > 0) != facts.reverse:
-            raise Refused(
-                Reason.WRONG_SIGN,
-                f"the model's gain {model.K:g} does not go with a {'reverse' if facts.reverse else 'direct'} action",
-            )
+        model = _typed_in(facts, options)
     else:
         yield started("estimate")
         model = _estimate(facts, Kp, Ti, overshoot, ke, options.k_source, notes)
+        if len(step) and _wants_record(options):
+            model = yield from _identified(facts, point, step, model, notes)
         yield (StageDone("estimate", model),)
     yield started("optimise")
-    gains, predicted = _optimised(model, ultimate)
-    yield (StageDone("optimise", (gains, predicted)),)
+    designed = yield from _designed(options, model, ultimate)
+    gains, predicted = designed.gains, designed.predicted
+    notes += designed.notes
+    yield (StageDone("optimise", designed),)
 
     verification: StepResult | None = None
     if options.verify:
         yield started("verify")
         verification = yield from _verified(facts, point, gains, predicted, model)
         yield (StageDone("verify", verification),)
-    return Proposal(model, facts.old_gains, gains, predicted, ultimate, baseline, verification, tuple(notes))
+    return Proposal(
+        method=options.method,
+        chosen=designed.chosen,
+        model=model,
+        old_gains=facts.old_gains,
+        gains=gains,
+        predicted=predicted,
+        ultimate=ultimate,
+        baseline=baseline,
+        verification=verification,
+        notes=tuple(notes),
+    )
 
 
 def _typed(value: float | None) -> float:
@@ -253,25 +270,43 @@ def _estimate(facts: Facts, Kp: float, Ti: float, overshoot: float, ke: float, s
     return Model(K, estimate.T, estimate.L, source, k5, ke if known else None)
 
 
-def _optimised(model: Model, ultimate: Ultimate | None) -> tuple[Gains, Predicted]:
-    """Stage 5 and the refusal of what would not be robust on its own model, or at the measured ultimate point."""
-    plant = FOPDT(abs(model.K), model.T_s, model.L_s)
-    gains = optimise(plant).gains
-    m = margins(plant, gains)
-    figures = step_figures(plant, gains)
-    if m.GM is None or not (m.Ms <= MOST_Ms and m.GM >= LEAST_GM):
-        GM = "none" if m.GM is None else f"{m.GM:.2f}"
+def _typed_in(facts: Facts, options: Options) -> Model:
+    plant = options.model
+    assert plant is not None  # Options has checked it
+    if (plant.K > 0) != facts.reverse:
         raise Refused(
-            Reason.NOT_ROBUST, f"on the model Ms {m.Ms:.2f} (at most {MOST_Ms}), GM {GM} (at least {LEAST_GM})"
+            Reason.WRONG_SIGN,
+            f"the model's gain {plant.K:g} does not go with a {'reverse' if facts.reverse else 'direct'} action",
         )
-    if ultimate:
-        loop = -gains.Kp / ultimate.Ku * (1 - 1j / (2 * math.pi / ultimate.Pu_s * gains.Ti))
-        if abs(1 + loop) < 0.45:
-            raise Refused(
-                Reason.NOT_ROBUST,
-                f"at the measured ultimate point the loop comes within {abs(1 + loop):.2f} of instability (least 0.45)",
-            )
-    return gains, Predicted(m.Ms, m.GM, m.PM_deg, figures.overshoot_pct, figures.settling_s, figures.IAE)
+    return Model(plant.K, plant.T, plant.L, "typed in", zeta=plant.zeta if isinstance(plant, SOPDT) else None)
+
+
+def _wants_record(options: Options) -> bool:
+    if options.model_from is not None:
+        return options.model_from == "record"
+    return METHODS[options.method].takes[0] is SOPDT
+
+
+def _identified(facts: Facts, point: OperatingPoint, step: Trace, estimate: Model, notes: list[str]) -> Plan[Model]:
+    """The model that the set-point step of Stage 3 supports best, while the loop goes on."""
+    found = yield from worked(lambda: identify(step.t, step.mv, step.pv, u_before=point.mv))
+    notes += found.notes
+    plant = found.model
+    if isinstance(plant, Integrating):
+        raise Refused(Reason.NOT_SELF_REGULATING, f"the set-point step fits an integrating plant best: {plant}")
+    if (plant.K > 0) != facts.reverse:
+        raise Refused(Reason.WRONG_SIGN, f"the set-point step fits a gain of {plant.K:.4g}, of the wrong sign")
+    zeta = plant.zeta if isinstance(plant, SOPDT) else None
+    return Model(plant.K, plant.T, plant.L, "record", estimate.k5, estimate.ke, zeta, found.fit_pct)
+
+
+def _designed(options: Options, model: Model, ultimate: Ultimate | None) -> Plan[Designed]:
+    def compute() -> Designed:
+        return design(options.method, model.plant(), ultimate, options.method_options)
+
+    if METHODS[options.method].slow:
+        return (yield from worked(compute))
+    return compute()
 
 
 def _verified(

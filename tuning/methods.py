@@ -15,6 +15,7 @@ from typing import Literal
 from tuning.half_rule import exact, half_rule
 from tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction, integrators
 from tuning.reasons import Reason, Refused
+from tuning.rules import tyreus_luyben, ziegler_nichols
 from tuning.rules.amigo import amigo
 from tuning.rules.chien_hrones_reswick import chien_hrones_reswick
 from tuning.rules.cohen_coon import cohen_coon
@@ -25,8 +26,6 @@ from tuning.rules.kappa_tau import kappa_tau
 from tuning.rules.lambda_tuning import lambda_tuning
 from tuning.rules.robust import robust
 from tuning.rules.simc import simc
-from tuning.rules.tyreus_luyben import tyreus_luyben
-from tuning.rules.ziegler_nichols import zn_step, zn_ultimate
 from tuning.setting import Setting
 from tuning.tangent import tangent
 
@@ -73,7 +72,8 @@ class Option:
 @dataclass(frozen=True, slots=True)
 class Method:
     """for_what: when to choose it, one sentence.  needs: the models it takes, in words; takes: as types, lag saying
-    whether an Integrating may have one.  reaction_curve: made on the tangent of a step response."""
+    whether an Integrating may have one.  reaction_curve: made on the tangent of a step response.  measured: the same
+    rule from a measured (Ku, Pu).  slow: takes longer than a loop may go without being attended to (0.2 s)."""
 
     name: str
     title: str
@@ -85,18 +85,31 @@ class Method:
     options: Mapping[str, Option] = field(default_factory=dict)
     lag: bool = False
     reaction_curve: bool = False
+    measured: Callable[..., Setting] | None = None
+    slow: bool = False
 
     def tune(self, model: Model, **options: object) -> Setting:
         """Refused: bad_input (an option), not_self_regulating, outside_range, cannot_oscillate, as the rule says."""
+        checked = self.checked(options)
+        fitted, notes = self._fitted(model)
+        found = self.rule(fitted, **checked)
+        return replace(found, notes=notes + found.notes)
+
+    def tune_measured(self, Ku: float, Pu: float, **options: object) -> Setting:
+        """From the ultimate gain (MV units per PV unit) and period (s) found on the loop."""
+        if self.measured is None:
+            raise Refused(Reason.BAD_INPUT, f"{self.name} does not use the ultimate point")
+        return self.measured(Ku, Pu, **self.checked(options))
+
+    def checked(self, options: Mapping[str, object]) -> dict[str, Value]:
+        """The options as the rule takes them; refused (bad_input) if one is unknown or out of range."""
         checked: dict[str, Value] = {}
         for name, value in options.items():
             if name not in self.options:
                 known = ", ".join(self.options) or "none"
                 raise Refused(Reason.BAD_INPUT, f"{self.name} has no option {name!r}; it has: {known}")
             checked[name] = self.options[name].check(name, value)
-        fitted, notes = self._fitted(model)
-        found = self.rule(fitted, **checked)
-        return replace(found, notes=notes + found.notes)
+        return checked
 
     def _fitted(self, model: Model) -> tuple[Model, tuple[str, ...]]:
         """The model as a kind that the rule takes, and a note on how it was reduced."""
@@ -160,9 +173,10 @@ METHODS: dict[str, Method] = {
             "A first setting that recovers fast from loads and oscillates: Ms is 2 to 3.",
             "any stable plant that a P controller can make oscillate",
             ANY,
-            zn_ultimate,
+            ziegler_nichols.zn_ultimate,
             {"controller": _controller("p", "pi", "pid")},
             lag=True,
+            measured=ziegler_nichols.ultimate,
         ),
         Method(
             "zn-step",
@@ -171,7 +185,7 @@ METHODS: dict[str, Method] = {
             "A first setting from a step response; lively, little robustness.",
             "first order with dead time, L/T from 0.1 to 1, or integrating with dead time",
             (FOPDT, Integrating),
-            zn_step,
+            ziegler_nichols.zn_step,
             {"controller": _controller("p", "pi", "pid"), **EXTRAPOLATE},
             lag=True,
             reaction_curve=True,
@@ -183,7 +197,7 @@ METHODS: dict[str, Method] = {
             "Well damped loops on plants that integrate or have one large lag; slow integral action.",
             "any stable plant that a P controller can make oscillate",
             ANY,
-            tyreus_luyben,
+            tyreus_luyben.tyreus_luyben,
             {
                 "controller": _controller("pi", "pid"),
                 "variant": Option(
@@ -191,6 +205,7 @@ METHODS: dict[str, Method] = {
                 ),
             },
             lag=True,
+            measured=tyreus_luyben.ultimate,
         ),
         Method(
             "cohen-coon",

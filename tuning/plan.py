@@ -13,12 +13,14 @@ restores the loop: the runner does, on every way out. A plan that cannot go on r
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 from tuning.gains import Gains
+
+T = TypeVar("T")
 
 
 class Mode(IntEnum):
@@ -101,8 +103,39 @@ class Note:
     text: str
 
 
+class Work(Generic[T]):
+    """A computation too long to do between two samples: the runner does it beside them, and goes on pumping."""
+
+    def __init__(self, compute: Callable[[], T]) -> None:
+        self._compute = compute
+        self._value: T | None = None
+        self._error: BaseException | None = None
+        self.done = False
+
+    def run(self) -> None:
+        """Called once, by whoever pumps the plan, in a thread of its own or not."""
+        try:
+            self._value = self._compute()
+        except BaseException as error:
+            self._error = error
+        self.done = True
+
+    def result(self) -> T:
+        """What it came to; raises what it raised."""
+        if self._error is not None:
+            raise self._error
+        return cast(T, self._value)
+
+
 Command = SetMode | SetGains | SetSetpoint | SetOutput | SetRelay
 Event = StageStarted | StageDone | Note
+Plan = Generator[Sequence[Command | Event | Work[Any]], Sample, T]
 
-T = TypeVar("T")
-Plan = Generator[Sequence[Command | Event], Sample, T]
+
+def worked(compute: Callable[[], T]) -> Plan[T]:
+    """The result of a long computation, while the loop goes on under guard."""
+    work = Work(compute)
+    yield (work,)
+    while not work.done:
+        yield ()
+    return work.result()

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from service.rehearsal import rehearse
+from tuning.models import FOPDT
 from tuning.reasons import ADVICE, Reason
 
 LAG = {"num": [2], "den": [5, 1], "dead_time_s": 1}
@@ -68,7 +69,7 @@ def test_the_procedure_can_be_entered_at_each_stage_by_hand() -> None:
     zn = stages["zn_pi"]
     from_overshoot = rehearse(LAG, start="estimate", Kp=zn["Kp"], Ti_s=zn["Ti_s"], overshoot_pct=zn["overshoot_pct"])
     model = whole["model"]
-    from_model = rehearse(LAG, start="optimise", model_K=model["K"], model_T_s=model["T"], model_L_s=model["L"])
+    from_model = rehearse(LAG, start="optimise", model=FOPDT(model["K"], model["T"], model["L"]))
     for entered in (from_ultimate, from_overshoot, from_model):
         assert entered["outcome"] == "proposed", entered["detail"]
         assert entered["gains"] == pytest.approx(whole["gains"], rel=0.02)
@@ -77,4 +78,4 @@ def test_the_procedure_can_be_entered_at_each_stage_by_hand() -> None:
 
 def test_values_typed_in_are_checked() -> None:
     assert rehearse(LAG, start="zn_pi", Ku=4.0)["reason"] == "bad_input"
-    assert rehearse(LAG, start="optimise", model_K=-2.0, model_T_s=5.0, model_L_s=1.0)["reason"] == "wrong_sign"
+    assert rehearse(LAG, start="optimise", model=FOPDT(-2.0, 5.0, 1.0))["reason"] == "wrong_sign"

@@ -10,7 +10,7 @@ import numpy as np
 from tuning.gains import Gains
 from tuning.plan import Plan, SetSetpoint
 from tuning.reasons import Reason, Refused
-from tuning.stages.common import Array, Facts, OperatingPoint, same, settle
+from tuning.stages.common import Array, Facts, OperatingPoint, Trace, same, settle
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,17 +34,27 @@ class StepResult:
 
 
 def step_test(
-    facts: Facts, point: OperatingPoint, step: float, *, band: float, most_s: float, smooth_s: float
+    facts: Facts,
+    point: OperatingPoint,
+    step: float,
+    *,
+    band: float,
+    most_s: float,
+    smooth_s: float,
+    kept: Trace | None = None,
 ) -> Plan[StepResult]:
     """Steps the set-point from rest by `step` and waits until PV stays within band * step for T95/5.
 
     smooth_s: width of the parabola fitted around the peak (it must be shorter than the peak), s.
+    kept: filled with the samples, the first being that of the step.
     """
     target = point.sp + step
     sample = yield (SetSetpoint(target),)
     while not same(sample.sp, target):
         sample = yield ()
     trace, settled = yield from settle(target, band * abs(step), facts.T95_s / 5, most_s, point.noise)
+    if kept is not None:
+        kept.t, kept.sp, kept.pv, kept.mv = trace.t, trace.sp, trace.pv, trace.mv
     t, pv, mv = (np.asarray(column) for column in (trace.t, trace.pv, trace.mv))
     t = t - t[0]
     tail = trace.tail(facts.T95_s / 5)

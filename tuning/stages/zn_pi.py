@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from tuning.gains import Gains
 from tuning.plan import Mode, Note, Plan, SetGains, SetMode, SetSetpoint
 from tuning.reasons import Reason, Refused
-from tuning.stages.common import Facts, OperatingPoint, settle
+from tuning.stages.common import Facts, OperatingPoint, Trace, settle
 from tuning.stages.step_test import StepResult, step_test, unlimited
 
 MOST_STEPS = 12
@@ -36,8 +36,12 @@ def zn_pi(
     static_gain: float,
     window: tuple[float, float],
     factor: float | None,
+    kept: Trace,
 ) -> Plan[ZnResult]:
-    """static_gain: a first idea (nan when there is none), to keep MV inside. Raises Refused: NO_OVERSHOOT."""
+    """static_gain: a first idea (nan when there is none), to keep MV inside.  kept: gets the last step's samples.
+
+    Raises Refused: NO_OVERSHOOT, MV_LIMIT.
+    """
     Kp, Ti = Ku / 2.2, Pu / 1.2
     increment = 0.1 * (Ku - Kp)
     step = allowed_step(facts, point, 1.6 * Kp, static_gain)
@@ -51,7 +55,7 @@ def zn_pi(
         most_s = max(3 * facts.T95_s, 8 * Pu)
         yield from settle(point.sp, 0.005 * step, stay_s, most_s, point.noise, commands)
         found = yield from step_test(
-            facts, point, step, band=0.01, most_s=max(6 * facts.T95_s, 15 * Pu), smooth_s=Pu / 5
+            facts, point, step, band=0.01, most_s=max(6 * facts.T95_s, 15 * Pu), smooth_s=Pu / 5, kept=kept
         )
         unlimited(facts, found, gains)
         seen.append(found)
