@@ -15,15 +15,16 @@ from tuning.models import Reals
 class StepFigures:
     """Of a response to a step of the set-point, or of the load (for which overshoot is 0 and rise is None).
 
-    overshoot_pct: of the final change, not below 0.  settling_s: until within the band (2 % if not told otherwise) of
-    the final change (load: of the peak) for good, counted from the step; None if not within the record.  rise_s: 10 to
-    90 %; None if never.  peak: largest PV change along the step.
+    overshoot_pct: of the final change, not below 0.  settling_s: counted from the step (dead time included) until PV is
+    within `band` (PV units) of its final value for good; None if not within the record.  rise_s: 10 to 90 %; None if
+    never.  peak: largest PV change along the step.
 
-    Of the error e to the set-point, over the record, for the step as made, in PV units * s^n: IAE integral of |e|, ISE
-    of e^2, ITAE of t|e|, ITSE of t*e^2.  MIE: mean of |e| until settled, PV units.
+    Of the error e to the set-point, over the record, for the step as made: IAE integral of |e|, PV units * s; ISE of
+    e^2; ITAE of t|e|; ITSE of t*e^2.  MIE: mean of |e| until settled, PV units. An offset that stays (a loop without
+    integral action) makes the integrals grow with the record.
 
-    Of MV's change u, None where no MV was given: MIC mean of |u| until settled, effort integral of u^2 (of u less its
-    final value), TV total variation, all in MV units (* s); peak_u: largest |u|.
+    Of MV's change u, None where no MV was given: MIC mean of |u| until settled, MV units; effort integral of (u - its
+    final value)^2, MV units^2 * s; TV total variation, from before the step; peak_u largest |u|.
 
     MIE and MIC are those of Romasevych et al., PI-controller tuning optimization via PSO-based technique (there with a
     band of 5 %). A loop that does not settle within the record counts as settled at its end.
@@ -31,6 +32,7 @@ class StepFigures:
 
     overshoot_pct: float
     settling_s: float | None
+    band: float
     rise_s: float | None
     IAE: float
     ISE: float
@@ -102,6 +104,7 @@ def _figures(
     return StepFigures(
         overshoot_pct=max(0.0, 100.0 * (peak / final - 1.0)) if final else 0.0,
         settling_s=settling,
+        band=band,
         rise_s=_rise(t, smooth / final) if final else None,
         IAE=float(np.sum(weights * size)),
         ISE=float(np.sum(weights * squared)),

@@ -27,6 +27,7 @@ from tuning.reasons import Reason, Refused
 from tuning.stability import is_stable, open_loop
 
 MAX_STEPS = 40_000
+LONGER = 24
 SMALL_BLOCK = 100
 """States of a block up to which all blocks come from powers of one matrix instead of one convolution each."""
 
@@ -100,9 +101,9 @@ def step_response(
         return _simulated(model, gains, horizon, dt or _fine(model, gains, horizon), load)
     _require_stable(model, gains)
     final = final_value(model, gains, load)
-    lags = time_constants(model)
-    horizon = 10.0 * (float(lags.max(initial=0.0)) + model.L + 1.0 / _crossover(model, gains))
-    for _ in range(12):
+    # a slow tail that counts shows at the record's end and doubles it
+    horizon = 20.0 * (model.L + 1.0 / _crossover(model, gains))
+    for _ in range(LONGER):
         found = _simulated(model, gains, horizon, dt or _fine(model, gains, horizon), load)
         away = np.abs(found.y - final)
         late = found.t >= 0.8 * horizon

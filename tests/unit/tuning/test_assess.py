@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from tests.unit.tuning.tables import ROOT
+from tests.unit.tuning.tables import MODELS as TABLE_MODELS
+from tests.unit.tuning.tables import ROOT, transfer_function
 from tuning.assess import assess
 from tuning.gains import Gains
+from tuning.margins import ultimate_point
 from tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 from tuning.reasons import Reason, Refused
 from tuning.response import step_figures, step_response
@@ -224,6 +226,63 @@ def test_a_dead_time_that_does_not_matter(L: float) -> None:
     assert found.setpoint is not None and exact.setpoint is not None
     assert pytest.approx(exact.setpoint.IAE, rel=3e-3) == found.setpoint.IAE
     assert found.setpoint.overshoot_pct == pytest.approx(exact.setpoint.overshoot_pct, abs=0.2)
+
+
+@pytest.mark.parametrize("load", [False, True], ids=["set-point", "load"])
+@pytest.mark.parametrize("entry", TABLE_MODELS, ids=lambda m: str(m["id"]))
+def test_the_default_record_is_long_and_fine_enough(entry: dict[str, Any], load: bool) -> None:
+    model = transfer_function(entry)
+    Ku, Pu = ultimate_point(model)
+    gains = Gains(0.45 * Ku, 0.6 * Pu, 0.1 * Pu, 0.01 * Pu)
+    if not assess(model, gains).stable:
+        gains = Gains(0.2 * Ku, 1.5 * Pu)
+    record = step_response(model, gains, load=load)
+    step = float(np.max(np.diff(record.t)))
+    found = step_figures(model, gains, load=load)
+    finer = step_figures(model, gains, horizon=2.0 * float(record.t[-1]), dt=step / 3.0, load=load)
+    assert pytest.approx(finer.IAE, rel=1e-3) == found.IAE
+    assert pytest.approx(finer.ISE, rel=1e-3) == found.ISE
+    assert found.overshoot_pct == pytest.approx(finer.overshoot_pct, abs=0.1)
+    assert found.settling_s == pytest.approx(finer.settling_s, rel=2e-3)
+
+
+@pytest.mark.parametrize("L", [1e-4, 1e-2, 1.0, 100.0])
+def test_dead_times_of_all_sizes_beside_one_lag(L: float) -> None:
+    # the direct-synthesis gain: the same curve in dead times, whatever the lag
+    c = 6.0 - 4.0 * math.sqrt(2.0)
+    found = assess(FOPDT(1.0, 10.0, L), Gains(c * 10.0 / L, 10.0))
+    assert found.setpoint is not None and found.load is not None
+    assert pytest.approx(L / c, rel=1e-3) == found.setpoint.IAE
+    assert found.setpoint.settling_s == pytest.approx(7.4774 * L, rel=2e-3)
+    # of the load: Ti/Kp, for an error that does not change sign
+    assert pytest.approx(L / c, rel=1e-3) == found.load.IAE
+
+
+def test_the_band_is_the_callers() -> None:
+    model, gains = FOPDT(2.0, 5.0, 2.5), Gains(0.9, 7.5)
+    wide, narrow = assess(model, gains, band=0.1), assess(model, gains, band=0.01)
+    assert wide.setpoint is not None and narrow.setpoint is not None and narrow.load is not None
+    assert (wide.setpoint.band, narrow.setpoint.band) == (0.1, 0.01)
+    assert narrow.load.band == pytest.approx(0.01 * narrow.load.peak)
+    response = step_response(model, gains, horizon=100.0, dt=0.01)
+    for figures in (wide.setpoint, narrow.setpoint):
+        assert figures.settling_s is not None
+        later = np.abs(response.y - 1.0)[response.t > figures.settling_s + 0.01]
+        assert float(np.max(later)) <= figures.band
+        just_before = np.interp(figures.settling_s - 0.02, response.t, np.abs(response.y - 1.0))
+        assert float(just_before) > figures.band
+
+
+def test_an_instant_at_which_something_jumps_is_there_twice() -> None:
+    # an ideal derivative on a lag of first order: PV jumps by K*Kp*Td/T a dead time after the set-point
+    model, gains = FOPDT(2.0, 5.0, 1.5), Gains(0.5, 6.0, 1.0, c=1.0)
+    response = step_response(model, gains, horizon=9.0, dt=0.1)
+    twice = np.flatnonzero(np.diff(response.t) == 0.0)
+    assert response.t[twice[0]] == pytest.approx(1.5)
+    assert response.y[twice[0]] == pytest.approx(0.0, abs=1e-12)
+    assert response.y[twice[0] + 1] == pytest.approx(2.0 * 0.5 * 1.0 / 5.0, rel=1e-9)
+    # until then MV is Kp*(1 + t/Ti) and PV answers K*(1 - exp(-t/T)) to it, the derivative's impulse besides
+    assert response.u[5] == pytest.approx(0.5 * (1.0 + response.t[5] / 6.0), rel=1e-9)
 
 
 def test_gains_that_are_none() -> None:

@@ -119,6 +119,17 @@ def test_a_record_gives_the_figures_of_its_loop(step: float) -> None:
     assert found.settling_s == pytest.approx(truth.settling_s, rel=0.01)
     assert found.rise_s == pytest.approx(truth.rise_s, rel=0.01)
     assert pytest.approx(abs(step) * truth.IAE, rel=0.01) == found.IAE
+    assert found.TV is None and found.MIC is None
+    assert truth.TV is not None
+    # MV's first sample is taken before the step
+    with_mv = figures_of(
+        np.append(299.9, response.t + 300.0),
+        np.append(50.0, 50.0 + step * response.y),
+        step,
+        50.0,
+        u=np.append(20.0, 20.0 - step * response.u),
+    )
+    assert pytest.approx(abs(step) * truth.TV, rel=0.01) == with_mv.TV
 
 
 def test_noise_does_not_pass_for_overshoot() -> None:
