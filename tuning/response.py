@@ -88,8 +88,8 @@ def step_response(
     """The loop from rest under a unit step of the set-point, or (load) of the plant's input, at t = 0.
 
     horizon: s, by default until the response has come to rest.  dt: s, at most; by default a hundredth of the dead time
-    and of the crossover's radian, unless that is more than 40,000 steps. A dead time that would still be
-    less than four steps in twice that number is taken as its second-order Pade approximant.
+    and of the crossover's radian, unless that is more than 40,000 steps. A dead time has four steps at least;
+    one that is shorter than 2*dt and than a 20,000th of the horizon is taken as its second-order Pade approximant.
 
     Raises Refused: NOT_ROBUST for an unstable loop when no horizon is given, or when its response overflows; BAD_INPUT
     for gains that are none or an ideal derivative on a bi-proper plant.
@@ -150,7 +150,7 @@ def _final_control(model: Model, gains: Gains, load: bool) -> float:
 
 
 def _simulated(model: Model, gains: Gains, horizon: float, dt: float, load: bool) -> Response:
-    if 0.0 < model.L < 2.0 * horizon / MAX_STEPS:
+    if 0.0 < model.L < 2.0 * min(dt, horizon / MAX_STEPS):
         model = _without_dead_time(model)
     delay = max(4, math.ceil(model.L / dt - 1e-9)) if model.L > 0.0 else 0
     if delay:

@@ -61,6 +61,21 @@ def test_against_roots_without_dead_time(poles: list[float], Kp: float, Ti: floa
     assert unstable_poles(TransferFunction((1.0,), tuple(den)), Gains(Kp, Ti)) == int(np.sum(closed.real > 0.0))
 
 
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.floats(-2.0, 2.0), min_size=2, max_size=6), st.floats(-2.0, 2.0), st.booleans())
+def test_the_limit_of_lags_far_apart(decades: list[float], dead: float, integrating: bool) -> None:
+    den = np.array([1.0])
+    for decade in decades:
+        den = np.polymul(den, [10.0**decade, 1.0])
+    model = TransferFunction((-2.0,), (*den, 0.0) if integrating else tuple(den), 10.0**dead)
+    Ku, Pu = ultimate_point(model)
+    # the limit by its own equation: the loop at the ultimate frequency is -1/Ku
+    at = model.frequency_response(np.array([2.0 * math.pi / Pu]))[0]
+    assert at == pytest.approx(1.0 / Ku, rel=1e-6)
+    assert is_stable(model, Gains(0.999 * Ku))
+    assert unstable_poles(model, Gains(1.001 * Ku)) == 2
+
+
 @pytest.mark.parametrize("entry", MODELS, ids=lambda m: str(m["id"]))
 def test_the_ultimate_gain_is_the_limit(entry: dict[str, object]) -> None:
     model = transfer_function(entry)
