@@ -115,14 +115,12 @@ class Method:
         """The model as a kind that the rule takes, and a note on how it was reduced."""
         if isinstance(model, TransferFunction):
             model = exact(model)
-        if isinstance(model, Integrating) and Integrating in self.takes:
-            if model.T == 0.0 or self.lag:
-                return model, ()
-        elif isinstance(model, self.takes):
-            return model, ()
         integrating = integrators(model) > 0
         if integrating and Integrating not in self.takes:
             raise Refused(Reason.NOT_SELF_REGULATING, f"{self.title} takes {self.needs}, and this plant integrates")
+        bare = not isinstance(model, Integrating) or model.T == 0.0
+        if isinstance(model, self.takes) and (bare or self.lag):
+            return model, ()
         reduced: FOPDT | SOPDT | Integrating
         if isinstance(model, SOPDT) and self.reaction_curve:
             reduced, how = tangent(model), "its tangent"
