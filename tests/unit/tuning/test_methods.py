@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from tests.unit.tuning.tables import ROOT
 from tuning.methods import METHODS, Method, Option, tune
 from tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 from tuning.reasons import Reason, Refused
@@ -41,6 +42,15 @@ def test_every_method_is_described(method: Method) -> None:
     assert all((method.title, method.source, method.needs, method.takes))
     assert method.for_what.endswith(".")
     assert all(option.meaning for option in method.options.values())
+
+
+def test_the_documented_table() -> None:
+    lines = (ROOT / "docs/methods.md").read_text(encoding="utf-8").splitlines()
+    shown = [line for line in lines if line.startswith("| `")]
+    assert shown == [
+        f"| `{m.name}` | {m.for_what} | {m.needs} | {', '.join(f'`{name}`' for name in m.options)} |"
+        for m in METHODS.values()
+    ]
 
 
 @pytest.mark.parametrize("method", METHODS.values(), ids=NAMES)

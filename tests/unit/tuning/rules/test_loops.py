@@ -265,3 +265,19 @@ def test_where_a_pid_of_the_ultimate_cycle_ends() -> None:
         assert tune(name, FOPDT(1.0, 1.0, 20.0), controller="pi").gains.Kp > 0.0
         with pytest.raises(Refused, match="unstable"):
             tune(name, FOPDT(1.0, 1.0, 20.0), controller="pid")
+
+
+def test_the_coefficient_of_cohen_coons_variant_is_too_large() -> None:
+    """Unstable from L/T = 0.87 by the poles of the closed loop, where the original still decays to a quarter."""
+    for ratio, stable in ((0.865, True), (0.875, False)):
+        model = FOPDT(1.0, 1.0, ratio)
+        kp, tau = 0.9 * (1.0 + 0.92 * ratio) / ratio, ratio / (1.0 + ratio)
+        gains = Gains(kp, ratio * (3.3 - 3.0 * tau) / (1.0 + 1.2 * tau))
+        poles = np.roots(closed_loop(model, gains, pade(ratio, 8)))
+        assert bool(np.all(poles.real < 0.0)) is stable
+        if stable:
+            found = tune("cohen-coon", model, variant="tau").gains
+            assert [found.Kp, found.Ti] == pytest.approx([gains.Kp, gains.Ti])
+        else:
+            with pytest.raises(Refused, match="variant tau"):
+                tune("cohen-coon", model, variant="tau", extrapolate=True)
