@@ -10,7 +10,7 @@ Variant "tau", PI only, is the rewriting in tau = L/(L + T) that the ME-PSO pape
 
     PI     K Kp = 0.9 (1 + 0.92 r)/r    Ti = L (3.3 - 3 tau)/(1 + 1.2 tau)
 
-Its 0.92 is ten times the original's (1/12)/(9/10) = 0.0926, so its gain is far higher; from r = 0.87 its loop is
+Its 0.92 is ten times the original's (1/12)/(9/10) = 0.0926, so its gain is far higher; from r = 0.864 its loop is
 unstable, and refused.
 """
 
