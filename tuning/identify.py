@@ -39,13 +39,17 @@ NOISY = 0.2
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """One structure as fitted.  parameters: how many were.  rms: of the residual, PV units.  at_rest: at the start."""
+    """One structure as fitted.  parameters: how many were.  rms: of the residual, PV units.  at_rest: at the start.
+
+    chosen: it is the model. That need not be the one of the lowest BIC, which may have a zero.
+    """
 
     structure: str
     bic: float
     parameters: int
     rms: float
     at_rest: bool
+    chosen: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +60,7 @@ class Identified:
     noise_std: of what the model leaves unexplained, PV units.  standard_errors: of the model's parameters by their
     names, in their units.  whiteness: Ljung-Box p-value of the residual, below 0.001 not white noise.  explained: the
     residual is white, or too small to matter (0.15 % of PV's span, or what rounding PV to its resolution leaves).
-    fitted: PV as modelled, PV units, shape (N,).  candidates: all structures tried, best first.
+    fitted: PV as modelled, PV units, shape (N,).  candidates: all structures tried, the lowest BIC first.
     notes: what the user should know, one sentence each.
     """
 
@@ -116,7 +120,7 @@ def _result(problem: Problem, best: Fit, ranked: Sequence[Fit]) -> Identified:
         explained=best.explains,
         fitted=record.y - residual,
         candidates=tuple(
-            Candidate(fit.structure.name, fit.bic, fit.parameters, unit * fit.rms, fit.load_from is None)
+            Candidate(fit.structure.name, fit.bic, fit.parameters, unit * fit.rms, fit.load_from is None, fit is best)
             for fit in ranked
         ),
         notes=tuple(_notes(problem, best, ranked, model, errors)),

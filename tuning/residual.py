@@ -22,6 +22,10 @@ def whiteness(residual: Reals, searched: int) -> float:
 
 
 def colour(residual: Reals) -> float:
-    """How many times more the residual's slow part weighs than that of white noise of its differences; at least 1."""
+    """By how much the noise varies more in slow averages than white noise of its variance would; at least 1.
+
+    (1 + r)/(1 - r) with the correlation r of neighbours: exact for first-order autoregressive noise.
+    """
+    variance = float(np.mean(residual**2))
     fast = 0.5 * float(np.mean(np.diff(residual) ** 2))
-    return max(1.0, float(np.mean(residual**2)) / fast) if fast > 0.0 else 1.0
+    return max(1.0, 2.0 * variance / fast - 1.0) if fast > 0.0 else 1.0

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from tests.unit.tuning import recordings
 from tests.unit.tuning.recordings import (
@@ -105,6 +106,17 @@ def test_standard_errors_are_the_scatter_over_many_records(how: str) -> None:
     assert np.abs(np.mean(scatter, axis=0)).max() < 0.75
 
 
+def test_coloured_noise_is_told_and_widens_the_standard_errors() -> None:
+    scatter = []
+    for seed in range(12):
+        t, u, y = open_loop(FIRST_ORDER, step(300))
+        white = np.random.default_rng(seed).normal(scale=0.012, size=len(y) + 50)
+        found = identify(t, u, y + lfilter([1.0], [1.0, -0.8], white)[50:])
+        assert not found.explained and any("not white" in note for note in found.notes)
+        scatter.append((found.model.K - 2.0) / found.standard_errors["K"])
+    assert np.std(scatter) == pytest.approx(1.0, abs=0.6)
+
+
 @pytest.mark.parametrize("resolution", [0.005, 0.02, 0.05])
 def test_rounded_pv(resolution: float) -> None:
     t, u, y = open_loop(FIRST_ORDER, step())
@@ -143,7 +155,7 @@ def test_a_record_that_begins_with_the_move() -> None:
 def test_an_inverse_response_is_outside_and_is_said_to_be(how: str, noise: float) -> None:
     found = identify(*recorded(INVERSE_RESPONSE, how, noise=noise))
     assert not found.explained and found.whiteness < 1e-3
-    assert found.candidates[0].structure == "sopdt with zero"
+    assert found.candidates[0].structure == "sopdt with zero" and not found.candidates[0].chosen
     assert any("not white" in note for note in found.notes)
     assert any("inverse response" in note for note in found.notes)
 
@@ -193,7 +205,7 @@ def test_what_is_modelled_and_what_was_tried_is_shown() -> None:
     )
     assert {each.structure for each in found.candidates} == {"fopdt", "sopdt", "integrating", "integrating with lag"}
     assert [each.bic for each in found.candidates] == sorted(each.bic for each in found.candidates)
-    assert found.candidates[0].structure == "fopdt"
+    assert [each.structure for each in found.candidates if each.chosen] == ["fopdt"]
     assert all(math.isfinite(each.bic) and math.isfinite(each.rms) for each in found.candidates)
 
 

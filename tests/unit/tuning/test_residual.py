@@ -20,9 +20,14 @@ def test_correlated_noise_is_seen() -> None:
         assert whiteness(lfilter([1.0], [1.0, -0.5], random.normal(size=400)), 2) < 1e-3
 
 
-def test_colour_is_the_ratio_of_variances_that_the_correlation_of_neighbours_gives() -> None:
-    white = np.random.default_rng(4).normal(size=20000)
+def test_colour_is_the_variance_of_long_averages_against_that_of_white_noise() -> None:
+    white = np.random.default_rng(4).normal(size=40000)
+    coloured = lfilter([1.0], [1.0, -0.8], white)
+    averages = coloured.reshape(-1, 200).mean(axis=1)
+    assert colour(coloured) == pytest.approx((1.0 + 0.8) / (1.0 - 0.8), rel=0.06)
+    assert colour(coloured) == pytest.approx(200.0 * averages.var() / coloured.var(), rel=0.25)
     assert colour(white) == pytest.approx(1.0, abs=0.03)
-    # of an autoregressive process with pole a: 1/(1 - a)
-    assert colour(lfilter([1.0], [1.0, -0.8], white)) == pytest.approx(5.0, rel=0.05)
+
+
+def test_no_residual_is_white() -> None:
     assert colour(np.zeros(10)) == 1.0 and whiteness(np.zeros(30), 1) == 1.0
