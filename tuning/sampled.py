@@ -66,7 +66,7 @@ def _characteristic(phi: Reals) -> Reals:
 def _exponential(matrices: Reals) -> Reals:
     """exp of each small matrix, shape (n, k, k): Taylor's series of the matrix halved often enough, squared back.
 
-    scipy's is general, and on matrices this small slower: by a factor of 50 where its BLAS has to share a processor.
+    scipy's is no slower on an idle machine, but solves with threads, which on a busy one took 1.4 ms against 0.05 ms.
     """
     size = float(np.abs(matrices).sum(axis=2).max())
     halvings = max(0, math.ceil(math.log2(4.0 * size))) if size > 0.0 else 0
