@@ -1,0 +1,266 @@
+"""The complex criterion of Romasevych, Loveikin and Usenko for PI loops, many settings at once, dead time exact.
+
+    Cr + dT*Ter,   Cr = d1*MIE + d2*MIC + d3*OS + d4*ts
+
+of the answer to a unit set-point step. ts: last instant outside 5 % of the set-point. MIE, MIC: mean |e| and mean |u|
+from 0 to ts. OS: overshoot as a fraction. Ter: distance to the 5 % band and the sum of the sizes of all derivatives of
+PV up to the plant's order, at the end of the horizon (the paper leaves that instant open). Three weightings are named.
+Source: "PI-controller tuning optimization via PSO-based technique", the criterion, its terminal term and the weights.
+
+Everything is counted in the plant's own units: time in its largest lag or its dead time, whichever is longer, MV in
+what holds PV at the set-point. For the five plants of the paper these are its own second and its own unit.
+
+How it is made fast. All settings given together are simulated together. The rational loop is advanced by its matrix
+exponential, one with dead time by its map from one dead time to the next; powers of these matrices give all samples.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from scipy.linalg import expm
+
+from tuning.dead_time import DeadTimeLoop
+from tuning.models import Model, Reals, integrators, sign, time_constants
+from tuning.reasons import Reason, Refused
+from tuning.state_space import gain_unit, normalised, state_space, time_sum
+
+BAND = 0.05
+DIVERGED = 1e9
+SAMPLES = 6000
+HORIZON_IN_TIME_SUMS = 20.0
+BLOCK = 64
+
+
+class Weighting(StrEnum):
+    """What the criterion looks at most: the error, the control, or the duration of the answer."""
+
+    ERROR = "error"
+    CONTROL = "control"
+    DURATION = "duration"
+
+
+WEIGHTS = {
+    Weighting.ERROR: (1000.0, 1.0, 5.0, 1.0),
+    Weighting.CONTROL: (1.0, 1000.0, 5.0, 1.0),
+    Weighting.DURATION: (1.0, 1.0, 5.0, 1000.0),
+}
+"""d1 to d4 of the paper's three variants."""
+TERMINAL_WEIGHT = 1000.0
+
+
+@dataclass(frozen=True, slots=True)
+class Indices:
+    """Of p settings, each (p,). MIE: fraction of the step.  MIC: of the MV that holds PV there.  overshoot: fraction.
+
+    settling: in time units, the horizon if not settled.  terminal: the penalty at the end, without its weight. All of a
+    diverging loop may be inf or NaN.
+    """
+
+    MIE: Reals
+    MIC: Reals
+    overshoot: Reals
+    settling: Reals
+    terminal: Reals
+
+
+class ComplexCriterion:
+    """The criterion of one model; what does not depend on the controller is computed once.
+
+    time_unit_s: s.  gain_unit: PV units per MV unit.  horizon: in time units. Settings are given as kp = Kp*gain_unit
+    and ti = gain_unit/(Ki*time_unit_s), which is the paper's Ti, the reciprocal of the integral gain.
+    Ms_max: loops of a greater maximum sensitivity are penalised in proportion; none if None.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        weighting: Weighting,
+        horizon_s: float | None = None,
+        Ms_max: float | None = None,
+        samples: int = SAMPLES,
+    ) -> None:
+        """horizon_s: simulated time, s, rounded up to whole dead times; by default 20 times all lags and the dead time.
+
+        samples: about how many of each response are looked at. Raises Refused for a model without any time of its own.
+        """
+        total = time_sum(model)
+        if total <= 0.0:
+            raise Refused(Reason.BAD_INPUT, "the model has neither lag nor dead time: no PI loop is too fast for it")
+        self.time_unit_s = max(float(time_constants(model).max(initial=0.0)), model.L)
+        self.gain_unit = gain_unit(model, self.time_unit_s)
+        self.weights = WEIGHTS[weighting]
+        self.Ms_max = Ms_max
+        self.evaluations = 0
+        plant = normalised(model, self.time_unit_s)
+        horizon = (HORIZON_IN_TIME_SUMS * total if horizon_s is None else horizon_s) / self.time_unit_s
+        self._loops: _Delayed | _Immediate
+        self._loops = _Delayed(plant, horizon, samples) if plant.L > 0.0 else _Immediate(plant, horizon, samples)
+        self.horizon = self._loops.dt * self._loops.steps
+        self._w = np.geomspace(1e-2 * self.time_unit_s / total, 1e2 * _fastest(plant), 400)
+        self._plant = plant.frequency_response(self._w)
+
+    def __call__(self, kp: Reals, ti: Reals) -> Reals:
+        """The criterion of each setting, (p,) from (p,) and (p,), finite; above DIVERGED where a loop diverges."""
+        kp, ki = np.atleast_1d(np.asarray(kp, dtype=float)), 1.0 / np.atleast_1d(np.asarray(ti, dtype=float))
+        self.evaluations += len(kp)
+        found = self.indices(kp, 1.0 / ki)
+        d1, d2, d3, d4 = self.weights
+        with np.errstate(over="ignore", invalid="ignore"):
+            value = d1 * found.MIE + d2 * found.MIC + d3 * found.overshoot + d4 * found.settling
+            value = value + TERMINAL_WEIGHT * found.terminal
+        lost = ~(value < DIVERGED)
+        if lost.any():
+            value[lost] = DIVERGED * (1.0 + self._loops.growth(kp[lost], ki[lost]))
+        if self.Ms_max is not None:
+            excess = np.maximum(self.sensitivity(kp, 1.0 / ki) / self.Ms_max - 1.0, 0.0)
+            # the worst settled loop costs what it takes to settle at the end of the horizon
+            value = value + np.minimum(excess, 1e3) * max(self.weights) * self.horizon
+        return np.asarray(value)
+
+    def indices(self, kp: Reals, ti: Reals) -> Indices:
+        """The parts of the criterion, for kp and ti of shape (p,)."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            e, u, slopes = self._loops.sample(kp, 1.0 / ti)
+            return _indices(e, u, slopes, self._loops.dt)
+
+    def sensitivity(self, kp: Reals, ti: Reals) -> Reals:
+        """Ms of each loop on a grid of frequencies, (p,)."""
+        loop = (kp[:, None] + 1.0 / (1j * ti[:, None] * self._w)) * self._plant
+        return np.asarray(1.0 / np.abs(1.0 + loop).min(axis=1))
+
+    def stable(self, kp: float, ti: float) -> bool:
+        """Whether all roots of the loop are in the left half-plane."""
+        return bool(self._loops.growth(np.array([kp]), np.array([1.0 / ti]))[0] < 0.0)
+
+
+def _indices(e: Reals, u: Reals, slopes: Reals, dt: float) -> Indices:
+    """e, u: (p, n), u of which the first and last samples may jump.  slopes: (p,), sum of the derivatives' sizes."""
+    size = np.abs(e)
+    steps = size.shape[1] - 1
+    outside = size > BAND
+    last = steps - np.argmax(outside[:, ::-1], axis=1)
+    settled = last < steps
+    rows = np.arange(len(e))
+    here = np.minimum(last, steps - 1)
+    a, b = size[rows, here], size[rows, here + 1]
+    part = np.where(settled, (a - BAND) / np.where(settled, a - b, 1.0), 1.0)
+    settling = np.where(settled, dt * (here + part), dt * steps)
+
+    def mean(f: Reals) -> Reals:
+        """Of |f| from 0 to the settling, trapezoids and the first part of the last of them."""
+        f = np.abs(f)
+        first, second = f[rows, here], f[rows, here + 1]
+        whole = np.cumsum(f, axis=1)[rows, here] - 0.5 * (f[:, 0] + first)
+        return np.asarray(dt * (whole + part * (first + 0.5 * part * (second - first))) / settling)
+
+    return Indices(
+        MIE=mean(e),
+        MIC=mean(u),
+        overshoot=np.maximum(-e.min(axis=1), 0.0),
+        settling=settling,
+        terminal=np.maximum(size[:, -1] - BAND, 0.0) + slopes,
+    )
+
+
+def _fastest(plant: Model) -> float:
+    return float(1.0 / min([*time_constants(plant), plant.L or math.inf]))
+
+
+def _powers(step: Reals, start: Reals, count: int) -> Reals:
+    """(p, count, s): start (p, s) and what `step` (p, s, s) makes of it again and again, by doubling."""
+    states, across = start[:, None, :], step.transpose(0, 2, 1)
+    while states.shape[1] < count:
+        states = np.concatenate((states, states[:, : count - states.shape[1]] @ across), axis=1)
+        if states.shape[1] < count:
+            across = across @ across
+    return states
+
+
+class _Immediate:
+    """Loops without dead time: states (plant's, integral part), as what is missing to rest at the set-point."""
+
+    def __init__(self, plant: Model, horizon: float, samples: int) -> None:
+        self.dt, self.steps = horizon / samples, samples
+        self.plant = state_space(plant)
+        rest, self.u_rest = self.plant.rest()
+        self._start = np.concatenate((-rest, [-self.u_rest]))
+
+    def _loop(self, kp: Reals, ki: Reals) -> tuple[Reals, Reals]:
+        """(A (p, s, s), output row of e (p, s)) of the closed loop."""
+        g, n = self.plant, len(self.plant.b)
+        # e = -(c x + d u) and u = kp*e + integral part
+        error = -np.append(g.c, g.d) / (1.0 + g.d * kp[:, None])
+        closed = np.zeros((len(kp), n + 1, n + 1))
+        closed[:, :n, :n] = g.a
+        closed[:, :n, n] = g.b
+        closed[:, :n, :] += g.b[:, None] * (kp[:, None] * error)[:, None, :]
+        closed[:, n, :] = ki[:, None] * error
+        return closed, error
+
+    def sample(self, kp: Reals, ki: Reals) -> tuple[Reals, Reals, Reals]:
+        closed, error = self._loop(kp, ki)
+        step = np.asarray(expm(closed * self.dt))
+        rows = _powers(step.transpose(0, 2, 1), error, BLOCK)
+        block = np.linalg.matrix_power(step, BLOCK)
+        starts = _powers(block, np.broadcast_to(self._start, error.shape), self.steps // BLOCK + 1)
+        control = kp[:, None, None] * rows
+        integral = np.zeros((len(kp), BLOCK, len(self._start)))
+        integral[:] = _powers(step.transpose(0, 2, 1), np.broadcast_to(np.eye(len(self._start))[-1], error.shape), BLOCK)
+        e = (starts @ rows.transpose(0, 2, 1)).reshape(len(kp), -1)[:, : self.steps + 1]
+        u = (starts @ (control + integral).transpose(0, 2, 1)).reshape(len(kp), -1)[:, : self.steps + 1]
+        at = divmod(self.steps, BLOCK)
+        last = np.einsum("pij,pj->pi", np.linalg.matrix_power(step, at[1]), starts[:, at[0]])
+        slopes = np.zeros(len(kp))
+        for _ in range(len(self.plant.b)):
+            last = np.einsum("pij,pj->pi", closed, last)
+            slopes += np.abs(np.einsum("pi,pi->p", error, last))
+        return e, u + self.u_rest, slopes
+
+    def growth(self, kp: Reals, ki: Reals) -> Reals:
+        """The largest real part of each loop's roots."""
+        return np.asarray(np.linalg.eigvals(self._loop(kp, ki)[0]).real.max(axis=1))
+
+
+class _Delayed:
+    """Loops with dead time. A dead time shorter than a sample is stepped over in powers of two."""
+
+    def __init__(self, plant: Model, horizon: float, samples: int) -> None:
+        self.loop = DeadTimeLoop(plant)
+        wanted = horizon / samples
+        self.squarings = max(0, math.floor(math.log2(wanted / plant.L)))
+        block = plant.L * 2**self.squarings
+        self.inside = math.ceil(block / wanted)
+        self.dt = block / self.inside
+        self.blocks = math.ceil(horizon / block - 1e-9)
+        self.steps = self.blocks * self.inside
+        at = np.arange(self.inside) / self.inside
+        self._value, self._area = self.loop.values(at), self.loop.areas(at)
+        end = self.loop.values(np.ones(1))[0]
+        self._slopes = np.array(
+            [end @ np.linalg.matrix_power(self.loop.slopes, i) for i in range(1, self.loop.order + 1)]
+        )
+
+    def sample(self, kp: Reals, ki: Reals) -> tuple[Reals, Reals, Reals]:
+        advance, start = self.loop.maps(kp, ki), self.loop.start(kp)
+        for _ in range(self.squarings):
+            advance = advance @ advance
+        states = _powers(advance, start, self.blocks + 1)
+        errors, integral = states[:, :, self.loop.errors], states[:, :, -1:]
+        e = errors @ self._value.T
+        u = kp[:, None, None] * e + integral + ki[:, None, None] * (errors @ self._area.T)
+        shape = (len(kp), -1)
+        last = errors[:, self.blocks - 1]
+        slopes = np.abs(last @ self._slopes.T).sum(axis=1)
+        return (
+            e.reshape(shape)[:, : self.steps + 1],
+            u.reshape(shape)[:, : self.steps + 1] + self.loop.u_rest,
+            slopes,
+        )
+
+    def growth(self, kp: Reals, ki: Reals) -> Reals:
+        """The largest real part of each loop's roots."""
+        return np.asarray(self.loop.roots(self.loop.maps(kp, ki))[:, 0].real)

@@ -1,0 +1,125 @@
+"""Search for the least of a criterion in the unit square (or cube): three seeded, deterministic optimisers.
+
+A criterion takes many points at once, (p, n) to (p,); smaller is better; it must be finite everywhere.
+
+    multi_epoch_swarm        Romasevych and Loveikin's swarm with restarts
+    differential_evolution   scipy's
+    nelder_mead              scipy's, from the best of many random points
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import optimize
+
+from tuning.models import Reals
+
+Cost = Callable[[Reals], Reals]
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """point: (n,).  value: the criterion there.  evaluations: of single points.  epochs: restarts and the first start."""
+
+    point: Reals
+    value: float
+    evaluations: int
+    epochs: int = 1
+
+
+def multi_epoch_swarm(
+    cost: Cost,
+    dimensions: int,
+    seed: int,
+    particles: int = 50,
+    iterations: int = 50,
+    social: float = 2.1,
+    cognitive: float = 0.1,
+    acceptable_rate: float = 0.1,
+) -> Found:
+    """ME-PSO: x + cognitive*r1*(own best - x) + social*r2*(best of all - x), no velocity, clipped to the square.
+
+    When an iteration lowers the best of all by no more than acceptable_rate of it, all particles are thrown anew and
+    forget their own bests; the best of all stays. particles*iterations evaluations. Source: "PI-controller tuning
+    optimization via PSO-based technique", equations (8) to (10) and the parameter table, read by its words: the larger
+    coefficient belongs to the best of all, and (10), which as printed always holds, means the relative reduction.
+    Thrown particles first move, then are evaluated; r1 and r2 are drawn for each coordinate: both are not stated there.
+    """
+    rng = np.random.default_rng(seed)
+    shape = (particles, dimensions)
+    at = rng.random(shape)
+    value = cost(at)
+    own, own_value = at, value
+    best, best_value = at[np.argmin(value)], float(value.min())
+    epochs = 1
+    for _ in range(iterations - 1):
+        at = at + cognitive * rng.random(shape) * (own - at) + social * rng.random(shape) * (best - at)
+        at = np.clip(at, 0.0, 1.0)
+        value = cost(at)
+        better = value < own_value
+        own, own_value = np.where(better[:, None], at, own), np.where(better, value, own_value)
+        before = best_value
+        if float(value.min()) < best_value:
+            best, best_value = at[np.argmin(value)], float(value.min())
+        if before - best_value <= acceptable_rate * abs(best_value):
+            at = rng.random(shape)
+            own, own_value = at, np.full(particles, np.inf)
+            epochs += 1
+    return Found(best, best_value, particles * iterations, epochs)
+
+
+def differential_evolution(cost: Cost, dimensions: int, seed: int, budget: int = 2500) -> Found:
+    """scipy's differential evolution, a whole generation of 25 points a dimension at once, at most `budget` points."""
+    population, evaluations = 25 * dimensions, 0
+
+    def generation(x: Reals) -> Reals:
+        nonlocal evaluations
+        evaluations += x.shape[1]
+        return cost(x.T)
+
+    found = optimize.differential_evolution(
+        generation,
+        [(0.0, 1.0)] * dimensions,
+        popsize=25,
+        maxiter=budget // population - 1,
+        tol=1e-8,
+        seed=np.random.default_rng(seed),
+        polish=False,
+        updating="deferred",
+        vectorized=True,
+    )
+    return Found(np.asarray(found.x), float(found.fun), evaluations)
+
+
+def nelder_mead(cost: Cost, dimensions: int, seed: int, budget: int = 2500, starts: int = 10) -> Found:
+    """scipy's Nelder-Mead from the best few of budget/5 random points that are apart, then once more from the best."""
+    scattered = np.random.default_rng(seed).random((budget // 5, dimensions))
+    values = cost(scattered)
+    left = scattered[np.argsort(values)]
+    evaluations = len(scattered)
+    each = (budget - evaluations) // (starts + 1)
+
+    def search(start: Reals, size: float) -> Found:
+        simplex = np.vstack((start, start + size * np.where(start < 0.5, 1.0, -1.0) * np.eye(dimensions)))
+        found = optimize.minimize(
+            lambda x: float(cost(np.asarray(x)[None, :])[0]),
+            start,
+            method="Nelder-Mead",
+            bounds=[(0.0, 1.0)] * dimensions,
+            options={"initial_simplex": simplex, "xatol": 1e-6, "fatol": 1e-6, "maxfev": each},
+        )
+        return Found(np.asarray(found.x), float(found.fun), int(found.nfev))
+
+    runs: list[Found] = []
+    while len(runs) < starts and len(left):
+        runs.append(search(left[0], 0.05))
+        left = left[np.abs(left - left[0]).max(axis=1) > 0.05]
+    best = min(runs, key=lambda run: run.value)
+    # a simplex can collapse on a cliff; a small new one frees it
+    again = search(best.point, 0.01)
+    evaluations += sum(run.evaluations for run in runs) + again.evaluations
+    best = min(best, again, key=lambda run: run.value)
+    return Found(best.point, best.value, evaluations, len(runs) + 1)

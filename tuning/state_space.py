@@ -1,0 +1,60 @@
+"""A model's rational part as a balanced state space, with time and gain in units of one's own choice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import matrix_balance
+
+from tuning.models import Model, Reals, TransferFunction, integrators, sign, time_constants
+
+
+@dataclass(frozen=True, slots=True)
+class StateSpace:
+    """x' = a x + b u, y = c x + d u: a (n, n), b (n,), c (n,), d a number."""
+
+    a: Reals
+    b: Reals
+    c: Reals
+    d: float
+
+    def rest(self) -> tuple[Reals, float]:
+        """(x, u) at which the output rests at 1; the plant has no zero at the origin."""
+        n = len(self.b)
+        system = np.block([[self.a, self.b[:, None]], [self.c[None, :], np.array([[self.d]])]])
+        found = np.linalg.solve(system, np.eye(n + 1)[n])
+        return found[:n], float(found[n])
+
+
+def time_sum(model: Model) -> float:
+    """All lags and the dead time together, s; 0 for a bare integrator."""
+    return float(time_constants(model).sum()) + model.L
+
+
+def gain_unit(model: Model, time_unit: float) -> float:
+    """|K| of a self-regulating model; of an integrating one, what it rises in one time unit (s) per MV unit."""
+    slowest = np.trim_zeros(np.asarray(model.den), "b")[-1]
+    return abs(float(model.num[-1] / slowest)) * time_unit ** integrators(model)
+
+
+def normalised(model: Model, time_unit: float) -> TransferFunction:
+    """The same plant with a positive gain of one, its time counted in time_unit, s."""
+    scale = sign(model) / gain_unit(model, time_unit)
+    num = [c * scale * time_unit**-i for i, c in enumerate(reversed(model.num))]
+    den = [c * time_unit**-i for i, c in enumerate(reversed(model.den))]
+    return TransferFunction(tuple(reversed(num)), tuple(reversed(den)), model.L / time_unit)
+
+
+def state_space(model: Model) -> StateSpace:
+    """The model without its dead time. Balancing keeps lags far apart well conditioned."""
+    den = np.asarray(model.den) / model.den[0]
+    order = len(den) - 1
+    num = np.concatenate((np.zeros(len(den) - len(model.num)), model.num)) / model.den[0]
+    a = np.zeros((order, order))
+    a[0] = -den[1:]
+    a[1:, :-1] = np.eye(order - 1)
+    balanced, (scale, _) = matrix_balance(a, permute=False, separate=True)
+    b = np.zeros(order)
+    b[0] = 1.0 / scale[0]
+    return StateSpace(np.asarray(balanced), b, (num[1:] - den[1:] * num[0]) * scale, float(num[0]))
