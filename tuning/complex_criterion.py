@@ -24,7 +24,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from tuning.dead_time import DeadTimeLoop
-from tuning.models import Model, Reals, integrators, sign, time_constants
+from tuning.models import Model, Reals, time_constants
 from tuning.reasons import Reason, Refused
 from tuning.state_space import gain_unit, normalised, state_space, time_sum
 
@@ -97,26 +97,24 @@ class ComplexCriterion:
         self.evaluations = 0
         plant = normalised(model, self.time_unit_s)
         horizon = (HORIZON_IN_TIME_SUMS * total if horizon_s is None else horizon_s) / self.time_unit_s
-        self._loops: _Delayed | _Immediate
-        self._loops = _Delayed(plant, horizon, samples) if plant.L > 0.0 else _Immediate(plant, horizon, samples)
+        self._loops = (_Delayed if plant.L > 0.0 else _Immediate)(plant, horizon, samples)
         self.horizon = self._loops.dt * self._loops.steps
         self._w = np.geomspace(1e-2 * self.time_unit_s / total, 1e2 * _fastest(plant), 400)
         self._plant = plant.frequency_response(self._w)
 
     def __call__(self, kp: Reals, ti: Reals) -> Reals:
         """The criterion of each setting, (p,) from (p,) and (p,), finite; above DIVERGED where a loop diverges."""
-        kp, ki = np.atleast_1d(np.asarray(kp, dtype=float)), 1.0 / np.atleast_1d(np.asarray(ti, dtype=float))
         self.evaluations += len(kp)
-        found = self.indices(kp, 1.0 / ki)
+        found = self.indices(kp, ti)
         d1, d2, d3, d4 = self.weights
         with np.errstate(over="ignore", invalid="ignore"):
             value = d1 * found.MIE + d2 * found.MIC + d3 * found.overshoot + d4 * found.settling
             value = value + TERMINAL_WEIGHT * found.terminal
         lost = ~(value < DIVERGED)
         if lost.any():
-            value[lost] = DIVERGED * (1.0 + self._loops.growth(kp[lost], ki[lost]))
+            value[lost] = DIVERGED * (1.0 + self._loops.growth(kp[lost], 1.0 / ti[lost]))
         if self.Ms_max is not None:
-            excess = np.maximum(self.sensitivity(kp, 1.0 / ki) / self.Ms_max - 1.0, 0.0)
+            excess = np.maximum(self.sensitivity(kp, ti) / self.Ms_max - 1.0, 0.0)
             # the worst settled loop costs what it takes to settle at the end of the horizon
             value = value + np.minimum(excess, 1e3) * max(self.weights) * self.horizon
         return np.asarray(value)
@@ -204,16 +202,20 @@ class _Immediate:
     def sample(self, kp: Reals, ki: Reals) -> tuple[Reals, Reals, Reals]:
         closed, error = self._loop(kp, ki)
         step = np.asarray(expm(closed * self.dt))
-        rows = _powers(step.transpose(0, 2, 1), error, BLOCK)
-        block = np.linalg.matrix_power(step, BLOCK)
-        starts = _powers(block, np.broadcast_to(self._start, error.shape), self.steps // BLOCK + 1)
-        control = kp[:, None, None] * rows
-        integral = np.zeros((len(kp), BLOCK, len(self._start)))
-        integral[:] = _powers(step.transpose(0, 2, 1), np.broadcast_to(np.eye(len(self._start))[-1], error.shape), BLOCK)
-        e = (starts @ rows.transpose(0, 2, 1)).reshape(len(kp), -1)[:, : self.steps + 1]
-        u = (starts @ (control + integral).transpose(0, 2, 1)).reshape(len(kp), -1)[:, : self.steps + 1]
-        at = divmod(self.steps, BLOCK)
-        last = np.einsum("pij,pj->pi", np.linalg.matrix_power(step, at[1]), starts[:, at[0]])
+        backward = step.transpose(0, 2, 1)
+        rows = _powers(backward, error, BLOCK)
+        integral = _powers(backward, np.broadcast_to(np.eye(len(self._start))[-1], error.shape), BLOCK)
+        starts = _powers(
+            np.linalg.matrix_power(step, BLOCK),
+            np.broadcast_to(self._start, error.shape),
+            self.steps // BLOCK + 1,
+        )
+        e, u = (
+            (starts @ each.transpose(0, 2, 1)).reshape(len(kp), -1)[:, : self.steps + 1]
+            for each in (rows, kp[:, None, None] * rows + integral)
+        )
+        block, inside = divmod(self.steps, BLOCK)
+        last = np.einsum("pij,pj->pi", np.linalg.matrix_power(step, inside), starts[:, block])
         slopes = np.zeros(len(kp))
         for _ in range(len(self.plant.b)):
             last = np.einsum("pij,pj->pi", closed, last)

@@ -9,7 +9,6 @@ roots of the loop, exp(s*L), and the sum of its squares the integral of the squa
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -44,7 +43,8 @@ class DeadTimeLoop:
         self._to_series = np.linalg.inv(chebyshev.chebvander(2.0 * self.at - 1.0, count - 1))
 
         areas = self.areas(self.at)
-        self.slopes = self.L ** -1 * _series_map(chebyshev.chebder, 2.0, self.at, count) @ self._to_series
+        slopes = np.array([chebyshev.chebval(2.0 * self.at - 1.0, chebyshev.chebder(c)) for c in np.eye(count)]).T
+        self.slopes = 2.0 / self.L * slopes @ self._to_series
         free, driven = self._plant(plant.a, plant.b)
         out = np.einsum("k,ikl->il", plant.c, free)
         through = np.einsum("k,ikj->ij", plant.c, driven) + plant.d * np.eye(count)
@@ -86,8 +86,9 @@ class DeadTimeLoop:
 
     def areas(self, at: Reals) -> Reals:
         """(len(at), nodes): from the error at the nodes to its integral since the dead time began, in s."""
-        map_ = _series_map(lambda c: chebyshev.chebint(c, lbnd=-1.0), 0.5, at, self.nodes)
-        return np.asarray(self.L * map_ @ self._to_series)
+        series = [chebyshev.chebint(c, lbnd=-1.0) for c in np.eye(self.nodes)]
+        areas = np.array([chebyshev.chebval(2.0 * at - 1.0, c) for c in series]).T
+        return np.asarray(0.5 * self.L * areas @ self._to_series, dtype=np.float64)
 
     def squares(self, maps: Reals, start: Reals) -> tuple[Reals, Reals]:
         """(integral of e^2, integral of e'^2) over all time, each (p,); every loop must be stable.
@@ -114,7 +115,7 @@ class DeadTimeLoop:
         """
         found = np.linalg.eigvals(maps).astype(np.complex128)
         ordered = np.take_along_axis(found, np.argsort(-np.abs(found), axis=1), axis=1)
-        return np.asarray(np.log(np.maximum(np.abs(ordered), 1e-300)) + 1j * np.angle(ordered)) / self.L
+        return np.asarray((np.log(np.maximum(np.abs(ordered), 1e-300)) + 1j * np.angle(ordered)) / self.L)
 
     def _plant(self, a: Reals, b: Reals) -> tuple[Reals, Reals]:
         """(free (nodes, n, n), driven (nodes, n, nodes)): plant states at the nodes from their start and the input."""
@@ -135,8 +136,3 @@ class DeadTimeLoop:
             free[i + 1] = step[:n, :n] @ free[i]
             driven[i + 1] = step[:n, :n] @ driven[i] + step[:n, n:] @ local
         return free, driven
-
-
-def _series_map(change: Callable[[Reals], Reals], scale: float, at: Reals, count: int) -> Reals:
-    """(len(at), count): what `change` makes of each Chebyshev polynomial, times scale, at fractions `at`."""
-    return np.array([scale * chebyshev.chebval(2.0 * at - 1.0, change(c)) for c in np.eye(count)]).T

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import optimize
@@ -22,7 +23,7 @@ Cost = Callable[[Reals], Reals]
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """point: (n,).  value: the criterion there.  evaluations: of single points.  epochs: restarts and the first start."""
+    """point: (n,).  value: the criterion there.  evaluations: of single points.  epochs: starts of the search."""
 
     point: Reals
     value: float
@@ -75,14 +76,14 @@ def differential_evolution(cost: Cost, dimensions: int, seed: int, budget: int =
     """scipy's differential evolution, a whole generation of 25 points a dimension at once, at most `budget` points."""
     population, evaluations = 25 * dimensions, 0
 
-    def generation(x: Reals) -> Reals:
+    def generation(x: Reals, /) -> Any:
         nonlocal evaluations
         evaluations += x.shape[1]
         return cost(x.T)
 
     found = optimize.differential_evolution(
         generation,
-        [(0.0, 1.0)] * dimensions,
+        optimize.Bounds(np.zeros(dimensions), np.ones(dimensions)),
         popsize=25,
         maxiter=budget // population - 1,
         tol=1e-8,
@@ -96,19 +97,23 @@ def differential_evolution(cost: Cost, dimensions: int, seed: int, budget: int =
 
 def nelder_mead(cost: Cost, dimensions: int, seed: int, budget: int = 2500, starts: int = 10) -> Found:
     """scipy's Nelder-Mead from the best few of budget/5 random points that are apart, then once more from the best."""
-    scattered = np.random.default_rng(seed).random((budget // 5, dimensions))
+    scattered: Reals = np.random.default_rng(seed).random((budget // 5, dimensions))
     values = cost(scattered)
     left = scattered[np.argsort(values)]
     evaluations = len(scattered)
     each = (budget - evaluations) // (starts + 1)
 
+    def one(x: Reals) -> float:
+        return float(cost(x[None, :])[0])
+
     def search(start: Reals, size: float) -> Found:
-        simplex = np.vstack((start, start + size * np.where(start < 0.5, 1.0, -1.0) * np.eye(dimensions)))
+        inwards = np.where(start < 0.5, size, -size)
+        simplex = start + np.concatenate((np.zeros((1, dimensions)), inwards * np.eye(dimensions)))
         found = optimize.minimize(
-            lambda x: float(cost(np.asarray(x)[None, :])[0]),
+            one,
             start,
             method="Nelder-Mead",
-            bounds=[(0.0, 1.0)] * dimensions,
+            bounds=optimize.Bounds(np.zeros(dimensions), np.ones(dimensions)),
             options={"initial_simplex": simplex, "xatol": 1e-6, "fatol": 1e-6, "maxfev": each},
         )
         return Found(np.asarray(found.x), float(found.fun), int(found.nfev))

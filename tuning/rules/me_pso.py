@@ -1,7 +1,7 @@
 """ME-PSO: the PI that a multi-epoch particle swarm finds on the complex criterion.
 
-Source: Y. Romasevych, V. Loveikin, S. Usenko, "PI-controller tuning optimization via PSO-based technique". The criterion
-is in tuning.complex_criterion, the swarm in tuning.search; both say how what the paper leaves open is read here.
+Source: Y. Romasevych, V. Loveikin, S. Usenko, "PI-controller tuning optimization via PSO-based technique". The
+criterion is in tuning.complex_criterion, the swarm in tuning.search; both say how what the paper leaves open is read.
 
 What is ours and not the paper's: the bound on Ms, without which the criterion returns loops that no engineer would
 accept (Ms above 5 among the paper's five plants); the time and gain units, which make the result follow the plant's
@@ -48,7 +48,7 @@ def me_pso(
 ) -> Setting:
     """The PI of least complex criterion for a unit set-point step, b = 1.
 
-    weighting: "error", "control" or "duration" (the paper's three).  seed: of the search; the same seed, the same gains.
+    weighting: "error", "control" or "duration", the paper's three.  seed: the same seed gives the same gains.
     optimiser: "me-pso" (2,500 evaluations, as published), "de" (differential evolution) or "nelder-mead" (multi-start),
     both with at most as many.  Ms_max: bound on the maximum sensitivity, above 1; 0 for none, as published.
     horizon_s: simulated time, s; by default 20 times all lags and the dead time together.
@@ -125,6 +125,7 @@ def _search(
         return settings
 
     place = by_decades if optimiser == "nelder-mead" else even
+
     def cost(x: Reals) -> Reals:
         settings = place(x)
         return criterion(settings[:, 0], settings[:, 1])
