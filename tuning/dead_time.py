@@ -102,9 +102,11 @@ class DeadTimeLoop:
         forms[0, 0, self.errors, self.errors] = mass
         forms[1, 0, self.errors, self.errors] = self.slopes.T @ mass @ self.slopes
         total, power = np.broadcast_to(forms, (2, *maps.shape)), maps
-        while float(np.abs(power).max()) > 1e-12:
+        for _ in range(60):
             total = total + power.transpose(0, 2, 1) @ total @ power
             power = power @ power
+            if float(np.abs(power).max()) < 1e-12:
+                break
         e, rate = np.einsum("pi,fpij,pj->fp", start, total, start)
         return e, rate
 

@@ -1,0 +1,305 @@
+"""Pole placement with a quadratic criterion: prescribe the shape of the dominant roots, search their size.
+
+    roots  s = alpha*(-1 +/- j*mu),  for a PID also  s = -k1*alpha;     J = integral of (e^2 + tau^2 * e'^2) dt
+
+For each alpha the prescribed roots fix the gains by a linear system; alpha is where J of a unit set-point step is least
+among the alphas with positive gains and a stable loop. Source: M. Horbiichuk, M. Vasylenchuk, I. Yednak, A. Lahoida,
+"Devising a combined method for setting PI/PID controller parameters for oil and gas facilities", Eastern-European
+Journal of Enterprise Technologies 1(2(133)), 2025, the pole equations and J of its three plant orders.
+
+Here the same is done for any order and with exact dead time: each prescribed root must satisfy C(s)*G(s) = -1, and J is
+that of a Lyapunov equation. On the paper's three orders this is what the paper does.
+
+What is ours and not the paper's: the selection among several minima. The paper takes the one in an interval picked by
+hand; here it is the one of least J whose other roots all decay at 0.8*alpha or faster. Otherwise mu describes nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from tuning.dead_time import DeadTimeLoop
+from tuning.gains import Gains
+from tuning.models import Complexes, Model, Reals, TransferFunction
+from tuning.reasons import Reason, Refused
+from tuning.setting import Setting
+from tuning.state_space import gain_unit, normalised, time_sum
+
+GRID = 400
+INSIDE = 200
+SLOWER = 0.8
+SHOWN = 8
+STABLE_BY = 1e-9
+"""Over all lags and the dead time together: what rounding may hide."""
+CONTROLLERS = ("PI", "PID")
+
+
+@dataclass(frozen=True, slots=True)
+class Minimum:
+    """One local minimum of J.
+
+    alpha: 1/s.  gains: ISA; a PID has its derivative on the error, without filter.  J0: integral of e^2, s.  J1: of
+    e'^2, 1/s.  J: J0 + tau^2*J1, s.  left_over: the roots that were not prescribed, 1/s, the slowest first, at
+    most eight of them.
+    """
+
+    alpha: float
+    gains: Gains
+    J0: float
+    J1: float
+    J: float
+    left_over: tuple[complex, ...]
+
+    @property
+    def dominant(self) -> bool:
+        """Whether no left-over root is slower than 0.8*alpha."""
+        return all(-root.real >= SLOWER * self.alpha for root in self.left_over)
+
+
+@dataclass(frozen=True, slots=True)
+class Design:
+    """admissible: intervals of alpha, 1/s, ends included; beyond the last searched alpha it is not known.
+
+    minima: by alpha. Both may be empty.
+    """
+
+    admissible: tuple[tuple[float, float], ...]
+    minima: tuple[Minimum, ...]
+
+
+def s_plane(
+    model: Model, *, controller: str = "PI", mu: float = 1.0, tau_s: float | None = None, k1: float = 1.2
+) -> Setting:
+    """The PI or PID whose dominant roots have the shape mu and the size of least J; b = 1, for a PID c = 1 and Tf = 0.
+
+    controller: "PI" or "PID".  mu: imaginary over real part of the pair, positive; damping ratio 1/sqrt(1 + mu^2).
+    tau_s: weight of the error's rate, s, near the wanted closed-loop time constant; by default a quarter of all lags
+    and the dead time together.  k1: the real root of a PID over the pair's real part, positive.
+    Raises Refused for a bad argument, a model that `design` does not take, or when J has no minimum with positive gains
+    and a stable loop.
+    """
+    if tau_s is None:
+        tau_s = 0.25 * time_sum(model)
+    found = design(model, controller=controller, mu=mu, tau_s=tau_s, k1=k1)
+    if not found.admissible:
+        raise Refused(
+            Reason.BAD_INPUT,
+            f"mu {mu}, k1 {k1}: roots of this shape have positive gains and a stable loop at no size; "
+            f"another mu{' or k1' if controller == 'PID' else ''} may be accepted",
+        )
+    if not found.minima:
+        raise Refused(
+            Reason.BAD_INPUT,
+            f"mu {mu}, tau_s {tau_s}: J has no least value but falls to where a gain or the stability ends "
+            "(a PI on an integrating model does so: its integral action only costs at a set-point step); "
+            "another mu or a PID may be accepted",
+        )
+    dominant = [each for each in found.minima if each.dominant]
+    best = min(dominant or found.minima, key=lambda each: each.J)
+    notes = []
+    if not dominant:
+        slowest = -best.left_over[0].real
+        notes.append(f"A root of {slowest:.3g} 1/s is slower than the prescribed ones: the answer creeps.")
+    elif (least := min(found.minima, key=lambda each: each.J)) is not best:
+        notes.append(f"J is lower at alpha = {least.alpha:.3g} 1/s, but there a slower root rules; not taken.")
+    chosen = {"alpha_per_s": best.alpha, "mu": mu, "tau_s": tau_s, "J_s": best.J, "J0_s": best.J0, "J1_per_s": best.J1}
+    if controller == "PID":
+        chosen["k1"] = k1
+        notes.append("The derivative acts on the error without a filter: check the loop again with its filter.")
+    return Setting(best.gains, chosen, tuple(notes))
+
+
+def design(model: Model, *, controller: str, mu: float, tau_s: float, k1: float = 1.2) -> Design:
+    """The admissible alphas and all local minima of J on them; arguments as for `s_plane`.
+
+    alpha is searched from 0.01 to 100 over all lags and the dead time together, not beyond 10/L. More poles than zeros
+    are needed: none for a PI without dead time, one for a PI with it or a PID without, two for a PID with it. Raises
+    Refused otherwise and for bad arguments.
+    """
+    if controller not in CONTROLLERS:
+        raise Refused(Reason.BAD_INPUT, f"controller {controller!r}: one of {', '.join(CONTROLLERS)} is accepted")
+    for name, value in (("mu", mu), ("tau_s", tau_s), ("k1", k1)):
+        if not 0.0 < value < math.inf:
+            raise Refused(Reason.BAD_INPUT, f"{name} {value}: a positive number is accepted")
+    unit = time_sum(model)
+    if unit <= 0.0:
+        raise Refused(Reason.BAD_INPUT, "the model has neither lag nor dead time: no root is too fast for it")
+    plant, pid = normalised(model, unit), controller == "PID"
+    excess, needed = len(plant.den) - len(plant.num), int(pid) + int(plant.L > 0.0)
+    if excess < needed:
+        raise Refused(
+            Reason.BAD_INPUT,
+            f"{excess} more poles than zeros: for a {controller} on this model at least {needed} are accepted",
+        )
+    search = _Search(plant, mu, k1 if pid else None, tau_s / unit)
+    intervals = search.admissible()
+    per_gain = gain_unit(model, unit)
+    return Design(
+        admissible=tuple((low / unit, high / unit) for low, high in intervals),
+        minima=tuple(
+            search.minimum(alpha, unit, per_gain) for low, high in intervals for alpha in search.least(low, high)
+        ),
+    )
+
+
+class _Search:
+    """One plant of gain one, all times in the unit of its own; alphas and gains of shape (p,)."""
+
+    def __init__(self, plant: TransferFunction, mu: float, k1: float | None, tau: float) -> None:
+        self.plant, self.tau = plant, tau
+        self.shape = np.array([-1.0 + 1j * mu] if k1 is None else [-1.0 + 1j * mu, -k1 + 0j])
+        self.loop: _Rational | _Delayed = _Delayed(plant) if plant.L > 0.0 else _Rational(plant)
+
+    def gains(self, alpha: Reals) -> Reals:
+        """(p, 3): Kp, Ki, Kd that place the prescribed roots; not finite where there are none."""
+        s = alpha[:, None] * self.shape
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            wanted = -s * np.polyval(self.plant.den, s) / np.polyval(self.plant.num, s) * np.exp(self.plant.L * s)
+        # Kp*s + Ki + Kd*s^2 = wanted at each root: real and imaginary part of the pair, real part of the real one
+        terms = np.stack((s, np.ones_like(s), s * s), axis=2)[:, :, : 1 + len(self.shape)]
+        rows = np.concatenate((terms[:, :1].imag, terms.real), axis=1)
+        sides = np.concatenate((wanted[:, :1].imag, wanted.real), axis=1)
+        found = np.zeros((len(alpha), 3))
+        found[:, : rows.shape[2]] = np.nan
+        finite = np.isfinite(sides).all(axis=1)
+        found[finite, : rows.shape[2]] = np.linalg.solve(rows[finite], sides[finite][:, :, None])[:, :, 0]
+        return found
+
+    def is_admissible(self, alpha: Reals) -> NDArray[np.bool_]:
+        gains = self.gains(alpha)
+        good = np.asarray(np.isfinite(gains).all(axis=1) & (gains[:, : 1 + len(self.shape)] > 0.0).all(axis=1))
+        if good.any():
+            good[good] = self.loop.stable(gains[good])
+        return good
+
+    def admissible(self) -> list[tuple[float, float]]:
+        # faster roots than 10/L have died out before the loop answers: others decide, at vanishing gains
+        highest = min(100.0, 10.0 / self.plant.L) if self.plant.L > 0.0 else 100.0
+        grid = np.geomspace(0.01, highest, GRID)
+        good = self.is_admissible(grid)
+        edges = np.flatnonzero(good[1:] != good[:-1])
+        ends = [float(grid[0])] if good[0] else []
+        ends += [self._edge(float(grid[i]), float(grid[i + 1])) for i in edges]
+        ends += [float(grid[-1])] if good[-1] else []
+        return list(zip(ends[::2], ends[1::2], strict=True))
+
+    def _edge(self, low: float, high: float) -> float:
+        """The last admissible alpha between one that is and one that is not."""
+        rising = not bool(self.is_admissible(np.array([low]))[0])
+        for _ in range(50):
+            middle = 0.5 * (low + high)
+            if bool(self.is_admissible(np.array([middle]))[0]) == rising:
+                high = middle
+            else:
+                low = middle
+        return high if rising else low
+
+    def least(self, low: float, high: float) -> list[float]:
+        """Every local minimum of J inside an interval."""
+        grid = np.geomspace(low, high, INSIDE)[1:-1]
+        grid = np.concatenate(([low], grid, [high]))
+        J0, J1 = self.loop.squares(self.gains(grid))
+        J = J0 + self.tau**2 * J1
+        found = []
+        for i in np.flatnonzero((J[1:-1] < J[:-2]) & (J[1:-1] <= J[2:])) + 1:
+            least = minimize_scalar(
+                self._J, bounds=(grid[i - 1], grid[i + 1]), method="bounded", options={"xatol": 1e-9 * float(grid[i])}
+            )
+            found.append(float(least.x))
+        return found
+
+    def _J(self, alpha: float) -> float:
+        J0, J1 = self.loop.squares(self.gains(np.array([alpha])))
+        return float(J0[0] + self.tau**2 * J1[0])
+
+    def minimum(self, alpha: float, unit: float, per_gain: float) -> Minimum:
+        gains = self.gains(np.array([alpha]))
+        J0, J1 = (float(each[0]) for each in self.loop.squares(gains))
+        left = list(self.loop.roots(gains)[0])
+        for root in alpha * np.concatenate((self.shape, self.shape[:1].conj())):
+            away = np.array(left) - root
+            if self.plant.L > 0.0:
+                # imaginary parts are known up to a whole turn in one dead time
+                turn = 2.0 * math.pi / self.plant.L
+                away -= 1j * turn * np.round(away.imag / turn)
+            left.pop(int(np.argmin(np.abs(away))))
+        Kp, Ki, Kd = (float(each) for each in gains[0])
+        return Minimum(
+            alpha=alpha / unit,
+            gains=Gains(Kp=Kp / per_gain, Ti=Kp / Ki * unit, Td=Kd / Kp * unit, c=1.0 if Kd > 0.0 else 0.0),
+            J0=J0 * unit,
+            J1=J1 / unit,
+            J=(J0 + self.tau**2 * J1) * unit,
+            left_over=tuple(complex(root) / unit for root in sorted(left, key=lambda root: -root.real)[:SHOWN]),
+        )
+
+
+class _Rational:
+    """Loops without dead time, by their polynomials P = s*A + N*B; the error of a unit step is A/P."""
+
+    def __init__(self, plant: TransferFunction) -> None:
+        self.a, self.b = np.asarray(plant.den), np.asarray(plant.num)
+
+    def polynomials(self, gains: Reals) -> Reals:
+        """(p, n + 2), the leading coefficient not zero."""
+        size = len(self.a) + 1
+        total = np.zeros((len(gains), size))
+        total[:, :-1] = self.a
+        for power, gain in enumerate((gains[:, 1], gains[:, 0], gains[:, 2])):
+            top = size - power - len(self.b)
+            total[:, top : top + len(self.b)] += gain[:, None] * self.b
+        return total
+
+    def _companions(self, P: Reals) -> Reals:
+        n = P.shape[1] - 1
+        companions = np.zeros((len(P), n, n))
+        companions[:, 0] = -P[:, 1:] / P[:, :1]
+        companions[:, 1:, :-1] = np.eye(n - 1)
+        return companions
+
+    def roots(self, gains: Reals) -> Complexes:
+        return np.linalg.eigvals(self._companions(self.polynomials(gains))).astype(np.complex128)
+
+    def stable(self, gains: Reals) -> NDArray[np.bool_]:
+        return np.asarray(self.roots(gains).real.max(axis=1) < -STABLE_BY)
+
+    def squares(self, gains: Reals) -> tuple[Reals, Reals]:
+        """(integral of e^2, of e'^2 after t = 0), each (p,)."""
+        P = self.polynomials(gains)
+        e = np.broadcast_to(self.a, (len(P), len(self.a))) / P[:, :1]
+        # the jump at t = 0 is not a rate: s*E - e(0+)
+        rate = e[:, :1] * -P / P[:, :1]
+        rate[:, :-1] += e
+        A, identity = self._companions(P), np.eye(len(self.a))
+        size = len(self.a) ** 2
+        # A W + W A' = -b b', all loops at once
+        system = np.einsum("pij,kl->pikjl", A, identity) + np.einsum("ij,pkl->pikjl", identity, A)
+        side = np.zeros((len(P), size, 1))
+        side[:, 0] = -1.0
+        W = np.linalg.solve(system.reshape(-1, size, size), side).reshape(A.shape)
+        return np.einsum("pi,pij,pj->p", e, W, e), np.einsum("pi,pij,pj->p", rate[:, 1:], W, rate[:, 1:])
+
+
+class _Delayed:
+    """Loops with dead time, by their map from one dead time to the next."""
+
+    def __init__(self, plant: TransferFunction) -> None:
+        self.loop = DeadTimeLoop(plant)
+
+    def _maps(self, gains: Reals) -> Reals:
+        return self.loop.maps(gains[:, 0], gains[:, 1], gains[:, 2])
+
+    def roots(self, gains: Reals) -> Complexes:
+        return self.loop.roots(self._maps(gains))
+
+    def stable(self, gains: Reals) -> NDArray[np.bool_]:
+        return np.asarray(self.loop.roots(self._maps(gains))[:, 0].real < -STABLE_BY)
+
+    def squares(self, gains: Reals) -> tuple[Reals, Reals]:
+        """(integral of e^2, of e'^2 after t = 0), each (p,)."""
+        return self.loop.squares(self._maps(gains), self.loop.start(gains[:, 0], gains[:, 2]))
