@@ -73,25 +73,45 @@ class Design:
 
 
 def s_plane(
-    model: Model, *, controller: str = "PI", mu: float = 1.0, tau_s: float | None = None, k1: float = 1.2
+    model: Model,
+    *,
+    controller: str = "PI",
+    mu: float = 1.0,
+    tau_s: float | None = None,
+    k1: float = 1.2,
+    alpha_per_s: float | None = None,
 ) -> Setting:
     """The PI or PID whose dominant roots have the shape mu and the size of least J; b = 1, for a PID c = 1 and Tf = 0.
 
     controller: "PI" or "PID".  mu: imaginary over real part of the pair, positive; damping ratio 1/sqrt(1 + mu^2).
     tau_s: weight of the error's rate, s, near the wanted closed-loop time constant; by default a quarter of all lags
-    and the dead time together.  k1: the real root of a PID over the pair's real part, positive.
-    Raises Refused for a bad argument, a model that `design` does not take, or when J has no minimum with positive gains
-    and a stable loop.
+    and the dead time together.  k1: the real root of a PID over the pair's real part, positive.  alpha_per_s: the
+    pair's real part, 1/s, when it is not to be searched: pole placement alone.
+    Raises Refused for a bad argument, a model that `design` does not take, or when no alpha (or not the given one) has
+    positive gains and a stable loop, or J no minimum.
     """
     if tau_s is None:
         tau_s = 0.25 * time_sum(model)
-    found = design(model, controller=controller, mu=mu, tau_s=tau_s, k1=k1)
-    if not found.admissible:
-        raise Refused(
-            Reason.BAD_INPUT,
-            f"mu {mu}, k1 {k1}: roots of this shape have positive gains and a stable loop at no size; "
-            f"another mu{' or k1' if controller == 'PID' else ''} may be accepted",
-        )
+    search = _search(model, controller, mu, tau_s, k1)
+    if alpha_per_s is not None:
+        if not 0.0 < alpha_per_s < math.inf:
+            raise Refused(Reason.BAD_INPUT, f"alpha_per_s {alpha_per_s}: a positive number is accepted")
+        if not search.is_admissible(np.array([alpha_per_s * search.unit]))[0]:
+            shown = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in search.design().admissible)
+            raise Refused(
+                Reason.BAD_INPUT,
+                f"alpha_per_s {alpha_per_s} with mu {mu}: a gain is not positive or the loop not stable; "
+                f"{shown or 'no alpha'} 1/s is accepted",
+            )
+        found = Design((), (search.minimum(alpha_per_s * search.unit),))
+    else:
+        found = search.design()
+        if not found.admissible:
+            raise Refused(
+                Reason.BAD_INPUT,
+                f"mu {mu}, k1 {k1}: roots of this shape have positive gains and a stable loop at no size; "
+                f"another mu{' or k1' if controller == 'PID' else ''} may be accepted",
+            )
     if not found.minima:
         raise Refused(
             Reason.BAD_INPUT,
@@ -121,36 +141,34 @@ def design(model: Model, *, controller: str, mu: float, tau_s: float, k1: float 
     are needed: none for a PI without dead time, one for a PI with it or a PID without, two for a PID with it. Raises
     Refused otherwise and for bad arguments.
     """
+    return _search(model, controller, mu, tau_s, k1).design()
+
+
+def _search(model: Model, controller: str, mu: float, tau_s: float, k1: float) -> _Search:
     if controller not in CONTROLLERS:
         raise Refused(Reason.BAD_INPUT, f"controller {controller!r}: one of {', '.join(CONTROLLERS)} is accepted")
-    for name, value in (("mu", mu), ("tau_s", tau_s), ("k1", k1)):
-        if not 0.0 < value < math.inf:
-            raise Refused(Reason.BAD_INPUT, f"{name} {value}: a positive number is accepted")
     unit = time_sum(model)
     if unit <= 0.0:
         raise Refused(Reason.BAD_INPUT, "the model has neither lag nor dead time: no root is too fast for it")
-    plant, pid = normalised(model, unit), controller == "PID"
-    excess, needed = len(plant.den) - len(plant.num), int(pid) + int(plant.L > 0.0)
+    for name, value in (("mu", mu), ("tau_s", tau_s), ("k1", k1)):
+        if not 0.0 < value < math.inf:
+            raise Refused(Reason.BAD_INPUT, f"{name} {value}: a positive number is accepted")
+    pid = controller == "PID"
+    excess, needed = len(model.den) - len(model.num), int(pid) + int(model.L > 0.0)
     if excess < needed:
         raise Refused(
             Reason.BAD_INPUT,
             f"{excess} more poles than zeros: for a {controller} on this model at least {needed} are accepted",
         )
-    search = _Search(plant, mu, k1 if pid else None, tau_s / unit)
-    intervals = search.admissible()
-    per_gain = gain_unit(model, unit)
-    return Design(
-        admissible=tuple((low / unit, high / unit) for low, high in intervals),
-        minima=tuple(
-            search.minimum(alpha, unit, per_gain) for low, high in intervals for alpha in search.least(low, high)
-        ),
-    )
+    return _Search(model, unit, mu, k1 if pid else None, tau_s / unit)
 
 
 class _Search:
-    """One plant of gain one, all times in the unit of its own; alphas and gains of shape (p,)."""
+    """One plant made of gain one, all times in its own `unit`, s; alphas of shape (p,)."""
 
-    def __init__(self, plant: TransferFunction, mu: float, k1: float | None, tau: float) -> None:
+    def __init__(self, model: Model, unit: float, mu: float, k1: float | None, tau: float) -> None:
+        plant = normalised(model, unit)
+        self.unit, self.per_gain = unit, gain_unit(model, unit)
         self.plant, self.tau = plant, tau
         self.shape = np.array([-1.0 + 1j * mu] if k1 is None else [-1.0 + 1j * mu, -k1 + 0j])
         self.loop: _Rational | _Delayed = _Delayed(plant) if plant.L > 0.0 else _Rational(plant)
@@ -217,7 +235,16 @@ class _Search:
         J0, J1 = self.loop.squares(self.gains(np.array([alpha])))
         return float(J0[0] + self.tau**2 * J1[0])
 
-    def minimum(self, alpha: float, unit: float, per_gain: float) -> Minimum:
+    def design(self) -> Design:
+        intervals = self.admissible()
+        return Design(
+            admissible=tuple((low / self.unit, high / self.unit) for low, high in intervals),
+            minima=tuple(self.minimum(alpha) for low, high in intervals for alpha in self.least(low, high)),
+        )
+
+    def minimum(self, alpha: float) -> Minimum:
+        """What there is to say of one alpha."""
+        unit = self.unit
         gains = self.gains(np.array([alpha]))
         J0, J1 = (float(each[0]) for each in self.loop.squares(gains))
         left = list(self.loop.roots(gains)[0])
@@ -231,7 +258,7 @@ class _Search:
         Kp, Ki, Kd = (float(each) for each in gains[0])
         return Minimum(
             alpha=alpha / unit,
-            gains=Gains(Kp=Kp / per_gain, Ti=Kp / Ki * unit, Td=Kd / Kp * unit, c=1.0 if Kd > 0.0 else 0.0),
+            gains=Gains(Kp=Kp / self.per_gain, Ti=Kp / Ki * unit, Td=Kd / Kp * unit, c=1.0 if Kd > 0.0 else 0.0),
             J0=J0 * unit,
             J1=J1 / unit,
             J=(J0 + self.tau**2 * J1) * unit,
