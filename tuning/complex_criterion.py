@@ -241,13 +241,10 @@ class _Delayed:
         self.steps = self.blocks * self.inside
         at = np.arange(self.inside) / self.inside
         self._value, self._area = self.loop.values(at), self.loop.areas(at)
-        end = self.loop.values(np.ones(1))[0]
-        self._slopes = np.array(
-            [end @ np.linalg.matrix_power(self.loop.slopes, i) for i in range(1, self.loop.order + 1)]
-        )
 
     def sample(self, kp: Reals, ki: Reals) -> tuple[Reals, Reals, Reals]:
-        advance, start = self.loop.maps(kp, ki), self.loop.start(kp)
+        once, start = self.loop.maps(kp, ki), self.loop.start(kp)
+        advance = once
         for _ in range(self.squarings):
             advance = advance @ advance
         states = _powers(advance, start, self.blocks + 1)
@@ -255,8 +252,10 @@ class _Delayed:
         e = errors @ self._value.T
         u = kp[:, None, None] * e + integral + ki[:, None, None] * (errors @ self._area.T)
         shape = (len(kp), -1)
-        last = errors[:, self.blocks - 1]
-        slopes = np.abs(last @ self._slopes.T).sum(axis=1)
+        # derivatives at the horizon's end, or at most one block before it
+        before = states[:, max(self.blocks - (1 if self.squarings else 2), 0)]
+        after = np.einsum("pij,pj->pi", once, before)
+        slopes = np.abs(self.loop.rates(before, after, kp, ki)).sum(axis=1)
         return (
             e.reshape(shape)[:, : self.steps + 1],
             u.reshape(shape)[:, : self.steps + 1] + self.loop.u_rest,

@@ -65,6 +65,10 @@ class DeadTimeLoop:
         by_kd[:, self.errors] = receives @ self.slopes
         self._parts = np.stack((base, by_kp, by_ki, by_kd))
 
+        powers = [np.linalg.matrix_power(plant.a, i) for i in range(n + 1)]
+        self._of_states = np.array([plant.c @ power for power in powers])
+        self._markov = self.direction * np.array([plant.d, *(plant.c @ power @ plant.b for power in powers)])
+
         rest, u = plant.rest()
         self.u_rest = self.direction * u
         self._start = np.concatenate((-rest, np.ones(count), [-self.u_rest]))
@@ -89,6 +93,28 @@ class DeadTimeLoop:
         series = [chebyshev.chebint(c, lbnd=-1.0) for c in np.eye(self.nodes)]
         areas = np.array([chebyshev.chebval(2.0 * at - 1.0, c) for c in series]).T
         return np.asarray(0.5 * self.L * areas @ self._to_series, dtype=np.float64)
+
+    def rates(self, before: Reals, after: Reals, Kp: Reals, Ki: Reals) -> Reals:
+        """(p, order): first to last derivative of PV, 1/s each, at the end of the dead time whose states are `after`.
+
+        before: states of the dead time before. By the plant's equations: derivatives of the polynomial would lose all
+        digits in a short dead time.
+        """
+        end = self.values(np.ones(1))[0]
+        error = before[:, self.errors]
+        value = error @ end
+        inputs = [Kp * value + Ki * (error @ self.areas(np.ones(1))[0]) + before[:, -1]]
+        found = []
+        for i in range(1, self.order + 1):
+            error = error @ self.slopes.T
+            inputs.append(Ki * value + Kp * (value := error @ end))
+            rate = after[:, : self.order] @ self._of_states[i]
+            for j, each in enumerate(inputs):
+                # exactly zero where the plant does not pass this derivative on
+                if (passed := self._markov[i - j]) != 0.0:
+                    rate = rate + passed * each
+            found.append(rate)
+        return np.stack(found, axis=1)
 
     def squares(self, maps: Reals, start: Reals) -> tuple[Reals, Reals]:
         """(integral of e^2, integral of e'^2) over all time, each (p,); every loop must be stable.
