@@ -21,12 +21,11 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from scipy.linalg import expm
 
 from tuning.dead_time import DeadTimeLoop
 from tuning.models import Model, Reals, time_constants
 from tuning.reasons import Reason, Refused
-from tuning.state_space import gain_unit, normalised, state_space, time_sum
+from tuning.state_space import exponentials, gain_unit, normalised, state_space, time_sum
 
 BAND = 0.05
 DIVERGED = 1e9
@@ -201,7 +200,7 @@ class _Immediate:
 
     def sample(self, kp: Reals, ki: Reals) -> tuple[Reals, Reals, Reals]:
         closed, error = self._loop(kp, ki)
-        step = np.asarray(expm(closed * self.dt))
+        step = exponentials(closed * self.dt)
         backward = step.transpose(0, 2, 1)
         rows = _powers(backward, error, BLOCK)
         integral = _powers(backward, np.broadcast_to(np.eye(len(self._start))[-1], error.shape), BLOCK)

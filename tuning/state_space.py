@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,3 +59,21 @@ def state_space(model: Model) -> StateSpace:
     b = np.zeros(order)
     b[0] = 1.0 / scale[0]
     return StateSpace(np.asarray(balanced), b, (num[1:] - den[1:] * num[0]) * scale, float(num[0]))
+
+
+def exponentials(a: Reals) -> Reals:
+    """Matrix exponentials of many small matrices at once, (p, n, n): scaling, Taylor's series, squaring.
+
+    scipy's takes them one by one.
+    """
+    norm = float(np.abs(a).sum(axis=2).max(initial=0.0))
+    squarings = max(0, math.ceil(math.log2(max(norm, 1e-300))) + 1)
+    scaled = a * 0.5**squarings
+    # at a norm of a half the fourteenth term is below rounding
+    total = term = np.broadcast_to(np.eye(a.shape[1]), a.shape)
+    for k in range(1, 14):
+        term = term @ scaled / k
+        total = total + term
+    for _ in range(squarings):
+        total = total @ total
+    return total

@@ -28,7 +28,7 @@ OPTIMISERS: dict[str, Callable[[Cost, int, int], Found]] = {
     "de": differential_evolution,
     "nelder-mead": nelder_mead,
 }
-LOWEST = 1e-3
+LOWEST = np.array([1e-4, 1e-3])
 """Of kp and ti in the plant's units: ISA gains have no pure integral controller, and no gain is infinite."""
 KP_MAX = 10.0
 TI_MAX = 10.0
@@ -97,8 +97,8 @@ def _highest_kp(model: Model, criterion: ComplexCriterion, Kp_max: float | None)
             Kp_max = ultimate_point(model)[0]
         except Refused:
             return KP_MAX
-    if (kp := Kp_max * criterion.gain_unit) <= LOWEST:
-        raise Refused(Reason.BAD_INPUT, f"Kp_max {Kp_max}: above {LOWEST / criterion.gain_unit:.3g} is accepted")
+    if (kp := Kp_max * criterion.gain_unit) <= LOWEST[0]:
+        raise Refused(Reason.BAD_INPUT, f"Kp_max {Kp_max}: above {LOWEST[0] / criterion.gain_unit:.3g} is accepted")
     return kp
 
 
@@ -106,8 +106,8 @@ def _highest_ti(criterion: ComplexCriterion, Ki_min: float | None) -> float:
     if Ki_min is None:
         return TI_MAX
     scale = criterion.gain_unit * criterion.time_unit_s
-    if (ti := 1.0 / (Ki_min * scale)) <= LOWEST:
-        raise Refused(Reason.BAD_INPUT, f"Ki_min {Ki_min}: below {1.0 / (LOWEST * scale):.3g} is accepted")
+    if (ti := 1.0 / (Ki_min * scale)) <= LOWEST[1]:
+        raise Refused(Reason.BAD_INPUT, f"Ki_min {Ki_min}: below {1.0 / (LOWEST[1] * scale):.3g} is accepted")
     return ti
 
 
@@ -121,7 +121,7 @@ def _search(
 
     def by_decades(x: Reals) -> Reals:
         settings = even(x)
-        settings[..., 1] = LOWEST * (highest[1] / LOWEST) ** x[..., 1]
+        settings[..., 1] = LOWEST[1] * (highest[1] / LOWEST[1]) ** x[..., 1]
         return settings
 
     place = by_decades if optimiser == "nelder-mead" else even
@@ -137,12 +137,14 @@ def _search(
 
 def _notes(kp: float, ti: float, highest: Reals, Ms: float, weighting: str) -> tuple[str, ...]:
     notes = []
-    if kp <= 1.01 * LOWEST:
+    if kp <= 1.1 * LOWEST[0]:
         notes.append("The criterion wants a pure integral controller; Kp is as small as the search permits.")
     if kp >= 0.999 * highest[0] or ti >= 0.999 * highest[1]:
         notes.append("The optimum is on the edge of the search domain (Kp_max or Ki_min).")
+    if ti <= 1.1 * LOWEST[1]:
+        notes.append("The criterion wants no limit to the integral gain; it is as large as the search permits.")
     if weighting == Weighting.DURATION:
         notes.append("Settling jumps when a peak touches the 5 % band, and this optimum may sit there: check it.")
-    if Ms > ROBUST_MS:
+    if Ms > 1.005 * ROBUST_MS:
         notes.append(f"Ms is {Ms:.2f}: the loop is not robust; ask for Ms_max of 2 or less.")
     return tuple(notes)

@@ -67,7 +67,7 @@ def test_differential_evolution_on_the_paper_s_problems(plant: str, weighting: W
 
 def test_the_control_weighting_wants_a_pure_integral_controller_and_says_so() -> None:
     found = as_published("G2", "control", "nelder-mead")
-    assert found.gains.Kp == pytest.approx(1e-3, rel=0.01)
+    assert found.gains.Kp == pytest.approx(1e-4, rel=0.1)
     assert any("pure integral" in note for note in found.notes)
 
 
@@ -113,12 +113,11 @@ def test_gains_follow_the_scale_of_the_plant(gain: float, time: float) -> None:
     ],
 )
 def test_every_kind_of_model_gets_a_stable_robust_loop(model: Model) -> None:
-    for weighting in Weighting:
-        found = me_pso(model, weighting=weighting, optimiser="nelder-mead")
-        assert found.gains.Kp > 0.0
-        assert found.gains.Ti > 0.0
-        assert found.chosen["Ms"] < 2.05
-        assert found.chosen["settling_s"] <= found.chosen["horizon_s"] * 1.0001
+    found = me_pso(model)
+    assert found.gains.Kp > 0.0
+    assert found.gains.Ti > 0.0
+    assert found.chosen["Ms"] < 2.02
+    assert found.chosen["settling_s"] < found.chosen["horizon_s"]
 
 
 @pytest.mark.parametrize(
@@ -130,7 +129,7 @@ def test_every_kind_of_model_gets_a_stable_robust_loop(model: Model) -> None:
         ({"Ms_max": float("nan")}, "above 1"),
         ({"horizon_s": -1.0}, "horizon_s"),
         ({"Kp_max": 0.0}, "Kp_max"),
-        ({"Kp_max": 1e-9}, "above 0.0005 is accepted"),
+        ({"Kp_max": 1e-9}, "above 5e-05 is accepted"),
         ({"Ki_min": float("inf")}, "Ki_min"),
         ({"Ki_min": 1e9}, "below"),
     ],

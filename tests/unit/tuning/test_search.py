@@ -63,12 +63,12 @@ def test_the_same_seed_gives_the_same_point(search: Callable[[Cost, int, int], F
     assert not np.array_equal(first.point, other.point)
 
 
-def test_the_swarm_spends_the_paper_s_budget_and_restarts_nearly_always() -> None:
-    found = multi_epoch_swarm(ripples, 2, 0)
+def test_the_swarm_spends_the_paper_s_budget_and_nearly_always_restarts() -> None:
+    # a criterion that is nowhere near 0, as the paper's: then a reduction of a tenth is rare
+    found = multi_epoch_swarm(lambda x: 1.0 + ripples(x), 2, 0)
     assert found.evaluations == 2500
-    # a reduction of a tenth of the best is rare: 46 to 48 restarts of 48 possible with the paper's rate
-    assert found.epochs >= 40
-    assert multi_epoch_swarm(ripples, 2, 0, acceptable_rate=-1.0).epochs == 1
+    assert found.epochs >= 46
+    assert multi_epoch_swarm(lambda x: 1.0 + ripples(x), 2, 0, acceptable_rate=-1.0).epochs == 1
 
 
 def test_a_swarm_of_one_goes_where_the_equation_says() -> None:
