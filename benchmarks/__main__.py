@@ -14,7 +14,7 @@ from datetime import date
 from typing import Any
 
 WITH_VCAN = ("tools/with-vcan", "--timeout", "400", "--")
-BENCHMARKS = {"bus": WITH_VCAN, "rehearsal": (), "criterion": (), "response": ()}
+BENCHMARKS = {"bus": WITH_VCAN, "rehearsal": (), "criterion": (), "response": (), "me_pso": ()}
 
 
 def figures(name: str) -> dict[str, Any]:
@@ -33,7 +33,11 @@ def figures(name: str) -> dict[str, Any]:
 
 
 def table(
-    bus: dict[str, Any], rehearsal: dict[str, Any], criterion: dict[str, Any], response: dict[str, Any]
+    bus: dict[str, Any],
+    rehearsal: dict[str, Any],
+    criterion: dict[str, Any],
+    response: dict[str, Any],
+    me_pso: dict[str, Any],
 ) -> list[str]:
     def row(what: str, figure: str, goal: str = "", met: bool | None = None) -> str:
         return f"| {what} | {figure} | {goal} | {'' if met is None else 'met' if met else '**missed**'} |"
@@ -100,6 +104,18 @@ def table(
             f"{response['ours_y_error']:.1e} against {response['plain_y_error']:.1e}",
             "the same or lower",
             response["ours_y_error"] <= response["plain_y_error"],
+        ),
+        row(
+            f"ME-PSO, no dead time, {me_pso['no_dead_time_evaluations']:,.0f} step responses",
+            f"{me_pso['no_dead_time_s']:.2f} s",
+            "2 s",
+            me_pso["no_dead_time_s"] <= 2.0,
+        ),
+        row(
+            f"ME-PSO, dead time, {me_pso['dead_time_evaluations']:,.0f} step responses",
+            f"{me_pso['dead_time_s']:.2f} s",
+            "5 s",
+            me_pso["dead_time_s"] <= 5.0,
         ),
     ]
 

@@ -149,9 +149,9 @@ def _indices(e: Reals, u: Reals, slopes: Reals, dt: float) -> Indices:
 
     def mean(f: Reals) -> Reals:
         """Of |f| from 0 to the settling, trapezoids and the first part of the last of them."""
-        f = np.abs(f)
-        first, second = f[rows, here], f[rows, here + 1]
-        whole = np.cumsum(f, axis=1)[rows, here] - 0.5 * (f[:, 0] + first)
+        first, second = np.abs(f[rows, here]), np.abs(f[rows, here + 1])
+        sums = np.array([np.abs(row[: end + 1]).sum() for row, end in zip(f, here, strict=True)])
+        whole = sums - 0.5 * (np.abs(f[:, 0]) + first)
         return np.asarray(dt * (whole + part * (first + 0.5 * part * (second - first))) / settling)
 
     return Indices(

@@ -43,6 +43,7 @@ class DeadTimeLoop:
         self._to_series = np.linalg.inv(chebyshev.chebvander(2.0 * self.at - 1.0, count - 1))
 
         areas = self.areas(self.at)
+        self._whole_area = areas[-1]
         slopes = np.array([chebyshev.chebval(2.0 * self.at - 1.0, chebyshev.chebder(c)) for c in np.eye(count)]).T
         self.slopes = 2.0 / self.L * slopes @ self._to_series
         free, driven = self._plant(plant.a, plant.b)
@@ -100,14 +101,15 @@ class DeadTimeLoop:
         before: states of the dead time before. By the plant's equations: derivatives of the polynomial would lose all
         digits in a short dead time.
         """
-        end = self.values(np.ones(1))[0]
+        # the last node is the end
         error = before[:, self.errors]
-        value = error @ end
-        inputs = [Kp * value + Ki * (error @ self.areas(np.ones(1))[0]) + before[:, -1]]
+        value = error[:, -1]
+        inputs = [Kp * value + Ki * (error @ self._whole_area) + before[:, -1]]
         found = []
         for i in range(1, self.order + 1):
             error = error @ self.slopes.T
-            inputs.append(Ki * value + Kp * (value := error @ end))
+            inputs.append(Kp * error[:, -1] + Ki * value)
+            value = error[:, -1]
             rate = after[:, : self.order] @ self._of_states[i]
             for j, each in enumerate(inputs):
                 # exactly zero where the plant does not pass this derivative on
