@@ -20,8 +20,6 @@ from tuning.setting import Setting
 MOST_Ms, LEAST_GM = 2.0, 2.0
 LEAST_DISTANCE = 0.45
 """From the loop's response at the measured ultimate frequency to -1."""
-DERIVATIVE_FILTER = 10.0
-"""Tf = Td/10 where a rule gives an ideal derivative: it would answer noise and steps without bound."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +64,7 @@ def design(
     The rules made on the ultimate point take the measured one. Refused: as the rule says; NOT_ROBUST.
     """
     setting = _setting(method, plant, ultimate, options or {})
-    gains, notes = realisable(setting.gains)
+    gains, notes = realisable(setting.gains, METHODS[method].filter)
     found = assess(plant, gains, band=0.05)
     m, figures = found.margins, found.setpoint
     if figures is None or not (m.Ms <= MOST_Ms and (m.GM is None or m.GM >= LEAST_GM)):
@@ -89,14 +87,15 @@ def design(
     return Designed(method, gains, predicted, dict(setting.chosen), setting.notes + notes)
 
 
-def realisable(gains: Gains) -> tuple[Gains, tuple[str, ...]]:
-    """An ideal derivative gets its filter, and acts on PV alone: a set-point step would kick MV. Notes say so."""
+def realisable(gains: Gains, filter: float) -> tuple[Gains, tuple[str, ...]]:
+    """An ideal derivative gets the filter Tf = Td/filter, and acts on PV alone: it would answer noise without bound, and
+    a set-point step would kick MV. Notes say so."""
     if gains.Td == 0.0:
         return gains, ()
     notes = []
     if gains.Tf == 0.0:
-        gains = replace(gains, Tf=gains.Td / DERIVATIVE_FILTER)
-        notes.append(f"The derivative is filtered with Tf = Td/{DERIVATIVE_FILTER:g} = {gains.Tf:.4g} s.")
+        gains = replace(gains, Tf=gains.Td / filter)
+        notes.append(f"The derivative is filtered with Tf = Td/{filter:g} = {gains.Tf:.4g} s.")
     if gains.c != 0.0:
         gains = replace(gains, c=0.0)
         notes.append("The derivative acts on PV alone, not on the set-point.")

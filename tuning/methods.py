@@ -24,7 +24,9 @@ from tuning.rules.direct_synthesis import PAPER_C, STABLE_C, direct_synthesis
 from tuning.rules.imc import imc_pi, imc_pid
 from tuning.rules.kappa_tau import kappa_tau
 from tuning.rules.lambda_tuning import lambda_tuning
+from tuning.rules.me_pso import ROBUST_MS, me_pso
 from tuning.rules.robust import robust
+from tuning.rules.s_plane import s_plane
 from tuning.rules.simc import simc
 from tuning.setting import Setting
 from tuning.tangent import tangent
@@ -73,7 +75,7 @@ class Option:
 class Method:
     """for_what: when to choose it, one sentence.  needs: the models it takes, in words; takes: as types, lag saying
     whether an Integrating may have one.  reaction_curve: made on the tangent of a step response.  measured: the same
-    rule from a measured (Ku, Pu).  slow: takes longer than a loop may go without being attended to (0.2 s)."""
+    rule from a measured (Ku, Pu).  filter: Td/Tf where the loop realises an ideal derivative.  slow: takes longer than a loop may go without being attended to (0.2 s)."""
 
     name: str
     title: str
@@ -87,6 +89,7 @@ class Method:
     reaction_curve: bool = False
     measured: Callable[..., Setting] | None = None
     slow: bool = False
+    filter: float = 10.0
 
     def tune(self, model: Model, **options: object) -> Setting:
         """Refused: bad_input (an option), not_self_regulating, outside_range, cannot_oscillate, as the rule says."""
@@ -334,6 +337,7 @@ METHODS: dict[str, Method] = {
                     "", PAPER_C, "K Kp L/(T1 + T2): no overshoot to 0.3679, unstable from pi/2", range=(0.0, STABLE_C)
                 )
             },
+            filter=20.0,
         ),
         Method(
             "robust",
@@ -348,6 +352,46 @@ METHODS: dict[str, Method] = {
                 "scale_free": Option("", None, "weigh time in units of T; none: for T below 5 s", kind="flag"),
             },
         ),
-        # s-plane and me-pso are entered here
+        Method(
+            "s-plane",
+            "Pole placement with a quadratic criterion",
+            "Horbiichuk et al., Eastern-European J. of Enterprise Technologies 1(2(133)), 2025",
+            "A chosen damping of the dominant poles, their speed found by a criterion; plants of low order.",
+            "any stable or integrating plant; a PID needs at least second order",
+            ANY,
+            s_plane,
+            {
+                "controller": _controller("pi", "pid"),
+                "mu": Option("", 1.0, "imaginary over real part of the dominant pair", range=(0.0, None)),
+                "tau_s": Option(
+                    "s", None, "weight of the error's rate; none: a quarter of the lags", range=(0.0, None)
+                ),
+                "k1": Option("", 1.2, "a PID's real pole over the pair's real part", range=(0.0, None)),
+                "alpha_per_s": Option("1/s", None, "the pair's real part; none: searched", range=(0.0, None)),
+            },
+            lag=True,
+        ),
+        Method(
+            "me-pso",
+            "Multi-epoch particle swarm",
+            "Romasevych et al., PI-controller tuning optimization via PSO-based technique",
+            "A PI for one aim (error, control effort or duration) over the whole set-point response.",
+            "any stable or integrating plant",
+            ANY,
+            me_pso,
+            {
+                "weighting": Option("", "error", "what counts most", ("error", "control", "duration"), kind="choice"),
+                "optimiser": Option("", "me-pso", "how to search", ("me-pso", "de", "nelder-mead"), kind="choice"),
+                "seed": Option("", 0.0, "of the search", range=(0.0, None), kind="whole"),
+                "Ms_max": Option("", ROBUST_MS, "most sensitivity, above 1; 0: no bound", range=(0.0, None)),
+                "horizon_s": Option(
+                    "s", None, "simulated time; none: 20 times lags and dead time", range=(0.0, None)
+                ),
+                "Kp_max": Option("MV per PV", None, "none: the ultimate gain", range=(0.0, None)),
+                "Ki_min": Option("MV per PV and s", None, "none: a tenth of 1/(K time unit)", range=(0.0, None)),
+            },
+            lag=True,
+            slow=True,
+        ),
     )
 }

@@ -36,7 +36,7 @@ SLOWER = 0.8
 SHOWN = 8
 STABLE_BY = 1e-9
 """Over all lags and the dead time together: what rounding may hide."""
-CONTROLLERS = ("PI", "PID")
+CONTROLLERS = ("pi", "pid")
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ class Design:
 def s_plane(
     model: Model,
     *,
-    controller: str = "PI",
+    controller: str = "pi",
     mu: float = 1.0,
     tau_s: float | None = None,
     k1: float = 1.2,
@@ -83,7 +83,7 @@ def s_plane(
 ) -> Setting:
     """The PI or PID whose dominant roots have the shape mu and the size of least J; b = 1, for a PID c = 1 and Tf = 0.
 
-    controller: "PI" or "PID".  mu: imaginary over real part of the pair, positive; damping ratio 1/sqrt(1 + mu^2).
+    controller: "pi" or "pid".  mu: imaginary over real part of the pair, positive; damping ratio 1/sqrt(1 + mu^2).
     tau_s: weight of the error's rate, s, near the wanted closed-loop time constant; by default a quarter of all lags
     and the dead time together.  k1: the real root of a PID over the pair's real part, positive.  alpha_per_s: the
     pair's real part, 1/s, when it is not to be searched: pole placement alone.
@@ -128,7 +128,7 @@ def s_plane(
     elif (least := min(found.minima, key=lambda each: each.J)) is not best:
         notes.append(f"J is lower at alpha = {least.alpha:.3g} 1/s, but there a slower root rules; not taken.")
     chosen = {"alpha_per_s": best.alpha, "mu": mu, "tau_s": tau_s, "J_s": best.J, "J0_s": best.J0, "J1_per_s": best.J1}
-    if controller == "PID":
+    if controller == "pid":
         chosen["k1"] = k1
         notes.append("The derivative acts on the error without a filter: check the loop again with its filter.")
     return Setting(best.gains, chosen, tuple(notes))
@@ -153,7 +153,7 @@ def _search(model: Model, controller: str, mu: float, tau_s: float, k1: float) -
     for name, value in (("mu", mu), ("tau_s", tau_s), ("k1", k1)):
         if not 0.0 < value < math.inf:
             raise Refused(Reason.BAD_INPUT, f"{name} {value}: a positive number is accepted")
-    pid = controller == "PID"
+    pid = controller == "pid"
     excess, needed = len(model.den) - len(model.num), int(pid) + int(model.L > 0.0)
     if excess < needed:
         raise Refused(

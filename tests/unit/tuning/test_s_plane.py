@@ -29,7 +29,7 @@ ROWS = [
 
 
 def kind(name: str) -> str:
-    return "PID" if name == "third" else "PI"
+    return "pid" if name == "third" else "pi"
 
 
 def row_design(name: str, mu: float) -> Design:
@@ -104,7 +104,7 @@ def test_table_2_is_pole_placement_but_not_the_least_J(i: int) -> None:
 @pytest.mark.parametrize("i", range(4))
 def test_table_3_reproduces_within_its_own_minimum(i: int) -> None:
     printed = S_PLANE["printed"]["table3_third"][i]
-    found = s_plane(OBJECTS["third"], controller="PID", mu=printed["mu"], tau_s=TAU_S, k1=K1)
+    found = s_plane(OBJECTS["third"], controller="pid", mu=printed["mu"], tau_s=TAU_S, k1=K1)
     assert parallel(found.gains) == pytest.approx(np.array(printed["C"]), rel=4e-3)
     Kd, Kp, Ki = printed["C"]
     assert by_the_paper_s_rule(OBJECTS["third"], Gains(Kp, Kp / Ki, Kd / Kp, c=1.0), 10.0, 0.05, 0.01) == (
@@ -188,7 +188,7 @@ def test_the_third_order_equations(
     expected = third_order(a, b, alpha, mu, k1)
     P = np.polyadd(np.append(a, 0.0), np.polymul(expected, b))
     assume(expected.min() > 1e-2 and np.roots(P).real.max() < -1e-2 and expected.max() < 1e3)
-    found = s_plane(TransferFunction(b, a), controller="PID", mu=mu, k1=k1, alpha_per_s=alpha)
+    found = s_plane(TransferFunction(b, a), controller="pid", mu=mu, k1=k1, alpha_per_s=alpha)
     assert parallel(found.gains) == pytest.approx(expected, rel=1e-5)
     chosen = (found.chosen["J0_s"], found.chosen["J1_per_s"])
     assert chosen == pytest.approx(J0_J1(np.array(a), np.array(b), expected), rel=1e-4)
@@ -217,12 +217,12 @@ def test_plants_beyond_the_paper(
 
 
 LOOPS: list[tuple[Model, str]] = [
-    (FOPDT(-2.0, 5.0, 2.5), "PI"),
-    (FOPDT(1.0, 0.1, 3.0), "PI"),
-    (SOPDT(1.0, 2.0, 1.0, 1.0), "PI"),
-    (SOPDT(1.0, 3.0, 0.3, 0.5), "PID"),
-    (Integrating(-0.1, 2.0, 3.0), "PID"),
-    (PLANTS["G3"], "PI"),
+    (FOPDT(-2.0, 5.0, 2.5), "pi"),
+    (FOPDT(1.0, 0.1, 3.0), "pi"),
+    (SOPDT(1.0, 2.0, 1.0, 1.0), "pi"),
+    (SOPDT(1.0, 3.0, 0.3, 0.5), "pid"),
+    (Integrating(-0.1, 2.0, 3.0), "pid"),
+    (PLANTS["G3"], "pi"),
 ]
 
 
@@ -230,7 +230,7 @@ LOOPS: list[tuple[Model, str]] = [
 def test_the_prescribed_roots_are_roots(model: Model, controller: str) -> None:
     mu, k1 = 0.8, 1.3
     found = s_plane(model, controller=controller, mu=mu, k1=k1)
-    s = found.chosen["alpha_per_s"] * np.array([-1.0 + 1j * mu, -k1] if controller == "PID" else [-1.0 + 1j * mu])
+    s = found.chosen["alpha_per_s"] * np.array([-1.0 + 1j * mu, -k1] if controller == "pid" else [-1.0 + 1j * mu])
     plant = np.polyval(model.num, s) / np.polyval(model.den, s) * np.exp(-model.L * s)
     loop = math.copysign(1.0, model.num[-1]) * plant * np.polyval(parallel(found.gains), s) / s
     assert loop == pytest.approx(-np.ones(len(s)), abs=1e-9)
@@ -285,7 +285,7 @@ def test_left_over_roots(name: str) -> None:
 @pytest.mark.parametrize(("gain", "time"), [(-1.0, 1.0), (50.0, 1.0), (0.02, 300.0)])
 @pytest.mark.parametrize("L", [0.0, 0.7])
 def test_gains_follow_the_scale_of_the_plant(gain: float, time: float, L: float) -> None:
-    for controller in ("PI", "PID"):
+    for controller in ("pi", "pid"):
         plain = s_plane(SOPDT(1.0, 2.0, 0.9, L), controller=controller, mu=0.6)
         scaled = s_plane(SOPDT(gain, 2.0 * time, 0.9, L * time), controller=controller, mu=0.6)
         assert scaled.gains.Kp == pytest.approx(plain.gains.Kp / abs(gain), rel=1e-5)
@@ -294,7 +294,7 @@ def test_gains_follow_the_scale_of_the_plant(gain: float, time: float, L: float)
 
 
 def test_a_pid_acts_on_the_error_without_filter_and_says_so() -> None:
-    found = s_plane(SOPDT(1.0, 2.0, 0.9, 0.7), controller="PID")
+    found = s_plane(SOPDT(1.0, 2.0, 0.9, 0.7), controller="pid")
     assert (found.gains.b, found.gains.c, found.gains.Tf) == (1.0, 1.0, 0.0)
     assert found.gains.Td > 0.0
     assert any("filter" in note for note in found.notes)
@@ -308,9 +308,9 @@ def test_a_pid_acts_on_the_error_without_filter_and_says_so() -> None:
         (FOPDT(1.0, 2.0, 1.0), {"tau_s": math.inf}, "tau_s inf"),
         (FOPDT(1.0, 2.0, 1.0), {"k1": -1.0}, "k1 -1.0"),
         (FOPDT(1.0, 2.0, 1.0), {"alpha_per_s": 0.0}, "alpha_per_s 0.0"),
-        (FOPDT(1.0, 2.0, 1.0), {"controller": "PID"}, "at least 2 are accepted"),
+        (FOPDT(1.0, 2.0, 1.0), {"controller": "pid"}, "at least 2 are accepted"),
         (TransferFunction((1.0, 4.0), (3.0, 1.0), 1.0), {}, "at least 1 are accepted"),
-        (FOPDT(1.0, 2.0, 0.0), {"controller": "PID"}, "at no size"),
+        (FOPDT(1.0, 2.0, 0.0), {"controller": "pid"}, "at no size"),
         (SOPDT(1.0, 3.0, 0.3, 0.5), {}, "at no size"),
         (Integrating(0.1, 2.0), {}, "no least value"),
         (Integrating(0.1, 0.0), {}, "neither lag nor dead time"),
