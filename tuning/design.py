@@ -88,8 +88,10 @@ def design(
 
 
 def realisable(gains: Gains, filter: float) -> tuple[Gains, tuple[str, ...]]:
-    """An ideal derivative gets the filter Tf = Td/filter, and acts on PV alone: it would answer noise without bound, and
-    a set-point step would kick MV. Notes say so."""
+    """An ideal derivative gets the filter Tf = Td/filter, and acts on PV alone; notes say so.
+
+    It would answer noise without bound, and a set-point step would kick MV.
+    """
     if gains.Td == 0.0:
         return gains, ()
     notes = []

@@ -74,8 +74,11 @@ class Option:
 @dataclass(frozen=True, slots=True)
 class Method:
     """for_what: when to choose it, one sentence.  needs: the models it takes, in words; takes: as types, lag saying
-    whether an Integrating may have one.  reaction_curve: made on the tangent of a step response.  measured: the same
-    rule from a measured (Ku, Pu).  filter: Td/Tf where the loop realises an ideal derivative.  slow: takes longer than a loop may go without being attended to (0.2 s)."""
+    whether an Integrating may have one.  reaction_curve: made on the tangent of a step response.
+
+    measured: the same rule from a measured (Ku, Pu).  filter: Td/Tf where the loop realises an ideal derivative.
+    slow: takes longer than a loop may go without being attended to (0.2 s).
+    """
 
     name: str
     title: str
