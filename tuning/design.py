@@ -18,6 +18,8 @@ from tuning.reasons import Reason, Refused
 from tuning.setting import Setting
 
 MOST_Ms, LEAST_GM = 2.0, 2.0
+ROUNDING = 1.002
+"""A method that seeks the bound ends on it."""
 LEAST_DISTANCE = 0.45
 """From the loop's response at the measured ultimate frequency to -1."""
 
@@ -67,7 +69,7 @@ def design(
     gains, notes = realisable(setting.gains, METHODS[method].filter)
     found = assess(plant, gains, band=0.05)
     m, figures = found.margins, found.setpoint
-    if figures is None or not (m.Ms <= MOST_Ms and (m.GM is None or m.GM >= LEAST_GM)):
+    if figures is None or not (m.Ms <= MOST_Ms * ROUNDING and (m.GM is None or m.GM >= LEAST_GM)):
         GM = "none" if m.GM is None else f"{m.GM:.2f}"
         stable = "" if figures else "the loop would be unstable: "
         raise Refused(

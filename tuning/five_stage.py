@@ -33,9 +33,15 @@ from tuning.stages.zn_pi import allowed_step, zn_pi
 __all__ = ["STAGES", "Facts", "Options", "Proposal", "five_stage"]
 
 STAGES = ("preflight", "baseline", "relay", "ultimate", "zn_pi", "estimate", "optimise", "verify")
+PROCEDURE = "five-stage"
 MOST_GAIN = 60.0
 """Ku * K of a FOPDT plant with L/T = 0.026, half the least that formula (2) was checked for."""
 Entry = Literal["relay", "zn_pi", "estimate", "optimise"]
+
+
+def rule_of(method: str) -> str:
+    """The method's name in `tuning.methods`: the procedure's own Stage 5 is the robust PI."""
+    return "robust" if method == PROCEDURE else method
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +50,9 @@ class Options:
     optimise needs model.
 
     k_source: the gain that goes into the FOPDT estimate, "k5" (formula 5) or "ke" (measured).
-    method, method_options: which rule of `tuning.methods` gives the gains.  model_from: the model it gets, "overshoot"
-    (Stage 4 of the paper) or "record" (identified from the set-point step of Stage 3), by default the one it is for.
+    method, method_options: what gives the gains, "five-stage" (criterion 7) or another of `tuning.methods`.
+    model_from: the model it gets, "overshoot" (the paper's FOPDT estimate) or "record" (identified from the set-point
+    step of Stage 3). By default five-stage takes the first; the others the second, unless it does not explain the step.
     kp_step_factor: Stage 3 multiplies Kp by this instead of adding 0.1 (Ku - Kp).
     """
 
@@ -61,7 +68,7 @@ class Options:
     overshoot_window_pct: tuple[float, float] = (10.0, 50.0)
     baseline: bool = True
     verify: bool = True
-    method: str = "robust"
+    method: str = PROCEDURE
     method_options: Mapping[str, object] = field(default_factory=dict)
     model_from: Literal["overshoot", "record"] | None = None
 
@@ -78,10 +85,10 @@ class Options:
                 raise Refused(Reason.BAD_INPUT, f"entering at {self.start} needs {name}, a number > 0, not {value!r}")
         if self.start == "optimise" and self.model is None:
             raise Refused(Reason.BAD_INPUT, "entering at optimise needs a model")
-        rule = METHODS.get(self.method)
-        if rule is None:
-            raise Refused(Reason.BAD_INPUT, f"method must be one of {', '.join(METHODS)}, not {self.method!r}")
-        rule.checked(self.method_options)
+        if self.method != PROCEDURE and self.method not in METHODS:
+            known = ", ".join((PROCEDURE, *METHODS))
+            raise Refused(Reason.BAD_INPUT, f"method must be one of {known}, not {self.method!r}")
+        METHODS[rule_of(self.method)].checked(self.method_options)
         if self.model_from == "record" and self.start in ("estimate", "optimise"):
             raise Refused(Reason.BAD_INPUT, f'model_from "record" needs Stage 3; the start is {self.start}')
         if self.kp_step_factor is not None and not 1 < self.kp_step_factor <= 2:
@@ -203,7 +210,7 @@ def five_stage(facts: Facts, options: Options) -> Plan[Proposal]:
         yield started("estimate")
         model = _estimate(facts, Kp, Ti, overshoot, ke, options.k_source, notes)
         if len(step) and _wants_record(options):
-            model = yield from _identified(facts, point, step, model, notes)
+            model = yield from _identified(facts, point, step, model, options.model_from is not None, notes)
         yield (StageDone("estimate", model),)
     yield started("optimise")
     designed = yield from _designed(options, model, ultimate)
@@ -282,14 +289,26 @@ def _typed_in(facts: Facts, options: Options) -> Model:
 
 
 def _wants_record(options: Options) -> bool:
-    if options.model_from is not None:
-        return options.model_from == "record"
-    return METHODS[options.method].takes[0] is SOPDT
+    return options.model_from == "record" or (options.model_from is None and options.method != PROCEDURE)
 
 
-def _identified(facts: Facts, point: OperatingPoint, step: Trace, estimate: Model, notes: list[str]) -> Plan[Model]:
-    """The model that the set-point step of Stage 3 supports best, while the loop goes on."""
-    found = yield from worked(lambda: identify(step.t, step.mv, step.pv, u_before=point.mv))
+def _identified(
+    facts: Facts, point: OperatingPoint, step: Trace, estimate: Model, asked: bool, notes: list[str]
+) -> Plan[Model]:
+    """The model that the set-point step of Stage 3 supports best, while the loop goes on.
+
+    Unless it was asked for, one that does not explain the step gives way to the estimate.
+    """
+    try:
+        found = yield from worked(lambda: identify(step.t, step.mv, step.pv, u_before=point.mv))
+    except Refused as refused:
+        if asked:
+            raise
+        notes.append(f"The model is the estimate from the overshoot: {refused.detail}.")
+        return estimate
+    if not found.explained and not asked:
+        notes.append("The model is the estimate from the overshoot: none of up to second order explains the step.")
+        return estimate
     notes += found.notes
     plant = found.model
     if isinstance(plant, Integrating):
@@ -302,9 +321,10 @@ def _identified(facts: Facts, point: OperatingPoint, step: Trace, estimate: Mode
 
 def _designed(options: Options, model: Model, ultimate: Ultimate | None) -> Plan[Designed]:
     def compute() -> Designed:
-        return design(options.method, model.plant(), ultimate, options.method_options)
+        return design(rule, model.plant(), ultimate, options.method_options)
 
-    if METHODS[options.method].slow:
+    rule = rule_of(options.method)
+    if METHODS[rule].slow:
         return (yield from worked(compute))
     return compute()
 
