@@ -318,7 +318,7 @@ def test_a_pid_acts_on_the_error_without_filter_and_says_so() -> None:
 @pytest.mark.parametrize(
     ("model", "options", "said"),
     [
-        (FOPDT(1.0, 2.0, 1.0), {"controller": "PD"}, "PI, PID"),
+        (FOPDT(1.0, 2.0, 1.0), {"controller": "PD"}, "pi, pid"),
         (FOPDT(1.0, 2.0, 1.0), {"mu": 0.0}, "mu 0.0: 0.01 to 10.0"),
         (FOPDT(1.0, 2.0, 1.0), {"mu": math.nan}, "mu nan"),
         (FOPDT(1.0, 2.0, 1.0), {"tau_s": math.inf}, "tau_s inf"),
