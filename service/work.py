@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
@@ -174,14 +175,15 @@ def plain(value: object) -> dict[str, Any] | None:
 
 
 def _plain(value: Any) -> Any:
-    """Dataclasses, tuples and numpy scalars become what JSON knows."""
+    """Dataclasses, tuples and numpy scalars become what JSON knows; a number that is none becomes null."""
     if is_dataclass(value) and not isinstance(value, type):
         return _plain({f.name: getattr(value, f.name) for f in fields(value)})
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
-    return value.item() if hasattr(value, "item") else value
+    value = value.item() if hasattr(value, "item") else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _reason(text: object) -> Reason:
