@@ -10,6 +10,8 @@ import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+PRINTED = "printed"
+
 
 class Verdict(StrEnum):
     """GIVEN: an input, taken from the print.  LOST: the paper does not say what it would be computed from."""
@@ -35,7 +37,9 @@ class Tolerance:
         return math.isfinite(found) and abs(found - reference) <= allowed
 
     def in_words(self, unit: str) -> str:
-        parts = [f"{self.absolute:g} {unit}".rstrip()] if self.absolute else []
+        # of a percentage a relative tolerance is in percent as well
+        absolute = "points" if unit == "%" else unit
+        parts = [f"{self.absolute:g} {absolute}".rstrip()] if self.absolute else []
         parts += [f"{100.0 * self.relative:g} %"] if self.relative else []
         return " or ".join(parts)
 
@@ -44,8 +48,8 @@ class Tolerance:
 class Column:
     """One quantity of a table.
 
-    decimals: how many are shown, in the print as in ours; negative ones round to tens and hundreds.  tolerance: to the
-    print.  own: to the independent calculation where the print is not met, by default the same.
+    decimals: how many the tolerance supports; a print with more is shown as it is.  tolerance: to the print.  own: to
+    the independent calculation where the print is not met, by default the same.
     """
 
     name: str
@@ -55,16 +59,22 @@ class Column:
     own: Tolerance | None = None
 
     def show(self, value: float | None) -> str:
+        """Rounded."""
         if value is None:
             return "–"
-        shown = f"{round(value, self.decimals):.{max(self.decimals, 0)}f}"
+        shown = f"{value:.{self.decimals}f}"
         return shown.removeprefix("-") if float(shown) == 0.0 else shown
 
+    def as_printed(self, value: float | None) -> str:
+        """With all its own decimals, at least as many as ours has."""
+        own = len(repr(float(value)).partition(".")[2]) if value is not None else 0
+        return f"{value:.{own}f}" if own > self.decimals else self.show(value)
+
     def difference(self, cell: Cell) -> str:
-        """Of the numbers as shown."""
+        """Of ours as shown."""
         if cell.given or cell.ours is None or cell.printed is None:
             return "–"
-        off = round(cell.ours, self.decimals) - round(cell.printed, self.decimals)
+        off = round(cell.ours, self.decimals) - cell.printed
         shown = self.show(off)
         return shown if off < 0.0 or float(shown) == 0.0 else f"+{shown}"
 
@@ -114,7 +124,7 @@ class Table:
     rows: tuple[Row, ...]
     text: str = ""
     causes: dict[str, str] = field(default_factory=dict)
-    reference: str = "printed"
+    reference: str = PRINTED
 
     def verdicts(self, row: Row) -> list[Verdict]:
         return [column.verdict(cell) for column, cell in zip(self.columns, row.cells, strict=True)]

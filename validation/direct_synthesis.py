@@ -260,7 +260,7 @@ def _claims(references: References) -> tuple[Claim, ...]:
             min(first, key=lambda k: first[k][1]) == "MDS" and [k for k in first if first[k][0] < 1e-3] == ["MDS"],
         ),
         Claim(
-            "(30): so MDS is the fastest method for it.",
+            "(30): MDS is the fastest of the methods.",
             f"IMC for this plant with lambda = sqrt 2 theta settles in {fair_s:.1f} s, MDS in {first['MDS'][1]:.1f} s.",
             fair_s > first["MDS"][1],
             "The printed IMC row is of another plant.",

@@ -28,15 +28,23 @@ ME_PSO_SHOWN = ("ME-PSO-Error", "ME-PSO-Control", "ME-PSO-Duration", "Skogestad"
 ME_PSO_LENGTH_S = {"G1": 15.0, "G2": 25.0, "G3": 25.0, "G4": 3.0, "G5": 25.0}
 
 
+IMC_CASE_1 = "imc-case-1"
+
+
 def draw(references: References, folder: Path) -> None:
     """All of them, by the names that the papers' checks give."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, panels in panels_by_name(references).items():
+    for name, panels in _panels(references).items():
         _save(_figure(panels), folder / f"{name}.png")
-    _save(_imc_case_1(references), folder / "imc-case-1.png")
+    _save(_imc_case_1(references), folder / f"{IMC_CASE_1}.png")
 
 
-def panels_by_name(references: References) -> dict[str, list[Panel]]:
+def names(references: References) -> set[str]:
+    """Of the files that are drawn, without ending."""
+    return {*_panels(references), IMC_CASE_1}
+
+
+def _panels(references: References) -> dict[str, list[Panel]]:
     groups: tuple[Callable[[References], dict[str, list[Panel]]], ...] = (
         _five_stage,
         _direct_synthesis,
@@ -50,7 +58,10 @@ def panels_by_name(references: References) -> dict[str, list[Panel]]:
 def _five_stage(references: References) -> dict[str, list[Panel]]:
     tables = references.five_stage
     printed = {row["model"]: row["printed"] for row in tables["table2"]["rows"]}
-    controllers = {name: Gains(p["kp"], p["kp"] / p["ki"]) for name, p in printed.items()}
+    controllers = {
+        "of the plant itself" if name == "original" else f"of model {name}": Gains(p["kp"], p["kp"] / p["ki"])
+        for name, p in printed.items()
+    }
     table_4: list[Panel] = []
     for m in tables["table4"]["models_settled"]:
         model = five_stage.table_4_model(tables["table4"], m["id"])
@@ -60,7 +71,7 @@ def _five_stage(references: References) -> dict[str, list[Panel]]:
         }
         table_4.append((f"{m['id']}: tau = {model.L:g} s", model, settings, 40.0))
     return {
-        "five-stage-table-2": [("1/(s+1)^5, controller designed on model", FIVE_LAGS, controllers, 40.0)],
+        "five-stage-table-2": [("1/(s+1)^5 under the six controllers", FIVE_LAGS, controllers, 40.0)],
         "five-stage-table-4": table_4,
         "five-stage-reactor": [
             (
@@ -140,7 +151,7 @@ def _figure(panels: list[Panel]) -> Figure:
         ax.title.set_fontsize(10)
         ax.grid(alpha=0.3)
         if i == 0:
-            ax.set_ylabel("PV")
+            ax.set_ylabel("PV, step of the set-point = 1")
     axes[-1].legend(fontsize=8, loc="lower right")
     return figure
 

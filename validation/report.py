@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from validation.checks import Claim, Column, Paper, Row, Table, Verdict
+from validation.checks import PRINTED, Cell, Claim, Column, Paper, Row, Table, Verdict
 
 INTRODUCTION = """\
 # Validation against the five papers
@@ -14,7 +14,7 @@ come from, with the same `tuning/` that tunes loops. It fails when a number leav
 text with what the run gives, so it is never out of date.
 
 How to read a table. A line is a row of the paper's table, its numbers in the order that the line above the table gives;
-the difference is of the numbers as shown. The verdict is on the unrounded ones:
+the difference is of the numbers as shown, rounded to what the tolerance supports. The verdict is on the unrounded ones:
 
 - **reproduced**: within the tolerance stated below the table, with its reason.
 - **explained (a)**: not within it. The cause stands below the table. A cause alone does not pass: our number must agree
@@ -59,7 +59,7 @@ def _paper(paper: Paper) -> list[str]:
     for table in paper.tables:
         lines += _table(table)
     if paper.claims:
-        lines += ["### What the paper says", "", "| claim | found | verdict |", "| --- | --- | --- |"]
+        lines += ["### What the paper says", "", "| statement | found | verdict |", "| --- | --- | --- |"]
         lines += [f"| {claim.said} | {claim.found}{_because(claim)} | {_of_claim(claim)} |" for claim in paper.claims]
         lines.append("")
     for figure in paper.figures:
@@ -82,13 +82,17 @@ def _table(table: Table) -> list[str]:
     lines += [f"| row | {table.reference} | ours | difference | verdict |", "| --- | ---: | ---: | ---: | --- |"]
     for row in table.rows:
         pairs = list(zip(table.columns, row.cells, strict=True))
-        printed = (column.show(cell.printed) for column, cell in pairs)
+        printed = (_reference(table, column, cell) for column, cell in pairs)
         ours = ("*given*" if cell.given else column.show(cell.ours) for column, cell in pairs)
         off = (column.difference(cell) for column, cell in pairs)
         lines.append(f"| {row.label} | {_row(printed)} | {_row(ours)} | {_row(off)} | {_verdict(table, row)} |")
     lines += ["", f"Tolerance: {_tolerances(table)}.", ""]
     lines += [f"- ({key}) {text}" for key, text in sorted(table.causes.items())]
     return [*lines, ""] if table.causes else lines
+
+
+def _reference(table: Table, column: Column, cell: Cell) -> str:
+    return column.as_printed(cell.printed) if table.reference == PRINTED else column.show(cell.printed)
 
 
 def _row(cells: Iterable[str]) -> str:

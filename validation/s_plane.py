@@ -219,11 +219,11 @@ def _claims(references: References) -> tuple[Claim, ...]:
             "just below 5 %.",
         ),
         Claim(
-            "J has one minimum on the interval of alpha.",
-            f"On the plant of Table 2 the least of several minima is one with a slower left-over root for {several} of "
-            f"the {len(mus)} mu.",
+            "The setting of the least J is the one to take.",
+            f"On the plant of Table 2 the least of several minima has a slower left-over root for {several} of the "
+            f"{len(mus)} mu.",
             several == 0,
-            "The paper brackets one minimum by hand. Here the least J with no slower root is taken.",
+            "The paper brackets one of the minima by hand. Here the least J with no slower root is taken.",
         ),
     )
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from validation.checks import Tolerance
 
 GM = Tolerance("printed with two decimals, from models of as many digits", relative=0.005)
-PM_DEG = Tolerance("the same", absolute=0.3)
+PM_DEG = Tolerance("printed with one decimal or two, from models of two or three digits", absolute=0.3)
 OPTIMUM_GM = Tolerance("the optimum is flat: the gain that it follows from is known to 1.3 %", relative=0.015)
-OPTIMUM_PM = Tolerance("the same", absolute=0.4)
-OPTIMUM_KP = Tolerance("the same", relative=0.015)
+OPTIMUM_PM = Tolerance("the optimum is flat", absolute=0.4)
+OPTIMUM_KP = Tolerance("the optimum is flat in the gain", relative=0.015)
 OPTIMUM_TI = Tolerance("the integral time is known better", relative=0.005)
 SETTLING = Tolerance("a sampled record in the paper, exact instants here", relative=0.02)
 OVERSHOOT = Tolerance("a sampled record in the paper", absolute=0.5)
@@ -34,7 +34,7 @@ SIMULATED_SETTLING = Tolerance("two exact simulations", relative=0.005)
 
 PRINTED_IAE = Tolerance("four printed digits", relative=0.001)
 PRINTED_ISE = Tolerance("four printed digits, of gains cut to two or three", relative=0.005)
-PRINTED_ITAE = Tolerance("the same", relative=0.005)
+PRINTED_ITAE = Tolerance("four printed digits, of gains cut to two or three", relative=0.005)
 EQUATION_40 = Tolerance("two printed digits", absolute=0.0005)
 EQUATION_40_TD = Tolerance("one printed digit", absolute=0.005)
 
