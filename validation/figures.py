@@ -14,7 +14,7 @@ from tuning.methods import tune
 from tuning.models import Model
 from tuning.response import step_response
 from tuning.robust import optimise
-from validation import direct_synthesis, five_stage, imc, me_pso, s_plane
+from validation import direct_synthesis, five_stage, imc, me_pso, reactor, s_plane
 from validation.loops import FIVE_LAGS, ideal_pid, of_numerator, plant, sopdt
 from validation.references import References
 
@@ -76,8 +76,8 @@ def _five_stage(references: References) -> dict[str, list[Panel]]:
         "five-stage-reactor": [
             (
                 "Reactor, linearised; PV in mol/m3",
-                five_stage.reactor_model(),
-                five_stage.reactor_controllers(tables["reactor"]),
+                reactor.linear_reactor(),
+                reactor.controllers(tables["reactor"]),
                 250.0,
             )
         ],

@@ -1,27 +1,25 @@
-"""Stopakevych et al., automatic re-tuning of PI controllers: Tables 1, 2, 4, 5, the formulas, the reactor."""
+"""Stopakevych et al., automatic re-tuning of PI controllers: Tables 1, 2, 4, 5; with the 50 models and the reactor."""
 
 from __future__ import annotations
 
 import math
-from statistics import mean, median
 from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
 
-from tuning.estimate import fopdt_from_overshoot
 from tuning.gains import Gains
 from tuning.margins import margins, ultimate_point
-from tuning.models import FOPDT, TransferFunction
+from tuning.models import FOPDT
 from tuning.recorded_step import fit_closed_loop, fit_step
 from tuning.reduction import half_rule, two_areas
 from tuning.response import step_figures, step_response
 from tuning.robust import optimise
-from tuning.stability import is_stable
+from validation import reactor
 from validation import tolerances as tol
-from validation.checks import Cell, Claim, Column, Figure, Paper, Row, Table
+from validation.checks import Cell, Column, Figure, Paper, Row, Table
+from validation.fifty_models import FiftyModels
 from validation.loops import FIVE_LAGS, plant
-from validation.reactor import linear_reactor
 from validation.references import References
 
 DESIGNED_FOR_THE_PLANT = Gains(Kp=0.887, Ti=0.887 / 0.225)
@@ -30,7 +28,7 @@ TABLE_4_HORIZON_S = 40.0
 
 def check(references: References) -> Paper:
     tables = references.five_stage
-    claims, settling = _fifty_models(references)
+    fifty = FiftyModels(references)
     return Paper(
         "Five-stage re-tuning of PI loops",
         "Stopakevych et al., automatic re-tuning of PI controllers in poorly performing control loops, "
@@ -45,11 +43,10 @@ def check(references: References) -> Paper:
             _table_4_optimised(tables["table4"]),
             _table_5(references),
             _table_5_optimised(tables["table5"]),
-            _formulas(references, settling),
-            _reactor(tables["reactor"]),
-            _reactor_loops(tables["reactor"]),
+            fifty.table(),
+            *reactor.tables(tables["reactor"]),
         ),
-        (*claims, *_reactor_claims(tables["reactor"])),
+        (*fifty.claims(), *reactor.claims(tables["reactor"])),
         (
             Figure("five-stage-table-2", "Controllers of Table 2 on 1/(s+1)^5, unit set-point step."),
             Figure("five-stage-table-4", "Table 4: the Ziegler-Nichols PI and the optimised PI on P1, P2 and P3."),
@@ -280,150 +277,4 @@ def _table_5_optimised(table: dict[str, Any]) -> Table:
             "a": "The print fits a dead time 3 to 5 % shorter than Ti/3. For model 14 rounding it to the sample of "
             "0.1 s would do that; for model 41 the cause is unknown.",
         },
-    )
-
-
-def _formulas(references: References, settling: Cell) -> Table:
-    printed = references.more["five_stage"]
-    Ku, Pu = ultimate_point(FIVE_LAGS)
-    gains = Gains(Ku / 2.2, Pu / 1.2)
-    found = fopdt_from_overshoot(gains.Kp, gains.Ti, step_figures(FIVE_LAGS, gains).overshoot_pct)
-    formula = Column("value", 2, tol.RATIO, own=tol.RATIO)
-    return Table(
-        "Formula (3) and the mean over the 50 plants",
-        (formula,),
-        (
-            Row("tau of 1/(s+1)^5 by (3), s", (Cell(printed["formula3_of_five_equal_lags_s"], found.L),)),
-            Row("settling time on the estimate over that on the plant, mean of 50", (settling,)),
-        ),
-        "The estimate by (2) to (5), with the gain of (5), stands in for the plant under the same Ziegler-Nichols PI.",
-        {
-            "a": "The dead times of 18 of the 50 plants are illegible and assumed, and the paper's own Ku and Pu come "
-            "from test runs; here they are exact."
-        },
-    )
-
-
-def _fifty_models(references: References) -> tuple[tuple[Claim, ...], Cell]:
-    """The paper's claims on its 50 plants, and the mean ratio of settling times."""
-    ratios, overshoots, unstable, untouched = [], [], 0, 0
-    beyond: list[str] = []
-    for entry in references.plants:
-        model = plant(entry)
-        Ku, Pu = ultimate_point(model)
-        zn = Gains(Ku / 2.2, Pu / 1.2)
-        figures = step_figures(model, zn)
-        Kp, overshoot = zn.Kp, figures.overshoot_pct
-        # Stage 3: a tenth of the way to Ku at a time, until the overshoot is within its window
-        while not 10.0 <= overshoot <= 50.0:
-            Kp += math.copysign(0.1 * (Ku - zn.Kp), 30.0 - overshoot)
-            overshoot = step_figures(model, Gains(Kp, zn.Ti)).overshoot_pct
-        found = fopdt_from_overshoot(Kp, zn.Ti, overshoot)
-        estimate = FOPDT(found.k5, found.T, found.L)
-        if not is_stable(estimate, zn):
-            unstable += 1
-            continue
-        other = step_figures(estimate, zn)
-        assert figures.settling_s is not None and other.settling_s is not None
-        ratios.append(other.settling_s / figures.settling_s)
-        overshoots.append(other.overshoot_pct - figures.overshoot_pct)
-        if Kp == zn.Kp:
-            untouched += 1
-            if other.IAE > 1.1 * figures.IAE:
-                beyond.append(f"No. {entry['id']} by {100.0 * (other.IAE / figures.IAE - 1.0):.0f} %")
-    printed = references.more["five_stage"]["mean_settling_ratio"]
-    claims = (
-        Claim(
-            "The estimate never makes the loop unstable where the plant is stable.",
-            f"Unstable on {unstable} of {len(references.plants)} plants.",
-            unstable == 0,
-        ),
-        Claim(
-            "The loop's IAE on the estimate is not worse than on the plant by more than 10 %.",
-            f"Of the {untouched} plants whose Kp Stage 3 leaves as it is, worse by more are: {', '.join(beyond)}.",
-            not beyond,
-            "On the others it is so.",
-        ),
-        Claim(
-            "The overshoot is underestimated.",
-            f"In the median it is lower by {-median(overshoots):.0f} points.",
-            median(overshoots) < 0.0,
-        ),
-    )
-    return claims, Cell(printed["printed"], mean(ratios), "a", printed["recomputed"])
-
-
-def reactor_model(lag_s: float = 4.0, delay_s: float = 10.0) -> TransferFunction:
-    return linear_reactor(lag_s, delay_s)
-
-
-def reactor_controllers(reactor: dict[str, Any]) -> dict[str, Gains]:
-    """The four of the paper, by name."""
-    p = reactor["printed"]
-    zn = Gains(p["ZN"]["Kp"], p["ZN"]["Ti"])
-    return {
-        "ZN": zn,
-        "retuned": Gains(p["retuned"]["factor"] * zn.Kp, zn.Ti),
-        "optimised": Gains(p["opt"]["Kp"], p["opt"]["Ti"]),
-        "pidtune": Gains(p["pidtune"]["Kp"], p["pidtune"]["Ti"]),
-    }
-
-
-def _reactor(reactor: dict[str, Any]) -> Table:
-    p, settled, other = reactor["printed"], reactor["settled"]["estimated"], reactor["recomputed"]
-    Ku, Pu = ultimate_point(reactor_model())
-    Ku3, Pu3 = ultimate_point(reactor_model(3.0))
-    estimate = fopdt_from_overshoot(
-        p["retuned"]["factor"] * p["Ku"] / 2.2, p["ZN"]["Ti"], p["retuned"]["overshoot_pct"]
-    )
-    best = optimise(FOPDT(settled["k"], settled["T"], settled["tau"])).gains
-    lag3 = other["lag3_delay10"]
-    return Table(
-        "Reactor",
-        (
-            Column("Ku or k or Kp", 3, tol.FORMULA, own=tol.ULTIMATE_GAIN),
-            Column("Pu or T or Ti", 2, tol.FORMULA, "s", tol.ULTIMATE_PERIOD),
-        ),
-        (
-            Row("ultimate point, actuator lag 4 s", (Cell(p["Ku"], Ku), Cell(p["Pu"], Pu))),
-            Row(
-                "the same with the printed lag, 3 s",
-                (Cell(p["Ku"], Ku3, "a", lag3["Ku"]), Cell(p["Pu"], Pu3, "a", lag3["Pu"])),
-            ),
-            Row("Ziegler-Nichols PI", (Cell(p["ZN"]["Kp"], p["Ku"] / 2.2), Cell(p["ZN"]["Ti"], p["Pu"] / 1.2))),
-            Row(
-                "estimate by (2), (4), (5)",
-                (Cell(p["estimated"]["k"], estimate.k5), Cell(p["estimated"]["T"], estimate.T, "b", settled["T"])),
-            ),
-            Row("optimised PI of the estimate", (Cell(p["opt"]["Kp"], best.Kp), Cell(p["opt"]["Ti"], best.Ti))),
-        ),
-        "Linearised at 50 %. The sensor's delay is illegible; 10 s, with an actuator lag of 4 s, gives the ultimate "
-        "point.",
-        {
-            "a": "With the printed actuator lag no delay gives both Ku and Pu; 10 s is shown. A misprint, or a lag in "
-            "the paper's model that it does not list.",
-            "b": "One wrong digit: (2) and (4), the margin of pidtune's controller and the optimum all want 16.89 s.",
-        },
-    )
-
-
-def _reactor_loops(reactor: dict[str, Any]) -> Table:
-    found = step_figures(reactor_model(), reactor_controllers(reactor)["retuned"])
-    return Table(
-        "Reactor, overshoot with one and a half times the Ziegler-Nichols gain",
-        (Column("OV", 1, tol.OVERSHOOT, "%"),),
-        (Row("set-point step", (Cell(reactor["printed"]["retuned"]["overshoot_pct"], found.overshoot_pct),)),),
-        "With the printed gain, 1.5 times 0.7. It is sensitive: 1.5 times the unrounded 0.695 gives 9.2 %.",
-    )
-
-
-def _reactor_claims(reactor: dict[str, Any]) -> tuple[Claim, ...]:
-    model = reactor_model()
-    IAE = {name: step_figures(model, gains).IAE for name, gains in reactor_controllers(reactor).items()}
-    return (
-        Claim(
-            "On the reactor the optimised PI is best, pidtune's close to it, the Ziegler-Nichols PI last.",
-            f"IAE of a set-point step: {IAE['optimised']:.1f}, {IAE['pidtune']:.1f}, {IAE['ZN']:.1f} mol/m3 s.",
-            IAE["optimised"] < IAE["pidtune"] < 1.1 * IAE["optimised"] < IAE["ZN"],
-        ),
     )

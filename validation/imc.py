@@ -103,7 +103,7 @@ def _equation_39(references: References) -> Table:
         )
         for power, printed, ours in zip(("s^2", "s", "1"), polynomial, found, strict=True)
     ]
-    rows.append(Row("factor", (Cell(q["gain"], 1.0 / model.K, "a", 0.01),)))
+    rows.append(Row("factor", (Cell(q["gain"], 1.0 / model.K, "a", q["exact_gain"]),)))
     return Table(
         "Equation (39), Q(s) of case 1",
         (exact,),

@@ -92,23 +92,22 @@ def by_rule(references: References, name: str, rule: str) -> Gains:
 
 
 def _settings(references: References) -> Table:
-    rows = []
+    rows, by_formula = [], references.more["me_pso"]["lambda_rule"]
     for name, settings in references.rules["me_pso"]["table4"].items():
         for rule, printed in settings.items():
             if printed is None:
                 continue
             found = to_reciprocal(by_rule(references, name, rule))
             Kp, Ti = Cell(printed[0], found.Kp), Cell(printed[1], found.Ti)
-            fitted = moments(references, name)
             if (name, rule) == ("G4", "Lambda"):
-                Kp = Cell(printed[0], found.Kp, "a", fitted.T / (fitted.L + 3.0 * fitted.T))
-                Ti = Cell(printed[1], found.Ti, "a", fitted.L + 3.0 * fitted.T)
+                Kp = Cell(printed[0], found.Kp, "a", by_formula[name]["Kp"])
+                Ti = Cell(printed[1], found.Ti, "a", by_formula[name]["Ti"])
             elif (name, rule) == ("G5", "Lambda"):
-                Ti = Cell(printed[1], found.Ti, "b", fitted.L + 3.0 * fitted.T)
+                Ti = Cell(printed[1], found.Ti, "b", by_formula[name]["Ti"])
             rows.append(Row(f"{name} {rule}", (Kp, Ti)))
     return Table(
         "Table 4, settings of the classical rules",
-        (Column("Kp", 3, tol.CLASSICAL, own=tol.RULE), Column("Ti", 3, tol.CLASSICAL, own=tol.RULE)),
+        (Column("Kp", 3, tol.CLASSICAL), Column("Ti", 3, tol.CLASSICAL)),
         tuple(rows),
         "On FOPDT models by moments; Skogestad by the half rule, Tyreus-Luyben on the ultimate point. Cohen-Coon has a "
         "gain with 0.92 where the original has 0.092.",
