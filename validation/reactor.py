@@ -108,7 +108,7 @@ def claims(reactor: dict[str, Any]) -> tuple[Claim, ...]:
     return (
         Claim(
             "The initial state of the reactor is at rest.",
-            "With the heat of reaction and the reference temperature that the balance wants, all rates are below 1e-10.",
+            "With the heat of reaction and reference temperature that the balance wants, all rates are below 1e-10.",
             rest < 1e-10,
         ),
         Claim(
