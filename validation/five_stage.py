@@ -9,10 +9,11 @@ import numpy as np
 from scipy.optimize import brentq
 
 from tuning.gains import Gains
+from tuning.half_rule import half_rule
 from tuning.margins import margins, ultimate_point
 from tuning.models import FOPDT
 from tuning.recorded_step import fit_closed_loop, fit_step
-from tuning.reduction import half_rule, two_areas
+from tuning.reduction import two_areas
 from tuning.response import step_figures, step_response
 from tuning.robust import optimise
 from validation import reactor
