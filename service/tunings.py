@@ -7,7 +7,7 @@ just these, on the model as given with its exact dead time.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -64,8 +64,16 @@ def tune_model(model: Model, method: str = ALL, options: Mapping[str, object] | 
 
     Raises BadTuning. A method that refuses the model is in the list with its refusal.
     """
+    return tune_each(model, list(METHODS) if method == ALL else [method], options)
+
+
+def tune_each(model: Model, names: Sequence[str], options: Mapping[str, object] | None = None) -> list[Tuned]:
+    """By the methods named, in this order; as `tune_model`."""
+    for name in names:
+        if name not in METHODS:
+            raise BadTuning(f"method must be one of {', '.join(METHODS)}, not {name!r}")
+    methods = [METHODS[name] for name in names]
     asked = options or {}
-    methods = _methods(method)
     for name, value in asked.items():
         _check(methods, name, value)
     return [_tuned(each, model, {k: v for k, v in asked.items() if k in each.options}) for each in methods]
@@ -80,7 +88,7 @@ def answer(model: Model, found: Iterable[Tuned]) -> dict[str, Any]:
     """The JSON object; what is not known is null."""
     return {
         "model": dump_model(model),
-        "methods": [finite(as_json(each)) for each in found],
+        "methods": [as_json(each) for each in found],
         "form": FORM,
         "figures_are": OF_WHAT,
         "units": UNITS,
@@ -91,12 +99,13 @@ def as_json(found: Tuned) -> dict[str, Any]:
     """One method's part of the JSON object."""
     gains, assessed, refusal = found.gains, found.assessment, found.refusal
     parallel = to_parallel(gains) if gains else None
-    return {
+    told: dict[str, Any] = {
         "method": found.method.name,
         "title": found.method.title,
         "outcome": "refused" if refusal else "tuned",
         "reason": refusal.reason.value if refusal else None,
         "detail": refusal.detail if refusal else None,
+        "advice": refusal.advice if refusal else None,
         "gains": {"form": "ISA", **asdict(gains)} if gains else None,
         "parallel": {"Kp": parallel.Kp, "Ki": parallel.Ki, "Kd": parallel.Kd, "Tf": parallel.Tf} if parallel else None,
         "chosen": dict(found.chosen) if found.chosen is not None else None,
@@ -105,6 +114,8 @@ def as_json(found: Tuned) -> dict[str, Any]:
         "setpoint": _figures(assessed.setpoint) if assessed else None,
         "load": _figures(assessed.load) if assessed else None,
     }
+    clean: dict[str, Any] = finite(told)
+    return clean
 
 
 def methods_json() -> list[dict[str, Any]]:
@@ -129,14 +140,6 @@ def finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _methods(name: str) -> list[Method]:
-    if name == ALL:
-        return list(METHODS.values())
-    if name not in METHODS:
-        raise BadTuning(f"method must be {ALL} or one of {', '.join(METHODS)}, not {name!r}")
-    return [METHODS[name]]
 
 
 def _check(methods: list[Method], name: str, value: object) -> None:

@@ -1,0 +1,45 @@
+"""What other methods would make of the model that a job found, each with the wish that tries it on the loop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from service.jobs import Conflict
+from service.states import ACTIVE, JobState
+from service.store.tables import EventRow, JobRow
+from service.tunings import Tuned, answer, tune_each
+from tuning.methods import METHODS
+from tuning.models import FOPDT, SOPDT
+
+
+def alternatives(row: JobRow, events: Sequence[EventRow], method: str | None = None) -> dict[str, Any]:
+    """The JSON object of GET /jobs/{id}/alternatives: by the method named, else by all that are not slow.
+
+    Raises Conflict for a job that has no model (yet), BadTuning for an unknown method.
+    """
+    model = job_model(row, events)
+    names = [method] if method else [name for name, each in METHODS.items() if not each.slow]
+    found = tune_each(model, names)
+    told = answer(model, found)
+    for each, shown in zip(found, told["methods"], strict=True):
+        shown["retune"] = _retune(each, told["model"])
+    return {"job": row.id, "loop": row.loop, **told}
+
+
+def job_model(row: JobRow, events: Sequence[EventRow]) -> FOPDT | SOPDT:
+    """The model of the job's result, else the last that one of its stages found. Raises Conflict if there is none."""
+    if JobState(row.state) in ACTIVE:
+        raise Conflict(f"job {row.id} is not over: it has no model to compare methods on yet")
+    results = [event.data.get("result") for event in reversed(events) if event.kind == "stage_done"]
+    for data in [(row.result or {}).get("model"), *results]:
+        if data and all(isinstance(data.get(name), int | float) for name in ("K", "T_s", "L_s")):
+            K, T, L, zeta = data["K"], data["T_s"], data["L_s"], data.get("zeta")
+            return FOPDT(K, T, L) if zeta is None else SOPDT(K, T, zeta, L)
+    raise Conflict(f"job {row.id} ended as {row.state} before it had a model")
+
+
+def _retune(found: Tuned, model: dict[str, Any]) -> dict[str, Any] | None:
+    if found.assessment is None or not found.assessment.stable:
+        return None
+    return {"start": "optimise", "method": found.method.name, "model": model}
