@@ -79,6 +79,17 @@ def dump_model(model: Model) -> dict[str, Any]:
             return {"num": list(num), "den": list(den), "dead_time_s": L}
 
 
+def describe(data: Mapping[str, Any]) -> str:
+    """A model as dumped, on one line for people."""
+    parts = []
+    for name, value in data.items():
+        if name != "integrating":
+            shown = f"[{', '.join(f'{c:.4g}' for c in value)}]" if isinstance(value, list) else f"{value:.4g}"
+            unit = " s" if name in ("T", "T1", "T2", "L", "dead_time_s") else ""
+            parts.append(f"{name.removesuffix('_s').replace('_', ' ')} {shown}{unit}")
+    return ("integrating, " if data.get("integrating") else "") + ", ".join(parts)
+
+
 def _form(data: Mapping[str, object]) -> _Form:
     """The form whose own quantities are there."""
     if "num" in data or "den" in data:

@@ -11,9 +11,11 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from service.model_forms import describe, dump_model
 from service.record import Record
 from service.tunings import Tuned
 from tuning.identify import Identified
+from tuning.methods import METHODS
 from tuning.models import Model
 from tuning.response import Response, step_response
 
@@ -43,6 +45,7 @@ def responses(path: Path, model: Model, found: Sequence[Tuned]) -> None:
         axes[1, column].set_xlim(0.0, horizon)
     axes[0, 0].set_ylabel("change of PV, PV units")
     axes[1, 0].set_ylabel("change of MV, MV units")
+    figure.suptitle(describe(dump_model(model)))
     if stable:
         figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right upper", fontsize=10)
     figure.savefig(path, dpi=110)
@@ -70,8 +73,10 @@ def record_and_model(path: Path, record: Record, found: Identified) -> None:
 
 def _curves(axes: Axes, drawn: Sequence[Response], names: Sequence[str], of_mv: bool) -> None:
     lows, highs = [], []
-    for i, (response, name) in enumerate(zip(drawn, names, strict=True)):
+    for response, name in zip(drawn, names, strict=True):
         values = response.u if of_mv else response.y
+        # the same colour in every picture
+        i = list(METHODS).index(name)
         style = _LINES[i // 10 % len(_LINES)]
         axes.plot(response.t, values, label=name, linewidth=1.4, color=_COLOURS(i % 10), linestyle=style)
         lows.append(float(np.min(values)))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+
+from service.model_forms import describe
 
 console = Console(highlight=False)
 
@@ -44,13 +47,13 @@ def tunings(answer: dict[str, Any]) -> None:
     """A line for each method that gave gains; below it the refusals and what there is to know."""
     tuned = [each for each in answer["methods"] if each["outcome"] == "tuned"]
     refused = [each for each in answer["methods"] if each["outcome"] == "refused"]
-    console.print(f"Model {describe(answer['model'])}")
+    console.print(f"Model {escape(describe(answer['model']))}")
     if tuned:
         table = Table("method", box=None, padding=(0, 0, 0, 1), pad_edge=False)
         for heading, name, _ in _COLUMNS:
             table.add_column(heading or name, justify="right")
         for each in tuned:
-            cells = [short((each[part] or {}).get(name)) for _, name, part in _COLUMNS]
+            cells = [_cell(name, (each[part] or {}).get(name)) for _, name, part in _COLUMNS]
             if not each["margins"]["stable"]:
                 cells[3:] = ["unstable", *[""] * (len(cells) - 4)]
             table.add_row(each["method"], *cells)
@@ -81,37 +84,35 @@ def identified(answer: dict[str, Any]) -> None:
     if answer["outcome"] == "refused":
         console.print(f"[bold]{answer['reason']}[/bold]: {escape(answer['detail'])}\n{answer['advice']}")
         return
-    console.print(f"Model {describe(answer['model'])}")
+    console.print(f"Model {escape(describe(answer['model']))}")
     table = Table("", "value", "standard error", box=box.SIMPLE_HEAD, pad_edge=False)
     for name, error in answer["standard_errors"].items():
-        table.add_row(name, show_number(answer["model"].get(name)), show_number(error))
+        table.add_row(name, number(answer["model"].get(name)), number(error))
     console.print(table)
     white = "explains it" if answer["explained"] else "leaves a part unexplained"
     console.print(
         f"Fit {answer['fit_pct']:.2f} % (R2 {answer['r2_pct']:.3f} %) of {answer['samples']} samples; "
-        f"the model {white}; noise {show_number(answer['noise_std'])} PV units"
+        f"the model {white}; noise {number(answer['noise_std'])} PV units"
     )
     table = Table("structure", "BIC", "rms", "parameters", "from rest", "", box=box.SIMPLE_HEAD, pad_edge=False)
     for each in answer["candidates"]:
         table.add_row(
-            each["structure"], f"{each['bic']:.1f}", show_number(each["rms"]), str(each["parameters"]),
+            each["structure"], f"{each['bic']:.1f}", number(each["rms"]), str(each["parameters"]),
             "yes" if each["at_rest"] else "no", "chosen" if each["chosen"] else "",
         )  # fmt: skip
     console.print(table)
+    console.print("For `loopwright tune --model`: " + json.dumps(answer["model"]), markup=False, soft_wrap=True)
     for note in answer["notes"]:
         console.print(f"note: {note}", markup=False)
 
 
-def describe(model: dict[str, Any]) -> str:
-    """A model on one line, without its dataclass's punctuation."""
-    units = {"T": " s", "T1": " s", "T2": " s", "L": " s", "dead_time_s": " s"}
-    parts = []
-    for name, value in model.items():
-        if name == "integrating":
-            continue
-        shown = "[" + ", ".join(map(show_number, value)) + "]" if isinstance(value, list) else show_number(value)
-        parts.append(f"{name.removesuffix('_s').replace('_', ' ')} {shown}{units.get(name, '')}")
-    return escape(("integrating: " if model.get("integrating") else "") + ", ".join(parts))
+def _cell(name: str, value: float | None) -> str:
+    # a percentage has no digits to show below rounding
+    return short(round(value, 6) if value is not None and name.endswith("_pct") else value)
+
+
+def number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
 
 
 def short(value: float | None) -> str:
@@ -120,10 +121,6 @@ def short(value: float | None) -> str:
         return "-"
     rounded = float(f"{value:.3g}")
     return f"{rounded:.0f}" if 100.0 <= abs(rounded) < 1e6 else f"{rounded:.3g}"
-
-
-def show_number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
 
 
 def _option(option: dict[str, Any]) -> str:
