@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -37,12 +38,15 @@ def tune(
     as_json: AsJson = False,
 ) -> None:
     """Gains for a process model by one method or all, compared on it. Exit 0: gains found, 3: none."""
+    # the matrices are small: threads of the linear algebra cost more than they save
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from service import tunings
     from service.model_forms import BadModel, parse_model
 
     _check(plot)
     try:
-        given = json_object(model, "--model") if model.lstrip().startswith("{") else read_json_object(Path(model))
+        typed = model.lstrip().startswith(("{", "["))
+        given = json_object(model, "--model") if typed else read_json_object(Path(model))
         plant = parse_model(given)
         found = tunings.tune_model(plant, method, dict(_option(text) for text in option or ()))
     except (BadModel, tunings.BadTuning) as error:

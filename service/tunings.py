@@ -174,8 +174,7 @@ def _tuned(method: Method, model: Model, options: Mapping[str, object]) -> Tuned
 
 def _margins(found: Assessment) -> dict[str, Any]:
     m = found.margins
-    return {
-        "stable": m.stable,
+    margins = {
         "Ms": m.Ms,
         "Mt": m.Mt,
         "GM": m.GM,
@@ -183,6 +182,8 @@ def _margins(found: Assessment) -> dict[str, Any]:
         "delay_margin_s": m.delay_margin_s,
         "bandwidth_rad_s": m.bandwidth,
     }
+    # an unstable loop has a curve, but no margins
+    return {"stable": m.stable} | (margins if m.stable else dict.fromkeys(margins))
 
 
 def _figures(found: StepFigures | None) -> dict[str, Any] | None:

@@ -61,11 +61,11 @@ class ParallelView(BaseModel):
 
 
 class MarginsView(BaseModel):
-    """Of the loop on the model; null where there is no such crossing."""
+    """Of the loop on the model; null where there is no such crossing, all for an unstable loop."""
 
     stable: bool
-    Ms: float = Field(description="Maximum sensitivity", examples=[1.59])
-    Mt: float = Field(description="Maximum complementary sensitivity", examples=[1.0])
+    Ms: float | None = Field(description="Maximum sensitivity", examples=[1.59])
+    Mt: float | None = Field(description="Maximum complementary sensitivity", examples=[1.0])
     GM: float | None = Field(description="Gain margin, ratio", examples=[3.1])
     PM_deg: float | None = Field(description="Phase margin, degrees", examples=[61.0])
     delay_margin_s: float | None = Field(description="Dead time that the loop bears in addition, s", examples=[2.1])
