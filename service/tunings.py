@@ -19,7 +19,7 @@ from tuning.forms import to_parallel
 from tuning.gains import Gains
 from tuning.methods import METHODS, Method, Option
 from tuning.models import Model
-from tuning.reasons import Ended, Refused
+from tuning.reasons import Ended, Failed, Reason, Refused
 
 ALL = "all"
 FORM = "ISA: u = Kp*(b*SP - PV + integral(SP - PV)/Ti + Td*d/dt(c*SP - PV)/(1 + Tf*s)); Ti = 0: no integral"
@@ -167,6 +167,9 @@ def _tuned(method: Method, model: Model, options: Mapping[str, object]) -> Tuned
         assessed = assess(model, gains)
     except Ended as refusal:
         return Tuned(method, refusal=refusal)
+    except (ArithmeticError, ValueError) as error:
+        # one method's defect must not take the other methods' answers with it
+        return Tuned(method, refusal=Failed(Reason.INTERNAL, f"{type(error).__name__}: {error}"))
     if not assessed.stable:
         notes += ("With these gains the loop is unstable on this model.",)
     return Tuned(method, gains, setting.chosen, setting.notes + notes, assessed)
