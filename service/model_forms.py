@@ -80,7 +80,10 @@ def dump_model(model: Model) -> dict[str, Any]:
 
 
 def describe(data: Mapping[str, Any]) -> str:
-    """A model as dumped, on one line for people."""
+    """A model as dumped, on one line for people; two real lags are shown as such."""
+    model = parse_model(data)
+    if isinstance(model, SOPDT) and model.zeta >= 1.0:
+        data = {"K": model.K, "T1": model.T1, "T2": model.T2, "L": model.L}
     parts = []
     for name, value in data.items():
         if name != "integrating":
