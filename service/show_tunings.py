@@ -68,8 +68,8 @@ def tunings(answer: dict[str, Any]) -> None:
         _hanging([(each["method"], f"{each['reason']}: {each['detail']}") for each in refused])
     if len(tuned) == 1:
         chosen = ", ".join(f"{name} {short(value)}" for name, value in tuned[0]["chosen"].items())
-        parallel = ", ".join(f"{name} {short(tuned[0]['parallel'][name])}" for name in ("Kp", "Ki", "Kd"))
-        console.print(f"\nParallel form: {parallel} (per s, s)" + (f"\nChosen: {chosen}" if chosen else ""))
+        Kp, Ki, Kd = (short(tuned[0]["parallel"][name]) for name in ("Kp", "Ki", "Kd"))
+        console.print(f"\nParallel form: Kp {Kp}, Ki {Ki} per s, Kd {Kd} s" + (f"\nChosen: {chosen}" if chosen else ""))
     notes: dict[str, list[str]] = {}
     for each in tuned:
         for note in each["notes"]:
