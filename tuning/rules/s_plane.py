@@ -279,8 +279,6 @@ class _Rational:
         total[:, :-1] = self.a
         for power, gain in enumerate((gains[:, 1], gains[:, 0], gains[:, 2])):
             top = size - power - len(self.b)
-            if top < 0:
-                continue  # a bi-proper plant, which gets no derivative
             total[:, top : top + len(self.b)] += gain[:, None] * self.b
         return total
 

@@ -320,18 +320,3 @@ def test_what_cannot_be_done_is_refused(model: Model, options: dict[str, Any], s
     with pytest.raises(Refused, match=said) as refused:
         s_plane(model, **options)
     assert refused.value.reason is Reason.BAD_INPUT
-
-
-@pytest.mark.parametrize("num", [(1.0, 2.0, 3.0), (0.2, 2.0, 3.0)])
-def test_a_pi_on_a_biproper_plant(num: tuple[float, ...]) -> None:
-    plant = TransferFunction(num, (1.0, 3.0, 3.0))
-    found = s_plane(plant, mu=0.3)
-    Kp, Ki = found.gains.Kp, found.gains.Kp / found.gains.Ti
-    characteristic = np.polyadd(np.polymul((1.0, 0.0), plant.den), np.polymul((Kp, Ki), num))
-    alpha = found.chosen["alpha_per_s"]
-    pair = complex(-alpha, 0.3 * alpha)
-    assert np.abs(np.roots(characteristic) - pair).min() < 1e-9 * alpha
-    # e is a sum of exponentials r*exp(p*t), its square's integral the sum of -r1*r2/(p1 + p2)
-    r, p, _ = signal.residue(plant.den, characteristic)
-    squares = -np.sum(np.outer(r, r) / np.add.outer(p, p)).real
-    assert found.chosen["J0_s"] == pytest.approx(squares, rel=1e-9)
