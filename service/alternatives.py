@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from service.jobs import Conflict
+from service.request import ProcessModel
 from service.states import ACTIVE, JobState
 from service.store.tables import EventRow, JobRow
 from service.tunings import Tuned, answer, tune_each
+from tuning.design import LEAST_GM, MOST_Ms
 from tuning.methods import METHODS
 from tuning.models import FOPDT, SOPDT
 
@@ -23,7 +25,7 @@ def alternatives(row: JobRow, events: Sequence[EventRow], method: str | None = N
     found = tune_each(model, names)
     told = answer(model, found)
     for each, shown in zip(found, told["methods"], strict=True):
-        shown["retune"] = _retune(each, told["model"])
+        shown["retune"] = _retune(each, model)
     return {"job": row.id, "loop": row.loop, **told}
 
 
@@ -39,7 +41,12 @@ def job_model(row: JobRow, events: Sequence[EventRow]) -> FOPDT | SOPDT:
     raise Conflict(f"job {row.id} ended as {row.state} before it had a model")
 
 
-def _retune(found: Tuned, model: dict[str, Any]) -> dict[str, Any] | None:
-    if found.assessment is None or not found.assessment.stable:
+def _retune(found: Tuned, model: FOPDT | SOPDT) -> dict[str, Any] | None:
+    """None for gains that the service would not try on a loop (see `tuning.design`)."""
+    if found.assessment is None:
         return None
-    return {"start": "optimise", "method": found.method.name, "model": model}
+    m = found.assessment.margins
+    if not (m.stable and m.Ms <= MOST_Ms and (m.GM is None or m.GM >= LEAST_GM)):
+        return None
+    asked = ProcessModel(K=model.K, T_s=model.T, L_s=model.L, zeta=model.zeta if isinstance(model, SOPDT) else None)
+    return {"start": "optimise", "method": found.method.name, "model": asked.model_dump(exclude_none=True)}

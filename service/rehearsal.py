@@ -18,7 +18,7 @@ from controller.pid import Parameters
 from plantsim.plant import LinearPlant, Plant
 from service.loop import LoopState
 from service.runner import RunResult, Watch, run
-from tuning.five_stage import STAGES, Facts, Options, Proposal, five_stage
+from tuning.five_stage import PROCEDURE, STAGES, Facts, Options, Proposal, five_stage
 from tuning.gains import Gains
 from tuning.margins import ultimate_point
 from tuning.models import TransferFunction
@@ -36,7 +36,6 @@ from tuning.plan import (
 )
 from tuning.reasons import Ended, Failed, Reason, Refused
 
-METHODS = ("five-stage",)
 LEASE_SAMPLES = 1_000_000
 
 
@@ -202,7 +201,7 @@ def _t95(file: PlantFile) -> float:
 
 
 def rehearse(
-    spec: dict[str, Any], method: str = "five-stage", on_event: Callable[[Event], None] | None = None, **options: Any
+    spec: dict[str, Any], method: str = PROCEDURE, on_event: Callable[[Event], None] | None = None, **options: Any
 ) -> dict[str, Any]:
     """Preflight to verification on a model in memory. Returns the JSON object of `loopwright rehearse`.
 
@@ -218,11 +217,10 @@ def rehearse(
             on_event(event)
 
     try:
-        if method not in METHODS:
-            raise Refused(Reason.BAD_INPUT, f"method {method!r} is not one of {', '.join(METHODS)}")
         file = _complete(PlantFile.model_validate(spec))
         loop, facts = _loop(file)
-        outcome = run(five_stage(facts, Options(**options)), loop, watch=_watch(facts, _reach(file)), on_event=listen)
+        plan = five_stage(facts, Options(method=method, **options))
+        outcome = run(plan, loop, watch=_watch(facts, _reach(file)), on_event=listen)
     except ValidationError as error:
         lines = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'file'}: {e['msg']}" for e in error.errors())
         return _answer(None, RunResult(ended=Refused(Reason.BAD_INPUT, lines)), results)
@@ -265,7 +263,8 @@ def _answer(file: PlantFile | None, outcome: RunResult[Proposal], results: dict[
     times = {stage: outcome.plant_time_s[stage] for stage in STAGES if stage in outcome.plant_time_s}
     answer: dict[str, Any] = {
         "name": file.name if file else None,
-        "method": "five-stage",
+        "method": proposal.method if proposal else None,
+        "chosen": dict(proposal.chosen) if proposal else None,
         "outcome": "proposed" if proposal else "failed" if isinstance(ended, Failed) else "refused",
         "reason": ended.reason.value if ended else None,
         "detail": ended.detail if ended else None,
@@ -286,7 +285,9 @@ def _answer(file: PlantFile | None, outcome: RunResult[Proposal], results: dict[
     if proposal:
         model = proposal.model
         answer["model"] = {"K": model.K, "T": model.T_s, "L": model.L_s, "k_source": model.k_source}
-        answer["gains"] = {"Kp": proposal.gains.Kp, "Ti": proposal.gains.Ti, "Td": proposal.gains.Td}
+        answer["model"] |= {"zeta": model.zeta, "fit_pct": model.fit_pct}
+        gains = proposal.gains
+        answer["gains"] = {"Kp": gains.Kp, "Ti": gains.Ti, "Td": gains.Td, "Tf": gains.Tf}
         answer["predicted"] = asdict(proposal.predicted)
         answer["measured"] = {
             "before": asdict(proposal.baseline) if proposal.baseline else None,

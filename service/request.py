@@ -7,6 +7,10 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from service.config import LoopConfig
+from tuning.five_stage import PROCEDURE, rule_of
+from tuning.methods import METHODS
+from tuning.models import FOPDT, SOPDT
+from tuning.reasons import Refused
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -18,14 +22,26 @@ class BadLimits(ValueError):
     """The limits asked for contradict each other or the loop's configuration."""
 
 
-class Fopdt(BaseModel):
-    """K exp(-L s) / (T s + 1)."""
+class ProcessModel(BaseModel):
+    """K exp(-L s) / (T s + 1), or with zeta K exp(-L s) / (T^2 s^2 + 2 zeta T s + 1)."""
 
     model_config = ConfigDict(extra="forbid")
 
     K: Finite = Field(description="Static gain, PV units per MV unit (percent)", examples=[0.8])
-    T_s: Positive = Field(description="Time constant, s", examples=[3.0])
+    T_s: Positive = Field(description="Time constant, s; of second order 1/(natural frequency)", examples=[3.0])
     L_s: NotNegative = Field(description="Dead time, s", examples=[1.0])
+    zeta: Positive | None = Field(default=None, description="Damping ratio; leave out for first order", examples=[1.2])
+
+    def plant(self) -> FOPDT | SOPDT:
+        if self.zeta is None:
+            return FOPDT(self.K, self.T_s, self.L_s)
+        return SOPDT(self.K, self.T_s, self.zeta, self.L_s)
+
+    @model_validator(mode="after")
+    def _gain(self) -> Self:
+        if self.K == 0:
+            raise ValueError("K must not be 0")
+        return self
 
 
 class PlantModel(BaseModel):
@@ -48,7 +64,20 @@ class RetuneRequest(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    method: Literal["five-stage"] = Field(default="five-stage", description="Tuning procedure")
+    method: str = Field(
+        default=PROCEDURE,
+        description="What gives the gains once the experiment has given the model: the five-stage procedure's own "
+        "optimisation, or any of GET /methods",
+        json_schema_extra={"enum": [PROCEDURE, *METHODS]},
+    )
+    method_options: dict[str, bool | float | str] = Field(
+        default_factory=dict, description="Options of the method, by name", examples=[{"lambda_s": 12.0}]
+    )
+    model_from: Literal["overshoot", "record"] | None = Field(
+        default=None,
+        description="Model for the method: the estimate from the overshoot, or one identified from the set-point step; "
+        "by default the first for five-stage, the second for the others if it explains the step",
+    )
     dry_run: bool = Field(default=False, description="Rehearse in memory; the loop is not touched")
     sp_deviation: Positive | None = Field(
         default=None, description="Permitted set-point step, PV units; at most the loop's own", examples=[2.0]
@@ -74,7 +103,7 @@ class RetuneRequest(BaseModel):
     overshoot_pct: Positive | None = Field(
         default=None, description="Overshoot of the recorded PI step, percent, for start=estimate", examples=[25.0]
     )
-    model: Fopdt | None = Field(
+    model: ProcessModel | None = Field(
         default=None, description="Model for start=optimise; in a dry run without `plant` the plant itself"
     )
     k_source: Literal["k5", "ke"] = Field(
@@ -93,6 +122,18 @@ class RetuneRequest(BaseModel):
     verify: bool = Field(default=True, description="Record the set-point step with the new gains")
     plant: PlantModel | None = Field(default=None, description="Plant to rehearse on; only with dry_run")
     requested_by: str = Field(default="api", max_length=100, description="Who asks", examples=["night shift"])
+
+    @model_validator(mode="after")
+    def _known_method(self) -> Self:
+        if self.method != PROCEDURE and self.method not in METHODS:
+            raise ValueError(f"method must be one of {PROCEDURE}, {', '.join(METHODS)}, not {self.method!r}")
+        if self.model_from == "record" and self.start in ("estimate", "optimise"):
+            raise ValueError(f"model_from=record needs the step of stage zn_pi; the start is {self.start}")
+        try:
+            METHODS[rule_of(self.method)].checked(self.method_options)
+        except Refused as refused:
+            raise ValueError(refused.detail) from refused
+        return self
 
     @model_validator(mode="after")
     def _complete(self) -> Self:

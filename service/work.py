@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
@@ -10,7 +11,6 @@ from typing import Any, Protocol, cast
 from service.config import LoopConfig
 from service.loop import Loop, LoopState
 from service.request import RetuneRequest
-from tuning.models import FOPDT
 from tuning.plan import Event, Sample
 from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 
@@ -93,7 +93,7 @@ def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcom
 
     spec = rehearsal_spec(config, request)
     # A model typed in for a dry run is the plant itself; the procedure still starts where the request says.
-    answer = rehearse_spec(spec, method=request.method, on_event=hooks.on_event, **_options(request))
+    answer = rehearse_spec(spec, on_event=hooks.on_event, **_options(request))
     times = {name: float(value) for name, value in (answer.get("plant_time_s") or {}).items() if name != "total"}
     if answer["outcome"] == "proposed":
         return Outcome(_as_proposal(answer), None, None, times)
@@ -112,10 +112,13 @@ def _options(request: RetuneRequest) -> dict[str, Any]:
         "Kp": request.Kp,
         "Ti_s": request.Ti_s,
         "overshoot_pct": request.overshoot_pct,
-        "model": FOPDT(model.K, model.T_s, model.L_s) if model else None,
+        "model": model.plant() if model else None,
         "k_source": request.k_source,
         "kp_step_factor": request.kp_step_factor,
         "overshoot_window_pct": request.overshoot_window_pct,
+        "method": request.method,
+        "method_options": request.method_options,
+        "model_from": request.model_from,
         "baseline": request.baseline,
         "verify": request.verify,
     }
@@ -126,7 +129,10 @@ def _as_proposal(answer: dict[str, Any]) -> dict[str, Any]:
     ultimate, model, measured = (answer.get(key) or {} for key in ("ultimate", "model", "measured"))
     return {
         "ultimate": {"Ku": ultimate["Ku"], "Pu_s": ultimate["Pu"]} if ultimate else None,
-        "model": {"K": model.get("K"), "T_s": model.get("T"), "L_s": model.get("L"), "k_source": model.get("k_source")},
+        "method": answer.get("method"),
+        "chosen": answer.get("chosen") or {},
+        "model": model and {"K": model["K"], "T_s": model["T"], "L_s": model["L"]}
+        | {key: model.get(key) for key in ("zeta", "k_source", "fit_pct")},
         "old_gains": (answer.get("input") or {}).get("gains"),
         "gains": answer.get("gains"),
         "predicted": answer.get("predicted"),
@@ -151,8 +157,8 @@ def rehearsal_spec(config: LoopConfig, request: RetuneRequest) -> dict[str, Any]
     if request.plant is not None:
         return spec | request.plant.model_dump(exclude_none=True)
     if request.model is not None:
-        model = request.model
-        return spec | {"num": [model.K], "den": [model.T_s, 1.0], "dead_time_s": model.L_s}
+        plant = request.model.plant()
+        return spec | {"num": list(plant.num), "den": list(plant.den), "dead_time_s": plant.L}
     # Nothing is known but T95 = L + 3 T (a FOPDT's 95 % time): a fifth of it as dead time is a typical loop, and a
     # tenth of the MV range for the permitted set-point step is a loop that was sized sensibly.
     dead_time = 0.2 * config.t95_s
@@ -169,14 +175,15 @@ def plain(value: object) -> dict[str, Any] | None:
 
 
 def _plain(value: Any) -> Any:
-    """Dataclasses, tuples and numpy scalars become what JSON knows."""
+    """Dataclasses, tuples and numpy scalars become what JSON knows; a number that is none becomes null."""
     if is_dataclass(value) and not isinstance(value, type):
         return _plain({f.name: getattr(value, f.name) for f in fields(value)})
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
-    return value.item() if hasattr(value, "item") else value
+    value = value.item() if hasattr(value, "item") else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _reason(text: object) -> Reason:

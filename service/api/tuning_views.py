@@ -7,6 +7,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.api.views import GainsView
+from tuning.design import LEAST_GM, MOST_Ms
 from tuning.reasons import Reason
 
 
@@ -122,8 +123,8 @@ class TuningsView(BaseModel):
 class AlternativeView(TunedView):
     retune: dict[str, Any] | None = Field(
         description="Body for POST /loops/{tag}/retune, which tries these gains on the loop without another "
-        "experiment; null where there are no gains, or unstable ones",
-        examples=[{"start": "optimise", "method": "simc", "model": {"K": 0.8, "T": 3.0, "L": 1.0}}],
+        f"experiment; null without gains, or where Ms is above {MOST_Ms:g} or GM below {LEAST_GM:g}",
+        examples=[{"start": "optimise", "method": "simc", "model": {"K": 0.8, "T_s": 3.0, "L_s": 1.0}}],
     )
 
 

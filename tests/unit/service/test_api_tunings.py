@@ -9,9 +9,11 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.model_forms import parse_model
+from service.request import RetuneRequest
 from service.tunings import tunings
 from tests.unit.service.fakes import RESULT, Service
 from tests.unit.service.test_api import assert_problem, finished, start
+from tuning.design import design
 from tuning.methods import METHODS
 from tuning.models import FOPDT, SOPDT
 from tuning.reasons import Reason, Refused
@@ -86,9 +88,20 @@ def test_alternatives_to_a_proposal(service: Service, client: TestClient) -> Non
     # the job's model, in the form that POST /tunings takes
     assert found["model"] == {"K": 2.0, "T": 3.0, "L": 1.0}
     assert [each["method"] for each in found["methods"]] == FAST
+    tried = {each["method"] for each in found["methods"] if each["retune"]}
+    assert {"simc", "amigo", "robust"} <= tried < set(FAST)
     for each in found["methods"]:
-        wish = {"start": "optimise", "method": each["method"], "model": found["model"]}
-        assert each["retune"] == (wish if each["outcome"] == "tuned" else None)
+        if each["outcome"] == "refused":
+            assert each["retune"] is None
+            continue
+        try:
+            design(each["method"], FOPDT(2.0, 3.0, 1.0), None)
+        except Refused as refused:
+            assert refused.reason is Reason.NOT_ROBUST and each["retune"] is None
+        else:
+            asked = RetuneRequest(**each["retune"])
+            assert asked.start == "optimise" and asked.method == each["method"]
+            assert asked.model and asked.model.plant() == FOPDT(2.0, 3.0, 1.0)
     direct = client.post("/tunings", json={"model": found["model"], "method": "amigo"}).json()["methods"][0]
     (amigo,) = [each for each in found["methods"] if each["method"] == "amigo"]
     assert {name: value for name, value in amigo.items() if name != "retune"} == direct
@@ -125,6 +138,8 @@ def test_a_second_order_model(service: Service, client: TestClient, monkeypatch:
     job = finished(service, client)
     found = client.get(f"{job['url']}/alternatives?method=direct-synthesis").json()
     assert parse_model(found["model"]) == SOPDT(2.0, 6.0, 0.5, 3.0)
+    asked = RetuneRequest(**found["methods"][0]["retune"])
+    assert asked.model and asked.model.plant() == SOPDT(2.0, 6.0, 0.5, 3.0)
 
 
 def test_a_refused_job_whose_stages_found_a_model(service: Service, client: TestClient) -> None:
