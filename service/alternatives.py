@@ -30,11 +30,11 @@ def alternatives(row: JobRow, events: Sequence[EventRow], method: str | None = N
 
 
 def job_model(row: JobRow, events: Sequence[EventRow]) -> FOPDT | SOPDT:
-    """The model of the job's result, else the last that one of its stages found. Raises Conflict if there is none."""
+    """The model of the job's result, else the last that a stage found, else the one typed in; or Conflict."""
     if JobState(row.state) in ACTIVE:
         raise Conflict(f"job {row.id} is not over: it has no model to compare methods on yet")
     results = [event.data.get("result") for event in reversed(events) if event.kind == "stage_done"]
-    for data in [(row.result or {}).get("model"), *results]:
+    for data in [(row.result or {}).get("model"), *results, row.request.get("model")]:
         if data and all(isinstance(data.get(name), int | float) for name in ("K", "T_s", "L_s")):
             K, T, L, zeta = data["K"], data["T_s"], data["L_s"], data.get("zeta")
             return FOPDT(K, T, L) if zeta is None else SOPDT(K, T, zeta, L)

@@ -154,6 +154,14 @@ def test_a_refused_job_whose_stages_found_a_model(service: Service, client: Test
     assert job["state"] == "refused" and found["model"] == {"K": 2.0, "T": 3.0, "L": 1.0}
 
 
+def test_a_refused_job_whose_model_was_typed_in(service: Service, client: TestClient) -> None:
+    service.tune.ends = Refused(Reason.NOT_CONFIRMED, "overshoot 60 %")
+    model = {"K": 2.0, "T_s": 6.0, "L_s": 3.0, "zeta": 0.5}
+    job = finished(service, client, start="optimise", model=model)
+    found = client.get(f"{job['url']}/alternatives?method=direct-synthesis").json()
+    assert job["state"] == "refused" and found["model"] == {"K": 2.0, "T": 6.0, "zeta": 0.5, "L": 3.0}
+
+
 def test_jobs_without_a_model(service: Service, client: TestClient) -> None:
     assert_problem(client.get("/jobs/none/alternatives"), 404)
     service.tune.hold.clear()
