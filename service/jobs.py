@@ -15,7 +15,9 @@ from dataclasses import asdict
 from typing import Any
 
 from service.config import LoopConfig
+from service.logs import about
 from service.loop import Loop, LoopState
+from service.metrics import STAGE_SECONDS
 from service.observed import ObservedLoop
 from service.progress import Progress
 from service.request import RetuneRequest, within
@@ -62,6 +64,7 @@ class Running:
         self._store = store
         self._buffer: list[Sample] = []
         self._stage = "preflight"
+        self._stage_since = 0.0
         self._boundaries: list[tuple[float, str]] = []
         self._last_t = -math.inf
         self._flushed = time.monotonic()
@@ -70,6 +73,7 @@ class Running:
         self.keep_time()
         if isinstance(event, StageStarted):
             self.progress.stage_started(event)
+            self._stage_since = self.progress.plant_time_s
             self._boundaries.append((self._last_t, event.stage))
             self._store.update(self.job_id, stage=event.stage, plant_time_s=self.progress.plant_time_s)
             data: dict[str, Any] = {
@@ -77,6 +81,8 @@ class Running:
             }  # fmt: skip
             self._tell("stage_started", data)
         elif isinstance(event, StageDone):
+            if self.loop is not None:  # a rehearsal has no plant whose time it takes
+                STAGE_SECONDS.labels(event.stage).observe(self.progress.plant_time_s - self._stage_since)
             self._tell("stage_done", {"stage": event.stage, "result": plain(event.result)})
         elif isinstance(event, Note):
             self._tell("note", {"stage": self.progress.stage, "text": event.text})
@@ -181,7 +187,7 @@ class Jobs:
             raise IllegalMove(JobState(row.state), JobState.ABORTED)
         if running.stop_reason is None:
             running.stop_reason = Reason.OPERATOR
-            self.store.append(job_id, "abort_requested", {"by": by}, running.progress.plant_time_s)
+            self.store.abort_requested(job_id, by, running.progress.plant_time_s)
         return row
 
     def request_stop(self) -> None:
@@ -222,7 +228,11 @@ class Jobs:
                 return self.store.move(job_id, wanted, by=by)
             old, new = gains_of(row.old_gains), gains_of((row.result or {}).get("gains"))
             before, after = (old, new) if wanted is JobState.ACCEPTED else (new, old)
-            state = self._exchange(self.config(row.loop), before, after)
+            try:
+                state = self._exchange(self.config(row.loop), before, after)
+            except Ended as ended:
+                self.store.decision_failed(job_id, wanted, by, f"{ended.reason.value}: {ended.detail}")
+                raise
             return self.store.move(job_id, wanted, by=by, restored=state_json(state))
 
     def _exchange(self, config: LoopConfig, before: Gains, after: Gains) -> LoopState:
@@ -243,17 +253,22 @@ class Jobs:
 
     # the thread of a job
     def _work(self, running: Running, config: LoopConfig, request: RetuneRequest) -> None:
+        with about(job=running.job_id, loop=config.tag):
+            log.info("job started")
+            self._do(running, config, request)
+
+    def _do(self, running: Running, config: LoopConfig, request: RetuneRequest) -> None:
         try:
             outcome = self._dry(running, config, request) if request.dry_run else self._live(running, config, request)
         except Ended as ended:
             outcome = Outcome(None, ended, None, {})
         except Exception as error:
-            log.exception("job %s", running.job_id)
+            log.exception("a defect in the job")
             outcome = Outcome(None, Failed(Reason.INTERNAL, f"{type(error).__name__}: {error}"), None, {})
         try:
             self._finish(running, outcome)
         except Exception:
-            log.exception("job %s: its end could not be written", running.job_id)
+            log.exception("the end of the job could not be written")
         finally:
             self._running.pop(running.job_id, None)
 
@@ -294,10 +309,12 @@ class Jobs:
             columns["restored"] = state_json(outcome.restored)
         if outcome.ended is None:
             self.store.move(running.job_id, JobState.PROPOSED, **columns)
+            log.info("job proposes new gains")
         else:
             ended = outcome.ended
             columns |= {"reason": ended.reason.value, "detail": ended.detail}
             self.store.move(running.job_id, state_after(ended), **columns)
+            log.warning("job %s, %s: %s", state_after(ended).value, ended.reason.value, ended.detail)
 
 
 def gains_of(data: dict[str, Any] | None) -> Gains:

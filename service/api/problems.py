@@ -97,3 +97,9 @@ def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     return {
         status: {"model": Problem, "content": content, "description": HTTPStatus(status).phrase} for status in statuses
     }
+
+
+def documented(*statuses: int) -> dict[int, dict[str, Any]]:
+    """The same for a document that is made already."""
+    content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    return {status: {"content": content, "description": HTTPStatus(status).phrase} for status in statuses}

@@ -8,21 +8,27 @@ import secrets
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from alembic import command
 from alembic.config import Config
-from sqlalchemy import create_engine, event, func, select
+from sqlalchemy import Engine, create_engine, event, func, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session, sessionmaker
 
+from service.security import audit
 from service.states import ACTIVE, JobState, check
 from service.store import chunks
+from service.store.clock import now
 from service.store.tables import ChunkRow, EventRow, JobRow
 from tuning.plan import Sample
+from tuning.reasons import Reason
 
+DATABASE_FILE = "loopwright.sqlite"
+LOCK_FILE = "lock"
+DECISIONS = {JobState.ACCEPTED: "accept", JobState.ROLLED_BACK: "rollback"}
+"""What the audit log calls the moves that somebody decides."""
 _ACTIVE = [state.value for state in ACTIVE]
 
 
@@ -51,29 +57,14 @@ class Store:
     """Opens (and if needed creates or migrates) `loopwright.sqlite` in the data folder."""
 
     def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        self._folder_lock = open(folder / "lock", "w")  # noqa: SIM115 - held until close
-        try:
-            fcntl.flock(self._folder_lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            self._folder_lock.close()
-            raise FolderInUse(f"another service works in the data folder {folder}") from error
+        self._folder_lock = lock_folder(folder)
         # One writer at a time inside the process: "read the last seq, write the next" must not interleave.
         self._write_lock = threading.Lock()
-        self._engine = create_engine(f"sqlite:///{folder / 'loopwright.sqlite'}", connect_args={"timeout": 5.0})
-        event.listen(self._engine, "connect", _pragmas)
-        self._session = sessionmaker(self._engine, expire_on_commit=False)
-        self._migrate()
-
-    def _migrate(self) -> None:
-        config = Config()
-        config.set_main_option("script_location", "service.store:migrations")
-        with self._engine.begin() as connection:
-            config.attributes["connection"] = connection
-            command.upgrade(config, "head")
+        self.engine = open_database(folder)
+        self._session = sessionmaker(self.engine, expire_on_commit=False)
 
     def close(self) -> None:
-        self._engine.dispose()
+        self.engine.dispose()
         self._folder_lock.close()
 
     @contextmanager
@@ -98,6 +89,7 @@ class Store:
                 session.add(row)
                 session.flush()
                 _append(session, row.id, "state", {"state": row.state, "by": requested_by}, 0.0)
+                audit.record(session, "retune", row.id, after=row.request, loop=loop, said_by=requested_by)
         except IntegrityError as error:
             active = self.active(loop)
             if active is None:
@@ -120,6 +112,8 @@ class Store:
             told = {"state": wanted.value, "from": previous.value, "by": by}
             told |= {key: columns[key] for key in ("reason", "detail") if columns.get(key)}
             _append(session, job_id, "state", told, row.plant_time_s)
+            if wanted in (JobState.ACCEPTED, JobState.ROLLED_BACK):
+                _audit_decision(session, row, previous, wanted, by)
             return row
 
     def update(self, job_id: str, **columns: Any) -> None:
@@ -156,10 +150,36 @@ class Store:
         with self._writing() as session:
             _append(session, job_id, kind, data, plant_time_s)
 
+    def abort_requested(self, job_id: str, by: str, plant_time_s: float) -> None:
+        """Writes down who wants the job to end."""
+        with self._writing() as session:
+            row = _find(session, job_id)
+            _append(session, job_id, "abort_requested", {"by": by}, plant_time_s)
+            audit.record(session, "abort", job_id, before={"state": row.state}, loop=row.loop, said_by=by)
+
+    def decision_failed(self, job_id: str, wanted: JobState, by: str, detail: str) -> None:
+        """A decision that reached for the controller and ended in an error: its gains may have been written."""
+        with self._writing() as session:
+            row = _find(session, job_id)
+            what = f"{DECISIONS[wanted]}_failed"
+            audit.record(
+                session, what, job_id, before={"state": row.state}, after={"error": detail}, loop=row.loop, said_by=by
+            )
+
     def events(self, job_id: str, after: int = 0) -> Sequence[EventRow]:
         wanted = select(EventRow).where(EventRow.job_id == job_id, EventRow.seq > after).order_by(EventRow.seq)
         with self._session() as session:
             return session.scalars(wanted).all()
+
+    def restored(self, source: str) -> int:
+        """Ends what was active when a back-up was made: its experiment is long over. Returns how many jobs."""
+        active = self.unfinished()
+        for row in active:
+            detail = f"was {row.state} when the back-up was made that has now been restored"
+            self.move(row.id, JobState.INTERRUPTED, reason=Reason.SERVICE_STOPPED.value, detail=detail)
+        with self._writing() as session:
+            audit.record(session, "restore", source, after={"interrupted": [row.id for row in active]})
+        return len(active)
 
     # samples
     def add_samples(self, job_id: str, stage: str, samples: Sequence[Sample]) -> None:
@@ -182,9 +202,28 @@ class Store:
         return [(row.stage, chunks.unpack(row.data, row.count, row.first_t_s)) for row in rows]
 
 
-def now() -> str:
-    """UTC, ISO 8601, milliseconds."""
-    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+def lock_folder(folder: Path) -> IO[str]:
+    """Makes the data folder if need be, and takes it for this process until the answer is closed. Raises FolderInUse."""
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    held = open(folder / LOCK_FILE, "w")  # noqa: SIM115 - the caller closes it
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        held.close()
+        raise FolderInUse(f"another service works in the data folder {folder}") from error
+    return held
+
+
+def open_database(folder: Path) -> Engine:
+    """The database of a data folder, at the present revision. Takes no lock: a running service may have it open."""
+    engine = create_engine(f"sqlite:///{folder / DATABASE_FILE}", connect_args={"timeout": 5.0})
+    event.listen(engine, "connect", _pragmas)
+    config = Config()
+    config.set_main_option("script_location", "service.store:migrations")
+    with engine.begin() as connection:
+        config.attributes["connection"] = connection
+        command.upgrade(config, "head")
+    return engine
 
 
 def clean(value: Any) -> Any:
@@ -216,6 +255,20 @@ def _find(session: Session, job_id: str) -> JobRow:
 def _set(row: JobRow, columns: dict[str, Any]) -> None:
     for name, value in columns.items():
         setattr(row, name, clean(value))
+
+
+def _audit_decision(session: Session, row: JobRow, previous: JobState, wanted: JobState, by: str) -> None:
+    old, new = row.old_gains, (row.result or {}).get("gains")
+    had, has = (new, old) if previous is JobState.ACCEPTED else (old, new if wanted is JobState.ACCEPTED else old)
+    audit.record(
+        session,
+        DECISIONS[wanted],
+        row.id,
+        before={"state": previous.value, "gains": had},
+        after={"state": wanted.value, "gains": has},
+        loop=row.loop,
+        said_by=by,
+    )
 
 
 def _append(session: Session, job_id: str, kind: str, data: dict[str, Any], plant_time_s: float) -> None:
