@@ -1,4 +1,4 @@
-"""Back-up and restore of a data folder. A back-up is one SQLite file, whole and checked, made while the service runs."""
+"""Back-up and restore of a data folder. A back-up is one SQLite file, checked, made while the service runs."""
 
 from __future__ import annotations
 

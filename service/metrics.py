@@ -17,7 +17,7 @@ from service.states import ACTIVE, JobState
 from service.store.store import Store
 from service.store.tables import JobRow
 
-disable_created_metrics()
+disable_created_metrics()  # type: ignore[no-untyped-call]
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
 SAMPLES_LOST = Counter("loopwright_samples_lost", "Samples that did not arrive during a test", ["bus"], registry=None)

@@ -203,7 +203,7 @@ class Store:
 
 
 def lock_folder(folder: Path) -> IO[str]:
-    """Makes the data folder if need be, and takes it for this process until the answer is closed. Raises FolderInUse."""
+    """Makes the data folder if need be, and takes it until the answer is closed. Raises FolderInUse."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     held = open(folder / LOCK_FILE, "w")  # noqa: SIM115 - the caller closes it
     try:
