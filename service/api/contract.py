@@ -54,6 +54,8 @@ def _one(path: str, method: str, operation: dict[str, Any]) -> None:
         more += (401,)
     if method != "get":
         more += (413,)
+    if "requestBody" in operation:
+        more += (400,)  # not text at all
     if path not in ALWAYS:
         more += (429, 503)
     elif needed is not None:
