@@ -1,5 +1,5 @@
 # make demo    a loop is retuned before your eyes      make test    every test and every check
-# make setup   the Python environment in .venv         make check   types, style, import directions
+# make setup   the Python environment in .venv         make check   types, style, import directions, packages
 # make bench   every benchmark, in one table
 
 PYTHON ?= python3
@@ -34,6 +34,7 @@ check: setup
 	$(BIN)/ruff check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python tools/audit_dependencies.py
 
 bench: setup
 	$(BIN)/python -m benchmarks
