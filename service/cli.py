@@ -60,20 +60,34 @@ def hub(context: typer.Context) -> None:
 def serve(
     loops: Annotated[Path, typer.Option(help="The loops, YAML.")] = Path("loops.yaml"),
     data: Annotated[Path, typer.Option(help="Folder for jobs and samples.")] = Path("data"),
-    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    bind: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on; 0: any free one.")] = 8080,
+    database: Annotated[
+        str | None,
+        typer.Option(envvar="LOOPWRIGHT_DATABASE", help="postgresql://..., shared by several hosts; default: a file."),
+    ] = None,
+    host: Annotated[
+        str | None, typer.Option(envvar="LOOPWRIGHT_HOST", help="Name of this host among those of a shared database.")
+    ] = None,
+    resume: Annotated[bool, typer.Option(help="Go on with jobs that a crash has cut off.")] = True,
 ) -> None:
     """The service: REST over jobs that retune live loops."""
+    from sqlalchemy.exc import SQLAlchemyError
+
     from service.config import ConfigError
+    from service.serving import Setup
     from service.serving import serve as run
-    from service.store.store import FolderInUse
+    from service.store.database import BadDatabase
+    from service.store.store import FolderInUse, ForeignLoop
 
     try:
-        run(loops, data, host, port)
-    except (ConfigError, FolderInUse) as error:
+        run(Setup(loops, data, bind, port, database, host, resume))
+    except (ConfigError, FolderInUse, ForeignLoop, BadDatabase) as error:
         _die(str(error), 2)
+    except SQLAlchemyError as error:
+        _die(f"the database cannot be used: {getattr(error, 'orig', None) or error}", 2)
     except OSError as error:
-        _die(f"cannot listen on {host}:{port} or write to {data}: {error.strerror or error}", 2)
+        _die(f"cannot listen on {bind}:{port} or write to {data}: {error.strerror or error}", 2)
 
 
 @app.command("loops")
