@@ -5,7 +5,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-DEBIAN := user-mode-linux tshark can-utils iproute2
+DEBIAN := user-mode-linux tshark can-utils iproute2 postgresql
 
 .PHONY: setup demo test check bench system clean
 

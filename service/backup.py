@@ -13,7 +13,9 @@ from pathlib import Path
 from alembic.config import Config
 from alembic.script import ScriptDirectory
 
-from service.store.store import DATABASE_FILE, LOCK_FILE, Store, lock_folder
+from service.store.database import FILE
+from service.store.lock import FolderLock
+from service.store.store import Store
 
 
 class BackupProblem(Exception):
@@ -25,9 +27,9 @@ def back_up(data: Path, target: Path, replace: bool = False) -> int:
 
     Raises BackupProblem, OSError.
     """
-    source = data / DATABASE_FILE
+    source = data / FILE
     if not source.exists():
-        raise BackupProblem(f"{data} is not a data folder of a service: it has no {DATABASE_FILE}")
+        raise BackupProblem(f"{data} is not a data folder of a service: it has no {FILE}")
     if target.exists() and not replace:
         raise BackupProblem(f"{target} exists already; --replace writes over it")
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".backup-") as folder:
@@ -55,25 +57,26 @@ def restore(source: Path, data: Path, replace: bool = False) -> tuple[int, Path 
     if not source.is_file():
         raise BackupProblem(f"{source} is not a file")
     _check(source)
+    data.mkdir(mode=0o700, parents=True, exist_ok=True)
     # Held to the end: a service that starts meanwhile must not open half of it.
-    with lock_folder(data), tempfile.TemporaryDirectory(dir=data, prefix=".restore-") as name:
-        there = [path for path in sorted(data.iterdir()) if path.is_file() and path.name != LOCK_FILE]
+    with closing(FolderLock(data)), tempfile.TemporaryDirectory(dir=data, prefix=".restore-") as name:
+        there = [path for path in sorted(data.iterdir()) if path.is_file() and path.name != "lock"]
         if there and not replace:
             raise BackupProblem(f"{data} has a database already; --replace keeps it aside and takes the back-up")
         made = Path(name)
-        shutil.copyfile(source, made / DATABASE_FILE)
+        shutil.copyfile(source, made / FILE)
         store = Store(made)  # brings it to the present revision
         interrupted = store.restored(source.name)
         store.close()
-        _to_disk(made / DATABASE_FILE)
+        _to_disk(made / FILE)
         aside = None
         if there:
             aside = data / f"replaced-{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}"
             aside.mkdir(mode=0o700)
             for path in there:
                 path.rename(aside / path.name)
-        (made / DATABASE_FILE).chmod(0o600)
-        (made / DATABASE_FILE).rename(data / DATABASE_FILE)
+        (made / FILE).chmod(0o600)
+        (made / FILE).rename(data / FILE)
         return interrupted, aside
 
 

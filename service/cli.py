@@ -65,11 +65,20 @@ def serve(
     data: Annotated[Path, typer.Option(help="Folder for jobs and samples.")] = Path("data"),
     bind: Annotated[str, typer.Option(help="Address to listen on; others than loopback need keys.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on; 0: any free one.")] = 8080,
+    database: Annotated[
+        str | None,
+        typer.Option(envvar="LOOPWRIGHT_DATABASE", help="postgresql://..., shared by several hosts; default: a file."),
+    ] = None,
+    host: Annotated[
+        str | None, typer.Option(envvar="LOOPWRIGHT_HOST", help="Name of this host among those of a shared database.")
+    ] = None,
+    resume: Annotated[bool, typer.Option(help="Go on with jobs that a crash has cut off.")] = True,
     auth: Annotated[
         bool | None, typer.Option("--auth/--no-auth", help="Ask for keys. Default: unless only this machine is served.")
     ] = None,
-    max_body: Annotated[int, typer.Option(min=1024, envvar="LOOPWRIGHT_MAX_BODY", help="Bytes of a request.")] = 1
-    << 20,
+    max_body: Annotated[
+        int, typer.Option(min=1024, envvar="LOOPWRIGHT_MAX_BODY", help="Longest body of a request, bytes.")
+    ] = 1_048_576,
     rate: Annotated[
         float, typer.Option(min=0.1, envvar="LOOPWRIGHT_RATE", help="Requests/s of one caller; twice that at once.")
     ] = 500.0,
@@ -84,21 +93,30 @@ def serve(
     ] = "text",
 ) -> None:
     """The service: REST over jobs that retune live loops."""
+    from sqlalchemy.exc import SQLAlchemyError
+
     from service.config import ConfigError
     from service.security.limits import RequestLimits
-    from service.serving import NotSafe
+    from service.serving import NotSafe, Setup
     from service.serving import serve as run
-    from service.store.store import FolderInUse
+    from service.store.database import BadDatabase
+    from service.store.store import FolderInUse, ForeignLoop
 
     if log_format not in ("text", "json"):
         _die(f"--log-format must be text or json, not {log_format!r}", 2)
     limits = RequestLimits(
         body_bytes=max_body, rate_per_s=rate, burst=max(1, round(2 * rate)), at_once=at_once, streams_at_once=streams
     )
+    setup = Setup(
+        loops, data, bind, port, database, host, resume,
+        auth=auth, limits=limits, log_format="json" if log_format == "json" else "text",
+    )  # fmt: skip
     try:
-        run(loops, data, bind, port, auth=auth, limits=limits, log_format="json" if log_format == "json" else "text")
-    except (ConfigError, FolderInUse, NotSafe) as error:
+        run(setup)
+    except (ConfigError, FolderInUse, ForeignLoop, BadDatabase, NotSafe) as error:
         _die(str(error), 2)
+    except SQLAlchemyError as error:
+        _die(f"the database cannot be used: {getattr(error, 'orig', None) or error}", 2)
     except OSError as error:
         _die(f"cannot listen on {bind}:{port} or write to {data}: {error.strerror or error}", 2)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import socket
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 
@@ -11,15 +12,17 @@ import uvicorn
 
 from service import logs
 from service.api.app import create_app
-from service.config import LoopConfig, load_loops
-from service.jobs import Jobs
+from service.config import LoopConfig, load_site
+from service.engine.durable import POLL_S, DurableEngine
+from service.jobs import Jobs, LoopFactory
 from service.logs import LogFormat
 from service.loop import Loop
 from service.security.gate import Policy, is_loopback
 from service.security.keyring import Keyring
 from service.security.limits import RequestLimits
-from service.store.store import Store
-from service.work import rehearse, tune
+from service.store.database import BadDatabase
+from service.store.store import LOCAL, Store
+from service.work import Tune, rehearse, tune
 
 _GRACE_S = 10
 
@@ -54,59 +57,73 @@ class NotSafe(Exception):
     """What was asked for would open the plant to the network; the text says what to do instead."""
 
 
-def serve(
-    loops_file: Path,
-    data: Path,
-    bind: str,
-    port: int,
-    *,
-    auth: bool | None = None,
-    limits: RequestLimits | None = None,
-    log_format: LogFormat = "text",
-) -> None:
+@dataclass(frozen=True)
+class Setup:
+    """How the service is run. database: a PostgreSQL URL, or None for a file in the data folder.
+
+    bind: the address to listen on.  host: this host's name among those that share the database.
+    resume: jobs that a dead service left go on.  poll_s: how often the engine looks for jobs, s of wall time.
+    auth: whether keys are asked for; None: unless the address is this machine's own.
+    """
+
+    loops_file: Path
+    data: Path
+    bind: str
+    port: int
+    database: str | None = None
+    host: str | None = None
+    resume: bool = True
+    poll_s: float = POLL_S
+    auth: bool | None = None
+    limits: RequestLimits = field(default_factory=RequestLimits)
+    log_format: LogFormat = "text"
+
+
+def serve(setup: Setup, open_loop: LoopFactory = open_bus_loop, tune: Tune = tune) -> None:
     """Serves until SIGTERM or SIGINT; every loop is restored before it returns.
 
-    auth None: keys are asked for unless the address is this machine's own.
-    Raises ConfigError, FolderInUse, NotSafe, OSError (the address cannot be had).
+    Raises ConfigError, FolderInUse, ForeignLoop, BadDatabase, NotSafe, OSError (the address cannot be had),
+    SQLAlchemyError (the database cannot be reached).
     """
-    logs.configure(log_format)
+    logs.configure(setup.log_format)
     # python-can's socketcand client warns of every frame that TCP splits, which is what TCP does.
     logging.getLogger("can").setLevel(logging.ERROR)
-    local = is_loopback(bind)
-    if auth is False and not local:
-        raise NotSafe(f"without keys only this machine is served: leave out --no-auth, or --bind {bind}")
-    loops = load_loops(loops_file)
+    site = load_site(setup.loops_file)
+    if setup.database is not None and setup.host is None:
+        raise BadDatabase("a shared database needs --host NAME: what this host is called among the others, for ever")
+    local = is_loopback(setup.bind)
+    if setup.auth is False and not local:
+        raise NotSafe(f"without keys only this machine is served: leave out --no-auth, or --bind {setup.bind}")
     # Bound before anything is started, so that a busy port is an error and not half a service.
-    listener = socket.create_server((bind, port), family=_family(bind), reuse_port=False)
-    try:
-        store = Store(data)
-    except BaseException:
-        listener.close()
-        raise
-    jobs: Jobs | None = None
-    try:
-        keyring = Keyring(store.engine) if auth or not local else None
-        if keyring is not None and not keyring.any_valid():
-            raise NotSafe(
-                f"keys are asked for on {bind} and there is none; make one with: "
-                f"loopwright key create NAME --scope admin --data {data}"
+    with socket.create_server((setup.bind, setup.port), family=_family(setup.bind), reuse_port=False) as listener:
+        store = Store(setup.data, setup.database, setup.host or LOCAL)
+        try:
+            keyring = Keyring(store.engine) if setup.auth or not local else None
+            if keyring is not None and not keyring.any_valid():
+                raise NotSafe(
+                    f"keys are asked for on {setup.bind} and there is none; make one with: "
+                    f"loopwright key create NAME --scope admin --data {setup.data}"
+                )
+            policy = Policy(keyring, setup.limits, local_only=True)
+            engine = DurableEngine(setup.data, store.engine if store.shared else None, store.host, setup.poll_s)
+            jobs = Jobs(
+                site.loops, store, open_loop, tune, rehearse, engine=engine, buses=site.buses, resume=setup.resume
             )
-        policy = Policy(keyring, limits or RequestLimits(), local_only=True)
-        jobs = Jobs(loops, store, open_bus_loop, tune, rehearse)
-        config = uvicorn.Config(
-            create_app(jobs, policy),
-            log_config=None,
-            log_level="warning",
-            access_log=False,
-            server_header=False,
-            timeout_graceful_shutdown=_GRACE_S,
-        )
-        _Server(config, jobs).run(sockets=[listener])
-    finally:
-        if jobs is not None:
-            jobs.stop()
-        store.close()
-        listener.close()
+            config = uvicorn.Config(
+                create_app(jobs, policy),
+                log_config=None,
+                log_level="warning",
+                access_log=False,
+                server_header=False,
+                timeout_graceful_shutdown=_GRACE_S,
+            )
+            try:
+                jobs.boot()
+                _Server(config, jobs).run(sockets=[listener])
+            finally:
+                jobs.stop()
+        finally:
+            store.close()
 
 
 def _family(bind: str) -> socket.AddressFamily:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, Protocol, cast
 
 from service.config import LoopConfig
 from service.loop import Loop, LoopState
 from service.request import RetuneRequest
+from service.store.tables import EventRow
 from tuning.plan import Event, Sample
 from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 
@@ -20,11 +21,15 @@ _STOPPED = (Reason.OPERATOR, Reason.SERVICE_STOPPED)
 
 @dataclass(frozen=True)
 class Hooks:
-    """How work reports, and how it learns that it should stop."""
+    """How work reports, and how it learns that it should stop.
+
+    earlier: what the earlier attempts of a job that is resumed have stored; a stage done there is not run again.
+    """
 
     on_event: Callable[[Event], None]
     on_samples: Callable[[list[Sample]], None]
     stop: Callable[[], Reason | None]
+    earlier: Sequence[EventRow] = ()
 
 
 @dataclass(frozen=True)

@@ -64,17 +64,20 @@ def create_app(
     def view(row: JobRow) -> JobView:
         return job_view(row, jobs.store.events(row.id), jobs.running(row.id))
 
-    @app.get("/loops", tags=["loops"], summary="The configured loops")
+    @app.get("/loops", tags=["loops"], summary="The configured loops of every host",
+        responses=problems.responses(503))
     def loops() -> list[LoopView]:
-        return [LoopView(**loop_view(config, jobs.store.active(tag))) for tag, config in jobs.loops.items()]
+        busy = jobs.store.busy()
+        return [LoopView(**loop_view(config, host, busy.get(config.tag))) for config, host in jobs.everywhere()]
 
     @app.get(
         "/loops/{tag}", tags=["loops"], summary="A loop and its present state", responses=problems.responses(404, 503)
     )
     def loop(tag: Tag) -> LoopDetail:
-        config = jobs.config(tag)
-        state, _ = jobs.live(tag)
-        return LoopDetail(**loop_view(config, jobs.store.active(tag)), live=live_view(state))
+        config, host = jobs.owner(tag)
+        state = jobs.live(tag)
+        view = loop_view(config, host, jobs.store.busy().get(tag))
+        return LoopDetail(**view, live=live_view(state) if state else None)
 
     @app.post(
         "/loops/{tag}/retune",

@@ -11,7 +11,6 @@ from urllib.parse import urlencode
 from fastapi import APIRouter, FastAPI, Query, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import BaseModel, Field
-from sqlalchemy import text
 
 from protocol.bus import BusError, open_bus
 from service import metrics
@@ -24,6 +23,7 @@ from service.security.tables import AuditRow
 Check = Callable[[], None]
 """Returns when all is well; raises with the reason when not."""
 CHECK_S = 2.0
+BEHIND_S = 1.0
 FRESH_S = 2.0
 """An answer this old is given again: who asks often does not open the buses as often."""
 
@@ -105,12 +105,15 @@ def checks(jobs: Jobs) -> dict[str, Check]:
     """database, engine, and each bus of the configured loops."""
 
     def database() -> None:
-        with jobs.store.engine.connect() as connection:
-            connection.execute(text("SELECT count(*) FROM alembic_version"))
+        jobs.store.ping()
+        if jobs.journal.behind_s > BEHIND_S:
+            raise RuntimeError(f"takes nothing for {jobs.journal.behind_s:.0f} s; reports of jobs wait in memory")
 
     def engine() -> None:
         if jobs.stopping:
             raise RuntimeError("the service is shutting down")
+        if not jobs.engine.alive():
+            raise RuntimeError("the engine does not run")
 
     def bus(url: str) -> Check:
         return lambda: bus_opens(url)

@@ -9,9 +9,11 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
+from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 
 from service.jobs import Conflict, Stopping, UnknownLoop
+from service.journal import temporary
 from service.request import BadLimits
 from service.states import IllegalMove
 from service.store.store import Busy, NoSuchJob
@@ -81,6 +83,13 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(Stopping)
     async def _stopping(_request: Request, error: Stopping) -> JSONResponse:
         return problem(503, str(error), reason=Reason.SERVICE_STOPPED)
+
+    @app.exception_handler(SQLAlchemyError)
+    async def _database(_request: Request, error: SQLAlchemyError) -> JSONResponse:
+        if not temporary(error):
+            return problem(500, f"{type(error).__name__} of the database", reason=Reason.INTERNAL)
+        detail = "the database does not answer; jobs that run go on, ask again"
+        return problem(503, detail, headers={"Retry-After": "5"})
 
     @app.exception_handler(Ended)
     async def _ended(_request: Request, error: Ended) -> JSONResponse:

@@ -28,13 +28,15 @@ def data(tmp_path: Path) -> Path:
 
 
 def filled(data: Path) -> tuple[str, str, str]:
-    """A finished job, a queued one, and a key, in a folder whose service is stopped again."""
+    """A finished job, a queued one, and a key, in a folder whose service is gone."""
     service = Service(data)
     job = service.jobs.start(TAG, RetuneRequest())
     service.wait(job.id)
-    active = service.store.create("OTHER", {}, "me", False)
     _, key = Keyring(service.store.engine).create("a", Scope.READ)
     service.close()
+    store = Store(data)
+    active = store.create("OTHER", {}, "me", False)
+    store.close()
     return job.id, active.id, key
 
 

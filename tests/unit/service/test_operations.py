@@ -64,7 +64,7 @@ def test_a_database_that_is_gone_is_named(service: Service, monkeypatch: pytest.
     def gone() -> None:
         raise OSError("server closed the connection")
 
-    monkeypatch.setattr(service.store.engine, "connect", gone)
+    monkeypatch.setattr(service.store, "ping", gone)
     body = client.get("/readyz")
     assert body.status_code == 503 and body.json()["parts"]["database"]["detail"] == "server closed the connection"
 
@@ -122,6 +122,7 @@ def test_loops_and_jobs_are_counted(service: Service, client: TestClient) -> Non
     finished(service, client)
     service.tune.ends = None
     service.tune.hold.clear()
+    service.tune.inside.clear()
     start(client)
     service.tune.inside.wait(5)
     found = samples(client)

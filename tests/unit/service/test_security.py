@@ -21,7 +21,7 @@ from service.security.gate import Policy, is_loopback
 from service.security.keyring import REVOKED_WITHIN_S, KeyProblem, Keyring
 from service.security.keys import Scope, hash_key, matches, new_key
 from service.security.limits import Buckets, RequestLimits
-from service.serving import NotSafe, serve
+from service.serving import NotSafe, Setup, serve
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
 from tests.unit.service.test_api import assert_problem
 from tuning.reasons import Failed, Reason
@@ -382,7 +382,7 @@ def test_serve_refuses_what_is_not_safe(tmp_path: Path, bind: str, auth: bool | 
     before = logging.getLogger().handlers[:]
     try:
         with pytest.raises(NotSafe, match=words):
-            serve(loops, tmp_path / "data", bind, 0, auth=auth)
+            serve(Setup(loops, tmp_path / "data", bind, 0, auth=auth))
     finally:
         logging.getLogger().handlers[:] = before
         logging.captureWarnings(False)
