@@ -105,6 +105,7 @@ class FakeTune:
         self, config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks
     ) -> Outcome:
         ended: Ended | None = None
+        times: dict[str, float] = {}
         done = {event.data["stage"] for event in hooks.earlier if event.kind == "stage_done"}
         try:
             for stage, remaining in (("preflight", 3.0), ("relay", 1.0)):
@@ -119,6 +120,7 @@ class FakeTune:
                     if reason := hooks.stop():
                         raise Aborted(reason, "asked to stop")
                 hooks.on_event(StageDone(stage, Found(2.05, 3.32)))
+                times[stage] = 1.0
             hooks.on_event(Note("nearly there"))
             if self.ends:
                 raise self.ends
@@ -126,7 +128,7 @@ class FakeTune:
             ended = error
         finally:
             restored = loop.restore(state)
-        return Outcome(None if ended else RESULT, ended, restored, {"preflight": 1.0, "relay": 1.0})
+        return Outcome(None if ended else RESULT, ended, restored, times)
 
 
 def fake_rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:
