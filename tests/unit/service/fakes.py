@@ -16,9 +16,11 @@ from service.request import RetuneRequest
 from service.states import ACTIVE, JobState
 from service.store.store import Store
 from service.work import Hooks, Outcome, Rehearse
+from tuning.design import Predicted
 from tuning.gains import Gains
 from tuning.plan import Command, Mode, Note, Sample, SetGains, SetSetpoint, StageDone, StageStarted
 from tuning.reasons import Aborted, Ended, Failed, Reason
+from tuning.stages.step_test import StepResult
 
 OLD, NEW = Gains(0.5, 2.0), Gains(0.75, 3.0)
 TAG = "TIC-101"
@@ -86,8 +88,9 @@ class Found:
 
 RESULT = {
     "ultimate": asdict(Found(2.05, 3.32)), "model": {"K": 2.0, "T_s": 3.0, "L_s": 1.0},
-    "old_gains": asdict(OLD), "gains": asdict(NEW), "predicted": {"Ms": 1.6, "GM": 3.0, "PM_deg": 60.0},
-    "baseline": {"IAE": 9.0, "overshoot_pct": 40.0}, "verification": {"IAE": 4.0, "overshoot_pct": 5.0},
+    "old_gains": asdict(OLD), "gains": asdict(NEW), "predicted": asdict(Predicted(1.6, 3.0, 60.0, 4.0, 8.0, 2.0)),
+    "baseline": asdict(StepResult(2.0, 40.0, 9.0, 20.0, 2.0, 3.0, 0.0, True, 30.0)),
+    "verification": asdict(StepResult(2.0, 5.0, 4.0, 9.0, 2.0, 2.0, 0.0, True, 30.0)),
     "notes": ["all quiet"],
 }  # fmt: skip
 
