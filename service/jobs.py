@@ -460,7 +460,7 @@ class Jobs:
         columns: dict[str, Any] = {
             "result": outcome.result,
             "stage_times_s": times,
-            "plant_time_s": running.progress.plant_time_s or sum(times.values()),
+            "plant_time_s": max(running.progress.plant_time_s, running.before_s + sum(outcome.plant_time_s.values())),
         }
         if outcome.restored is not None:
             columns["restored"] = state_json(outcome.restored)

@@ -34,7 +34,7 @@ class Running:
         self.stop_reason: Reason | None = None
         self.over = threading.Event()
         """Set when the loop is given up and the end is written."""
-        self._before_s = before_s
+        self.before_s = before_s
         self._journal = journal
         self._buffer: list[Sample] = []
         self._stage = "preflight"
@@ -66,7 +66,7 @@ class Running:
             while self._boundaries and sample.t > self._boundaries[0][0]:
                 self.flush()
                 self._stage = self._boundaries.pop(0)[1]
-            self._buffer.append(sample._replace(t=sample.t + self._before_s) if self._before_s else sample)
+            self._buffer.append(sample._replace(t=sample.t + self.before_s) if self.before_s else sample)
         if len(self._buffer) >= _BLOCK_SAMPLES or time.monotonic() - self._flushed > _BLOCK_WALL_S:
             self.flush()
 

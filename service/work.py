@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
@@ -58,6 +59,7 @@ class Rehearse(Protocol):
 
 def tune(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks) -> Outcome:
     """The five stages on the live loop."""
+    from service.checkpoints import finished
     from service.runner import Watch, run
     from tuning.five_stage import Facts, Options, five_stage
 
@@ -79,8 +81,9 @@ def tune(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopStat
         max_time_s=request.max_time_s or TIME_BUDGET_T95 * config.t95_s,
         max_frozen_s=FROZEN_T95 * config.t95_s,
     )
+    done = ((event.data["stage"], event.data["result"]) for event in hooks.earlier if event.kind == "stage_done")
     ran = run(
-        five_stage(facts, options),
+        five_stage(facts, options, finished(done)),
         loop,
         watch=watch,
         on_event=hooks.on_event,
@@ -179,14 +182,15 @@ def plain(value: object) -> dict[str, Any] | None:
 
 
 def _plain(value: Any) -> Any:
-    """Dataclasses, tuples and numpy scalars become what JSON knows."""
+    """Dataclasses, tuples and numpy scalars become what JSON knows; a number that is none becomes null."""
     if is_dataclass(value) and not isinstance(value, type):
         return _plain({f.name: getattr(value, f.name) for f in fields(value)})
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
-    return value.item() if hasattr(value, "item") else value
+    value = value.item() if hasattr(value, "item") else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _reason(text: object) -> Reason:

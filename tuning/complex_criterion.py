@@ -31,6 +31,7 @@ BAND = 0.05
 DIVERGED = 1e9
 SAMPLES = 6000
 HORIZON_IN_TIME_SUMS = 20.0
+LEAST_HORIZON = 0.5
 BLOCK = 64
 
 
@@ -70,7 +71,7 @@ class ComplexCriterion:
     """The criterion of one model; what does not depend on the controller is computed once.
 
     time_unit_s: s.  gain_unit: PV units per MV unit.  horizon: in time units. Settings are given as kp = Kp*gain_unit
-    and ti = gain_unit/(Ki*time_unit_s), which is the paper's Ti, the reciprocal of the integral gain.
+    and ti = 1/(Ki*gain_unit*time_unit_s), which is the paper's Ti, the reciprocal of the integral gain.
     Ms_max: loops of a greater maximum sensitivity are penalised in proportion; none if None.
     """
 
@@ -84,7 +85,8 @@ class ComplexCriterion:
     ) -> None:
         """horizon_s: simulated time, s, rounded up to whole dead times; by default 20 times all lags and the dead time.
 
-        samples: about how many of each response are looked at. Raises Refused for a model without any time of its own.
+        samples: about how many of each response are looked at. Raises Refused for a model without any time of its own
+        and for a horizon of less than half a time unit.
         """
         total = time_sum(model)
         if total <= 0.0:
@@ -93,9 +95,11 @@ class ComplexCriterion:
         self.gain_unit = gain_unit(model, self.time_unit_s)
         self.weights = WEIGHTS[weighting]
         self.Ms_max = Ms_max
-        self.evaluations = 0
         plant = normalised(model, self.time_unit_s)
         horizon = (HORIZON_IN_TIME_SUMS * total if horizon_s is None else horizon_s) / self.time_unit_s
+        if horizon < LEAST_HORIZON:
+            shown = f"at least {LEAST_HORIZON * self.time_unit_s:.3g} s is accepted"
+            raise Refused(Reason.BAD_INPUT, f"horizon_s {horizon_s}: {shown} for this model")
         self._loops = (_Delayed if plant.L > 0.0 else _Immediate)(plant, horizon, samples)
         self.horizon = self._loops.dt * self._loops.steps
         self._w = np.geomspace(1e-2 * self.time_unit_s / total, 1e2 * _fastest(plant), 400)
@@ -103,7 +107,6 @@ class ComplexCriterion:
 
     def __call__(self, kp: Reals, ti: Reals) -> Reals:
         """The criterion of each setting, (p,) from (p,) and (p,), finite; above DIVERGED where a loop diverges."""
-        self.evaluations += len(kp)
         found = self.indices(kp, ti)
         d1, d2, d3, d4 = self.weights
         with np.errstate(over="ignore", invalid="ignore"):

@@ -121,7 +121,7 @@ class DeadTimeLoop:
     def squares(self, maps: Reals, start: Reals) -> tuple[Reals, Reals]:
         """(integral of e^2, integral of e'^2) over all time, each (p,); every loop must be stable.
 
-        The jump of e at t = 0 does not count as a rate.
+        Infinite where a loop is so near to being unstable that it cannot be told. The jump of e at t = 0 is no rate.
         """
         points, weights = np.polynomial.legendre.leggauss(self.nodes)
         value = self.values(0.5 * (points + 1.0))
@@ -130,13 +130,14 @@ class DeadTimeLoop:
         forms[0, 0, self.errors, self.errors] = mass
         forms[1, 0, self.errors, self.errors] = self.slopes.T @ mass @ self.slopes
         total, power = np.broadcast_to(forms, (2, *maps.shape)), maps
-        for _ in range(60):
-            total = total + power.transpose(0, 2, 1) @ total @ power
-            power = power @ power
-            if float(np.abs(power).max()) < 1e-12:
-                break
-        e, rate = np.einsum("pi,fpij,pj->fp", start, total, start)
-        return e, rate
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in range(60):
+                total = total + power.transpose(0, 2, 1) @ total @ power
+                power = power @ power
+                if float(np.abs(power).max()) < 1e-12:
+                    break
+            e, rate = np.einsum("pi,fpij,pj->fp", start, total, start)
+        return np.where(np.isfinite(e), e, np.inf), np.where(np.isfinite(rate), rate, np.inf)
 
     def roots(self, maps: Reals) -> Complexes:
         """(p, size): the rightmost roots of each loop, 1/s, those of least real part last and not accurate.

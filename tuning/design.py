@@ -20,6 +20,8 @@ from tuning.setting import Setting
 MOST_Ms, LEAST_GM = 2.0, 2.0
 ROUNDING = 1.002
 """A method that seeks the bound ends on it."""
+SLOWER = {"lambda_s": "larger", "tau_c_s": "larger", "c": "smaller"}
+"""The options that make a rule more robust."""
 LEAST_DISTANCE = 0.45
 """From the loop's response at the measured ultimate frequency to -1."""
 
@@ -75,7 +77,7 @@ def design(
         raise Refused(
             Reason.NOT_ROBUST,
             f"{method} gives Kp {gains.Kp:.4g}, Ti {gains.Ti:.4g} s, Td {gains.Td:.4g} s; on the model {stable}Ms "
-            f"{m.Ms:.2f} (at most {MOST_Ms}), GM {GM} (at least {LEAST_GM})",
+            f"{m.Ms:.2f} (at most {MOST_Ms}), GM {GM} (at least {LEAST_GM}){_slower(setting)}",
         )
     if ultimate is not None:
         distance = abs(1.0 - _controller(gains, 2.0 * math.pi / ultimate.Pu_s) / ultimate.Ku)
@@ -87,6 +89,14 @@ def design(
             )
     predicted = Predicted(m.Ms, m.GM, m.PM_deg, figures.overshoot_pct, figures.settling_s, figures.IAE)
     return Designed(method, gains, predicted, dict(setting.chosen), setting.notes + notes)
+
+
+def _slower(setting: Setting) -> str:
+    """What to ask for instead, where the rule has a number for it."""
+    for name, direction in SLOWER.items():
+        if name in setting.chosen:
+            return f"; ask for a {direction} {name} than {setting.chosen[name]:.4g}"
+    return ""
 
 
 def realisable(gains: Gains, filter: float) -> tuple[Gains, tuple[str, ...]]:

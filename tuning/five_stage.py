@@ -11,9 +11,9 @@ at any stage with values typed in by hand, as in the paper's manual mode.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeVar
 
 from tuning.design import Designed, Predicted, Ultimate, design
 from tuning.estimate import fopdt_from_overshoot
@@ -25,14 +25,15 @@ from tuning.plan import Mode, Plan, SetGains, SetMode, SetSetpoint, StageDone, S
 from tuning.reasons import Reason, Refused
 from tuning.stages.common import Facts, OperatingPoint, Trace, settle, to_rest
 from tuning.stages.preflight import preflight
-from tuning.stages.relay import relay_test
+from tuning.stages.relay import RelayResult, relay_test
 from tuning.stages.step_test import StepResult, step_test, unlimited
-from tuning.stages.ultimate import ultimate_gain
-from tuning.stages.zn_pi import allowed_step, zn_pi
+from tuning.stages.ultimate import UltimateResult, ultimate_gain
+from tuning.stages.zn_pi import ZnResult, allowed_step, zn_pi
 
 __all__ = ["STAGES", "Facts", "Options", "Proposal", "five_stage"]
 
 STAGES = ("preflight", "baseline", "relay", "ultimate", "zn_pi", "estimate", "optimise", "verify")
+R = TypeVar("R")
 PROCEDURE = "five-stage"
 MOST_GAIN = 60.0
 """Ku * K of a FOPDT plant with L/T = 0.026, half the least that formula (2) was checked for."""
@@ -137,7 +138,19 @@ class Proposal:
     notes: tuple[str, ...]
 
 
-def five_stage(facts: Facts, options: Options) -> Plan[Proposal]:
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """What an earlier attempt, cut off later, had found: those stages are not run again. Preflight and verify are."""
+
+    baseline: StepResult | None = None
+    relay: RelayResult | None = None
+    ultimate: UltimateResult | None = None
+    zn_pi: ZnResult | None = None
+    estimate: Model | None = None
+    optimise: Designed | None = None
+
+
+def five_stage(facts: Facts, options: Options, finished: Finished = Finished()) -> Plan[Proposal]:
     """The whole procedure on a loop in automatic and at rest. Raises Refused; restores nothing (the runner does)."""
     T95 = facts.T95_s
     pu_guess = options.Pu_s or T95 / 2
@@ -162,74 +175,75 @@ def five_stage(facts: Facts, options: Options) -> Plan[Proposal]:
         after = todo[todo.index(stage) + 1 :]
         return (StageStarted(stage, expected[stage], sum(expected[s] for s in after)),)
 
+    def stage(name: str, found: R | None, make: Callable[[], Plan[R]]) -> Plan[R]:
+        if found is not None:
+            return found
+        yield started(name)
+        result = yield from make()
+        yield (StageDone(name, result),)
+        return result
+
     notes: list[str] = []
-    yield started("preflight")
-    point = yield from preflight(facts)
-    yield (StageDone("preflight", point),)
+    point = yield from stage("preflight", None, lambda: preflight(facts))
 
     baseline: StepResult | None = None
     if options.baseline:
-        yield started("baseline")
-        baseline = yield from _baseline(facts, point)
-        yield (StageDone("baseline", baseline),)
-        yield from to_rest(facts, point, 0.02 * facts.sp_deviation)
+        baseline = yield from stage("baseline", finished.baseline, lambda: _baseline(facts, point))
+        if finished.baseline is None:
+            yield from to_rest(facts, point, 0.02 * facts.sp_deviation)
     gain = baseline.static_gain if baseline else math.nan
     step = Trace()
 
     ultimate: Ultimate | None = None
-    if options.start in ("relay", "zn_pi"):
-        if options.start == "relay":
-            yield started("relay")
-            rough = yield from relay_test(facts, point)
-            yield (StageDone("relay", rough),)
-            if gain == gain and abs(gain) * rough.Ku_a > MOST_GAIN:
-                raise Refused(
-                    Reason.CANNOT_OSCILLATE,
-                    f"Ku * K is about {abs(gain) * rough.Ku_a:.0f} (at most {MOST_GAIN:g}): next to no dead time",
-                )
-            expected["ultimate"] = 5 * (5 * rough.Pu_a_s + T95)
-            yield started("ultimate")
-            found = yield from ultimate_gain(facts, point, rough)
-            yield (StageDone("ultimate", found),)
-            ultimate = Ultimate(found.Ku, found.Pu_s)
-            gain = gain if gain == gain else found.static_gain
-        else:
-            ultimate = Ultimate(_typed(options.Ku), _typed(options.Pu_s))
-        yield started("zn_pi")
-        zn = yield from zn_pi(
-            facts, point, ultimate.Ku, ultimate.Pu_s, gain, options.overshoot_window_pct, options.kp_step_factor, step
-        )
-        yield (StageDone("zn_pi", zn),)
-        Kp, Ti, overshoot, ke = zn.Kp, zn.Ti_s, zn.overshoot_pct, zn.static_gain
-    elif options.start == "estimate":
-        Kp, Ti, overshoot, ke = _typed(options.Kp), _typed(options.Ti_s), _typed(options.overshoot_pct), gain
+    if options.start == "relay":
+        rough = yield from stage("relay", finished.relay, lambda: relay_test(facts, point))
+        if gain == gain and abs(gain) * rough.Ku_a > MOST_GAIN:
+            raise Refused(
+                Reason.CANNOT_OSCILLATE,
+                f"Ku * K is about {abs(gain) * rough.Ku_a:.0f} (at most {MOST_GAIN:g}): next to no dead time",
+            )
+        expected["ultimate"] = 5 * (5 * rough.Pu_a_s + T95)
+        found = yield from stage("ultimate", finished.ultimate, lambda: ultimate_gain(facts, point, rough))
+        ultimate = Ultimate(found.Ku, found.Pu_s)
+        gain = gain if gain == gain else found.static_gain
+    elif options.start == "zn_pi":
+        ultimate = Ultimate(_typed(options.Ku), _typed(options.Pu_s))
 
+    def estimated() -> Plan[Model]:
+        if zn is None:
+            Kp, Ti, overshoot = _typed(options.Kp), _typed(options.Ti_s), _typed(options.overshoot_pct)
+            return _estimate(facts, Kp, Ti, overshoot, gain, options.k_source, notes)
+        model = _estimate(facts, zn.Kp, zn.Ti_s, zn.overshoot_pct, zn.static_gain, options.k_source, notes)
+        if _wants_record(options):
+            model = yield from _identified(facts, point, step, model, options.model_from is not None, notes)
+        return model
+
+    zn: ZnResult | None = None
+    if ultimate is not None:
+        # the record of this stage is not kept: whoever wants a model of it needs it anew
+        done = finished.zn_pi if finished.estimate is not None or not _wants_record(options) else None
+        known, window, factor = ultimate, options.overshoot_window_pct, options.kp_step_factor
+        zn = yield from stage(
+            "zn_pi", done, lambda: zn_pi(facts, point, known.Ku, known.Pu_s, gain, window, factor, step)
+        )
     if options.start == "optimise":
         model = _typed_in(facts, options)
     else:
-        yield started("estimate")
-        model = _estimate(facts, Kp, Ti, overshoot, ke, options.k_source, notes)
-        if len(step) and _wants_record(options):
-            model = yield from _identified(facts, point, step, model, options.model_from is not None, notes)
-        yield (StageDone("estimate", model),)
-    yield started("optimise")
-    designed = yield from _designed(options, model, ultimate)
-    gains, predicted = designed.gains, designed.predicted
+        model = yield from stage("estimate", finished.estimate, estimated)
+    designed = yield from stage("optimise", finished.optimise, lambda: _designed(options, model, ultimate))
     notes += designed.notes
-    yield (StageDone("optimise", designed),)
 
     verification: StepResult | None = None
     if options.verify:
-        yield started("verify")
-        verification = yield from _verified(facts, point, gains, predicted, model)
-        yield (StageDone("verify", verification),)
+        gains, predicted = designed.gains, designed.predicted
+        verification = yield from stage("verify", None, lambda: _verified(facts, point, gains, predicted, model))
     return Proposal(
         method=options.method,
         chosen=designed.chosen,
         model=model,
         old_gains=facts.old_gains,
-        gains=gains,
-        predicted=predicted,
+        gains=designed.gains,
+        predicted=designed.predicted,
         ultimate=ultimate,
         baseline=baseline,
         verification=verification,

@@ -1,4 +1,4 @@
-"""Simpler models for a given one: the half rule, moments and two areas. The gain is always kept."""
+"""A FOPDT model for a given one by moments or two areas. The gain is kept; the half rule is in tuning.half_rule."""
 
 from __future__ import annotations
 
@@ -8,45 +8,8 @@ from collections.abc import Iterable
 import numpy as np
 from scipy.linalg import expm
 
-from tuning.models import FOPDT, SOPDT, Integrating, Model, integrators
+from tuning.models import FOPDT, Model, integrators
 from tuning.reasons import Reason, Refused
-
-SAME_ROOT = 0.01
-"""Roots nearer to each other than this, relative to their size, are one multiple root split by rounding."""
-
-
-def half_rule(model: Model) -> FOPDT | Integrating:
-    """FOPDT (of an integrating model: Integrating without lag) by the half rule.
-
-    The largest lag plus half the second is T; the other half, the smaller lags and the time constants of zeros in the
-    right half plane go to the dead time. For an integrating model the integrator takes the place of the largest lag, so
-    half of its largest lag has nowhere to go and all of it counts as dead time.
-
-    Source: S. Skogestad, Simple analytic rules for model reduction and PID controller tuning, J. Process Control 13
-    (2003), eq. (10) and (11). Raises Refused, BAD_INPUT: complex or unstable poles, zeros in the left half plane.
-    """
-    lags, inverse = _lags(model)
-    if integrators(model):
-        return Integrating(_slope(model), model.L + sum(lags) + inverse)
-    second = lags[1] if len(lags) > 1 else 0.0
-    return FOPDT(model.static_gain, lags[0] + second / 2.0, model.L + second / 2.0 + sum(lags[2:]) + inverse)
-
-
-def half_rule_second_order(model: Model) -> SOPDT | Integrating:
-    """SOPDT (of an integrating model: Integrating with a lag) by the half rule; source and errors as `half_rule`.
-
-    A model of first order is refused: it has no second lag.
-    """
-    lags, inverse = _lags(model)
-    if integrators(model):
-        second = lags[1] if len(lags) > 1 else 0.0
-        lag = lags[0] + second / 2.0 if lags else 0.0
-        return Integrating(_slope(model), model.L + second / 2.0 + sum(lags[2:]) + inverse, lag)
-    if len(lags) < 2:
-        raise Refused(Reason.BAD_INPUT, f"one lag only, {lags[0]:.4g} s: two at least make a second-order model")
-    third = lags[2] if len(lags) > 2 else 0.0
-    dead = model.L + third / 2.0 + sum(lags[3:]) + inverse
-    return SOPDT.of_time_constants(model.static_gain, lags[0], lags[1] + third / 2.0, dead)
 
 
 def moments(model: Model) -> FOPDT:
@@ -103,11 +66,6 @@ def _fopdt(K: float, T: float, L: float, found: str) -> FOPDT:
     return FOPDT(K, T, L)
 
 
-def _slope(model: Model) -> float:
-    """Of an integrating model: PV units per MV unit and second, signed."""
-    return model.num[-1] / model.den[-2]
-
-
 def _moments(model: Model) -> tuple[float, float]:
     """(mean in s, variance in s^2) of the impulse response."""
 
@@ -130,33 +88,3 @@ def _require_stable(poles: Iterable[complex]) -> None:
     right = [complex(p) for p in poles if p.real >= 0.0]
     if right:
         raise Refused(Reason.BAD_INPUT, f"an unstable pole, {right[0]:.4g} rad/s: reductions need a stable model")
-
-
-def _lags(model: Model) -> tuple[list[float], float]:
-    """(lags in s from the largest down, without the integrator; sum of the right zeros' time constants in s)."""
-    poles = _clustered(np.roots(np.trim_zeros(np.asarray(model.den), "b")))
-    _require_stable(poles)
-    for p in poles:
-        if p.imag:
-            raise Refused(Reason.BAD_INPUT, f"complex poles, {p:.4g} rad/s: the half rule needs real ones")
-    inverse = 0.0
-    for z in _clustered(np.roots(model.num)):
-        if z.imag or z.real < 0.0:
-            raise Refused(Reason.BAD_INPUT, f"a zero at {z:.4g} rad/s: the half rule takes right real zeros only")
-        inverse += 1.0 / z.real
-    return sorted((-1.0 / p.real for p in poles), reverse=True), inverse
-
-
-def _clustered(roots: Iterable[complex]) -> list[complex]:
-    """Roots with the clusters into which rounding splits a multiple root put back on their mean."""
-    left = [complex(r) for r in roots]
-    found: list[complex] = []
-    while left:
-        first = left.pop()
-        near = [r for r in left if abs(r - first) < SAME_ROOT * abs(first)]
-        left = [r for r in left if r not in near]
-        mean = sum([first, *near]) / (len(near) + 1)
-        if abs(mean.imag) < 1e-6 * abs(mean):
-            mean = complex(mean.real)
-        found += [mean] * (len(near) + 1)
-    return found

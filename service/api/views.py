@@ -7,11 +7,13 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
+from service.api.results import ModelView, PredictedView, StepView, UltimateView, known
 from service.config import Limits, LoopConfig
 from service.loop import LoopState
 from service.running import Running
 from service.states import ACTIVE, JobState
 from service.store.tables import EventRow, JobRow
+from tuning.five_stage import PROCEDURE
 from tuning.gains import Gains
 from tuning.reasons import ADVICE, Reason
 
@@ -93,17 +95,15 @@ class JobView(BaseModel):
     remaining_plant_time_s: float | None = Field(description="Expected plant time to the end, s", examples=[310.0])
     plant_time_s: float = Field(description="Plant time so far, s", examples=[224.0])
     stages: list[StageView]
-    ultimate: dict[str, Any] | None = Field(description="Ku, MV percent per PV unit; Pu, s")
-    model: dict[str, Any] | None = Field(description="FOPDT: K, PV units per MV percent; T, s; L, s")
+    method: str = Field(description="What gives the gains", examples=["five-stage"])
+    chosen: dict[str, float] = Field(description="The method's design parameters in effect, by name with unit")
+    ultimate: UltimateView | None
+    model: ModelView | None
     old_gains: GainsView | None
     new_gains: GainsView | None
-    predicted: dict[str, Any] | None = Field(
-        description="New gains on the model: GM (ratio), PM (degrees), Ms (ratio), overshoot (percent)"
-    )
-    before: dict[str, Any] | None = Field(
-        description="Set-point step with the old gains: IAE, PV units * s; overshoot, %"
-    )
-    after: dict[str, Any] | None = Field(description="The same step with the new gains")
+    predicted: PredictedView | None
+    before: StepView | None = Field(description="Set-point step with the old gains")
+    after: StepView | None = Field(description="The same step with the new gains")
     notes: list[str]
     reason: str | None = Field(description="Why there is no proposal, from the closed list", examples=["not_at_rest"])
     detail: str | None = Field(description="The reason's numbers")
@@ -178,13 +178,15 @@ def job_view(row: JobRow, events: Sequence[EventRow], running: Running | None) -
         remaining_plant_time_s=remaining,
         plant_time_s=plant_time,
         stages=_stages(events, row),
-        ultimate=result.get("ultimate"),
-        model=result.get("model"),
+        method=row.request.get("method", PROCEDURE),
+        chosen=result.get("chosen") or {},
+        ultimate=known(UltimateView, result.get("ultimate")),
+        model=known(ModelView, result.get("model")),
         old_gains=_stored_gains(row.old_gains or result.get("old_gains")),
         new_gains=_stored_gains(new),
-        predicted=result.get("predicted"),
-        before=result.get("baseline"),
-        after=result.get("verification"),
+        predicted=known(PredictedView, result.get("predicted")),
+        before=known(StepView, result.get("baseline")),
+        after=known(StepView, result.get("verification")),
         notes=[e.data["text"] for e in events if e.kind == "note"] + list(result.get("notes") or ()),
         reason=row.reason,
         detail=row.detail,

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.e2e.plantsite import MODEL_14, MODEL_41, NEEDS_VCAN, REACTOR, Case, Plantsite
+from tests.e2e.plantsite import MODEL_14, MODEL_41, NEEDS_VCAN, REACTOR, SOPDT, Case, Plantsite
 
 pytestmark = NEEDS_VCAN
 
@@ -41,6 +41,26 @@ def test_a_live_loop_is_retuned_and_the_change_taken_back(site: Callable[[Case],
     here.controller.wait_ready()
     assert here.state().gains.Kp == pytest.approx(job["new_gains"]["Kp"], rel=1e-6)
     assert here.http.post(f"{url}/rollback").json()["state"] == "rolled_back"
+    assert here.is_home()
+
+
+@pytest.mark.parametrize("method", ["imc-pid", "direct-synthesis"])
+def test_another_method_on_a_model_of_the_jobs_own_samples(method: str, site: Callable[[Case], Plantsite]) -> None:
+    here = site(SOPDT)
+    url = here.retune(method=method)
+    job = here.finished(url)
+    assert job["state"] == "proposed", (job["reason"], job["detail"])
+    model = job["model"]
+    # 2 exp(-s) / (50 s^2 + 15 s + 1), a percent being a hundredth of its unit; a sampled loop has half a sample more
+    assert model["k_source"] == "record" and model["fit_pct"] > 99
+    assert model["K"] == pytest.approx(0.02, rel=0.01)
+    assert model["T_s"] == pytest.approx(50**0.5, rel=0.02)
+    assert model["zeta"] == pytest.approx(7.5 / 50**0.5, rel=0.02)
+    assert model["L_s"] == pytest.approx(1.0, abs=0.05)
+    gains = job["new_gains"]
+    assert gains["Td"] > 0 and gains["Tf"] > 0
+    assert job["predicted"]["Ms"] < 2
+    assert job["after"]["settled"] and job["after"]["IAE"] < job["before"]["IAE"]
     assert here.is_home()
 
 

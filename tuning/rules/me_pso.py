@@ -53,7 +53,8 @@ def me_pso(
     both with at most as many.  Ms_max: bound on the maximum sensitivity, above 1; 0 for none, as published.
     horizon_s: simulated time, s; by default 20 times all lags and the dead time together.
     Kp_max: MV per PV units, by default the ultimate gain (10/K without one).  Ki_min: MV per PV units and s, by default
-    a tenth of 1/(K*time unit). With Ms_max = 0 and the paper's horizon and domain it is the paper's problem.
+    a tenth of 1/(K*time unit). With Ms_max = 0 and the paper's horizon and domain it is the paper's problem, but for
+    Kp, which is not quite 0 at the least.
     Raises Refused for a bad argument, a model without lag and dead time, or when no stable loop was found.
     """
     if weighting not in tuple(Weighting):
@@ -62,13 +63,15 @@ def me_pso(
         raise Refused(Reason.BAD_INPUT, f"optimiser {optimiser!r}: one of {', '.join(OPTIMISERS)} is accepted")
     if not (Ms_max == 0.0 or 1.0 < Ms_max < math.inf):
         raise Refused(Reason.BAD_INPUT, f"Ms_max {Ms_max}: above 1, or 0 for no bound, is accepted")
+    if isinstance(seed, bool) or int(seed) != seed or seed < 0:
+        raise Refused(Reason.BAD_INPUT, f"seed {seed}: a whole number, not negative, is accepted")
     for name, value in (("horizon_s", horizon_s), ("Kp_max", Kp_max), ("Ki_min", Ki_min)):
         if value is not None and not 0.0 < value < math.inf:
             raise Refused(Reason.BAD_INPUT, f"{name} {value}: a positive number is accepted")
 
     criterion = ComplexCriterion(model, Weighting(weighting), horizon_s, Ms_max or None)
     highest = np.array([_highest_kp(model, criterion, Kp_max), _highest_ti(criterion, Ki_min)])
-    found, (kp, ti) = _search(criterion, highest, optimiser, seed)
+    found, (kp, ti) = _search(criterion, highest, optimiser, int(seed))
     if not criterion.stable(kp, ti):
         raise Refused(Reason.NOT_ROBUST, f"no stable loop among {found.evaluations} settings up to Kp*K = {highest[0]}")
 
@@ -86,9 +89,11 @@ def me_pso(
         "seed": float(seed),
         "evaluations": float(found.evaluations),
     }
-    Kp = kp / criterion.gain_unit
+    notes = _notes(kp, ti, highest, Ms, weighting)
+    if each.settling[0] >= criterion.horizon:
+        notes += ("The answer is not within 5 % of the set-point by the end of the horizon.",)
     # the paper's Ti is the reciprocal of the integral gain
-    return Setting(Gains(Kp=Kp, Ti=kp * ti * criterion.time_unit_s), chosen, _notes(kp, ti, highest, Ms, weighting))
+    return Setting(Gains(Kp=kp / criterion.gain_unit, Ti=kp * ti * criterion.time_unit_s), chosen, notes)
 
 
 def _highest_kp(model: Model, criterion: ComplexCriterion, Kp_max: float | None) -> float:

@@ -30,6 +30,8 @@ from tuning.reasons import Reason, Refused
 from tuning.setting import Setting
 from tuning.state_space import gain_unit, normalised, time_sum
 
+MU = (0.01, 10.0)
+K1 = (0.01, 100.0)
 GRID = 400
 INSIDE = 200
 SLOWER = 0.8
@@ -83,9 +85,9 @@ def s_plane(
 ) -> Setting:
     """The PI or PID whose dominant roots have the shape mu and the size of least J; b = 1, for a PID c = 1 and Tf = 0.
 
-    controller: "pi" or "pid".  mu: imaginary over real part of the pair, positive; damping ratio 1/sqrt(1 + mu^2).
+    controller: "pi" or "pid".  mu: imaginary over real part of the pair, 0.01 to 10; damping ratio 1/sqrt(1 + mu^2).
     tau_s: weight of the error's rate, s, near the wanted closed-loop time constant; by default a quarter of all lags
-    and the dead time together.  k1: the real root of a PID over the pair's real part, positive.  alpha_per_s: the
+    and the dead time together.  k1: the real root of a PID over the pair's real part, 0.01 to 100.  alpha_per_s: the
     pair's real part, 1/s, when it is not to be searched: pole placement alone.
     Raises Refused for a bad argument, a model that `design` does not take, or when no alpha (or not the given one) has
     positive gains and a stable loop, or J no minimum.
@@ -150,9 +152,11 @@ def _search(model: Model, controller: str, mu: float, tau_s: float, k1: float) -
     unit = time_sum(model)
     if unit <= 0.0:
         raise Refused(Reason.BAD_INPUT, "the model has neither lag nor dead time: no root is too fast for it")
-    for name, value in (("mu", mu), ("tau_s", tau_s), ("k1", k1)):
-        if not 0.0 < value < math.inf:
-            raise Refused(Reason.BAD_INPUT, f"{name} {value}: a positive number is accepted")
+    if not 0.0 < tau_s < math.inf:
+        raise Refused(Reason.BAD_INPUT, f"tau_s {tau_s}: a positive number is accepted")
+    for name, value, (low, high) in (("mu", mu, MU), ("k1", k1, K1)):
+        if not low <= value <= high:
+            raise Refused(Reason.BAD_INPUT, f"{name} {value}: {low} to {high} is accepted")
     pid = controller == "pid"
     excess, needed = len(model.den) - len(model.num), int(pid) + int(model.L > 0.0)
     if excess < needed:
@@ -278,7 +282,8 @@ class _Rational:
         total = np.zeros((len(gains), size))
         total[:, :-1] = self.a
         for power, gain in enumerate((gains[:, 1], gains[:, 0], gains[:, 2])):
-            top = size - power - len(self.b)
+            if (top := size - power - len(self.b)) < 0:
+                break  # no derivative on a model that passes jumps on
             total[:, top : top + len(self.b)] += gain[:, None] * self.b
         return total
 

@@ -52,7 +52,8 @@ def step_test(
     sample = yield (SetSetpoint(target),)
     while not same(sample.sp, target):
         sample = yield ()
-    trace, settled = yield from settle(target, band * abs(step), facts.T95_s / 5, most_s, point.noise)
+    later, settled = yield from settle(target, band * abs(step), facts.T95_s / 5, most_s, point.noise)
+    trace = Trace([sample.t, *later.t], [sample.sp, *later.sp], [sample.pv, *later.pv], [sample.mv, *later.mv])
     if kept is not None:
         kept.t, kept.sp, kept.pv, kept.mv = trace.t, trace.sp, trace.pv, trace.mv
     t, pv, mv = (np.asarray(column) for column in (trace.t, trace.pv, trace.mv))

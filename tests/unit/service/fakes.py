@@ -16,9 +16,11 @@ from service.request import RetuneRequest
 from service.states import ACTIVE, JobState
 from service.store.store import Store
 from service.work import Hooks, Outcome, Rehearse
+from tuning.design import Predicted
 from tuning.gains import Gains
 from tuning.plan import Command, Mode, Note, Sample, SetGains, SetSetpoint, StageDone, StageStarted
 from tuning.reasons import Aborted, Ended, Failed, Reason
+from tuning.stages.step_test import StepResult
 
 OLD, NEW = Gains(0.5, 2.0), Gains(0.75, 3.0)
 TAG = "TIC-101"
@@ -86,8 +88,9 @@ class Found:
 
 RESULT = {
     "ultimate": asdict(Found(2.05, 3.32)), "model": {"K": 2.0, "T_s": 3.0, "L_s": 1.0},
-    "old_gains": asdict(OLD), "gains": asdict(NEW), "predicted": {"Ms": 1.6, "GM": 3.0, "PM_deg": 60.0},
-    "baseline": {"IAE": 9.0, "overshoot_pct": 40.0}, "verification": {"IAE": 4.0, "overshoot_pct": 5.0},
+    "old_gains": asdict(OLD), "gains": asdict(NEW), "predicted": asdict(Predicted(1.6, 3.0, 60.0, 4.0, 8.0, 2.0)),
+    "baseline": asdict(StepResult(2.0, 40.0, 9.0, 20.0, 2.0, 3.0, 0.0, True, 30.0)),
+    "verification": asdict(StepResult(2.0, 5.0, 4.0, 9.0, 2.0, 2.0, 0.0, True, 30.0)),
     "notes": ["all quiet"],
 }  # fmt: skip
 
@@ -105,6 +108,7 @@ class FakeTune:
         self, config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks
     ) -> Outcome:
         ended: Ended | None = None
+        times: dict[str, float] = {}
         done = {event.data["stage"] for event in hooks.earlier if event.kind == "stage_done"}
         try:
             for stage, remaining in (("preflight", 3.0), ("relay", 1.0)):
@@ -119,6 +123,7 @@ class FakeTune:
                     if reason := hooks.stop():
                         raise Aborted(reason, "asked to stop")
                 hooks.on_event(StageDone(stage, Found(2.05, 3.32)))
+                times[stage] = 1.0
             hooks.on_event(Note("nearly there"))
             if self.ends:
                 raise self.ends
@@ -126,7 +131,7 @@ class FakeTune:
             ended = error
         finally:
             restored = loop.restore(state)
-        return Outcome(None if ended else RESULT, ended, restored, {"preflight": 1.0, "relay": 1.0})
+        return Outcome(None if ended else RESULT, ended, restored, times)
 
 
 def fake_rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:

@@ -1,8 +1,9 @@
 """A service as a process of its own, whose loops are files: what a test may kill.
 
-    python -m tests.unit.service.gateway FOLDER --host NAME --tag TAG ... [--database URL] [--no-resume]
+    python -m tests.unit.service.gateway FOLDER --tag TAG ... [--host NAME] [--database URL] [--no-resume]
 
 A stage lasts until FOLDER/go-STAGE (or FOLDER/go) is there; the controllers outlive the process as FOLDER/TAG.json.
+With --hours-back its clock is set back as soon as FOLDER/clock-is-back is there.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import yaml
@@ -21,6 +23,7 @@ from service.jobs import loop_state, state_json
 from service.loop import Loop, LoopState
 from service.request import RetuneRequest
 from service.serving import Setup, serve
+from service.store import store
 from service.work import Hooks, Outcome
 from tests.unit.service.fakes import NEW, OLD, RESULT, Found, loop_entry
 from tuning.plan import Command, Mode, Sample, SetGains, SetSetpoint, StageDone, StageStarted
@@ -106,6 +109,13 @@ def tune_in(folder: Path) -> Callable[[LoopConfig, RetuneRequest, Loop, LoopStat
     return tune
 
 
+def set_back(flag: Path, seconds: float) -> None:
+    """The wall clock of this process is that much behind from the moment on in which the flag is there."""
+    real = time.time
+    time.time = lambda: real() - (seconds if flag.exists() else 0.0)
+    store.now = lambda: datetime.fromtimestamp(time.time(), UTC).isoformat(timespec="milliseconds")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
@@ -113,8 +123,10 @@ def main() -> None:
     parser.add_argument("--tag", action="append", required=True)
     parser.add_argument("--database")
     parser.add_argument("--no-resume", action="store_true")
+    parser.add_argument("--hours-back", type=float, default=0.0)
     asked = parser.parse_args()
     asked.folder.mkdir(parents=True, exist_ok=True)
+    set_back(asked.folder / "clock-is-back", 3600 * asked.hours_back)
     loops = asked.folder / "loops.yaml"
     entries = [loop_entry(tag=tag, channel=n + 1) for n, tag in enumerate(asked.tag)]
     loops.write_text(yaml.safe_dump({"loops": entries}))

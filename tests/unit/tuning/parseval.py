@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from tests.unit.tuning.isa import response
 from tuning.gains import Gains
-from tuning.margins import controller_response
 from tuning.models import Complexes, Model, Reals, sign
 
 
@@ -19,7 +19,7 @@ def error_squares(model: Model, gains: Gains, low: float, high: float) -> tuple[
     """
 
     def loop(w: Reals) -> Complexes:
-        return sign(model) * model.frequency_response(w) * controller_response(gains, w)
+        return sign(model) * model.frequency_response(w) * response(gains, 1j * w)
 
     def error(w: Reals) -> Complexes:
         return 1.0 / (1j * w * (1.0 + loop(w)))

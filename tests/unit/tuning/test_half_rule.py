@@ -77,6 +77,22 @@ def test_the_ramp_of_an_integrating_plant_stays(lags: list[float], L: float) -> 
     assert pytest.approx(L + sum(lags), rel=1e-6) == second.T + second.L
 
 
+def test_half_rule_with_a_right_zero_keeps_two_lags() -> None:
+    # lags 12, 3, 1, 0.2 s, zero 0.3 s, dead time 1 s: T2 3.5, L 1 + 0.5 + 0.2 + 0.3
+    den = np.polymul(np.polymul([12.0, 1.0], [3.0, 1.0]), np.polymul([1.0, 1.0], [0.2, 1.0]))
+    model = half_rule(TransferFunction((-0.6, 2.0), tuple(den), 1.0), 2)
+    assert isinstance(model, SOPDT)
+    assert pytest.approx((2.0, 12.0, 3.5, 2.0), rel=1e-9) == (model.K, model.T1, model.T2, model.L)
+
+
+def test_half_rule_of_an_integrating_model() -> None:
+    model = TransferFunction((0.4,), tuple(np.polymul([1.0, 0.0], np.polymul([4.0, 2.0], [1.0, 1.0]))), 0.5)
+    assert half_rule(model) == Integrating(0.2, 3.5)
+    kept = half_rule(model, 2)
+    assert isinstance(kept, Integrating)
+    assert pytest.approx((0.2, 2.5, 1.0), rel=1e-9) == (kept.K, kept.T, kept.L)
+
+
 @given(T=st.floats(0.1, 10.0), ratio=st.floats(0.01, 1.0))
 def test_a_model_of_that_order_is_left_alone(T: float, ratio: float) -> None:
     for model, order in ((FOPDT(1.0, T, 1.0), 1), (Integrating(1.0, 1.0, T), 2)):

@@ -128,6 +128,9 @@ def test_every_kind_of_model_gets_a_stable_robust_loop(model: Model) -> None:
         ({"Ms_max": 0.9}, "above 1"),
         ({"Ms_max": float("nan")}, "above 1"),
         ({"horizon_s": -1.0}, "horizon_s"),
+        ({"horizon_s": 0.1}, "at least 2.5 s"),
+        ({"seed": -1}, "not negative"),
+        ({"seed": 0.5}, "whole number"),
         ({"Kp_max": 0.0}, "Kp_max"),
         ({"Kp_max": 1e-9}, "above 5e-05 is accepted"),
         ({"Ki_min": float("inf")}, "Ki_min"),
@@ -138,6 +141,11 @@ def test_bad_arguments_are_refused(options: dict[str, Any], said: str) -> None:
     with pytest.raises(Refused, match=said) as refused:
         me_pso(FOPDT(2.0, 5.0, 1.0), **options)
     assert refused.value.reason is Reason.BAD_INPUT
+
+
+def test_a_horizon_too_short_to_settle_is_said() -> None:
+    found = me_pso(FOPDT(2.0, 5.0, 2.5), horizon_s=3.0)
+    assert any("by the end of the horizon" in note for note in found.notes)
 
 
 def test_a_domain_without_a_stable_loop_is_refused() -> None:

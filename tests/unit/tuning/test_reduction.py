@@ -10,10 +10,11 @@ import pytest
 
 from tests.unit.tuning.tables import EQUIPOLE5, TABLES
 from tuning.gains import Gains
+from tuning.half_rule import half_rule
 from tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
 from tuning.reasons import Reason, Refused
 from tuning.recorded_step import fit_closed_loop, fit_step, moments_of, two_areas_of
-from tuning.reduction import half_rule, half_rule_second_order, moments, two_areas
+from tuning.reduction import moments, two_areas
 from tuning.response import step_response
 
 PLANTS_PI = Gains(Kp=0.887, Ti=0.887 / 0.225)
@@ -25,50 +26,6 @@ FIVE_LAGS_Y = 1.0 - np.exp(-FIVE_LAGS_T) * sum(FIVE_LAGS_T**k / math.factorial(k
 def row(method: str) -> dict[str, Any]:
     found: dict[str, Any] = next(r for r in TABLES["table1"]["rows"] if r["method"] == method)
     return found
-
-
-def test_half_rule_of_table_1() -> None:
-    model = half_rule(EQUIPOLE5)
-    assert isinstance(model, FOPDT)
-    assert pytest.approx((1.0, 1.5, 3.5), rel=1e-6) == (model.K, model.T, model.L)
-    printed = row("Half rule")["printed"]
-    assert pytest.approx((printed["T"], printed["tau"]), rel=1e-6) == (model.T, model.L)
-
-
-def test_half_rule_of_a_printed_example() -> None:
-    # Skogestad 2003, example E1: 1/((s+1)(0.2s+1)): T 1.1, L 0.1
-    model = half_rule(TransferFunction((1.0,), tuple(np.polymul([1.0, 1.0], [0.2, 1.0]))))
-    assert isinstance(model, FOPDT)
-    assert pytest.approx((1.1, 0.1), rel=1e-9) == (model.T, model.L)
-
-
-def test_half_rule_with_a_right_zero_keeps_two_lags() -> None:
-    # lags 12, 3, 1, 0.2 s, zero 0.3 s, dead time 1 s: T2 3.5, L 1 + 0.5 + 0.2 + 0.3
-    den = np.polymul(np.polymul([12.0, 1.0], [3.0, 1.0]), np.polymul([1.0, 1.0], [0.2, 1.0]))
-    model = half_rule_second_order(TransferFunction((-0.6, 2.0), tuple(den), 1.0))
-    assert isinstance(model, SOPDT)
-    assert pytest.approx((2.0, 12.0, 3.5, 2.0), rel=1e-9) == (model.K, model.T1, model.T2, model.L)
-
-
-def test_half_rule_of_an_integrating_model() -> None:
-    model = TransferFunction((0.4,), tuple(np.polymul([1.0, 0.0], np.polymul([4.0, 2.0], [1.0, 1.0]))), 0.5)
-    assert half_rule(model) == Integrating(0.2, 3.5)
-    kept = half_rule_second_order(model)
-    assert isinstance(kept, Integrating)
-    assert pytest.approx((0.2, 2.5, 1.0), rel=1e-9) == (kept.K, kept.T, kept.L)
-
-
-def test_what_the_half_rule_cannot_do() -> None:
-    for model in (
-        SOPDT(1.0, 3.0, 0.5, 1.0),
-        TransferFunction((2.0, 1.0), (6.0, 5.0, 1.0)),
-        TransferFunction((1.0,), (-5.0, 1.0)),
-    ):
-        with pytest.raises(Refused) as refused:
-            half_rule(model)
-        assert refused.value.reason is Reason.BAD_INPUT
-    with pytest.raises(Refused):
-        half_rule_second_order(FOPDT(1.0, 2.0, 1.0))
 
 
 def test_two_areas_in_closed_form() -> None:
