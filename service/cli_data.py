@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -22,6 +23,7 @@ def backup(
     """Copies the data folder's database while the service runs: jobs, samples, keys, audit log."""
     from service.backup import BackupProblem, back_up
 
+    _only_files()
     try:
         size = back_up(data, file, replace)
     except (BackupProblem, OSError) as error:
@@ -40,6 +42,7 @@ def restore(
     from service.backup import restore as run
     from service.store.store import FolderInUse
 
+    _only_files()
     try:
         interrupted, aside = run(file, data, replace)
     except FolderInUse:
@@ -50,6 +53,11 @@ def restore(
     if aside is not None:
         print(f"what was there before is in {aside}")
     print("keys are as they were in the back-up: see loopwright key list")
+
+
+def _only_files() -> None:
+    if os.environ.get("LOOPWRIGHT_DATABASE"):
+        _die("LOOPWRIGHT_DATABASE is set: a shared database is backed up and restored with pg_dump and pg_restore")
 
 
 def _die(why: object) -> NoReturn:

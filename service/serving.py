@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
 import socket
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -36,6 +38,7 @@ class _Server(uvicorn.Server):
         self._jobs = jobs
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        tell_systemd("STOPPING=1")
         self._jobs.request_stop()
         super().handle_exit(sig, frame)
 
@@ -44,6 +47,15 @@ class _Server(uvicorn.Server):
         if self.started and sockets:
             host, port = sockets[0].getsockname()[:2]
             print(f"ready http://{f'[{host}]' if ':' in host else host}:{port}", flush=True)
+            tell_systemd("READY=1")
+
+
+def tell_systemd(state: str) -> None:
+    """sd_notify: says where we are to a unit of Type=notify; nothing where there is none."""
+    address = os.environ.get("NOTIFY_SOCKET")
+    if address:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify, suppress(OSError):
+            notify.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
 
 
 def open_bus_loop(config: LoopConfig) -> Loop:

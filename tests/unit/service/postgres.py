@@ -24,19 +24,19 @@ class Server:
 
     def __init__(self, folder_of_binaries: Path) -> None:
         self._bin = folder_of_binaries
-        self._folder = Path(tempfile.mkdtemp(prefix="loopwright-pg-"))
+        self.folder = Path(tempfile.mkdtemp(prefix="loopwright-pg-"))
         self._user: str | None = None
         self._count = 0
         if os.getuid() == 0:  # postgres refuses to run as root
             self._user = next(user.pw_name for user in pwd.getpwall() if user.pw_name in ("postgres", "nobody"))
-            shutil.chown(self._folder, self._user)
-        self._data = self._folder / "data"
+            shutil.chown(self.folder, self._user)
+        self._data = self.folder / "data"
         self._run("initdb", "-D", str(self._data), "-U", "loopwright", "-A", "trust", "--no-sync")
         self.start()
 
     def start(self) -> None:
-        settings = f"-k {self._folder} -c listen_addresses='' -c fsync=off -c max_connections=300"
-        log = str(self._folder / "log")
+        settings = f"-k {self.folder} -c listen_addresses='' -c fsync=off -c max_connections=300"
+        log = str(self.folder / "log")
         self._run("pg_ctl", "-D", str(self._data), "-l", log, "-o", settings, "-w", "start")
 
     def stop(self) -> None:
@@ -55,16 +55,16 @@ class Server:
 
     def close(self) -> None:
         self.stop()
-        shutil.rmtree(self._folder)
+        shutil.rmtree(self.folder)
 
     def _url(self, name: str, driver: str) -> str:
-        return f"{driver}://loopwright@/{name}?host={self._folder}"
+        return f"{driver}://loopwright@/{name}?host={self.folder}"
 
     def _run(self, program: str, *arguments: str) -> None:
         done = subprocess.run(
             [self._bin / program, *arguments],
             user=self._user,
-            cwd=self._folder,
+            cwd=self.folder,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,  # a pipe would stay open with the server
             stderr=subprocess.PIPE if program == "initdb" else subprocess.DEVNULL,

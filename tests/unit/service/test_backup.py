@@ -205,7 +205,7 @@ def test_no_room(data: Path, tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data"]
 
 
-def test_the_commands(data: Path, tmp_path: Path) -> None:
+def test_the_commands(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def run(*arguments: object) -> Any:
         return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
 
@@ -220,6 +220,10 @@ def test_the_commands(data: Path, tmp_path: Path) -> None:
     assert run("restore", file, "--data", data).exit_code == 2
     done = run("restore", file, "--data", data, "--replace")
     assert done.exit_code == 0 and "1 job(s)" in done.stdout and "replaced-" in done.stdout
+    monkeypatch.setenv("LOOPWRIGHT_DATABASE", "postgresql://somewhere/else")
+    for command in ("backup", "restore"):
+        assert "pg_dump" in run(command, file, "--data", data, "--replace").stderr
+    monkeypatch.delenv("LOOPWRIGHT_DATABASE")
     store = Store(data)
     refused = run("restore", file, "--data", data, "--replace")
     assert refused.exit_code == 2 and "stop it first" in refused.stderr

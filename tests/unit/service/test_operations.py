@@ -4,8 +4,10 @@ import asyncio
 import json
 import logging
 import re
+import socket
 import threading
 from html.parser import HTMLParser
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,6 +20,7 @@ from service.api.app import create_app
 from service.api.operations import Readiness, bus_opens
 from service.logs import JsonLines, about
 from service.metrics import SAMPLES_LOST
+from service.serving import tell_systemd
 from tests.unit.service.fakes import TAG, Service
 from tests.unit.service.test_api import finished, start
 from tuning.reasons import Failed, Reason
@@ -209,6 +212,17 @@ def test_a_line_is_one_line_whatever_is_in_it() -> None:
 def test_an_answer_names_its_request(client: TestClient) -> None:
     one, other = (client.get(path).headers["x-request-id"] for path in ("/loops", "/nowhere"))
     assert one != other
+
+
+def test_systemd_is_told_when_requests_are_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tell_systemd("READY=1")  # without systemd: nothing
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        systemd.settimeout(5)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        tell_systemd("READY=1")
+        assert systemd.recv(100) == b"READY=1"
+    tell_systemd("STOPPING=1")  # a socket nobody reads is no reason to fail
 
 
 # the page of the API

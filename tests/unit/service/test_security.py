@@ -17,12 +17,15 @@ from typer.testing import CliRunner
 from service import cli
 from service.api.app import create_app
 from service.logs import JsonLines, Lines
+from service.security import audit
 from service.security.gate import Policy, is_loopback
 from service.security.keyring import REVOKED_WITHIN_S, KeyProblem, Keyring
 from service.security.keys import Scope, hash_key, matches, new_key
 from service.security.limits import Buckets, RequestLimits
 from service.serving import NotSafe, Setup, serve
+from service.store.store import Store
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
+from tests.unit.service.postgres import Server
 from tests.unit.service.test_api import assert_problem
 from tuning.reasons import Failed, Reason
 
@@ -301,6 +304,24 @@ def test_the_audit_log_in_pages(keyring: Keyring, open_client: Open) -> None:
         url = page["next"]
     assert seen == ["k4", "k3", "k2", "k1", "k0"]
     assert client.get(f"/audit?loop={TAG}").json() == {"entries": [], "next": None}
+
+
+def test_keys_and_audit_log_on_a_shared_database(tmp_path: Path, postgres: Server) -> None:
+    """A key made on one host is valid on the other, and the log is one."""
+    url = postgres.database()
+    stores = [Store(tmp_path / name, url, name) for name in ("one", "two")]
+    one, two = (Keyring(store.engine) for store in stores)
+    row, key = one.create("a", Scope.OPERATE)
+    found = two.check(key)
+    assert found is not None and found.id == row.id
+    job = stores[1].create("L", {"x": 1}, "me", False)
+    stores[1].wish_to_stop(job.id, "operator", "me")
+    two.revoke(row.id)
+    assert one.check(key) is None
+    entries = [(entry.what, entry.subject) for entry in audit.trail(stores[0].engine, 10)]
+    assert entries == [("key_revoke", row.id), ("abort", job.id), ("retune", job.id), ("key_create", row.id)]
+    for store in stores:
+        store.close()
 
 
 def test_a_change_and_its_entry_are_one_transaction(service: Service) -> None:
