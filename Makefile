@@ -1,11 +1,11 @@
 # make demo    a loop is retuned before your eyes      make test    every test and every check
-# make setup   the Python environment in .venv         make check   types, style, import directions
+# make setup   the Python environment in .venv         make check   types, style, import directions, packages
 # make bench   every benchmark, in one table           make validate    the five papers, recomputed
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-DEBIAN := user-mode-linux tshark can-utils iproute2
+DEBIAN := user-mode-linux tshark can-utils iproute2 postgresql
 
 .PHONY: setup demo test check bench validate system clean
 
@@ -34,6 +34,7 @@ check: setup
 	$(BIN)/ruff check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python tools/audit_dependencies.py
 
 bench: setup
 	$(BIN)/python -m benchmarks

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -83,6 +83,9 @@ class BusSample(NamedTuple):
 # The SDO server answers one request at a time, whoever asks: loops of one process on one node take turns.
 _turns: dict[tuple[str, int], threading.RLock] = {}
 _turns_guard = threading.Lock()
+
+sdo_retries: Counter[str] = Counter()
+"""By bus: SDO requests that this process sent again because no answer came."""
 
 
 def _turn(url: str, node: int) -> threading.RLock:
@@ -234,7 +237,10 @@ class Tuner:
         while self._receive(0.0):
             pass
         self._answers.clear()
-        for _ in range(self._sdo_tries):
+        for attempt in range(self._sdo_tries):
+            if attempt:
+                with _turns_guard:
+                    sdo_retries[self._url] += 1
             self._bus.send(sdo_request_id(node), request)
             give_up = time.monotonic() + self._sdo_timeout_s
             while (answer := self._answer(node, give_up)) is not None:

@@ -20,6 +20,7 @@ from protocol.objects import Device, default_of, lookup
 from protocol.profile import FOREVER, TUNER_NODE, Abort, Cause, Emcy, Experiment, ParameterCommand
 from protocol.tuner import BusSample, Kind, Tuner, TunerError
 from service.loop import LoopState
+from service.metrics import SAMPLES_LOST
 from tuning.gains import Gains
 from tuning.plan import Command, Mode, Sample, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
 from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
@@ -297,6 +298,8 @@ class BusLoop:
         self._last_n = found.n
         if passed < 1:
             raise Failed(Reason.SAMPLES_LOST, f"the plant started anew: sample {found.n} after {found.n - passed}")
+        if passed > 1:
+            SAMPLES_LOST.labels(self._url).inc(passed - 1)
         if passed > self._max_gap + 1:
             raise Failed(Reason.SAMPLES_LOST, f"{passed - 1} samples missing before sample {found.n}")
         self._left -= passed if self._in_blocks else 0

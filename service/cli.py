@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from service import cli_tuning
+from service import cli_data, cli_keys, cli_tuning
 from service.cli_output import AsJson, die, print_json, read_json_object
 from service.client import DEFAULT_URL, ApiError, Client
 
@@ -18,6 +18,8 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(cli_keys.app, name="key")
+app.add_typer(cli_data.app)
 _HAND_OVER: dict[str, Any] = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
 Url = Annotated[str, typer.Option("--url", envvar="LOOPWRIGHT_URL", help="Where the service is.")]
@@ -60,20 +62,62 @@ def hub(context: typer.Context) -> None:
 def serve(
     loops: Annotated[Path, typer.Option(help="The loops, YAML.")] = Path("loops.yaml"),
     data: Annotated[Path, typer.Option(help="Folder for jobs and samples.")] = Path("data"),
-    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    bind: Annotated[str, typer.Option(help="Address to listen on; others than loopback need keys.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on; 0: any free one.")] = 8080,
+    database: Annotated[
+        str | None,
+        typer.Option(envvar="LOOPWRIGHT_DATABASE", help="postgresql://..., shared by several hosts; default: a file."),
+    ] = None,
+    host: Annotated[
+        str | None, typer.Option(envvar="LOOPWRIGHT_HOST", help="Name of this host among those of a shared database.")
+    ] = None,
+    resume: Annotated[bool, typer.Option(help="Go on with jobs that a crash has cut off.")] = True,
+    auth: Annotated[
+        bool | None, typer.Option("--auth/--no-auth", help="Ask for keys. Default: unless only this machine is served.")
+    ] = None,
+    max_body: Annotated[
+        int, typer.Option(min=1024, envvar="LOOPWRIGHT_MAX_BODY", help="Longest body of a request, bytes.")
+    ] = 1_048_576,
+    rate: Annotated[
+        float, typer.Option(min=0.1, envvar="LOOPWRIGHT_RATE", help="Requests/s of one caller; twice that at once.")
+    ] = 500.0,
+    at_once: Annotated[
+        int, typer.Option(min=1, envvar="LOOPWRIGHT_AT_ONCE", help="Requests answered at once, of all callers.")
+    ] = 64,
+    streams: Annotated[
+        int, typer.Option(min=1, envvar="LOOPWRIGHT_STREAMS", help="Event streams open at once, of all callers.")
+    ] = 200,
+    log_format: Annotated[
+        str, typer.Option(envvar="LOOPWRIGHT_LOG_FORMAT", help="text, or json: one object a line.")
+    ] = "text",
 ) -> None:
     """The service: REST over jobs that retune live loops."""
-    from service.config import ConfigError
-    from service.serving import serve as run
-    from service.store.store import FolderInUse
+    from sqlalchemy.exc import SQLAlchemyError
 
+    from service.config import ConfigError
+    from service.security.limits import RequestLimits
+    from service.serving import NotSafe, Setup
+    from service.serving import serve as run
+    from service.store.database import BadDatabase
+    from service.store.store import FolderInUse, ForeignLoop
+
+    if log_format not in ("text", "json"):
+        die(f"--log-format must be text or json, not {log_format!r}", 2)
+    limits = RequestLimits(
+        body_bytes=max_body, rate_per_s=rate, burst=max(1, round(2 * rate)), at_once=at_once, streams_at_once=streams
+    )
+    setup = Setup(
+        loops, data, bind, port, database, host, resume,
+        auth=auth, limits=limits, log_format="json" if log_format == "json" else "text",
+    )  # fmt: skip
     try:
-        run(loops, data, host, port)
-    except (ConfigError, FolderInUse) as error:
+        run(setup)
+    except (ConfigError, FolderInUse, ForeignLoop, BadDatabase, NotSafe) as error:
         die(str(error), 2)
+    except SQLAlchemyError as error:
+        die(f"the database cannot be used: {getattr(error, 'orig', None) or error}", 2)
     except OSError as error:
-        die(f"cannot listen on {host}:{port} or write to {data}: {error.strerror or error}", 2)
+        die(f"cannot listen on {bind}:{port} or write to {data}: {error.strerror or error}", 2)
 
 
 @app.command("loops")

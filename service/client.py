@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,8 @@ if TYPE_CHECKING:
     import httpx
 
 DEFAULT_URL = "http://127.0.0.1:8080"
+KEY_VARIABLE = "LOOPWRIGHT_KEY"
+"""In the environment and not on the command line, where every user of the machine could read it."""
 
 
 class ApiError(Exception):
@@ -23,7 +26,9 @@ class Client:
         import httpx
 
         self.url = url.rstrip("/")
-        self._http = httpx.Client(base_url=self.url, timeout=30.0, trust_env=False)
+        key = os.environ.get(KEY_VARIABLE)
+        headers = {"Authorization": f"Bearer {key}"} if key else {}
+        self._http = httpx.Client(base_url=self.url, timeout=30.0, trust_env=False, headers=headers)
 
     def get(self, path: str, **query: Any) -> Any:
         return self._json("GET", path, params={k: v for k, v in query.items() if v is not None})
@@ -77,5 +82,7 @@ class Client:
             body = answer.json()
         except ValueError:
             raise ApiError(f"HTTP {answer.status_code}: {answer.text[:200]}") from None
+        if answer.status_code == 401:
+            body["advice"] = f"Put an API key into the environment variable {KEY_VARIABLE}."
         lines = [body.get("detail") or body.get("title"), body.get("advice"), body.get("job")]
         raise ApiError("\n".join(line for line in lines if line))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -76,23 +77,39 @@ class LoopConfig(BaseModel):
         return self
 
 
-def load_loops(path: Path) -> dict[str, LoopConfig]:
-    """The loops of a file by tag. Raises ConfigError with everything that is wrong with it."""
+class BusConfig(BaseModel):
+    """A bus. at_once: how many of its loops may be tuned at the same time."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    at_once: int = Field(default=8, ge=1, le=1000)
+
+
+@dataclass(frozen=True)
+class Site:
+    """What a file configures: the loops by tag, and the buses it says something about."""
+
+    loops: dict[str, LoopConfig]
+    buses: dict[str, BusConfig]
+
+
+def load_site(path: Path) -> Site:
+    """The site of a file. Raises ConfigError with everything that is wrong with it."""
     try:
         document = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(str(path), [error.strerror or str(error)]) from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(str(path), [f"not YAML: {error}"]) from error
-    return parse_loops(document, str(path))
+    return parse_site(document, str(path))
 
 
-def parse_loops(document: Any, source: str) -> dict[str, LoopConfig]:
-    """The loops of a parsed document `{"loops": [...]}`."""
+def parse_site(document: Any, source: str) -> Site:
+    """The site of a parsed document `{"loops": [...], "buses": {BUS: {"at_once": ...}}}`."""
     entries = document.get("loops") if isinstance(document, dict) else None
     if not isinstance(entries, list) or not entries:
         raise ConfigError(source, ["expected a list of loops under the key 'loops'"])
-    problems = [f"{key}: unknown key" for key in document if key != "loops"]
+    problems = [f"{key}: unknown key" for key in document if key not in ("loops", "buses")]
     loops: list[LoopConfig] = []
     for number, entry in enumerate(entries):
         try:
@@ -103,9 +120,25 @@ def parse_loops(document: Any, source: str) -> dict[str, LoopConfig]:
     problems += _repeated(
         "channel", [f"{loop.bus} node {loop.controller_node} channel {loop.channel}" for loop in loops]
     )
+    buses = _buses(document.get("buses") or {}, {loop.bus for loop in loops}, problems)
     if problems:
         raise ConfigError(source, problems)
-    return {loop.tag: loop for loop in loops}
+    return Site({loop.tag: loop for loop in loops}, buses)
+
+
+def _buses(entries: Any, known: set[str], problems: list[str]) -> dict[str, BusConfig]:
+    if not isinstance(entries, dict):
+        problems.append("buses: expected a mapping from the name of a bus to its settings")
+        return {}
+    found = {}
+    for bus, entry in entries.items():
+        if bus not in known:
+            problems.append(f"buses.{bus}: no loop is on this bus")
+        try:
+            found[bus] = BusConfig.model_validate(entry)
+        except ValidationError as error:
+            problems += [f"buses.{bus}.{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
+    return found
 
 
 def _tag(entry: Any) -> str | None:

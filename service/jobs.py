@@ -1,37 +1,49 @@
-"""Jobs: one thread per active job, the store as the memory, the table of moves as the law.
+"""Jobs: the engine starts them, a thread pumps each, the store is the memory, the table of moves the law.
 
 A job's thread is the one that pumps the loop (heartbeat and lease go out from `step`), so what it does between two
-samples is kept short: events are one small transaction, samples are gathered into blocks.
+samples is kept short: what it has to tell goes into the journal, which another thread writes.
 """
 
 from __future__ import annotations
 
 import logging
-import math
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
-from typing import Any
+from typing import Any, TypeVar
 
-from service.config import LoopConfig
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.config import BusConfig, LoopConfig
+from service.engine import WORKFLOW_VERSION, Engine
+from service.journal import Journal, temporary
+from service.logs import about
 from service.loop import Loop, LoopState
 from service.observed import ObservedLoop
-from service.progress import Progress
-from service.request import RetuneRequest, within
+from service.request import BadLimits, RetuneRequest, within
+from service.running import Running
+from service.safe import PATIENCE_S, Safe, make_safe, same
 from service.states import ACTIVE, IllegalMove, JobState, state_after
-from service.store.store import Busy, Store
+from service.store.store import Busy, FolderInUse, NoSuchJob, Store
 from service.store.tables import JobRow
-from service.work import Hooks, Outcome, Rehearse, Tune, plain
+from service.work import Hooks, Outcome, Rehearse, Tune
 from tuning.gains import Gains
-from tuning.plan import Event, Note, Sample, StageDone, StageStarted
+from tuning.plan import Event, Mode
 from tuning.reasons import Aborted, Ended, Failed, Reason
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 LoopFactory = Callable[[LoopConfig], Loop]
-_BLOCK_SAMPLES = 4096
-_BLOCK_WALL_S = 1.0
+REHEARSALS_AT_ONCE = 4
+MOST_ATTEMPTS = 10
+_WATCH_S = 0.2
+_RECONCILE_S = 15.0
+_AT_BOOT = 16
+_STOP_PATIENCE_S = 20.0
 
 
 class UnknownLoop(Exception):
@@ -50,139 +62,207 @@ class Conflict(Exception):
     """The job or its loop is not as the wish supposes."""
 
 
-class Running:
-    """The live part of an active job; other threads read it and may set `stop_reason`."""
-
-    def __init__(self, job_id: str, store: Store) -> None:
-        self.job_id = job_id
-        self.progress = Progress()
-        self.loop: ObservedLoop | None = None
-        self.stop_reason: Reason | None = None
-        self.thread: threading.Thread | None = None
-        self._store = store
-        self._buffer: list[Sample] = []
-        self._stage = "preflight"
-        self._boundaries: list[tuple[float, str]] = []
-        self._last_t = -math.inf
-        self._flushed = time.monotonic()
-
-    def on_event(self, event: Event) -> None:
-        self.keep_time()
-        if isinstance(event, StageStarted):
-            self.progress.stage_started(event)
-            self._boundaries.append((self._last_t, event.stage))
-            self._store.update(self.job_id, stage=event.stage, plant_time_s=self.progress.plant_time_s)
-            data: dict[str, Any] = {
-                "stage": event.stage, "expected_s": event.expected_s, "remaining_s": event.remaining_s,
-            }  # fmt: skip
-            self._tell("stage_started", data)
-        elif isinstance(event, StageDone):
-            self._tell("stage_done", {"stage": event.stage, "result": plain(event.result)})
-        elif isinstance(event, Note):
-            self._tell("note", {"stage": self.progress.stage, "text": event.text})
-
-    def on_samples(self, samples: list[Sample]) -> None:
-        """Samples come in the runner's blocks, which do not end where a stage does: split by the stages' times."""
-        self.keep_time()
-        for sample in samples:
-            while self._boundaries and sample.t > self._boundaries[0][0]:
-                self.flush()
-                self._stage = self._boundaries.pop(0)[1]
-            self._buffer.append(sample)
-        if len(self._buffer) >= _BLOCK_SAMPLES or time.monotonic() - self._flushed > _BLOCK_WALL_S:
-            self.flush()
-
-    def flush(self) -> None:
-        """Writes the gathered samples as one block of their stage."""
-        if self._buffer:
-            self._store.add_samples(self.job_id, self._stage, self._buffer)
-            self._buffer = []
-        self._flushed = time.monotonic()
-
-    def keep_time(self) -> None:
-        """Brings the progress up to the latest sample."""
-        t = self.loop.t_s if self.loop else None
-        if t is not None:
-            self._last_t = t
-            self.progress.at(t)
-
-    def _tell(self, kind: str, data: dict[str, Any]) -> None:
-        self._store.append(self.job_id, kind, data, self.progress.plant_time_s)
-
-
 class Jobs:
-    """Starts, stops and decides jobs."""
+    """Starts, stops and decides jobs of this host's loops; shows, starts and aborts those of the others.
+
+    buses: what is configured for them.  resume: whether jobs that a dead service left go on at the next start.
+    patience_s: how long a loop that such a job had gets to come back by itself, s of wall time.
+    """
 
     def __init__(
-        self, loops: Mapping[str, LoopConfig], store: Store, open_loop: LoopFactory, tune: Tune, rehearse: Rehearse
+        self,
+        loops: Mapping[str, LoopConfig],
+        store: Store,
+        open_loop: LoopFactory,
+        tune: Tune,
+        rehearse: Rehearse,
+        *,
+        engine: Engine,
+        buses: Mapping[str, BusConfig] | None = None,
+        resume: bool = True,
+        patience_s: float = PATIENCE_S,
     ) -> None:
         self.loops = loops
         self.store = store
+        self.engine = engine
+        self.journal = Journal(store)
+        self.stopping = False
         self._open_loop = open_loop
         self._tune = tune
         self._rehearse = rehearse
+        self._buses = buses or {}
+        self._resume = resume
+        self._patience_s = patience_s
         self._running: dict[str, Running] = {}
-        # Guards starting a job against deciding another one on the same loop, and the two fields around it.
+        # Guards the registry of running jobs and `stopping`.
         self._lock = threading.Lock()
-        self.stopping = False
-        for row in store.unfinished():
-            store.move(
-                row.id,
-                JobState.INTERRUPTED,
-                reason=Reason.SERVICE_STOPPED.value,
-                detail="the service ended without stopping this job; the controller went back by itself",
-            )
+        # By loop: who is about to begin a job on it, or to decide one.
+        self._hands: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
+        self._lost: set[str] = set()
+        self._ended = threading.Event()
+        self._watcher = threading.Thread(target=self._watch, name="watcher", daemon=True)
+
+    # at the start of the service
+    def boot(self) -> None:
+        """Takes this host's loops, makes those of its active jobs safe, then lets the engine go on with the jobs.
+
+        Raises ForeignLoop.
+        """
+        self.store.own_loops({tag: config.model_dump(mode="json") for tag, config in self.loops.items()})
+        with ThreadPoolExecutor(_AT_BOOT, "boot") as pool:
+            for _ in pool.map(self._recover, self.store.unfinished()):
+                pass
+        queues = {self._queue(config): self._at_once(config.bus) for config in self.loops.values()}
+        self.engine.launch(self.work, queues | {self._rehearsals(self.store.host): REHEARSALS_AT_ONCE})
+        self.reconcile(at_once=True)
+        self._watcher.start()
+
+    def _recover(self, row: JobRow) -> None:
+        """Makes the loop of a job that a dead service left safe, and ends the job if it is not to go on."""
+        safe: Safe | None = None
+        if row.found is not None:
+            safe = self._safe(row)
+            self.store.append(row.id, "loop_found", {"text": safe.text}, row.plant_time_s)
+        restored: dict[str, Any] = {}
+        if safe is not None and safe.state is not None:
+            restored = {"restored": state_json(safe.state)}
+        if row.stop_reason is not None:
+            detail = "asked to stop before the service ended; " + _loop_words(safe)
+            self.store.move(row.id, JobState.ABORTED, reason=row.stop_reason, detail=detail, **restored)
+            return
+        why = self._why_not(row, safe)
+        if why is not None:
+            reason, text = why
+            detail = f"cut off by the end of the service, and not resumed: {text}; {_loop_words(safe)}"
+            self.store.move(row.id, JobState.INTERRUPTED, reason=reason.value, detail=detail, **restored)
+
+    def _safe(self, row: JobRow) -> Safe:
+        config = self.loops.get(row.loop)
+        if config is None:
+            return Safe(None, "the loop is no longer configured here", Reason.SERVICE_STOPPED)
+        try:
+            loop = self._open_loop(config)
+        except Exception as error:
+            return Safe(None, f"not reached: {error}; the controller goes back by itself", Reason.BUS_LOST)
+        try:
+            return make_safe(loop, loop_state(row.found or {}), self._patience_s)
+        finally:
+            loop.close()
+
+    def _why_not(self, row: JobRow, safe: Safe | None) -> tuple[Reason, str] | None:
+        """Why a job is not to be resumed, if so."""
+        config = self.loops.get(row.loop)
+        if row.version != WORKFLOW_VERSION:
+            return Reason.SERVICE_STOPPED, "it was begun by another version of Loopwright"
+        if config is None:
+            return Reason.SERVICE_STOPPED, "its loop is no longer configured here"
+        if not self._resume:
+            return Reason.SERVICE_STOPPED, "the service was started with --no-resume"
+        if safe is not None and safe.reason is not None:
+            return safe.reason, "the loop is not as the job had found it" if safe.state else "the loop is not reached"
+        if row.attempt >= MOST_ATTEMPTS:
+            return Reason.SERVICE_STOPPED, f"that was attempt {row.attempt} of at most {MOST_ATTEMPTS}"
+        try:
+            within(config, RetuneRequest.model_validate(row.request))
+        except ValueError as error:  # BadLimits too
+            return Reason.BAD_LIMITS, f"the loop's configuration has changed: {error}"
+        return None
+
+    def reconcile(self, at_once: bool = False) -> None:
+        """Hands the engine what it has lost (an enqueue that failed, a file that was deleted or is older than ours).
+
+        at_once: without waiting for a second look, which keeps a job that is just being started from being lost.
+        """
+        with self._lock:
+            idle = [row for row in self.store.unfinished() if row.id not in self._running]
+        lost = {row.id for row in idle} - self.engine.known([row.id for row in idle])
+        for row in idle:
+            if row.id in lost and (at_once or row.id in self._lost):
+                self.engine.forget(row.id)
+                self.engine.enqueue(row.id, self._queue_of(row))
+        self._lost = lost
+
+    def _queue_of(self, row: JobRow) -> str:
+        return self._rehearsals(row.host) if row.dry_run else self._queue(self.loops[row.loop])
+
+    def _queue(self, config: LoopConfig, host: str | None = None) -> str:
+        """A bus has its name from its host: two hosts may both have a vcan0."""
+        return f"{host or self.store.host}:{config.bus}"
+
+    @staticmethod
+    def _rehearsals(host: str) -> str:
+        return f"{host}:rehearsals"
+
+    def _at_once(self, bus: str) -> int:
+        return self._buses.get(bus, BusConfig()).at_once
 
     # what there is
     def config(self, tag: str) -> LoopConfig:
-        if tag not in self.loops:
+        return self.owner(tag)[0]
+
+    def owner(self, tag: str) -> tuple[LoopConfig, str]:
+        """The loop's configuration, and the host that has it. Raises UnknownLoop."""
+        if tag in self.loops:
+            return self.loops[tag], self.store.host
+        row = self.store.foreign_loop(tag)
+        if row is None:
             raise UnknownLoop(tag)
-        return self.loops[tag]
+        return LoopConfig.model_validate(row.config), row.host
+
+    def everywhere(self) -> list[tuple[LoopConfig, str]]:
+        """Every loop of every host: ours first."""
+        ours = [(config, self.store.host) for config in self.loops.values()]
+        return ours + [(LoopConfig.model_validate(row.config), row.host) for row in self.store.foreign_loops()]
 
     def running(self, job_id: str) -> Running | None:
         return self._running.get(job_id)
 
-    def live(self, tag: str) -> tuple[LoopState, str | None]:
-        """The present state of a loop and the job it belongs to: from the job if one runs, else read from the bus."""
-        config = self.config(tag)
+    def live(self, tag: str) -> LoopState | None:
+        """The present state of a loop: from the job if one runs, else read from the bus; None on another host."""
+        if tag not in self.loops:
+            self.owner(tag)
+            return None
         active = self.store.active(tag)
         running = self.running(active.id) if active else None
         state = running.loop.latest if running and running.loop else None
-        if active and state:
-            return state, active.id
-        loop = self._open_loop(config)
+        if state:
+            return state
+        loop = self._open_loop(self.loops[tag])
         try:
-            return loop.read(), active.id if active else None
+            return loop.read()
         finally:
             loop.close()
 
     # start and stop
     def start(self, tag: str, request: RetuneRequest) -> JobRow:
-        """Queues a job and starts its thread. Raises UnknownLoop, BadLimits, Busy, Stopping."""
-        config = within(self.config(tag), request)
-        with self._lock:
-            if self.stopping:
-                raise Stopping("the service is shutting down")
-            row = self.store.create(
-                tag, request.model_dump(mode="json", exclude_none=True), request.requested_by, request.dry_run
-            )
-            running = Running(row.id, self.store)
-            self._running[row.id] = running
-            # Not a daemon: the process must not end before the loop is restored.
-            running.thread = threading.Thread(target=self._work, args=(running, config, request), name=f"job-{row.id}")
-            running.thread.start()
+        """Queues a job on the host that has the loop. Raises UnknownLoop, BadLimits, Busy, Stopping."""
+        config, host = self.owner(tag)
+        within(config, request)
+        if self.stopping:
+            raise Stopping("the service is shutting down")
+        asked = request.model_dump(mode="json", exclude_none=True)
+        row = self.store.create(tag, asked, request.requested_by, request.dry_run, host, WORKFLOW_VERSION)
+        self.engine.enqueue(row.id, self._rehearsals(host) if row.dry_run else self._queue(config, host))
         return row
 
     def abort(self, job_id: str, by: str) -> JobRow:
-        """Asks an active job to stop; it ends as aborted once the loop is restored."""
-        row = self.store.get(job_id)
-        running = self.running(job_id)
-        if running is None or JobState(row.state) not in ACTIVE:
-            raise IllegalMove(JobState(row.state), JobState.ABORTED)
-        if running.stop_reason is None:
-            running.stop_reason = Reason.OPERATOR
-            self.store.append(job_id, "abort_requested", {"by": by}, running.progress.plant_time_s)
-        return row
+        """Asks an active job to stop; it ends as aborted once the loop is restored. Raises IllegalMove."""
+        row = self.store.wish_to_stop(job_id, Reason.OPERATOR.value, by)
+        if row.host == self.store.host:
+            self._heed(job_id, Reason.OPERATOR)
+        return self.store.get(job_id)
+
+    def _heed(self, job_id: str, reason: Reason) -> None:
+        """A job that runs hears of it at its next sample; one that waits for its turn has nothing to restore."""
+        with self._lock:
+            running = self._running.get(job_id)
+            if running is not None:
+                running.stop_reason = running.stop_reason or reason
+                return
+            row = self.store.get(job_id)
+            if JobState(row.state) in ACTIVE:
+                detail = "stopped while it waited for its turn"
+                self.store.move(job_id, JobState.ABORTED, reason=reason.value, detail=detail)
 
     def request_stop(self) -> None:
         """Tells every job to end; returns at once."""
@@ -191,12 +271,40 @@ class Jobs:
             running.stop_reason = running.stop_reason or Reason.SERVICE_STOPPED
 
     def stop(self) -> None:
-        """Ends every job and waits until each has restored its loop."""
+        """Ends every job, waits until each has restored its loop, and gives the engine up."""
+        if self._ended.is_set():
+            return
         with self._lock:
             self.request_stop()
         for running in list(self._running.values()):
-            if running.thread is not None:
-                running.thread.join()
+            running.over.wait()
+        self._ended.set()
+        try:
+            for row in self._lasting(self.store.unfinished):
+                self._heed(row.id, Reason.SERVICE_STOPPED)
+        except SQLAlchemyError as error:
+            log.error("the end of the waiting jobs could not be written, they go on at the next start: %s", error)
+        if self._watcher.is_alive():
+            self._watcher.join()
+        self.engine.close()
+        self.journal.close(_STOP_PATIENCE_S)
+
+    def _watch(self) -> None:
+        """Hears of jobs to stop, from whatever host; holds the lock on our name; finds what the engine has lost."""
+        reconciled = time.monotonic()
+        while not self._ended.wait(_WATCH_S):
+            try:
+                for job_id, reason in self.store.wishes_to_stop().items():
+                    self._heed(job_id, Reason(reason))
+                if time.monotonic() - reconciled > _RECONCILE_S:
+                    self.store.check_lock()
+                    self.reconcile()
+                    reconciled = time.monotonic()
+            except FolderInUse as error:
+                log.critical("%s; every job is stopped", error)
+                self.request_stop()
+            except (SQLAlchemyError, IllegalMove, NoSuchJob) as error:
+                log.warning("%s", error)
 
     # decide
     def accept(self, job_id: str, by: str) -> JobRow:
@@ -208,7 +316,8 @@ class Jobs:
         return self._decide(job_id, JobState.ROLLED_BACK, by)
 
     def _decide(self, job_id: str, wanted: JobState, by: str) -> JobRow:
-        with self._lock:
+        row = self.store.get(job_id)
+        with self._hands[row.loop]:
             row = self.store.get(job_id)
             now = JobState(row.state)
             if now not in (JobState.PROPOSED, JobState.ACCEPTED) or now is wanted:
@@ -220,9 +329,16 @@ class Jobs:
                 raise Busy(row.loop, active.id)
             if now is JobState.PROPOSED and wanted is JobState.ROLLED_BACK:
                 return self.store.move(job_id, wanted, by=by)
+            config, host = self.owner(row.loop)
+            if host != self.store.host:
+                raise Conflict(f"loop {row.loop} is on the bus of host {host}: only the service there can write to it")
             old, new = gains_of(row.old_gains), gains_of((row.result or {}).get("gains"))
             before, after = (old, new) if wanted is JobState.ACCEPTED else (new, old)
-            state = self._exchange(self.config(row.loop), before, after)
+            try:
+                state = self._exchange(config, before, after)
+            except Ended as ended:
+                self.store.decision_failed(job_id, wanted, by, f"{ended.reason.value}: {ended.detail}")
+                raise
             return self.store.move(job_id, wanted, by=by, restored=state_json(state))
 
     def _exchange(self, config: LoopConfig, before: Gains, after: Gains) -> LoopState:
@@ -242,41 +358,92 @@ class Jobs:
             loop.close()
 
     # the thread of a job
-    def _work(self, running: Running, config: LoopConfig, request: RetuneRequest) -> None:
+    def work(self, job_id: str) -> None:
+        """Runs a job to its end, or its rest after a crash. Called by the engine; a job that is over is left alone."""
         try:
-            outcome = self._dry(running, config, request) if request.dry_run else self._live(running, config, request)
-        except Ended as ended:
-            outcome = Outcome(None, ended, None, {})
-        except Exception as error:
-            log.exception("job %s", running.job_id)
-            outcome = Outcome(None, Failed(Reason.INTERNAL, f"{type(error).__name__}: {error}"), None, {})
+            row = self._lasting(lambda: self.store.get(job_id))
+            before_s = self._lasting(lambda: self.store.last_sample_s(job_id)) if row.attempt else 0.0
+        except NoSuchJob:
+            return
+        with self._lock:
+            if self.stopping or job_id in self._running or JobState(row.state) not in ACTIVE:
+                return
+            running = Running(job_id, row.loop, self.journal, max(row.plant_time_s, before_s))
+            if row.stop_reason is not None:
+                running.stop_reason = Reason(row.stop_reason)
+            self._running[job_id] = running
         try:
-            self._finish(running, outcome)
-        except Exception:
-            log.exception("job %s: its end could not be written", running.job_id)
+            with about(job=job_id, loop=row.loop):
+                self._to_the_end(running, row)
         finally:
-            self._running.pop(running.job_id, None)
+            with self._lock:
+                self._running.pop(job_id, None)
+            running.over.set()
 
-    def _live(self, running: Running, config: LoopConfig, request: RetuneRequest) -> Outcome:
+    def _to_the_end(self, running: Running, row: JobRow) -> None:
+        log.info("job started, attempt %d", row.attempt + 1)
+        try:
+            self._finish(running, self._run(running, row))
+        except Exception:
+            log.exception("the end of the job could not be written")
+
+    def _run(self, running: Running, row: JobRow) -> Outcome:
+        try:
+            request = RetuneRequest.model_validate(row.request)
+            config = within(self.config(row.loop), request)
+            run = self._dry if row.dry_run else self._live
+            return run(running, row, config, request)
+        except Ended as ended:
+            return Outcome(None, ended, None, {})
+        except BadLimits as error:
+            return Outcome(None, Failed(Reason.BAD_LIMITS, str(error)), None, {})
+        except Exception as error:
+            log.exception("a defect in the job")
+            return Outcome(None, Failed(Reason.INTERNAL, f"{type(error).__name__}: {error}"), None, {})
+
+    def _live(self, running: Running, row: JobRow, config: LoopConfig, request: RetuneRequest) -> Outcome:
         self._check_stop(running)
         loop = ObservedLoop(self._open_loop(config))
         try:
             running.loop = loop
-            state = loop.read()
-            self.store.move(running.job_id, JobState.RUNNING, old_gains=asdict(state.gains))
-            hooks = Hooks(running.on_event, running.on_samples, lambda: running.stop_reason)
+            with self._hands[row.loop]:
+                state = self._begun(loop, row)
+            earlier = self.store.events(row.id) if row.found is not None else ()
+            hooks = Hooks(running.on_event, running.on_samples, lambda: running.stop_reason, earlier)
             return self._tune(config, request, loop, state, hooks)
         finally:
             loop.close()
 
-    def _dry(self, running: Running, config: LoopConfig, request: RetuneRequest) -> Outcome:
-        self.store.move(running.job_id, JobState.RUNNING)
+    def _begun(self, loop: Loop, row: JobRow) -> LoopState:
+        """The state of the loop as an attempt begins, written down before anything is touched."""
+        if row.found is None:
+            state = loop.read()
+            columns: dict[str, Any] = {"old_gains": asdict(state.gains), "found": state_json(state), "attempt": 1}
+            self._lasting(lambda: self.store.move(row.id, JobState.RUNNING, **columns))
+            return state
+        safe = make_safe(loop, loop_state(row.found), self._patience_s)
+        if safe.state is None:
+            raise Failed(safe.reason or Reason.NODE_LOST, safe.text)
+        if safe.reason is not None:
+            raise Aborted(safe.reason, safe.text)
+        self._resumed(row, safe.text)
+        return safe.state
+
+    def _dry(self, running: Running, row: JobRow, config: LoopConfig, request: RetuneRequest) -> Outcome:
+        if JobState(row.state) is JobState.QUEUED:
+            self._lasting(lambda: self.store.move(row.id, JobState.RUNNING, attempt=1))
+        else:
+            self._resumed(row, "a rehearsal begins anew")
 
         def on_event(event: Event) -> None:
             self._check_stop(running)
             running.on_event(event)
 
         return self._rehearse(config, request, Hooks(on_event, running.on_samples, lambda: running.stop_reason))
+
+    def _resumed(self, row: JobRow, text: str) -> None:
+        told = {"attempt": row.attempt + 1, "text": text}
+        self._lasting(lambda: self.store.resumed(row.id, told, attempt=row.attempt + 1))
 
     @staticmethod
     def _check_stop(running: Running) -> None:
@@ -285,19 +452,47 @@ class Jobs:
 
     def _finish(self, running: Running, outcome: Outcome) -> None:
         running.flush()
+        while not self.journal.flush(1.0):
+            if self.stopping and self.journal.behind_s > _STOP_PATIENCE_S:
+                log.error("the database takes nothing, the last reports of the job are lost")
+                break
+        times = self._earlier_times(running.job_id) | outcome.plant_time_s
         columns: dict[str, Any] = {
             "result": outcome.result,
-            "stage_times_s": outcome.plant_time_s,
-            "plant_time_s": sum(outcome.plant_time_s.values()) or running.progress.plant_time_s,
+            "stage_times_s": times,
+            "plant_time_s": max(running.progress.plant_time_s, running.before_s + sum(outcome.plant_time_s.values())),
         }
         if outcome.restored is not None:
             columns["restored"] = state_json(outcome.restored)
+        state = JobState.PROPOSED
+        if outcome.ended is not None:
+            state = state_after(outcome.ended)
+            columns |= {"reason": outcome.ended.reason.value, "detail": outcome.ended.detail}
+        self._lasting(lambda: self.store.move(running.job_id, state, **columns))
         if outcome.ended is None:
-            self.store.move(running.job_id, JobState.PROPOSED, **columns)
+            log.info("job proposes new gains")
         else:
-            ended = outcome.ended
-            columns |= {"reason": ended.reason.value, "detail": ended.detail}
-            self.store.move(running.job_id, state_after(ended), **columns)
+            log.warning("job %s, %s: %s", state.value, outcome.ended.reason.value, outcome.ended.detail)
+
+    def _earlier_times(self, job_id: str) -> dict[str, float]:
+        """Plant time of the stages that any attempt has finished, s."""
+        events = self._lasting(lambda: self.store.events(job_id))
+        return {e.data["stage"]: e.data["stage_time_s"] for e in events if e.kind == "stage_done"}
+
+    def _lasting(self, wish: Callable[[], T]) -> T:
+        """The answer of the database, asked until it gives one; while the service stops, for a while only."""
+        since = time.monotonic()
+        while True:
+            try:
+                return wish()
+            except SQLAlchemyError as error:
+                if not temporary(error) or (self.stopping and time.monotonic() - since > _STOP_PATIENCE_S):
+                    raise
+                time.sleep(0.5)
+
+
+def _loop_words(safe: Safe | None) -> str:
+    return "the loop had not been touched" if safe is None else f"the loop: {safe.text}"
 
 
 def gains_of(data: dict[str, Any] | None) -> Gains:
@@ -312,9 +507,7 @@ def state_json(state: LoopState) -> dict[str, Any]:
     return asdict(state) | {"mode": state.mode.name.lower()}
 
 
-def same(one: Gains, other: Gains) -> bool:
-    """Equal as far as the bus can tell: gains travel as float32 (24 bits, 6e-8)."""
-    return all(
-        math.isclose(getattr(one, name), getattr(other, name), rel_tol=1e-6, abs_tol=1e-9)
-        for name in Gains.__dataclass_fields__
-    )
+def loop_state(data: dict[str, Any]) -> LoopState:
+    """A loop's state from its JSON. PV and MV that were not numbers are of no account."""
+    numbers = {name: 0.0 if data[name] is None else data[name] for name in ("pv", "mv")}
+    return LoopState(**data | numbers | {"mode": Mode[data["mode"].upper()], "gains": gains_of(data["gains"])})

@@ -8,8 +8,10 @@ from tuning.plan import StageStarted
 class Progress:
     """Fed with stages and with plant time; answers a fraction that never falls, and the remaining plant seconds."""
 
-    def __init__(self) -> None:
+    def __init__(self, before_s: float = 0.0) -> None:
+        """before_s: plant time that earlier attempts of the job took, s."""
         self.stage: str | None = None
+        self._before_s = before_s
         self._fraction = 0.0
         self._start_s: float | None = None
         self._now_s = 0.0
@@ -33,7 +35,12 @@ class Progress:
     @property
     def plant_time_s(self) -> float:
         """Plant time since the job's first sample, s."""
-        return self._now_s - (self._start_s or 0.0)
+        return self._before_s + self._now_s - (self._start_s or 0.0)
+
+    @property
+    def stage_time_s(self) -> float:
+        """Plant time since the present stage began, s."""
+        return self._now_s - self._stage_start_s
 
     @property
     def remaining_s(self) -> float | None:

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import logging
+import os
 import socket
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 
 import uvicorn
 
+from service import logs
 from service.api.app import create_app
-from service.config import LoopConfig, load_loops
-from service.jobs import Jobs
+from service.config import LoopConfig, load_site
+from service.engine.durable import POLL_S, DurableEngine
+from service.jobs import Jobs, LoopFactory
+from service.logs import LogFormat
 from service.loop import Loop
-from service.store.store import Store
-from service.work import rehearse, tune
+from service.security.gate import Policy, is_loopback
+from service.security.keyring import Keyring
+from service.security.limits import RequestLimits
+from service.store.database import BadDatabase
+from service.store.store import LOCAL, Store
+from service.work import Tune, rehearse, tune
 
 _GRACE_S = 10
 
@@ -28,6 +38,7 @@ class _Server(uvicorn.Server):
         self._jobs = jobs
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        tell_systemd("STOPPING=1")
         self._jobs.request_stop()
         super().handle_exit(sig, frame)
 
@@ -35,7 +46,16 @@ class _Server(uvicorn.Server):
         await super().startup(sockets)
         if self.started and sockets:
             host, port = sockets[0].getsockname()[:2]
-            print(f"ready http://{host}:{port}", flush=True)
+            print(f"ready http://{f'[{host}]' if ':' in host else host}:{port}", flush=True)
+            tell_systemd("READY=1")
+
+
+def tell_systemd(state: str) -> None:
+    """sd_notify: says where we are to a unit of Type=notify; nothing where there is none."""
+    address = os.environ.get("NOTIFY_SOCKET")
+    if address:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify, suppress(OSError):
+            notify.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
 
 
 def open_bus_loop(config: LoopConfig) -> Loop:
@@ -45,22 +65,78 @@ def open_bus_loop(config: LoopConfig) -> Loop:
     return BusLoop(config.bus, config.controller_node, config.plant_node, channel=config.channel)
 
 
-def serve(loops_file: Path, data: Path, host: str, port: int) -> None:
+class NotSafe(Exception):
+    """What was asked for would open the plant to the network; the text says what to do instead."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """How the service is run. database: a PostgreSQL URL, or None for a file in the data folder.
+
+    bind: the address to listen on.  host: this host's name among those that share the database.
+    resume: jobs that a dead service left go on.  poll_s: how often the engine looks for jobs, s of wall time.
+    auth: whether keys are asked for; None: unless the address is this machine's own.
+    """
+
+    loops_file: Path
+    data: Path
+    bind: str
+    port: int
+    database: str | None = None
+    host: str | None = None
+    resume: bool = True
+    poll_s: float = POLL_S
+    auth: bool | None = None
+    limits: RequestLimits = field(default_factory=RequestLimits)
+    log_format: LogFormat = "text"
+
+
+def serve(setup: Setup, open_loop: LoopFactory = open_bus_loop, tune: Tune = tune) -> None:
     """Serves until SIGTERM or SIGINT; every loop is restored before it returns.
 
-    Raises ConfigError, FolderInUse, OSError (the address cannot be had).
+    Raises ConfigError, FolderInUse, ForeignLoop, BadDatabase, NotSafe, OSError (the address cannot be had),
+    SQLAlchemyError (the database cannot be reached).
     """
+    logs.configure(setup.log_format)
     # python-can's socketcand client warns of every frame that TCP splits, which is what TCP does.
     logging.getLogger("can").setLevel(logging.ERROR)
-    loops = load_loops(loops_file)
+    site = load_site(setup.loops_file)
+    if setup.database is not None and setup.host is None:
+        raise BadDatabase("a shared database needs --host NAME: what this host is called among the others, for ever")
+    local = is_loopback(setup.bind)
+    if setup.auth is False and not local:
+        raise NotSafe(f"without keys only this machine is served: leave out --no-auth, or --bind {setup.bind}")
     # Bound before anything is started, so that a busy port is an error and not half a service.
-    listener = socket.create_server((host, port), reuse_port=False)
-    store = Store(data)
-    jobs = Jobs(loops, store, open_bus_loop, tune, rehearse)
-    config = uvicorn.Config(create_app(jobs), log_level="warning", timeout_graceful_shutdown=_GRACE_S)
-    try:
-        _Server(config, jobs).run(sockets=[listener])
-    finally:
-        jobs.stop()
-        store.close()
-        listener.close()
+    with socket.create_server((setup.bind, setup.port), family=_family(setup.bind), reuse_port=False) as listener:
+        store = Store(setup.data, setup.database, setup.host or LOCAL)
+        try:
+            keyring = Keyring(store.engine) if setup.auth or not local else None
+            if keyring is not None and not keyring.any_valid():
+                raise NotSafe(
+                    f"keys are asked for on {setup.bind} and there is none; make one with: "
+                    f"loopwright key create NAME --scope admin --data {setup.data}"
+                )
+            policy = Policy(keyring, setup.limits, local_only=True)
+            engine = DurableEngine(setup.data, store.engine if store.shared else None, store.host, setup.poll_s)
+            jobs = Jobs(
+                site.loops, store, open_loop, tune, rehearse, engine=engine, buses=site.buses, resume=setup.resume
+            )
+            config = uvicorn.Config(
+                create_app(jobs, policy),
+                log_config=None,
+                log_level="warning",
+                access_log=False,
+                server_header=False,
+                timeout_graceful_shutdown=_GRACE_S,
+            )
+            try:
+                jobs.boot()
+                _Server(config, jobs).run(sockets=[listener])
+            finally:
+                jobs.stop()
+        finally:
+            store.close()
+
+
+def _family(bind: str) -> socket.AddressFamily:
+    return socket.AF_INET6 if ":" in bind else socket.AF_INET

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, Protocol, cast
 
 from service.config import LoopConfig
 from service.loop import Loop, LoopState
 from service.request import RetuneRequest
+from service.store.tables import EventRow
 from tuning.plan import Event, Sample
 from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 
@@ -21,11 +22,15 @@ _STOPPED = (Reason.OPERATOR, Reason.SERVICE_STOPPED)
 
 @dataclass(frozen=True)
 class Hooks:
-    """How work reports, and how it learns that it should stop."""
+    """How work reports, and how it learns that it should stop.
+
+    earlier: what the earlier attempts of a job that is resumed have stored; a stage done there is not run again.
+    """
 
     on_event: Callable[[Event], None]
     on_samples: Callable[[list[Sample]], None]
     stop: Callable[[], Reason | None]
+    earlier: Sequence[EventRow] = ()
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,7 @@ class Rehearse(Protocol):
 
 def tune(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks) -> Outcome:
     """The five stages on the live loop."""
+    from service.checkpoints import finished
     from service.runner import Watch, run
     from tuning.five_stage import Facts, Options, five_stage
 
@@ -75,8 +81,9 @@ def tune(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopStat
         max_time_s=request.max_time_s or TIME_BUDGET_T95 * config.t95_s,
         max_frozen_s=FROZEN_T95 * config.t95_s,
     )
+    done = ((event.data["stage"], event.data["result"]) for event in hooks.earlier if event.kind == "stage_done")
     ran = run(
-        five_stage(facts, options),
+        five_stage(facts, options, finished(done)),
         loop,
         watch=watch,
         on_event=hooks.on_event,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from importlib.metadata import version
 from typing import Annotated, Literal
@@ -12,7 +12,8 @@ from typing import Annotated, Literal
 from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
 from fastapi.responses import PlainTextResponse, StreamingResponse
 
-from service.api import problems, tunings
+from service.api import contract, operations, problems, tunings
+from service.api.access import Access
 from service.api.stream import event_stream
 from service.api.views import (
     Decision,
@@ -26,6 +27,7 @@ from service.api.views import (
 )
 from service.jobs import Jobs
 from service.request import RetuneRequest
+from service.security.gate import Gate, Policy
 from service.states import ACTIVE, JobState
 from service.store.tables import JobRow
 from tuning.plan import Sample
@@ -34,8 +36,10 @@ Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 JobId = Annotated[str, Path(description="Id of the job", examples=["4f0c2a9be113"])]
 
 
-def create_app(jobs: Jobs) -> FastAPI:
-    """The API over these jobs; ends them when the server shuts down."""
+def create_app(
+    jobs: Jobs, policy: Policy | None = None, checks: Mapping[str, operations.Check] | None = None
+) -> FastAPI:
+    """The API over these jobs; ends them when the server shuts down. checks: what must be well to be ready."""
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -48,23 +52,32 @@ def create_app(jobs: Jobs) -> FastAPI:
         description="Retunes PI loops by itself. Gains are in ISA form, MV in percent, times in plant seconds "
         "unless they say wall. A retune ends as a proposal; the loop keeps its gains until it is accepted.",
         lifespan=lifespan,
+        docs_url=None,  # would load its scripts from elsewhere
+        redoc_url=None,
     )
+    app.add_middleware(Gate, policy=policy or Policy())
+    app.add_middleware(Access)
     problems.install(app)
+    contract.install(app)
+    operations.install(app, jobs, operations.checks(jobs) if checks is None else checks)
 
     def view(row: JobRow) -> JobView:
         return job_view(row, jobs.store.events(row.id), jobs.running(row.id))
 
-    @app.get("/loops", tags=["loops"], summary="The configured loops")
+    @app.get("/loops", tags=["loops"], summary="The configured loops of every host",
+        responses=problems.responses(503))
     def loops() -> list[LoopView]:
-        return [LoopView(**loop_view(config, jobs.store.active(tag))) for tag, config in jobs.loops.items()]
+        busy = jobs.store.busy()
+        return [LoopView(**loop_view(config, host, busy.get(config.tag))) for config, host in jobs.everywhere()]
 
     @app.get(
         "/loops/{tag}", tags=["loops"], summary="A loop and its present state", responses=problems.responses(404, 503)
     )
     def loop(tag: Tag) -> LoopDetail:
-        config = jobs.config(tag)
-        state, _ = jobs.live(tag)
-        return LoopDetail(**loop_view(config, jobs.store.active(tag)), live=live_view(state))
+        config, host = jobs.owner(tag)
+        state = jobs.live(tag)
+        view = loop_view(config, host, jobs.store.busy().get(tag))
+        return LoopDetail(**view, live=live_view(state) if state else None)
 
     @app.post(
         "/loops/{tag}/retune",

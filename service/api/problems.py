@@ -9,9 +9,11 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
+from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 
 from service.jobs import Conflict, Stopping, UnknownLoop
+from service.journal import temporary
 from service.model_forms import BadModel
 from service.request import BadLimits
 from service.states import IllegalMove
@@ -89,6 +91,13 @@ def install(app: FastAPI) -> None:
     async def _stopping(_request: Request, error: Stopping) -> JSONResponse:
         return problem(503, str(error), reason=Reason.SERVICE_STOPPED)
 
+    @app.exception_handler(SQLAlchemyError)
+    async def _database(_request: Request, error: SQLAlchemyError) -> JSONResponse:
+        if not temporary(error):
+            return problem(500, f"{type(error).__name__} of the database", reason=Reason.INTERNAL)
+        detail = "the database does not answer; jobs that run go on, ask again"
+        return problem(503, detail, headers={"Retry-After": "5"})
+
     @app.exception_handler(Ended)
     async def _ended(_request: Request, error: Ended) -> JSONResponse:
         return problem(503, error.detail, reason=error.reason)
@@ -104,3 +113,9 @@ def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     return {
         status: {"model": Problem, "content": content, "description": HTTPStatus(status).phrase} for status in statuses
     }
+
+
+def documented(*statuses: int) -> dict[int, dict[str, Any]]:
+    """The same for a document that is made already."""
+    content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    return {status: {"content": content, "description": HTTPStatus(status).phrase} for status in statuses}

@@ -9,9 +9,9 @@ from pydantic import BaseModel, Field
 
 from service.api.results import ModelView, PredictedView, StepView, UltimateView, known
 from service.config import Limits, LoopConfig
-from service.jobs import Running
 from service.loop import LoopState
-from service.states import JobState
+from service.running import Running
+from service.states import ACTIVE, JobState
 from service.store.tables import EventRow, JobRow
 from tuning.five_stage import PROCEDURE
 from tuning.gains import Gains
@@ -45,6 +45,7 @@ class LoopView(BaseModel):
     t95_s: float = Field(description="Time in which the plant covers 95 % of a step, s", examples=[9.1])
     sp_deviation: float = Field(description="Permitted set-point step, PV units", examples=[2.0])
     notes: str = Field(description="For the operator")
+    host: str = Field(description="The service that has the loop's bus", examples=["local"])
     active_job: str | None = Field(description="URL of the job that has the loop", examples=["/jobs/4f0c2a9be113"])
 
 
@@ -64,7 +65,7 @@ class LiveView(BaseModel):
 
 
 class LoopDetail(LoopView):
-    live: LiveView
+    live: LiveView | None = Field(description="null: the bus is another host's, whose service can tell")
 
 
 class StageView(BaseModel):
@@ -82,6 +83,8 @@ class JobView(BaseModel):
     loop: str = Field(examples=["TIC-101"])
     state: JobState = Field(examples=["running"])
     dry_run: bool
+    host: str = Field(description="The service that runs it", examples=["local"])
+    attempts: int = Field(description="How often it was begun: more than once after a crash", examples=[1])
     request: dict[str, Any] = Field(description="The options asked for")
     requested_by: str = Field(examples=["night shift"])
     created_at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
@@ -126,9 +129,10 @@ class Decision(BaseModel):
     by: str = Field(default="api", max_length=100, examples=["operator A"])
 
 
-def loop_view(config: LoopConfig, active: JobRow | None) -> dict[str, Any]:
+def loop_view(config: LoopConfig, host: str, active: str | None) -> dict[str, Any]:
+    """active: the id of the job that has the loop."""
     fields = config.model_dump(exclude={"noise_std_hint"})
-    return fields | {"active_job": None if active is None else f"/jobs/{active.id}"}
+    return fields | {"host": host, "active_job": None if active is None else f"/jobs/{active}"}
 
 
 def live_view(state: LoopState) -> LiveView:
@@ -154,7 +158,7 @@ def job_view(row: JobRow, events: Sequence[EventRow], running: Running | None) -
     """The job from the store, and from its live part while it runs."""
     state = JobState(row.state)
     result = row.result or {}
-    progress, remaining, plant_time = _progress(state, row, running)
+    progress, remaining, plant_time = _progress(state, row, events, running)
     new = result.get("gains")
     return JobView(
         id=row.id,
@@ -162,6 +166,8 @@ def job_view(row: JobRow, events: Sequence[EventRow], running: Running | None) -
         loop=row.loop,
         state=state,
         dry_run=row.dry_run,
+        host=row.host,
+        attempts=row.attempt,
         request=row.request,
         requested_by=row.requested_by,
         created_at=row.created_at,
@@ -189,13 +195,22 @@ def job_view(row: JobRow, events: Sequence[EventRow], running: Running | None) -
     )
 
 
-def _progress(state: JobState, row: JobRow, running: Running | None) -> tuple[float, float | None, float]:
+def _progress(
+    state: JobState, row: JobRow, events: Sequence[EventRow], running: Running | None
+) -> tuple[float, float | None, float]:
+    """Fraction, remaining and present plant time; of a job on another host as of its last stage."""
     if running is not None:
         running.keep_time()
         live = running.progress
         return live.fraction, live.remaining_s, live.plant_time_s
-    ended = state not in (JobState.QUEUED, JobState.RUNNING)
-    return (1.0 if ended else 0.0), (0.0 if ended else None), row.plant_time_s
+    if state not in ACTIVE:
+        return 1.0, 0.0, row.plant_time_s
+    told = next((e.data for e in reversed(events) if e.kind == "stage_started"), None)
+    if told is None:
+        return 0.0, None, row.plant_time_s
+    remaining = told["expected_s"] + told["remaining_s"]
+    total = row.plant_time_s + remaining
+    return (min(0.99, row.plant_time_s / total) if total > 0 else 0.0), remaining, row.plant_time_s
 
 
 def _stages(events: Sequence[EventRow], row: JobRow) -> list[StageView]:

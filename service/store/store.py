@@ -1,28 +1,36 @@
-"""The store: short transactions on one SQLite file (WAL), called from job threads and from the API alike."""
+"""The store: short transactions on SQLite or PostgreSQL, called from the journal, the jobs and the API alike."""
 
 from __future__ import annotations
 
-import fcntl
 import math
 import secrets
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from datetime import UTC, datetime
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from alembic import command
-from alembic.config import Config
-from sqlalchemy import create_engine, event, func, select
+from sqlalchemy import delete, func, select, text, update
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session, sessionmaker
 
+from service.security import audit
 from service.states import ACTIVE, JobState, check
 from service.store import chunks
-from service.store.tables import ChunkRow, EventRow, JobRow
+from service.store.clock import now
+from service.store.database import migrate, open_database
+from service.store.lock import FolderInUse, FolderLock, HostLock, ourselves
+from service.store.tables import ChunkRow, EventRow, JobRow, LoopRow
 from tuning.plan import Sample
+from tuning.reasons import Reason
 
+__all__ = ["Busy", "FolderInUse", "ForeignLoop", "NoSuchJob", "Store", "Write", "clean", "now"]
+
+Write = Callable[[Session], None]
+"""A piece of a transaction, for the journal."""
+LOCAL = "local"
+DECISIONS = {JobState.ACCEPTED: "accept", JobState.ROLLED_BACK: "rollback"}
+"""What the audit log calls the moves that somebody decides."""
 _ACTIVE = [state.value for state in ACTIVE]
 
 
@@ -43,47 +51,102 @@ class NoSuchJob(Exception):
         self.job_id = job_id
 
 
-class FolderInUse(Exception):
-    """Another service works in this data folder: two of them would interrupt each other's jobs."""
+class ForeignLoop(Exception):
+    """A loop of that tag belongs to another host."""
 
 
 class Store:
-    """Opens (and if needed creates or migrates) `loopwright.sqlite` in the data folder."""
+    """Opens (and if needed creates or migrates) `loopwright.sqlite` in the data folder, or a PostgreSQL database.
 
-    def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        self._folder_lock = open(folder / "lock", "w")  # noqa: SIM115 - held until close
+    host: the name under which this service owns its loops and jobs. A data folder without a PostgreSQL database has
+    one host, whatever it was called before. Raises FolderInUse, BadDatabase.
+    """
+
+    def __init__(self, folder: Path, database: str | None = None, host: str = LOCAL) -> None:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self.host = host
+        self.folder = folder
+        self._folder_lock = FolderLock(folder)
+        self._host_lock: HostLock | None = None
         try:
-            fcntl.flock(self._folder_lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            self._folder_lock.close()
-            raise FolderInUse(f"another service works in the data folder {folder}") from error
-        # One writer at a time inside the process: "read the last seq, write the next" must not interleave.
-        self._write_lock = threading.Lock()
-        self._engine = create_engine(f"sqlite:///{folder / 'loopwright.sqlite'}", connect_args={"timeout": 5.0})
-        event.listen(self._engine, "connect", _pragmas)
-        self._session = sessionmaker(self._engine, expire_on_commit=False)
-        self._migrate()
+            self.engine = open_database(folder, database, f"loopwright {host}, {ourselves()}")
+            self.shared = self.engine.dialect.name != "sqlite"
+            # One writer at a time inside the process: SQLite has one anyway, and does not queue them fairly.
+            self._write_lock = nullcontext() if self.shared else threading.Lock()
+            self._session = sessionmaker(self.engine, expire_on_commit=False)
+            if self.shared:
+                self._host_lock = HostLock(self.engine, host)
+            migrate(self.engine)
+            if not self.shared:
+                self._adopt()
+        except BaseException:
+            self.close()
+            raise
 
-    def _migrate(self) -> None:
-        config = Config()
-        config.set_main_option("script_location", "service.store:migrations")
-        with self._engine.begin() as connection:
-            config.attributes["connection"] = connection
-            command.upgrade(config, "head")
+    def _adopt(self) -> None:
+        """The one host of a data folder has everything in it."""
+        with self.writing() as session:
+            for table in (JobRow, LoopRow):
+                session.execute(update(table).where(table.host != self.host).values(host=self.host))
 
     def close(self) -> None:
-        self._engine.dispose()
+        if self._host_lock is not None:
+            self._host_lock.close()
+        if hasattr(self, "engine"):
+            self.engine.dispose()
         self._folder_lock.close()
 
+    def check_lock(self) -> None:
+        """Raises FolderInUse when another service has taken our host name while the database was away."""
+        if self._host_lock is not None:
+            self._host_lock.check()
+
     @contextmanager
-    def _writing(self) -> Iterator[Session]:
+    def writing(self) -> Iterator[Session]:
         with self._write_lock, self._session.begin() as session:
             yield session
 
+    def ping(self) -> None:
+        """Raises SQLAlchemyError unless the database answers."""
+        with self._session() as session:
+            session.execute(text("SELECT 1"))
+
+    # loops
+    def own_loops(self, loops: dict[str, dict[str, Any]]) -> None:
+        """These are the loops of this host from now on, by tag. Raises ForeignLoop."""
+        with self.writing() as session:
+            taken = session.scalars(select(LoopRow).where(LoopRow.tag.in_(loops), LoopRow.host != self.host)).all()
+            if taken:
+                others = ", ".join(f"{row.tag} of {row.host}" for row in taken)
+                raise ForeignLoop(f"loops of other hosts: {others}; take them out of one of the two configurations")
+            session.execute(delete(LoopRow).where(LoopRow.host == self.host))
+            session.add_all(LoopRow(tag=tag, host=self.host, config=config) for tag, config in loops.items())
+
+    def foreign_loops(self) -> Sequence[LoopRow]:
+        """The loops of the other hosts."""
+        if not self.shared:
+            return []
+        with self._session() as session:
+            wanted = select(LoopRow).where(LoopRow.host != self.host).order_by(LoopRow.host, LoopRow.tag)
+            return session.scalars(wanted).all()
+
+    def foreign_loop(self, tag: str) -> LoopRow | None:
+        if not self.shared:
+            return None
+        with self._session() as session:
+            return session.scalars(select(LoopRow).where(LoopRow.tag == tag, LoopRow.host != self.host)).one_or_none()
+
     # jobs
-    def create(self, loop: str, request: dict[str, Any], requested_by: str, dry_run: bool) -> JobRow:
-        """A new queued job. Raises Busy when the loop has an active one."""
+    def create(
+        self,
+        loop: str,
+        request: dict[str, Any],
+        requested_by: str,
+        dry_run: bool,
+        host: str | None = None,
+        version: str = "0",
+    ) -> JobRow:
+        """A new queued job, on this host unless on another. Raises Busy when the loop has an active one."""
         row = JobRow(
             id=secrets.token_hex(6),
             loop=loop,
@@ -92,12 +155,15 @@ class Store:
             request=clean(request),
             requested_by=requested_by,
             created_at=now(),
+            host=host or self.host,
+            version=version,
         )
         try:
-            with self._writing() as session:
+            with self.writing() as session:
                 session.add(row)
                 session.flush()
-                _append(session, row.id, "state", {"state": row.state, "by": requested_by}, 0.0)
+                append(session, row.id, "state", {"state": row.state, "by": requested_by}, 0.0)
+                audit.record(session, "retune", row.id, after=row.request, loop=loop, said_by=requested_by)
         except IntegrityError as error:
             active = self.active(loop)
             if active is None:
@@ -107,24 +173,29 @@ class Store:
 
     def move(self, job_id: str, wanted: JobState, by: str = "service", **columns: Any) -> JobRow:
         """Moves the job as the table allows and sets the columns, in one transaction with its event."""
-        with self._writing() as session:
-            row = _find(session, job_id)
+        with self.writing() as session:
+            row = _find(session, job_id, lock=True)
             previous = JobState(row.state)
             check(previous, wanted)
             row.state = wanted.value
-            _set(row, columns)
+            set_columns(row, columns)
             if wanted is JobState.RUNNING:
                 row.started_at = now()
             elif previous in ACTIVE:
                 row.ended_at = now()
             told = {"state": wanted.value, "from": previous.value, "by": by}
             told |= {key: columns[key] for key in ("reason", "detail") if columns.get(key)}
-            _append(session, job_id, "state", told, row.plant_time_s)
+            append(session, job_id, "state", told, row.plant_time_s)
+            if wanted in DECISIONS:
+                _audit_decision(session, row, previous, wanted, by)
             return row
 
-    def update(self, job_id: str, **columns: Any) -> None:
-        with self._writing() as session:
-            _set(_find(session, job_id), columns)
+    def resumed(self, job_id: str, told: dict[str, Any], **columns: Any) -> None:
+        """Notes that an active job has begun another attempt."""
+        with self.writing() as session:
+            row = _find(session, job_id, lock=True)
+            set_columns(row, columns)
+            append(session, job_id, "resumed", told, row.plant_time_s)
 
     def get(self, job_id: str) -> JobRow:
         with self._session() as session:
@@ -136,10 +207,44 @@ class Store:
         with self._session() as session:
             return session.scalars(wanted).one_or_none()
 
-    def unfinished(self) -> list[JobRow]:
-        """Every job in an active state, dry runs included."""
+    def busy(self) -> dict[str, str]:
+        """The active job by loop, of every host."""
+        wanted = select(JobRow.loop, JobRow.id).where(JobRow.state.in_(_ACTIVE), JobRow.dry_run.is_(False))
         with self._session() as session:
-            return list(session.scalars(select(JobRow).where(JobRow.state.in_(_ACTIVE)).order_by(JobRow.number)))
+            return {row.loop: row.id for row in session.execute(wanted)}
+
+    def unfinished(self) -> list[JobRow]:
+        """Every job of this host in an active state, dry runs included."""
+        mine = (JobRow.host == self.host, JobRow.state.in_(_ACTIVE))
+        with self._session() as session:
+            return list(session.scalars(select(JobRow).where(*mine).order_by(JobRow.number)))
+
+    def wishes_to_stop(self) -> dict[str, str]:
+        """The reason by job, for the active jobs of this host that somebody wants to stop."""
+        mine = (JobRow.host == self.host, JobRow.state.in_(_ACTIVE), JobRow.stop_reason.is_not(None))
+        with self._session() as session:
+            rows = session.execute(select(JobRow.id, JobRow.stop_reason).where(*mine))
+            return {row.id: row.stop_reason for row in rows}
+
+    def wish_to_stop(self, job_id: str, reason: str, by: str) -> JobRow:
+        """Notes that the job is to stop, once. Raises IllegalMove when it is over."""
+        with self.writing() as session:
+            row = _find(session, job_id, lock=True)
+            check(JobState(row.state), JobState.ABORTED)
+            if row.stop_reason is None:
+                row.stop_reason = reason
+                append(session, job_id, "abort_requested", {"by": by}, row.plant_time_s)
+                audit.record(session, "abort", job_id, before={"state": row.state}, loop=row.loop, said_by=by)
+            return row
+
+    def decision_failed(self, job_id: str, wanted: JobState, by: str, detail: str) -> None:
+        """A decision that reached for the controller and ended in an error: its gains may have been written."""
+        with self.writing() as session:
+            row = _find(session, job_id)
+            what = f"{DECISIONS[wanted]}_failed"
+            audit.record(
+                session, what, job_id, before={"state": row.state}, after={"error": detail}, loop=row.loop, said_by=by
+            )
 
     def recent(self, loop: str | None = None, state: JobState | None = None, limit: int = 50) -> Sequence[JobRow]:
         """The latest jobs first."""
@@ -153,24 +258,36 @@ class Store:
 
     # events
     def append(self, job_id: str, kind: str, data: dict[str, Any], plant_time_s: float) -> None:
-        with self._writing() as session:
-            _append(session, job_id, kind, data, plant_time_s)
+        with self.writing() as session:
+            _find(session, job_id, lock=True)
+            append(session, job_id, kind, data, plant_time_s)
 
     def events(self, job_id: str, after: int = 0) -> Sequence[EventRow]:
         wanted = select(EventRow).where(EventRow.job_id == job_id, EventRow.seq > after).order_by(EventRow.seq)
         with self._session() as session:
             return session.scalars(wanted).all()
 
+    def restored(self, source: str) -> int:
+        """Ends what was active when a back-up was made: its experiment is long over. Returns how many jobs."""
+        active = self.unfinished()
+        for row in active:
+            detail = f"was {row.state} when the back-up was made that has now been restored"
+            self.move(row.id, JobState.INTERRUPTED, reason=Reason.SERVICE_STOPPED.value, detail=detail)
+        with self.writing() as session:
+            audit.record(session, "restore", source, after={"interrupted": [row.id for row in active]})
+        return len(active)
+
     # samples
     def add_samples(self, job_id: str, stage: str, samples: Sequence[Sample]) -> None:
-        with self._writing() as session:
-            seq = session.scalar(select(func.max(ChunkRow.seq)).where(ChunkRow.job_id == job_id)) or 0
-            block = chunks.pack(samples)
-            session.add(
-                ChunkRow(
-                    job_id=job_id, seq=seq + 1, stage=stage, first_t_s=samples[0].t, count=len(samples), data=block
-                )
-            )
+        with self.writing() as session:
+            block_of(job_id, stage, samples)(session)
+
+    def last_sample_s(self, job_id: str) -> float:
+        """Time of the last sample kept of a job, s; 0 when there is none."""
+        last = select(ChunkRow).where(ChunkRow.job_id == job_id).order_by(ChunkRow.seq.desc()).limit(1)
+        with self._session() as session:
+            row = session.scalars(last).one_or_none()
+        return 0.0 if row is None else chunks.unpack(row.data, row.count, row.first_t_s)[-1].t
 
     def samples(self, job_id: str, stage: str | None = None) -> list[tuple[str, list[Sample]]]:
         """The blocks in order, each with the stage it belongs to."""
@@ -180,11 +297,6 @@ class Store:
         with self._session() as session:
             rows = session.scalars(wanted).all()
         return [(row.stage, chunks.unpack(row.data, row.count, row.first_t_s)) for row in rows]
-
-
-def now() -> str:
-    """UTC, ISO 8601, milliseconds."""
-    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def clean(value: Any) -> Any:
@@ -198,26 +310,64 @@ def clean(value: Any) -> Any:
     return value
 
 
-def _pragmas(connection: Any, _record: object) -> None:
-    cursor = connection.cursor()
-    # WAL: readers (the API) never wait for a job's writes. NORMAL: a power cut may lose the last moments, no more.
-    for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON"):
-        cursor.execute(f"PRAGMA {pragma}")
-    cursor.close()
+def event_of(job_id: str, kind: str, data: dict[str, Any], plant_time_s: float, **columns: Any) -> Write:
+    """An event, at the time it happened, and what it changes in the job's row."""
+    at, told = now(), clean(data)
+
+    def write(session: Session) -> None:
+        row = _find(session, job_id, lock=True)
+        set_columns(row, {"plant_time_s": plant_time_s, **columns})
+        append(session, job_id, kind, told, plant_time_s, at)
+
+    return write
 
 
-def _find(session: Session, job_id: str) -> JobRow:
-    row = session.scalars(select(JobRow).where(JobRow.id == job_id)).one_or_none()
+def block_of(job_id: str, stage: str, samples: Sequence[Sample]) -> Write:
+    """A block of samples of one stage, packed now: a database that is away does not fill the memory."""
+    first_t_s, count, data = samples[0].t, len(samples), chunks.pack(samples)
+
+    def write(session: Session) -> None:
+        seq = session.scalar(select(func.max(ChunkRow.seq)).where(ChunkRow.job_id == job_id)) or 0
+        session.add(ChunkRow(job_id=job_id, seq=seq + 1, stage=stage, first_t_s=first_t_s, count=count, data=data))
+        session.flush()
+
+    return write
+
+
+def _find(session: Session, job_id: str, lock: bool = False) -> JobRow:
+    """lock: nobody else, on whatever host, changes the job or appends to it before this transaction ends."""
+    wanted = select(JobRow).where(JobRow.id == job_id)
+    row = session.scalars(wanted.with_for_update() if lock else wanted).one_or_none()
     if row is None:
         raise NoSuchJob(job_id)
     return row
 
 
-def _set(row: JobRow, columns: dict[str, Any]) -> None:
+def set_columns(row: JobRow, columns: dict[str, Any]) -> None:
     for name, value in columns.items():
         setattr(row, name, clean(value))
 
 
-def _append(session: Session, job_id: str, kind: str, data: dict[str, Any], plant_time_s: float) -> None:
+def _audit_decision(session: Session, row: JobRow, previous: JobState, wanted: JobState, by: str) -> None:
+    old, new = row.old_gains, (row.result or {}).get("gains")
+    had, has = (new, old) if previous is JobState.ACCEPTED else (old, new if wanted is JobState.ACCEPTED else old)
+    audit.record(
+        session,
+        DECISIONS[wanted],
+        row.id,
+        before={"state": previous.value, "gains": had},
+        after={"state": wanted.value, "gains": has},
+        loop=row.loop,
+        said_by=by,
+    )
+
+
+def append(
+    session: Session, job_id: str, kind: str, data: dict[str, Any], plant_time_s: float, at: str | None = None
+) -> None:
+    """The next event of a job whose row this transaction has locked."""
     seq = session.scalar(select(func.max(EventRow.seq)).where(EventRow.job_id == job_id)) or 0
-    session.add(EventRow(job_id=job_id, seq=seq + 1, at=now(), plant_time_s=plant_time_s, kind=kind, data=clean(data)))
+    session.add(
+        EventRow(job_id=job_id, seq=seq + 1, at=at or now(), plant_time_s=plant_time_s, kind=kind, data=clean(data))
+    )
+    session.flush()

@@ -22,8 +22,10 @@ class JobRow(Base):
             "loop",
             unique=True,
             sqlite_where=text("state IN ('queued', 'running') AND dry_run = 0"),
+            postgresql_where=text("state IN ('queued', 'running') AND NOT dry_run"),
         ),
         Index("jobs_by_loop", "loop", "number"),
+        Index("jobs_by_host", "host", "state"),
     )
 
     number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
@@ -44,6 +46,24 @@ class JobRow(Base):
     old_gains: Mapped[dict[str, Any] | None]
     restored: Mapped[dict[str, Any] | None]
     result: Mapped[dict[str, Any] | None]
+    # The host that runs it, the version of the workflow it was started under, how often it was started.
+    host: Mapped[str] = mapped_column(server_default="local")
+    version: Mapped[str] = mapped_column(server_default="0")
+    attempt: Mapped[int] = mapped_column(server_default="0", default=0)
+    # The loop as the first attempt found it, before anything was touched: what every attempt has to bring back.
+    found: Mapped[dict[str, Any] | None]
+    # Why the job is to stop, once somebody wants it to: any host may write it, the job's own host acts.
+    stop_reason: Mapped[str | None]
+
+
+class LoopRow(Base):
+    """A loop of some host, as that host's configuration has it."""
+
+    __tablename__ = "loops"
+
+    tag: Mapped[str] = mapped_column(primary_key=True)
+    host: Mapped[str]
+    config: Mapped[dict[str, Any]]
 
 
 class EventRow(Base):

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,6 +9,7 @@ import pytest
 
 from service.api.app import create_app
 from tests.unit.service.fakes import Service
+from tests.unit.service.postgres import Server, binaries
 
 with warnings.catch_warnings():
     # starlette warns that its test client will want another HTTP package one day.
@@ -26,3 +28,15 @@ def service(tmp_path: Path) -> Iterator[Service]:
 def client(service: Service) -> Iterator[TestClient]:
     with TestClient(create_app(service.jobs), raise_server_exceptions=False) as client:
         yield client
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[Server]:
+    """A private server. Skipped where there is none to start, but not where the tests must be complete."""
+    found = binaries()
+    if found is None:
+        assert not os.environ.get("CI"), "the tests need the package postgresql"
+        pytest.skip("no PostgreSQL server is installed")
+    server = Server(found)
+    yield server
+    server.close()

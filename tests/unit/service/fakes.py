@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from service.config import LoopConfig, parse_loops
+from service.config import LoopConfig, parse_site
 from service.jobs import Jobs
 from service.loop import Loop, LoopState
 from service.request import RetuneRequest
+from service.states import ACTIVE, JobState
 from service.store.store import Store
-from service.work import Hooks, Outcome
+from service.work import Hooks, Outcome, Rehearse
 from tuning.design import Predicted
 from tuning.gains import Gains
 from tuning.plan import Command, Mode, Note, Sample, SetGains, SetSetpoint, StageDone, StageStarted
@@ -106,8 +108,12 @@ class FakeTune:
         self, config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks
     ) -> Outcome:
         ended: Ended | None = None
+        times: dict[str, float] = {}
+        done = {event.data["stage"] for event in hooks.earlier if event.kind == "stage_done"}
         try:
             for stage, remaining in (("preflight", 3.0), ("relay", 1.0)):
+                if stage in done:
+                    continue
                 hooks.on_event(StageStarted(stage, 1.0, remaining))
                 samples = [loop.step((SetGains(NEW),) if n == 0 else ()) for n in range(10)]
                 hooks.on_samples(samples)
@@ -117,6 +123,7 @@ class FakeTune:
                     if reason := hooks.stop():
                         raise Aborted(reason, "asked to stop")
                 hooks.on_event(StageDone(stage, Found(2.05, 3.32)))
+                times[stage] = 1.0
             hooks.on_event(Note("nearly there"))
             if self.ends:
                 raise self.ends
@@ -124,7 +131,7 @@ class FakeTune:
             ended = error
         finally:
             restored = loop.restore(state)
-        return Outcome(None if ended else RESULT, ended, restored, {"preflight": 1.0, "relay": 1.0})
+        return Outcome(None if ended else RESULT, ended, restored, times)
 
 
 def fake_rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:
@@ -133,20 +140,60 @@ def fake_rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> O
     return Outcome(RESULT, None, None, {"preflight": 1.0})
 
 
+class ThreadEngine:
+    """Starts every job at once in a thread, and forgets everything with the process."""
+
+    def __init__(self) -> None:
+        self._run: Callable[[str], None] | None = None
+        self._threads: dict[str, threading.Thread] = {}
+        self.enqueued: list[tuple[str, str]] = []
+
+    def launch(self, run: Callable[[str], None], queues: Mapping[str, int]) -> None:
+        self._run = run
+
+    def enqueue(self, job_id: str, queue: str) -> None:
+        assert self._run is not None
+        self.enqueued.append((job_id, queue))
+        thread = self._threads[job_id] = threading.Thread(target=self._run, args=(job_id,))
+        thread.start()
+
+    def known(self, job_ids: Collection[str]) -> set[str]:
+        return {job_id for job_id in job_ids if job_id in self._threads and self._threads[job_id].is_alive()}
+
+    def forget(self, job_id: str) -> None:
+        self._threads.pop(job_id, None)
+
+    def alive(self) -> bool:
+        return self._run is not None
+
+    def close(self) -> None:
+        self._run = None
+
+
 class Service:
     """Everything of a service that a test wants to put a hand on."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, **options: Any) -> None:
         self.controller = FakeController()
         self.tune = FakeTune()
         self.store = Store(folder)
-        self.loops = parse_loops({"loops": [loop_entry(), loop_entry(tag="FIC-2", channel=2)]}, "test")
-        self.jobs = Jobs(self.loops, self.store, lambda config: FakeLoop(self.controller), self.tune, fake_rehearse)
+        self.loops = parse_site({"loops": [loop_entry(), loop_entry(tag="FIC-2", channel=2)]}, "test").loops
+        self.jobs = self.more_jobs(lambda config: FakeLoop(self.controller), **options)
+
+    def more_jobs(
+        self, open_loop: Callable[[LoopConfig], Loop], rehearse: Rehearse = fake_rehearse, **options: Any
+    ) -> Jobs:
+        """Jobs on the same store, started."""
+        settings = {"engine": ThreadEngine(), "patience_s": 0.3} | options
+        jobs = Jobs(self.loops, self.store, open_loop, self.tune, rehearse, **settings)
+        jobs.boot()
+        return jobs
 
     def wait(self, job_id: str) -> None:
-        running = self.jobs.running(job_id)
-        if running and running.thread:
-            running.thread.join(10)
+        """Until the job is over."""
+        deadline = time.monotonic() + 10
+        while JobState(self.store.get(job_id).state) in ACTIVE and time.monotonic() < deadline:
+            time.sleep(0.005)
 
     def close(self) -> None:
         self.tune.hold.set()

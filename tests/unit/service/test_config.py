@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from service.config import ConfigError, load_loops, parse_loops
+from service.config import ConfigError, load_site, parse_site
 from service.demo import loops_yaml
 from tests.unit.service.fakes import loop_entry
 
@@ -13,13 +13,13 @@ from tests.unit.service.fakes import loop_entry
 def test_a_good_file(tmp_path: Path) -> None:
     file = tmp_path / "loops.yaml"
     file.write_text(yaml.safe_dump({"loops": [loop_entry(), loop_entry(tag="B", channel=2, plant_node=None)]}))
-    loops = load_loops(file)
+    loops = load_site(file).loops
     assert list(loops) == ["TIC-101", "B"]
     assert loops["B"].plant_node is None and loops["B"].mv_limits.high == 100.0
 
 
 def test_the_demo_writes_a_good_file() -> None:
-    assert "TIC-101" in parse_loops(yaml.safe_load(loops_yaml("socketcan:vcan0")), "demo")
+    assert "TIC-101" in parse_site(yaml.safe_load(loops_yaml("socketcan:vcan0")), "demo").loops
 
 
 def test_every_error_is_listed_at_once() -> None:
@@ -35,7 +35,7 @@ def test_every_error_is_listed_at_once() -> None:
         "nonsense",
     ]
     with pytest.raises(ConfigError) as caught:
-        parse_loops({"loops": entries, "extra": 1}, "loops.yaml")
+        parse_site({"loops": entries, "extra": 1}, "loops.yaml")
     text = str(caught.value)
     for words in (
         "loops[0].t95_s (TIC-101)", "loops[0].colour (TIC-101)", "socketcan:vcan0",
@@ -48,7 +48,7 @@ def test_every_error_is_listed_at_once() -> None:
 
 def test_two_loops_may_not_share_a_tag_or_a_channel() -> None:
     with pytest.raises(ConfigError) as caught:
-        parse_loops({"loops": [loop_entry(), loop_entry()]}, "loops.yaml")
+        parse_site({"loops": [loop_entry(), loop_entry()]}, "loops.yaml")
     assert len(caught.value.problems) == 2
 
 
@@ -57,9 +57,9 @@ def test_not_a_list_of_loops(tmp_path: Path, text: str) -> None:
     file = tmp_path / "loops.yaml"
     file.write_text(text)
     with pytest.raises(ConfigError):
-        load_loops(file)
+        load_site(file)
 
 
 def test_no_such_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="No such file"):
-        load_loops(tmp_path / "none.yaml")
+        load_site(tmp_path / "none.yaml")

@@ -4,13 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from service.jobs import Jobs
 from service.progress import Progress
 from service.request import RetuneRequest
 from service.states import JobState
 from service.store.store import Store
 from service.work import rehearsal_spec, rehearse
-from tests.unit.service.fakes import OLD, TAG, FakeLoop, Service, fake_rehearse
+from tests.unit.service.fakes import OLD, TAG, FakeLoop, Service
 from tuning.plan import StageStarted
 from tuning.reasons import Reason
 
@@ -41,8 +40,9 @@ def test_a_job_that_cannot_open_its_loop_fails_and_frees_it(service: Service) ->
     def no_bus(config: object) -> FakeLoop:
         raise OSError("no such device")
 
-    jobs = Jobs(service.loops, service.store, no_bus, service.tune, fake_rehearse)
+    jobs = service.more_jobs(no_bus)
     row = jobs.start(TAG, RetuneRequest())
+    service.wait(row.id)
     jobs.stop()
     row = service.store.get(row.id)
     assert (row.state, row.reason) == ("failed", "internal")
@@ -72,11 +72,10 @@ def test_a_dry_run_guesses_a_plant_that_fits_the_loop(service: Service) -> None:
 
 
 def test_a_real_rehearsal_through_a_job(service: Service) -> None:
-    jobs = Jobs(service.loops, service.store, lambda config: FakeLoop(service.controller), service.tune, rehearse)
+    jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
     row = jobs.start(TAG, RetuneRequest(dry_run=True))
-    running = jobs.running(row.id)
-    if running and running.thread:
-        running.thread.join(60)
+    service.wait(row.id)
+    jobs.stop()
     row = service.store.get(row.id)
     assert (row.state, row.reason) == ("proposed", None), row.detail
     assert row.result is not None

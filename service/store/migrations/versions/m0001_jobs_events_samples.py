@@ -39,6 +39,7 @@ def upgrade() -> None:
         ["loop"],
         unique=True,
         sqlite_where=sa.text("state IN ('queued', 'running') AND dry_run = 0"),
+        postgresql_where=sa.text("state IN ('queued', 'running') AND NOT dry_run"),
     )
     op.create_index("jobs_by_loop", "jobs", ["loop", "number"])
     op.create_table(

@@ -1,0 +1,64 @@
+"""What every operation shares is written into the OpenAPI document in one place: the key it needs, and what the door
+may answer instead of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import FastAPI
+
+from service.api import problems
+from service.security.gate import ALWAYS, scope_for
+
+_KEY = "key"
+_METHODS = ("get", "post", "put", "patch", "delete")
+
+
+def install(app: FastAPI) -> None:
+    """Completes the document that the application makes of itself."""
+    make = app.openapi
+
+    def complete() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            _complete(make())
+        assert app.openapi_schema is not None
+        return app.openapi_schema
+
+    app.openapi = complete  # type: ignore[method-assign]
+
+
+def _complete(document: dict[str, Any]) -> None:
+    schemas = document.setdefault("components", {})
+    schemas["securitySchemes"] = {
+        _KEY: {
+            "type": "http",
+            "scheme": "bearer",
+            "description": "An API key, made by `loopwright key create`. Not asked for on a service that listens on "
+            "its own machine only, unless it was started with --auth.",
+        }
+    }
+    for path, item in document["paths"].items():
+        for method in _METHODS:
+            if method in item:
+                _one(path, method, item[method])
+
+
+def _one(path: str, method: str, operation: dict[str, Any]) -> None:
+    needed = scope_for(method.upper(), path)
+    more: tuple[int, ...] = (403,)  # without keys, a name that is not this machine's
+    if needed is not None:
+        operation["security"] = [{_KEY: []}]
+        operation["description"] = "\n\n".join(
+            part for part in (operation.get("description"), f"Scope: {needed.value}.") if part
+        )
+        more += (401,)
+    if method != "get":
+        more += (413,)
+    if "requestBody" in operation:
+        more += (400,)  # not text at all
+    if path not in ALWAYS:
+        more += (429, 503)
+    elif needed is not None:
+        more += (429, 503)  # too many wrong keys; the keys cannot be read
+    for status, documented in problems.documented(*more).items():
+        operation["responses"].setdefault(str(status), documented)

@@ -1,0 +1,187 @@
+"""What an operator's tools ask: is it alive, is it ready, what does it count, who changed what."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any
+from urllib.parse import urlencode
+
+from fastapi import APIRouter, FastAPI, Query, Response
+from fastapi.responses import HTMLResponse, JSONResponse
+from pydantic import BaseModel, Field
+
+from protocol.bus import BusError, open_bus
+from service import metrics
+from service.api import problems
+from service.api.page import POLICY, page
+from service.jobs import Jobs
+from service.security import audit
+from service.security.tables import AuditRow
+
+Check = Callable[[], None]
+"""Returns when all is well; raises with the reason when not."""
+CHECK_S = 2.0
+BEHIND_S = 1.0
+FRESH_S = 2.0
+"""An answer this old is given again: who asks often does not open the buses as often."""
+
+
+class Alive(BaseModel):
+    status: str = Field(description="alive", examples=["alive"])
+
+
+class PartView(BaseModel):
+    """One thing the service cannot do without."""
+
+    ready: bool
+    detail: str | None = Field(description="What is wrong with it", examples=["CAN interface 'can0' cannot be opened"])
+
+
+class Ready(BaseModel):
+    """Whether the service can take work."""
+
+    ready: bool = Field(description="All of its parts are")
+    parts: dict[str, PartView] = Field(description="database, engine and each bus by its address")
+
+
+class AuditView(BaseModel):
+    """One change."""
+
+    number: int = Field(description="Counts up; the latest change has the largest", examples=[17])
+    at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
+    who: str = Field(
+        description="Name of the key; `local`: without a key, from this machine; `cli:USER`: by a command there; "
+        "`service`: by itself",
+        examples=["control room"],
+    )
+    key_id: str | None = Field(description="Id of the key", examples=["0f3ac2d9be11"])
+    address: str | None = Field(description="Network address of the caller", examples=["10.0.0.7"])
+    said_by: str | None = Field(description="Who the request itself says it is from", examples=["night shift"])
+    what: str = Field(
+        description="retune, abort, accept, rollback, accept_failed, rollback_failed, key_create, key_revoke",
+        examples=["accept"],
+    )
+    subject: str = Field(description="Id of the job or key", examples=["4f0c2a9be113"])
+    loop: str | None = Field(examples=["TIC-101"])
+    before: dict[str, Any] | None = Field(description="State and gains before, where there were some")
+    after: dict[str, Any] | None = Field(description="State and gains after; of a retune the request")
+
+
+class AuditPage(BaseModel):
+    entries: list[AuditView] = Field(description="The latest change first")
+    next: str | None = Field(description="URL of the page after this one", examples=["/audit?before=17"])
+
+
+class Readiness:
+    """Asks every part, each within CHECK_S."""
+
+    def __init__(self, checks: Mapping[str, Check]) -> None:
+        self._checks = checks
+        self._asking = asyncio.Lock()
+        self._last: tuple[float, Ready] | None = None
+
+    async def ask(self) -> Ready:
+        async with self._asking:
+            if self._last is None or time.monotonic() - self._last[0] > FRESH_S:
+                views = await asyncio.gather(*(self._one(check) for check in self._checks.values()))
+                parts = dict(zip(self._checks, views, strict=True))
+                self._last = time.monotonic(), Ready(ready=all(part.ready for part in views), parts=parts)
+            return self._last[1]
+
+    @staticmethod
+    async def _one(check: Check) -> PartView:
+        try:
+            await asyncio.wait_for(asyncio.to_thread(check), CHECK_S)
+        except TimeoutError:
+            return PartView(ready=False, detail=f"no answer within {CHECK_S:g} s")
+        except Exception as error:  # whatever it is, this part is not ready
+            return PartView(ready=False, detail=str(error) or type(error).__name__)
+        return PartView(ready=True, detail=None)
+
+
+def checks(jobs: Jobs) -> dict[str, Check]:
+    """database, engine, and each bus of the configured loops."""
+
+    def database() -> None:
+        jobs.store.ping()
+        if jobs.journal.behind_s > BEHIND_S:
+            raise RuntimeError(f"takes nothing for {jobs.journal.behind_s:.0f} s; reports of jobs wait in memory")
+
+    def engine() -> None:
+        if jobs.stopping:
+            raise RuntimeError("the service is shutting down")
+        if not jobs.engine.alive():
+            raise RuntimeError("the engine does not run")
+
+    def bus(url: str) -> Check:
+        return lambda: bus_opens(url)
+
+    urls = sorted({loop.bus for loop in jobs.loops.values()})
+    return {"database": database, "engine": engine, **{f"bus {url}": bus(url) for url in urls}}
+
+
+def bus_opens(url: str) -> None:
+    """Raises BusError unless the bus can be opened; sends nothing on it."""
+    try:
+        open_bus(url).close()
+    except OSError as error:
+        raise BusError(f"{url}: {error.strerror or error}") from error
+
+
+def install(app: FastAPI, jobs: Jobs, parts: Mapping[str, Check]) -> None:
+    """Adds the routes."""
+    router = APIRouter(tags=["operations"])
+    readiness = Readiness(parts)
+    counted = metrics.registry(jobs.loops, jobs.store)
+
+    @router.get("/healthz", summary="Is the process alive")
+    async def healthz() -> Alive:
+        return Alive(status="alive")
+
+    @router.get(
+        "/readyz",
+        summary="Can it take work: database, engine, each bus",
+        response_model=Ready,
+        responses={503: {"model": Ready, "description": "At least one part is not ready"}},
+    )
+    async def readyz() -> JSONResponse:
+        found = await readiness.ask()
+        return JSONResponse(found.model_dump(), status_code=200 if found.ready else 503)
+
+    @router.get(
+        "/metrics",
+        summary="Counts for Prometheus",
+        response_class=Response,
+        responses={200: {"content": {"text/plain": {}}, "description": "Prometheus' text format"}},
+    )
+    def counts() -> Response:
+        return Response(metrics.exposition(counted), media_type=metrics.MEDIA_TYPE)
+
+    @router.get("/audit", summary="Every change, the latest first", responses=problems.responses(422))
+    def changes(
+        limit: Annotated[int, Query(ge=1, le=1000, description="At most so many")] = 100,
+        before: Annotated[
+            int | None, Query(ge=1, le=2**53, description="Only those with a smaller number", examples=[17])
+        ] = None,
+        what: Annotated[str | None, Query(description="Only this kind of change", examples=["accept"])] = None,
+        loop: Annotated[str | None, Query(description="Only of this loop", examples=["TIC-101"])] = None,
+    ) -> AuditPage:
+        rows = audit.trail(jobs.store.engine, limit + 1, before, what, loop)
+        page_of = rows[:limit]
+        more = None
+        if len(rows) > limit:
+            kept = {"limit": limit, "before": page_of[-1].number, "what": what, "loop": loop}
+            more = f"/audit?{urlencode({k: v for k, v in kept.items() if v is not None})}"
+        return AuditPage(entries=[_view(row) for row in page_of], next=more)
+
+    app.include_router(router)
+
+    @app.get("/docs", include_in_schema=False)
+    def docs() -> HTMLResponse:
+        return HTMLResponse(page(app.openapi()), headers={"Content-Security-Policy": POLICY})
+
+
+def _view(row: AuditRow) -> AuditView:
+    return AuditView(**{name: getattr(row, name) for name in AuditView.model_fields})

@@ -1,0 +1,65 @@
+"""The API on one page, from its own OpenAPI document: plain HTML, nothing loaded from elsewhere."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import Any
+
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
+code { font: 14px ui-monospace, monospace; }
+summary { cursor: pointer; padding: .3rem 0; }
+.method { display: inline-block; width: 4rem; font-weight: bold; }
+table { border-collapse: collapse; margin: .3rem 0 1rem 4rem; }
+td, th { text-align: left; vertical-align: top; padding: .1rem .8rem .1rem 0; }
+"""
+POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+
+
+def page(document: dict[str, Any]) -> str:
+    """HTML of every operation: what it is for, its parameters and body, its answers."""
+    info = document["info"]
+    schemas = document["components"].get("schemas", {})
+    parts = [
+        f"<!doctype html><html lang=en><meta charset=utf-8><title>{escape(info['title'])}</title>",
+        f"<style>{STYLE}</style><h1>{escape(info['title'])} {escape(info['version'])}</h1>",
+        f"<p>{escape(info.get('description', ''))}</p>",
+        "<p>For programs: <a href=openapi.json>openapi.json</a></p>",
+    ]
+    tag = None
+    for path, item in document["paths"].items():
+        for method, operation in item.items():
+            if operation.get("tags", [""])[0] != tag:
+                tag = operation.get("tags", [""])[0]
+                parts.append(f"<h2>{escape(tag or 'more')}</h2>")
+            parts.append(_operation(path, method, operation, schemas))
+    return "\n".join(parts) + "\n</html>\n"
+
+
+def _operation(path: str, method: str, operation: dict[str, Any], schemas: dict[str, Any]) -> str:
+    rows = [
+        (f"{x['name']} ({x['in']})", x.get("description", ""), x.get("required", False))
+        for x in operation.get("parameters", ())
+    ]
+    body = operation.get("requestBody", {}).get("content", {}).get("application/json", {}).get("schema", {})
+    model = schemas.get(_name(body), {})
+    needed = model.get("required", ())
+    rows += [(f"{k} (body)", v.get("description", ""), k in needed) for k, v in model.get("properties", {}).items()]
+    rows += [(str(k), v.get("description", ""), False) for k, v in operation.get("responses", {}).items()]
+    cells = "".join(
+        f"<tr><td><code>{escape(name)}</code>{' *' if required else ''}<td>{escape(text)}"
+        for name, text, required in rows
+    )
+    return (
+        f"<details><summary><span class=method>{method.upper()}</span><code>{escape(path)}</code> "
+        f"{escape(operation.get('summary', ''))}</summary>"
+        f"<p>{escape(operation.get('description', ''))}</p><table>{cells}</table></details>"
+    )
+
+
+def _name(schema: dict[str, Any]) -> str:
+    """The schema referred to, also where it may be null."""
+    for choice in (schema, *schema.get("anyOf", ())):
+        if "$ref" in choice:
+            return str(choice["$ref"]).rpartition("/")[2]
+    return ""

@@ -1,0 +1,65 @@
+"""`loopwright backup` and `loopwright restore`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+
+app = typer.Typer()
+
+Data = Annotated[Path, typer.Option(help="The service's data folder.")]
+
+
+@app.command()
+def backup(
+    file: Annotated[Path, typer.Argument(help="Where to write the back-up.")],
+    data: Data = Path("data"),
+    replace: Annotated[bool, typer.Option("--replace", help="Write over an existing file.")] = False,
+) -> None:
+    """Copies the data folder's database while the service runs: jobs, samples, keys, audit log."""
+    from service.backup import BackupProblem, back_up
+
+    _only_files()
+    try:
+        size = back_up(data, file, replace)
+    except (BackupProblem, OSError) as error:
+        _die(error)
+    print(f"{file}: {size} bytes, checked")
+
+
+@app.command()
+def restore(
+    file: Annotated[Path, typer.Argument(help="The back-up.")],
+    data: Data = Path("data"),
+    replace: Annotated[bool, typer.Option("--replace", help="Keep what is there aside, and take the back-up.")] = False,
+) -> None:
+    """Makes a back-up the data of a stopped service. Jobs that were active in it end as interrupted."""
+    from service.backup import BackupProblem
+    from service.backup import restore as run
+    from service.store.store import FolderInUse
+
+    _only_files()
+    try:
+        interrupted, aside = run(file, data, replace)
+    except FolderInUse:
+        _die(f"a service is running on {data}: stop it first")
+    except (BackupProblem, OSError) as error:
+        _die(error)
+    print(f"restored {file} to {data}; {interrupted} job(s) that were active in it are marked interrupted")
+    if aside is not None:
+        print(f"what was there before is in {aside}")
+    print("keys are as they were in the back-up: see loopwright key list")
+
+
+def _only_files() -> None:
+    if os.environ.get("LOOPWRIGHT_DATABASE"):
+        _die("LOOPWRIGHT_DATABASE is set: a shared database is backed up and restored with pg_dump and pg_restore")
+
+
+def _die(why: object) -> NoReturn:
+    print(f"loopwright: {why}", file=sys.stderr)
+    raise typer.Exit(2)

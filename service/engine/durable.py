@@ -1,0 +1,102 @@
+"""DBOS as the engine: one workflow per job, its id that of the job, its one argument too.
+
+It has no steps: a workflow cut off is started anew, and what its stages had found is in our own tables.
+DBOS is one per process.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+
+from dbos import DBOS, DBOSConfig, SetWorkflowID
+from sqlalchemy import Engine as Database
+
+from service.engine import WORKFLOW_VERSION
+from service.store.database import sqlite
+
+log = logging.getLogger(__name__)
+
+FILE = "engine.sqlite"
+"""Nothing in it that our own tables would not restore: it may be deleted while the service is stopped."""
+POLL_S = 1.0
+_ALIVE = ("PENDING", "ENQUEUED", "DELAYED")
+
+_run: Callable[[str], None] | None = None
+
+
+@DBOS.workflow(name="job", max_recovery_attempts=None)
+def _job(job_id: str) -> None:
+    if _run is not None:
+        _run(job_id)
+
+
+class DurableEngine:
+    """database: the PostgreSQL engine shared with the other hosts, or None for a file of its own in the folder.
+
+    poll_s: how often each queue is looked at, s of wall time.
+    """
+
+    def __init__(self, folder: Path, database: Database | None, host: str, poll_s: float = POLL_S) -> None:
+        self._host = host
+        self._poll_s = poll_s
+        self._own = sqlite(folder / FILE) if database is None else None
+        self._database = self._own if database is None else database
+        self._queues: frozenset[str] = frozenset()
+        self._launched = False
+
+    def launch(self, run: Callable[[str], None], queues: Mapping[str, int]) -> None:
+        global _run
+        _run = run
+        # Said here, so that no variable of the environment sends anything anywhere.
+        for name in ("DBOS__CLOUD", "DBOS__APPVERSION", "DBOS__VMID"):
+            os.environ.pop(name, None)
+        config: DBOSConfig = {
+            "name": "loopwright",
+            "system_database_engine": self._database,
+            "application_version": WORKFLOW_VERSION,
+            "executor_id": self._host,
+            "log_level": "WARNING",
+            "enable_otlp": False,
+            "use_listen_notify": False,
+            "notification_listener_polling_interval_sec": self._poll_s,
+        }
+        DBOS(config=config)
+        logging.getLogger("dbos").setLevel(logging.WARNING)
+        DBOS.listen_queues(list(queues))
+        DBOS.launch()
+        for name, at_once in queues.items():
+            DBOS.register_queue(
+                name, worker_concurrency=at_once, polling_interval_sec=self._poll_s, on_conflict="always_update"
+            )
+        self._queues = frozenset(queues)
+        self._launched = True
+
+    def enqueue(self, job_id: str, queue: str) -> None:
+        with SetWorkflowID(job_id):
+            DBOS.enqueue_workflow(queue, _job, job_id)
+
+    def known(self, job_ids: Collection[str]) -> set[str]:
+        if not job_ids:
+            return set()
+        found = DBOS.list_workflows(
+            workflow_ids=list(job_ids), status=list(_ALIVE), load_input=False, load_output=False
+        )
+        return {one.workflow_id for one in found if one.queue_name in self._queues}
+
+    def forget(self, job_id: str) -> None:
+        DBOS.delete_workflow(job_id)
+
+    def alive(self) -> bool:
+        return self._launched
+
+    def close(self) -> None:
+        global _run
+        if self._launched:
+            self._launched = False
+            DBOS.destroy()
+        _run = None
+        if self._own is not None:
+            self._own.dispose()

@@ -1,0 +1,79 @@
+"""What Prometheus sees. Counters are of this process; jobs and loops are asked of the store when somebody looks."""
+
+from __future__ import annotations
+
+from collections import Counter as Tally
+from collections.abc import Iterable, Mapping
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, disable_created_metrics, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from protocol.tuner import sdo_retries
+from service.config import LoopConfig
+from service.states import ACTIVE, JobState
+from service.store.store import Store
+from service.store.tables import JobRow
+
+disable_created_metrics()  # type: ignore[no-untyped-call]
+MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+
+SAMPLES_LOST = Counter("loopwright_samples_lost", "Samples that did not arrive during a test", ["bus"], registry=None)
+STAGE_SECONDS = Histogram(
+    "loopwright_stage_plant_seconds",
+    "Plant time of a finished stage, s",
+    ["stage"],
+    buckets=(1, 3, 10, 30, 100, 300, 1000, 3000, 10_000, 30_000),
+    registry=None,
+)
+REQUESTS = Counter("loopwright_http_requests", "Answered requests", ["method", "route", "status"], registry=None)
+REQUEST_SECONDS = Histogram(
+    "loopwright_http_request_seconds",
+    "Wall time to the end of an answer, s; event streams left out",
+    ["route"],
+    buckets=(0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1, 3, 10),
+    registry=None,
+)
+IN_FLIGHT = Gauge("loopwright_http_requests_in_flight", "Requests being answered", registry=None)
+
+
+class _OfTheStore(Collector):
+    def __init__(self, loops: Mapping[str, LoopConfig], store: Store) -> None:
+        self._loops, self._store = loops, store
+
+    def collect(self) -> Iterable[Metric]:
+        loops = GaugeMetricFamily("loopwright_loops", "Configured loops", labels=["bus"])
+        for bus, count in sorted(Tally(loop.bus for loop in self._loops.values()).items()):
+            loops.add_metric([bus], count)
+        yield loops
+        with Session(self._store.engine) as session:
+            counts = session.execute(
+                select(JobRow.state, JobRow.reason, func.count()).group_by(JobRow.state, JobRow.reason)
+            ).all()
+        jobs = GaugeMetricFamily("loopwright_jobs", "Jobs in the database", labels=["state", "reason"])
+        found = {(state, reason or ""): count for state, reason, count in counts}
+        # Active states are always there: a gauge that vanishes cannot be alarmed on.
+        for key in sorted(found.keys() | {(state.value, "") for state in ACTIVE | {JobState.PROPOSED}}):
+            jobs.add_metric(list(key), found.get(key, 0))
+        yield jobs
+        retries = CounterMetricFamily(
+            "loopwright_sdo_retries", "SDO requests sent again for want of an answer", labels=["bus"]
+        )
+        for bus, count in sorted(sdo_retries.items()):
+            retries.add_metric([bus], count)
+        yield retries
+
+
+def registry(loops: Mapping[str, LoopConfig], store: Store) -> CollectorRegistry:
+    """Everything that /metrics shows of a service."""
+    found = CollectorRegistry()
+    for collector in (SAMPLES_LOST, STAGE_SECONDS, REQUESTS, REQUEST_SECONDS, IN_FLIGHT, _OfTheStore(loops, store)):
+        found.register(collector)
+    return found
+
+
+def exposition(of: CollectorRegistry) -> bytes:
+    """The text that Prometheus scrapes."""
+    return generate_latest(of)

@@ -1,0 +1,108 @@
+"""The keys in the database: made, listed, revoked, and checked at the door."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+import time
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
+
+from sqlalchemy import Engine, select
+from sqlalchemy.orm import sessionmaker
+
+from service.security import audit
+from service.security.keys import Scope, hash_key, key_id_of, matches, new_key
+from service.security.tables import KeyRow
+from service.store.clock import now, stamp
+
+REVOKED_WITHIN_S = 2.0
+"""How long a key that was just used may still be taken for valid after it was revoked."""
+
+
+class KeyProblem(Exception):
+    """The wish about a key cannot be met; the text says why."""
+
+
+class Keyring:
+    """Keys of one database. `wall` gives monotonic seconds."""
+
+    def __init__(self, engine: Engine, wall: Callable[[], float] = time.monotonic) -> None:
+        self._session = sessionmaker(engine, expire_on_commit=False)
+        self._wall = wall
+        # Digest of a key seen to be right -> when it was last compared with the database.
+        self._known: dict[bytes, tuple[float, KeyRow]] = {}
+        self._one_hash_at_a_time = threading.Lock()
+
+    def create(self, name: str, scope: Scope, valid_for: timedelta | None = None) -> tuple[KeyRow, str]:
+        """A new key; its text is given here and never again. Raises KeyProblem when a valid key has the name."""
+        key_id, key = new_key()
+        at = datetime.now(UTC)
+        row = KeyRow(
+            id=key_id, name=name, scope=scope.value, hash=hash_key(key), created_at=stamp(at),
+            expires_at=stamp(at + valid_for) if valid_for else None, revoked_at=None,
+        )  # fmt: skip
+        with self._session.begin() as session:
+            if any(valid(other) for other in session.scalars(select(KeyRow).where(KeyRow.name == name))):
+                raise KeyProblem(f"there is a valid key named {name!r}; choose another name, or revoke it first")
+            session.add(row)
+            audit.record(session, "key_create", key_id, after=_shown(row))
+        return row, key
+
+    def list(self) -> Sequence[KeyRow]:
+        """Every key there ever was, oldest first."""
+        with self._session() as session:
+            return session.scalars(select(KeyRow).order_by(KeyRow.created_at, KeyRow.id)).all()
+
+    def any_valid(self) -> bool:
+        return any(valid(row) for row in self.list())
+
+    def revoke(self, wanted: str) -> KeyRow:
+        """Revokes the key of this id, or the valid one of this name. Raises KeyProblem when there is none."""
+        with self._session.begin() as session:
+            named = select(KeyRow).where((KeyRow.id == wanted) | (KeyRow.name == wanted), KeyRow.revoked_at.is_(None))
+            row = session.scalars(named.order_by(KeyRow.created_at.desc())).first()
+            if row is None:
+                raise KeyProblem(f"there is no key {wanted!r} that could be revoked")
+            before = _shown(row)
+            row.revoked_at = now()
+            audit.record(session, "key_revoke", row.id, before=before, after=_shown(row))
+            return row
+
+    def known(self, key: str) -> KeyRow | None:
+        """The key's row if it was found right within the last moments: no database, no hashing."""
+        seen = self._known.get(_digest(key))
+        if seen is None or self._wall() - seen[0] > REVOKED_WITHIN_S or not valid(seen[1]):
+            return None
+        return seen[1]
+
+    def check(self, key: str) -> KeyRow | None:
+        """The row of a valid key, else None. A key seen before costs one query; a new one its hash too."""
+        key_id = key_id_of(key)
+        if key_id is None:
+            return None
+        with self._session() as session:
+            row = session.get(KeyRow, key_id)
+        digest = _digest(key)
+        if row is None or not valid(row):
+            self._known.pop(digest, None)
+            return None
+        if digest not in self._known:
+            with self._one_hash_at_a_time:
+                if not matches(key, row.hash):
+                    return None
+        self._known[digest] = (self._wall(), row)
+        return row
+
+
+def valid(row: KeyRow) -> bool:
+    """Neither revoked nor expired."""
+    return row.revoked_at is None and (row.expires_at is None or row.expires_at > now())
+
+
+def _shown(row: KeyRow) -> dict[str, str | None]:
+    return {name: getattr(row, name) for name in ("name", "scope", "expires_at", "revoked_at")}
+
+
+def _digest(key: str) -> bytes:
+    return hashlib.sha256(key.encode()).digest()

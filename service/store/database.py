@@ -1,0 +1,83 @@
+"""Opening the database: a file in the data folder, or a PostgreSQL server shared by several hosts.
+
+Nothing that waits for the database waits for ever: a request is answered with 503 instead.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from alembic import command
+from alembic.config import Config
+from sqlalchemy import Engine, create_engine, event, make_url, text
+from sqlalchemy.exc import ArgumentError
+
+FILE = "loopwright.sqlite"
+WAIT_S = 5
+"""Wall time for a connection, a lock or a locked file."""
+STATEMENT_S = 10
+_MIGRATING = 0x4C6F6F70  # any number that hosts agree on
+
+
+class BadDatabase(Exception):
+    """The database setting cannot be used. The text never holds a password."""
+
+
+def open_database(folder: Path, url: str | None, name: str) -> Engine:
+    """The engine for our tables. name: how a PostgreSQL server lists the connections."""
+    if url is None:
+        return sqlite(folder / FILE)
+    try:
+        parsed = make_url(url)
+    except ArgumentError as error:
+        raise BadDatabase("the database must be given as postgresql://USER:PASSWORD@HOST:PORT/NAME") from error
+    if parsed.get_backend_name() != "postgresql":
+        kind = parsed.get_backend_name()
+        raise BadDatabase(f"the database must be postgresql://..., not {kind}://; without one a file is used")
+    return create_engine(
+        parsed.set(drivername="postgresql+psycopg"),
+        pool_size=10,
+        max_overflow=20,
+        pool_timeout=WAIT_S,
+        # A connection that died while it lay idle is noticed before a transaction begins on it.
+        pool_pre_ping=True,
+        connect_args={
+            "connect_timeout": WAIT_S,
+            "application_name": name,
+            "options": f"-c statement_timeout={STATEMENT_S}s -c lock_timeout={WAIT_S}s",
+            "keepalives_idle": WAIT_S,
+            "keepalives_interval": 1,
+            "keepalives_count": 5,
+            "tcp_user_timeout": 1000 * STATEMENT_S,
+        },
+    )
+
+
+def sqlite(file: Path) -> Engine:
+    """A file that keeps what was committed through a power cut, and whose readers never wait for its writer."""
+    engine = create_engine(f"sqlite:///{file}", connect_args={"timeout": float(WAIT_S)})
+    event.listen(engine, "connect", _pragmas)
+    return engine
+
+
+def migrate(engine: Engine) -> None:
+    """Makes the tables, or brings them to the present revision."""
+    config = Config()
+    config.set_main_option("script_location", "service.store:migrations")
+    with engine.begin() as connection:
+        if engine.dialect.name != "sqlite":
+            connection.execute(text("SET LOCAL lock_timeout = 0"))
+            connection.execute(text("SET LOCAL statement_timeout = 0"))
+            connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _MIGRATING})
+        config.attributes["connection"] = connection
+        command.upgrade(config, "head")
+
+
+def _pragmas(connection: Any, _record: object) -> None:
+    # A transaction that writes takes the lock as it begins: one that read first could not wait for it later.
+    connection.isolation_level = "IMMEDIATE"
+    cursor = connection.cursor()
+    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
+        cursor.execute(f"PRAGMA {pragma}")
+    cursor.close()

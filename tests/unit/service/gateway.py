@@ -1,0 +1,140 @@
+"""A service as a process of its own, whose loops are files: what a test may kill.
+
+    python -m tests.unit.service.gateway FOLDER --tag TAG ... [--host NAME] [--database URL] [--no-resume]
+
+A stage lasts until FOLDER/go-STAGE (or FOLDER/go) is there; the controllers outlive the process as FOLDER/TAG.json.
+With --hours-back its clock is set back as soon as FOLDER/clock-is-back is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import yaml
+
+from service.config import LoopConfig
+from service.jobs import loop_state, state_json
+from service.loop import Loop, LoopState
+from service.request import RetuneRequest
+from service.serving import Setup, serve
+from service.store import store
+from service.work import Hooks, Outcome
+from tests.unit.service.fakes import NEW, OLD, RESULT, Found, loop_entry
+from tuning.plan import Command, Mode, Sample, SetGains, SetSetpoint, StageDone, StageStarted
+from tuning.reasons import Aborted, Ended, Failed, Reason
+
+STAGES = ("relay", "ultimate", "zn_pi", "estimate", "verify")
+HOME = LoopState(Mode.AUTOMATIC, 50.0, 50.0, 40.0, OLD, False, 0.0, 100.0, 0.1, True)
+
+
+def read_loop(folder: Path, tag: str) -> LoopState:
+    """The controller of a loop, whatever became of the service."""
+    return loop_state(json.loads((folder / f"{tag}.json").read_text()))
+
+
+def write_loop(folder: Path, tag: str, state: LoopState) -> None:
+    new = folder / f"{tag}.new"
+    new.write_text(json.dumps(state_json(state)))
+    new.replace(folder / f"{tag}.json")
+
+
+class FileLoop:
+    """A controller that keeps what it is told, even when its tuner dies: the service has to bring it back."""
+
+    def __init__(self, folder: Path, tag: str) -> None:
+        self._folder, self._tag = folder, tag
+        self._n = 0
+        if not (folder / f"{tag}.json").exists():
+            write_loop(folder, tag, HOME)
+
+    def read(self) -> LoopState:
+        if (self._folder / f"{self._tag}.silent").exists():
+            raise Failed(Reason.NODE_LOST, "node 32 does not answer")
+        return read_loop(self._folder, self._tag)
+
+    def begin(self, stop: Callable[[], Reason | None] = lambda: None) -> LoopState:
+        return self.read()
+
+    def step(self, commands: Sequence[Command]) -> Sample:
+        for command in commands:
+            state = self.read()
+            if isinstance(command, SetSetpoint):
+                write_loop(self._folder, self._tag, replace(state, sp=command.value))
+            elif isinstance(command, SetGains):
+                write_loop(self._folder, self._tag, replace(state, gains=command.gains, on_trial=True))
+        self._n += 1
+        return Sample(0.1 * self._n, 50.0, 50.0, 40.0, int(Mode.AUTOMATIC))
+
+    def restore(self, state: LoopState) -> LoopState:
+        write_loop(self._folder, self._tag, state)
+        return self.read()
+
+    def accept(self, gains: object) -> LoopState:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def tune_in(folder: Path) -> Callable[[LoopConfig, RetuneRequest, Loop, LoopState, Hooks], Outcome]:
+    """Five stages on trial gains; one that is done already is not run again."""
+
+    def tune(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks) -> Outcome:
+        done = {event.data["stage"] for event in hooks.earlier if event.kind == "stage_done"}
+        ended: Ended | None = None
+        try:
+            for stage in STAGES:
+                if stage in done:
+                    continue
+                hooks.on_event(StageStarted(stage, 1.0, 1.0))
+                with (folder / f"{config.tag}.ran").open("a") as ran:
+                    ran.write(f"{stage}\n")
+                hooks.on_samples([loop.step((SetGains(NEW),) if n == 0 else ()) for n in range(10)])
+                while not ((folder / "go").exists() or (folder / f"go-{stage}").exists()):
+                    loop.step(())
+                    if reason := hooks.stop():
+                        raise Aborted(reason, f"in stage {stage}")
+                    time.sleep(0.005)
+                hooks.on_event(StageDone(stage, Found(2.05, 3.32)))
+        except Ended as error:
+            ended = error
+        return Outcome(None if ended else RESULT, ended, loop.restore(state), {})
+
+    return tune
+
+
+def set_back(flag: Path, seconds: float) -> None:
+    """The wall clock of this process is that much behind from the moment on in which the flag is there."""
+    real = time.time
+    time.time = lambda: real() - (seconds if flag.exists() else 0.0)
+    store.now = lambda: datetime.fromtimestamp(time.time(), UTC).isoformat(timespec="milliseconds")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--host", default="local")
+    parser.add_argument("--tag", action="append", required=True)
+    parser.add_argument("--database")
+    parser.add_argument("--no-resume", action="store_true")
+    parser.add_argument("--hours-back", type=float, default=0.0)
+    asked = parser.parse_args()
+    asked.folder.mkdir(parents=True, exist_ok=True)
+    set_back(asked.folder / "clock-is-back", 3600 * asked.hours_back)
+    loops = asked.folder / "loops.yaml"
+    entries = [loop_entry(tag=tag, channel=n + 1) for n, tag in enumerate(asked.tag)]
+    loops.write_text(yaml.safe_dump({"loops": entries}))
+    setup = Setup(
+        loops, asked.folder / "data", "127.0.0.1", 0, asked.database, asked.host, not asked.no_resume, poll_s=0.05
+    )
+    serve(setup, lambda config: FileLoop(asked.folder, config.tag), tune_in(asked.folder))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,230 @@
+from __future__ import annotations
+
+import sqlite3
+import subprocess
+import sys
+import threading
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from service import cli
+from service.backup import BackupProblem, back_up, restore
+from service.request import RetuneRequest
+from service.security.keyring import Keyring
+from service.security.keys import Scope
+from service.states import JobState
+from service.store.store import FolderInUse, Store
+from tests.unit.service.fakes import TAG, Service
+from tuning.plan import Sample
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    return tmp_path / "data"
+
+
+def filled(data: Path) -> tuple[str, str, str]:
+    """A finished job, a queued one, and a key, in a folder whose service is gone."""
+    service = Service(data)
+    job = service.jobs.start(TAG, RetuneRequest())
+    service.wait(job.id)
+    _, key = Keyring(service.store.engine).create("a", Scope.READ)
+    service.close()
+    store = Store(data)
+    active = store.create("OTHER", {}, "me", False)
+    store.close()
+    return job.id, active.id, key
+
+
+def test_there_and_back(data: Path, tmp_path: Path) -> None:
+    done, active, key = filled(data)
+    size = back_up(data, tmp_path / "b")
+    assert size == (tmp_path / "b").stat().st_size and (tmp_path / "b").stat().st_mode & 0o777 == 0o600
+    interrupted, aside = restore(tmp_path / "b", tmp_path / "new")
+    assert (interrupted, aside) == (1, None)
+    store, old = Store(tmp_path / "new"), Store(data)
+    assert store.get(done).result == old.get(done).result and store.samples(done) == old.samples(done) != []
+    assert len(store.events(done)) == len(old.events(done))
+    assert Keyring(store.engine).check(key) is not None
+    row = store.get(active)
+    assert (row.state, row.reason) == ("interrupted", "service_stopped") and "back-up" in (row.detail or "")
+    assert store.unfinished() == [] and old.get(active).state == "queued"
+    store.close()
+    old.close()
+    assert not [path for path in (tmp_path / "new").iterdir() if path.name.startswith(".")]
+
+
+def test_a_back_up_of_a_service_that_writes_is_of_one_moment(data: Path, tmp_path: Path) -> None:
+    store = Store(data)
+    stop = threading.Event()
+    written = 0
+
+    def write() -> None:
+        nonlocal written
+        while not stop.is_set():
+            row = store.create("L", {}, "me", False)
+            store.add_samples(row.id, "relay", [Sample(0.1 * n, 1.0, 2.0, 3.0, 2) for n in range(500)])
+            store.move(row.id, JobState.FAILED, reason="internal")
+            written += 1
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    try:
+        for n in range(5):
+            seen = written
+            back_up(data, tmp_path / f"b{n}")
+            with closing(sqlite3.connect(tmp_path / f"b{n}")) as copy:
+                # A job is three transactions; whatever the moment, none is there by half.
+                jobs, ended, blocks = copy.execute(
+                    "SELECT count(*), count(ended_at), (SELECT count(*) FROM sample_chunks) FROM jobs"
+                ).fetchone()
+                assert ended <= blocks <= jobs <= ended + 1 and ended >= seen
+    finally:
+        stop.set()
+        writer.join()
+        store.close()
+    assert written > 5
+
+
+def test_restore_keeps_what_was_there(data: Path, tmp_path: Path) -> None:
+    done, _, _ = filled(data)
+    back_up(data, tmp_path / "b")
+    (data / "engine.sqlite").write_bytes(b"another database")
+    store = Store(data)
+    later = store.create("L", {}, "me", False).id
+    store.close()
+    with pytest.raises(BackupProblem, match="--replace"):
+        restore(tmp_path / "b", data)
+    _, aside = restore(tmp_path / "b", data, replace=True)
+    assert aside is not None and (aside / "engine.sqlite").exists() and not (data / "engine.sqlite").exists()
+    for folder, jobs in ((data, {done}), (aside, {done, later})):
+        store = Store(folder)
+        assert jobs <= {row.id for row in store.recent()} and (later in jobs) == (len(store.recent()) == 3)
+        store.close()
+
+
+def test_no_restore_over_a_running_service(data: Path, tmp_path: Path) -> None:
+    service = Service(data)
+    back_up(data, tmp_path / "b")
+    with pytest.raises(FolderInUse):
+        restore(tmp_path / "b", data, replace=True)
+    assert service.store.recent() == [] and sorted(p.name for p in data.iterdir() if p.is_dir()) == []
+    service.close()
+
+
+def test_no_service_starts_in_the_middle_of_a_restore(data: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    filled(data)
+    back_up(data, tmp_path / "b")
+    tried = []
+    restored = Store.restored
+
+    def and_start(store: Store, source: str) -> int:
+        with pytest.raises(FolderInUse):
+            Store(data)
+        tried.append(1)
+        return restored(store, source)
+
+    monkeypatch.setattr(Store, "restored", and_start)
+    restore(tmp_path / "b", data, replace=True)
+    assert tried
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:20_000])
+
+
+def _scramble(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[8192:16384] = b"\xaa" * 8192
+    path.write_bytes(content)
+
+
+def _other_tables(path: Path) -> None:
+    path.unlink()
+    with closing(sqlite3.connect(path)) as made:
+        made.execute("CREATE TABLE alembic_version (version_num)")
+
+
+def _newer(path: Path) -> None:
+    with closing(sqlite3.connect(path)) as made:
+        made.execute("UPDATE alembic_version SET version_num = '9999'")
+        made.commit()
+
+
+@pytest.mark.parametrize(
+    "harm", [_cut, _scramble, _other_tables, _newer, Path.unlink, lambda path: path.write_bytes(b"no database")]
+)
+def test_what_is_not_a_whole_back_up_is_refused_and_nothing_changes(data: Path, tmp_path: Path, harm: Any) -> None:
+    done, _, _ = filled(data)
+    back_up(data, tmp_path / "b")
+    harm(tmp_path / "b")
+    with pytest.raises(BackupProblem):
+        restore(tmp_path / "b", data, replace=True)
+    store = Store(data)
+    assert store.get(done).state == "proposed"
+    store.close()
+
+
+def test_a_back_up_of_the_first_revision_is_brought_to_the_present_one(data: Path, tmp_path: Path) -> None:
+    from alembic import command
+    from alembic.config import Config
+    from sqlalchemy import create_engine
+
+    engine = create_engine(f"sqlite:///{tmp_path / 'old'}")
+    config = Config()
+    config.set_main_option("script_location", "service.store:migrations")
+    with engine.begin() as connection:
+        config.attributes["connection"] = connection
+        command.upgrade(config, "0001")
+        connection.exec_driver_sql(
+            "INSERT INTO jobs (id, loop, state, dry_run, request, requested_by, created_at, plant_time_s)"
+            " VALUES ('j1', 'A', 'running', 0, '{}', 'me', '2026-01-01T00:00:00.000Z', 3.0)"
+        )
+    engine.dispose()
+    assert restore(tmp_path / "old", data) == (1, None)
+    store = Store(data)
+    assert store.get("j1").state == "interrupted" and Keyring(store.engine).list() == []
+    store.close()
+
+
+def test_no_room(data: Path, tmp_path: Path) -> None:
+    """A full disk: the command says so, and leaves no half file."""
+    filled(data)
+    code = (
+        "import resource, sys; from service.cli import main; "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (30000, 30000)); "
+        "import signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "
+        f"sys.argv = ['loopwright', 'backup', {str(tmp_path / 'b')!r}, '--data', {str(data)!r}]; main()"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ran.returncode == 2 and ran.stderr.startswith("loopwright: ") and "Traceback" not in ran.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["data"]
+
+
+def test_the_commands(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(*arguments: object) -> Any:
+        return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+
+    file = tmp_path / "b.sqlite"
+    assert "not a data folder" in run("backup", file, "--data", data).stderr
+    filled(data)
+    assert run("backup", file, "--data", data).exit_code == 0
+    again = run("backup", file, "--data", data)
+    assert again.exit_code == 2 and "--replace" in again.stderr
+    assert run("backup", file, "--data", data, "--replace").exit_code == 0
+    assert run("backup", tmp_path / "no" / "folder", "--data", data).exit_code == 2
+    assert run("restore", file, "--data", data).exit_code == 2
+    done = run("restore", file, "--data", data, "--replace")
+    assert done.exit_code == 0 and "1 job(s)" in done.stdout and "replaced-" in done.stdout
+    monkeypatch.setenv("LOOPWRIGHT_DATABASE", "postgresql://somewhere/else")
+    for command in ("backup", "restore"):
+        assert "pg_dump" in run(command, file, "--data", data, "--replace").stderr
+    monkeypatch.delenv("LOOPWRIGHT_DATABASE")
+    store = Store(data)
+    refused = run("restore", file, "--data", data, "--replace")
+    assert refused.exit_code == 2 and "stop it first" in refused.stderr
+    store.close()

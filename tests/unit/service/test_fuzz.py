@@ -1,0 +1,179 @@
+"""The OpenAPI document against the service: every operation, fed with what its schema allows and with what it forbids.
+
+No answer may be a 5xx, and none may be undocumented in status, media type, headers or shape. The examples are the same
+at every run; how many there were is in the run's summary.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections import Counter
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+from fastapi.testclient import TestClient
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from service.api.app import create_app
+from service.request import RetuneRequest
+from service.security.gate import Policy
+from service.security.keyring import Keyring
+from service.security.keys import Scope
+from service.security.limits import RequestLimits
+from tests.unit.service.fakes import TAG, Service
+from tuning.reasons import Failed, Reason
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    import schemathesis
+    from schemathesis import GenerationMode
+    from schemathesis.checks import not_a_server_error
+    from schemathesis.specs.openapi import checks
+
+DOCUMENT = json.loads((Path(__file__).parents[2] / "golden" / "openapi.json").read_text())
+SCHEMA = schemathesis.openapi.from_dict(DOCUMENT)
+OPERATIONS = {found.ok().label: found.ok() for found in cast(Any, SCHEMA).get_all_operations()}
+WITH_INPUT = [
+    f"{method.upper()} {path}"
+    for path, item in DOCUMENT["paths"].items()
+    for method, operation in item.items()
+    if operation.get("parameters") or operation.get("requestBody")
+]
+CHECKS = [
+    not_a_server_error,
+    checks.status_code_conformance,
+    checks.content_type_conformance,
+    checks.response_headers_conformance,
+    checks.response_schema_conformance,
+]
+BOUNDED = settings(
+    derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck), print_blob=False
+)
+ABORT = "POST /jobs/{job_id}/abort"
+KEYS = ("none", "wrong", "revoked", "expired", *Scope)
+
+
+class Site:
+    """A service with a job of every end, and with keys of every kind."""
+
+    def __init__(self, folder: Path, authenticated: bool) -> None:
+        self.service = Service(folder)
+        keyring = Keyring(self.service.store.engine)
+        limits = RequestLimits(rate_per_s=1e6, burst=10**6, bad_keys_per_s=1e6, bad_keys_burst=10**6)
+        policy = Policy(keyring if authenticated else None, limits)
+        self.client = TestClient(create_app(self.service.jobs, policy), raise_server_exceptions=False)
+        self.keys = {scope.value: keyring.create(scope, scope)[1] for scope in Scope}
+        self.keys["expired"] = keyring.create("old", Scope.ADMIN, timedelta(days=-1))[1]
+        revoked, self.keys["revoked"] = keyring.create("revoked", Scope.ADMIN)
+        keyring.revoke(revoked.id)
+        self.keys["wrong"] = self.keys["admin"][:-4] + "AAAA"
+        self.jobs = [self.ended(None), self.ended(None), self.ended(Failed(Reason.NODE_LOST, "silent"))]
+        self.cases = 0
+
+    def ended(self, how: Exception | None) -> str:
+        self.service.tune.ends = how
+        job = self.service.jobs.start(TAG, RetuneRequest()).id
+        self.service.wait(job)
+        self.service.tune.ends = None
+        return job
+
+    def running(self) -> str:
+        """A job that is in the middle of its experiment; the one before it ends first."""
+        self.service.tune.hold.set()
+        for row in self.service.store.unfinished():
+            self.service.wait(row.id)
+        self.service.tune.inside.clear()
+        self.service.tune.hold.clear()
+        job = self.service.jobs.start("FIC-2", RetuneRequest()).id
+        assert self.service.tune.inside.wait(5)
+        return job
+
+    def send(self, case: Any, **headers: str) -> Any:
+        """The case as a request; its answer, checked against the document."""
+        sent = case.as_transport_kwargs(base_url="http://testserver", headers=headers)
+        body = {"content" if name == "data" else name: sent[name] for name in ("json", "data") if name in sent}
+        answer = self.client.request(
+            sent["method"], sent["url"], params=sent["params"], headers=dict(sent["headers"]), **body
+        )
+        case.validate_response(answer, checks=CHECKS)
+        self.cases += 1
+        return answer
+
+    def close(self) -> None:
+        self.client.close()
+        self.service.close()
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory, fuzz_count: Counter[str]) -> Iterator[Site]:
+    site = Site(tmp_path_factory.mktemp("open"), authenticated=False)
+    yield site
+    fuzz_count["cases without keys"] += site.cases
+    fuzz_count["operations"] += len(OPERATIONS)
+    site.close()
+
+
+@pytest.mark.parametrize("label", OPERATIONS)
+def test_what_the_document_allows(label: str, site: Site) -> None:
+    operation = OPERATIONS[label]
+    seen = set()
+
+    @settings(BOUNDED, max_examples=40)
+    @given(case=operation.as_strategy(GenerationMode.POSITIVE), known=st.booleans(), pick=st.integers(0, 2))
+    def run(case: Any, known: bool, pick: int) -> None:
+        if known:  # else nearly every answer would be a 404
+            names = {"tag": TAG, "job_id": site.running() if label == ABORT else site.jobs[pick]}
+            case.path_parameters.update({k: v for k, v in names.items() if k in case.path_parameters})
+        seen.add(site.send(case).status_code)
+
+    run()
+    assert seen & {200, 202, 409}, f"only {seen}: nothing but refusals was tried"
+
+
+@pytest.mark.parametrize("label", WITH_INPUT)
+def test_what_the_document_forbids(label: str, site: Site) -> None:
+    refused = 0
+
+    @settings(BOUNDED, max_examples=40)
+    @given(case=OPERATIONS[label].as_strategy(GenerationMode.NEGATIVE))
+    def run(case: Any) -> None:
+        nonlocal refused
+        refused += site.send(case).status_code >= 400
+
+    run()
+    assert refused
+
+
+def test_each_operation_asks_for_its_key(tmp_path: Path, fuzz_count: Counter[str]) -> None:
+    site = Site(tmp_path, authenticated=True)
+    seen: Counter[int] = Counter()
+
+    @settings(BOUNDED, max_examples=200)
+    @given(data=st.data(), key=st.sampled_from(KEYS))
+    def run(data: st.DataObject, key: str) -> None:
+        label = data.draw(st.sampled_from(sorted(OPERATIONS)))
+        case = data.draw(OPERATIONS[label].as_strategy(GenerationMode.POSITIVE))
+        headers = {} if key == "none" else {"Authorization": f"Bearer {site.keys[key]}"}
+        status = site.send(case, **headers).status_code
+        seen[status] += 1
+        expected = None if label == "GET /healthz" else _refusal(key, label)
+        assert expected == status if expected else status not in (401, 403), f"{label} with key {key}: {status}"
+
+    run()
+    site.close()
+    fuzz_count["cases with keys"] += site.cases
+    assert {200, 401, 403} <= seen.keys()
+
+
+def _refusal(key: str, label: str) -> int | None:
+    """Written from the table in docs/operations.md, not from the code."""
+    if key not in list(Scope):
+        return 401
+    needs = "admin" if label == "GET /audit" else "read" if label.startswith("GET ") else "operate"
+    permitted = {"read": ("read",), "operate": ("read", "operate"), "admin": ("read", "operate", "admin")}
+    return None if needs in permitted[key] else 403

@@ -1,0 +1,221 @@
+"""What a service does with the jobs that another one left, without processes: the same store, opened again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.engine import WORKFLOW_VERSION
+from service.jobs import MOST_ATTEMPTS, Jobs, state_json
+from service.loop import LoopState
+from service.request import RetuneRequest
+from service.states import JobState
+from service.store.store import Store
+from service.store.tables import JobRow
+from tests.unit.service.fakes import NEW, OLD, TAG, FakeController, FakeLoop, Service, ThreadEngine
+from tuning.plan import Mode
+from tuning.reasons import Reason
+
+HOME = FakeController().state
+
+
+@pytest.fixture
+def started() -> Iterator[list[Service]]:
+    services: list[Service] = []
+    yield services
+    for service in services:
+        service.close()
+
+
+def left(folder: Path, version: str = WORKFLOW_VERSION, done: tuple[str, ...] = (), **columns: Any) -> str:
+    """A job in the middle of its test, as kill -9 leaves it."""
+    store = Store(folder)
+    row = store.create(TAG, {}, "me", False, version=version)
+    old = {"Kp": OLD.Kp, "Ti": OLD.Ti}
+    store.move(row.id, JobState.RUNNING, **{"old_gains": old, "found": state_json(HOME), "attempt": 1, **columns})
+    for stage in done:
+        store.append(row.id, "stage_started", {"stage": stage, "expected_s": 1.0, "remaining_s": 1.0}, 5.0)
+        store.append(row.id, "stage_done", {"stage": stage, "result": {}, "stage_time_s": 5.0}, 5.0)
+    store.close()
+    return row.id
+
+
+def again(
+    started: list[Service], folder: Path, found: LoopState = HOME, absent: Reason | None = None, **options: Any
+) -> Service:
+    """The next start, with the controller in that state."""
+
+    class Later(Service):
+        def more_jobs(self, open_loop: Callable[..., Any], *more: Any, **settings: Any) -> Jobs:
+            self.controller.state, self.controller.absent = found, absent
+            return super().more_jobs(open_loop, *more, **settings)
+
+    service = Later(folder, **options)
+    started.append(service)
+    return service
+
+
+def texts(service: Service, job_id: str, kind: str) -> list[str]:
+    return [event.data["text"] for event in service.store.events(job_id) if event.kind == kind]
+
+
+ON_TRIAL = replace(HOME, gains=NEW, on_trial=True, sp=52.0)
+
+
+def test_a_loop_on_trial_is_brought_back_and_its_job_goes_on_where_it_was(
+    started: list[Service], tmp_path: Path
+) -> None:
+    job_id = left(tmp_path, done=("preflight",), plant_time_s=7.0)
+    service = again(started, tmp_path, ON_TRIAL)
+    service.wait(job_id)
+    row = service.store.get(job_id)
+    assert (row.state, row.attempt) == ("proposed", 2), row.detail
+    assert "brought back" in texts(service, job_id, "loop_found")[0] and len(texts(service, job_id, "resumed")) == 1
+    assert service.controller.state == HOME
+    assert [stage for stage, _ in service.store.samples(job_id)] == ["relay"]
+    assert service.store.samples(job_id)[0][1][0].t > 7.0
+    assert row.stage_times_s == {"preflight": 5.0, "relay": 1.0} and row.plant_time_s == 8.0
+
+
+def test_a_job_that_had_not_begun_is_begun(started: list[Service], tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    row = store.create(TAG, {}, "me", False, version=WORKFLOW_VERSION)
+    store.close()
+    service = again(started, tmp_path)
+    service.wait(row.id)
+    assert service.store.get(row.id).state == "proposed" and not texts(service, row.id, "loop_found")
+
+
+@pytest.mark.parametrize(
+    ("found", "reason", "words"),
+    [
+        (replace(HOME, sp=55.0), Reason.SETPOINT_CHANGED, "set-point is 55, was 50"),
+        (replace(HOME, mode=Mode.MANUAL), Reason.MODE_CHANGED, "mode is manual, was automatic"),
+        (replace(HOME, gains=NEW), Reason.SERVICE_STOPPED, "gains is"),
+    ],
+)
+def test_what_somebody_changed_meanwhile_stays_and_the_job_does_not_go_on(
+    started: list[Service], tmp_path: Path, found: LoopState, reason: Reason, words: str
+) -> None:
+    job_id = left(tmp_path)
+    service = again(started, tmp_path, found)
+    row = service.store.get(job_id)
+    assert (row.state, row.reason) == ("interrupted", reason.value) and words in (row.detail or "")
+    assert service.controller.state == found and row.restored == state_json(found)
+
+
+@pytest.mark.parametrize(
+    ("columns", "options", "words"),
+    [
+        ({"version": "0"}, {}, "another version"),
+        ({}, {"resume": False}, "--no-resume"),
+        ({"attempt": MOST_ATTEMPTS}, {}, f"attempt {MOST_ATTEMPTS}"),
+        ({"request": {"sp_deviation": 2.5}}, {}, "configuration has changed"),
+    ],
+)
+def test_a_job_that_may_not_go_on_says_why_and_what_was_restored(
+    started: list[Service], tmp_path: Path, columns: dict[str, Any], options: dict[str, Any], words: str
+) -> None:
+    job_id = left(tmp_path, **columns)
+    service = again(started, tmp_path, ON_TRIAL, **options)
+    row = service.store.get(job_id)
+    assert (row.state, row.reason) == ("interrupted", row.reason) and words in (row.detail or "")
+    assert "brought back" in (row.detail or "") and row.restored == state_json(HOME) == state_json(
+        service.controller.state
+    )
+    assert service.store.active(TAG) is None
+
+
+def test_a_loop_that_is_not_reached_is_said_so(started: list[Service], tmp_path: Path) -> None:
+    job_id = left(tmp_path)
+    service = again(started, tmp_path, absent=Reason.NODE_LOST)
+    row = service.store.get(job_id)
+    assert (row.state, row.reason, row.restored) == ("interrupted", "node_lost", None)
+    assert "not reached" in (row.detail or "")
+
+
+def test_a_job_asked_to_stop_before_the_crash_is_stopped(started: list[Service], tmp_path: Path) -> None:
+    job_id = left(tmp_path, stop_reason="operator")
+    service = again(started, tmp_path, ON_TRIAL)
+    row = service.store.get(job_id)
+    assert (row.state, row.reason) == ("aborted", "operator") and service.controller.state == HOME
+
+
+def test_the_loop_of_a_job_is_configured_no_more(started: list[Service], tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    row = store.create("GONE", {}, "me", False, version=WORKFLOW_VERSION)
+    store.close()
+    service = again(started, tmp_path)
+    found: JobRow = service.store.get(row.id)
+    assert found.state == "interrupted" and "no longer configured" in (found.detail or "")
+
+
+class Forgetful(ThreadEngine):
+    """Loses the first job that it is given."""
+
+    def enqueue(self, job_id: str, queue: str) -> None:
+        if not self.enqueued:
+            self.enqueued.append((job_id, queue))
+        else:
+            super().enqueue(job_id, queue)
+
+
+def test_a_job_that_the_engine_has_lost_is_given_to_it_again(started: list[Service], tmp_path: Path) -> None:
+    engine = Forgetful()
+    service = again(started, tmp_path, engine=engine)
+    row = service.jobs.start(TAG, RetuneRequest())
+    service.jobs.reconcile()
+    assert service.store.get(row.id).state == "queued"  # at first sight it may still be on its way
+    service.jobs.reconcile()
+    service.wait(row.id)
+    assert service.store.get(row.id).state == "proposed"
+    assert engine.enqueued == [(row.id, "local:virtual:test")] * 2
+
+
+def test_a_job_that_waits_for_its_turn_ends_at_once_when_aborted(started: list[Service], tmp_path: Path) -> None:
+    service = again(started, tmp_path, engine=Forgetful())
+    row = service.jobs.start(TAG, RetuneRequest())
+    row = service.jobs.abort(row.id, "me")
+    assert (row.state, row.reason) == ("aborted", "operator")
+    assert [event.kind for event in service.store.events(row.id)] == ["state", "abort_requested", "state"]
+
+
+def test_a_job_that_waits_when_the_service_stops_ends_as_such(started: list[Service], tmp_path: Path) -> None:
+    service = again(started, tmp_path, engine=Forgetful())
+    row = service.jobs.start(TAG, RetuneRequest())
+    service.jobs.stop()
+    assert (service.store.get(row.id).state, service.store.get(row.id).reason) == ("aborted", "service_stopped")
+
+
+def test_an_abort_written_by_another_host_is_heard(service: Service) -> None:
+    service.tune.hold.clear()
+    row = service.jobs.start(TAG, RetuneRequest())
+    service.tune.inside.wait(5)
+    service.store.wish_to_stop(row.id, Reason.OPERATOR.value, "gateway B")
+    service.wait(row.id)
+    assert (service.store.get(row.id).state, service.controller.state) == ("aborted", HOME)
+
+
+def test_no_loop_is_read_while_a_decision_is_carried_out(service: Service) -> None:
+    """A job begins with what the controller holds: not in the middle of an exchange of gains."""
+    first = service.jobs.start(TAG, RetuneRequest())
+    service.wait(first.id)
+    seen: list[Any] = []
+
+    class Slow(FakeLoop):
+        def accept(self, gains: Any) -> LoopState:
+            second = service.store.create(TAG, {}, "B", False, version=WORKFLOW_VERSION)
+            service.jobs.engine.enqueue(second.id, "local:virtual:test")
+            seen.append(second.id)
+            service.tune.inside.wait(0.2)
+            return super().accept(gains)
+
+    service.tune.inside.clear()
+    service.jobs._open_loop = lambda config: Slow(service.controller)
+    service.jobs.accept(first.id, "me")
+    service.wait(seen[0])
+    assert service.store.get(seen[0]).old_gains == {**state_json(HOME)["gains"], "Kp": NEW.Kp, "Ti": NEW.Ti}
