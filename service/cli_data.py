@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
+
+from service.cli_output import die
 
 app = typer.Typer()
 
@@ -27,7 +28,7 @@ def backup(
     try:
         size = back_up(data, file, replace)
     except (BackupProblem, OSError) as error:
-        _die(error)
+        die(str(error), 2)
     print(f"{file}: {size} bytes, checked")
 
 
@@ -46,9 +47,9 @@ def restore(
     try:
         interrupted, aside = run(file, data, replace)
     except FolderInUse:
-        _die(f"a service is running on {data}: stop it first")
+        die(f"a service is running on {data}: stop it first", 2)
     except (BackupProblem, OSError) as error:
-        _die(error)
+        die(str(error), 2)
     print(f"restored {file} to {data}; {interrupted} job(s) that were active in it are marked interrupted")
     if aside is not None:
         print(f"what was there before is in {aside}")
@@ -57,9 +58,4 @@ def restore(
 
 def _only_files() -> None:
     if os.environ.get("LOOPWRIGHT_DATABASE"):
-        _die("LOOPWRIGHT_DATABASE is set: a shared database is backed up and restored with pg_dump and pg_restore")
-
-
-def _die(why: object) -> NoReturn:
-    print(f"loopwright: {why}", file=sys.stderr)
-    raise typer.Exit(2)
+        die("LOOPWRIGHT_DATABASE is set: a shared database is backed up and restored with pg_dump and pg_restore", 2)

@@ -7,10 +7,11 @@ import json
 import sys
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from service.cli_output import die
 from service.security.keys import Scope
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ def create(
 ) -> None:
     """Makes a key and shows it, this once."""
     if not name.strip() or len(name) > 100 or not name.isprintable():
-        _die("a name has 1 to 100 printable characters")
+        die("a name has 1 to 100 printable characters", 2)
     with _Keys(data, database, make=True) as keys:
         row, key = keys.create(name, scope, timedelta(days=days) if days else None)
     if as_json:
@@ -88,14 +89,14 @@ class _Keys:
         if database is None and make:
             data.mkdir(mode=0o700, parents=True, exist_ok=True)
         elif database is None and not (data / FILE).exists():
-            _die(f"{data} is not a data folder of a service: it has no {FILE}")
+            die(f"{data} is not a data folder of a service: it has no {FILE}", 2)
         try:
             self._engine = open_database(data, database, "loopwright key")
             migrate(self._engine)
         except BadDatabase as error:
-            _die(str(error))
+            die(str(error), 2)
         except SQLAlchemyError as error:
-            _die(f"the database cannot be used: {getattr(error, 'orig', None) or error}")
+            die(f"the database cannot be used: {getattr(error, 'orig', None) or error}", 2)
         self._keyring = Keyring(self._engine)
         current.set(Principal(f"cli:{_user()}", Scope.ADMIN))
 
@@ -107,7 +108,7 @@ class _Keys:
 
         self._engine.dispose()
         if isinstance(error, KeyProblem):
-            _die(str(error))
+            die(str(error), 2)
 
 
 def _user() -> str:
@@ -115,8 +116,3 @@ def _user() -> str:
         return getpass.getuser()
     except (KeyError, OSError):
         return "unknown"
-
-
-def _die(text: str) -> NoReturn:
-    print(f"loopwright: {text}", file=sys.stderr)
-    raise typer.Exit(2)
