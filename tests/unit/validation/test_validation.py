@@ -17,6 +17,9 @@ from validation.references import ROOT, References, load
 from validation.report import document
 from validation.run import validate
 
+# seconds of work on an idle machine, far more on a crowded one
+pytestmark = pytest.mark.timeout(300)
+
 
 @pytest.fixture(scope="module")
 def references() -> References:
