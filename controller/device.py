@@ -121,6 +121,8 @@ class ControllerDevice:
         if len(data) != PV_FRAME.size:
             return
         pv, number = PV_FRAME.unpack(data)
+        if number == self._numbers[at] and number:  # a frame that came twice is one sample
+            return
         self._numbers[at] = number
         self._pvs[at] = pv
         channel = self.channels[at]

@@ -111,9 +111,7 @@ class Hub:
             if frame is None:
                 member.queue += b"< error malformed frame >"
                 return
-            for other in self._members:
-                if other is not member and other.raw_from is not None:
-                    other.queue += frame
+            self._pass_on(member, frame)
         elif words[0] in (b"open", b"rawmode"):
             with suppress(OSError):
                 member.connection.send(b"< ok >")
@@ -121,6 +119,11 @@ class Hub:
                 member.raw_from = time.monotonic() + _JOINING_S
         elif words[0] == b"echo":
             member.queue += b"< echo >"
+
+    def _pass_on(self, sender: _Member, frame: bytes) -> None:
+        for other in self._members:
+            if other is not sender and other.raw_from is not None:
+                other.queue += frame
 
     def _flush(self, member: _Member) -> None:
         if not member.queue or member not in self._members:

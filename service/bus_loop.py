@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 
 from protocol.bus import BusError
 from protocol.objects import Device, default_of, lookup
@@ -34,6 +35,8 @@ SHORTEST_LEASE = 20
 SILENCE_S = 1.0
 """Wall time without a sample (at least three sampling periods) after which the nodes are asked whether they live."""
 RESTORE_PATIENCE_S = 4.0
+COMMAND_WALL_S = 2.0
+"""How long a handful of commands may take on a slow bus."""
 RELAY_LONGEST = 1_000_000  # samples; plans end their relays, and so does the lease
 MAX_GAP = 5
 
@@ -96,7 +99,7 @@ class BusLoop:
                 self._take_plant(tuner, stop)
                 self._watch_us(tuner)
                 self._take_time(tuner)
-                state = self._state(tuner)
+                state = replace(self._state(tuner), command_lag_samples=self._command_lag())
                 if state.mode is Mode.EXPERIMENT:
                     raise Refused(Reason.WRONG_MODE, "an experiment is running in the controller")
                 self._plan_lease()
@@ -127,6 +130,8 @@ class BusLoop:
                     tuner.write("plant_samples_to_run", self._block)
                     self._left = self._block
             found = tuner.sample(self._silence_s)
+            while found is not None and self._first_n is not None and found.n == self._last_n:
+                found = tuner.sample(self._silence_s)  # a frame that came twice
             if tuner.emergencies or tuner.restarted:
                 self._hear(tuner)
             if found is None:
@@ -220,6 +225,12 @@ class BusLoop:
                 pass
         elif self._plant is not None and not tuner.number("plant_samples_to_run"):
             tuner.write("plant_samples_to_run", FOREVER)
+
+    def _command_lag(self) -> int:
+        """A block, or the samples that come while several commands wait for slow answers."""
+        if self._in_blocks:
+            return 5 * self._block
+        return max(50, math.ceil(COMMAND_WALL_S * self._pace / self._sample_time_s))
 
     def _plan_lease(self) -> None:
         """Samples we pay for at a time: some seconds of wall time, or some blocks."""

@@ -13,7 +13,10 @@ from tuning.reasons import Reason
 
 @dataclass(frozen=True, slots=True)
 class LoopState:
-    """What a loop is and must come back to. MV and PV in the loop's units, limits as the controller holds them."""
+    """What a loop is and must come back to. MV and PV in the loop's units, limits as the controller holds them.
+
+    command_lag_samples: how many samples a command may take to show before another's hand is suspected.
+    """
 
     mode: Mode
     sp: float
@@ -25,6 +28,7 @@ class LoopState:
     mv_high: float
     sample_time_s: float
     reverse_acting: bool
+    command_lag_samples: int = 50
 
 
 class Loop(Protocol):

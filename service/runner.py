@@ -32,8 +32,6 @@ from tuning.stages.common import same
 
 T = TypeVar("T")
 CHUNK = 200
-GRACE = 50
-"""Samples that a command may take to show on a live bus before another's hand is suspected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +71,7 @@ class Guard:
         self._mode = int(state.mode)
         self._start: float | None = None
         self._last = 0.0
-        self._grace = GRACE
+        self._lag = self._grace = state.command_lag_samples
         self._acting = False
         self._slack = 0.01 * min(watch.mv_high - watch.mv_low, 1e300)
         self._pv = math.nan
@@ -90,7 +88,7 @@ class Guard:
                 self._sp = command.value
             elif isinstance(command, SetMode):
                 self._mode = int(command.mode)
-        self._grace = GRACE
+        self._grace = self._lag
 
     def check(self, sample: Sample) -> None:
         t, sp, pv, mv, mode = sample

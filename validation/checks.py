@@ -14,9 +14,13 @@ PRINTED = "printed"
 
 
 class Verdict(StrEnum):
-    """GIVEN: an input, taken from the print.  LOST: the paper does not say what it would be computed from."""
+    """AGREES: with an independent calculation, where the paper prints nothing.  GIVEN: an input, taken from the print.
+
+    LOST: the paper does not say what it would be computed from.
+    """
 
     REPRODUCED = "reproduced"
+    AGREES = "agrees"
     EXPLAINED = "explained"
     LOST = "cannot be recomputed"
     GIVEN = "given"
@@ -38,7 +42,7 @@ class Tolerance:
 
     def in_words(self, unit: str) -> str:
         # of a percentage a relative tolerance is in percent as well
-        absolute = "points" if unit == "%" else unit
+        absolute = unit if unit != "%" else "point" if self.absolute == 1.0 else "points"
         parts = [f"{self.absolute:g} {absolute}".rstrip()] if self.absolute else []
         parts += [f"{100.0 * self.relative:g} %"] if self.relative else []
         return " or ".join(parts)
@@ -127,7 +131,10 @@ class Table:
     reference: str = PRINTED
 
     def verdicts(self, row: Row) -> list[Verdict]:
-        return [column.verdict(cell) for column, cell in zip(self.columns, row.cells, strict=True)]
+        found = [column.verdict(cell) for column, cell in zip(self.columns, row.cells, strict=True)]
+        if self.reference == PRINTED:
+            return found
+        return [Verdict.AGREES if each is Verdict.REPRODUCED else each for each in found]
 
 
 @dataclass(frozen=True, slots=True)

@@ -202,7 +202,7 @@ def _table_4_optimised(table: dict[str, Any]) -> Table:
         (
             Column("Kp", 3, tol.OPTIMUM_KP),
             Column("Ti", 2, tol.OPTIMUM_TI, "s"),
-            Column("ST", 2, tol.SETTLING, "s"),
+            Column("ST", 1, tol.SETTLING, "s"),
             Column("OV", 1, tol.OVERSHOOT, "%"),
             Column("GM", 2, tol.OPTIMUM_GM),
             Column("PM", 1, tol.OPTIMUM_PM, "°"),
@@ -239,9 +239,9 @@ def _table_5(references: References) -> Table:
         (
             Column("Ku", 3, tol.ULTIMATE_MEASURED, own=tol.ULTIMATE_GAIN),
             Column("Pu", 2, tol.ULTIMATE_MEASURED, "s", tol.ULTIMATE_GAIN),
-            Column("Kp of ZN", 3, tol.BOUND),
-            Column("Ti of ZN", 3, tol.BOUND, "s"),
-            Column("tau", 3, tol.BOUND, "s"),
+            Column("Kp of ZN", 3, tol.FROM_PRINTS),
+            Column("Ti of ZN", 3, tol.FROM_PRINTS, "s"),
+            Column("tau", 3, tol.FROM_PRINTS, "s"),
         ),
         tuple(rows),
         "Ku and Pu: ours are those of the plant itself. The PI and tau: ours follow from the printed Ku and Pu by "

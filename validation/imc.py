@@ -75,7 +75,7 @@ def _equation_40(references: References) -> Table:
         "Equations (40) and (42), settings",
         (
             Column("Kp", 3, tol.EQUATION_40),
-            Column("Ti", 1, tol.BOUND, "s"),
+            Column("Ti", 1, tol.FROM_PRINTS, "s"),
             Column("Td", 1, tol.EQUATION_40_TD, "s"),
         ),
         (

@@ -20,7 +20,8 @@ from validation.loops import moments, plant
 from validation.references import References
 
 HORIZON_S = {"G1": 60.0, "G2": 60.0, "G3": 60.0, "G4": 20.0, "G5": 80.0}
-INDICES = ("MIE", "MIC", "overshoot", "ts")
+SMOOTH = (Weighting.ERROR, Weighting.CONTROL)
+"""Weightings whose least is not on an edge of the criterion."""
 OWN_KEYS = ("MIE", "MIC", "overshoot_pct", "ts")
 PLANTS = {
     "G1": "1/(s + 1)^2",
@@ -220,42 +221,50 @@ def _at_printed(references: References, name: str, weighting: Weighting) -> floa
     return float(criterion(np.array(row[:1]), np.array(row[1:2]))[0])
 
 
+def _best_known(references: References, name: str, weighting: Weighting) -> dict[str, float]:
+    """By an independent calculation."""
+    found: dict[str, float] = references.search["paper_b"]["recomputed"]["best_found"][name][weighting[0].upper()]
+    return found
+
+
 def _optima(references: References) -> Table:
     rows = []
     for name in PLANTS:
         for weighting in Weighting:
-            best = references.search["paper_b"]["recomputed"]["best_found"][name][weighting[0].upper()]["criterion"]
-            at_printed = _at_printed(references, name, weighting)
-            least = _search(references, name, weighting, "nelder-mead")
-            rows.append(Row(f"{name} {weighting}", (Cell(at_printed, least, "a", best),)))
+            best = _best_known(references, name, weighting)
+            at_printed = Cell(best["criterion_at_printed_ME_PSO"], _at_printed(references, name, weighting))
+            least = Cell(best["criterion"], _search(references, name, weighting, "nelder-mead"))
+            rows.append(Row(f"{name} {weighting}", (at_printed, least)))
     return Table(
-        "Are the printed ME-PSO settings the optima?",
-        (Column("criterion", 0, tol.SAME_OPTIMUM, own=tol.BEST_FOUND),),
+        "The criterion at the printed ME-PSO settings and at its least",
+        (Column("at the printed setting", 0, tol.CRITERION), Column("least", 0, tol.BEST_FOUND)),
         tuple(rows),
-        "The paper prints no value of its criterion. In the place of the print stands the criterion at its setting, "
-        "ours is the least that Nelder-Mead finds from many starts in the paper's domain.",
-        {
-            "a": "A better setting exists, under every reading of what the paper leaves open that was tried. Either "
-            "its runs had not converged, or its criterion was another: a band of 2 % comes near for three of the "
-            "fifteen."
-        },
-        reference="at the printed setting",
+        "The paper prints no value of its criterion. Ours is the least that Nelder-Mead finds from many starts in the "
+        "paper's domain.",
+        reference="independent calculation",
     )
 
 
 def _claims(references: References) -> tuple[Claim, ...]:
-    better = close = 0
+    better = close = beaten = 0
     for name in PLANTS:
         for weighting in Weighting:
-            found = _search(references, name, weighting, "me-pso")
-            best = references.search["paper_b"]["recomputed"]["best_found"][name][weighting[0].upper()]["criterion"]
-            better += found < _at_printed(references, name, weighting)
-            close += found < 1.01 * best and weighting is not Weighting.DURATION
+            found, at_printed = _search(references, name, weighting, "me-pso"), _at_printed(references, name, weighting)
+            better += found < at_printed
+            close += found < 1.01 * _best_known(references, name, weighting)["criterion"] and weighting in SMOOTH
+            beaten += _search(references, name, weighting, "nelder-mead") < (1.0 - 1e-4) * at_printed
     figures = {name: exact_indices(references, name) for name in PLANTS}
     overshoots = {name: rows["ME-PSO-Duration"][2] for name, rows in figures.items()}
     fastest = {name: min(rows, key=lambda m: rows[m][3]) for name, rows in figures.items()}
     theirs, slowest = figures["G5"]["ME-PSO-Duration"][3], [figures["G5"][m][3] for m in _classical(references, "G5")]
     return (
+        Claim(
+            "The printed ME-PSO settings are the optima of its criterion.",
+            f"A better setting was found in {beaten} of 15 problems.",
+            beaten == 0,
+            "So it is under every reading of what the paper leaves open that was tried. Either its runs had not "
+            "converged, or its criterion was another: a band of 2 % comes near for three of the fifteen.",
+        ),
         Claim(
             "The swarm, with the parameters of the paper, finds settings that are near the best.",
             f"Better than the printed one in {better} of 15 problems, within 1 % of the best known in {close} of the "

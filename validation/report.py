@@ -21,13 +21,14 @@ the difference is of the numbers as shown, rounded to what the tolerance support
   with an independent calculation (made with other code, its results are in `tests/data/`), and it fails when the print
   is met after all.
 - **cannot be recomputed (a)**: the paper does not state what the number follows from.
+- **agrees**: with an independent calculation, where the paper prints no number.
 - *given*: an input that we take from the print.
 
 Dead times are exact everywhere, never a Pade approximant; the plots are our simulations, not copies of the papers'
 figures.
 """
 
-SUMMED = (Verdict.REPRODUCED, Verdict.EXPLAINED, Verdict.LOST, Verdict.FAILED)
+SUMMED = (Verdict.REPRODUCED, Verdict.AGREES, Verdict.EXPLAINED, Verdict.LOST, Verdict.FAILED)
 
 
 def document(papers: list[Paper]) -> str:
@@ -109,8 +110,9 @@ def _verdict(table: Table, row: Row) -> str:
             what = f"**{verdict}**" if verdict is Verdict.FAILED else str(verdict)
             whole = len(named) == len(row.cells)
             parts.append(f"{'' if whole else f'{names} '}{what}{f' ({cause})' if cause else ''}")
-    if Verdict.REPRODUCED in verdicts:
-        parts.append("rest reproduced" if parts else "reproduced")
+    for verdict in (Verdict.REPRODUCED, Verdict.AGREES):
+        if verdict in verdicts:
+            parts.append(f"rest {verdict}" if parts else str(verdict))
     return "; ".join(parts)
 
 

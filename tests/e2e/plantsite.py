@@ -56,14 +56,21 @@ REACTOR = Case("reactor", 0.25, 0.5, 30.0, 49.2838831323648137, (30.0, 70.0), 31
 class Plantsite:
     """The three processes of one case. more_loops: further entries of loops.yaml, what they change of the first."""
 
-    def __init__(self, stack: ExitStack, folder: Path, case: Case, more_loops: tuple[dict[str, Any], ...] = ()) -> None:
-        self.case = case
+    def __init__(
+        self,
+        stack: ExitStack,
+        folder: Path,
+        case: Case,
+        more_loops: tuple[dict[str, Any], ...] = (),
+        bus: str = BUS,
+    ) -> None:
+        self.case, self.bus = case, bus
         self._stack, self._folder, self._more_loops = stack, folder, more_loops
-        ts = str(case.ts)
         self.start_controller()
         self._service = self._launch_service()
         self.controller.wait_ready()
-        self.plant = self.launch("plant", "plantsim", "--bus", BUS, "--model", case.model, "--ts", ts, "--speed", "max")
+        model = ("--model", case.model, "--ts", str(case.ts), "--speed", "max")
+        self.plant = self.launch("plant", "plantsim", "--bus", self.bus, *model)
         self.plant.wait_ready()
         self._connect()
 
@@ -71,7 +78,8 @@ class Plantsite:
         case = self.case
         gains = ("--kp", str(case.kp), "--ti", str(case.ti), "--sp", str(case.sp))
         kept = ("--keep", str(self._folder / "kept.json"))
-        self.controller = self.launch("controller", "controller", "--bus", BUS, "--ts", str(case.ts), *gains, *kept)
+        where = ("--bus", self.bus, "--ts", str(case.ts))
+        self.controller = self.launch("controller", "controller", *where, *gains, *kept)
 
     def launch(self, name: str, *arguments: str) -> Process:
         """Starts a process and does not wait for it."""
@@ -88,7 +96,7 @@ class Plantsite:
         case = self.case
         low, high = case.pv_limits
         loop = {
-            "tag": TAG, "bus": BUS, "controller_node": 0x20, "plant_node": 0x10, "pv_unit": "unit",
+            "tag": TAG, "bus": self.bus, "controller_node": 0x20, "plant_node": 0x10, "pv_unit": "unit",
             "pv_limits": {"low": low, "high": high}, "t95_s": case.t95_s, "sp_deviation": case.sp_deviation,
         }  # fmt: skip
         loops = self._folder / "loops.yaml"
@@ -125,14 +133,14 @@ class Plantsite:
 
     def state(self) -> LoopState:
         """Read from the controller itself, not through the service."""
-        loop = BusLoop(BUS, 0x20, 0x10)
+        loop = BusLoop(self.bus, 0x20, 0x10)
         try:
             return loop.read()
         finally:
             loop.close()
 
     def read(self, name: str) -> float:
-        tuner = Tuner(BUS, 0x20, 0x10)
+        tuner = Tuner(self.bus, 0x20, 0x10)
         try:
             return tuner.number(name)
         finally:
@@ -140,7 +148,7 @@ class Plantsite:
 
     def write(self, name: str, value: float) -> None:
         """By SDO, as somebody else on the bus would."""
-        tuner = Tuner(BUS, 0x20, 0x10)
+        tuner = Tuner(self.bus, 0x20, 0x10)
         try:
             tuner.write(name, value)
         finally:
