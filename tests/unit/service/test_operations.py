@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
+from sqlalchemy.exc import OperationalError
 
 from protocol.tuner import Kind, Tuner, TunerError, sdo_retries
 from service.api import operations
@@ -159,6 +160,20 @@ def test_stages_requests_samples_and_retries_are_counted(service: Service, clien
     assert grown("loopwright_http_request_seconds_count", route="/jobs/{job_id}") == 4
     assert grown("loopwright_samples_lost_total", bus="virtual:test") == 3
     assert grown("loopwright_sdo_retries_total", bus="virtual:test") == 2
+
+
+def test_a_scrape_goes_on_without_the_database(
+    service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert samples(client)["loopwright_database_up", ()] == 1
+
+    def gone(*_: object) -> None:
+        raise OperationalError("SELECT", {}, Exception("server closed the connection"))
+
+    monkeypatch.setattr(service.store.engine, "connect", gone)
+    found = samples(client)
+    assert found["loopwright_database_up", ()] == 0 and ("loopwright_loops", (("bus", "virtual:test"),)) in found
+    assert not any(name == "loopwright_jobs" for name, _ in found)
 
 
 def test_an_sdo_without_answer_counts_its_retries() -> None:
