@@ -21,7 +21,7 @@ from service.api.app import create_app
 from service.api.operations import Readiness, bus_opens
 from service.logs import JsonLines, about
 from service.metrics import SAMPLES_LOST
-from service.serving import tell_systemd
+from service.serving import listen, tell_systemd
 from tests.unit.service.fakes import TAG, Service
 from tests.unit.service.test_api import finished, start
 from tuning.reasons import Failed, Reason
@@ -238,6 +238,13 @@ def test_systemd_is_told_when_requests_are_answered(tmp_path: Path, monkeypatch:
         tell_systemd("READY=1")
         assert systemd.recv(100) == b"READY=1"
     tell_systemd("STOPPING=1")  # a socket nobody reads is no reason to fail
+
+
+def test_answers_do_not_wait_for_acknowledgements() -> None:
+    with listen("127.0.0.1", 0) as listener, socket.create_connection(listener.getsockname()):
+        accepted, _ = listener.accept()
+        with accepted:
+            assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
 
 
 # the page of the API
