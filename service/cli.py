@@ -87,6 +87,9 @@ def serve(
     streams: Annotated[
         int, typer.Option(min=1, envvar="LOOPWRIGHT_STREAMS", help="Event streams open at once, of all callers.")
     ] = 200,
+    computations: Annotated[
+        int, typer.Option(min=1, envvar="LOOPWRIGHT_COMPUTATIONS", help="Tunings computed at once, of all callers.")
+    ] = 2,
     log_format: Annotated[
         str, typer.Option(envvar="LOOPWRIGHT_LOG_FORMAT", help="text, or json: one object a line.")
     ] = "text",
@@ -104,7 +107,12 @@ def serve(
     if log_format not in ("text", "json"):
         die(f"--log-format must be text or json, not {log_format!r}", 2)
     limits = RequestLimits(
-        body_bytes=max_body, rate_per_s=rate, burst=max(1, round(2 * rate)), at_once=at_once, streams_at_once=streams
+        body_bytes=max_body,
+        rate_per_s=rate,
+        burst=max(1, round(2 * rate)),
+        at_once=at_once,
+        streams_at_once=streams,
+        computations_at_once=computations,
     )
     setup = Setup(
         loops, data, bind, port, database, host, resume,

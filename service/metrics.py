@@ -9,6 +9,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, disa
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 from sqlalchemy import func, select
+from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from protocol.tuner import sdo_retries
@@ -48,22 +49,32 @@ class _OfTheStore(Collector):
         for bus, count in sorted(Tally(loop.bus for loop in self._loops.values()).items()):
             loops.add_metric([bus], count)
         yield loops
-        with Session(self._store.engine) as session:
-            counts = session.execute(
-                select(JobRow.state, JobRow.reason, func.count()).group_by(JobRow.state, JobRow.reason)
-            ).all()
-        jobs = GaugeMetricFamily("loopwright_jobs", "Jobs in the database", labels=["state", "reason"])
-        found = {(state, reason or ""): count for state, reason, count in counts}
-        # Active states are always there: a gauge that vanishes cannot be alarmed on.
-        for key in sorted(found.keys() | {(state.value, "") for state in ACTIVE | {JobState.PROPOSED}}):
-            jobs.add_metric(list(key), found.get(key, 0))
-        yield jobs
         retries = CounterMetricFamily(
             "loopwright_sdo_retries", "SDO requests sent again for want of an answer", labels=["bus"]
         )
         for bus, count in sorted(sdo_retries.items()):
             retries.add_metric([bus], count)
         yield retries
+        up = GaugeMetricFamily("loopwright_database_up", "1: the database answers")
+        try:
+            jobs = self._jobs()
+        except SQLAlchemyError:
+            up.add_metric([], 0)
+        else:
+            up.add_metric([], 1)
+            yield jobs
+        yield up
+
+    def _jobs(self) -> Metric:
+        by = JobRow.state, JobRow.reason
+        with Session(self._store.engine) as session:
+            counts = session.execute(select(*by, func.count()).group_by(*by)).all()
+        jobs = GaugeMetricFamily("loopwright_jobs", "Jobs in the database", labels=["state", "reason"])
+        found = {(state, reason or ""): count for state, reason, count in counts}
+        # Active states are always there: a gauge that vanishes cannot be alarmed on.
+        for key in sorted(found.keys() | {(state.value, "") for state in ACTIVE | {JobState.PROPOSED}}):
+            jobs.add_metric(list(key), found.get(key, 0))
+        return jobs
 
 
 def registry(loops: Mapping[str, LoopConfig], store: Store) -> CollectorRegistry:

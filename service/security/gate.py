@@ -67,8 +67,12 @@ class Gate:
         limits = policy.limits
         self._callers = Buckets(limits.rate_per_s, limits.burst)
         self._bad_keys = Buckets(limits.bad_keys_per_s, limits.bad_keys_burst)
-        self._now = {"streams": 0, "requests": 0}
-        self._most = {"streams": limits.streams_at_once, "requests": limits.at_once}
+        self._most = {
+            "requests": limits.at_once,
+            "streams": limits.streams_at_once,
+            "computations": limits.computations_at_once,
+        }
+        self._now = dict.fromkeys(self._most, 0)
 
     async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -83,7 +87,7 @@ class Gate:
             await refused(scope, receive, send)
             return
         token = current.set(found)
-        kind = "streams" if scope["path"].endswith("/events") else "requests"
+        kind = _kind(scope["path"])
         self._now[kind] += 1
         try:
             await self._pass(scope, receive, send)
@@ -134,7 +138,7 @@ class Gate:
             return None
         if wait := self._callers.take(who.key_id or who.address or "unknown"):
             return _wait(429, "too many requests from this caller", wait)
-        kind = "streams" if scope["path"].endswith("/events") else "requests"
+        kind = _kind(scope["path"])
         if self._now[kind] >= self._most[kind]:
             return _wait(503, f"{self._now[kind]} {kind} are being answered already, no more are taken", 1.0)
         return None
@@ -157,6 +161,12 @@ class Gate:
             return message
 
         await self._app(scope, counted, send)
+
+
+def _kind(path: str) -> str:
+    if path.endswith("/events"):
+        return "streams"
+    return "computations" if path in _CHANGES_NOTHING or path.endswith("/alternatives") else "requests"
 
 
 def _not_local(headers: Headers) -> str | None:

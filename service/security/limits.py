@@ -12,7 +12,8 @@ from dataclasses import dataclass
 @dataclass(frozen=True)
 class RequestLimits:
     """body_bytes: of one request.  rate_per_s, burst: of one caller (key, or address without one).
-    at_once, streams_at_once: of all callers; an event stream counts as a stream only.
+    at_once, streams_at_once, computations_at_once: of all callers; a request counts in one of the three.
+    Computations take the processor from the threads that pump the loops.
     bad_keys_per_s, bad_keys_burst: wrong keys from one address."""
 
     body_bytes: int = 1 << 20
@@ -20,6 +21,7 @@ class RequestLimits:
     burst: int = 1000
     at_once: int = 64
     streams_at_once: int = 200
+    computations_at_once: int = 2
     bad_keys_per_s: float = 0.5
     bad_keys_burst: int = 10
 

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
+from sqlalchemy.exc import OperationalError
 
 from protocol.tuner import Kind, Tuner, TunerError, sdo_retries
 from service.api import operations
@@ -20,7 +21,7 @@ from service.api.app import create_app
 from service.api.operations import Readiness, bus_opens
 from service.logs import JsonLines, about
 from service.metrics import SAMPLES_LOST
-from service.serving import tell_systemd
+from service.serving import listen, tell_systemd
 from tests.unit.service.fakes import TAG, Service
 from tests.unit.service.test_api import finished, start
 from tuning.reasons import Failed, Reason
@@ -161,6 +162,20 @@ def test_stages_requests_samples_and_retries_are_counted(service: Service, clien
     assert grown("loopwright_sdo_retries_total", bus="virtual:test") == 2
 
 
+def test_a_scrape_goes_on_without_the_database(
+    service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert samples(client)["loopwright_database_up", ()] == 1
+
+    def gone(*_: object) -> None:
+        raise OperationalError("SELECT", {}, Exception("server closed the connection"))
+
+    monkeypatch.setattr(service.store.engine, "connect", gone)
+    found = samples(client)
+    assert found["loopwright_database_up", ()] == 0 and ("loopwright_loops", (("bus", "virtual:test"),)) in found
+    assert not any(name == "loopwright_jobs" for name, _ in found)
+
+
 def test_an_sdo_without_answer_counts_its_retries() -> None:
     tuner = Tuner("virtual:nobody", 0x20, None, sdo_timeout_s=0.0, sdo_tries=3)
     before = sdo_retries["virtual:nobody"]
@@ -223,6 +238,13 @@ def test_systemd_is_told_when_requests_are_answered(tmp_path: Path, monkeypatch:
         tell_systemd("READY=1")
         assert systemd.recv(100) == b"READY=1"
     tell_systemd("STOPPING=1")  # a socket nobody reads is no reason to fail
+
+
+def test_answers_do_not_wait_for_acknowledgements() -> None:
+    with listen("127.0.0.1", 0) as listener, socket.create_connection(listener.getsockname()):
+        accepted, _ = listener.accept()
+        with accepted:
+            assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
 
 
 # the page of the API

@@ -29,7 +29,7 @@ loops:
 - {tag: TIC-101, bus: 'virtual:page', controller_node: 32, pv_unit: degC, pv_limits: {low: 0, high: 100}, t95_s: 9,
    sp_deviation: 2}
 """
-pytestmark = pytest.mark.timeout(300)
+pytestmark = pytest.mark.timeout(600)
 
 
 def blocks(section: str) -> list[str]:
@@ -80,7 +80,7 @@ class Machine:
             input=f"{key}\n",
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=240,
         )
         logs = "".join(path.read_text() for path in (self.folder / "run").glob("*.log"))
         assert done.returncode == 0, f"{text}\n{done.stdout}{done.stderr}\n{logs}"

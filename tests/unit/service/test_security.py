@@ -227,6 +227,8 @@ def test_too_many_at_once(open_client: Open) -> None:
     assert answer.headers["retry-after"] == "1"
     assert full.get("/jobs/x/events").status_code == 404 and full.get("/healthz").status_code == 200
     assert open_client(streams_at_once=0).get("/jobs/x/events").status_code == 503
+    busy = open_client(computations_at_once=0)
+    assert busy.get("/jobs/x/alternatives").status_code == 503 and busy.get("/loops").status_code == 200
     one = open_client(at_once=1)
     assert [one.get("/loops").status_code for _ in range(3)] == [200, 200, 200]
 
