@@ -49,15 +49,19 @@ def entry(tag: str, bus: str = "virtual:rehearsed", channel: int = 1, node: int 
 
 
 def open_loop(_config: LoopConfig) -> RehearsedLoop:
-    settings = Settings(
-        mv_low=0.0, mv_high=100.0, safe_output=MIDDLE, pv_low=-200.0, pv_high=200.0, reverse=True
-    )
+    settings = Settings(mv_low=0.0, mv_high=100.0, safe_output=MIDDLE, pv_low=-200.0, pv_high=200.0, reverse=True)
     channel = Channel(TS, settings, Parameters(0.2, 6.0), 0.0, int(Mode.AUTOMATIC), MIDDLE)
     return RehearsedLoop(AroundTheMiddle(), channel, TS)
 
 
 def main() -> None:
-    folder, host, loops, at_once, database = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), int(sys.argv[4]), sys.argv[5]
+    folder, host, loops, at_once, database = (
+        Path(sys.argv[1]),
+        sys.argv[2],
+        int(sys.argv[3]),
+        int(sys.argv[4]),
+        sys.argv[5],
+    )
     folder.mkdir(parents=True, exist_ok=True)
     bus = "virtual:rehearsed"
     entries = [entry(f"{host}-{n}", bus, n % 199 + 1, 1 + n // 199) for n in range(loops)]
