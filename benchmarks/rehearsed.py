@@ -55,18 +55,12 @@ def open_loop(_config: LoopConfig) -> RehearsedLoop:
 
 
 def main() -> None:
-    folder, host, loops, at_once, database = (
-        Path(sys.argv[1]),
-        sys.argv[2],
-        int(sys.argv[3]),
-        int(sys.argv[4]),
-        sys.argv[5],
-    )
+    folder, (host, count, at_once, database) = Path(sys.argv[1]), sys.argv[2:]
     folder.mkdir(parents=True, exist_ok=True)
     bus = "virtual:rehearsed"
-    entries = [entry(f"{host}-{n}", bus, n % 199 + 1, 1 + n // 199) for n in range(loops)]
+    entries = [entry(f"{host}-{n}", bus, n % 199 + 1, 1 + n // 199) for n in range(int(count))]
     file = folder / "loops.yaml"
-    file.write_text(yaml.safe_dump({"loops": entries, "buses": {bus: {"at_once": at_once}}}))
+    file.write_text(yaml.safe_dump({"loops": entries, "buses": {bus: {"at_once": int(at_once)}}}))
     serve(Setup(file, folder / "data", "127.0.0.1", 0, database or None, host, poll_s=0.1), open_loop)
 
 

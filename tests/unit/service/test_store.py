@@ -50,7 +50,7 @@ def test_a_store_of_the_revision_before_is_taken_over_with_its_data(store: Store
         connection.execute(
             text(
                 "INSERT INTO jobs (id, loop, state, dry_run, request, requested_by, created_at, plant_time_s, result)"
-                " VALUES ('old', 'A', 'proposed', :no, '{\"start\": \"relay\"}', 'me', '2026-01-01T00:00:00.000Z', 12.5,"
+                " VALUES ('old', 'A', 'proposed', :no, '{\"start\": \"relay\"}', 'me', '2026-01-01', 12.5,"
                 " '{\"gains\": {\"Kp\": 2.0}}'), ('cut', 'A', 'running', :no, '{}', 'me', '2026-01-02', 0.0, NULL)"
             ),
             {"no": False},
@@ -226,7 +226,7 @@ def test_unknown_job(store: Store) -> None:
 
 @pytest.mark.parametrize("now", list(JobState))
 @pytest.mark.parametrize("wanted", list(JobState))
-def test_only_the_moves_of_the_table(store: Store, now: JobState, wanted: JobState) -> None:
+def test_only_the_moves_of_the_table(now: JobState, wanted: JobState) -> None:
     if wanted in MOVES[now]:
         check(now, wanted)
     else:
