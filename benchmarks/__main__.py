@@ -124,7 +124,7 @@ def table(
         ),
         row(
             "a stage's two events, written (SQLite, synced); what the loop's own thread waits of it",
-            f"{engine['stage_written_ms']:.1f} ms, {engine['stage_of_shortest_pct']:.2f} % of the shortest stage (5 s); "
+            f"{engine['stage_written_ms']:.1f} ms, {engine['stage_of_shortest_pct']:.2f} % of the shortest stage, 5 s; "
             f"{engine['stage_told_ms']:.2f} ms",
             "under 1 %",
             engine["stage_of_shortest_pct"] < 1.0,

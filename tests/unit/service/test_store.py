@@ -177,6 +177,13 @@ def test_loops_belong_to_their_host(tmp_path: Path, postgres: Server) -> None:
     assert [(row.tag, row.host) for row in a.foreign_loops()] == [("B-1", "b"), ("X", "b")]
     found = a.foreign_loop("X")
     assert found is not None and found.host == "b" and b.foreign_loop("X") is None
+    job = b.create("X", {}, "me", False)
+    b.close()
+    a.own_loops({"A-1": {}, "X": {}})  # the bus has moved while b was not running: with the job that was on it
+    assert a.foreign_loops()[0].tag == "B-1" and [row.id for row in a.unfinished()] == [job.id]
+    b = Store(tmp_path / "b", database, "b")
+    with pytest.raises(ForeignLoop):
+        b.own_loops({"B-1": {}, "X": {}})
     for store in (a, b):
         store.close()
 
