@@ -1,6 +1,6 @@
 """`make bench`: every benchmark in a process of its own, then one table in Markdown.
 
-    python -m benchmarks
+python -m benchmarks
 """
 
 from __future__ import annotations
@@ -14,7 +14,15 @@ from datetime import date
 from typing import Any
 
 WITH_VCAN = ("tools/with-vcan", "--timeout", "400", "--")
-BENCHMARKS = {"bus": WITH_VCAN, "rehearsal": (), "criterion": (), "response": (), "me_pso": (), "tune": ()}
+BENCHMARKS = {
+    "bus": WITH_VCAN,
+    "rehearsal": (),
+    "criterion": (),
+    "response": (),
+    "me_pso": (),
+    "tune": (),
+    "engine": (),
+}
 
 
 def figures(name: str) -> dict[str, Any]:
@@ -39,6 +47,7 @@ def table(
     response: dict[str, Any],
     me_pso: dict[str, Any],
     tune: dict[str, Any],
+    engine: dict[str, Any],
 ) -> list[str]:
     def row(what: str, figure: str, goal: str = "", met: bool | None = None) -> str:
         return f"| {what} | {figure} | {goal} | {'' if met is None else 'met' if met else '**missed**'} |"
@@ -125,6 +134,22 @@ def table(
             tune["wall_s"] <= 2.0,
         ),
         row("the same, peak memory", f"{tune['peak_MB']:.0f} MB", "under 200 MB", tune["peak_MB"] < 200),
+        row(
+            "a job that does nothing, from asking to its written end, 60 at once, SQLite",
+            f"{engine['job_ms']:.1f} ms, of which {engine['job_ask_ms']:.1f} ms to ask",
+        ),
+        row(
+            "a stage's two events, written (SQLite, synced); what the loop's own thread waits of it",
+            f"{engine['stage_written_ms']:.1f} ms, {engine['stage_of_shortest_pct']:.2f} % of the shortest stage, 5 s; "
+            f"{engine['stage_told_ms']:.2f} ms",
+            "under 1 %",
+            engine["stage_of_shortest_pct"] < 1.0,
+        ),
+        row(
+            f"{engine['loops']:,} rehearsed loops on one PostgreSQL, {'/'.join(engine['jobs_per_min'])} gateways, "
+            f"{engine['processors']} processors, {engine['sample']} jobs each time",
+            "/".join(f"{rate:.0f}" for rate in engine["jobs_per_min"].values()) + " jobs per minute",
+        ),
     ]
 
 
