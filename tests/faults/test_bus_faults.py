@@ -90,7 +90,11 @@ def down(can_id: int) -> Sequence[float]:
 
 @pytest.mark.parametrize(
     ("seconds", "reasons"),
-    [(0.1, (None, "samples_lost")), (1.0, ("samples_lost", "node_lost", "device_went_back")), (10.0, ("node_lost", "restore_unconfirmed"))],
+    [
+        (0.1, (None, "samples_lost")),
+        (1.0, ("samples_lost", "node_lost", "device_went_back")),
+        (10.0, ("node_lost", "restore_unconfirmed")),
+    ],
 )
 def test_the_bus_is_down_for_a_while(site: Site, seconds: float, reasons: tuple[str | None, ...]) -> None:
     url = in_baseline(site)
