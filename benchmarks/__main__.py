@@ -14,7 +14,7 @@ from datetime import date
 from typing import Any
 
 WITH_VCAN = ("tools/with-vcan", "--timeout", "400", "--")
-BENCHMARKS = {"bus": WITH_VCAN, "rehearsal": (), "criterion": (), "response": (), "me_pso": (), "engine": ()}
+BENCHMARKS = {"bus": WITH_VCAN} | dict.fromkeys(("rehearsal", "criterion", "response", "me_pso", "tune", "engine"), ())
 
 
 def figures(name: str) -> dict[str, Any]:
@@ -38,6 +38,7 @@ def table(
     criterion: dict[str, Any],
     response: dict[str, Any],
     me_pso: dict[str, Any],
+    tune: dict[str, Any],
     engine: dict[str, Any],
 ) -> list[str]:
     def row(what: str, figure: str, goal: str = "", met: bool | None = None) -> str:
@@ -118,6 +119,13 @@ def table(
             "5 s",
             me_pso["dead_time_s"] <= 5.0,
         ),
+        row(
+            f"loopwright tune --method all, start to exit, slowest of {tune['models']} models ({tune['slowest']})",
+            f"{tune['wall_s']:.2f} s",
+            "2 s",
+            tune["wall_s"] <= 2.0,
+        ),
+        row("the same, peak memory", f"{tune['peak_MB']:.0f} MB", "under 200 MB", tune["peak_MB"] < 200),
         row(
             "a job that does nothing, from asking to its written end, 60 at once, SQLite",
             f"{engine['job_ms']:.1f} ms, of which {engine['job_ask_ms']:.1f} ms to ask",

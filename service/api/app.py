@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
 from fastapi.responses import PlainTextResponse, StreamingResponse
 
-from service.api import problems
+from service.api import problems, tunings
 from service.api.stream import event_stream
 from service.api.views import (
     Decision,
@@ -178,6 +178,7 @@ def create_app(jobs: Jobs) -> FastAPI:
     def rollback(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
         return view(jobs.rollback(job_id, (decision or Decision()).by))
 
+    app.include_router(tunings.router(jobs))
     return app
 
 
