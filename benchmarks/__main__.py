@@ -1,6 +1,6 @@
 """`make bench`: every benchmark in a process of its own, then one table in Markdown.
 
-python -m benchmarks
+    python -m benchmarks
 """
 
 from __future__ import annotations
@@ -14,15 +14,7 @@ from datetime import date
 from typing import Any
 
 WITH_VCAN = ("tools/with-vcan", "--timeout", "400", "--")
-BENCHMARKS = {
-    "bus": WITH_VCAN,
-    "rehearsal": (),
-    "criterion": (),
-    "response": (),
-    "me_pso": (),
-    "tune": (),
-    "engine": (),
-}
+BENCHMARKS = {"bus": WITH_VCAN} | dict.fromkeys(("rehearsal", "criterion", "response", "me_pso", "tune", "engine"), ())
 
 
 def figures(name: str) -> dict[str, Any]:

@@ -6,19 +6,19 @@ import math
 import secrets
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from sqlalchemy import delete, func, select, text, update
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy.exc import IntegrityError, TimeoutError
 from sqlalchemy.orm import Session, sessionmaker
 
 from service.security import audit
 from service.states import ACTIVE, JobState, check
 from service.store import chunks
 from service.store.clock import now
-from service.store.database import migrate, open_database
+from service.store.database import WAIT_S, migrate, open_database
 from service.store.lock import FolderInUse, FolderLock, HostLock, ourselves
 from service.store.tables import ChunkRow, EventRow, JobRow, LoopRow
 from tuning.plan import Sample
@@ -72,7 +72,7 @@ class Store:
             self.engine = open_database(folder, database, f"loopwright {host}, {ourselves()}")
             self.shared = self.engine.dialect.name != "sqlite"
             # One writer at a time inside the process: SQLite has one anyway, and does not queue them fairly.
-            self._write_lock = nullcontext() if self.shared else threading.Lock()
+            self._write_lock = None if self.shared else threading.Lock()
             self._session = sessionmaker(self.engine, expire_on_commit=False)
             if self.shared:
                 self._host_lock = HostLock(self.engine, host)
@@ -103,8 +103,14 @@ class Store:
 
     @contextmanager
     def writing(self) -> Iterator[Session]:
-        with self._write_lock, self._session.begin() as session:
-            yield session
+        if self._write_lock is not None and not self._write_lock.acquire(timeout=WAIT_S):
+            raise TimeoutError("another writer of this process waits for the database")
+        try:
+            with self._session.begin() as session:
+                yield session
+        finally:
+            if self._write_lock is not None:
+                self._write_lock.release()
 
     def ping(self) -> None:
         """Raises SQLAlchemyError unless the database answers."""
