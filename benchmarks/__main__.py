@@ -14,7 +14,7 @@ from datetime import date
 from typing import Any
 
 WITH_VCAN = ("tools/with-vcan", "--timeout", "400", "--")
-BENCHMARKS = {"bus": WITH_VCAN, "rehearsal": (), "criterion": (), "response": (), "me_pso": ()}
+BENCHMARKS = {"bus": WITH_VCAN, "rehearsal": (), "criterion": (), "response": (), "me_pso": (), "engine": ()}
 
 
 def figures(name: str) -> dict[str, Any]:
@@ -38,6 +38,7 @@ def table(
     criterion: dict[str, Any],
     response: dict[str, Any],
     me_pso: dict[str, Any],
+    engine: dict[str, Any],
 ) -> list[str]:
     def row(what: str, figure: str, goal: str = "", met: bool | None = None) -> str:
         return f"| {what} | {figure} | {goal} | {'' if met is None else 'met' if met else '**missed**'} |"
@@ -116,6 +117,22 @@ def table(
             f"{me_pso['dead_time_s']:.2f} s",
             "5 s",
             me_pso["dead_time_s"] <= 5.0,
+        ),
+        row(
+            "a job that does nothing, from asking to its written end, 60 at once, SQLite",
+            f"{engine['job_ms']:.1f} ms, of which {engine['job_ask_ms']:.1f} ms to ask",
+        ),
+        row(
+            "a stage's two events, written (SQLite, synced); what the loop's own thread waits of it",
+            f"{engine['stage_written_ms']:.1f} ms, {engine['stage_of_shortest_pct']:.2f} % of the shortest stage, 5 s; "
+            f"{engine['stage_told_ms']:.2f} ms",
+            "under 1 %",
+            engine["stage_of_shortest_pct"] < 1.0,
+        ),
+        row(
+            f"{engine['loops']:,} rehearsed loops on one PostgreSQL, {'/'.join(engine['jobs_per_min'])} gateways, "
+            f"{engine['processors']} processors, {engine['sample']} jobs each time",
+            "/".join(f"{rate:.0f}" for rate in engine["jobs_per_min"].values()) + " jobs per minute",
         ),
     ]
 

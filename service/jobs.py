@@ -242,7 +242,13 @@ class Jobs:
             raise Stopping("the service is shutting down")
         asked = request.model_dump(mode="json", exclude_none=True)
         row = self.store.create(tag, asked, request.requested_by, request.dry_run, host, WORKFLOW_VERSION)
-        self.engine.enqueue(row.id, self._rehearsals(host) if row.dry_run else self._queue(config, host))
+        try:
+            self.engine.enqueue(row.id, self._rehearsals(host) if row.dry_run else self._queue(config, host))
+        except Exception:
+            # Whoever asked is told that it failed: it must not begin later.
+            detail = "it could not be queued"
+            self.store.move(row.id, JobState.FAILED, reason=Reason.INTERNAL.value, detail=detail)
+            raise
         return row
 
     def abort(self, job_id: str, by: str) -> JobRow:
@@ -279,13 +285,13 @@ class Jobs:
         for running in list(self._running.values()):
             running.over.wait()
         self._ended.set()
-        try:
-            for row in self._lasting(self.store.unfinished):
-                self._heed(row.id, Reason.SERVICE_STOPPED)
-        except SQLAlchemyError as error:
-            log.error("the end of the waiting jobs could not be written, they go on at the next start: %s", error)
-        if self._watcher.is_alive():
+        if self._watcher.ident is not None:  # a service that did not come to its start leaves the jobs as they are
             self._watcher.join()
+            try:
+                for row in self._lasting(self.store.unfinished):
+                    self._heed(row.id, Reason.SERVICE_STOPPED)
+            except SQLAlchemyError as error:
+                log.error("the end of the waiting jobs could not be written, they go on at the next start: %s", error)
         self.engine.close()
         self.journal.close(_STOP_PATIENCE_S)
 
@@ -303,8 +309,10 @@ class Jobs:
             except FolderInUse as error:
                 log.critical("%s; every job is stopped", error)
                 self.request_stop()
-            except (SQLAlchemyError, IllegalMove, NoSuchJob) as error:
-                log.warning("%s", error)
+            except SQLAlchemyError as error:
+                log.warning("the database does not answer: %s", error)
+            except Exception:  # whatever it is, aborts from other hosts must go on being heard
+                log.exception("watching the jobs")
 
     # decide
     def accept(self, job_id: str, by: str) -> JobRow:

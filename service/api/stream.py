@@ -7,10 +7,14 @@ import asyncio
 import json
 from collections.abc import AsyncIterator
 
+from sqlalchemy.exc import SQLAlchemyError
+
 from service.jobs import Jobs
+from service.journal import temporary
 from service.states import ACTIVE, JobState
 
 _POLL_S = 0.2
+_AWAY_S = 1.0
 _KEEP_ALIVE_POLLS = 75  # 15 s: proxies close a silent connection after 30 s or more
 
 
@@ -19,10 +23,18 @@ async def event_stream(jobs: Jobs, job_id: str, after: int) -> AsyncIterator[str
     told = ""
     silent = 0
     while True:
-        # Asked before the events are read: an event written in between is then seen in the next round.
-        row = await asyncio.to_thread(jobs.store.get, job_id)
+        try:
+            # Asked before the events are read: an event written in between is then seen in the next round.
+            row = await asyncio.to_thread(jobs.store.get, job_id)
+            events = await asyncio.to_thread(jobs.store.events, job_id, after)
+        except SQLAlchemyError as error:
+            if not temporary(error):
+                raise
+            yield ": the database does not answer\n\n"
+            await asyncio.sleep(_AWAY_S)
+            continue
         over = JobState(row.state) not in ACTIVE
-        for event in await asyncio.to_thread(jobs.store.events, job_id, after):
+        for event in events:
             after, silent = event.seq, 0
             data = {"at": event.at, "plant_time_s": event.plant_time_s, **event.data}
             yield f"id: {event.seq}\nevent: {event.kind}\ndata: {json.dumps(data)}\n\n"

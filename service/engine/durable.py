@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 FILE = "engine.sqlite"
 """Nothing in it that our own tables would not restore: it may be deleted while the service is stopped."""
-POLL_S = 1.0
+POLL_S = 0.5
 _ALIVE = ("PENDING", "ENQUEUED", "DELAYED")
 
 _run: Callable[[str], None] | None = None

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from sqlalchemy import Connection, Engine, text
 from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Session
 
 
 class FolderInUse(Exception):
@@ -48,9 +49,14 @@ class HostLock:
     def __init__(self, engine: Engine, host: str) -> None:
         self._engine = engine
         self._host = host
-        self._key = int.from_bytes(hashlib.sha256(f"loopwright host {host}".encode()).digest()[:8], signed=True)
+        self._key = _key(host)
         self._connection: Connection | None = None
         self._take()
+
+    @staticmethod
+    def free(session: Session, host: str) -> bool:
+        """True when no service runs under this name; until the end of the transaction none can be started."""
+        return bool(session.scalar(text("SELECT pg_try_advisory_xact_lock(:key)"), {"key": _key(host)}))
 
     def check(self) -> None:
         """Takes the lock again after the server was away. Raises FolderInUse when another was faster.
@@ -82,6 +88,10 @@ class HostLock:
             # Not given back to the pool: the lock lives as long as its connection.
             connection.invalidate()
             connection.close()
+
+
+def _key(host: str) -> int:
+    return int.from_bytes(hashlib.sha256(f"loopwright host {host}".encode()).digest()[:8], signed=True)
 
 
 _HOLDER = text(

@@ -113,13 +113,23 @@ class Store:
 
     # loops
     def own_loops(self, loops: dict[str, dict[str, Any]]) -> None:
-        """These are the loops of this host from now on, by tag. Raises ForeignLoop."""
+        """These are the loops of this host from now on, by tag.
+
+        A loop of a host that is not running is taken over with its active job: its bus has moved. Raises ForeignLoop
+        when the other host is running.
+        """
         with self.writing() as session:
-            taken = session.scalars(select(LoopRow).where(LoopRow.tag.in_(loops), LoopRow.host != self.host)).all()
+            foreign = session.scalars(select(LoopRow).where(LoopRow.tag.in_(loops), LoopRow.host != self.host)).all()
+            free = {host: HostLock.free(session, host) for host in {row.host for row in foreign}}
+            taken = [row for row in foreign if not free[row.host]]
             if taken:
                 others = ", ".join(f"{row.tag} of {row.host}" for row in taken)
                 raise ForeignLoop(f"loops of other hosts: {others}; take them out of one of the two configurations")
-            session.execute(delete(LoopRow).where(LoopRow.host == self.host))
+            moved = [row.tag for row in foreign]
+            session.execute(
+                update(JobRow).where(JobRow.loop.in_(moved), JobRow.state.in_(_ACTIVE)).values(host=self.host)
+            )
+            session.execute(delete(LoopRow).where((LoopRow.host == self.host) | LoopRow.tag.in_(moved)))
             session.add_all(LoopRow(tag=tag, host=self.host, config=config) for tag, config in loops.items())
 
     def foreign_loops(self) -> Sequence[LoopRow]:

@@ -190,7 +190,7 @@ def test_sigterm_of_the_service(here: Plantsite) -> None:
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_kill_9_of_the_service_leaves_the_controller_to_itself(here: Plantsite, stage: str) -> None:
+def test_kill_9_of_the_service_leaves_the_controller_to_itself_and_the_job_resumes(here: Plantsite, stage: str) -> None:
     url = in_stage(here, stage, **STAGES[stage])
     here.service.kill()
     deadline = time.monotonic() + BACK_WITHIN_S
@@ -198,7 +198,11 @@ def test_kill_9_of_the_service_leaves_the_controller_to_itself(here: Plantsite, 
         time.sleep(0.05)
     assert here.is_home()
     here.serve()
-    assert ended(here, url) == ("interrupted", "service_stopped")
+    job = here.until(url, lambda job: job["attempts"] == 2)
+    assert job["state"] == "running" and here.http.get(f"/loops/{TAG}").json()["active_job"] == url
+    assert here.http.post(f"{url}/abort").status_code == 202
+    assert ended(here, url) == ("aborted", "operator")
+    assert here.is_home()
 
 
 def test_sample_times_that_differ_and_a_wrong_action(here: Plantsite) -> None:

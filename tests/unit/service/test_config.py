@@ -63,3 +63,15 @@ def test_not_a_list_of_loops(tmp_path: Path, text: str) -> None:
 def test_no_such_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="No such file"):
         load_site(tmp_path / "none.yaml")
+
+
+def test_buses_say_how_many_of_their_loops_are_tuned_at_once() -> None:
+    bus = loop_entry()["bus"]
+    site = parse_site({"loops": [loop_entry()], "buses": {bus: {"at_once": 3}}}, "loops.yaml")
+    assert site.buses[bus].at_once == 3 and parse_site({"loops": [loop_entry()]}, "loops.yaml").buses == {}
+    wrong = {"socketcan:can9": {"at_once": 2}, bus: {"at_once": 0}}
+    with pytest.raises(ConfigError) as caught:
+        parse_site({"loops": [loop_entry()], "buses": wrong}, "loops.yaml")
+    assert len(caught.value.problems) == 2 and "no loop is on this bus" in caught.value.problems[0]
+    with pytest.raises(ConfigError, match="mapping"):
+        parse_site({"loops": [loop_entry()], "buses": [1]}, "loops.yaml")

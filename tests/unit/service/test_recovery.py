@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy.exc import OperationalError
 
+from service.config import parse_site
 from service.engine import WORKFLOW_VERSION
 from service.jobs import MOST_ATTEMPTS, Jobs, state_json
 from service.loop import LoopState
@@ -16,7 +18,18 @@ from service.request import RetuneRequest
 from service.states import JobState
 from service.store.store import Store
 from service.store.tables import JobRow
-from tests.unit.service.fakes import NEW, OLD, TAG, FakeController, FakeLoop, Service, ThreadEngine
+from tests.unit.service.fakes import (
+    NEW,
+    OLD,
+    TAG,
+    FakeController,
+    FakeLoop,
+    FakeTune,
+    Service,
+    ThreadEngine,
+    fake_rehearse,
+    loop_entry,
+)
 from tuning.plan import Mode
 from tuning.reasons import Reason
 
@@ -174,6 +187,37 @@ def test_a_job_that_the_engine_has_lost_is_given_to_it_again(started: list[Servi
     service.wait(row.id)
     assert service.store.get(row.id).state == "proposed"
     assert engine.enqueued == [(row.id, "local:virtual:test")] * 2
+
+
+class Broken(ThreadEngine):
+    def enqueue(self, job_id: str, queue: str) -> None:
+        raise OperationalError("INSERT", {}, Exception("no room"))
+
+
+def test_what_could_not_be_queued_is_over_and_does_not_begin_later(started: list[Service], tmp_path: Path) -> None:
+    service = again(started, tmp_path, engine=Broken())
+    with pytest.raises(OperationalError):
+        service.jobs.start(TAG, RetuneRequest())
+    (row,) = service.store.recent()
+    assert (row.state, row.reason) == ("failed", "internal") and service.store.active(TAG) is None
+
+
+def test_a_service_that_does_not_come_to_its_start_leaves_the_jobs(tmp_path: Path) -> None:
+    job_id = left(tmp_path)
+    store = Store(tmp_path)
+
+    class NoStart(ThreadEngine):
+        def launch(self, run: Callable[[str], None], queues: Mapping[str, int]) -> None:
+            raise OSError("no engine")
+
+    loops = parse_site({"loops": [loop_entry()]}, "test").loops
+    controller = FakeController()
+    jobs = Jobs(loops, store, lambda config: FakeLoop(controller), FakeTune(), fake_rehearse, engine=NoStart())
+    with pytest.raises(OSError, match="no engine"):
+        jobs.boot()
+    jobs.stop()
+    assert store.get(job_id).state == "running"
+    store.close()
 
 
 def test_a_job_that_waits_for_its_turn_ends_at_once_when_aborted(started: list[Service], tmp_path: Path) -> None:
