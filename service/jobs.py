@@ -142,12 +142,13 @@ class Jobs:
             return Safe(None, "the loop is no longer configured here", Reason.SERVICE_STOPPED)
         try:
             loop = self._open_loop(config)
-        except Exception as error:
+            try:
+                return make_safe(loop, loop_state(row.found or {}), self._patience_s)
+            finally:
+                loop.close()
+        except Exception as error:  # one loop must not keep the service of the others from starting
+            log.exception("loop %s", row.loop)
             return Safe(None, f"not reached: {error}; the controller goes back by itself", Reason.BUS_LOST)
-        try:
-            return make_safe(loop, loop_state(row.found or {}), self._patience_s)
-        finally:
-            loop.close()
 
     def _why_not(self, row: JobRow, safe: Safe | None) -> tuple[Reason, str] | None:
         """Why a job is not to be resumed, if so."""

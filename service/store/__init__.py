@@ -1,1 +1,1 @@
-"""Jobs, their events and their samples, in SQLite."""
+"""Jobs, their events and their samples, in SQLite or PostgreSQL."""

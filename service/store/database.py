@@ -37,8 +37,8 @@ def open_database(folder: Path, url: str | None, name: str) -> Engine:
         raise BadDatabase(f"the database must be postgresql://..., not {kind}://; without one a file is used")
     return create_engine(
         parsed.set(drivername="postgresql+psycopg"),
-        pool_size=10,
-        max_overflow=20,
+        pool_size=5,
+        max_overflow=10,
         pool_timeout=WAIT_S,
         # A connection that died while it lay idle is noticed before a transaction begins on it.
         pool_pre_ping=True,

@@ -21,6 +21,8 @@ from tests.unit.service.fakes import NEW, OLD, TAG
 from tests.unit.service.gateway import HOME, STAGES, read_loop
 from tests.unit.service.postgres import Server
 
+pytestmark = pytest.mark.timeout(300)  # processes that start slowly on a busy machine
+
 
 class Gateway:
     """The process of tests.unit.service.gateway, started again as often as a test likes."""

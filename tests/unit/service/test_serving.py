@@ -1,0 +1,27 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from service.cli import app
+from tests.unit.service.fakes import loop_entry
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--database", "postgresql://me:secret@127.0.0.1:1/none"], "needs --host"),
+        (["--database", "postgresql://me:secret@127.0.0.1:1/none", "--host", "a"], "the database cannot be used"),
+        (["--database", "mysql://me:secret@127.0.0.1:1/none", "--host", "a"], "not mysql://"),
+    ],
+)
+def test_a_database_that_cannot_be_used_is_said_in_words(tmp_path: Path, options: list[str], words: str) -> None:
+    loops = tmp_path / "loops.yaml"
+    loops.write_text(yaml.safe_dump({"loops": [loop_entry()]}))
+    place = ["--loops", str(loops), "--data", str(tmp_path / "data"), "--port", "0"]
+    ended = CliRunner().invoke(app, ["serve", *place, *options])
+    assert ended.exit_code == 2 and words in ended.output
+    assert "secret" not in ended.output and "Traceback" not in ended.output
