@@ -1,45 +1,92 @@
 from __future__ import annotations
 
-import sqlite3
+import os
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from alembic import command
 from alembic.autogenerate import compare_metadata
+from alembic.config import Config
 from alembic.migration import MigrationContext
-from sqlalchemy import create_engine
+from sqlalchemy import Connection, inspect, text
+from sqlalchemy.exc import IntegrityError
 
 from service.states import MOVES, IllegalMove, JobState, check
-from service.store.store import Busy, FolderInUse, NoSuchJob, Store
+from service.store.database import BadDatabase
+from service.store.store import Busy, FolderInUse, ForeignLoop, NoSuchJob, Store
 from service.store.tables import Base
+from tests.unit.service.postgres import Server
 from tuning.plan import Sample
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    store = Store(tmp_path)
+@pytest.fixture(params=["sqlite", "postgresql"])
+def store(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Store]:
+    database = None if request.param == "sqlite" else request.getfixturevalue("postgres").database()
+    store = Store(tmp_path, database)
     yield store
     store.close()
 
 
-def test_migrations_make_the_tables_of_the_code(store: Store, tmp_path: Path) -> None:
-    engine = create_engine(f"sqlite:///{tmp_path / 'loopwright.sqlite'}")
-    with engine.connect() as connection:
-        assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
-    engine.dispose()
+def test_migrations_make_the_tables_of_the_code(store: Store) -> None:
+    with store.engine.connect() as connection:
+        differences = compare_metadata(MigrationContext.configure(connection), Base.metadata)
+    assert differences == []
 
 
-def test_wal_and_the_index_hold_in_the_database_itself(store: Store, tmp_path: Path) -> None:
+def migrate(connection: Connection, revision: str) -> None:
+    config = Config()
+    config.set_main_option("script_location", "service.store:migrations")
+    config.attributes["connection"] = connection
+    (command.upgrade if revision == "head" else command.downgrade)(config, revision)
+
+
+def test_a_store_of_the_revision_before_is_taken_over_with_its_data(store: Store) -> None:
+    """Down to the revision before, data put there as its code did, and up again."""
+    with store.engine.begin() as connection:
+        migrate(connection, "0001")
+        assert "host" not in {column["name"] for column in inspect(connection).get_columns("jobs")}
+        connection.execute(
+            text(
+                "INSERT INTO jobs (id, loop, state, dry_run, request, requested_by, created_at, plant_time_s, result)"
+                " VALUES ('old', 'A', 'proposed', :no, '{\"start\": \"relay\"}', 'me', '2026-01-01', 12.5,"
+                " '{\"gains\": {\"Kp\": 2.0}}'), ('cut', 'A', 'running', :no, '{}', 'me', '2026-01-02', 0.0, NULL)"
+            ),
+            {"no": False},
+        )
+        connection.execute(
+            text("INSERT INTO events VALUES ('old', 1, '2026-01-01', 0.5, 'note', '{\"text\": \"hm\"}')")
+        )
+    with store.engine.begin() as connection:
+        migrate(connection, "head")
+    row = store.get("old")
+    assert (row.state, row.host, row.version, row.attempt) == ("proposed", "local", "0", 0)
+    assert (row.plant_time_s, row.request, row.result) == (12.5, {"start": "relay"}, {"gains": {"Kp": 2.0}})
+    assert [event.data for event in store.events("old")] == [{"text": "hm"}]
+    assert [job.id for job in store.unfinished()] == ["cut"]
+    with pytest.raises(Busy):  # the index that holds it has come through
+        store.create("A", {}, "me", False)
+    store.move("cut", JobState.INTERRUPTED)
     store.create("A", {}, "me", False)
-    connection = sqlite3.connect(tmp_path / "loopwright.sqlite")
-    assert connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+
+
+def test_one_active_job_per_loop_holds_in_the_database_itself(store: Store) -> None:
+    store.create("A", {}, "me", False)
     copy = (
         "INSERT INTO jobs (id, loop, state, dry_run, request, requested_by, created_at, plant_time_s)"
         " SELECT 'x', loop, 'running', dry_run, request, requested_by, created_at, 0 FROM jobs"
     )
-    with pytest.raises(sqlite3.IntegrityError):
-        connection.execute(copy)
-    connection.close()
+    with store.engine.connect() as connection, pytest.raises(IntegrityError):
+        connection.execute(text(copy))
+
+
+def test_a_power_cut_loses_nothing_that_was_committed(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    with store.engine.connect() as connection:
+        found = [connection.execute(text(f"PRAGMA {name}")).scalar() for name in ("journal_mode", "synchronous")]
+        assert [*found, connection.execute(text("PRAGMA busy_timeout")).scalar()] == ["wal", 2, 5000]
+    store.close()
 
 
 def test_one_active_job_per_loop(store: Store) -> None:
@@ -70,9 +117,93 @@ def test_what_was_written_is_there_after_reopening(tmp_path: Path) -> None:
     store.close()
 
 
-def test_a_data_folder_has_one_service(store: Store, tmp_path: Path) -> None:
-    with pytest.raises(FolderInUse):
+def test_a_data_folder_has_one_service(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    with pytest.raises(FolderInUse, match=f"process {os.getpid()} on"):
         Store(tmp_path)
+    store.close()
+    Store(tmp_path).close()
+
+
+def test_a_data_folder_has_one_host_whatever_it_is_called(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    job = store.create("A", {}, "me", False)
+    store.close()
+    store = Store(tmp_path, host="renamed")
+    assert [row.id for row in store.unfinished()] == [job.id]
+    store.close()
+
+
+def test_a_database_has_one_service_per_host_name(tmp_path: Path, postgres: Server) -> None:
+    database = postgres.database()
+    a, b = Store(tmp_path / "a", database, "a"), Store(tmp_path / "b", database, "b")
+    with pytest.raises(FolderInUse, match=f"host 'a' is served already: loopwright a, process {os.getpid()} on"):
+        Store(tmp_path / "c", database, "a")
+    a.close()
+    taken = Store(tmp_path / "c", database, "a")
+    b.check_lock()
+    for store in (taken, b):
+        store.close()
+
+
+def test_a_lock_lost_with_the_server_is_taken_again_unless_another_was_faster(tmp_path: Path, postgres: Server) -> None:
+    database = postgres.database()
+    a = Store(tmp_path / "a", database, "a")
+    postgres.stop()
+    a.check_lock()  # a server that is away is no reason to end
+    postgres.start()
+    a.check_lock()
+    with pytest.raises(FolderInUse):
+        Store(tmp_path / "b", database, "a")
+    postgres.stop()
+    postgres.start()
+    other = Store(tmp_path / "b", database, "a")
+    with pytest.raises(FolderInUse):
+        a.check_lock()
+    for store in (a, other):
+        store.close()
+
+
+def test_loops_belong_to_their_host(tmp_path: Path, postgres: Server) -> None:
+    database = postgres.database()
+    a, b = Store(tmp_path / "a", database, "a"), Store(tmp_path / "b", database, "b")
+    a.own_loops({"A-1": {"tag": "A-1"}, "X": {"tag": "X"}})
+    b.own_loops({"B-1": {"tag": "B-1"}})
+    with pytest.raises(ForeignLoop, match="X of a"):
+        b.own_loops({"B-1": {}, "X": {}})
+    assert [row.tag for row in b.foreign_loops()] == ["A-1", "X"]
+    a.own_loops({"A-1": {"tag": "A-1"}})  # a gives X up
+    b.own_loops({"B-1": {}, "X": {}})
+    assert [(row.tag, row.host) for row in a.foreign_loops()] == [("B-1", "b"), ("X", "b")]
+    found = a.foreign_loop("X")
+    assert found is not None and found.host == "b" and b.foreign_loop("X") is None
+    for store in (a, b):
+        store.close()
+
+
+def test_two_hosts_may_append_to_one_job_at_the_same_time(tmp_path: Path, postgres: Server) -> None:
+    database = postgres.database()
+    stores = [Store(tmp_path / name, database, name) for name in ("a", "b")]
+    job = stores[0].create("A", {}, "me", False)
+    threads = [
+        threading.Thread(target=lambda store=store: [store.append(job.id, "note", {}, 0.0) for _ in range(30)])
+        for store in stores
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [event.seq for event in stores[0].events(job.id)] == list(range(1, 62))
+    for store in stores:
+        store.close()
+
+
+@pytest.mark.parametrize("url", ["mysql://u:secret@h/d", "nonsense", "postgres://u:secret@h/d"])
+def test_other_databases_are_refused_without_telling_the_password(tmp_path: Path, url: str) -> None:
+    with pytest.raises(BadDatabase) as refused:
+        Store(tmp_path, url)
+    assert "secret" not in str(refused.value) and "postgresql://" in str(refused.value)
+    Store(tmp_path).close()  # the folder is free again
 
 
 def test_samples_come_back(store: Store) -> None:
@@ -95,7 +226,7 @@ def test_unknown_job(store: Store) -> None:
 
 @pytest.mark.parametrize("now", list(JobState))
 @pytest.mark.parametrize("wanted", list(JobState))
-def test_only_the_moves_of_the_table(store: Store, now: JobState, wanted: JobState) -> None:
+def test_only_the_moves_of_the_table(now: JobState, wanted: JobState) -> None:
     if wanted in MOVES[now]:
         check(now, wanted)
     else:

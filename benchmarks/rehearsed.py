@@ -1,0 +1,68 @@
+"""Live loops without a bus: the controller's algorithm and a plant model in memory, behind the configuration of a loop.
+
+A gateway of its own process, which tunes so many of them:
+
+    python -m benchmarks.rehearsed FOLDER HOST LOOPS AT_ONCE URL
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from controller.channel import Channel, Settings
+from controller.pid import Parameters
+from plantsim.plant import LinearPlant
+from service.config import LoopConfig
+from service.rehearsal import RehearsedLoop
+from service.serving import Setup, serve
+from tuning.plan import Mode
+
+TS = 0.1
+MIDDLE = 50.0
+"""MV at which PV is 0, percent."""
+
+
+class AroundTheMiddle:
+    """K = 2 PV units per percent, T = 6 s, L = 1.5 s, for an MV in 0..100 percent."""
+
+    def __init__(self) -> None:
+        self._plant = LinearPlant([2.0], [6.0, 1.0], 1.5, TS)
+
+    @property
+    def pv(self) -> float:
+        return self._plant.pv
+
+    def step(self, mv: float) -> float:
+        return self._plant.step(mv - MIDDLE)
+
+
+def entry(tag: str, bus: str = "virtual:rehearsed", channel: int = 1, node: int = 32) -> dict[str, Any]:
+    """Such a loop in loops.yaml."""
+    return {
+        "tag": tag, "bus": bus, "controller_node": node, "channel": channel, "pv_unit": "degC",
+        "pv_limits": {"low": -100.0, "high": 100.0}, "t95_s": 20.0, "sp_deviation": 2.0,
+    }  # fmt: skip
+
+
+def open_loop(_config: LoopConfig) -> RehearsedLoop:
+    settings = Settings(mv_low=0.0, mv_high=100.0, safe_output=MIDDLE, pv_low=-200.0, pv_high=200.0, reverse=True)
+    channel = Channel(TS, settings, Parameters(0.2, 6.0), 0.0, int(Mode.AUTOMATIC), MIDDLE)
+    return RehearsedLoop(AroundTheMiddle(), channel, TS)
+
+
+def main() -> None:
+    folder, (host, count, at_once, database) = Path(sys.argv[1]), sys.argv[2:]
+    folder.mkdir(parents=True, exist_ok=True)
+    bus = "virtual:rehearsed"
+    entries = [entry(f"{host}-{n}", bus, n % 199 + 1, 1 + n // 199) for n in range(int(count))]
+    file = folder / "loops.yaml"
+    file.write_text(yaml.safe_dump({"loops": entries, "buses": {bus: {"at_once": int(at_once)}}}))
+    serve(Setup(file, folder / "data", "127.0.0.1", 0, database or None, host, poll_s=0.1), open_loop)
+
+
+if __name__ == "__main__":
+    main()

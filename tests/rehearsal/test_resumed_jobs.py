@@ -1,0 +1,103 @@
+"""Jobs of the real procedure on a loop in memory, cut off in every stage by the end of their service, then resumed."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.rehearsed import entry, open_loop
+from service.config import parse_site
+from service.jobs import Jobs
+from service.rehearsal import RehearsedLoop
+from service.request import RetuneRequest
+from service.store.store import Store
+from service.work import rehearse, tune
+from tests.unit.service.fakes import ThreadEngine
+from tuning.five_stage import STAGES
+from tuning.plan import Command, Sample
+
+TAG = "TIC-1"
+LIVE = [stage for stage in STAGES if stage not in ("estimate", "optimise")]  # those that take samples
+
+
+class Killed(BaseException):
+    """The end of the process, as far as a job's thread can tell: nothing after it is run."""
+
+
+class Mortal(RehearsedLoop):
+    """A loop whose tuner dies at a sample of a stage; the controller goes back by itself, the plant settles."""
+
+    def __init__(self, loop: RehearsedLoop, dies: Callable[[], bool]) -> None:
+        self.__dict__ = loop.__dict__
+        self._dies = dies
+
+    def step(self, commands: Sequence[Command]) -> Sample:
+        if self._dies():
+            raise Killed
+        return super().step(commands)
+
+
+class MortalEngine(ThreadEngine):
+    def launch(self, run: Callable[[str], None], queues: Any) -> None:
+        def until_death(job_id: str) -> None:
+            try:
+                run(job_id)
+            except Killed:
+                self.dead.set()
+
+        self.dead = threading.Event()
+        super().launch(until_death, queues)
+
+
+@pytest.mark.parametrize("stage", LIVE)
+def test_a_job_cut_off_in_a_stage_ends_as_one_that_was_not(tmp_path: Path, stage: str) -> None:
+    loops = parse_site({"loops": [entry(TAG)]}, "test").loops
+    ran: list[str] = []
+
+    def service(folder: Path, dies_in: str | None) -> tuple[Store, Jobs, MortalEngine]:
+        store, engine = Store(folder), MortalEngine()
+        samples = [0]
+
+        def dies() -> bool:
+            running = list(jobs._running.values())
+            samples[0] += bool(running and running[0].progress.stage == dies_in)
+            return samples[0] > 20
+
+        jobs = Jobs(loops, store, lambda config: Mortal(open_loop(config), dies), tune, rehearse, engine=engine)
+        jobs.boot()
+        return store, jobs, engine
+
+    def finish(store: Store, jobs: Jobs) -> Any:
+        for thread in list(jobs.engine._threads.values()):  # type: ignore[attr-defined]
+            thread.join(60)
+        row = store.recent()[0]
+        events = store.events(row.id)
+        ran[:] = [event.data["stage"] for event in events if event.kind == "stage_started"]
+        jobs.stop()
+        store.close()
+        return row
+
+    store, jobs, _ = service(tmp_path / "whole", None)
+    jobs.start(TAG, RetuneRequest())
+    whole = finish(store, jobs)
+    assert whole.state == "proposed", whole.detail
+
+    store, jobs, engine = service(tmp_path / "cut", stage)
+    jobs.start(TAG, RetuneRequest())
+    assert engine.dead.wait(60)
+    assert jobs.journal.flush(10)
+    jobs._ended.set()
+    store.close()
+    store, jobs, _ = service(tmp_path / "cut", None)
+    row = finish(store, jobs)
+    assert (row.state, row.attempt) == ("proposed", 2), row.detail
+    # Preflight looks at the loop anew; of the others only the one cut off began twice.
+    assert [ran.count(each) for each in STAGES] == [1 + (each in ("preflight", stage)) for each in STAGES]
+    for gain in ("Kp", "Ti"):
+        assert row.result["gains"][gain] == pytest.approx(whole.result["gains"][gain], rel=0.02)
+    assert sorted(row.stage_times_s) == sorted(whole.stage_times_s)
+    assert row.restored["gains"]["Kp"] == pytest.approx(0.2) and row.restored["on_trial"] is False
