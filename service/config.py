@@ -61,6 +61,7 @@ class LoopConfig(BaseModel):
     t95_s: Positive
     sp_deviation: Positive
     noise_std_hint: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    area: str | None = Field(default=None, min_length=1, max_length=64)
     notes: str = ""
 
     @model_validator(mode="after")

@@ -27,7 +27,7 @@ from service.request import BadLimits, RetuneRequest, within
 from service.running import Running
 from service.safe import PATIENCE_S, Safe, make_safe, same
 from service.states import ACTIVE, IllegalMove, JobState, state_after
-from service.store.store import Busy, FolderInUse, NoSuchJob, Store
+from service.store.store import Busy, FolderInUse, NoSuchJob, Store, WithJob
 from service.store.tables import JobRow
 from service.work import Hooks, Outcome, Rehearse, Tune
 from tuning.gains import Gains
@@ -91,7 +91,7 @@ class Jobs:
         self._tune = tune
         self._rehearse = rehearse
         self._buses = buses or {}
-        self._resume = resume
+        self.resumes = resume
         self._patience_s = patience_s
         self._running: dict[str, Running] = {}
         # Guards the registry of running jobs and `stopping`.
@@ -112,7 +112,7 @@ class Jobs:
         with ThreadPoolExecutor(_AT_BOOT, "boot") as pool:
             for _ in pool.map(self._recover, self.store.unfinished()):
                 pass
-        queues = {self._queue(config): self._at_once(config.bus) for config in self.loops.values()}
+        queues = {self._queue(config): self.at_once(config.bus) for config in self.loops.values()}
         self.engine.launch(self.work, queues | {self._rehearsals(self.store.host): REHEARSALS_AT_ONCE})
         self.reconcile(at_once=True)
         self._watcher.start()
@@ -157,7 +157,7 @@ class Jobs:
             return Reason.SERVICE_STOPPED, "it was begun by another version of Loopwright"
         if config is None:
             return Reason.SERVICE_STOPPED, "its loop is no longer configured here"
-        if not self._resume:
+        if not self.resumes:
             return Reason.SERVICE_STOPPED, "the service was started with --no-resume"
         if safe is not None and safe.reason is not None:
             return safe.reason, "the loop is not as the job had found it" if safe.state else "the loop is not reached"
@@ -194,7 +194,8 @@ class Jobs:
     def _rehearsals(host: str) -> str:
         return f"{host}:rehearsals"
 
-    def _at_once(self, bus: str) -> int:
+    def at_once(self, bus: str) -> int:
+        """How many loops of one of our buses may be under test at the same time."""
         return self._buses.get(bus, BusConfig()).at_once
 
     # what there is
@@ -235,14 +236,17 @@ class Jobs:
             loop.close()
 
     # start and stop
-    def start(self, tag: str, request: RetuneRequest) -> JobRow:
-        """Queues a job on the host that has the loop. Raises UnknownLoop, BadLimits, Busy, Stopping."""
+    def start(self, tag: str, request: RetuneRequest, also: WithJob | None = None) -> JobRow:
+        """Queues a job on the host that has the loop. Raises UnknownLoop, BadLimits, Busy, Stopping.
+
+        also: what is written in the same transaction; when it raises, there is no job.
+        """
         config, host = self.owner(tag)
         within(config, request)
         if self.stopping:
             raise Stopping("the service is shutting down")
         asked = request.model_dump(mode="json", exclude_none=True)
-        row = self.store.create(tag, asked, request.requested_by, request.dry_run, host, WORKFLOW_VERSION)
+        row = self.store.create(tag, asked, request.requested_by, request.dry_run, host, WORKFLOW_VERSION, also)
         try:
             self.engine.enqueue(row.id, self._rehearsals(host) if row.dry_run else self._queue(config, host))
         except Exception:

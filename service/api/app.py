@@ -12,19 +12,19 @@ from typing import Annotated, Literal
 from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
 from fastapi.responses import PlainTextResponse, StreamingResponse
 
-from service.api import contract, operations, problems, tunings
+from service.api import contract, fleet, operations, problems, tunings
 from service.api.access import Access
 from service.api.stream import event_stream
 from service.api.views import (
     Decision,
     JobView,
     LoopDetail,
-    LoopView,
     SamplesView,
     job_view,
     live_view,
     loop_view,
 )
+from service.fleet import Fleet
 from service.jobs import Jobs
 from service.request import RetuneRequest
 from service.security.gate import Gate, Policy
@@ -41,9 +41,13 @@ def create_app(
 ) -> FastAPI:
     """The API over these jobs; ends them when the server shuts down. checks: what must be well to be ready."""
 
+    many = Fleet(jobs)
+
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        many.boot()
         yield
+        many.close()
         jobs.stop()
 
     app = FastAPI(
@@ -64,11 +68,7 @@ def create_app(
     def view(row: JobRow) -> JobView:
         return job_view(row, jobs.store.events(row.id), jobs.running(row.id))
 
-    @app.get("/loops", tags=["loops"], summary="The configured loops of every host",
-        responses=problems.responses(503))
-    def loops() -> list[LoopView]:
-        busy = jobs.store.busy()
-        return [LoopView(**loop_view(config, host, busy.get(config.tag))) for config, host in jobs.everywhere()]
+    fleet.install(app, jobs, many, view)
 
     @app.get(
         "/loops/{tag}", tags=["loops"], summary="A loop and its present state", responses=problems.responses(404, 503)
@@ -76,8 +76,8 @@ def create_app(
     def loop(tag: Tag) -> LoopDetail:
         config, host = jobs.owner(tag)
         state = jobs.live(tag)
-        view = loop_view(config, host, jobs.store.busy().get(tag))
-        return LoopDetail(**view, live=live_view(state) if state else None)
+        shown = loop_view(config, host, jobs.store.busy().get(tag), jobs.store.last_states(tag).get(tag))
+        return LoopDetail(**shown, live=live_view(state) if state else None)
 
     @app.post(
         "/loops/{tag}/retune",
@@ -92,14 +92,6 @@ def create_app(
         row = jobs.start(tag, options or RetuneRequest())
         response.headers["Location"] = str(request.url_for("job", job_id=row.id).path)
         return view(row)
-
-    @app.get("/jobs", tags=["jobs"], summary="The latest jobs first", responses=problems.responses(422))
-    def job_list(
-        loop: Annotated[str | None, Query(description="Only of this loop", examples=["TIC-101"])] = None,
-        state: Annotated[JobState | None, Query(description="Only in this state")] = None,
-        limit: Annotated[int, Query(ge=1, le=1000, description="At most so many")] = 50,
-    ) -> list[JobView]:
-        return [view(row) for row in jobs.store.recent(loop, state, limit)]
 
     @app.get("/jobs/{job_id}", tags=["jobs"], summary="A job", responses=problems.responses(404))
     def job(job_id: JobId) -> JobView:

@@ -44,9 +44,11 @@ class LoopView(BaseModel):
     pv_limits: Limits = Field(description="Permitted PV, PV units")
     t95_s: float = Field(description="Time in which the plant covers 95 % of a step, s", examples=[9.1])
     sp_deviation: float = Field(description="Permitted set-point step, PV units", examples=[2.0])
+    area: str | None = Field(description="Part of the site, by its name in loops.yaml", examples=["distillation"])
     notes: str = Field(description="For the operator")
     host: str = Field(description="The service that has the loop's bus", examples=["local"])
     active_job: str | None = Field(description="URL of the job that has the loop", examples=["/jobs/4f0c2a9be113"])
+    last_job_state: JobState | None = Field(description="State of its latest job; dry runs do not count")
 
 
 class LiveView(BaseModel):
@@ -129,10 +131,10 @@ class Decision(BaseModel):
     by: str = Field(default="api", max_length=100, examples=["operator A"])
 
 
-def loop_view(config: LoopConfig, host: str, active: str | None) -> dict[str, Any]:
-    """active: the id of the job that has the loop."""
+def loop_view(config: LoopConfig, host: str, active: str | None, last: str | None) -> dict[str, Any]:
+    """active: the id of the job that has the loop.  last: the state of its latest one."""
     fields = config.model_dump(exclude={"noise_std_hint"})
-    return fields | {"host": host, "active_job": None if active is None else f"/jobs/{active}"}
+    return fields | {"host": host, "active_job": None if active is None else f"/jobs/{active}", "last_job_state": last}
 
 
 def live_view(state: LoopState) -> LiveView:

@@ -16,18 +16,20 @@ from sqlalchemy.orm import Session, sessionmaker
 
 from service.security import audit
 from service.states import ACTIVE, JobState, check
-from service.store import chunks
+from service.store import chunks, retunes
 from service.store.clock import now
 from service.store.database import WAIT_S, migrate, open_database
 from service.store.lock import FolderInUse, FolderLock, HostLock, ourselves
-from service.store.tables import ChunkRow, EventRow, JobRow, LoopRow
+from service.store.tables import ChunkRow, EventRow, JobRow, LoopRow, RetuneRow
 from tuning.plan import Sample
 from tuning.reasons import Reason
 
-__all__ = ["Busy", "FolderInUse", "ForeignLoop", "NoSuchJob", "Store", "Write", "clean", "now"]
+__all__ = ["Busy", "FolderInUse", "ForeignLoop", "NoSuchJob", "Store", "WithJob", "Write", "clean", "now"]
 
 Write = Callable[[Session], None]
 """A piece of a transaction, for the journal."""
+WithJob = Callable[[Session, JobRow], None]
+"""A piece of the transaction that makes a job."""
 LOCAL = "local"
 DECISIONS = {JobState.ACCEPTED: "accept", JobState.ROLLED_BACK: "rollback"}
 """What the audit log calls the moves that somebody decides."""
@@ -86,7 +88,7 @@ class Store:
     def _adopt(self) -> None:
         """The one host of a data folder has everything in it."""
         with self.writing() as session:
-            for table in (JobRow, LoopRow):
+            for table in (JobRow, LoopRow, RetuneRow):
                 session.execute(update(table).where(table.host != self.host).values(host=self.host))
 
     def close(self) -> None:
@@ -111,6 +113,11 @@ class Store:
         finally:
             if self._write_lock is not None:
                 self._write_lock.release()
+
+    @contextmanager
+    def reading(self) -> Iterator[Session]:
+        with self._session() as session:
+            yield session
 
     def ping(self) -> None:
         """Raises SQLAlchemyError unless the database answers."""
@@ -161,6 +168,7 @@ class Store:
         dry_run: bool,
         host: str | None = None,
         version: str = "0",
+        also: WithJob | None = None,
     ) -> JobRow:
         """A new queued job, on this host unless on another. Raises Busy when the loop has an active one."""
         row = JobRow(
@@ -180,6 +188,8 @@ class Store:
                 session.flush()
                 append(session, row.id, "state", {"state": row.state, "by": requested_by}, 0.0)
                 audit.record(session, "retune", row.id, after=row.request, loop=loop, said_by=requested_by)
+                if also is not None:
+                    also(session, row)
         except IntegrityError as error:
             active = self.active(loop)
             if active is None:
@@ -262,9 +272,22 @@ class Store:
                 session, what, job_id, before={"state": row.state}, after={"error": detail}, loop=row.loop, said_by=by
             )
 
-    def recent(self, loop: str | None = None, state: JobState | None = None, limit: int = 50) -> Sequence[JobRow]:
-        """The latest jobs first."""
+    def last_states(self, loop: str | None = None) -> dict[str, str]:
+        """The state of the latest job by loop, of every host or of one loop; dry runs do not count."""
+        last = select(func.max(JobRow.number)).where(JobRow.dry_run.is_(False)).group_by(JobRow.loop)
+        if loop is not None:
+            last = last.where(JobRow.loop == loop)
+        with self._session() as session:
+            found = session.execute(select(JobRow.loop, JobRow.state).where(JobRow.number.in_(last)))
+            return {row.loop: row.state for row in found}
+
+    def recent(
+        self, loop: str | None = None, state: JobState | None = None, limit: int = 50, before: int | None = None
+    ) -> Sequence[JobRow]:
+        """The latest jobs first; before: only those with a smaller number."""
         wanted = select(JobRow).order_by(JobRow.number.desc()).limit(limit)
+        if before is not None:
+            wanted = wanted.where(JobRow.number < before)
         if loop is not None:
             wanted = wanted.where(JobRow.loop == loop)
         if state is not None:
@@ -290,6 +313,10 @@ class Store:
             detail = f"was {row.state} when the back-up was made that has now been restored"
             self.move(row.id, JobState.INTERRUPTED, reason=Reason.SERVICE_STOPPED.value, detail=detail)
         with self.writing() as session:
+            for retune in retunes.unfinished(session, self.host):
+                detail = f"was {retune.state} when the back-up was made that has now been restored"
+                retunes.stop(session, retune.id, retunes.StopReason.SERVICE_STOPPED, detail)
+                retunes.end(session, retune.id)
             audit.record(session, "restore", source, after={"interrupted": [row.id for row in active]})
         return len(active)
 

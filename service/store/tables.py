@@ -90,3 +90,34 @@ class ChunkRow(Base):
     first_t_s: Mapped[float]
     count: Mapped[int]
     data: Mapped[bytes] = mapped_column(LargeBinary)
+
+
+class RetuneRow(Base):
+    """A retune of many loops. Its host begins their jobs, whatever hosts these are on."""
+
+    __tablename__ = "retunes"
+    __table_args__ = (Index("retunes_by_host", "host", "ended_at"),)
+
+    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    id: Mapped[str] = mapped_column(unique=True)
+    host: Mapped[str]
+    state: Mapped[str]
+    request: Mapped[dict[str, Any]]
+    requested_by: Mapped[str]
+    created_at: Mapped[str]
+    ended_at: Mapped[str | None]
+    # Why no more jobs are begun, and that in words.
+    stop_reason: Mapped[str | None]
+    detail: Mapped[str | None]
+
+
+class RetuneLoopRow(Base):
+    """A loop of such a retune. detail: why it has no job, when it will never have one."""
+
+    __tablename__ = "retune_loops"
+
+    retune_id: Mapped[str] = mapped_column(ForeignKey("retunes.id"), primary_key=True)
+    position: Mapped[int] = mapped_column(primary_key=True)
+    loop: Mapped[str]
+    job_id: Mapped[str | None] = mapped_column(ForeignKey("jobs.id"))
+    detail: Mapped[str | None]

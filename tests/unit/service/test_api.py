@@ -37,7 +37,7 @@ def assert_problem(answer: Any, status: int) -> dict[str, Any]:
 
 
 def test_loops_and_live_state(client: TestClient) -> None:
-    assert [loop["tag"] for loop in client.get("/loops").json()] == [TAG, "FIC-2"]
+    assert [loop["tag"] for loop in client.get("/loops").json()] == ["FIC-2", TAG]
     loop = client.get(f"/loops/{TAG}").json()
     assert loop["live"]["sp"] == 50.0 and loop["live"]["mode"] == "automatic"
     assert loop["live"]["gains"]["Kp"] == OLD.Kp and loop["active_job"] is None

@@ -1,0 +1,220 @@
+"""Many loops: the list of them, each one's history, and retunes of many."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Body, FastAPI, Path, Query, Request, Response
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, Field
+
+from service.api import problems
+from service.api.paging import LINK, Cursor, Limit, more
+from service.api.views import Decision, JobView, LoopView, loop_view
+from service.fleet import BadFleet, Fleet, FleetRequest
+from service.jobs import Jobs
+from service.states import JobState
+from service.store.retunes import NoSuchRetune, Part, RetuneOver, RetuneState, StopReason
+from service.store.tables import JobRow, RetuneRow
+from tuning.reasons import Reason
+
+RetuneId = Annotated[str, Path(description="Id of the retune", examples=["9d1b7c02aa45"])]
+Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
+LoopFilter = Literal["busy", "idle"] | JobState
+
+
+class PartView(BaseModel):
+    """A loop of the retune."""
+
+    loop: str = Field(examples=["TIC-101"])
+    state: str = Field(description="waiting; skipped: never begun; else the state of its job", examples=["proposed"])
+    job: str | None = Field(description="URL of its job", examples=["/jobs/4f0c2a9be113"])
+    reason: str | None = Field(description="Why there is no proposal, from the closed list", examples=["not_at_rest"])
+    detail: str | None = Field(description="The reason's numbers, or why there is no job")
+
+
+class RetuneSummary(BaseModel):
+    """A retune of many loops."""
+
+    id: str = Field(examples=["9d1b7c02aa45"])
+    url: str = Field(examples=["/retunes/9d1b7c02aa45"])
+    state: RetuneState = Field(
+        description="running; stopping: begins no more, some still run; done: every loop had its turn; "
+        "stopped: after failures or with the service; aborted: by somebody",
+        examples=["running"],
+    )
+    host: str = Field(description="The service that drives it", examples=["local"])
+    requested_by: str = Field(examples=["night shift"])
+    created_at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
+    ended_at: str | None = Field(description="UTC, ISO 8601, wall time")
+    request: dict[str, Any] = Field(description="The options asked for")
+    counts: dict[str, int] = Field(description="Number of loops by state", examples=[{"waiting": 12, "running": 4}])
+    failures: int = Field(description="Loops that ended without a proposal; aborted ones not counted", examples=[1])
+    stop_reason: StopReason | None = Field(description="Why no more loops are begun", examples=["failures"])
+    detail: str | None = Field(description="The same in words")
+
+
+class RetuneView(RetuneSummary):
+    loops: list[PartView] = Field(description="In the order in which they are begun")
+
+
+def install(app: FastAPI, jobs: Jobs, fleet: Fleet, view: Callable[[JobRow], JobView]) -> None:
+    """Adds the routes. view: a job as the API shows it."""
+    router = APIRouter()
+
+    @router.get(
+        "/loops",
+        tags=["loops"],
+        summary="The configured loops of every host, by tag",
+        responses={**LINK, **problems.responses(422)},
+    )
+    def loops(
+        response: Response,
+        state: Annotated[
+            LoopFilter | None,
+            Query(description="Only busy ones (a job has them), idle ones, or by the state of their latest job"),
+        ] = None,
+        limit: Limit = 1000,
+        cursor: Annotated[
+            str | None, Query(max_length=64, description="From the URL of the next page, as it came")
+        ] = None,
+    ) -> list[LoopView]:
+        busy, last = jobs.store.busy(), jobs.store.last_states()
+        found: list[LoopView] = []
+        for config, host in sorted(jobs.everywhere(), key=lambda one: one[0].tag):
+            if cursor is not None and config.tag <= cursor:
+                continue
+            if not _is(state, config.tag in busy, last.get(config.tag)):
+                continue
+            if len(found) == limit:
+                more(response, "/loops", found[-1].tag, state=state, limit=limit)
+                break
+            found.append(LoopView(**loop_view(config, host, busy.get(config.tag), last.get(config.tag))))
+        return found
+
+    @router.get(
+        "/loops/{tag}/jobs",
+        tags=["loops"],
+        summary="The jobs of a loop, the latest first",
+        responses={**LINK, **problems.responses(404, 422)},
+    )
+    def history(tag: Tag, response: Response, limit: Limit = 50, cursor: Cursor = None) -> list[JobView]:
+        jobs.owner(tag)
+        rows = jobs.store.recent(tag, None, limit + 1, cursor)
+        if len(rows) > limit:
+            more(response, f"/loops/{tag}/jobs", rows[limit - 1].number, limit=limit)
+        return [view(row) for row in rows[:limit]]
+
+    @router.get("/jobs", tags=["jobs"], summary="The latest jobs first", responses={**LINK, **problems.responses(422)})
+    def job_list(
+        response: Response,
+        loop: Annotated[str | None, Query(description="Only of this loop", examples=["TIC-101"])] = None,
+        state: Annotated[JobState | None, Query(description="Only in this state")] = None,
+        limit: Limit = 50,
+        cursor: Cursor = None,
+    ) -> list[JobView]:
+        rows = jobs.store.recent(loop, state, limit + 1, cursor)
+        if len(rows) > limit:
+            more(response, "/jobs", rows[limit - 1].number, loop=loop, state=state, limit=limit)
+        return [view(row) for row in rows[:limit]]
+
+    @router.post(
+        "/retunes",
+        tags=["retunes"],
+        summary="Retune many loops",
+        status_code=202,
+        responses=problems.responses(422, 503),
+    )
+    def retune_many(request: Request, response: Response, wish: Annotated[FleetRequest, Body()]) -> RetuneView:
+        row = fleet.start(wish)
+        response.headers["Location"] = str(request.url_for("retunes_one", retune_id=row.id).path)
+        return _view(*fleet.get(row.id))
+
+    @router.get(
+        "/retunes",
+        tags=["retunes"],
+        summary="The latest retunes of many loops first",
+        responses={**LINK, **problems.responses(422)},
+    )
+    def retunes_list(response: Response, limit: Limit = 20, cursor: Cursor = None) -> list[RetuneSummary]:
+        found = fleet.recent(limit + 1, cursor)
+        if len(found) > limit:
+            more(response, "/retunes", found[limit - 1][0].number, limit=limit)
+        return [RetuneSummary(**_summary(row, parts)) for row, parts in found[:limit]]
+
+    @router.get(
+        "/retunes/{retune_id}",
+        tags=["retunes"],
+        summary="How far a retune of many loops is",
+        responses=problems.responses(404),
+    )
+    def retunes_one(retune_id: RetuneId) -> RetuneView:
+        return _view(*fleet.get(retune_id))
+
+    @router.post(
+        "/retunes/{retune_id}/abort",
+        tags=["retunes"],
+        summary="Begin no more loops, and stop the jobs that run; their loops are restored",
+        status_code=202,
+        responses=problems.responses(404, 409, 422),
+    )
+    def abort(retune_id: RetuneId, decision: Annotated[Decision | None, Body()] = None) -> RetuneView:
+        fleet.abort(retune_id, (decision or Decision()).by)
+        return _view(*fleet.get(retune_id))
+
+    app.include_router(router)
+
+    @app.exception_handler(BadFleet)
+    async def _bad(_request: Request, error: BadFleet) -> JSONResponse:
+        return problems.problem(422, str(error), reason=Reason.BAD_INPUT)
+
+    @app.exception_handler(NoSuchRetune)
+    async def _unknown(_request: Request, error: NoSuchRetune) -> JSONResponse:
+        return problems.problem(404, str(error))
+
+    @app.exception_handler(RetuneOver)
+    async def _over(_request: Request, error: RetuneOver) -> JSONResponse:
+        return problems.problem(409, str(error))
+
+
+def _is(wanted: LoopFilter | None, busy: bool, last: str | None) -> bool:
+    if wanted is None:
+        return True
+    if wanted in ("busy", "idle"):
+        return busy == (wanted == "busy")
+    return wanted == last
+
+
+def _summary(row: RetuneRow, parts: list[Part]) -> dict[str, Any]:
+    may_begin = row.stop_reason is None
+    return {
+        "id": row.id,
+        "url": f"/retunes/{row.id}",
+        "state": row.state,
+        "host": row.host,
+        "requested_by": row.requested_by,
+        "created_at": row.created_at,
+        "ended_at": row.ended_at,
+        "request": row.request,
+        "counts": dict(Counter(part.state(may_begin) for part in parts)),
+        "failures": sum(part.failed for part in parts),
+        "stop_reason": row.stop_reason,
+        "detail": row.detail,
+    }
+
+
+def _view(row: RetuneRow, parts: list[Part]) -> RetuneView:
+    may_begin = row.stop_reason is None
+    loops = [
+        PartView(
+            loop=part.loop,
+            state=part.state(may_begin),
+            job=None if part.job_id is None else f"/jobs/{part.job_id}",
+            reason=part.reason,
+            detail=part.detail,
+        )
+        for part in parts
+    ]
+    return RetuneView(**_summary(row, parts), loops=loops)

@@ -1,0 +1,195 @@
+"""Retunes of many loops in the store."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from sqlalchemy import select, update
+from sqlalchemy.orm import Session
+
+from service.security import audit
+from service.states import ACTIVE, JobState
+from service.store.clock import now
+from service.store.tables import JobRow, RetuneLoopRow, RetuneRow
+from tuning.reasons import Reason
+
+
+class RetuneState(StrEnum):
+    """The value is what the API shows and the database holds."""
+
+    RUNNING = "running"
+    STOPPING = "stopping"
+    DONE = "done"
+    STOPPED = "stopped"
+    ABORTED = "aborted"
+
+
+class StopReason(StrEnum):
+    """Why no more loops are begun."""
+
+    FAILURES = "failures"
+    OPERATOR = "operator"
+    SERVICE_STOPPED = "service_stopped"
+
+
+OPEN = (RetuneState.RUNNING, RetuneState.STOPPING)
+WAITING, SKIPPED = "waiting", "skipped"
+_FAILURES = frozenset({JobState.REFUSED, JobState.FAILED, JobState.INTERRUPTED})
+_NOBODYS_FAULT = frozenset({Reason.OPERATOR.value, Reason.SERVICE_STOPPED.value})
+
+
+class NoSuchRetune(Exception):
+    """No retune of that id."""
+
+    def __init__(self, retune_id: str) -> None:
+        super().__init__(f"there is no retune {retune_id}")
+
+
+class RetuneOver(Exception):
+    """The retune begins no more jobs, or has ended."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One loop of a retune with its job, as far as there is one."""
+
+    position: int
+    loop: str
+    job_id: str | None
+    job_state: JobState | None
+    reason: str | None
+    detail: str | None
+
+    @property
+    def active(self) -> bool:
+        return self.job_state in ACTIVE
+
+    @property
+    def waiting(self) -> bool:
+        """A job that the end of the service cut short is made up for."""
+        if self.job_state is None:
+            return self.detail is None
+        return self.job_state is JobState.ABORTED and self.reason == Reason.SERVICE_STOPPED.value
+
+    @property
+    def failed(self) -> bool:
+        """Ended without a proposal, and not because somebody or the end of the service stopped it."""
+        if self.job_state is None:
+            return self.detail is not None
+        if self.job_state is JobState.ABORTED:
+            return self.reason not in _NOBODYS_FAULT
+        return self.job_state in _FAILURES
+
+    def state(self, is_open: bool) -> str:
+        """`waiting`, `skipped`, or the state of its job. is_open: whether the retune may still begin it."""
+        if self.waiting and is_open:
+            return WAITING
+        return SKIPPED if self.job_state is None else self.job_state.value
+
+
+def add(session: Session, host: str, request: dict[str, Any], loops: Sequence[str], requested_by: str) -> RetuneRow:
+    """A new retune of these loops, in this order."""
+    row = RetuneRow(
+        id=secrets.token_hex(6),
+        host=host,
+        state=RetuneState.RUNNING.value,
+        request=request,
+        requested_by=requested_by,
+        created_at=now(),
+    )
+    session.add(row)
+    session.flush()
+    session.add_all(RetuneLoopRow(retune_id=row.id, position=n, loop=loop) for n, loop in enumerate(loops))
+    after = {"request": request, "loops": list(loops)}
+    audit.record(session, "retune_many", row.id, after=after, said_by=requested_by)
+    return row
+
+
+def find(session: Session, retune_id: str, lock: bool = False) -> RetuneRow:
+    """Raises NoSuchRetune. lock: nobody else, on whatever host, changes it before this transaction ends."""
+    wanted = select(RetuneRow).where(RetuneRow.id == retune_id)
+    row = session.scalars(wanted.with_for_update() if lock else wanted).one_or_none()
+    if row is None:
+        raise NoSuchRetune(retune_id)
+    return row
+
+
+def parts(session: Session, retune_id: str) -> list[Part]:
+    """Its loops in order."""
+    wanted = (
+        select(RetuneLoopRow, JobRow.state, JobRow.reason, JobRow.detail)
+        .outerjoin(JobRow, JobRow.id == RetuneLoopRow.job_id)
+        .where(RetuneLoopRow.retune_id == retune_id)
+        .order_by(RetuneLoopRow.position)
+    )
+    return [
+        Part(row.position, row.loop, row.job_id, JobState(state) if state else None, reason, detail or row.detail)
+        for row, state, reason, detail in session.execute(wanted)
+    ]
+
+
+def unfinished(session: Session, host: str) -> list[RetuneRow]:
+    """Those that the host has to drive, the oldest first."""
+    mine = (RetuneRow.host == host, RetuneRow.ended_at.is_(None))
+    return list(session.scalars(select(RetuneRow).where(*mine).order_by(RetuneRow.number)))
+
+
+def recent(session: Session, limit: int, before: int | None) -> Sequence[RetuneRow]:
+    """The latest first; before: only those with a smaller number."""
+    wanted = select(RetuneRow).order_by(RetuneRow.number.desc()).limit(limit)
+    if before is not None:
+        wanted = wanted.where(RetuneRow.number < before)
+    return session.scalars(wanted).all()
+
+
+def begins(retune_id: str, position: int) -> Callable[[Session, JobRow], None]:
+    """Notes the job that a loop gets, in the transaction that makes it: raises RetuneOver, and there is no job, when
+    the retune was stopped meanwhile."""
+
+    def write(session: Session, job: JobRow) -> None:
+        if find(session, retune_id, lock=True).state != RetuneState.RUNNING:
+            raise RetuneOver(retune_id)
+        _set(session, retune_id, position, job_id=job.id)
+
+    return write
+
+
+def give_up(session: Session, retune_id: str, position: int, detail: str) -> None:
+    """Notes why a loop will have no job."""
+    _set(session, retune_id, position, detail=detail)
+
+
+def stop(session: Session, retune_id: str, reason: StopReason, detail: str, by: str | None = None) -> bool:
+    """From now on it begins no more jobs. False when that was so already. by: whose wish it was, for the audit log.
+
+    Raises NoSuchRetune, and RetuneOver when it has ended.
+    """
+    row = find(session, retune_id, lock=True)
+    if row.state not in OPEN:
+        raise RetuneOver(f"retune {retune_id} is {row.state} already")
+    if row.stop_reason == StopReason.OPERATOR or row.stop_reason == reason:
+        return False
+    row.state, row.stop_reason, row.detail = RetuneState.STOPPING.value, reason.value, detail
+    if by is not None:
+        audit.record(session, "retune_many_abort", retune_id, after={"reason": reason.value}, said_by=by)
+    return True
+
+
+def end(session: Session, retune_id: str) -> None:
+    """Notes that nothing of it runs any more."""
+    row = find(session, retune_id, lock=True)
+    if row.stop_reason is None:
+        row.state = RetuneState.DONE.value
+    else:
+        aborted = row.stop_reason == StopReason.OPERATOR
+        row.state = (RetuneState.ABORTED if aborted else RetuneState.STOPPED).value
+    row.ended_at = now()
+
+
+def _set(session: Session, retune_id: str, position: int, **columns: str) -> None:
+    one = (RetuneLoopRow.retune_id == retune_id, RetuneLoopRow.position == position)
+    session.execute(update(RetuneLoopRow).where(*one).values(**columns))
