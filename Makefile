@@ -1,13 +1,13 @@
 # make demo    a loop is retuned before your eyes      make test    every test and every check
 # make setup   the Python environment in .venv         make check   types, style, import directions, packages
-# make bench   every benchmark, in one table
+# make bench   every benchmark, in one table           make validate    the five papers, recomputed
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEBIAN := user-mode-linux tshark can-utils iproute2 postgresql
 
-.PHONY: setup demo test check bench system clean
+.PHONY: setup demo test check bench validate system clean
 
 setup: $(VENV)/.installed
 
@@ -38,6 +38,10 @@ check: setup
 
 bench: setup
 	$(BIN)/python -m benchmarks
+
+# Writes docs/validation.md and its plots; fails when a number of a paper leaves its tolerance.
+validate: setup
+	$(BIN)/python -m validation
 
 clean:
 	rm -rf $(VENV) *.egg-info

@@ -14,7 +14,7 @@ from datetime import date
 from typing import Any
 
 WITH_VCAN = ("tools/with-vcan", "--timeout", "400", "--")
-BENCHMARKS = {"bus": WITH_VCAN, "rehearsal": (), "criterion": (), "response": (), "me_pso": (), "engine": ()}
+BENCHMARKS = {"bus": WITH_VCAN} | dict.fromkeys(("rehearsal", "criterion", "response", "me_pso", "engine", "tune"), ())
 
 
 def figures(name: str) -> dict[str, Any]:
@@ -39,6 +39,7 @@ def table(
     response: dict[str, Any],
     me_pso: dict[str, Any],
     engine: dict[str, Any],
+    tune: dict[str, Any],
 ) -> list[str]:
     def row(what: str, figure: str, goal: str = "", met: bool | None = None) -> str:
         return f"| {what} | {figure} | {goal} | {'' if met is None else 'met' if met else '**missed**'} |"
@@ -134,6 +135,13 @@ def table(
             f"{engine['processors']} processors, {engine['sample']} jobs each time",
             "/".join(f"{rate:.0f}" for rate in engine["jobs_per_min"].values()) + " jobs per minute",
         ),
+        row(
+            f"loopwright tune --method all, start to exit, slowest of {tune['models']} models ({tune['slowest']})",
+            f"{tune['wall_s']:.2f} s",
+            "2 s",
+            tune["wall_s"] <= 2.0,
+        ),
+        row("the same, peak memory", f"{tune['peak_MB']:.0f} MB", "under 200 MB", tune["peak_MB"] < 200),
     ]
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import typer
 
-from service import cli_data, cli_keys
+from service import cli_data, cli_keys, cli_tuning
+from service.cli_output import AsJson, die, print_json, read_json_object
 from service.client import DEFAULT_URL, ApiError, Client
 
 app = typer.Typer(
@@ -23,7 +23,6 @@ app.add_typer(cli_data.app)
 _HAND_OVER: dict[str, Any] = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
 Url = Annotated[str, typer.Option("--url", envvar="LOOPWRIGHT_URL", help="Where the service is.")]
-AsJson = Annotated[bool, typer.Option("--json", help="JSON, for scripts.")]
 
 
 def main() -> None:
@@ -106,7 +105,7 @@ def serve(
     from service.store.store import FolderInUse, ForeignLoop
 
     if log_format not in ("text", "json"):
-        _die(f"--log-format must be text or json, not {log_format!r}", 2)
+        die(f"--log-format must be text or json, not {log_format!r}", 2)
     limits = RequestLimits(
         body_bytes=max_body,
         rate_per_s=rate,
@@ -122,11 +121,11 @@ def serve(
     try:
         run(setup)
     except (ConfigError, FolderInUse, ForeignLoop, BadDatabase, NotSafe) as error:
-        _die(str(error), 2)
+        die(str(error), 2)
     except SQLAlchemyError as error:
-        _die(f"the database cannot be used: {getattr(error, 'orig', None) or error}", 2)
+        die(f"the database cannot be used: {getattr(error, 'orig', None) or error}", 2)
     except OSError as error:
-        _die(f"cannot listen on {bind}:{port} or write to {data}: {error.strerror or error}", 2)
+        die(f"cannot listen on {bind}:{port} or write to {data}: {error.strerror or error}", 2)
 
 
 @app.command("loops")
@@ -136,7 +135,7 @@ def list_loops(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
 
     found = Client(url).get("/loops")
     if as_json:
-        _print_json(found)
+        print_json(found)
         return
     show.rows(
         "loops",
@@ -173,7 +172,7 @@ def retune(
     elif wait:
         job = show.follow(client, job["url"])
     if as_json:
-        _print_json(job)
+        print_json(job)
     else:
         show.job_report(job)
     if wait and job["state"] != "proposed":
@@ -191,7 +190,7 @@ def list_jobs(
 
     found = Client(url).get("/jobs", loop=loop)
     if as_json:
-        _print_json(found)
+        print_json(found)
         return
     lines = ((x["id"], x["loop"], x["state"], x["stage"], x["progress"], x["reason"], x["created_at"]) for x in found)
     show.rows("jobs", ("id", "loop", "state", "stage", "progress", "reason", "created"), lines)
@@ -214,12 +213,12 @@ def one_job(
     path = f"/jobs/{job_id}"
     wishes = [name for name, wanted in (("abort", abort), ("accept", accept), ("rollback", rollback)) if wanted]
     if len(wishes) > 1:
-        _die("one decision at a time", 2)
+        die("one decision at a time", 2)
     job = client.post(f"{path}/{wishes[0]}", {"by": "cli"}) if wishes else client.get(path)
     if follow:
         job = show.follow(client, path)
     if as_json:
-        _print_json(job)
+        print_json(job)
     else:
         show.job_report(job)
 
@@ -235,14 +234,7 @@ def rehearse_file(
     from service.rehearsal import rehearse
     from tuning.plan import Event, StageStarted
 
-    try:
-        spec = json.loads(plant_file.read_text(encoding="utf-8"))
-    except OSError as error:
-        _die(f"{plant_file}: {error.strerror}", 2)
-    except ValueError as error:
-        _die(f"{plant_file}: not JSON: {error}", 2)
-    if not isinstance(spec, dict):
-        _die(f"{plant_file}: expected one JSON object", 2)
+    spec = read_json_object(plant_file)
 
     def tell(event: Event) -> None:
         if isinstance(event, StageStarted):
@@ -252,9 +244,14 @@ def rehearse_file(
     listener = None if as_json else tell
     answer = rehearse(spec, method=method, on_event=listener)
     if as_json:
-        _print_json(answer)
+        print_json(answer)
     else:
         show.console.print_json(data={k: v for k, v in answer.items() if k not in ("stages", "input")})
+
+
+app.command("methods")(cli_tuning.methods)
+app.command("tune")(cli_tuning.tune)
+app.command("identify")(cli_tuning.identify)
 
 
 @app.command()
@@ -271,13 +268,4 @@ def demo(
     try:
         run_demo(folder, speed, hub_only)
     except DemoFailed as error:
-        _die(str(error), 1)
-
-
-def _print_json(value: object) -> None:
-    print(json.dumps(value, indent=2, allow_nan=False))
-
-
-def _die(text: str, status: int) -> NoReturn:
-    print(f"loopwright: {text}", file=sys.stderr)
-    raise typer.Exit(status)
+        die(str(error), 1)

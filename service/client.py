@@ -1,13 +1,14 @@
-"""The service's HTTP API as the command line uses it."""
+"""The service's HTTP API as the command line uses it. httpx is imported where it is used: most commands need none."""
 
 from __future__ import annotations
 
 import json
 import os
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import httpx
+if TYPE_CHECKING:
+    import httpx
 
 DEFAULT_URL = "http://127.0.0.1:8080"
 KEY_VARIABLE = "LOOPWRIGHT_KEY"
@@ -22,6 +23,8 @@ class Client:
     """One service."""
 
     def __init__(self, url: str) -> None:
+        import httpx
+
         self.url = url.rstrip("/")
         key = os.environ.get(KEY_VARIABLE)
         headers = {"Authorization": f"Bearer {key}"} if key else {}
@@ -35,6 +38,8 @@ class Client:
 
     def events(self, job_url: str) -> Iterator[tuple[str, dict[str, Any]]]:
         """(kind, data) of each event of a job until it is over; resumes when the connection breaks."""
+        import httpx
+
         last, failures = "0", 0
         while True:
             try:
@@ -59,6 +64,8 @@ class Client:
                     raise ApiError(f"{self.url}: {error}") from error
 
     def _json(self, method: str, path: str, **more: Any) -> Any:
+        import httpx
+
         try:
             answer = self._http.request(method, path, **more)
         except httpx.TransportError as error:

@@ -138,8 +138,12 @@ class ComplexCriterion:
 
 
 def _indices(e: Reals, u: Reals, slopes: Reals, dt: float) -> Indices:
-    """e, u: (p, n), u of which the first and last samples may jump.  slopes: (p,), sum of the derivatives' sizes."""
-    size = np.abs(e)
+    """e, u: (p, n), u of which the first and last samples may jump.  slopes: (p,), sum of the derivatives' sizes.
+
+    e is overwritten.
+    """
+    overshoot = np.maximum(-e.min(axis=1), 0.0)
+    size = np.abs(e, out=e)
     steps = size.shape[1] - 1
     outside = size > BAND
     last = steps - np.argmax(outside[:, ::-1], axis=1)
@@ -160,7 +164,7 @@ def _indices(e: Reals, u: Reals, slopes: Reals, dt: float) -> Indices:
     return Indices(
         MIE=mean(e),
         MIC=mean(u),
-        overshoot=np.maximum(-e.min(axis=1), 0.0),
+        overshoot=overshoot,
         settling=settling,
         terminal=np.maximum(size[:, -1] - BAND, 0.0) + slopes,
     )
@@ -243,16 +247,26 @@ class _Delayed:
         self.steps = self.blocks * self.inside
         at = np.arange(self.inside) / self.inside
         self._value, self._area = self.loop.values(at), self.loop.areas(at)
+        self._held: Reals | None = None
 
     def sample(self, kp: Reals, ki: Reals) -> tuple[Reals, Reals, Reals]:
+        """e and u are overwritten by the next call: new memory for every swarm takes longer than the arithmetic."""
         once, start = self.loop.maps(kp, ki), self.loop.start(kp)
         advance = once
         for _ in range(self.squarings):
             advance = advance @ advance
         states = _powers(advance, start, self.blocks + 1)
         errors, integral = states[:, :, self.loop.errors], states[:, :, -1:]
-        e = errors @ self._value.T
-        u = kp[:, None, None] * e + integral + ki[:, None, None] * (errors @ self._area.T)
+        if self._held is None or self._held.shape[1] != len(kp):
+            self._held = np.empty((3, len(kp), self.blocks + 1, self.inside))
+        e, u, area = self._held
+        np.matmul(errors, self._value.T, out=e)
+        np.matmul(errors, self._area.T, out=area)
+        np.multiply(kp[:, None, None], e, out=u)
+        u += integral
+        area *= ki[:, None, None]
+        u += area
+        u += self.loop.u_rest
         shape = (len(kp), -1)
         # derivatives at the horizon's end, or at most one block before it
         before = states[:, max(self.blocks - (1 if self.squarings else 2), 0)]
@@ -260,7 +274,7 @@ class _Delayed:
         slopes = np.abs(self.loop.rates(before, after, kp, ki)).sum(axis=1)
         return (
             e.reshape(shape)[:, : self.steps + 1],
-            u.reshape(shape)[:, : self.steps + 1] + self.loop.u_rest,
+            u.reshape(shape)[:, : self.steps + 1],
             slopes,
         )
 

@@ -52,7 +52,8 @@ class Option:
             return None
         if self.kind == "choice":
             for choice in self.choices:
-                if value == choice and not isinstance(value, bool):
+                # a choice that reads as a number may come as one
+                if (value == choice or str(value) == choice) and not isinstance(value, bool):
                     return choice
             raise _bad(name, value, "one of " + ", ".join(f"{c}" for c in self.choices))
         if self.kind == "flag":

@@ -12,7 +12,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 from tuning.figures import StepFigures, response_figures
 from tuning.gains import Gains
@@ -191,7 +190,12 @@ def _lagged(v: Reals, steps: float) -> Reals:
     w1 = 1.0 - steps * (1.0 - decay)
     w0 = 1.0 - decay - w1
     found = np.zeros_like(v)
-    found[:, 1:] = lfilter([1.0], [1.0, -decay], w0 * v[:, :-1] + w1 * v[:, 1:], axis=1)
+    found[:, 1:] = w0 * v[:, :-1] + w1 * v[:, 1:]
+    # found[n] += decay found[n - 1] for all n, by doubling: scipy's lfilter costs 0.2 s of import
+    shift = 1
+    while shift < v.shape[1] and (weight := decay**shift) > 1e-20:
+        found[:, shift:] += weight * found[:, :-shift]
+        shift *= 2
     fading = decay ** np.arange(v.shape[1])
     start = 0.0
     for block in found:

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
 from fastapi.responses import PlainTextResponse, StreamingResponse
 
-from service.api import contract, operations, problems
+from service.api import contract, operations, problems, tunings
 from service.api.access import Access
 from service.api.stream import event_stream
 from service.api.views import (
@@ -188,6 +188,7 @@ def create_app(
     def rollback(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
         return view(jobs.rollback(job_id, (decision or Decision()).by))
 
+    app.include_router(tunings.router(jobs))
     return app
 
 

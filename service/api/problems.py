@@ -14,9 +14,11 @@ from starlette.exceptions import HTTPException
 
 from service.jobs import Conflict, Stopping, UnknownLoop
 from service.journal import temporary
+from service.model_forms import BadModel
 from service.request import BadLimits
 from service.states import IllegalMove
 from service.store.store import Busy, NoSuchJob
+from service.tunings import BadTuning
 from tuning.reasons import ADVICE, Ended, Reason
 
 MEDIA_TYPE = "application/problem+json"
@@ -64,6 +66,11 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(BadLimits)
     async def _limits(_request: Request, error: BadLimits) -> JSONResponse:
         return problem(422, str(error), reason=Reason.BAD_LIMITS)
+
+    @app.exception_handler(BadModel)
+    @app.exception_handler(BadTuning)
+    async def _input(_request: Request, error: Exception) -> JSONResponse:
+        return problem(422, str(error), reason=Reason.BAD_INPUT)
 
     @app.exception_handler(UnknownLoop)
     @app.exception_handler(NoSuchJob)

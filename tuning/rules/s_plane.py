@@ -301,7 +301,7 @@ class _Rational:
         return np.asarray(self.roots(gains).real.max(axis=1) < -STABLE_BY)
 
     def squares(self, gains: Reals) -> tuple[Reals, Reals]:
-        """(integral of e^2, of e'^2 after t = 0), each (p,)."""
+        """(integral of e^2, of e'^2 after t = 0), each (p,); infinite where a loop is on the edge of stability."""
         P = self.polynomials(gains)
         e = np.broadcast_to(self.a, (len(P), len(self.a))) / P[:, :1]
         # the jump at t = 0 is not a rate: s*E - e(0+)
@@ -313,8 +313,20 @@ class _Rational:
         system = np.einsum("pij,kl->pikjl", A, identity) + np.einsum("ij,pkl->pikjl", identity, A)
         side = np.zeros((len(P), size, 1))
         side[:, 0] = -1.0
-        W = np.linalg.solve(system.reshape(-1, size, size), side).reshape(A.shape)
-        return np.einsum("pi,pij,pj->p", e, W, e), np.einsum("pi,pij,pj->p", rate[:, 1:], W, rate[:, 1:])
+        W = _solved(system.reshape(-1, size, size), side).reshape(A.shape)
+        J0, J1 = (np.einsum("pi,pij,pj->p", f, W, f) for f in (e, rate[:, 1:]))
+        return np.where(np.isnan(J0), np.inf, J0), np.where(np.isnan(J1), np.inf, J1)
+
+
+def _solved(systems: Reals, sides: Reals) -> Reals:
+    """Of linear systems, NaN where one is singular: at an end of the admissible alphas, where gains run to infinity,
+    it may be so or not, as the processor rounds."""
+    try:
+        return np.asarray(np.linalg.solve(systems, sides))
+    except np.linalg.LinAlgError:
+        if len(systems) == 1:
+            return np.full(sides.shape, np.nan)
+        return np.concatenate([_solved(systems[i : i + 1], sides[i : i + 1]) for i in range(len(systems))])
 
 
 class _Delayed:

@@ -18,7 +18,7 @@ from tuning.gains import Gains
 from tuning.margins import margins
 from tuning.models import FOPDT, SOPDT, Integrating, Model, Reals, TransferFunction
 from tuning.reasons import Reason, Refused
-from tuning.rules.s_plane import Design, Minimum, design, s_plane
+from tuning.rules.s_plane import Design, Minimum, _Rational, design, s_plane
 
 TAU_S, K1 = S_PLANE["tau"], S_PLANE["objects"]["third"]["k1"]
 ROWS = [
@@ -280,6 +280,14 @@ def test_a_slow_root_is_not_taken_for_a_lower_J() -> None:
     chosen = s_plane(OBJECTS["second_identified"], mu=0.4, tau_s=TAU_S)
     assert chosen.chosen["alpha_per_s"] == found.minima[0].alpha
     assert any("not taken" in note for note in chosen.notes)
+
+
+def test_a_loop_on_the_edge_of_stability_has_no_finite_J() -> None:
+    # s^2 + 1: its Lyapunov equation is singular; the loop beside it is not touched
+    J0, J1 = _Rational(TransferFunction((1.0,), (1.0, 1.0))).squares(np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0]]))
+    expected = J0_J1(np.array([1.0, 1.0]), np.array([1.0]), np.array([1.0, 1.0]))
+    assert (J0[0], J1[0]) == (math.inf, math.inf)
+    assert (J0[1], J1[1]) == pytest.approx(expected, rel=1e-12)
 
 
 def test_a_creeping_answer_is_said() -> None:

@@ -1,0 +1,60 @@
+"""Routes over models: the methods, and tunings of a model that was typed in or that a job found."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Query
+
+from service import tunings
+from service.alternatives import alternatives
+from service.api import problems
+from service.api.tuning_views import AlternativesView, MethodView, TuningRequest, TuningsView
+from service.jobs import Jobs
+from service.model_forms import parse_model
+
+
+def router(jobs: Jobs) -> APIRouter:
+    """GET /methods, POST /tunings, GET /jobs/{job_id}/alternatives."""
+    routes = APIRouter()
+    one_at_a_time = asyncio.Semaphore(1)
+
+    async def computed(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        # a second of arithmetic each: many at once would crowd out the threads that attend to live loops
+        async with one_at_a_time:
+            return await asyncio.to_thread(work)
+
+    @routes.get("/methods", tags=["tunings"], summary="The tuning methods")
+    def methods() -> list[MethodView]:
+        return [MethodView(**each) for each in tunings.methods_json()]
+
+    @routes.post(
+        "/tunings",
+        tags=["tunings"],
+        summary="Tune a model by one method or all",
+        responses=problems.responses(422),
+    )
+    async def tune(request: TuningRequest) -> TuningsView:
+        model = parse_model(request.model)
+        return TuningsView(**await computed(lambda: tunings.tunings(model, request.method, request.options)))
+
+    @routes.get(
+        "/jobs/{job_id}/alternatives",
+        tags=["jobs"],
+        summary="What other methods make of the job's model",
+        responses=problems.responses(404, 409, 422),
+    )
+    async def job_alternatives(
+        job_id: Annotated[str, Path(description="Id of the job", examples=["4f0c2a9be113"])],
+        method: Annotated[
+            str | None, Query(description="Only this one; without it all but the slow one, me-pso", examples=["me-pso"])
+        ] = None,
+    ) -> AlternativesView:
+        def work() -> dict[str, Any]:
+            return alternatives(jobs.store.get(job_id), jobs.store.events(job_id), method)
+
+        return AlternativesView(**await computed(work))
+
+    return routes

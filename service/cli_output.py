@@ -1,0 +1,43 @@
+"""What the commands have in common: JSON in and out, and how they end when they cannot go on."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+AsJson = Annotated[bool, typer.Option("--json", help="JSON, for scripts.")]
+
+
+def print_json(value: object) -> None:
+    print(json.dumps(value, indent=2, allow_nan=False))
+
+
+def die(text: str, status: int) -> NoReturn:
+    print(f"loopwright: {text}", file=sys.stderr)
+    raise typer.Exit(status)
+
+
+def read_json_object(path: Path) -> dict[str, Any]:
+    """The JSON object in a file; dies with status 2 for a file that has none."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        die(f"{path}: {error.strerror}", 2)
+    except UnicodeDecodeError as error:
+        die(f"{path}: is not text in UTF-8: byte {error.start}", 2)
+    return json_object(text, str(path))
+
+
+def json_object(text: str, source: str) -> dict[str, Any]:
+    """The JSON object in a text; dies with status 2 if there is none. `source` names it in the error."""
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        die(f"{source}: not JSON: {error}", 2)
+    if not isinstance(found, dict):
+        die(f"{source}: expected one JSON object", 2)
+    return found

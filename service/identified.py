@@ -1,0 +1,46 @@
+"""A model identified from a record, or the refusal, as the JSON object of `loopwright identify`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from service.model_forms import dump_model
+from service.record import Record
+from service.tunings import finite
+from tuning.identify import Identified
+from tuning.reasons import Refused
+
+
+def identified(found: Identified, record: Record) -> dict[str, Any]:
+    """Errors, noise_std and rms in the units of what they are of; fits in percent."""
+    answer: dict[str, Any] = finite(
+        {
+            "outcome": "identified",
+            "reason": None,
+            "detail": None,
+            "advice": None,
+            "model": dump_model(found.model),
+            "standard_errors": found.standard_errors,
+            "fit_pct": found.fit_pct,
+            "r2_pct": found.r2_pct,
+            "noise_std": found.noise_std,
+            "whiteness": found.whiteness,
+            "explained": found.explained,
+            "samples": len(record.t),
+            "candidates": [asdict(each) for each in found.candidates],
+            "notes": list(found.notes),
+        }
+    )
+    return answer
+
+
+def refused(refusal: Refused) -> dict[str, Any]:
+    """The same object's first fields, and no model."""
+    return {
+        "outcome": "refused",
+        "reason": refusal.reason.value,
+        "detail": refusal.detail,
+        "advice": refusal.advice,
+        "model": None,
+    }

@@ -1,0 +1,170 @@
+"""GET /methods, POST /tunings and the alternatives to what a job proposes."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from service.model_forms import parse_model
+from service.request import RetuneRequest
+from service.tunings import tunings
+from tests.unit.service.fakes import RESULT, Service
+from tests.unit.service.test_api import assert_problem, finished, start
+from tuning.design import design
+from tuning.methods import METHODS
+from tuning.models import FOPDT, SOPDT
+from tuning.reasons import Reason, Refused
+
+FAST = [name for name, method in METHODS.items() if not method.slow]
+
+
+def test_methods(client: TestClient) -> None:
+    found = {each["method"]: each for each in client.get("/methods").json()}
+    assert list(found) == list(METHODS)
+    for name, method in METHODS.items():
+        assert found[name]["source"] == method.source and set(found[name]["options"]) == set(method.options)
+    assert found["kappa-tau"]["options"]["Ms"]["choices"] == [1.4, 2.0]
+
+
+def test_one_method(client: TestClient) -> None:
+    body = {"model": {"K": 2, "T": 10, "L": 8}, "method": "simc", "options": {"tau_c_s": 4}}
+    found = client.post("/tunings", json=body).json()
+    (simc,) = found["methods"]
+    assert found["model"] == {"K": 2.0, "T": 10.0, "L": 8.0}
+    assert simc["outcome"] == "tuned" and simc["gains"]["form"] == "ISA"
+    # k e^(-Ls)/s is left, k = 1/12
+    assert simc["gains"]["Kp"] == pytest.approx(5.0 / 12.0) and simc["gains"]["Ti"] == 10.0
+    assert simc["margins"]["PM_deg"] == pytest.approx(90.0 - math.degrees(8.0 / 12.0))
+
+
+def test_all_methods_as_the_command_line_has_them(client: TestClient) -> None:
+    body = {"model": {"K": 0.1, "L": 3, "integrating": True}}
+    answer = client.post("/tunings", json=body)
+    assert answer.status_code == 200
+    assert answer.json() == tunings(parse_model(body["model"]))
+    refused = [each for each in answer.json()["methods"] if each["outcome"] == "refused"]
+    assert {each["reason"] for each in refused} >= {"not_self_regulating"}
+
+
+def test_a_refusal_is_an_answer(client: TestClient) -> None:
+    body = {"model": {"K": 0.1, "L": 3, "integrating": True}, "method": "robust"}
+    (found,) = client.post("/tunings", json=body).json()["methods"]
+    assert (found["outcome"], found["reason"], found["gains"]) == ("refused", "not_self_regulating", None)
+    assert found["advice"]
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ({}, "model"),
+        ({"model": 1}, "model"),
+        ({"model": {"K": 2}}, "T, L: missing"),
+        ({"model": {"K": 2, "T": -1, "L": 0}}, "T must be a number > 0 (s), not -1"),
+        ({"model": {"K": 2, "T": 1, "L": 1}, "method": "magic"}, "method must be one of"),
+        ({"model": {"K": 2, "T": 1, "L": 1}, "method": "simc", "options": {"Ms": 1}}, "no option 'Ms'"),
+        ({"model": {"K": 2, "T": 1, "L": 1}, "options": {"tau_c_s": "fast"}}, "tau_c_s must be"),
+        ({"model": {"K": 2, "T": 1, "L": 1}, "options": {"tau_c_s": [1]}}, "tau_c_s must be"),
+        ({"model": {"K": 2, "T": 1, "L": 1}, "surplus": 1}, "surplus"),
+    ],
+)
+def test_bad_requests(client: TestClient, body: dict[str, Any], words: str) -> None:
+    problem = assert_problem(client.post("/tunings", json=body), 422)
+    assert problem["reason"] == "bad_input" and words in problem["detail"]
+
+
+def test_nan_is_a_problem(client: TestClient) -> None:
+    text = '{"model": {"K": NaN, "T": 1, "L": 1}}'
+    answer = client.post("/tunings", content=text, headers={"content-type": "application/json"})
+    assert "K must be a finite number" in assert_problem(answer, 422)["detail"]
+
+
+def test_alternatives_to_a_proposal(service: Service, client: TestClient) -> None:
+    job = finished(service, client)
+    found = client.get(f"{job['url']}/alternatives").json()
+    assert (found["job"], found["loop"]) == (job["id"], job["loop"])
+    # the job's model, in the form that POST /tunings takes
+    assert found["model"] == {"K": 2.0, "T": 3.0, "L": 1.0}
+    assert [each["method"] for each in found["methods"]] == FAST
+    tried = {each["method"] for each in found["methods"] if each["retune"]}
+    assert {"simc", "amigo", "robust"} <= tried < set(FAST)
+    for each in found["methods"]:
+        if each["outcome"] == "refused":
+            assert each["retune"] is None
+            continue
+        try:
+            design(each["method"], FOPDT(2.0, 3.0, 1.0), None)
+        except Refused as refused:
+            assert refused.reason is Reason.NOT_ROBUST and each["retune"] is None
+        else:
+            asked = RetuneRequest(**each["retune"])
+            assert asked.start == "optimise" and asked.method == each["method"]
+            assert asked.model and asked.model.plant() == FOPDT(2.0, 3.0, 1.0)
+    direct = client.post("/tunings", json={"model": found["model"], "method": "amigo"}).json()["methods"][0]
+    (amigo,) = [each for each in found["methods"] if each["method"] == "amigo"]
+    assert {name: value for name, value in amigo.items() if name != "retune"} == direct
+    client.post(f"{job['url']}/accept")
+    assert client.get(f"{job['url']}/alternatives").json() == found
+
+
+def test_the_slow_method_on_request(service: Service, client: TestClient) -> None:
+    job = finished(service, client)
+    assert "me-pso" not in FAST
+    (found,) = client.get(f"{job['url']}/alternatives?method=me-pso").json()["methods"]
+    assert found["outcome"] == "tuned" and found["retune"]["method"] == "me-pso"
+    problem = assert_problem(client.get(f"{job['url']}/alternatives?method=magic"), 422)
+    assert problem["reason"] == "bad_input"
+
+
+def test_unstable_gains_are_not_to_be_tried(
+    service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from service import tunings as module
+    from tuning.assess import assess
+    from tuning.gains import Gains
+
+    # a hundred times the gains that the method found
+    monkeypatch.setattr(module, "realisable", lambda gains, _filter: (Gains(100.0 * gains.Kp, gains.Ti), ()))
+    job = finished(service, client)
+    (found,) = client.get(f"{job['url']}/alternatives?method=simc").json()["methods"]
+    assert not assess(FOPDT(2.0, 3.0, 1.0), Gains(found["gains"]["Kp"], found["gains"]["Ti"])).stable
+    assert found["outcome"] == "tuned" and found["margins"]["stable"] is False and found["retune"] is None
+
+
+def test_a_second_order_model(service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(RESULT, "model", {"K": 2.0, "T_s": 6.0, "L_s": 3.0, "zeta": 0.5, "k_source": "fit"})
+    job = finished(service, client)
+    found = client.get(f"{job['url']}/alternatives?method=direct-synthesis").json()
+    assert parse_model(found["model"]) == SOPDT(2.0, 6.0, 0.5, 3.0)
+    asked = RetuneRequest(**found["methods"][0]["retune"])
+    assert asked.model and asked.model.plant() == SOPDT(2.0, 6.0, 0.5, 3.0)
+
+
+def test_a_refused_job_whose_stages_found_a_model(service: Service, client: TestClient) -> None:
+    service.tune.ends = Refused(Reason.NOT_ROBUST, "Ms 2.4")
+    job = finished(service, client)
+    assert_problem(client.get(f"{job['url']}/alternatives"), 409)
+    for K in (1.0, 2.0):
+        result = {"K": K, "T_s": 3.0, "L_s": 1.0, "k_source": "k5", "k5": K, "ke": None}
+        service.store.append(job["id"], "stage_done", {"stage": "estimate", "result": result}, 1.0)
+    service.store.append(job["id"], "stage_done", {"stage": "optimise", "result": None}, 1.0)
+    found = client.get(f"{job['url']}/alternatives?method=simc").json()
+    assert job["state"] == "refused" and found["model"] == {"K": 2.0, "T": 3.0, "L": 1.0}
+
+
+def test_a_refused_job_whose_model_was_typed_in(service: Service, client: TestClient) -> None:
+    service.tune.ends = Refused(Reason.NOT_CONFIRMED, "overshoot 60 %")
+    model = {"K": 2.0, "T_s": 6.0, "L_s": 3.0, "zeta": 0.5}
+    job = finished(service, client, start="optimise", model=model)
+    found = client.get(f"{job['url']}/alternatives?method=direct-synthesis").json()
+    assert job["state"] == "refused" and found["model"] == {"K": 2.0, "T": 6.0, "zeta": 0.5, "L": 3.0}
+
+
+def test_jobs_without_a_model(service: Service, client: TestClient) -> None:
+    assert_problem(client.get("/jobs/none/alternatives"), 404)
+    service.tune.hold.clear()
+    job_id = start(client)
+    service.tune.inside.wait(5)
+    assert "not over" in assert_problem(client.get(f"/jobs/{job_id}/alternatives"), 409)["detail"]

@@ -1,0 +1,291 @@
+"""`loopwright methods`, `tune` and `identify`: what they answer, and what they say of bad input."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from plantsim.plant import LinearPlant
+from service.cli import app
+from tuning.methods import METHODS
+from tuning.reasons import Reason
+
+MODELS = {
+    "lag-dominant": '{"K": 2, "T": 50, "L": 2}',
+    "balanced": '{"K": 2, "T": 10, "L": 8}',
+    "delay-dominant": '{"K": 1, "T": 2, "L": 10}',
+    "second-order": '{"K": 2, "T1": 10, "T2": 4, "L": 3}',
+    "integrating": '{"K": 0.1, "L": 3, "integrating": true}',
+    "inverse-response": '{"num": [-2, 1], "den": [15, 8, 1], "dead_time_s": 1}',
+}
+SELF_REGULATING_ONLY = {"cohen-coon", "chr", "kappa-tau", "direct-synthesis", "robust"}
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(app, list(arguments))
+
+
+def answer(*arguments: str) -> dict[str, Any]:
+    """Of a command with --json: strict JSON and nothing else on standard output."""
+    result = run(*arguments, "--json")
+    assert result.exit_code == 0, result.output
+    return strict(result.stdout)
+
+
+def strict(text: str) -> Any:
+    def no(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(text, parse_constant=no)
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
+def test_all_methods_on_six_models(model: str) -> None:
+    found = answer("tune", "--model", model)
+    assert [each["method"] for each in found["methods"]] == list(METHODS)
+    tuned = [each for each in found["methods"] if each["outcome"] == "tuned"]
+    refused = {each["method"] for each in found["methods"] if each["outcome"] == "refused"}
+    assert len(tuned) >= 9
+    for each in tuned:
+        gains, margins = each["gains"], each["margins"]
+        assert each["reason"] is None and gains["form"] == "ISA" and gains["Kp"] > 0.0
+        assert each["parallel"]["Ki"] == pytest.approx(gains["Kp"] / gains["Ti"])
+        assert each["parallel"]["Kd"] == pytest.approx(gains["Kp"] * gains["Td"])
+        # realisable: no derivative without its filter, none on the set-point
+        assert gains["Td"] == 0.0 or (gains["Tf"] > 0.0 and gains["c"] == 0.0)
+        assert margins["stable"] is True
+        # |1/S| >= 1/Ms on the circle: the classical bounds on both margins
+        assert margins["PM_deg"] >= 2.0 * math.degrees(math.asin(0.5 / margins["Ms"])) - 1e-6
+        assert margins["GM"] is None or margins["GM"] >= margins["Ms"] / (margins["Ms"] - 1.0) - 1e-6
+        for figures in (each["setpoint"], each["load"]):
+            assert figures["IAE"] > 0.0 and figures["settling_s"] > 0.0 and figures["TV"] > 0.0
+        # the load's error integrates to Ti/Kp, and its size to no less
+        assert each["load"]["IAE"] >= 0.999 * gains["Ti"] / gains["Kp"]
+    for each in found["methods"]:
+        if each["outcome"] == "refused":
+            assert Reason(each["reason"]) and each["detail"] and each["advice"]
+            assert each["gains"] is None and each["margins"] is None and each["setpoint"] is None
+    if "integrating" in model:
+        assert refused >= SELF_REGULATING_ONLY
+    else:
+        assert {"simc", "robust", "me-pso"}.isdisjoint(refused)
+
+
+def test_one_method_by_its_equation() -> None:
+    found = answer("tune", "--model", MODELS["balanced"], "--method", "simc", "--option", "tau_c_s=4")
+    (simc,) = found["methods"]
+    # Kp = T/(K (tau_c + L)), Ti = min(T, 4 (tau_c + L))
+    assert simc["gains"]["Kp"] == pytest.approx(10.0 / (2.0 * 12.0)) and simc["gains"]["Ti"] == 10.0
+    assert simc["chosen"]["tau_c_s"] == 4.0
+    # pole and zero cancel: the loop is k e^(-Ls)/s with k = 1/12, of known margins
+    assert simc["margins"]["GM"] == pytest.approx(math.pi / 2 * 12.0 / 8.0, rel=1e-6)
+    assert simc["margins"]["PM_deg"] == pytest.approx(90.0 - math.degrees(8.0 / 12.0), rel=1e-6)
+    assert found["model"] == {"K": 2.0, "T": 10.0, "L": 8.0}
+    assert found["units"]["Kp"] == "MV per PV unit" and "ISA" in found["form"] and "filter" in found["figures_are"]
+
+
+def test_options_go_to_the_methods_that_have_them() -> None:
+    found = answer("tune", "--model", MODELS["balanced"], "--option", "Ms=2.0")
+    by_name = {each["method"]: each for each in found["methods"]}
+    alone = answer("tune", "--model", MODELS["balanced"], "--method", "kappa-tau", "--option", "Ms=2.0")
+    assert by_name["kappa-tau"] == alone["methods"][0]
+    assert by_name["kappa-tau"] != answer("tune", "--model", MODELS["balanced"], "--method", "kappa-tau")["methods"][0]
+
+
+@pytest.mark.parametrize(
+    ("option", "method"),
+    [
+        ("variant=2.2", "tyreus-luyben"),
+        ("overshoot_pct=20", "chr"),
+        ("extrapolate=true", "zn-step"),
+        ("seed=3", "me-pso"),
+    ],
+)
+def test_values_of_every_kind(option: str, method: str) -> None:
+    found = answer("tune", "--model", MODELS["balanced"], "--method", method, "--option", option)
+    assert found["methods"][0]["outcome"] == "tuned"
+
+
+def test_a_model_from_a_plant_file(tmp_path: Path) -> None:
+    file = tmp_path / "plant.json"
+    file.write_text('{"name": "heater", "num": [0.8], "den": [13, 1], "dead_time_s": 2, "noise_std": 0.002}')
+    found = answer("tune", "--model", str(file), "--method", "amigo")
+    assert found["model"] == {"num": [0.8], "den": [13.0, 1.0], "dead_time_s": 2.0}
+    assert found["methods"] == answer("tune", "--model", '{"K":0.8,"T":13,"L":2}', "--method", "amigo")["methods"]
+
+
+def test_an_unstable_loop_is_said_to_be_one() -> None:
+    model = {"num": [1.5, -2.5, 1.0], "den": [15.0, 23.0, 9.0, 1.0]}
+    arguments = ("tune", "--model", json.dumps(model), "--method", "direct-synthesis", "--option")
+    for c, stable in (("0.3679", True), ("1.4", False)):
+        (found,) = answer(*arguments, f"c={c}")["methods"]
+        g = found["gains"]
+        # the roots of 1 + C G, C = Kp (1 + 1/(Ti s) + Td s/(1 + Tf s))
+        over = g["Kp"] * np.array([g["Ti"] * (g["Td"] + g["Tf"]), g["Ti"] + g["Tf"], 1.0])
+        under = g["Ti"] * np.array([g["Tf"], 1.0, 0.0])
+        roots = np.roots(np.polyadd(np.polymul(over, model["num"]), np.polymul(under, model["den"])))
+        assert (roots.real.max() < 0.0) == stable == found["margins"]["stable"]
+        assert (found["setpoint"] is not None) == (found["load"] is not None) == stable
+        assert any("unstable" in note for note in found["notes"]) != stable
+        assert ("direct-synthesis" in run(*arguments, f"c={c}").stdout.split("Kp: MV")[0]) is True
+        assert ("unstable" in run(*arguments, f"c={c}").stdout) != stable
+    assert {value for name, value in found["margins"].items() if name != "stable"} == {None}
+
+
+def test_the_table_names_methods_and_refusals() -> None:
+    result = run("tune", "--model", MODELS["integrating"])
+    assert result.exit_code == 0
+    rows, refusals = result.stdout.split("Refused:")
+    for name in METHODS:
+        where = refusals if name in SELF_REGULATING_ONLY | {"s-plane"} else rows
+        assert any(line.startswith(name) for line in where.splitlines()), name
+    assert "not_self_regulating" in refusals and "MV per PV unit" in rows
+
+
+def test_exit_status_3_when_no_method_gave_gains() -> None:
+    result = run("tune", "--model", MODELS["integrating"], "--method", "robust", "--json")
+    assert result.exit_code == 3
+    (found,) = strict(result.stdout)["methods"]
+    assert (found["outcome"], found["reason"]) == ("refused", "not_self_regulating")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--model", "{"], "--model: not JSON"),
+        (["--model", '{"K": 2}'], "T, L: missing"),
+        (["--model", '{"K": NaN, "T": 1, "L": 1}'], "K must be a finite number, not nan"),
+        (["--model", '{"K": 2, "T": -1, "L": 1}'], "T must be a number > 0 (s), not -1"),
+        (["--model", '{"K": 2, "T": 1, "L": 1, "x": 1}'], "x: not a quantity"),
+        (["--model", "/nowhere/plant.json"], "No such file"),
+        (["--model", "[1]"], "--model: expected one JSON object"),
+        (["--model", MODELS["balanced"], "--method", "magic"], "method must be one of zn-ultimate"),
+        (
+            ["--model", MODELS["balanced"], "--method", "simc", "--option", "lambda_s=1"],
+            "simc has no option 'lambda_s'",
+        ),
+        (["--model", MODELS["balanced"], "--option", "nothing=1"], "no method has an option 'nothing'"),
+        (["--model", MODELS["balanced"], "--method", "simc", "--option", "tau_c_s"], "NAME=VALUE"),
+        (["--model", MODELS["balanced"], "--method", "simc", "--option", "tau_c_s=-1"], "tau_c_s must be"),
+        (["--model", MODELS["balanced"], "--method", "simc", "--option", "tau_c_s=nan"], "tau_c_s must be"),
+        (["--model", MODELS["balanced"], "--method", "simc", "--option", "controller=x"], "controller must be one of"),
+        (["--model", MODELS["balanced"], "--method", "simc", "--plot", "picture.gif"], "--plot must end in .png"),
+        (["--model", MODELS["balanced"], "--method", "simc", "--plot", "/nowhere/x.png"], "No such file"),
+    ],
+)
+def test_bad_input_of_tune(arguments: list[str], words: str) -> None:
+    result = run("tune", *arguments)
+    assert result.exit_code == 2 and result.stdout == ""
+    assert result.stderr.startswith("loopwright: ") and words in result.stderr
+
+
+def test_a_picture_of_the_tuned_methods(tmp_path: Path) -> None:
+    file = tmp_path / "picture.svg"
+    assert run("tune", "--model", MODELS["integrating"], "--plot", str(file)).exit_code == 0
+    drawn = file.read_text()
+    for name in METHODS:
+        # matplotlib leaves the text of each label in a comment
+        assert (f"<!-- {name} -->" in drawn) == (name not in SELF_REGULATING_ONLY | {"s-plane"})
+    assert "<!-- time since the step, s -->" in drawn and "<!-- change of MV, MV units -->" in drawn
+
+
+def test_methods() -> None:
+    result = run("methods", "--json")
+    found = strict(result.stdout)
+    assert [each["method"] for each in found] == list(METHODS)
+    assert found[-1]["options"]["seed"]["kind"] == "whole"
+    told = run("methods").stdout
+    assert all(name in told for name in METHODS)
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """600 samples of (0.4 s) steps of MV on 2 e^(-3s)/((10s + 1)(4s + 1)), by the exact simulator."""
+    plant = LinearPlant([2.0], [40.0, 14.0, 1.0], 3.0, 0.4, noise_std=0.02, seed=3, mv_low=-50.0, mv_high=50.0)
+    lines, pv = ["t,u,y,operator"], plant.pv
+    for k in range(600):
+        move = 0.0 if k < 20 else 5.0 if k < 250 else -3.0
+        lines.append(f"{0.4 * k:.3f},{50.0 + move},{20.0 + pv:.6f},A")
+        pv = plant.step(move)
+    file = tmp_path_factory.mktemp("records") / "steps.csv"
+    file.write_text("\n".join(lines) + "\n")
+    return file
+
+
+def test_identify_finds_the_plant(record: Path, tmp_path: Path) -> None:
+    picture = tmp_path / "fit.png"
+    found = answer("identify", str(record), "--plot", str(picture))
+    truth = {"K": 2.0, "T": math.sqrt(40.0), "zeta": 14.0 / (2.0 * math.sqrt(40.0)), "L": 3.0}
+    for name, value in truth.items():
+        assert abs(found["model"][name] - value) < 4.0 * found["standard_errors"][name]
+        assert found["standard_errors"][name] < 0.02 * value
+    assert found["outcome"] == "identified" and found["fit_pct"] > 99.0 and found["samples"] == 600
+    assert [each["structure"] for each in found["candidates"] if each["chosen"]] == ["sopdt"]
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    # what it found is what tune takes
+    assert answer("tune", "--model", json.dumps(found["model"]), "--method", "simc")["methods"][0]["outcome"] == "tuned"
+
+
+def test_identify_on_a_terminal(record: Path) -> None:
+    result = run("identify", str(record))
+    assert result.exit_code == 0
+    assert "zeta" in result.stdout and "standard error" in result.stdout and "sopdt" in result.stdout
+    model = json.loads(result.stdout.split("--model`: ")[1].splitlines()[0])
+    assert model == answer("identify", str(record))["model"]
+
+
+def test_identify_without_an_answer_in_pv(tmp_path: Path) -> None:
+    plant = LinearPlant([1e-6], [1.0, 1.0], 1.0, 0.5, noise_std=1.0, seed=1, mv_low=-50.0, mv_high=50.0)
+    lines = ["t,u,y"] + [f"{0.5 * k},{5.0 * (k > 20)},{plant.step(5.0 * (k > 20))}" for k in range(200)]
+    file = tmp_path / "noise.csv"
+    file.write_text("\n".join(lines))
+    result = run("identify", str(file), "--json")
+    assert result.exit_code == 3
+    found = strict(result.stdout)
+    assert (found["outcome"], found["reason"], found["model"]) == ("refused", "no_response", None)
+    assert "no_response" in run("identify", str(file)).stdout
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "is empty"),
+        ("t,u\n0,1\n", "no column y or pv"),
+        ("t,u,y\n0,1,x\n", "line 2: y is not a number"),
+        ("t,u,y\n" + "".join(f"{k},5,{k % 3}\n" for k in range(50)), "u"),
+        ("t,u,y\n0,1,2\n1,1,2\n", "too few samples: 2"),
+    ],
+)
+def test_bad_records(tmp_path: Path, text: str, words: str) -> None:
+    file = tmp_path / "data.csv"
+    file.write_text(text)
+    result = run("identify", str(file))
+    assert result.exit_code == 2 and result.stdout == ""
+    assert str(file) in result.stderr and words in result.stderr
+
+
+def test_identify_of_no_file() -> None:
+    result = run("identify", "/nowhere/data.csv")
+    assert result.exit_code == 2 and "No such file" in result.stderr
+
+
+def test_tune_imports_nothing_that_it_does_not_use() -> None:
+    code = (
+        "import sys; from service.cli import app\n"
+        "try: app(['tune', '--method', 'simc', '--json', '--model', sys.argv[1]])\n"
+        "except SystemExit as end: assert not end.code\n"
+        "print(*sys.modules, file=sys.stderr)"
+    )
+    ran = subprocess.run([sys.executable, "-c", code, MODELS["balanced"]], capture_output=True, text=True, check=True)
+    loaded = set(ran.stderr.split())
+    assert "tuning.methods" in loaded
+    heavy = {"fastapi", "sqlalchemy", "matplotlib", "httpx", "can", "scipy.signal", "scipy.stats"}
+    assert loaded.isdisjoint(heavy), loaded & heavy

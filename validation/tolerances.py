@@ -1,0 +1,60 @@
+"""How far a recomputed number may be from the print, stated once, each with its reason."""
+
+from __future__ import annotations
+
+from validation.checks import Tolerance
+
+GM = Tolerance("printed with two decimals, from models of as many digits", relative=0.005)
+PM_DEG = Tolerance("printed with one decimal or two, from models of two or three digits", absolute=0.3)
+OPTIMUM_GM = Tolerance("the optimum is flat: the gain that it follows from is known to 1.3 %", relative=0.015)
+OPTIMUM_PM = Tolerance("the optimum is flat", absolute=0.4)
+OPTIMUM_KP = Tolerance("the optimum is flat in the gain", relative=0.015)
+OPTIMUM_TI = Tolerance("the integral time is known better", relative=0.005)
+SETTLING = Tolerance("a sampled record in the paper, exact instants here", relative=0.02)
+OVERSHOOT = Tolerance("a sampled record in the paper", absolute=0.5)
+RISE = Tolerance("a sampled record in the paper", relative=0.02)
+REDUCTION = Tolerance("areas and fits are of a sampled record in the paper", relative=0.01)
+FROM_GM = Tolerance("GM, from which it follows, has three digits", absolute=0.003)
+ULTIMATE_MEASURED = Tolerance("found by the paper on a loop with noise", relative=0.035)
+ULTIMATE_GAIN = Tolerance("of the plant itself, without noise", relative=0.002)
+ULTIMATE_PERIOD = Tolerance("of the plant itself, read from peaks in the paper", relative=0.006)
+FORMULA = Tolerance("three or four printed digits, of inputs of as many", relative=0.008)
+OPTIMUM_OF_ESTIMATE = Tolerance("two independent minimisers of a flat criterion", relative=0.01)
+RATIO = Tolerance("a mean over 50 plants, some of them guessed", absolute=0.03)
+
+CUT = Tolerance("the paper cuts to two decimals", absolute=0.01)
+RULE = Tolerance("a closed formula", relative=1e-6)
+CONSTANT = Tolerance("a constant of a closed formula", relative=1e-5)
+FROM_PRINTS = Tolerance("follows from printed numbers of three or four digits", relative=0.001)
+BOUND = Tolerance("a limit printed as a plain number", relative=1e-3)
+
+SIMULATED_IAE = Tolerance("two exact simulations", relative=0.001)
+SIMULATED_ITAE = Tolerance("two exact simulations, to the same horizon", relative=0.004)
+SIMULATED_OVERSHOOT = Tolerance("two exact simulations", absolute=0.1)
+SIMULATED_SETTLING = Tolerance("two exact simulations", relative=0.005)
+
+PRINTED_IAE = Tolerance("four printed digits", relative=0.001)
+PRINTED_ISE = Tolerance("four printed digits, of gains cut to two or three", relative=0.005)
+PRINTED_ITAE = Tolerance("four printed digits, of gains cut to two or three", relative=0.005)
+EQUATION_40 = Tolerance("two printed digits", absolute=0.0005)
+EQUATION_40_TD = Tolerance("one printed digit", absolute=0.005)
+
+LAST_DIGIT_2 = Tolerance("cut to two decimals", absolute=0.01)
+LAST_DIGIT_4 = Tolerance("cut to four decimals", absolute=1e-4)
+PLACED = Tolerance("five printed digits", relative=1e-4)
+THIRD_ORDER = Tolerance("the paper's minimum is off by up to 0.8 % in alpha", relative=0.004)
+BY_THEIR_RULE = Tolerance("four printed decimals of the same samples", absolute=5e-4)
+ON_THE_GRID = Tolerance("the same sample of the paper's grid", absolute=1e-6)
+MINIMISER = Tolerance("two independent minimisers", relative=3e-4)
+
+CLASSICAL = Tolerance("three decimals, rounded or cut", absolute=0.0010001)
+MIE = Tolerance("two printed decimals and the paper's integration step", absolute=0.012)
+MIC = Tolerance("two printed decimals and the paper's integration step", absolute=0.025, relative=0.015)
+TABLE_4_OVERSHOOT = Tolerance("the paper's integration step, at a low gain", absolute=1.0)
+TABLE_4_SETTLING = Tolerance("one printed decimal and the paper's integration step", absolute=0.25)
+OWN_MIE = Tolerance("two exact simulations", absolute=1e-3)
+OWN_MIC = Tolerance("two exact simulations, up to 8 units of MV", absolute=3e-3)
+OWN_OVERSHOOT = Tolerance("two exact simulations", absolute=0.05)
+OWN_SETTLING = Tolerance("two exact simulations", absolute=0.01)
+CRITERION = Tolerance("two exact simulations", relative=1e-3)
+BEST_FOUND = Tolerance("the best of several searches by others", relative=0.01)
