@@ -55,6 +55,18 @@ BOUNDED = settings(
     derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck), print_blob=False
 )
 ABORT = "POST /jobs/{job_id}/abort"
+_NUMBER = st.floats(allow_nan=False, allow_infinity=False) | st.floats(0.01, 100.0)
+# A model is any object to the document; nearly all that could be made up would be refused at once.
+BODIES = {
+    "POST /tunings": st.fixed_dictionaries(
+        {
+            "model": st.fixed_dictionaries({"K": _NUMBER, "T": _NUMBER, "L": _NUMBER})
+            | st.fixed_dictionaries({"K": st.floats(0.1, 10.0), "T": st.floats(0.1, 10.0), "L": st.floats(0.1, 10.0)})
+            | st.fixed_dictionaries({"K": _NUMBER, "L": _NUMBER, "integrating": st.just(True)}),
+            "method": st.sampled_from(["simc", "amigo", "lambda", "kappa-tau", "direct-synthesis", "robust"]),
+        }
+    ),
+}
 KEYS = ("none", "wrong", "revoked", "expired", *Scope)
 
 
@@ -124,10 +136,16 @@ def test_what_the_document_allows(label: str, site: Site) -> None:
     seen = set()
 
     @settings(BOUNDED, max_examples=40)
-    @given(case=operation.as_strategy(GenerationMode.POSITIVE), known=st.booleans(), pick=st.integers(0, 2))
-    def run(case: Any, known: bool, pick: int) -> None:
+    @given(
+        case=operation.as_strategy(GenerationMode.POSITIVE),
+        known=st.booleans(),
+        pick=st.integers(0, 2),
+        body=BODIES.get(label, st.none()),
+    )
+    def run(case: Any, known: bool, pick: int, body: Any) -> None:
         if known:  # else nearly every answer would be a 404
             names = {"tag": TAG, "job_id": site.running() if label == ABORT else site.jobs[pick]}
+            case.body = case.body if body is None else body
             case.path_parameters.update({k: v for k, v in names.items() if k in case.path_parameters})
         seen.add(site.send(case).status_code)
 
