@@ -135,7 +135,7 @@ def list_loops(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
     """The configured loops."""
     from service import show
 
-    found = Client(url).get("/loops")
+    found = Client(url).pages("/loops")
     if as_json:
         _print_json(found)
         return
