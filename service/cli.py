@@ -90,6 +90,13 @@ def serve(
     computations: Annotated[
         int, typer.Option(min=1, envvar="LOOPWRIGHT_COMPUTATIONS", help="Tunings computed at once, of all callers.")
     ] = 2,
+    keep_jobs: Annotated[
+        int | None,
+        typer.Option(min=1, envvar="LOOPWRIGHT_KEEP_JOBS", help="Keep samples of so many jobs per loop; default: all."),
+    ] = None,
+    keep_days: Annotated[
+        float | None, typer.Option(min=0.0, envvar="LOOPWRIGHT_KEEP_DAYS", help="Keep samples so long; default: ever.")
+    ] = None,
     log_format: Annotated[
         str, typer.Option(envvar="LOOPWRIGHT_LOG_FORMAT", help="text, or json: one object a line.")
     ] = "text",
@@ -98,6 +105,7 @@ def serve(
     from sqlalchemy.exc import SQLAlchemyError
 
     from service.config import ConfigError
+    from service.retention import Keep
     from service.security.limits import RequestLimits
     from service.serving import NotSafe, Setup
     from service.serving import serve as run
@@ -117,6 +125,7 @@ def serve(
     setup = Setup(
         loops, data, bind, port, database, host, resume,
         auth=auth, limits=limits, log_format="json" if log_format == "json" else "text",
+        keep=Keep(keep_jobs, keep_days),
     )  # fmt: skip
     try:
         run(setup)
@@ -133,7 +142,7 @@ def list_loops(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
     """The configured loops."""
     from service import show
 
-    found = Client(url).get("/loops")
+    found = Client(url).pages("/loops")
     if as_json:
         print_json(found)
         return

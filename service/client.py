@@ -33,6 +33,16 @@ class Client:
     def get(self, path: str, **query: Any) -> Any:
         return self._json("GET", path, params={k: v for k, v in query.items() if v is not None})
 
+    def pages(self, path: str) -> list[Any]:
+        """The whole of a list that comes in pages."""
+        found, following = [], httpx.URL(path)
+        while True:
+            answer = self._answer("GET", following)
+            found += answer.json()
+            if "next" not in answer.links:
+                return found
+            following = httpx.URL(answer.links["next"]["url"])
+
     def post(self, path: str, body: dict[str, Any] | None = None) -> Any:
         return self._json("POST", path, json=body or {})
 
@@ -64,6 +74,9 @@ class Client:
                     raise ApiError(f"{self.url}: {error}") from error
 
     def _json(self, method: str, path: str, **more: Any) -> Any:
+        return self._answer(method, path, **more).json()
+
+    def _answer(self, method: str, path: str | httpx.URL, **more: Any) -> httpx.Response:
         import httpx
 
         try:
@@ -71,7 +84,7 @@ class Client:
         except httpx.TransportError as error:
             raise ApiError(f"no service at {self.url} ({error}); start one with: loopwright serve") from error
         self._check(answer)
-        return answer.json()
+        return answer
 
     @staticmethod
     def _check(answer: httpx.Response) -> None:

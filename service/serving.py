@@ -19,6 +19,7 @@ from service.engine.durable import POLL_S, DurableEngine
 from service.jobs import Jobs, LoopFactory
 from service.logs import LogFormat
 from service.loop import Loop
+from service.retention import Keep, Retention
 from service.security.gate import Policy, is_loopback
 from service.security.keyring import Keyring
 from service.security.limits import RequestLimits
@@ -75,6 +76,7 @@ class Setup:
 
     bind: the address to listen on.  host: this host's name among those that share the database.
     resume: jobs that a dead service left go on.  poll_s: how often the engine looks for jobs, s of wall time.
+    keep: whose samples are kept.
     auth: whether keys are asked for; None: unless the address is this machine's own.
     """
 
@@ -89,6 +91,7 @@ class Setup:
     auth: bool | None = None
     limits: RequestLimits = field(default_factory=RequestLimits)
     log_format: LogFormat = "text"
+    keep: Keep = field(default_factory=Keep)
 
 
 def serve(setup: Setup, open_loop: LoopFactory = open_bus_loop, tune: Tune = tune) -> None:
@@ -130,10 +133,13 @@ def serve(setup: Setup, open_loop: LoopFactory = open_bus_loop, tune: Tune = tun
                 server_header=False,
                 timeout_graceful_shutdown=_GRACE_S,
             )
+            retention = Retention(store, setup.keep)
             try:
                 jobs.boot()
+                retention.start()
                 _Server(config, jobs).run(sockets=[listener])
             finally:
+                retention.close()
                 jobs.stop()
         finally:
             store.close()

@@ -19,6 +19,12 @@ def fuzz_count(pytestconfig: pytest.Config) -> Counter[str]:
     return pytestconfig.stash[_COUNTS].setdefault("OpenAPI fuzzing", Counter())
 
 
+@pytest.fixture(scope="session")
+def machine_count(pytestconfig: pytest.Config) -> Counter[str]:
+    """What the state machine over jobs did, by rule and outcome."""
+    return pytestconfig.stash[_COUNTS].setdefault("State machine over jobs", Counter())
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     for title, counts in config.stash[_COUNTS].items():
         told = ", ".join(f"{count} {kind}" for kind, count in counts.items())

@@ -105,7 +105,7 @@ def create_app(
         responses={
             200: {
                 "content": {"text/event-stream": {}},
-                "description": "state, stage_started, stage_done, note, progress, abort_requested, loop_found, resumed",
+                "description": "state, stage_started, stage_done, note, progress, and what befell the job",
             },
             204: {"description": "The job is over and the client has seen everything: do not reconnect"},
             **problems.responses(404, 422),

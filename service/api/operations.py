@@ -60,10 +60,11 @@ class AuditView(BaseModel):
     address: str | None = Field(description="Network address of the caller", examples=["10.0.0.7"])
     said_by: str | None = Field(description="Who the request itself says it is from", examples=["night shift"])
     what: str = Field(
-        description="retune, abort, accept, rollback, accept_failed, rollback_failed, key_create, key_revoke",
+        description="retune, abort, accept, rollback, accept_failed, rollback_failed, retune_many, retune_many_abort, "
+        "samples_delete, restore, key_create, key_revoke",
         examples=["accept"],
     )
-    subject: str = Field(description="Id of the job or key", examples=["4f0c2a9be113"])
+    subject: str = Field(description="Id of the job, key, or retune of many loops", examples=["4f0c2a9be113"])
     loop: str | None = Field(examples=["TIC-101"])
     before: dict[str, Any] | None = Field(description="State and gains before, where there were some")
     after: dict[str, Any] | None = Field(description="State and gains after; of a retune the request")

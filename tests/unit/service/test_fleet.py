@@ -6,11 +6,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 from fastapi.testclient import TestClient
 from pydantic import ValidationError
 
 from service.api.app import create_app
+from service.client import Client
 from service.config import BusConfig, parse_site
 from service.fleet import BadFleet, Fleet, FleetRequest
 from service.jobs import Jobs
@@ -424,6 +426,17 @@ def test_pages_hold_everything_once_also_while_new_jobs_come(plant: Plant, clien
     ]  # fmt: skip
     assert client.get("/loops/Z/jobs").status_code == 404
     assert client.get("/jobs", params={"cursor": "x"}).status_code == 422
+
+
+def test_the_command_line_gets_the_whole_list(monkeypatch: pytest.MonkeyPatch) -> None:
+    def answer(request: httpx.Request) -> httpx.Response:
+        at = int(request.url.params.get("cursor", 0))
+        links = {"Link": f'</loops?limit=2&cursor={at + 2}>; rel="next"'} if at < 4 else {}
+        return httpx.Response(200, json=[at, at + 1], headers=links)
+
+    client = Client("http://gateway")
+    monkeypatch.setattr(client, "_http", httpx.Client(base_url="http://gateway", transport=httpx.MockTransport(answer)))
+    assert client.pages("/loops") == [0, 1, 2, 3, 4, 5]
 
 
 def test_unknown(plant: Plant) -> None:

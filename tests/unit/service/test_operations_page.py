@@ -98,7 +98,7 @@ def machine(tmp_path: Path) -> Iterator[Machine]:
 
 
 def test_no_section_with_commands_is_left_out() -> None:
-    tried = {"Install", "Keys", "Rotate a key", "Back up", "Restore", "Upgrade", "Add a gateway", "Watch"}
+    tried = {"Install", "Keys", "Rotate a key", "Back up", "Restore", "Upgrade", "Add a gateway", "Watch", "Many loops"}
     assert {section for section in SECTIONS if blocks(section)} == tried
 
 
@@ -123,6 +123,8 @@ def test_one_machine(machine: Machine) -> None:
     use_it = 'curl --silent -w "%{http_code}" -H "Authorization: Bearer $LOOPWRIGHT_KEY" http://127.0.0.1:8080/loops'
     assert [machine.run(use_it, key=k.strip())[-3:] for k in (new, key, later)] == ["200", "401", "401"]
     assert '"ready":true' in machine.run(upgrade, key=new)
+    (many,) = blocks("Many loops")
+    assert '"url":"/retunes/' in machine.run(many, key=new)
     (look,) = blocks("Watch")
     assert '"level"' in machine.run(look)
 

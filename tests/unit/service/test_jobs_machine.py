@@ -1,0 +1,408 @@
+"""Jobs against a plain model of them: any order of submit, begin, end, abort, accept, roll back, crash and restart.
+
+The model is a table of what each wish does, written from docs/safety.md and the README; it shares no code with the
+service. The examples are the same at every run; how often each rule was tried, and how it ended, is told at its end.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import threading
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
+
+from service.config import LoopConfig, parse_site
+from service.jobs import Conflict, Jobs
+from service.loop import Loop, LoopState
+from service.request import RetuneRequest
+from service.states import IllegalMove
+from service.store import database
+from service.store.database import FILE
+from service.store.store import Busy, Store
+from service.work import Hooks, Outcome
+from tests.unit.service.fakes import OLD, RESULT, FakeController, FakeLoop, loop_entry
+from tuning.gains import Gains
+from tuning.plan import SetGains, StageStarted
+from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
+
+TAGS = ("TIC-101", "FIC-2")
+ENTRIES = [loop_entry(tag=tag, channel=n + 1) for n, tag in enumerate(TAGS)]
+ENDS: dict[str, Ended | None] = {
+    "proposed": None,
+    "refused": Refused(Reason.NOT_AT_REST, "drifts"),
+    "failed": Failed(Reason.NODE_LOST, "silent"),
+    "aborted": Aborted(Reason.MODE_CHANGED, "manual"),
+}
+MOST_ATTEMPTS = 10
+WHICH = st.integers(0, 15)
+RULES = {
+    "submit: queued", "submit: busy", "begin: running", "begin: again", "end: proposed", "end: refused", "end: failed",
+    "end: aborted", "abort: aborted", "abort: illegal", "accept: accepted", "accept: illegal", "accept: conflict",
+    "accept: busy", "rollback: rolled_back", "rollback: illegal", "rollback: conflict", "rollback: busy",
+    "crash: on trial", "crash: gone back", "restart: done", "by hand: done",
+}  # fmt: skip
+
+
+class Killed(BaseException):
+    """The process is gone: nothing is restored, nothing is written."""
+
+
+@dataclass
+class Act:
+    """An experiment that is under way, and what becomes of it."""
+
+    new: Gains
+    inside: threading.Event = field(default_factory=threading.Event)
+    told: threading.Event = field(default_factory=threading.Event)
+    end: Ended | None = None
+    killed: bool = False
+
+    def play(self, hooks: Hooks) -> tuple[dict[str, Any] | None, Ended | None]:
+        ended = None
+        hooks.on_event(StageStarted("relay", 1.0, 1.0))
+        self.inside.set()
+        while not self.told.wait(0.001):
+            if reason := hooks.stop():
+                return None, Aborted(reason, "asked to stop")
+        if self.killed:
+            raise Killed
+        ended = self.end
+        return (None, ended) if ended else (RESULT | {"gains": asdict(self.new)}, None)
+
+
+class HandEngine:
+    """Begins a job when the test says so."""
+
+    def __init__(self) -> None:
+        self.queued: list[str] = []
+        self.threads: dict[str, threading.Thread] = {}
+        self._run: Callable[[str], None] | None = None
+
+    def launch(self, run: Callable[[str], None], queues: Mapping[str, int]) -> None:
+        self._run = run
+
+    def enqueue(self, job_id: str, queue: str) -> None:
+        self.queued.append(job_id)
+
+    def begin(self, job_id: str) -> None:
+        self.queued.remove(job_id)
+        thread = self.threads[job_id] = threading.Thread(target=self._until_killed, args=(job_id,))
+        thread.start()
+
+    def _until_killed(self, job_id: str) -> None:
+        assert self._run is not None
+        try:
+            self._run(job_id)
+        except Killed:
+            return
+
+    def known(self, job_ids: Collection[str]) -> set[str]:
+        return set(job_ids) & (set(self.queued) | self.threads.keys())
+
+    def forget(self, job_id: str) -> None:
+        """There is nothing to forget."""
+
+    def alive(self) -> bool:
+        return self._run is not None
+
+    def close(self) -> None:
+        self._run = None
+
+
+@dataclass
+class Job:
+    """What the model knows of a job."""
+
+    id: str
+    loop: str
+    dry: bool
+    act: Act
+    state: str = "queued"
+    begun: bool = False
+    attempts: int = 0
+    old: Gains | None = None
+
+    @property
+    def active(self) -> bool:
+        return self.state in ("queued", "running")
+
+
+class JobsMachine(RuleBasedStateMachine):
+    """The service on the left, the model on the right."""
+
+    def __init__(self, empty: Path, counts: Counter[str]) -> None:
+        super().__init__()
+        self.counts = counts
+        self.folder = Path(tempfile.mkdtemp(prefix="machine-"))
+        shutil.copy(empty, self.folder / FILE)
+        self.controllers = {tag: FakeController() for tag in TAGS}
+        self.acts: dict[str, Act] = {}
+        self.jobs: list[Job] = []
+        self.gains = dict.fromkeys(TAGS, OLD)
+        self.boot()
+
+    # the service
+    def boot(self) -> None:
+        self.store, self.engine = Store(self.folder), HandEngine()
+        self.service = Jobs(
+            parse_site({"loops": ENTRIES}, "test").loops, self.store, self.open, self.tune, self.rehearse,
+            engine=self.engine, patience_s=0.3,
+        )  # fmt: skip
+        self.service.boot()
+
+    def open(self, config: LoopConfig) -> Loop:
+        return FakeLoop(self.controllers[config.tag])
+
+    def tune(self, config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks) -> Outcome:
+        act = self.acts[request.requested_by]
+        loop.step((SetGains(act.new),))
+        result, ended = act.play(hooks)
+        return Outcome(result, ended, loop.restore(state), {})
+
+    def rehearse(self, config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:
+        result, ended = self.acts[request.requested_by].play(hooks)
+        return Outcome(result, ended, None, {})
+
+    # helpers
+    def said(self, what: str, outcome: str) -> None:
+        self.counts[f"{what}: {outcome}"] += 1
+
+    def having(self, loop: str) -> Job | None:
+        """The model's active job of a loop."""
+        return next((job for job in self.jobs if job.loop == loop and job.active and not job.dry), None)
+
+    def one(self, which: int, wanted: Callable[[Job], bool]) -> Job:
+        """One of the wanted jobs; now and then, or when there are none, one of all."""
+        found = [job for job in self.jobs if wanted(job) and which % 4] or self.jobs
+        return found[-1 - which // 4 % len(found)]
+
+    def over(self, job: Job) -> None:
+        self.engine.threads[job.id].join(10)
+        assert not self.engine.threads[job.id].is_alive()
+
+    # rules
+    @rule(loop=st.sampled_from(TAGS), dry=st.sampled_from((False, False, False, True)), begins=st.booleans())
+    def submit(self, loop: str, dry: bool, begins: bool) -> None:
+        n = len(self.acts)
+        name = f"wish {n}"
+        self.acts[name] = act = Act(Gains(0.6 + 0.01 * n, 3.0))
+        request = RetuneRequest(requested_by=name, dry_run=dry)
+        other = None if dry else self.having(loop)
+        if other is not None:
+            with pytest.raises(Busy) as busy:
+                self.service.start(loop, request)
+            assert busy.value.job_id == other.id
+            self.said("submit", "busy")
+        else:
+            self.jobs.append(Job(self.service.start(loop, request).id, loop, dry, act))
+            self.said("submit", "queued")
+            if begins:
+                self.begun(self.jobs[-1])
+
+    @precondition(lambda self: any(job.active and not job.begun for job in self.jobs))
+    @rule(which=st.integers(0, 9))
+    def begin(self, which: int) -> None:
+        job = next(job for job in (*self.jobs[which:], *self.jobs) if job.active and not job.begun)
+        self.begun(job)
+
+    def begun(self, job: Job) -> None:
+        self.engine.begin(job.id)
+        assert job.act.inside.wait(10)
+        if job.old is None and not job.dry:
+            job.old = self.gains[job.loop]
+        job.attempts += 1
+        self.said("begin", "running" if job.state == "queued" else "again")
+        job.state, job.begun = "running", True
+
+    @precondition(lambda self: any(job.begun for job in self.jobs))
+    @rule(which=st.integers(0, 9), how=st.sampled_from(sorted(ENDS)))
+    def end(self, which: int, how: str) -> None:
+        self.ended(next(job for job in (*self.jobs[which:], *self.jobs) if job.begun), how)
+
+    def ended(self, job: Job, how: str) -> None:
+        job.act.end = ENDS[how]
+        job.act.told.set()
+        self.over(job)
+        job.state, job.begun = how, False
+        self.said("end", how)
+
+    @rule(loop=st.sampled_from(TAGS))
+    def propose(self, loop: str) -> None:
+        """A job from its beginning to its end, where the loop is free: decisions are what is then tried."""
+        if self.having(loop) is None:
+            self.submit(loop, dry=False, begins=True)
+            self.ended(self.jobs[-1], "proposed")
+
+    @precondition(lambda self: len(self.jobs) > 1)
+    @rule(which=WHICH)
+    def abort(self, which: int) -> None:
+        job = self.one(which, lambda job: job.active)
+        if not job.active:
+            with pytest.raises(IllegalMove):
+                self.service.abort(job.id, "me")
+            self.said("abort", "illegal")
+            return
+        self.service.abort(job.id, "me")
+        if job.begun:
+            self.over(job)
+        elif job.id in self.engine.queued:
+            self.engine.begin(job.id)  # the engine still has it, and finds nothing to do
+            self.over(job)
+        job.state, job.begun = "aborted", False
+        assert self.store.get(job.id).reason == "operator"
+        self.said("abort", "aborted")
+
+    def decide(self, job: Job, what: str, wish: Callable[[str, str], object], legal: tuple[str, ...]) -> bool:
+        """Whether the model lets it pass to the controller; else the service refuses in the same way."""
+        before = {"accept": job.old, "rollback": job.act.new}[what]
+        declined = what == "rollback" and job.state == "proposed"
+        refusal: type[Exception] | None = None
+        if job.state not in legal:
+            refusal, word = IllegalMove, "illegal"
+        elif job.dry:
+            refusal, word = Conflict, "conflict"
+        elif self.having(job.loop):
+            refusal, word = Busy, "busy"
+        elif not declined and self.gains[job.loop] != before:
+            refusal, word = Conflict, "conflict"
+        if refusal is None:
+            wish(job.id, "me")
+            return True
+        with pytest.raises(refusal):
+            wish(job.id, "me")
+        self.said(what, word)
+        return False
+
+    @precondition(lambda self: self.jobs)
+    @rule(which=WHICH)
+    def accept(self, which: int) -> None:
+        job = self.one(which, lambda job: job.state == "proposed")
+        if self.decide(job, "accept", self.service.accept, ("proposed",)):
+            job.state, self.gains[job.loop] = "accepted", job.act.new
+            self.said("accept", "accepted")
+
+    @precondition(lambda self: self.jobs)
+    @rule(which=WHICH)
+    def rollback(self, which: int) -> None:
+        job = self.one(which, lambda job: job.state in ("proposed", "accepted"))
+        if self.decide(job, "rollback", self.service.rollback, ("proposed", "accepted")):
+            if job.state == "accepted":
+                assert job.old is not None
+                self.gains[job.loop] = job.old
+            job.state = "rolled_back"
+            self.said("rollback", "rolled_back")
+
+    @precondition(lambda self: any(job.state in ("proposed", "accepted") for job in self.jobs[-2:]))
+    @rule(loop=st.sampled_from(TAGS), kp=st.floats(1.0, 2.0))
+    def by_hand(self, loop: str, kp: float) -> None:
+        """An operator puts other gains into a controller that no job has."""
+        if self.having(loop) is None:
+            self.gains[loop] = Gains(kp, 5.0)
+            self.controllers[loop].state = replace(self.controllers[loop].state, gains=self.gains[loop])
+            self.said("by hand", "done")
+
+    @precondition(lambda self: any(job.begun for job in self.jobs))
+    @rule(goes_back=st.booleans())
+    def crash(self, goes_back: bool) -> None:
+        """kill -9 and the next start; the controllers have ended their sessions meanwhile, or not yet."""
+        self.service._ended.set()
+        self.service._watcher.join()
+        for job in self.jobs:
+            if job.begun:
+                job.act.killed = True
+                job.act.told.set()
+                self.over(job)
+        self.service.journal.close(5.0)
+        self.store.close()
+        for tag, controller in self.controllers.items():
+            if goes_back:
+                controller.state = replace(controller.state, gains=self.gains[tag], on_trial=False)
+        self.boot()
+        for job in self.jobs:
+            if not job.active:
+                continue
+            job.begun = False
+            job.act.killed = False
+            job.act.told.clear()
+            job.act.inside.clear()
+            if job.attempts >= MOST_ATTEMPTS:
+                job.state = "interrupted"
+        assert sorted(self.engine.queued) == sorted(job.id for job in self.jobs if job.active)
+        self.said("crash", "gone back" if goes_back else "on trial")
+
+    @precondition(lambda self: any(job.begun for job in self.jobs))
+    @rule()
+    def restart(self) -> None:
+        """SIGTERM and the next start: what was active is aborted, and does not go on."""
+        self.service.stop()
+        self.store.close()
+        for job in self.jobs:
+            if job.active:
+                job.state, job.begun = "aborted", False
+        self.boot()
+        assert self.engine.queued == []
+        self.said("restart", "done")
+
+    # what always holds
+    @invariant()
+    def states_agree(self) -> None:
+        rows = {row.id: row for row in self.store.recent(limit=1000)}
+        found = {job_id: (row.state, row.loop, row.dry_run, row.attempt) for job_id, row in rows.items()}
+        assert found == {job.id: (job.state, job.loop, job.dry, job.attempts) for job in self.jobs}
+        for job in self.jobs:
+            row = rows[job.id]
+            assert (row.ended_at is None) == job.active
+            assert row.reason is None or row.state in ("refused", "failed", "aborted", "interrupted")
+        assert self.store.busy() == {job.loop: job.id for job in self.jobs if job.active and not job.dry}
+
+    @invariant()
+    def a_loop_without_a_job_has_its_gains(self) -> None:
+        under_test = {job.loop for job in self.jobs if job.begun and not job.dry}
+        for tag, controller in self.controllers.items():
+            if tag not in under_test:
+                assert controller.state == replace(FakeController().state, gains=self.gains[tag])
+            assert controller.open == (tag in under_test)
+
+    def teardown(self) -> None:
+        try:
+            self.service.stop()
+            for job in self.jobs:
+                events = self.store.events(job.id)
+                assert [event.seq for event in events] == list(range(1, len(events) + 1))
+                told = [(event.data.get("from"), event.data["state"]) for event in events if event.kind == "state"]
+                chain = [state for _, state in told]
+                assert [before for before, _ in told] == [None, *chain[:-1]], "each state follows the one before"
+        finally:
+            self.store.close()
+            shutil.rmtree(self.folder)
+
+
+def test_jobs_do_what_the_model_says(
+    tmp_path: Path, machine_count: Counter[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pragmas = database._pragmas
+
+    def hasty(connection: Any, record: object) -> None:
+        """These crashes are no power cuts: waiting for the disk would only take time."""
+        pragmas(connection, record)
+        connection.execute("PRAGMA synchronous=OFF")
+
+    monkeypatch.setattr(database, "_pragmas", hasty)
+    Store(tmp_path).close()
+    run_state_machine_as_test(  # type: ignore[no-untyped-call]
+        lambda: JobsMachine(tmp_path / FILE, machine_count),
+        settings=settings(
+            max_examples=30, stateful_step_count=40, derandomize=True, database=None, deadline=None,
+            suppress_health_check=list(HealthCheck), print_blob=False,
+        ),
+    )  # fmt: skip
+    assert RULES - machine_count.keys() == set(), "outcomes that were not seen"
