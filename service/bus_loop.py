@@ -81,6 +81,7 @@ class BusLoop:
         self._silence_s = SILENCE_S
         self._lease = SHORTEST_LEASE
         self._until_renewal = 0
+        self._until_look = 0
         self._mode_found: Mode | None = None
         self._first_n: int | None = None
         self._last_n = 0
@@ -108,7 +109,7 @@ class BusLoop:
                 tuner.mode, tuner.on_trial, tuner.sp = state.mode, state.on_trial, state.sp
                 tuner.emergencies.clear()
                 tuner.restarted = False
-                self._until_renewal = self._lease // 3
+                self._until_renewal = self._until_look = self._lease // 3
                 self._mode_found = state.mode
                 self._first_n, self._left = None, 0
                 self._commands.clear()
@@ -121,9 +122,13 @@ class BusLoop:
         with self._translated() as tuner:
             self._commands += commands
             if self._left <= 0:
+                if self._commands:
+                    self._until_look = self._command_lag() // 2
                 for command in self._commands:
                     self._carry_out(tuner, command)
                 self._commands.clear()
+                if self._until_look <= 0:
+                    self._look(tuner)
                 if self._until_renewal <= 0:
                     self._renew(tuner)
                 if self._in_blocks:
@@ -277,6 +282,12 @@ class BusLoop:
         tuner.write("controller_lease", self._lease)
         self._until_renewal = self._lease // 3
 
+    def _look(self, tuner: Tuner) -> None:
+        """Asks for what the status frames tell: one of them may have been lost."""
+        tuner.sp = tuner.number("controller_setpoint")
+        tuner.mode = int(tuner.number("controller_mode"))
+        self._until_look = self._lease // 3
+
     def _hear(self, tuner: Tuner) -> None:
         """An emergency may concern another channel: our own lease tells."""
         codes, tuner.emergencies = tuner.emergencies, []
@@ -315,6 +326,7 @@ class BusLoop:
             raise Failed(Reason.SAMPLES_LOST, f"{passed - 1} samples missing before sample {found.n}")
         self._left -= passed if self._in_blocks else 0
         self._until_renewal -= passed
+        self._until_look -= passed
         return Sample((found.n - self._first_n) * self._sample_time_s, found.sp, found.pv, found.mv, found.mode)
 
     # -- the way out
