@@ -115,7 +115,8 @@ def test_frames_are_lost_at_random(site: Site, share: float) -> None:
     job = site.plant.finished(url)
     site.hub.fault = well
     assert (job["state"], job["reason"]) == ("proposed", None) or (
-        job["state"] == "failed" and job["reason"] in ("samples_lost", "node_lost", "device_went_back", "restore_unconfirmed")
+        job["state"] == "failed"
+        and job["reason"] in ("samples_lost", "node_lost", "device_went_back", "restore_unconfirmed")
     ), job
     assert is_home_in_time(site)
 
