@@ -46,10 +46,10 @@ def _proof(client: Client, job: dict[str, Any], seconds: float) -> list[str]:
         f"{label} {show.cell(before.get(name))} -> {show.cell(after.get(name))}{unit}"
         for label, name, unit in (("overshoot", "overshoot_pct", " %"), ("IAE", "IAE", f" {PV_UNIT} s"))
     ]
-    gains = ", ".join(f"{name} {show.cell(live['gains'][name])}" for name in ("Kp", "Ti"))
+    held = ", ".join(f"{name} {show.cell(live['gains'][name])}" for name in ("Kp", "Ti"))
     return [
         f"proof       {', '.join(changes)}",
-        f"controller  {live['mode']}, {gains}, set-point {show.cell(live['sp'])}: its own until the proposal is accepted",
+        f"controller  {live['mode']}, {held}, set-point {show.cell(live['sp'])}: its own until a proposal is accepted",
         f"time        {job['plant_time_s']:.0f} s of plant time in {seconds:.1f} s",
         f"state       {job['state']}",
     ]
