@@ -35,5 +35,5 @@ ENV PATH=/opt/loopwright/bin:$PATH PYTHONUNBUFFERED=1 MPLCONFIGDIR=/tmp
 USER loopwright
 WORKDIR /data
 EXPOSE 8080
-HEALTHCHECK --interval=5s --timeout=5s --start-period=20s --retries=3 CMD ["python", "-m", "containers.health", "service"]
+HEALTHCHECK --interval=5s --timeout=5s --start-period=60s --retries=3 CMD ["python", "-m", "containers.health", "service"]
 CMD ["loopwright", "serve", "--loops", "/etc/loopwright/loops.yaml", "--data", "/data"]
