@@ -12,7 +12,6 @@ from typing import Any
 
 from service import show
 from service.client import ApiError, Client
-from service.demo import PV_UNIT, TAG
 
 URL = "http://127.0.0.1:8080"
 
@@ -27,24 +26,25 @@ def main() -> int:
 
 def _demonstrate(client: Client) -> int:
     started = time.monotonic()
-    url = next(loop for loop in client.get("/loops") if loop["tag"] == TAG)["active_job"]
-    if url:
+    loop = client.get("/loops")[0]
+    if url := loop["active_job"]:
         show.console.print(f"GET   {url}: a retune is on its way", highlight=False)
     else:
-        url = client.post(f"/loops/{TAG}/retune", {"requested_by": "demo"})["url"]
-        show.console.print(f"POST  /loops/{TAG}/retune -> {url}", highlight=False)
+        url = client.post(f"/loops/{loop['tag']}/retune", {"requested_by": "demo"})["url"]
+        show.console.print(f"POST  /loops/{loop['tag']}/retune -> {url}", highlight=False)
     job = show.follow(client, url)
-    show.job_report(job, PV_UNIT)
-    show.console.print("\n".join(_proof(client, job, time.monotonic() - started)), highlight=False, soft_wrap=True)
+    show.job_report(job, loop["pv_unit"])
+    proof = _proof(job, client.get(f"/loops/{loop['tag']}"), time.monotonic() - started)
+    show.console.print("\n".join(proof), highlight=False, soft_wrap=True)
     return 0 if job["state"] == "proposed" else 3
 
 
-def _proof(client: Client, job: dict[str, Any], seconds: float) -> list[str]:
-    live = client.get(f"/loops/{TAG}")["live"]
+def _proof(job: dict[str, Any], loop: dict[str, Any], seconds: float) -> list[str]:
+    live = loop["live"]
     before, after = job["before"] or {}, job["after"] or {}
     changes = [
         f"{label} {show.cell(before.get(name))} -> {show.cell(after.get(name))}{unit}"
-        for label, name, unit in (("overshoot", "overshoot_pct", " %"), ("IAE", "IAE", f" {PV_UNIT} s"))
+        for label, name, unit in (("overshoot", "overshoot_pct", " %"), ("IAE", "IAE", f" {loop['pv_unit']} s"))
     ]
     held = ", ".join(f"{name} {show.cell(live['gains'][name])}" for name in ("Kp", "Ti"))
     return [
