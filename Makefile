@@ -1,13 +1,15 @@
 # make demo    a loop is retuned before your eyes      make test    every test and every check
 # make setup   the Python environment in .venv         make check   types, style, import directions, packages
 # make bench   every benchmark, in one table           make validate    the five papers, recomputed
+# make compose-test    the containers, with a real engine
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEBIAN := user-mode-linux tshark can-utils iproute2 postgresql
+ENGINE := docker.io docker-compose debootstrap user-mode-linux iproute2
 
-.PHONY: setup demo test check bench validate system clean
+.PHONY: setup demo test compose-test check bench validate system clean
 
 setup: $(VENV)/.installed
 
@@ -29,6 +31,11 @@ system:
 test: setup system check
 	quick=0; $(BIN)/python -m pytest --ignore=tests/vcan --ignore=tests/e2e || quick=$$?; \
 	LOOPWRIGHT_REQUIRE_VCAN=1 tools/with-vcan --timeout 3600 -- $(BIN)/python -m pytest $(wildcard tests/vcan tests/e2e) && exit $$quick
+
+# Where no container engine answers, one is installed as the packages above are, and runs for this test alone.
+compose-test:
+	@docker info >/dev/null 2>&1 || sh tools/system-packages $(ENGINE)
+	tools/compose-test
 
 check: setup
 	$(BIN)/ruff check

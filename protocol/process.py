@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import signal
 import sys
 from collections.abc import Callable, Iterable
@@ -52,6 +53,8 @@ def read_channels(path: str, keys: Iterable[str]) -> list[dict[str, Any]]:
 
 def run_device(name: str, bus_url: str, make: Callable[[Bus], DeviceProcess], description: str) -> int:
     """Runs a device until SIGTERM or SIGINT. Exit status 0, or 1 when there is no bus."""
+    # python-can's socketcand client warns of every frame that TCP splits, which is what TCP does.
+    logging.getLogger("can").setLevel(logging.ERROR)
     try:
         bus = open_bus(bus_url)
     except BusError as error:

@@ -1,0 +1,59 @@
+"""The demo of docker-compose.yml: one HTTP call retunes the loop; what happens is shown live, then the proof.
+
+Exit status 0: proposed, 3: the retune ended otherwise, 1: no answer. A retune that is on its way already, one that went
+on after a restart for example, is followed instead of starting another.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+from service import show
+from service.client import ApiError, Client
+
+URL = "http://127.0.0.1:8080"
+
+
+def main() -> int:
+    try:
+        return _demonstrate(Client(URL))
+    except ApiError as error:
+        print(f"demo: {error}", file=sys.stderr)
+        return 1
+
+
+def _demonstrate(client: Client) -> int:
+    started = time.monotonic()
+    loop = client.get("/loops")[0]
+    if url := loop["active_job"]:
+        show.console.print(f"GET   {url}: a retune is on its way", highlight=False)
+    else:
+        url = client.post(f"/loops/{loop['tag']}/retune", {"requested_by": "demo"})["url"]
+        show.console.print(f"POST  /loops/{loop['tag']}/retune -> {url}", highlight=False)
+    job = show.follow(client, url)
+    show.job_report(job, loop["pv_unit"])
+    proof = _proof(job, client.get(f"/loops/{loop['tag']}"), time.monotonic() - started)
+    show.console.print("\n".join(proof), highlight=False, soft_wrap=True)
+    return 0 if job["state"] == "proposed" else 3
+
+
+def _proof(job: dict[str, Any], loop: dict[str, Any], seconds: float) -> list[str]:
+    live = loop["live"]
+    before, after = job["before"] or {}, job["after"] or {}
+    changes = [
+        f"{label} {show.cell(before.get(name))} -> {show.cell(after.get(name))}{unit}"
+        for label, name, unit in (("overshoot", "overshoot_pct", " %"), ("IAE", "IAE", f" {loop['pv_unit']} s"))
+    ]
+    held = ", ".join(f"{name} {show.cell(live['gains'][name])}" for name in ("Kp", "Ti"))
+    return [
+        f"proof       {', '.join(changes)}",
+        f"controller  {live['mode']}, {held}, set-point {show.cell(live['sp'])}: its own until a proposal is accepted",
+        f"time        {job['plant_time_s']:.0f} s of plant time in {seconds:.1f} s",
+        f"state       {job['state']}",
+    ]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

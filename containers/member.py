@@ -1,0 +1,78 @@
+"""Runs a command on the bus of this network namespace, for as long as there is that bus.
+
+    python -m containers.member [--write TEMPLATE FILE] -- COMMAND...
+
+{bus} in an argument, and in TEMPLATE, which is written to FILE, stands for the bus's address. When the bus goes, the
+command is ended as by `docker stop`, and this container with it: started anew, it joins the new bus.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+
+from containers import keeper
+
+BUS_GONE = 75
+"""Exit status, "try again" (EX_TEMPFAIL)."""
+_JOIN_S = 20.0
+_STOP_S = 9.0
+"""What the command has to make its loops safe, before the engine's 10 s are over."""
+_BUS_RESTARTS_S = 3.0
+"""The bus has to be there before the engine starts this container again: it does not try a second time."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m containers.member", description=__doc__.split("\n")[0])
+    parser.add_argument("--write", nargs=2, type=Path, metavar=("TEMPLATE", "FILE"), help="with {bus} filled in")
+    parser.add_argument("command", nargs="+")
+    options = parser.parse_args(argv)
+    try:
+        url, connection = keeper.join(_JOIN_S)
+        if options.write:
+            template, target = options.write
+            target.write_text(template.read_text(encoding="utf-8").replace("{bus}", url), encoding="utf-8")
+    except (keeper.NoBus, OSError) as error:
+        print(f"member: {error}", file=sys.stderr)
+        return 1
+    with connection:
+        return _run([word.replace("{bus}", url) for word in options.command], connection)
+
+
+def _run(command: list[str], connection: socket.socket) -> int:
+    process = subprocess.Popen(command)
+    gone = threading.Event()
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        process.terminate()
+
+    def watch() -> None:
+        connection.recv(1)
+        gone.set()
+        process.terminate()
+        try:
+            process.wait(_STOP_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, stop)
+    threading.Thread(target=watch, daemon=True).start()
+    status = process.wait()
+    if gone.is_set():
+        print("member: the bus has gone: ended, to join the next one", file=sys.stderr, flush=True)
+        time.sleep(_BUS_RESTARTS_S)
+        return BUS_GONE
+    return status if status >= 0 else 128 - status
+
+
+if __name__ == "__main__":
+    sys.exit(main())
