@@ -1,0 +1,176 @@
+"""Which structure the record supports, and whether something beside MV moved PV.
+
+Seven structures by BIC. What the noise does not explain is first taken for a step of the load at a free time, then for
+two, or for a drift; such a story must earn its parameters clearly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tuning.fast.evidence import averaged
+from tuning.fast.fit import QUIET, Fit, Fitted, Hypothesis
+from tuning.models import Reals
+from tuning.sampled import pulses
+from tuning.structures import (
+    FIRST,
+    FIRST_FED,
+    SECOND,
+    SECOND_FED,
+    SECOND_WITH_ZERO,
+    THIRD_WITH_ZERO,
+    THIRD_WITH_ZEROS,
+    Structure,
+)
+
+STRUCTURES = (FIRST, FIRST_FED, SECOND, SECOND_WITH_ZERO, SECOND_FED, THIRD_WITH_ZERO, THIRD_WITH_ZEROS)
+RIVAL = 10.0
+"""Of BIC: structures this near to the best could be true as well."""
+EARNED = 15.0
+"""Of BIC: what a story beside MV must gain."""
+UNEXPLAINED = 1.15
+"""Of the noise at rest: a residual above it asks for a story."""
+UNIMPORTANT = 0.0015
+"""Of PV's span: a residual below it never does."""
+STARTS = 2
+THIRD_RATES = (1.0, 12.0, 40.0)  # 1/period
+EVERY = 0.1  # periods, between the first guesses of a load's time
+FIRST_STEPS = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chosen:
+    """best: the fit to go on with.  rivals: others that could be true as well.  unexplained: see UNEXPLAINED."""
+
+    best: Fitted
+    rivals: tuple[Fitted, ...]
+    unexplained: bool
+
+
+def choose(fit: Fit, known: Sequence[Fitted] = ()) -> Chosen:
+    """known: fits of an earlier part of the same record, from which is started as well."""
+    quiet = _all(fit, QUIET, known)
+    best = quiet
+    stories: tuple[Fitted, ...] = ()
+    if _unexplained(fit, min(quiet, key=_bic)):
+        stories = tuple(_stories(fit, quiet, known))
+        if stories and min(map(_bic, stories)) < min(map(_bic, quiet)) - EARNED:
+            best = list(stories)
+    ranked = sorted(best, key=_bic)
+    rivals = tuple(each for each in ranked[1:] if each.bic < ranked[0].bic + RIVAL)
+    return Chosen(ranked[0], rivals, _unexplained(fit, ranked[0]))
+
+
+def _stories(fit: Fit, quiet: Sequence[Fitted], known: Sequence[Fitted]) -> list[Fitted]:
+    """All structures with one step of the load; with a drift, or a second step, where that leaves something over."""
+    found = _all(fit, Hypothesis(loads=1), (*known, *_with_load(fit, quiet)))
+    if _unexplained(fit, min(found, key=_bic)):
+        for more in (Hypothesis(drift=True), Hypothesis(loads=2)):
+            simple = quiet if more.drift else found
+            starts = _with_load(fit, simple) if more.loads == 2 else _as(more, simple)
+            found = [*found, *_all(fit, more, (*known, *starts))]
+    return found
+
+
+def _all(fit: Fit, hypothesis: Hypothesis, known: Sequence[Fitted]) -> list[Fitted]:
+    """Every structure under this hypothesis; those with the same denominator share where they begin."""
+    times = _times(hypothesis, known)
+    begun: dict[int, list[Reals]] = {}
+    for lags, plain in ((1, FIRST), (2, SECOND)):
+        grid = fit.grid(plain, STARTS, float(times[0]) if hypothesis.loads == 1 else None)
+        begun[lags] = grid if hypothesis.loads < 2 else []
+    found: list[Fitted] = []
+    for structure in STRUCTURES:
+        same = [k.theta for k in known if k.structure.lags == structure.lags and k.hypothesis == hypothesis]
+        exact = [k.theta for k in known if k.structure is structure and k.hypothesis == hypothesis]
+        starts = [*exact, *same[:STARTS], *begun.get(structure.lags, [])]
+        if structure.lags == 3:
+            simpler = [each for each in found if each.structure in (SECOND, SECOND_WITH_ZERO)]
+            starts += [_third(fit, each, rate) for each in simpler for rate in THIRD_RATES]
+            starts += [each.theta for each in found if each.structure is THIRD_WITH_ZERO]
+        elif structure is not FIRST and structure is not SECOND:
+            starts += [each.theta for each in found if each.structure.lags == structure.lags]
+        found.append(fit.search(structure, hypothesis, _distinct(starts)))
+    return found
+
+
+def _third(fit: Fit, simpler: Fitted, rate: float) -> Reals:
+    """A fast lag more, and as much less dead time."""
+    theta = simpler.theta
+    p = rate / fit.period
+    L = max(theta[2] - 0.8 / p, 0.0)
+    return np.concatenate((theta[:2], [np.log(p), L], theta[3:]))
+
+
+def _distinct(starts: Sequence[Reals]) -> list[Reals]:
+    kept: list[Reals] = []
+    for theta in starts:
+        if all(np.max(np.abs(theta - other)) > 1e-3 for other in kept):
+            kept.append(theta)
+    return kept
+
+
+def _times(hypothesis: Hypothesis, known: Sequence[Fitted]) -> Reals:
+    """Of the loads, as best known."""
+    best = min((k for k in known if k.hypothesis == hypothesis), key=_bic, default=None)
+    return best.theta[best.structure.searched :] if best is not None else np.zeros(hypothesis.loads)
+
+
+def _as(hypothesis: Hypothesis, found: Sequence[Fitted]) -> list[Fitted]:
+    return [fitted for each in found for fitted in [_under(hypothesis, each)]]
+
+
+def _under(hypothesis: Hypothesis, each: Fitted) -> Fitted:
+    return Fitted(each.structure, hypothesis, each.theta, each.columns, each.linear, each.bic)
+
+
+def _with_load(fit: Fit, simpler: Sequence[Fitted]) -> list[Fitted]:
+    """Second-order fits with one step of the load more than `simpler`, from the most promising times."""
+    second = min((each for each in simpler if each.structure is SECOND), key=_bic)
+    hypothesis = Hypothesis(second.hypothesis.loads + 1)
+    earlier = second.theta[3:]
+    if len(earlier):
+        thetas = [second.theta[:3]]
+    else:
+        thetas = [second.theta[:3], *(np.append(d, L * fit.period) for d in fit.denominators(SECOND) for L in (0.06, 0.14, 0.23, 0.41))]
+    guesses: list[tuple[float, Reals]] = []
+    times = np.arange(0.0, len(fit.u) - 0.2 * fit.period, EVERY * fit.period)
+    shifts = np.round(times / fit.block).astype(int)
+    for theta in thetas:
+        rss = _by_time(fit, theta, earlier, shifts)
+        for i in np.argsort(rss)[:3]:
+            guesses.append((float(rss[i]), np.concatenate((theta, earlier, [shifts[i] * fit.block]))))
+    guesses.sort(key=lambda each: each[0])
+    starts = fit.differing([theta for _, theta in guesses], SECOND, 6)
+    rough = sorted((fit.search(SECOND, hypothesis, [start], FIRST_STEPS) for start in starts), key=_bic)
+    return [fit.search(SECOND, hypothesis, [each.theta]) for each in rough[:2]]
+
+
+def _by_time(fit: Fit, theta: Reals, earlier: Reals, shifts: Sequence[int]) -> Reals:
+    """Sum of squares left with one step of the load more at each of these rows; a load only shifts its response."""
+    base = fit.regressors(SECOND, Hypothesis(len(earlier)), [np.append(theta, earlier)])[0]
+    q = np.linalg.qr(base)[0]
+    rest = fit.y - q @ (q.T @ fit.y)
+    monic = SECOND.monic(theta)[None, :]
+    answer = averaged(pulses(monic, [0.0], 2)[0].drive(np.ones(len(fit.u))), fit.block)
+    answer = answer / np.max(np.abs(answer), axis=0)
+    shifted = np.zeros((len(shifts), fit.samples, 2))
+    for i, m in enumerate(shifts):
+        shifted[i, m:] = answer[: fit.samples - m]
+    across = np.einsum("nk,snj->skj", q, shifted, optimize=True)
+    gram = np.swapaxes(shifted, 1, 2) @ shifted - np.swapaxes(across, 1, 2) @ across
+    scale = np.maximum(np.einsum("sii->s", gram), 1e-12)[:, None, None]
+    along = np.einsum("snj,n->sj", shifted, rest, optimize=True)
+    weights = np.linalg.solve(gram + 1e-9 * scale * np.eye(2), along[:, :, None])[:, :, 0]
+    return np.asarray(rest @ rest - np.einsum("si,si->s", weights, along))
+
+
+def _unexplained(fit: Fit, best: Fitted) -> bool:
+    return best.rms > max(UNEXPLAINED * fit.evidence.noise / fit.evidence.span, UNIMPORTANT)
+
+
+def _bic(fitted: Fitted) -> float:
+    return fitted.bic
