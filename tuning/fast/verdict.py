@@ -1,0 +1,95 @@
+"""Identification, design and verdict of a fast record in one call."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from tuning.fast.choice import Chosen, choose
+from tuning.fast.design import Best, Design, Wish
+from tuning.fast.evidence import Evidence
+from tuning.fast.fit import Fit, Fitted
+from tuning.fast.spread import colour, difference_of_rivals, peak, uncertainty_of_Ms
+from tuning.gains import Gains
+from tuning.models import TransferFunction
+
+MOST_RESIDUAL, UNIMPORTANT = 1.35, 0.004
+"""Of the residual: in noises at rest; in spans of PV, below which it does not matter."""
+MOST_COLOUR = 1.35
+MOST_UNCERTAINTY = 0.10
+"""Of Ms, by the delta method and among the rivals."""
+SURPRISE = 0.5
+"""Of Ms of the tested controller on the new model, from what was asked."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """cause: why the result is not to be trusted, None if it is: unexplained, disturbed, uncertain, ambiguous, surprise.
+
+    model: without the delay of the sampling, which is in `design_delay` (s).  Ms: on the model.
+    uncertainty, ambiguity: of Ms.  residual: its rms in noises at rest.
+    """
+
+    cause: str | None
+    detail: str
+    model: TransferFunction
+    structure: str
+    best: Best
+    Ms: float
+    uncertainty: float
+    ambiguity: float
+    residual: float
+    chosen: Chosen
+    fit: Fit
+    design_delay: float
+
+
+def judge(
+    evidence: Evidence, wish: Wish, known: Sequence[Fitted] = (), tested: Gains | None = None
+) -> Judged:
+    """known: fits of an earlier part of the record.  tested: the gains under which its last part was made.
+
+    Raises Refused, NOT_ROBUST, where the model allows no such controller.
+    """
+    fit = Fit(evidence)
+    chosen = choose(fit, known)
+    found = chosen.best
+    model = fit.model(found)
+    delay = 0.5 * evidence.Ts
+    design = Design(replace(model, L=model.L + delay), wish, evidence.period * evidence.Ts)
+    best = design.best()
+    spread = uncertainty_of_Ms(fit, found, best.gains, design.w, wish.N, delay)
+    rivals = difference_of_rivals(fit, found, chosen.rivals, best.gains, design.w, delay)
+    noise = evidence.noise / evidence.span
+    whiteness = colour(found.linear.residual)
+    cause, detail = None, ""
+    if found.rms > max(MOST_RESIDUAL * noise, UNIMPORTANT):
+        cause = "unexplained"
+        detail = f"the model leaves {100.0 * found.rms:.2g} % of PV's span unexplained, the noise is {100.0 * noise:.2g} %"
+    elif found.rms > UNIMPORTANT and whiteness > MOST_COLOUR * max(evidence.colour, 1.0):
+        cause = "disturbed"
+        detail = f"what the model leaves varies slowly: {whiteness:.2f} times white noise, {evidence.colour:.2f} at rest"
+    elif spread > MOST_UNCERTAINTY:
+        cause = "uncertain"
+        detail = f"Ms is known to +{spread:.2g} only"
+    elif rivals > MOST_UNCERTAINTY:
+        cause = "ambiguous"
+        detail = f"another model that explains the record as well gives an Ms off by {rivals:.2g}"
+    elif tested is not None and abs((seen := peak(model, tested, design.w, delay)) - wish.Ms) > SURPRISE:
+        cause = "surprise"
+        detail = f"the controller that was tested has Ms {seen:.2f} on the model of the whole record, not {wish.Ms:g}"
+    return Judged(
+        cause=cause,
+        detail=detail,
+        model=model,
+        structure=found.structure.name,
+        best=best,
+        Ms=peak(model, best.gains, design.w, delay),
+        uncertainty=spread,
+        ambiguity=rivals,
+        residual=found.rms / noise if noise > 0.0 else math.inf,
+        chosen=chosen,
+        fit=fit,
+        design_delay=delay,
+    )
