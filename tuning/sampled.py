@@ -60,10 +60,10 @@ def states(monic: Reals, L: float, u: Reals, count: int) -> Reals:
 
 def pulses(monics: Reals, dead_times: Sequence[float], count: int) -> list[Pulse]:
     """How the first `count` states answer, for each denominator (rows of `monics`) and its dead time, see `states`."""
-    dead_times = np.asarray(dead_times, dtype=float)
     many, order = monics.shape
-    whole = np.floor(dead_times)
-    part = (dead_times - whole)[:, None, None]
+    L = np.asarray(dead_times, dtype=float)
+    whole = np.floor(L)
+    part = (L - whole)[:, None, None]
     block = np.zeros((many, order + 1, order + 1))
     block[:, : order - 1, 1:order] = np.eye(order - 1)
     block[:, order - 1, :order] = -monics[:, ::-1]

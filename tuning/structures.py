@@ -21,8 +21,8 @@ Plant = FOPDT | SOPDT | Integrating
 class Structure:
     """(b_z s^z + ... + b_0) * exp(-L*s) / den(s), den monic with `lags` searched coefficients, times s if integrating.
 
-    Three lags are (s^2 + a1 s + a0)(s + p). feed_through: a part g*exp(-L*s) of MV is in PV at once.
-    theta = (logs of the searched coefficients, highest power first, p last; L), time in samples. The b are linear, g is.
+    Three lags are (s^2 + a1 s + a0)(s + p). feed_through: a part g*exp(-L*s) of MV is in PV at once. The b and g are
+    linear, theta = (logs of the searched coefficients, highest power first, p last; L) is not; time in samples.
     """
 
     name: str

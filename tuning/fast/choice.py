@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tuning.fast.evidence import averaged
 from tuning.fast.fit import QUIET, Fit, Fitted, Hypothesis
@@ -23,7 +24,6 @@ from tuning.structures import (
     SECOND_WITH_ZERO,
     THIRD_WITH_ZERO,
     THIRD_WITH_ZEROS,
-    Structure,
 )
 
 STRUCTURES = (FIRST, FIRST_FED, SECOND, SECOND_WITH_ZERO, SECOND_FED, THIRD_WITH_ZERO, THIRD_WITH_ZEROS)
@@ -39,15 +39,16 @@ STARTS = 2
 THIRD_RATES = (1.0, 12.0, 40.0)  # 1/period
 EVERY = 0.1  # periods, between the first guesses of a load's time
 FIRST_STEPS = 8
+LOAD_DEAD_TIMES = (0.06, 0.14, 0.23, 0.41)  # periods
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chosen:
-    """best: the fit to go on with.  rivals: others that could be true as well.  unexplained: see UNEXPLAINED."""
+    """best: the fit to go on with.  rivals: others that could be true as well.  fits: all with the same story."""
 
     best: Fitted
     rivals: tuple[Fitted, ...]
-    unexplained: bool
+    fits: tuple[Fitted, ...]
 
 
 def choose(fit: Fit, known: Sequence[Fitted] = ()) -> Chosen:
@@ -61,7 +62,8 @@ def choose(fit: Fit, known: Sequence[Fitted] = ()) -> Chosen:
             best = list(stories)
     ranked = sorted(best, key=_bic)
     rivals = tuple(each for each in ranked[1:] if each.bic < ranked[0].bic + RIVAL)
-    return Chosen(ranked[0], rivals, _unexplained(fit, ranked[0]))
+    same = tuple(each for each in ranked if each.hypothesis == ranked[0].hypothesis)
+    return Chosen(ranked[0], rivals, same)
 
 
 def _stories(fit: Fit, quiet: Sequence[Fitted], known: Sequence[Fitted]) -> list[Fitted]:
@@ -79,9 +81,11 @@ def _all(fit: Fit, hypothesis: Hypothesis, known: Sequence[Fitted]) -> list[Fitt
     """Every structure under this hypothesis; those with the same denominator share where they begin."""
     times = _times(hypothesis, known)
     begun: dict[int, list[Reals]] = {}
-    for lags, plain in ((1, FIRST), (2, SECOND)):
-        grid = fit.grid(plain, STARTS, float(times[0]) if hypothesis.loads == 1 else None)
-        begun[lags] = grid if hypothesis.loads < 2 else []
+    for plain in (FIRST, SECOND):
+        if hypothesis.loads == 1:
+            begun[plain.lags] = fit.grid(plain, STARTS, float(times[0]))
+        else:
+            begun[plain.lags] = [np.append(theta, times) for theta in fit.grid(plain, STARTS)]
     found: list[Fitted] = []
     for structure in STRUCTURES:
         same = [k.theta for k in known if k.structure.lags == structure.lags and k.hypothesis == hypothesis]
@@ -135,10 +139,11 @@ def _with_load(fit: Fit, simpler: Sequence[Fitted]) -> list[Fitted]:
     if len(earlier):
         thetas = [second.theta[:3]]
     else:
-        thetas = [second.theta[:3], *(np.append(d, L * fit.period) for d in fit.denominators(SECOND) for L in (0.06, 0.14, 0.23, 0.41))]
+        grid = [np.append(logs, L * fit.period) for logs in fit.denominators(SECOND) for L in LOAD_DEAD_TIMES]
+        thetas = [second.theta[:3], *grid]
     guesses: list[tuple[float, Reals]] = []
     times = np.arange(0.0, len(fit.u) - 0.2 * fit.period, EVERY * fit.period)
-    shifts = np.round(times / fit.block).astype(int)
+    shifts = np.round(times / fit.block).astype(np.int64)
     for theta in thetas:
         rss = _by_time(fit, theta, earlier, shifts)
         for i in np.argsort(rss)[:3]:
@@ -149,7 +154,7 @@ def _with_load(fit: Fit, simpler: Sequence[Fitted]) -> list[Fitted]:
     return [fit.search(SECOND, hypothesis, [each.theta]) for each in rough[:2]]
 
 
-def _by_time(fit: Fit, theta: Reals, earlier: Reals, shifts: Sequence[int]) -> Reals:
+def _by_time(fit: Fit, theta: Reals, earlier: Reals, shifts: NDArray[np.int64]) -> Reals:
     """Sum of squares left with one step of the load more at each of these rows; a load only shifts its response."""
     base = fit.regressors(SECOND, Hypothesis(len(earlier)), [np.append(theta, earlier)])[0]
     q = np.linalg.qr(base)[0]

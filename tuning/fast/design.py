@@ -105,7 +105,7 @@ class Design:
         for end in sorted({min(end, cap) for end in largest_gains(g, wish.Ms, wish.Mt)}):
             if encircles_not(end * g):
                 cost = self.cost(end, Ti, Td, wish.N)
-                found.append((Gains(end, Ti, Td, Td / wish.N), cost))
+                found.append((Gains(float(end), float(Ti), float(Td), float(Td) / wish.N), cost))
         return found
 
     def _pi(self) -> Best:

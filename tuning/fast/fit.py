@@ -64,7 +64,7 @@ class Fitted:
 
     @property
     def parameters(self) -> int:
-        return len(self.theta) + self.columns.shape[1]
+        return len(self.theta) + int(self.columns.shape[1])
 
 
 class Fit:

@@ -11,11 +11,12 @@ from tuning.fast.design import controller
 from tuning.fast.fit import LOG_STEP, Fit, Fitted
 from tuning.gains import Gains
 from tuning.models import Complexes, Reals, TransferFunction, sign
-from tuning.varpro import covariance
 
 NEAR_THE_PEAK = 0.7
 """Of |S|: where it is less, an error of the model costs nothing."""
 STANDARD_DEVIATIONS = 2.0
+UNSEEN = 1e-7
+"""Singular value, of columns of unit length."""
 LEAST_DISTANCE = 0.05
 """Of the loop from -1; nearer, Ms is anything."""
 
@@ -41,7 +42,15 @@ def fit_covariance(fit: Fit, found: Fitted) -> Reals:
     slopes = ((outputs[:count] - outputs[count:]) / apart[:, None]).T
     rest = found.linear.residual
     variance = found.linear.rss / max(fit.samples - found.parameters, 1) * colour(rest)
-    return covariance(np.column_stack((slopes, found.columns)), variance)
+    return seen_covariance(np.column_stack((slopes, found.columns)), variance)
+
+
+def seen_covariance(columns: Reals, variance: float) -> Reals:
+    """variance * (A'A)^-1 without the directions that move PV by next to nothing: they move the loop as little."""
+    lengths = np.sqrt(np.einsum("ij,ij->j", columns, columns))
+    lengths = np.where(lengths > 0.0, lengths, 1.0)
+    inverse = np.linalg.pinv(columns / lengths, rcond=UNSEEN)
+    return np.asarray(variance * (inverse @ inverse.T) / np.outer(lengths, lengths))
 
 
 def uncertainty_of_Ms(fit: Fit, found: Fitted, gains: Gains, w: Reals, N: float, delay: float) -> float:
@@ -60,9 +69,10 @@ def uncertainty_of_Ms(fit: Fit, found: Fitted, gains: Gains, w: Reals, N: float,
     for i in range(len(at)):
         step = LOG_STEP * (fit.period if i == structure.lags else 1.0)
         step *= abs(at[i]) + 1e-12 if i >= structure.searched else 1.0
-        moved = at.copy()
-        moved[i] += step
-        slopes.append((loop(moved) - nominal) / step)
+        move = np.zeros(len(at))
+        move[i] = step
+        # weak directions are long: their parts must cancel to many digits
+        slopes.append((loop(at + move) - loop(at - move)) / (2.0 * step))
     distance = np.abs(1.0 + nominal)
     along = np.real(np.array(slopes) * np.conj(1.0 + nominal) / distance)
     whole = fit_covariance(fit, found)
@@ -73,7 +83,9 @@ def uncertainty_of_Ms(fit: Fit, found: Fitted, gains: Gains, w: Reals, N: float,
     return float(1.0 / worst.min() - 1.0 / distance.min()) if near.any() else 0.0
 
 
-def difference_of_rivals(fit: Fit, best: Fitted, rivals: Sequence[Fitted], gains: Gains, w: Reals, delay: float) -> float:
+def difference_of_rivals(
+    fit: Fit, best: Fitted, rivals: Sequence[Fitted], gains: Gains, w: Reals, delay: float
+) -> float:
     """The largest |Ms - nominal Ms| that the same controller has on another model the record supports."""
     nominal = peak(fit.model(best), gains, w, delay)
     return max((abs(peak(fit.model(rival), gains, w, delay) - nominal) for rival in rivals), default=0.0)

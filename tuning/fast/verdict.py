@@ -25,7 +25,7 @@ SURPRISE = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """cause: why the result is not to be trusted, None if it is: unexplained, disturbed, uncertain, ambiguous, surprise.
+    """cause: the value of the reason why the result is not to be trusted, None if it is.
 
     model: without the delay of the sampling, which is in `design_delay` (s).  Ms: on the model.
     uncertainty, ambiguity: of Ms.  residual: its rms in noises at rest.
@@ -66,10 +66,12 @@ def judge(
     cause, detail = None, ""
     if found.rms > max(MOST_RESIDUAL * noise, UNIMPORTANT):
         cause = "unexplained"
-        detail = f"the model leaves {100.0 * found.rms:.2g} % of PV's span unexplained, the noise is {100.0 * noise:.2g} %"
+        rms = 100.0 * found.rms
+        detail = f"the model leaves {rms:.2g} % of PV's span unexplained, the noise is {100.0 * noise:.2g} %"
     elif found.rms > UNIMPORTANT and whiteness > MOST_COLOUR * max(evidence.colour, 1.0):
         cause = "disturbed"
-        detail = f"what the model leaves varies slowly: {whiteness:.2f} times white noise, {evidence.colour:.2f} at rest"
+        at_rest = f"{evidence.colour:.2f} at rest"
+        detail = f"what the model leaves varies slowly: {whiteness:.2f} times white noise, {at_rest}"
     elif spread > MOST_UNCERTAINTY:
         cause = "uncertain"
         detail = f"Ms is known to +{spread:.2g} only"
