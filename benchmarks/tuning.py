@@ -154,6 +154,7 @@ class Row:
     refused: Counter[str] = field(default_factory=Counter)
     wrong: list[str] = field(default_factory=list)
     unstable: list[str] = field(default_factory=list)
+    endings: list[str] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
 
     def add(self, plant: Plant, gains: Gains, time_Pu: float, derivative: bool, label: str) -> None:
@@ -212,6 +213,7 @@ def measure(case: Case, chosen: Iterable[Plant], seeds: int) -> Row:
             else:
                 assert isinstance(result.ended, Ended)
                 row.refused[result.ended.reason.value] += 1
+                row.endings.append(f"{label}: {result.ended}")
     return row
 
 
@@ -261,6 +263,7 @@ def main() -> None:
         print(line(name, row), flush=True)
         doubtful += [f"{name}: {each} silently wrong" for each in row.wrong]
         doubtful += [f"{name}: {each} unstable" for each in row.unstable]
+        doubtful += [f"{name}: {each}" for each in row.endings]
         seconds += row.seconds
     print(f"\n{len(seconds)} runs, {np.median(seconds):.2f} s of processor each (median), {max(seconds):.2f} s (most).")
     print("\n".join(doubtful))

@@ -9,7 +9,7 @@ import numpy as np
 
 from tuning.fast.evidence import LEAST_SWITCHES, Evidence, noise_of, period
 from tuning.gains import Gains
-from tuning.plan import Command, Event, Mode, Plan, Sample, SetGains, SetMode, SetRelay, SetSetpoint, Work
+from tuning.plan import Command, Event, Mode, Plan, Sample, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint, Work
 from tuning.reasons import Reason, Refused
 from tuning.stages.common import Facts, OperatingPoint, Trace
 from tuning.stages.relay import no_oscillation
@@ -76,12 +76,26 @@ class Experiment:
         return True
 
     def step(self, gains: Gains) -> Plan[None]:
-        """The new gains take over, bumpless, and the set-point steps by up to half the span."""
+        """The new gains take over with nothing in the integral, and the set-point steps by up to half the span."""
+        facts, point = self.facts, self.point
         span = self.evidence().span
-        size = min(0.5 * span, self.amplitude / gains.Kp, self.facts.sp_deviation)
+        size = min(0.5 * span, self.amplitude / gains.Kp, facts.sp_deviation)
         self.relayed = len(self.trace)
         self._commands = ()
-        sample = yield (SetGains(gains), SetMode(Mode.AUTOMATIC), SetSetpoint(self.point.sp + size))
+        # bumpless from the relay's side, the integral would begin there, as far away as a load that has been lifted;
+        # from the proportional part alone it begins at rest
+        error = (point.pv - self.trace.pv[-1]) * (1.0 if facts.reverse else -1.0)
+        output = min(max(point.mv + gains.Kp * error, facts.mv_low), facts.mv_high)
+        self.trace.add((yield (SetMode(Mode.MANUAL), SetOutput(output), SetGains(gains))))
+        yield from self._follow((SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp + size)), span)
+
+    def step_back(self) -> Plan[None]:
+        """The set-point steps home, under the same gains."""
+        yield from self._follow((SetSetpoint(self.point.sp),), self.evidence().span)
+
+    def _follow(self, commands: tuple[Command, ...], span: float) -> Plan[None]:
+        """Raises Refused, DIVERGES."""
+        sample = yield commands
         self.trace.add(sample)
         end = sample.t + VERIFIED_PERIODS * period(tuple(self.switches)) * self.facts.sample_time_s
         while sample.t < end:

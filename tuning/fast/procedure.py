@@ -32,6 +32,8 @@ __all__ = ["FAST", "FAST_STAGES", "FastOptions", "FastProposal", "fast"]
 FAST = "fast"
 FAST_STAGES = ("preflight", "relay", "design", "verify", "redesign")
 SWITCHES = (4, 6, 8, 10)
+NOT_YET = (Reason.UNCERTAIN, Reason.AMBIGUOUS)
+"""What more of the same record may mend."""
 LEAST_SAMPLES = 2 * LEAST_LISTENED
 """At rest, for the noise and the offset."""
 
@@ -148,11 +150,17 @@ def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
         yield from experiment.tell(*started("verify"))
         tested = judged.best.gains
         yield from experiment.step(tested)
-        again = partial(judge, experiment.evidence(), wish, judged.chosen.fits, tested)
-        judged = yield from experiment.computed(again)
+        known = judged.chosen.fits
+        judged = yield from experiment.computed(partial(judge, experiment.evidence(), wish, known, tested))
+        ended = _wrong(facts, judged)
+        if ended is not None and ended.reason in NOT_YET:
+            yield from experiment.tell(Note(f"after the set-point step: {ended.detail}; it is stepped back"))
+            yield from experiment.step_back()
+            known = judged.chosen.fits
+            judged = yield from experiment.computed(partial(judge, experiment.evidence(), wish, known, tested))
+            ended = _wrong(facts, judged)
         found = _found(judged)
         yield (StageDone("verify", found), *started("redesign"), StageDone("redesign", found))
-        ended = _wrong(facts, judged)
         if ended is not None:
             raise ended
     gains = judged.best.gains

@@ -67,8 +67,10 @@ def uncertainty_of_Ms(fit: Fit, found: Fitted, gains: Gains, w: Reals, N: float,
     nominal = loop(at)
     slopes = []
     for i in range(len(at)):
-        step = LOG_STEP * (fit.period if i == structure.lags else 1.0)
-        step *= abs(at[i]) + 1e-12 if i >= structure.searched else 1.0
+        if i == structure.lags:
+            slopes.append(-1j * w * fit.evidence.Ts * nominal)
+            continue
+        step = LOG_STEP * (abs(at[i]) + 1e-12 if i >= structure.searched else 1.0)
         move = np.zeros(len(at))
         move[i] = step
         # weak directions are long: their parts must cancel to many digits
