@@ -1,6 +1,6 @@
 """How well the fast procedure tunes: many plants, several seeds, noise and load steps, judged on the true plant.
 
-    python -m benchmarks.tuning [--plants N] [--seeds N] [--cases pi-1,pid-1,...] [--methods fast,five-stage,...]
+    python -m benchmarks.tuning [--plants N] [--part I/N] [--seeds N] [--cases "PI 1 %,..."] [--save FILE] [--of FILE]
 
 The plants are 70 of the Astrom-Hagglund batch, the 50 models of the five-stage paper and the linearised reactor (every
 n-th with --plants N). Each run is a rehearsal: listening, relay, fit, step, fit. Noise is white, its standard deviation
@@ -18,16 +18,19 @@ import json
 import math
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import ss2tf
 
 from controller.channel import Channel, Settings
 from controller.pid import Parameters
+from plantsim import reactor
 from plantsim.plant import LinearPlant
 from service.rehearsal import RehearsedLoop
 from service.runner import RunResult, Watch, run
@@ -35,7 +38,7 @@ from tuning.fast.design import Design, Wish
 from tuning.fast.experiment import Experiment
 from tuning.fast.procedure import LEAST_SAMPLES, FastOptions, FastProposal, fast
 from tuning.gains import Gains
-from tuning.margins import margins
+from tuning.margins import margins, ultimate_point
 from tuning.models import TransferFunction, sign
 from tuning.plan import Mode, Plan
 from tuning.reasons import Ended
@@ -104,19 +107,36 @@ class Loaded(LinearPlant):
 
 def plants() -> list[Plant]:
     batch = json.loads((Path(__file__).parent.parent / "tests/data/plants-batch.json").read_text())["processes"]
-    found = [
-        Plant(p["id"], tuple(p["num"]), tuple(p["den"]), p["delay"], p["Ku"], p["Tu"]) for p in batch
-    ]
-    models = json.loads((files("plantsim") / "models-50.json").read_text())["models"]
-    for m in models:
-        model = TransferFunction(tuple(m["num"]), tuple(m["den"]), m["delay"])
-        at = margins(model, Gains(Kp=1.0))
-        assert at.GM is not None and at.wpc is not None
-        found.append(Plant(f"model-{m['id']}", model.num, model.den, model.L, at.GM, 2.0 * math.pi / at.wpc))
+    found = [Plant(p["id"], tuple(p["num"]), tuple(p["den"]), p["delay"], p["Ku"], p["Tu"]) for p in batch]
+    for m in json.loads((files("plantsim") / "models-50.json").read_text())["models"]:
+        found.append(_of(f"model-{m['id']}", TransferFunction(tuple(m["num"]), tuple(m["den"]), m["delay"])))
+    found.append(_of("reactor", linear_reactor()))
     return found
 
 
-def loop_of(plant: Plant, amplitude: float, span: float, noise: float, seed: int) -> tuple[RehearsedLoop, Facts, Loaded]:
+def _of(name: str, model: TransferFunction) -> Plant:
+    Ku, Pu = ultimate_point(model)
+    return Plant(name, model.num, model.den, model.L, Ku, Pu)
+
+
+def linear_reactor() -> TransferFunction:
+    """The reactor around its steady state, by central differences; its actuator and sensor with it."""
+    at = np.array([*reactor.STEADY_STATE, reactor.MV_NOMINAL])
+
+    def slope(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        a, b, c, h, T, opening = map(float, x)
+        return np.array(reactor.derivative((a, b, c, h, T), opening, reactor.INLET))
+
+    moves = np.diag(1e-5 * at)
+    jacobian = np.array([(slope(at + m) - slope(at - m)) / (2.0 * m.sum()) for m in moves]).T
+    num, den = ss2tf(jacobian[:, :5], jacobian[:, 5:], np.eye(5)[2:3], np.zeros((1, 1)))
+    lagged = np.convolve(den, (reactor.ACTUATOR_LAG_S, 1.0))
+    return TransferFunction(tuple(num[0][1:]), tuple(lagged), reactor.SENSOR_DELAY_S)
+
+
+def loop_of(
+    plant: Plant, amplitude: float, span: float, noise: float, seed: int
+) -> tuple[RehearsedLoop, Facts, Loaded]:
     """A loop at rest under sluggish gains, in deviation variables."""
     process = Loaded(plant.num, plant.den, plant.L, plant.Ts, noise_std=noise, seed=seed)
     reverse = sign(plant.model()) > 0.0
@@ -144,32 +164,26 @@ def relay_span(plant: Plant) -> float:
     return result.value
 
 
-@dataclass(slots=True)
-class Row:
-    """Of one case and method. Times in Pu."""
+@dataclass(frozen=True, slots=True)
+class Ran:
+    """How one run ended. passed: in Pu.  Ms, ratio (J over the best): on the true plant, None where it is unstable.
 
-    times: list[float] = field(default_factory=list)
-    errors: list[float] = field(default_factory=list)
-    ratios: list[float] = field(default_factory=list)
-    refused: Counter[str] = field(default_factory=Counter)
-    wrong: list[str] = field(default_factory=list)
-    unstable: list[str] = field(default_factory=list)
-    endings: list[str] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
+    reason: why nothing was proposed, None if something was.  seconds: of processor.
+    """
 
-    def add(self, plant: Plant, gains: Gains, time_Pu: float, derivative: bool, label: str) -> None:
-        true = margins(plant.model(), gains)
-        self.times.append(time_Pu)
-        if not true.stable:
-            self.unstable.append(label)
-            return
-        self.errors.append(abs(true.Ms - ASKED))
-        if self.errors[-1] > WRONG:
-            self.wrong.append(f"{label} (Ms {true.Ms:.2f})")
-        design, best, least = optimum(plant, derivative)
-        cost = design.cost(gains.Kp, gains.Ti, gains.Td, design.wish.N)
-        J = 0.5 * cost.setpoint / least[0] + 0.5 * cost.load / least[1]
-        self.ratios.append(J / best)
+    case: str
+    plant: str
+    seed: int
+    passed: float
+    seconds: float
+    reason: str | None = None
+    detail: str = ""
+    Ms: float | None = None
+    ratio: float | None = None
+
+    @property
+    def error(self) -> float:
+        return math.inf if self.Ms is None else abs(self.Ms - ASKED)
 
 
 @cache
@@ -200,36 +214,34 @@ def fast_run(plant: Plant, case: Case, seed: int) -> tuple[RunResult[FastProposa
     return result, passed / plant.Pu
 
 
-def measure(case: Case, chosen: Iterable[Plant], seeds: int) -> Row:
-    row = Row()
-    for plant in chosen:
-        for seed in range(1, seeds + 1):
-            start = time.process_time()
-            result, passed = fast_run(plant, case, seed)
-            row.seconds.append(time.process_time() - start)
-            label = f"{plant.name}, seed {seed}"
-            if result.value is not None:
-                row.add(plant, result.value.gains, passed, case.derivative, label)
-            else:
-                assert isinstance(result.ended, Ended)
-                row.refused[result.ended.reason.value] += 1
-                row.endings.append(f"{label}: {result.ended}")
-    return row
+def measure(case: Case, plant: Plant, seed: int) -> Ran:
+    start = time.process_time()
+    result, passed = fast_run(plant, case, seed)
+    seconds = time.process_time() - start
+    if result.value is None:
+        assert isinstance(result.ended, Ended)
+        return Ran(case.name, plant.name, seed, passed, seconds, result.ended.reason.value, result.ended.detail)
+    gains = result.value.gains
+    true = margins(plant.model(), gains)
+    if not true.stable:
+        return Ran(case.name, plant.name, seed, passed, seconds)
+    design, best, least = optimum(plant, case.derivative)
+    cost = design.cost(gains.Kp, gains.Ti, gains.Td, design.wish.N)
+    J = 0.5 * cost.setpoint / least[0] + 0.5 * cost.load / least[1]
+    return Ran(case.name, plant.name, seed, passed, seconds, Ms=true.Ms, ratio=J / best)
 
 
-def line(name: str, row: Row) -> str:
+def line(name: str, runs: Sequence[Ran]) -> str:
     """One row of the table in Markdown."""
-    proposed, runs = len(row.times), len(row.times) + sum(row.refused.values())
-    causes = ", ".join(f"{cause} {count}" for cause, count in row.refused.most_common())
-    errors = np.array(row.errors)
-
-    def within(limit: float) -> str:
-        return f"{100.0 * float(np.mean(errors <= limit)):.1f}" if len(errors) else "-"
-
+    proposed = [each for each in runs if each.reason is None]
+    causes = Counter(each.reason for each in runs if each.reason is not None).most_common()
+    errors = [each.error for each in proposed if each.Ms is not None]
+    within = " / ".join(f"{100.0 * sum(e <= limit for e in errors) / max(len(errors), 1):.1f}" for limit in (0.1, 0.05))
     return (
-        f"| {name} | {proposed}/{runs} | {_spread(row.times, 2)} | {_spread(row.errors, 3)} | "
-        f"{within(0.1)} / {within(0.05)} | {_spread(row.ratios, 3)} | {len(row.wrong)} | {len(row.unstable)} | "
-        f"{causes or '-'} |"
+        f"| {name} | {len(proposed)}/{len(runs)} | {_spread([each.passed for each in proposed], 2)} | "
+        f"{_spread(errors, 3)} | {within} | {_spread([each.ratio for each in proposed if each.ratio], 3)} | "
+        f"{sum(error > WRONG for error in errors)} | {len(proposed) - len(errors)} | "
+        f"{', '.join(f'{cause} {count}' for cause, count in causes) or '-'} |"
     )
 
 
@@ -249,24 +261,44 @@ def _spread(values: Sequence[float], digits: int) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--plants", type=int, help="so many, spread over the list; by default all")
-    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--part", default="0/1", help="i/n: every n-th of these plants, from the i-th on")
+    parser.add_argument("--seeds", default="1", help="so many, or first-last")
     parser.add_argument("--cases", default=",".join(CASES), help="names, comma-separated")
+    parser.add_argument("--save", type=Path, help="adds a line of JSON for every run to this file")
+    parser.add_argument("--of", type=Path, help="the table of such a file, nothing is run")
     given = parser.parse_args()
+    runs = _saved(given.of) if given.of else list(_runs(given))
+    print(HEAD)
+    for name in CASES:
+        if of_case := [each for each in runs if each.case == name]:
+            print(line(name, of_case))
+    seconds = [each.seconds for each in runs]
+    print(f"\n{len(runs)} runs, {np.median(seconds):.2f} s of processor each (median), {max(seconds):.2f} s (most).")
+    for each in runs:
+        if each.reason is not None:
+            print(f"{each.case}, {each.plant}, seed {each.seed}: {each.reason}: {each.detail}")
+        elif each.error > WRONG:
+            print(f"{each.case}, {each.plant}, seed {each.seed}: Ms {each.Ms}")
+
+
+def _saved(file: Path) -> list[Ran]:
+    return [Ran(**json.loads(text)) for text in file.read_text().splitlines()]
+
+
+def _runs(given: argparse.Namespace) -> Iterator[Ran]:
     everything = plants()
     step = len(everything) / min(given.plants or len(everything), len(everything))
-    chosen = [everything[int(i * step)] for i in range(round(len(everything) / step))]
-    print(HEAD, flush=True)
-    doubtful: list[str] = []
-    seconds: list[float] = []
+    part, parts = map(int, given.part.split("/"))
+    chosen = [everything[int(i * step)] for i in range(round(len(everything) / step))][part::parts]
+    first, _, last = given.seeds.rpartition("-")
     for name in given.cases.split(","):
-        row = measure(CASES[name], chosen, given.seeds)
-        print(line(name, row), flush=True)
-        doubtful += [f"{name}: {each} silently wrong" for each in row.wrong]
-        doubtful += [f"{name}: {each} unstable" for each in row.unstable]
-        doubtful += [f"{name}: {each}" for each in row.endings]
-        seconds += row.seconds
-    print(f"\n{len(seconds)} runs, {np.median(seconds):.2f} s of processor each (median), {max(seconds):.2f} s (most).")
-    print("\n".join(doubtful))
+        for plant in chosen:
+            for seed in range(int(first or 1), int(last) + 1):
+                ran = measure(CASES[name], plant, seed)
+                if given.save:
+                    with given.save.open("a") as file:
+                        file.write(json.dumps(asdict(ran)) + "\n")
+                yield ran
 
 
 if __name__ == "__main__":

@@ -34,6 +34,10 @@ class Pulse:
     recursion: Reals
     delay: int
 
+    def first(self, count: int) -> Pulse:
+        """Of the first so many states alone."""
+        return Pulse(self.forward[:, :count], self.recursion, self.delay)
+
     def drive(self, u: Reals) -> Reals:
         """The states under u, 0 before the first sample, as columns, shape (len(u), states)."""
         taps, count = self.forward.shape
@@ -58,7 +62,7 @@ def states(monic: Reals, L: float, u: Reals, count: int) -> Reals:
     return pulses(monic[None, :], [L], count)[0].drive(u)
 
 
-def pulses(monics: Reals, dead_times: Sequence[float], count: int) -> list[Pulse]:
+def pulses(monics: Reals, dead_times: Sequence[float] | Reals, count: int) -> list[Pulse]:
     """How the first `count` states answer, for each denominator (rows of `monics`) and its dead time, see `states`."""
     many, order = monics.shape
     L = np.asarray(dead_times, dtype=float)

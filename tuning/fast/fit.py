@@ -27,6 +27,8 @@ DEAD_TIMES = (0.01, 0.06, 0.14, 0.23, 0.32, 0.41, 0.49)
 LAGS = (0.02, 0.08, 0.25, 0.8, 4.0, 40.0)
 COMPLEX = ((3.0, 0.5), (6.0, 0.5), (10.0, 0.3))
 MOST_STEPS = 25
+FIRST_STEPS, LONG_SEARCHES = 5, 2
+"""Of many starts, all are followed so far, and so many to the end."""
 RELATIVE_DECREASE = 1e-6
 LOG_STEP = 1e-4
 LOG_REACH = 1.5
@@ -87,16 +89,15 @@ class Fit:
         """Columns of everything linear for each theta, shape (thetas, rows, columns)."""
         count, searched = structure.zeros + 1, structure.searched
         monics = np.array([structure.monic(theta[:searched]) for theta in thetas])
-        driven = pulses(monics, [theta[searched - 1] for theta in thetas], count)
-        loads = [
-            pulses(monics, [theta[searched + i] for theta in thetas], structure.order)
-            for i in range(hypothesis.loads)
-        ]
+        # one call for MV and every load: what it costs is mostly the call
+        times = np.array(thetas)[:, structure.lags :].T
+        answers = pulses(np.tile(monics, (len(times), 1)), times.ravel(), structure.order)
+        driven, loads = answers[: len(thetas)], answers[len(thetas) :]
         always = self._always[:, : 1 + hypothesis.drift]
         width = structure.inputs + always.shape[1] + structure.order * hypothesis.loads
         out = np.empty((len(thetas), self.samples, width))
         for k, each in enumerate(driven):
-            out[k, :, :count] = averaged(each.drive(self.u), self.block)
+            out[k, :, :count] = averaged(each.first(count).drive(self.u), self.block)
             if structure.feed_through:
                 delayed = np.zeros(len(self.u))
                 delayed[each.delay + 1 :] = self.u[: len(self.u) - each.delay - 1]
@@ -104,8 +105,8 @@ class Fit:
             at = structure.inputs
             out[k, :, at : at + always.shape[1]] = always
             at += always.shape[1]
-            for load in loads:
-                out[k, :, at : at + structure.order] = averaged(load[k].drive(self._step), self.block)
+            for load in loads[k :: len(thetas)]:
+                out[k, :, at : at + structure.order] = averaged(load.drive(self._step), self.block)
                 at += structure.order
         return out
 
@@ -127,14 +128,20 @@ class Fit:
         reach = np.append(np.full(structure.lags, LOG_REACH), np.full(times, 0.25 * self.period))
         step = np.append(np.full(structure.lags, LOG_STEP), np.full(times, LOG_STEP * self.period))
         projection = _Projection(self, structure, hypothesis)
-        found = [
-            search(
-                projection.residual, start, low, high, reach, step, projection.slopes, most_steps, RELATIVE_DECREASE
-            )
-            for start in starts
-        ]
-        theta = min(found, key=lambda each: each[1])[0]
-        return self.fitted(structure, hypothesis, theta)
+
+        def descend(starts: Sequence[Reals], most_steps: int) -> list[Reals]:
+            found = [
+                search(
+                    projection.residual, start, low, high, reach, step, projection.slopes, most_steps,
+                    RELATIVE_DECREASE,
+                )
+                for start in starts
+            ]  # fmt: skip
+            return [theta for theta, _ in sorted(found, key=lambda each: each[1])]
+
+        if len(starts) > LONG_SEARCHES:
+            starts = descend(starts, FIRST_STEPS)[:LONG_SEARCHES]
+        return self.fitted(structure, hypothesis, descend(starts, most_steps)[0])
 
     def bounds(self, structure: Structure, hypothesis: Hypothesis) -> tuple[Reals, Reals]:
         powers = np.array([1.0, 2.0, 1.0][: structure.lags] if structure.lags > 1 else [1.0])
