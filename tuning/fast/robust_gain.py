@@ -17,6 +17,9 @@ from tuning.models import Complexes, Reals
 HIGHEST_END, LOWEST_END = math.radians(45.0), math.radians(-225.0)
 """Phase of 1 + L at the lowest frequency, unwrapped from the highest: -90 degrees for one integrator, -180 for two."""
 
+LEAST_LOW = 10.0
+"""Of a loop with two integrators at the lowest frequency."""
+
 
 def largest_gains(g: Complexes, Ms: float, Mt: float | None = None) -> list[float]:
     """Kp > 0 at the upper end of each permitted piece, ascending. g: the loop for Kp = 1 on a grid, shape (points,).
@@ -49,6 +52,12 @@ def _forbidden(g: Complexes, least: float, leading: float) -> Reals:
 
 
 def encircles_not(loop: Complexes) -> bool:
-    """The closed loop is stable, for a plant without poles in the right half plane; loop on a rising grid."""
+    """The closed loop is stable, for a plant without poles in the right half plane; loop on a rising grid.
+
+    False as well where two integrators cross over too near to the grid's low end to tell.
+    """
+    first = loop[0]
+    if first.real < -abs(first.imag) and abs(first) < LEAST_LOW:
+        return False
     phase = np.unwrap(np.angle(1.0 + loop[::-1]))
     return bool(LOWEST_END <= phase[-1] - 2.0 * math.pi * round(float(phase[0]) / (2.0 * math.pi)) <= HIGHEST_END)
