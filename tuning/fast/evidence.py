@@ -20,13 +20,15 @@ class Evidence:
     """What a fast experiment has shown so far: time at rest first, then the relay, then perhaps a set-point step.
 
     Ts: s.  u: MV that held from each sample to the next, y: PV at it, both shape (N,) and as deviations from rest.
+    direction: +1 where PV finally rises with MV, else -1: known from the controller's action.
     listened: samples at rest.  relayed: samples up to the end of the relay.  switches: samples at which it switched,
-    its start not among them. After u, y and the counts everything is derived.
+    its start not among them.
     """
 
     Ts: float
     u: Reals
     y: Reals
+    direction: float
     listened: int
     relayed: int
     switches: tuple[int, ...]

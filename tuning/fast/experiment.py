@@ -123,6 +123,7 @@ class Experiment:
             Ts=self.facts.sample_time_s,
             u=np.asarray(trace.mv) - float(np.mean(trace.mv[rest])),
             y=np.asarray(trace.pv) - float(np.mean(trace.pv[rest])),
+            direction=1.0 if self.facts.reverse else -1.0,
             listened=self.listened,
             relayed=self.relayed if self._stepping else len(trace),
             switches=tuple(self.switches),

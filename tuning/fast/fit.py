@@ -188,6 +188,14 @@ class Fit:
 
     # what it means
 
+    def goes_right(self, fit: Fitted) -> bool:
+        """The static gain has the sign that the controller's action says."""
+        structure, c = fit.structure, fit.linear.coefficients
+        gain = float(c[0] / structure.monic(fit.theta[: structure.searched])[-1])
+        if structure.feed_through:
+            gain += float(c[structure.zeros + 1])
+        return gain * self.evidence.direction > 0.0
+
     def model(self, fit: Fitted) -> TransferFunction:
         """In s and the units of the record."""
         return self.transfer(fit.structure, fit.theta, fit.linear.coefficients)

@@ -148,16 +148,14 @@ def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
 
     if options.verify:
         yield from experiment.tell(*started("verify"))
-        tested = judged.best.gains
-        yield from experiment.step(tested)
-        known = judged.chosen.fits
-        judged = yield from experiment.computed(partial(judge, experiment.evidence(), wish, known, tested))
+        yield from experiment.step(judged.best.gains)
+        first = judged
+        judged = yield from experiment.computed(partial(judge, experiment.evidence(), wish, first))
         ended = _wrong(facts, judged)
         if ended is not None and ended.reason in NOT_YET:
             yield from experiment.tell(Note(f"after the set-point step: {ended.detail}; it is stepped back"))
             yield from experiment.step_back()
-            known = judged.chosen.fits
-            judged = yield from experiment.computed(partial(judge, experiment.evidence(), wish, known, tested))
+            judged = yield from experiment.computed(partial(judge, experiment.evidence(), wish, first))
             ended = _wrong(facts, judged)
         found = _found(judged)
         yield (StageDone("verify", found), *started("redesign"), StageDone("redesign", found))

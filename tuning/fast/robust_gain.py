@@ -30,7 +30,7 @@ def largest_gains(g: Complexes, Ms: float, Mt: float | None = None) -> list[floa
     if Mt is not None:
         # |Kp g| <= Mt |1 + Kp g|
         room = 1.0 - 1.0 / Mt**2
-        intervals.append(_forbidden(g, room, room))
+        intervals.append(_forbidden(g, 1.0, room))
     low, high = np.concatenate(intervals, axis=1)
     order = np.argsort(low)
     found: list[float] = []

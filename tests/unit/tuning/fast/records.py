@@ -72,4 +72,4 @@ def record(
         if k > LISTENED and u[-1] != u[-2]:
             switched.append(k)
         plant.step(u[-1])
-    return Evidence(bench.Ts, np.array(u), np.array(y), LISTENED, len(u), tuple(switched))
+    return Evidence(bench.Ts, np.array(u), np.array(y), sign(bench.model), LISTENED, len(u), tuple(switched))
