@@ -225,10 +225,15 @@ def measure(case: Case, plant: Plant, seed: int) -> Ran:
     true = margins(plant.model(), gains)
     if not true.stable:
         return Ran(case.name, plant.name, seed, passed, seconds)
-    design, best, least = optimum(plant, case.derivative)
+    ratio = cost_over_best(plant, gains, case.derivative)
+    return Ran(case.name, plant.name, seed, passed, seconds, Ms=true.Ms, ratio=ratio)
+
+
+def cost_over_best(plant: Plant, gains: Gains, derivative: bool = False) -> float:
+    """J of gains that are stable on the true plant, over that of the best PI (or PID) for it."""
+    design, best, least = optimum(plant, derivative)
     cost = design.cost(gains.Kp, gains.Ti, gains.Td, design.wish.N)
-    J = 0.5 * cost.setpoint / least[0] + 0.5 * cost.load / least[1]
-    return Ran(case.name, plant.name, seed, passed, seconds, Ms=true.Ms, ratio=J / best)
+    return (0.5 * cost.setpoint / least[0] + 0.5 * cost.load / least[1]) / best
 
 
 def line(name: str, runs: Sequence[Ran]) -> str:

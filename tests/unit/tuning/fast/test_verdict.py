@@ -60,7 +60,7 @@ def test_slow_noise_that_was_not_there_at_rest_is_told_from_white_noise() -> Non
 
 
 def test_much_noise_and_few_switches_are_uncertain() -> None:
-    found = judge(record(THREE_LAGS, 0.25 * record(THREE_LAGS).span, switches=4, seed=3), Wish(1.6))
+    found = judge(record(THREE_LAGS, 0.4 * record(THREE_LAGS).span, switches=4, seed=3), Wish(1.6))
     assert found.cause == Reason.UNCERTAIN
     assert "Ms" in found.detail
 
