@@ -1,13 +1,13 @@
 # make demo    a loop is retuned before your eyes      make test    every test and every check
 # make setup   the Python environment in .venv         make check   types, style, import directions
-# make bench   every benchmark, in one table
+# make bench   every benchmark, in one table      make bench-tuning   how well "fast" tunes 121 plants
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEBIAN := user-mode-linux tshark can-utils iproute2
 
-.PHONY: setup demo test check bench system clean
+.PHONY: setup demo test check bench bench-tuning system clean
 
 setup: $(VENV)/.installed
 
@@ -37,6 +37,10 @@ check: setup
 
 bench: setup
 	$(BIN)/python -m benchmarks
+
+# Long; BENCH="--plants 20 --seeds 1" limits it.
+bench-tuning: setup
+	$(BIN)/python -m benchmarks.tuning $(BENCH)
 
 clean:
 	rm -rf $(VENV) *.egg-info

@@ -21,6 +21,8 @@ MODELS = (1, 4, 8, 12, 16, 20, 24, 28, 32, 36, 40, 44)
 PERCENT = 100.0
 """MV on the bus for one unit of the model's input."""
 AMPLITUDE, NOISE = 0.2, 0.01
+WALL_S = 0.01
+"""Of a sample: a command over the bus takes a few milliseconds."""
 
 
 def benched(number: int) -> Plant:
@@ -37,8 +39,8 @@ def test_the_bus_gives_what_the_rehearsal_gives(start: Start, url: str, number: 
     present = Gains(15.0 * plant.Ku, round(2.0 * plant.Pu, 3))
     kp, ti = f"{present.Kp:.6g}", f"{present.Ti:.6g}"
     start("controller", "--bus", url, "--channels", "1", "--kp", kp, "--ti", ti, "--sp", "50", "--ts", str(Ts))
-    noise = f"{NOISE * span:.6g}"
-    start("plantsim", "--bus", url, "--model", plant.name, "--ts", str(Ts), "--speed", "100", "--noise", noise)
+    noise, speed = f"{NOISE * span:.6g}", f"{Ts / WALL_S:.6g}"
+    start("plantsim", "--bus", url, "--model", plant.name, "--ts", str(Ts), "--speed", speed, "--noise", noise)
 
     facts = Facts(Ts, 3.0 * plant.Pu, 0.0, 100.0, 0.5 * span, present)
     loop = BusLoop(url, CONTROLLER, PLANT)
