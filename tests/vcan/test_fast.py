@@ -17,7 +17,7 @@ from tuning.margins import margins
 from tuning.plan import Mode
 from tuning.stages.common import Facts
 
-MODELS = (1, 4, 8, 12, 16, 20, 24, 28, 32, 36, 40, 44)
+MODELS = (1, 2, 4, 6, 10, 12, 14, 16, 18, 20, 22, 24)
 PERCENT = 100.0
 """MV on the bus for one unit of the model's input."""
 AMPLITUDE, NOISE = 0.2, 0.01

@@ -24,6 +24,12 @@ from tuning.stability import is_stable
 POINTS = 440
 LOWEST, HIGHEST = 10**-2.8, 10**1.6
 """Of the frequency grid, in 2*pi/period."""
+TURNED = 13.0
+"""w*L, rad, from which the dead time turns by more than 0.3 rad from one point of the grid to the next."""
+BEYOND = 1e3
+"""How far above the grid a part that passes at once, or a lag too fast to see, is looked at."""
+TRUSTED = 0.6
+"""Of the bound there, for a derivative: it lives where the record says least of the plant."""
 SHORTEST, LONGEST = 0.25, 1.3
 """Of the model's own ultimate period, in periods of the relay."""
 TI = np.geomspace(0.04, 30.0, 30)  # periods
@@ -79,8 +85,11 @@ class Design:
         self.w = frequencies(self.period)
         self.G = positive.frequency_response(self.w)
         self.cost = LoopCost(positive, self.period)
-        # a jump passes at once, at frequencies above the grid
-        self.direct = abs(positive.num[0] / positive.den[0]) if len(positive.num) == len(positive.den) else 0.0
+        # where the dead time turns faster than the grid can follow, and above the grid, the size alone must do
+        end = float(self.w[-1])
+        start = min(TURNED / positive.L, end) if positive.L > 0.0 else end
+        self.tail = np.geomspace(start, BEYOND * end, POINTS)
+        self.G_tail = positive.frequency_response(self.tail)
         self.least: Cost | None = None
 
     def best(self) -> Best:
@@ -96,11 +105,10 @@ class Design:
         wish = self.wish
         g = self.G * controller(self.w, Ti, Td, wish.N)
         cap = math.inf
-        jump = 1.0 + wish.N if Td > 0.0 else 1.0
         if wish.noise_gain is not None:
-            cap = wish.noise_gain / jump
-        if self.direct:
-            cap = min(cap, (1.0 - 1.0 / wish.Ms) / (jump * self.direct))
+            cap = wish.noise_gain / (1.0 + wish.N if Td > 0.0 else 1.0)
+        size = float(np.max(np.abs(self.G_tail * controller(self.tail, Ti, Td, wish.N))))
+        cap = min(cap, (TRUSTED if Td > 0.0 else 1.0) * (1.0 - 1.0 / wish.Ms) / size)
         found = []
         for end in sorted({min(end, cap) for end in largest_gains(g, wish.Ms, wish.Mt)}):
             if encircles_not(end * g):
