@@ -1,7 +1,7 @@
 # make demo    a loop is retuned before your eyes      make test    every test and every check
 # make setup   the Python environment in .venv         make check   types, style, import directions, packages
 # make bench   every benchmark, in one table           make validate    the five papers, recomputed
-# make compose-test    the containers, with a real engine
+# make compose-test    the containers, with a real engine      make bench-tuning    how well "fast" tunes 121 plants
 
 PYTHON ?= python3
 VENV := .venv
@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 DEBIAN := user-mode-linux tshark can-utils iproute2 postgresql
 ENGINE := docker.io docker-compose debootstrap user-mode-linux iproute2
 
-.PHONY: setup demo test compose-test check bench validate system clean
+.PHONY: setup demo test compose-test check bench bench-tuning validate system clean
 
 setup: $(VENV)/.installed
 
@@ -49,6 +49,10 @@ bench: setup
 # Writes docs/validation.md and its plots; fails when a number of a paper leaves its tolerance.
 validate: setup
 	$(BIN)/python -m validation
+
+# Long; BENCH="--plants 20 --seeds 1" limits it.
+bench-tuning: setup
+	$(BIN)/python -m benchmarks.tuning $(BENCH)
 
 clean:
 	rm -rf $(VENV) *.egg-info

@@ -1,6 +1,6 @@
 """`make bench`: every benchmark in a process of its own, then one table in Markdown.
 
-    python -m benchmarks
+python -m benchmarks
 """
 
 from __future__ import annotations
@@ -14,7 +14,9 @@ from datetime import date
 from typing import Any
 
 WITH_VCAN = ("tools/with-vcan", "--timeout", "400", "--")
-BENCHMARKS = {"bus": WITH_VCAN} | dict.fromkeys(("rehearsal", "criterion", "response", "me_pso", "tune", "engine"), ())
+BENCHMARKS = {"bus": WITH_VCAN} | dict.fromkeys(
+    ("rehearsal", "criterion", "response", "me_pso", "tune", "engine", "fast"), ()
+)
 
 
 def figures(name: str) -> dict[str, Any]:
@@ -40,6 +42,7 @@ def table(
     me_pso: dict[str, Any],
     tune: dict[str, Any],
     engine: dict[str, Any],
+    fast: dict[str, Any],
 ) -> list[str]:
     def row(what: str, figure: str, goal: str = "", met: bool | None = None) -> str:
         return f"| {what} | {figure} | {goal} | {'' if met is None else 'met' if met else '**missed**'} |"
@@ -141,6 +144,25 @@ def table(
             f"{engine['loops']:,} rehearsed loops on one PostgreSQL, {'/'.join(engine['jobs_per_min'])} gateways, "
             f"{engine['processors']} processors, {engine['sample']} jobs each time",
             "/".join(f"{rate:.0f}" for rate in engine["jobs_per_min"].values()) + " jobs per minute",
+        ),
+        row(
+            f"fast: identification, design and verdict of one record of {fast['samples']} samples",
+            f"{fast['ours_s']:.2f} s of processor (median)",
+            "1 s",
+            fast["ours_s"] <= 1.0,
+        ),
+        row(
+            "the same, against least_squares on responses simulated step by step",
+            f"{fast['ratio']:.0f} times faster ({fast['plain_s']:.1f} s, Ms {fast['ours_Ms']:.3f} against "
+            f"{fast['plain_Ms']:.3f}, asked 1.6)",
+            "10",
+            fast["ratio"] >= 10.0,
+        ),
+        row(
+            f"the same, {fast['records']} records in a row",
+            f"{fast['each_s']:.2f} s of processor each, memory grown by {fast['grown_MB']:.1f} MB",
+            "1.5 s",
+            fast["each_s"] <= 1.5,
         ),
     ]
 

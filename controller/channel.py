@@ -8,10 +8,13 @@ or on `go_back`, the accepted parameters and all three come back.
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 from controller.pid import Parameters, Pid
 from protocol.profile import Cause, ExperimentState, Mode
+
+MOST_AVERAGED = 100
 
 __all__ = ["Cause", "Channel", "ExperimentState", "Mode", "Parameters", "Settings"]
 
@@ -48,6 +51,8 @@ class _Relay:
     pv_low: float
     pv_high: float
     high: bool
+    amplitude_low: float
+    errors: deque[float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,20 +198,38 @@ class Channel:
         max_samples: int,
         pv_low: float,
         pv_high: float,
+        amplitude_low: float = 0.0,
+        average: int = 1,
     ) -> None:
         """MV = working_output +- amplitude + parallel_gain*e, within the limits. MV units; hysteresis in PV units.
 
-        It switches up at e >= hysteresis and down at e <= -hysteresis (below 0 without hysteresis), and ends by itself
-        when PV leaves pv_low..pv_high or after max_samples.
+        amplitude_low: of the lower side, 0 for the same.  average: the mean error of so many samples switches the
+        relay, up at e >= hysteresis and down at e <= -hysteresis (below 0 without hysteresis). It begins high unless
+        that would switch it, a running one on the side it is on, and ends by itself when PV leaves pv_low..pv_high or
+        after max_samples.
         """
-        _finite(amplitude, hysteresis, working_output, parallel_gain, pv_low, pv_high)
+        _finite(amplitude, hysteresis, working_output, parallel_gain, pv_low, pv_high, amplitude_low)
         if amplitude <= 0 or hysteresis < 0 or max_samples <= 0 or pv_low >= pv_high:
             raise ValueError("a relay needs amplitude > 0, hysteresis >= 0, max_samples > 0 and pv_low < pv_high")
+        if amplitude_low < 0 or not 1 <= average <= MOST_AVERAGED:
+            raise ValueError(f"a relay's low amplitude must be >= 0, its average 1 .. {MOST_AVERAGED} samples")
+        error = 0.0 if self._pv is None else self._error(self._pv)
+        high, errors = error > -hysteresis or error >= 0, deque([error], average)
+        if self._relay is not None:
+            high, errors = self._relay.high, deque(self._relay.errors, average)
         if self._mode is not Mode.EXPERIMENT:
             self._mode_after_relay = self._mode
-        error = 0.0 if self._pv is None else self._error(self._pv)
         self._relay = _Relay(
-            amplitude, hysteresis, working_output, parallel_gain, max_samples, pv_low, pv_high, error >= 0
+            amplitude,
+            hysteresis,
+            working_output,
+            parallel_gain,
+            max_samples,
+            pv_low,
+            pv_high,
+            high,
+            amplitude_low or amplitude,
+            errors,
         )
         self._mode = Mode.EXPERIMENT
         self.experiment_state = ExperimentState.RUNNING
@@ -293,11 +316,13 @@ class Channel:
 
     @staticmethod
     def _swing(relay: _Relay, error: float) -> float:
-        if error >= relay.hysteresis:
+        relay.errors.append(error)
+        mean = sum(relay.errors) / len(relay.errors)
+        if mean >= relay.hysteresis:
             relay.high = True
-        elif error <= -relay.hysteresis:
+        elif mean <= -relay.hysteresis:
             relay.high = False
-        swing = relay.amplitude if relay.high else -relay.amplitude
+        swing = relay.amplitude if relay.high else -relay.amplitude_low
         return relay.working_output + swing + relay.parallel_gain * error
 
 

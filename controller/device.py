@@ -275,9 +275,11 @@ class ControllerDevice:
             for name in ("amplitude", "hysteresis", "working_output", "parallel_gain", "pv_low", "pv_high")
         )
         most = int(self.dictionary.get("controller_relay_max_samples", sub))
+        low = float(self.dictionary.get("controller_relay_amplitude_low", sub))
+        average = int(self.dictionary.get("controller_relay_average", sub))
         try:
             self.channels[sub - 1].start_relay(
-                amplitude, hysteresis, working_output, parallel_gain, most, pv_low, pv_high
+                amplitude, hysteresis, working_output, parallel_gain, most, pv_low, pv_high, low, average
             )
         except ValueError:
             raise SdoAbort(Abort.INVALID_VALUE) from None

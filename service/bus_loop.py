@@ -258,11 +258,13 @@ class BusLoop:
                 self._try(tuner, gains)
             case SetOutput(value):
                 tuner.write("controller_manual_output", value)
-            case SetRelay(amplitude, hysteresis, working_output, parallel_gain):
+            case SetRelay(amplitude, hysteresis, working_output, parallel_gain, amplitude_low, average):
                 tuner.write("controller_relay_amplitude", amplitude)
                 tuner.write("controller_relay_hysteresis", hysteresis)
                 tuner.write("controller_relay_working_output", working_output)
                 tuner.write("controller_relay_parallel_gain", parallel_gain)
+                tuner.write("controller_relay_amplitude_low", amplitude_low or 0.0)
+                tuner.write("controller_relay_average", average)
                 tuner.write("controller_relay_max_samples", RELAY_LONGEST)
                 tuner.write("controller_relay_pv_low", tuner.number("controller_pv_low"))
                 tuner.write("controller_relay_pv_high", tuner.number("controller_pv_high"))

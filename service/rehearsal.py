@@ -18,6 +18,7 @@ from controller.pid import Parameters
 from plantsim.plant import LinearPlant, Plant
 from service.loop import LoopState
 from service.runner import RunResult, Watch, run
+from tuning.fast.procedure import FAST, FAST_STAGES, FastOptions, FastProposal, fast
 from tuning.five_stage import PROCEDURE, STAGES, Facts, Options, Proposal, five_stage
 from tuning.gains import Gains
 from tuning.margins import ultimate_point
@@ -96,9 +97,11 @@ class RehearsedLoop:
                 channel.try_staged()
             case SetOutput(value):
                 channel.manual_output = value
-            case SetRelay(amplitude, hysteresis, working, parallel):
+            case SetRelay(amplitude, hysteresis, working, parallel, amplitude_low, average):
                 low, high = channel.settings.pv_low, channel.settings.pv_high
-                channel.start_relay(amplitude, hysteresis, working, parallel, 10**9, low, high)
+                channel.start_relay(
+                    amplitude, hysteresis, working, parallel, 10**9, low, high, amplitude_low or 0.0, average
+                )
 
     def restore(self, state: LoopState) -> LoopState:
         if int(self._channel.mode) == state.mode != self._mode_found:
@@ -205,7 +208,8 @@ def rehearse(
 ) -> dict[str, Any]:
     """Preflight to verification on a model in memory. Returns the JSON object of `loopwright rehearse`.
 
-    spec: the fields of `PlantFile`.  options: those of `tuning.five_stage.Options`.
+    spec: the fields of `PlantFile`.  method: "fast", "five-stage", or the five stages with a rule of `tuning.methods`.
+    options: those of `tuning.fast.procedure.FastOptions`, or of `tuning.five_stage.Options`.
     A spec that cannot be used gives outcome "refused", reason "bad_input".
     """
     results: dict[str, object] = {}
@@ -219,8 +223,12 @@ def rehearse(
     try:
         file = _complete(PlantFile.model_validate(spec))
         loop, facts = _loop(file)
-        plan = five_stage(facts, Options(method=method, **options))
-        outcome = run(plan, loop, watch=_watch(facts, _reach(file)), on_event=listen)
+        outcome: RunResult[Proposal] | RunResult[FastProposal]
+        watch = _watch(facts, _reach(file))
+        if method == FAST:
+            outcome = run(fast(facts, FastOptions(**options)), loop, watch=watch, on_event=listen)
+        else:
+            outcome = run(five_stage(facts, Options(method=method, **options)), loop, watch=watch, on_event=listen)
     except ValidationError as error:
         lines = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'file'}: {e['msg']}" for e in error.errors())
         return _answer(None, RunResult(ended=Refused(Reason.BAD_INPUT, lines)), results)
@@ -257,10 +265,13 @@ def _reach(file: PlantFile) -> float:
     return abs(file.num[-1] / file.den[-1]) * max(map(abs, file.mv_limits)) if file.den[-1] else 0.0
 
 
-def _answer(file: PlantFile | None, outcome: RunResult[Proposal], results: dict[str, object]) -> dict[str, Any]:
+def _answer(
+    file: PlantFile | None, outcome: RunResult[Proposal] | RunResult[FastProposal], results: dict[str, object]
+) -> dict[str, Any]:
     """The JSON object; what is not known is null."""
     proposal, ended = outcome.value, outcome.ended
-    times = {stage: outcome.plant_time_s[stage] for stage in STAGES if stage in outcome.plant_time_s}
+    stages = dict.fromkeys((*STAGES, *FAST_STAGES))
+    times = {stage: outcome.plant_time_s[stage] for stage in stages if stage in outcome.plant_time_s}
     answer: dict[str, Any] = {
         "name": file.name if file else None,
         "method": proposal.method if proposal else None,
@@ -283,19 +294,34 @@ def _answer(file: PlantFile | None, outcome: RunResult[Proposal], results: dict[
     if ultimate is not None:
         answer["ultimate"] = {"Ku": ultimate.Ku, "Pu": ultimate.Pu_s}  # type: ignore[attr-defined]
     if proposal:
-        model = proposal.model
-        answer["model"] = {"K": model.K, "T": model.T_s, "L": model.L_s, "k_source": model.k_source}
-        answer["model"] |= {"zeta": model.zeta, "fit_pct": model.fit_pct}
+        answer["model"] = _model(proposal)
         gains = proposal.gains
         answer["gains"] = {"Kp": gains.Kp, "Ti": gains.Ti, "Td": gains.Td, "Tf": gains.Tf}
         answer["predicted"] = asdict(proposal.predicted)
-        answer["measured"] = {
-            "before": asdict(proposal.baseline) if proposal.baseline else None,
-            "after": asdict(proposal.verification) if proposal.verification else None,
-        }
+        if isinstance(proposal, Proposal):
+            answer["measured"] = {
+                "before": asdict(proposal.baseline) if proposal.baseline else None,
+                "after": asdict(proposal.verification) if proposal.verification else None,
+            }
         answer["notes"] = list(proposal.notes)
     clean: dict[str, Any] = _finite(answer)
     return clean
+
+
+def _model(proposal: Proposal | FastProposal) -> dict[str, Any]:
+    """What the gains were made on."""
+    if isinstance(proposal, FastProposal):
+        found = proposal.found
+        return {"num": found.num, "den": found.den, "dead_time_s": found.L_s, "structure": found.structure}
+    model = proposal.model
+    return {
+        "K": model.K,
+        "T": model.T_s,
+        "L": model.L_s,
+        "k_source": model.k_source,
+        "zeta": model.zeta,
+        "fit_pct": model.fit_pct,
+    }
 
 
 def _plain(result: object) -> Any:

@@ -71,12 +71,16 @@ class SetRelay:
     """Arm and start the relay inside the controller (mode experiment).
 
     u = working_output +- amplitude (switching on the action-signed error, with hysteresis) + parallel_gain * error.
+    amplitude_low: of the lower side, if it is not the same.  average: the mean of so many samples switches.
+    While a relay is running it goes on from the side it is on.
     """
 
     amplitude: float
     hysteresis: float
     working_output: float
     parallel_gain: float = 0.0
+    amplitude_low: float | None = None
+    average: int = 1
 
 
 @dataclass(frozen=True, slots=True)

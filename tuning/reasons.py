@@ -34,6 +34,13 @@ class Reason(StrEnum):
     OUTSIDE_RANGE = "outside_range"
     DEVICE_MISMATCH = "device_mismatch"
     MV_LIMIT = "mv_limit"
+    STALLED = "stalled"
+    UNEXPLAINED = "unexplained"
+    DISTURBED = "disturbed"
+    UNCERTAIN = "uncertain"
+    AMBIGUOUS = "ambiguous"
+    SURPRISE = "surprise"
+    DIVERGES = "diverges"
     # failed
     PV_LIMIT = "pv_limit"
     TIME_BUDGET = "time_budget"
@@ -75,6 +82,17 @@ ADVICE: dict[Reason, str] = {
     "says would be accepted.",
     Reason.DEVICE_MISMATCH: "The device is not the one the configuration describes; check node ids and firmware.",
     Reason.MV_LIMIT: "MV reached its limit during the test: permit more MV or a smaller set-point deviation.",
+    Reason.STALLED: "The relay did not go on switching: a load about as large as the relay holds PV. Wait until it is "
+    "over, or permit more MV.",
+    Reason.UNEXPLAINED: "No linear model explains the record: look for a sticking valve, a limit, another loop or "
+    "several changes of the load, then retune.",
+    Reason.DISTURBED: "Something slow moved PV during the test: wait for a steady time, then retune.",
+    Reason.UNCERTAIN: "The record does not tell enough for this robustness: permit more MV, filter the measurement, or "
+    "ask for a lower Ms.",
+    Reason.AMBIGUOUS: "Several models explain the record and disagree: permit more MV, or retune in a steady time.",
+    Reason.SURPRISE: "The loop behaved differently under the new gains than under the relay: look for changes of the "
+    "load or of the plant, then retune.",
+    Reason.DIVERGES: "PV ran away under the new gains, which were taken back: keep the present gains, and repeat.",
     Reason.PV_LIMIT: "PV reached its limit: permit less MV deviation, or widen the PV limits if it is safe.",
     Reason.TIME_BUDGET: "The test took longer than its budget: check T95, or raise the budget.",
     Reason.BAD_SAMPLE: "A sample was not a finite number: check the sensor and its scaling.",

@@ -21,13 +21,15 @@ Plant = FOPDT | SOPDT | Integrating
 class Structure:
     """(b_z s^z + ... + b_0) * exp(-L*s) / den(s), den monic with `lags` searched coefficients, times s if integrating.
 
-    theta = (logs of the searched coefficients, highest power first; L), time in samples. The b are linear.
+    Three lags are (s^2 + a1 s + a0)(s + p). feed_through: a part g*exp(-L*s) of MV is in PV at once. The b and g are
+    linear, theta = (logs of the searched coefficients, highest power first, p last; L) is not; time in samples.
     """
 
     name: str
     lags: int
     integrating: bool = False
     zeros: int = 0
+    feed_through: bool = False
 
     @property
     def order(self) -> int:
@@ -41,11 +43,14 @@ class Structure:
     @property
     def inputs(self) -> int:
         """How many linear coefficients belong to the plant's input."""
-        return self.zeros + 1
+        return self.zeros + 1 + self.feed_through
 
     def monic(self, theta: Reals) -> Reals:
         """The denominator without its leading 1, highest power first."""
         searched = np.exp(theta[: self.lags])
+        if self.lags == 3:
+            a1, a0, p = searched
+            return np.array([a1 + p, a0 + a1 * p, a0 * p])
         return np.append(searched, 0.0) if self.integrating else searched
 
     def regressors(self, theta: Reals, u: Reals, load_from: int | None) -> Reals:
@@ -55,7 +60,7 @@ class Structure:
         for a plant that was not at rest at the start; None for no load.
         """
         monic = self.monic(theta)
-        parts = [states(monic, float(theta[-1]), u, self.inputs), np.ones((len(u), 1))]
+        parts = [states(monic, float(theta[-1]), u, self.zeros + 1), np.ones((len(u), 1))]
         if load_from is not None:
             parts.append(states(monic, 0.0, (np.arange(len(u)) >= load_from).astype(float), self.order))
         return np.concatenate(parts, axis=1)
@@ -80,3 +85,7 @@ SECOND = Structure("sopdt", 2)
 INTEGRATOR = Structure("integrating", 0, integrating=True)
 LAGGED_INTEGRATOR = Structure("integrating with lag", 1, integrating=True)
 SECOND_WITH_ZERO = Structure("sopdt with zero", 2, zeros=1)
+FIRST_FED = Structure("fopdt with feed-through", 1, feed_through=True)
+SECOND_FED = Structure("sopdt with zero and feed-through", 2, zeros=1, feed_through=True)
+THIRD_WITH_ZERO = Structure("third order with zero", 3, zeros=1)
+THIRD_WITH_ZEROS = Structure("third order with two zeros", 3, zeros=2)

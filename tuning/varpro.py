@@ -38,17 +38,26 @@ def solve(columns: Reals, y: Reals) -> Linear:
 
 
 def search(
-    residual: Callable[[Reals], Reals], start: Reals, low: Reals, high: Reals, reach: Reals, step: Reals
+    residual: Callable[[Reals], Reals],
+    start: Reals,
+    low: Reals,
+    high: Reals,
+    reach: Reals,
+    step: Reals,
+    slopes_of: Callable[[Reals, Reals, Reals, Reals], Reals] | None = None,
+    most_steps: int = MOST_STEPS,
+    relative_decrease: float = RELATIVE_DECREASE,
 ) -> tuple[Reals, float]:
     """A local minimum of the sum of squares within the bounds: (where, the sum there).
 
-    reach: the longest step of each parameter.  step: for its forward difference.
+    reach: the longest step of each parameter.  step: for its forward difference.  slopes_of: the residual's derivative
+    at (theta, residual there, high, step), by default by differences of the residual itself.
     """
     at = np.clip(start, low, high)
     r = residual(at)
     cost, damping = float(r @ r), 1e-3
-    for _ in range(MOST_STEPS):
-        slopes = jacobian(residual, at, r, high, step)
+    for _ in range(most_steps):
+        slopes = slopes_of(at, r, high, step) if slopes_of else jacobian(residual, at, r, high, step)
         normal, gradient = slopes.T @ slopes, slopes.T @ r
         scale = np.diag(normal).copy()
         scale[scale <= 0.0] = 1.0
@@ -68,7 +77,7 @@ def search(
                 damping = max(0.2 * damping, 1e-12)
                 break
             damping *= 4.0
-        if before - cost <= RELATIVE_DECREASE * before:
+        if before - cost <= relative_decrease * before:
             break
     return at, cost
 

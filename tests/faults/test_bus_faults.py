@@ -21,7 +21,7 @@ from tests.faults.faulty_hub import Fault, FaultyHub, well
 
 pytestmark = pytest.mark.timeout(200)
 
-PACE = 5.0
+PACE = 20.0
 PLANT, CONTROLLER = 0x10, 0x20
 PV = channel_ids(1, PLANT, CONTROLLER).pv
 HOME_WITHIN_S = 6.0

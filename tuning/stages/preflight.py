@@ -8,7 +8,7 @@ import numpy as np
 
 from tuning.plan import Mode, Plan
 from tuning.reasons import Reason, Refused
-from tuning.stages.common import Facts, OperatingPoint, record
+from tuning.stages.common import Facts, OperatingPoint, Trace, record
 
 MOST_NOISE = 0.10
 """Noise (standard deviation) as a share of the set-point step, above which no overshoot can be read."""
@@ -16,13 +16,14 @@ LEAST_ROOM = 0.05
 """Room for MV on both sides, as a share of its permitted range."""
 
 
-def preflight(facts: Facts) -> Plan[OperatingPoint]:
-    """Listens for half T95 (at least 60 samples) in automatic.
+def preflight(facts: Facts, least_samples: int = 60, into: Trace | None = None) -> Plan[OperatingPoint]:
+    """Listens for half T95 (at least so many samples) in automatic.
 
     Raises Refused: WRONG_MODE, NOT_AT_REST, NOISE_TOO_HIGH, SATURATED.
     """
-    trace = yield from record(max(facts.T95_s / 2, 60 * facts.sample_time_s))
+    trace = yield from record(max(facts.T95_s / 2, least_samples * facts.sample_time_s), into=into)
     sample = yield ()
+    trace.add(sample)
     if sample.mode != Mode.AUTOMATIC:
         raise Refused(Reason.WRONG_MODE, f"the controller is in mode {Mode(sample.mode).name.lower()}, not automatic")
     pv, mv = np.asarray(trace.pv), np.asarray(trace.mv)

@@ -53,7 +53,7 @@ def relay_test(facts: Facts, point: OperatingPoint) -> Plan[RelayResult]:
             was_high = high
         last = trace.t[ups[-1]] if ups else start
         if sample.t - last > max(3 * facts.T95_s, 40 * facts.sample_time_s) or len(ups) > 120:
-            raise _no_oscillation(facts, point, trace, len(ups))
+            raise no_oscillation(facts, point, trace, len(ups))
         sample = yield ()
     first, end = ups[-4], ups[-1]
     t, pv, mv = (np.asarray(column[first:end]) for column in (trace.t, trace.pv, trace.mv))
@@ -86,7 +86,7 @@ def _steady(trace: Trace, ups: list[int]) -> bool:
     )
 
 
-def _no_oscillation(facts: Facts, point: OperatingPoint, trace: Trace, switches: int) -> Refused:
+def no_oscillation(facts: Facts, point: OperatingPoint, trace: Trace, switches: int) -> Refused:
     moved = float(np.mean(trace.pv[trace.tail(facts.T95_s / 5)])) - point.pv
     expected = 1.0 if facts.reverse else -1.0
     after = f"{trace.t[-1] - trace.t[0]:.3g} s of relay (+-{point.room:.3g}, {switches} cycles) PV is {moved:+.3g} away"

@@ -391,3 +391,37 @@ def test_any_order_of_commands_keeps_the_promises(order: list[int]) -> None:
     assert (c.in_effect, c.on_trial, c.lease) == (c.accepted, False, 0)
     assert c.setpoint in (latched, 50.0, 57.0)
     assert c.mode is not Mode.EXPERIMENT
+
+
+def test_a_biased_relay_has_two_amplitudes_and_begins_high_within_its_hysteresis() -> None:
+    c = channel()
+    c.step(50.4)
+    c.start_relay(10.0, 0.5, 50.0, 0.0, 1000, 0.0, 100.0, amplitude_low=5.0)
+    outputs = [c.step(pv) for pv in (50.4, 50.6, 50.0, 49.6, 49.4, 50.0)]
+    assert outputs == [60.0, 45.0, 45.0, 45.0, 60.0, 60.0]
+
+
+def test_a_relay_that_averages_is_not_switched_by_one_sample() -> None:
+    c = channel()
+    c.step(50.0)
+    c.start_relay(10.0, 0.5, 50.0, 0.0, 1000, 0.0, 100.0, average=3)
+    # means of the last three: 0, 0.4, 0.4, 0.6
+    assert [c.step(pv) for pv in (50.0, 51.2, 50.0, 50.6)] == [60.0, 60.0, 60.0, 40.0]
+
+
+def test_a_running_relay_takes_new_amplitudes_on_the_side_it_is_on() -> None:
+    c = channel()
+    c.step(50.0)
+    c.start_relay(10.0, 0.5, 50.0, 0.0, 1000, 0.0, 100.0)
+    assert [c.step(pv) for pv in (51.0, 50.0)] == [40.0, 40.0]
+    c.start_relay(20.0, 0.5, 50.0, 0.0, 1000, 0.0, 100.0, amplitude_low=15.0)
+    assert [c.step(pv) for pv in (50.0, 49.0)] == [35.0, 70.0]
+
+
+@pytest.mark.parametrize(("amplitude_low", "average"), [(-1.0, 1), (math.nan, 1), (5.0, 0), (5.0, 101)])
+def test_a_biased_relay_refuses_what_it_cannot_do(amplitude_low: float, average: int) -> None:
+    c = channel()
+    c.step(50.0)
+    with pytest.raises(ValueError):
+        c.start_relay(10.0, 0.5, 50.0, 0.0, 1000, 0.0, 100.0, amplitude_low, average)
+    assert c.mode is Mode.AUTOMATIC

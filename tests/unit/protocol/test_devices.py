@@ -281,6 +281,22 @@ class TestSessions:
         assert rig.read("controller_experiment_state") == ExperimentState.ENDED_BY_LIMIT
         assert Emcy.PV_LIMIT in rig.emergencies(CONTROLLER)
 
+    def test_a_biased_relay_swings_between_its_two_amplitudes(self, rig: Rig) -> None:
+        rig.run(1)
+        rig.write("controller_lease", 10000)
+        rig.write("controller_experiment", 1)
+        rig.write("controller_relay_amplitude", 4.0)
+        rig.write("controller_relay_amplitude_low", 2.0)
+        rig.write("controller_relay_average", 3)
+        rig.write("controller_relay_working_output", 50.0)
+        assert rig.write("controller_relay_average", 0) is Abort.TOO_LOW
+        assert rig.write("controller_mode_command", Mode.EXPERIMENT) is None
+        outputs = set()
+        for _ in range(200):
+            rig.run(1)
+            outputs.add(rig.read("plant_mv"))
+        assert outputs == {48.0, 54.0}
+
 
 class TestSettings:
     def test_limits_hold_and_must_fit_each_other(self, rig: Rig) -> None:

@@ -1,0 +1,310 @@
+"""How well the fast procedure tunes: many plants, several seeds, noise and load steps, judged on the true plant.
+
+    python -m benchmarks.tuning [--plants N] [--part I/N] [--seeds N] [--cases "PI 1 %,..."] [--save FILE] [--of FILE]
+
+The plants are 70 of the Astrom-Hagglund batch, the 50 models of the five-stage paper and the linearised reactor (every
+n-th with --plants N). Each run is a rehearsal: listening, relay, fit, step, fit. Noise is white, its standard deviation
+a part of PV's span under the noise-free relay; a load step is 10 to 50 % of the relay's larger amplitude, of random
+sign and time within 3.5 Pu after the relay starts. Ms 1.6 is asked for; the sampled controller's Ts/2 counts as dead
+time on the true plant. J is the criterion of `tuning.fast.design`, against the best PI (or PID) on the true plant.
+Plant time counts from the start of the relay. A result is silently wrong when it is proposed and Ms is off by more
+than 0.1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import ss2tf
+
+from controller.channel import Channel, Settings
+from controller.pid import Parameters
+from plantsim import reactor
+from plantsim.plant import LinearPlant
+from service.rehearsal import RehearsedLoop
+from service.runner import RunResult, Watch, run
+from tuning.fast.design import Design, Wish
+from tuning.fast.experiment import Experiment
+from tuning.fast.procedure import LEAST_SAMPLES, FastOptions, FastProposal, fast
+from tuning.gains import Gains
+from tuning.margins import margins, ultimate_point
+from tuning.models import TransferFunction, sign
+from tuning.plan import Mode, Plan
+from tuning.reasons import Ended
+from tuning.stages.common import Facts, Trace
+from tuning.stages.preflight import preflight
+
+SAMPLES_PER_PERIOD = 80
+T95_PERIODS = 3.0
+ASKED = 1.6
+WRONG = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Plant:
+    name: str
+    num: tuple[float, ...]
+    den: tuple[float, ...]
+    L: float
+    Ku: float
+    Pu: float
+
+    @property
+    def Ts(self) -> float:
+        return self.Pu / SAMPLES_PER_PERIOD
+
+    def model(self) -> TransferFunction:
+        """With the sampled controller's half sample."""
+        return TransferFunction(self.num, self.den, self.L + 0.5 * self.Ts)
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """noise: of the span.  derivative: PID."""
+
+    name: str
+    noise: float
+    load: bool = False
+    derivative: bool = False
+
+
+CASES = {
+    case.name: case
+    for case in (
+        Case("PI 0.5 %", 0.005),
+        Case("PI 1 %", 0.01),
+        Case("PI 2 %", 0.02),
+        Case("PI 0.5 % + load", 0.005, load=True),
+        Case("PI 1 % + load", 0.01, load=True),
+        Case("PI 2 % + load", 0.02, load=True),
+        Case("PID 1 %", 0.01, derivative=True),
+    )
+}
+
+
+class Loaded(LinearPlant):
+    """A plant whose load steps at one sample."""
+
+    at, size, n = -1, 0.0, 0
+
+    def step(self, mv: float) -> float:
+        if self.n == self.at:
+            self.disturbance = self.size
+        self.n += 1
+        return super().step(mv)
+
+
+def plants() -> list[Plant]:
+    batch = json.loads((Path(__file__).parent.parent / "tests/data/plants-batch.json").read_text())["processes"]
+    found = [Plant(p["id"], tuple(p["num"]), tuple(p["den"]), p["delay"], p["Ku"], p["Tu"]) for p in batch]
+    for m in json.loads((files("plantsim") / "models-50.json").read_text())["models"]:
+        found.append(_of(f"model-{m['id']}", TransferFunction(tuple(m["num"]), tuple(m["den"]), m["delay"])))
+    found.append(_of("reactor", linear_reactor()))
+    return found
+
+
+def _of(name: str, model: TransferFunction) -> Plant:
+    Ku, Pu = ultimate_point(model)
+    return Plant(name, model.num, model.den, model.L, Ku, Pu)
+
+
+def linear_reactor() -> TransferFunction:
+    """The reactor around its steady state, by central differences; its actuator and sensor with it."""
+    at = np.array([*reactor.STEADY_STATE, reactor.MV_NOMINAL])
+
+    def slope(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        a, b, c, h, T, opening = map(float, x)
+        return np.array(reactor.derivative((a, b, c, h, T), opening, reactor.INLET))
+
+    moves = np.diag(1e-5 * at)
+    jacobian = np.array([(slope(at + m) - slope(at - m)) / (2.0 * m.sum()) for m in moves]).T
+    num, den = ss2tf(jacobian[:, :5], jacobian[:, 5:], np.eye(5)[2:3], np.zeros((1, 1)))
+    lagged = np.convolve(den, (reactor.ACTUATOR_LAG_S, 1.0))
+    return TransferFunction(tuple(num[0][1:]), tuple(lagged), reactor.SENSOR_DELAY_S)
+
+
+def loop_of(
+    plant: Plant, amplitude: float, span: float, noise: float, seed: int
+) -> tuple[RehearsedLoop, Facts, Loaded]:
+    """A loop at rest under sluggish gains, in deviation variables."""
+    process = Loaded(plant.num, plant.den, plant.L, plant.Ts, noise_std=noise, seed=seed)
+    reverse = sign(plant.model()) > 0.0
+    limit = 2.0 * amplitude
+    settings = Settings(mv_low=-limit, mv_high=limit, pv_low=-1e9, pv_high=1e9, reverse=reverse)
+    gains = Gains(Kp=0.15 * plant.Ku, Ti=2.0 * plant.Pu)
+    channel = Channel(plant.Ts, settings, Parameters(gains.Kp, gains.Ti), 0.0, int(Mode.AUTOMATIC), 0.0)
+    facts = Facts(plant.Ts, T95_PERIODS * plant.Pu, -limit, limit, span, gains, reverse)
+    return RehearsedLoop(process, channel, plant.Ts), facts, process
+
+
+def relay_span(plant: Plant) -> float:
+    """Of PV under four switches of a relay of amplitude 1, without noise."""
+
+    def plan(facts: Facts) -> Plan[float]:
+        listened = Trace()
+        point = yield from preflight(facts, LEAST_SAMPLES, listened)
+        experiment = Experiment(facts, point, listened, 1.0)
+        yield from experiment.relay(4)
+        return experiment.evidence().span
+
+    loop, facts, _ = loop_of(plant, 1.0, 1.0 / plant.Ku, 0.0, 1)
+    result = run(plan(facts), loop, watch=Watch())
+    assert result.value is not None, result.ended
+    return result.value
+
+
+@dataclass(frozen=True, slots=True)
+class Ran:
+    """How one run ended. passed: in Pu.  Ms, ratio (J over the best): on the true plant, None where it is unstable.
+
+    reason: why nothing was proposed, None if something was.  seconds: of processor.
+    """
+
+    case: str
+    plant: str
+    seed: int
+    passed: float
+    seconds: float
+    reason: str | None = None
+    detail: str = ""
+    Ms: float | None = None
+    ratio: float | None = None
+
+    @property
+    def error(self) -> float:
+        return math.inf if self.Ms is None else abs(self.Ms - ASKED)
+
+
+@cache
+def optimum(plant: Plant, derivative: bool) -> tuple[Design, float, tuple[float, float]]:
+    """The design on the true plant, its J, and the least integrals that J is counted in."""
+    design = Design(plant.model(), Wish(ASKED, derivative), plant.Pu)
+    best = design.best()
+    assert design.least is not None
+    return design, best.J, (design.least.setpoint, design.least.load)
+
+
+@cache
+def span_of(plant: Plant) -> float:
+    return relay_span(plant)
+
+
+def fast_run(plant: Plant, case: Case, seed: int) -> tuple[RunResult[FastProposal], float]:
+    span = span_of(plant)
+    loop, facts, process = loop_of(plant, 1.0, 0.5 * span, case.noise * span, seed)
+    if case.load:
+        random = np.random.default_rng([seed, len(plant.name), int(1e6 * plant.Pu)])
+        process.size = float(random.choice((-1.0, 1.0)) * random.uniform(0.1, 0.5))
+        start = T95_PERIODS * SAMPLES_PER_PERIOD / 2.0
+        process.at = round(start + random.uniform(0.0, 3.5) * SAMPLES_PER_PERIOD)
+    options = FastOptions(Ms=ASKED, derivative=case.derivative, amplitude=1.0)
+    result = run(fast(facts, options), loop, watch=Watch(max_time_s=100.0 * plant.Pu))
+    passed = sum(value for stage, value in result.plant_time_s.items() if stage != "preflight")
+    return result, passed / plant.Pu
+
+
+def measure(case: Case, plant: Plant, seed: int) -> Ran:
+    start = time.process_time()
+    result, passed = fast_run(plant, case, seed)
+    seconds = time.process_time() - start
+    if result.value is None:
+        assert isinstance(result.ended, Ended)
+        return Ran(case.name, plant.name, seed, passed, seconds, result.ended.reason.value, result.ended.detail)
+    gains = result.value.gains
+    true = margins(plant.model(), gains)
+    if not true.stable:
+        return Ran(case.name, plant.name, seed, passed, seconds)
+    ratio = cost_over_best(plant, gains, case.derivative)
+    return Ran(case.name, plant.name, seed, passed, seconds, Ms=true.Ms, ratio=ratio)
+
+
+def cost_over_best(plant: Plant, gains: Gains, derivative: bool = False) -> float:
+    """J of gains that are stable on the true plant, over that of the best PI (or PID) for it."""
+    design, best, least = optimum(plant, derivative)
+    cost = design.cost(gains.Kp, gains.Ti, gains.Td, design.wish.N)
+    return (0.5 * cost.setpoint / least[0] + 0.5 * cost.load / least[1]) / best
+
+
+def line(name: str, runs: Sequence[Ran]) -> str:
+    """One row of the table in Markdown."""
+    proposed = [each for each in runs if each.reason is None]
+    causes = Counter(each.reason for each in runs if each.reason is not None).most_common()
+    errors = [each.error for each in proposed if each.Ms is not None]
+    within = " / ".join(f"{100.0 * sum(e <= limit for e in errors) / max(len(errors), 1):.1f}" for limit in (0.1, 0.05))
+    return (
+        f"| {name} | {len(proposed)}/{len(runs)} | {_spread([each.passed for each in proposed], 2)} | "
+        f"{_spread(errors, 3)} | {within} | {_spread([each.ratio for each in proposed if each.ratio], 3)} | "
+        f"{sum(error > WRONG for error in errors)} | {len(proposed) - len(errors)} | "
+        f"{', '.join(f'{cause} {count}' for cause, count in causes) or '-'} |"
+    )
+
+
+HEAD = (
+    "| case | proposed | time, Pu: p50 / p90 / max | error of Ms: p50 / p90 / max | within 0.1 / 0.05, % | "
+    "J over the best: p50 / p90 / max | silently wrong | unstable | refused |\n"
+    "| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
+)
+
+
+def _spread(values: Sequence[float], digits: int) -> str:
+    if not values:
+        return "-"
+    return " / ".join(f"{v:.{digits}f}" for v in (*np.percentile(values, (50, 90)), max(values)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--plants", type=int, help="so many, spread over the list; by default all")
+    parser.add_argument("--part", default="0/1", help="i/n: every n-th of these plants, from the i-th on")
+    parser.add_argument("--seeds", default="1", help="so many, or first-last")
+    parser.add_argument("--cases", default=",".join(CASES), help="names, comma-separated")
+    parser.add_argument("--save", type=Path, help="adds a line of JSON for every run to this file")
+    parser.add_argument("--of", type=Path, help="the table of such a file, nothing is run")
+    given = parser.parse_args()
+    runs = _saved(given.of) if given.of else list(_runs(given))
+    print(HEAD)
+    for name in CASES:
+        if of_case := [each for each in runs if each.case == name]:
+            print(line(name, of_case))
+    seconds = [each.seconds for each in runs]
+    print(f"\n{len(runs)} runs, {np.median(seconds):.2f} s of processor each (median), {max(seconds):.2f} s (most).")
+    for each in runs:
+        if each.reason is not None:
+            print(f"{each.case}, {each.plant}, seed {each.seed}: {each.reason}: {each.detail}")
+        elif each.error > WRONG:
+            print(f"{each.case}, {each.plant}, seed {each.seed}: Ms {each.Ms}")
+
+
+def _saved(file: Path) -> list[Ran]:
+    return [Ran(**json.loads(text)) for text in file.read_text().splitlines()]
+
+
+def _runs(given: argparse.Namespace) -> Iterator[Ran]:
+    everything = plants()
+    step = len(everything) / min(given.plants or len(everything), len(everything))
+    part, parts = map(int, given.part.split("/"))
+    chosen = [everything[int(i * step)] for i in range(round(len(everything) / step))][part::parts]
+    first, _, last = given.seeds.rpartition("-")
+    for name in given.cases.split(","):
+        for plant in chosen:
+            for seed in range(int(first or 1), int(last) + 1):
+                ran = measure(CASES[name], plant, seed)
+                if given.save:
+                    with given.save.open("a") as file:
+                        file.write(json.dumps(asdict(ran)) + "\n")
+                yield ran
+
+
+if __name__ == "__main__":
+    main()

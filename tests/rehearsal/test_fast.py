@@ -1,0 +1,92 @@
+"""The fast procedure in memory: what it proposes on the true plant, and what it refuses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from service.rehearsal import rehearse
+from tuning.gains import Gains
+from tuning.margins import margins, ultimate_point
+from tuning.models import TransferFunction
+
+PLANTS: dict[str, dict[str, Any]] = {
+    "first order": {"num": [2.0], "den": [10.0, 1.0], "dead_time_s": 2.03},
+    "three lags": {"num": [1.0], "den": [2.0, 7.0, 7.0, 2.0], "dead_time_s": 0.5},
+    "inverse response": {"num": [-1.0, 1.0], "den": [2.0, 3.0, 1.0], "dead_time_s": 0.5},
+    "oscillates": {"num": [1.0], "den": [9.0, 1.8, 1.0], "dead_time_s": 1.8},
+    "integrates": {"num": [0.1], "den": [1.0, 0.0], "dead_time_s": 1.0, "t95_s": 12.0, "sp_deviation": 0.1,
+                   "gains": {"Kp": 1.5, "Ti": 30.0}},
+    "negative gain": {"num": [-1.5], "den": [8.0, 1.0], "dead_time_s": 2.0},
+}  # fmt: skip
+
+
+def spec(name: str, **more: Any) -> dict[str, Any]:
+    plant = PLANTS[name]
+    model = TransferFunction(tuple(plant["num"]), tuple(plant["den"]), plant["dead_time_s"])
+    return {"sample_time_s": round(ultimate_point(model)[1] / 80.0, 3), "noise_std": 0.0005, **plant, **more}
+
+
+def true_Ms(plant: dict[str, Any], gains: dict[str, float]) -> float:
+    half = plant["sample_time_s"] / 2
+    model = TransferFunction(tuple(plant["num"]), tuple(plant["den"]), plant["dead_time_s"] + half)
+    found = margins(model, Gains(gains["Kp"], gains["Ti"], gains["Td"], gains["Tf"]))
+    assert found.stable
+    return found.Ms
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_the_loop_gets_the_Ms_asked_in_a_few_periods(name: str) -> None:
+    plant = spec(name)
+    answer = rehearse(plant, method="fast")
+    assert answer["outcome"] == "proposed", answer["detail"]
+    assert answer["method"] == "fast"
+    assert abs(true_Ms(plant, answer["gains"]) - 1.6) < 0.05
+    times = answer["plant_time_s"]
+    model = TransferFunction(tuple(plant["num"]), tuple(plant["den"]), plant["dead_time_s"])
+    assert times["total"] - times["preflight"] < 8.0 * ultimate_point(model)[1]
+    assert answer["stages"]["redesign"]["uncertainty"] < 0.1
+
+
+@pytest.mark.parametrize("Ms", [1.3, 2.0])
+@pytest.mark.parametrize("derivative", [False, True])
+def test_the_robustness_asked_is_the_one_got(Ms: float, derivative: bool) -> None:
+    plant = spec("three lags")
+    answer = rehearse(plant, method="fast", Ms=Ms, derivative=derivative)
+    assert answer["outcome"] == "proposed", answer["detail"]
+    assert (answer["gains"]["Td"] > 0.0) == derivative
+    assert abs(true_Ms(plant, answer["gains"]) - Ms) < 0.05
+
+
+def test_without_the_step_it_switches_six_times_at_least() -> None:
+    answer = rehearse(spec("first order"), method="fast", verify=False)
+    assert answer["outcome"] == "proposed"
+    assert answer["stages"]["design"]["switches"] >= 6
+    assert "verify" not in answer["plant_time_s"]
+
+
+def test_the_same_seed_gives_the_same_answer() -> None:
+    assert rehearse(spec("three lags"), method="fast") == rehearse(spec("three lags"), method="fast")
+
+
+REFUSED = {
+    "unstable": ({"num": [1.0], "den": [10.0, -1.0], "dead_time_s": 1.0, "gains": {"Kp": 4.0, "Ti": 20.0}}, {}, None),
+    "no response": ({"num": [1e-12], "den": [10.0, 1.0], "dead_time_s": 1.0, "noise_std": 0.01, "sp_deviation": 0.3,
+                     "gains": {"Kp": 0.1, "Ti": 10.0}}, {}, None),
+    "Ms below one": ({}, {"Ms": 0.9}, "bad_input"),
+    "amplitude too large": ({}, {"amplitude": 3.0}, "bad_limits"),
+    "noise": ({"noise_std": 0.5}, {}, "noise_too_high"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_be_tuned_is_refused_with_its_cause(case: str) -> None:
+    plant, options, reason = REFUSED[case]
+    answer = rehearse(spec("first order") | plant, method="fast", **options)
+    assert answer["outcome"] in ("refused", "failed"), answer["gains"]
+    assert answer["gains"] is None
+    assert answer["advice"] and answer["detail"]
+    assert answer["reason"] != "internal", answer["detail"]
+    if reason is not None:
+        assert answer["reason"] == reason

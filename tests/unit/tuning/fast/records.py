@@ -1,0 +1,75 @@
+"""Fast records from the devices' own simulator and controller: rest, then a biased relay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from controller.channel import Channel, Mode, Parameters, Settings
+from plantsim.plant import LinearPlant
+from tuning.fast.evidence import Evidence
+from tuning.models import TransferFunction, sign
+
+LISTENED = 130
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """A plant and a sample time of about an eightieth of its ultimate period."""
+
+    num: tuple[float, ...]
+    den: tuple[float, ...]
+    L: float
+    Ts: float
+
+    @property
+    def model(self) -> TransferFunction:
+        return TransferFunction(self.num, self.den, self.L)
+
+
+FIRST = Bench((2.0,), (10.0, 1.0), 2.03, 0.1)
+THREE_LAGS = Bench((1.0,), (2.0, 7.0, 7.0, 2.0), 0.53, 0.07)
+FIVE_LAGS = Bench((1.0,), (1.0, 5.0, 10.0, 10.0, 5.0, 1.0), 0.0, 0.1)
+INVERSE = Bench((-1.0, 1.0), (2.0, 3.0, 1.0), 0.5, 0.09)
+INTEGRATES = Bench((0.3,), (2.0, 1.0, 0.0), 1.0, 0.12)
+NEGATIVE = Bench((-1.5,), (8.0, 1.0), 2.0, 0.09)
+BENCHES = {
+    "first order": FIRST,
+    "three lags": THREE_LAGS,
+    "five lags": FIVE_LAGS,
+    "inverse response": INVERSE,
+    "integrates": INTEGRATES,
+    "negative gain": NEGATIVE,
+}
+
+
+def record(
+    bench: Bench,
+    noise: float = 0.0,
+    switches: int = 6,
+    seed: int = 1,
+    load: float = 0.0,
+    load_at: int = 0,
+    drift: float = 0.0,
+) -> Evidence:
+    """Amplitudes +1, -1/2. noise: PV units.  load: MV units, from the sample load_at on.  drift: of PV, per sample."""
+    plant = LinearPlant(bench.num, bench.den, bench.L, bench.Ts, noise_std=noise, seed=seed)
+    channel = Channel(
+        bench.Ts, Settings(-5.0, 5.0, 0.0, reverse=sign(bench.model) > 0.0), Parameters(1.0), 0.0, Mode.MANUAL
+    )
+    u: list[float] = []
+    y: list[float] = []
+    switched: list[int] = []
+    while len(switched) < switches and len(u) < 5000:
+        k = len(u)
+        if k == LISTENED:
+            channel.start_relay(1.0, 2.2 * noise, 0.0, 0.0, 10_000, -1e9, 1e9, 0.5, 3 if noise else 1)
+        if load and k == load_at:
+            plant.disturbance = load
+        y.append(plant.pv + drift * k)
+        u.append(channel.step(y[-1]))
+        if k > LISTENED and u[-1] != u[-2]:
+            switched.append(k)
+        plant.step(u[-1])
+    return Evidence(bench.Ts, np.array(u), np.array(y), sign(bench.model), LISTENED, len(u), tuple(switched))

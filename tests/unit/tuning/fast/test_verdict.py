@@ -1,0 +1,95 @@
+"""Proposed where the true loop has the Ms asked, refused with its cause where the record does not allow it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from tests.unit.tuning.fast.records import BENCHES, FIRST, THREE_LAGS, record
+from tuning.fast.design import Wish
+from tuning.fast.spread import peak, seen_covariance
+from tuning.fast.verdict import judge
+from tuning.margins import margins
+from tuning.models import TransferFunction
+from tuning.reasons import Reason, Refused
+
+
+def true_Ms(name: str, noise: float, seed: int = 1) -> tuple[float, float, str | None]:
+    """(Ms on the true plant with the sampling's half sample, two standard deviations by the verdict, cause)."""
+    bench = BENCHES[name]
+    found = judge(record(bench, noise * record(bench).span, seed=seed), Wish(1.6))
+    true = TransferFunction(bench.num, bench.den, bench.L + 0.5 * bench.Ts)
+    return margins(true, found.best.gains).Ms, found.uncertainty, found.cause
+
+
+@pytest.mark.parametrize("name", BENCHES)
+def test_six_switches_with_one_percent_noise_give_the_Ms_asked(name: str) -> None:
+    Ms, uncertainty, cause = true_Ms(name, 0.01)
+    assert cause is None
+    assert abs(Ms - 1.6) < 0.05
+    assert uncertainty < 0.1
+
+
+def test_the_uncertainty_is_that_of_many_seeds() -> None:
+    found = [true_Ms("three lags", 0.02, seed) for seed in range(1, 17)]
+    spread = float(np.std([Ms for Ms, _, _ in found]))
+    told = float(np.median([uncertainty for _, uncertainty, _ in found])) / 2.0
+    # the structure is chosen anew each time, which the linear theory does not count
+    assert 0.4 * told < spread < 2.0 * told
+
+
+def test_a_record_that_no_linear_model_explains_is_refused() -> None:
+    evidence = record(THREE_LAGS, 0.002 * record(THREE_LAGS).span)
+    # a second plant that only some of the time is there
+    knocked = evidence.y + 0.05 * evidence.span * np.sin(np.arange(len(evidence.y)) / 7.0)
+    found = judge(replace(evidence, y=np.where(np.arange(len(knocked)) < evidence.listened, evidence.y, knocked)),
+                  Wish(1.6))  # fmt: skip
+    assert found.cause == Reason.UNEXPLAINED
+    assert "unexplained" in found.detail
+
+
+def test_slow_noise_that_was_not_there_at_rest_is_told_from_white_noise() -> None:
+    evidence = record(FIRST, 0.01 * record(FIRST).span)
+    slow = lfilter([1.0], [1.0, -0.97], np.random.default_rng(2).normal(size=len(evidence.y)))
+    slow[: evidence.listened] = 0.0
+    found = judge(replace(evidence, y=evidence.y + 0.004 * evidence.span * slow / np.std(slow)), Wish(1.6))
+    assert found.cause in (Reason.DISTURBED, Reason.UNEXPLAINED) or abs(found.Ms - 1.6) < 0.1
+
+
+def test_much_noise_and_few_switches_are_uncertain() -> None:
+    found = judge(record(THREE_LAGS, 0.4 * record(THREE_LAGS).span, switches=4, seed=3), Wish(1.6))
+    assert found.cause == Reason.UNCERTAIN
+    assert "Ms" in found.detail
+
+
+def test_gains_that_came_of_another_plant_are_a_surprise() -> None:
+    evidence = record(FIRST, 0.01 * record(FIRST).span)
+    other = judge(evidence, Wish(1.6))
+    stronger = replace(other.best, gains=replace(other.best.gains, Kp=1.6 * other.best.gains.Kp))
+    found = judge(evidence, Wish(1.6), replace(other, best=stronger))
+    assert found.cause == Reason.SURPRISE
+    assert f"{peak(found.model, stronger.gains, np.geomspace(1e-3, 30.0, 4000), 0.05):.2f}" in found.detail
+
+
+def test_too_few_switches_or_too_short_a_rest_are_no_evidence() -> None:
+    evidence = record(FIRST)
+    with pytest.raises(Refused) as refused:
+        replace(evidence, switches=evidence.switches[:3])
+    assert refused.value.reason is Reason.CANNOT_OSCILLATE
+    with pytest.raises(Refused):
+        replace(evidence, listened=20)
+
+
+def test_the_covariance_is_that_of_least_squares_and_leaves_out_what_is_not_seen() -> None:
+    A = np.random.default_rng(1).normal(size=(50, 3))
+    exact = 0.3 * np.linalg.inv(A.T @ A)
+    assert seen_covariance(A, 0.3) == pytest.approx(exact, rel=1e-9)
+    twice = np.column_stack((A, A[:, 0]))
+    found = seen_covariance(twice, 0.3)
+    # what both together do is known as before, how they share it does not count
+    assert found[np.ix_([1, 2], [1, 2])] == pytest.approx(exact[1:, 1:], rel=1e-9)
+    both = np.array([1.0, 0.0, 0.0, 1.0])
+    assert both @ found @ both == pytest.approx(exact[0, 0], rel=1e-9)

@@ -1,0 +1,67 @@
+"""The fast procedure over the bus: plant and controller as processes, the relay in the controller device."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+
+import pytest
+
+from benchmarks.tuning import ASKED, Plant, cost_over_best, loop_of, plants, span_of
+from service.bus_loop import BusLoop
+from service.runner import Watch, run
+from tests.vcan.test_bus_loop import CONTROLLER, PLANT, Start, start, url  # noqa: F401
+from tuning.fast.procedure import FastOptions, fast
+from tuning.gains import Gains
+from tuning.margins import margins
+from tuning.plan import Mode
+from tuning.stages.common import Facts
+
+MODELS = (1, 2, 4, 6, 10, 12, 14, 16, 18, 20, 22, 24)
+PERCENT = 100.0
+"""MV on the bus for one unit of the model's input."""
+AMPLITUDE, NOISE = 0.2, 0.01
+WALL_S = 0.01
+"""Of a sample: a command over the bus takes a few milliseconds."""
+
+
+def benched(number: int) -> Plant:
+    """Its sample time in whole microseconds, as the bus has it."""
+    return next(plant for plant in plants() if plant.name == f"model-{number}")
+
+
+@pytest.mark.timeout(240)
+@pytest.mark.parametrize("number", MODELS)
+def test_the_bus_gives_what_the_rehearsal_gives(start: Start, url: str, number: int) -> None:  # noqa: F811
+    plant = benched(number)
+    Ts = round(plant.Ts, 4)
+    span = AMPLITUDE * span_of(plant)
+    present = Gains(15.0 * plant.Ku, round(2.0 * plant.Pu, 3))
+    kp, ti = f"{present.Kp:.6g}", f"{present.Ti:.6g}"
+    start("controller", "--bus", url, "--channels", "1", "--kp", kp, "--ti", ti, "--sp", "50", "--ts", str(Ts))
+    noise, speed = f"{NOISE * span:.6g}", f"{Ts / WALL_S:.6g}"
+    start("plantsim", "--bus", url, "--model", plant.name, "--ts", str(Ts), "--speed", speed, "--noise", noise)
+
+    facts = Facts(Ts, 3.0 * plant.Pu, 0.0, 100.0, 0.5 * span, present)
+    loop = BusLoop(url, CONTROLLER, PLANT)
+    before = loop.read()
+    found = run(
+        fast(facts, FastOptions(Ms=ASKED, amplitude=AMPLITUDE * PERCENT)),
+        loop,
+        watch=Watch(0.0, 100.0, 0.0, 100.0),
+        start_work=lambda work: threading.Thread(target=work, daemon=True).start(),
+    )
+    loop.close()
+    assert found.value is not None, found.ended
+    assert found.restored is not None
+    assert (found.restored.mode, found.restored.sp) == (Mode.AUTOMATIC, 50.0)
+    assert found.restored.gains == before.gains and not found.restored.on_trial
+
+    in_model_units = replace(found.value.gains, Kp=found.value.gains.Kp / PERCENT)
+    assert margins(plant.model(), in_model_units).Ms == pytest.approx(ASKED, abs=0.05)
+
+    rehearsed, facts, _ = loop_of(plant, AMPLITUDE, 0.5 * span, NOISE * span, seed=5)
+    expected = run(fast(facts, FastOptions(Ms=ASKED, amplitude=AMPLITUDE)), rehearsed, watch=Watch()).value
+    assert expected is not None
+    # gains of the same robustness trade Kp for Ti where the criterion is flat: what counts is the loop they give
+    assert cost_over_best(plant, in_model_units) == pytest.approx(cost_over_best(plant, expected.gains), abs=0.03)

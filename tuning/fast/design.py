@@ -1,0 +1,212 @@
+"""The best PI or PID on a model for a robustness that is asked for.
+
+    J = 1/2 IAE_r/IAE_r° + 1/2 IAE_d/IAE_d°            under Ms <= asked (and Mt, and a bound on the noise gain)
+
+after a unit step of set-point and load; ° is the least value of each alone under the same bounds. For each (Ti, Td) the
+largest gains are known in closed form, so that only one or two numbers are searched.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+
+from tuning.fast.loop_cost import Cost, LoopCost
+from tuning.fast.robust_gain import encircles_not, largest_gains
+from tuning.gains import Gains
+from tuning.models import Complexes, Model, Reals, TransferFunction, sign
+from tuning.reasons import Reason, Refused
+from tuning.stability import is_stable
+
+POINTS = 440
+LOWEST, HIGHEST = 10**-2.8, 10**1.6
+"""Of the frequency grid, in 2*pi/period."""
+TURNED = 13.0
+"""w*L, rad, from which the dead time turns by more than 0.3 rad from one point of the grid to the next."""
+BEYOND = 1e3
+"""How far above the grid a part that passes at once, or a lag too fast to see, is looked at."""
+TRUSTED = 0.6
+"""Of the bound there, for a derivative: it lives where the record says least of the plant."""
+SHORTEST, LONGEST = 0.25, 1.3
+"""Of the model's own ultimate period, in periods of the relay."""
+TI = np.geomspace(0.04, 30.0, 30)  # periods
+HALVINGS = 5
+PID_TI = np.geomspace(0.1, 8.0, 11)
+PID_TD = (0.03, 0.06, 0.15, 0.25, 0.4, 0.65)  # of Ti
+LEAST_TD, LEAST_TI = 0.045, 0.08  # periods
+MOST_TD = 2.0  # of Ti
+PID_STEPS = 45
+WORTH = 0.97
+"""A derivative must bring J below this part of the PI's."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What the user asks for. Ms: 1.2 robust, 1.6, 2.0 fast.  Mt: largest peak of the closed loop, None for no bound.
+
+    derivative: a PID where it pays.  N: its filter is Td/N.  noise_gain: the most that MV may answer to a jump of PV,
+    MV units per PV unit, None for no bound.
+    """
+
+    Ms: float = 1.6
+    derivative: bool = False
+    Mt: float | None = None
+    noise_gain: float | None = None
+    N: float = 10.0
+
+    def __post_init__(self) -> None:
+        for name, value, low, high in (
+            ("Ms", self.Ms, 1.1, 3.0), ("Mt", self.Mt, 1.0, 3.0), ("N", self.N, 2.0, 100.0),
+            ("noise_gain", self.noise_gain, 0.0, math.inf),
+        ):  # fmt: skip
+            if value is not None and not low < value < high:
+                raise Refused(Reason.BAD_INPUT, f"{name} must be above {low:g} and below {high:g}, not {value!r}")
+
+
+@dataclass(frozen=True, slots=True)
+class Best:
+    """J: of the criterion.  cost: its parts.  Gains for a controller that acts with the plant's sign."""
+
+    gains: Gains
+    J: float
+    cost: Cost
+
+
+class Design:
+    """The criterion on one model, its dead time including what the sampling adds; relay_period: s."""
+
+    def __init__(self, model: Model, wish: Wish, relay_period: float) -> None:
+        positive = TransferFunction(tuple(sign(model) * c for c in model.num), model.den, model.L)
+        self.model, self.wish = positive, wish
+        self.period = own_period(positive, relay_period)
+        self.w = frequencies(self.period)
+        self.G = positive.frequency_response(self.w)
+        self.cost = LoopCost(positive, self.period)
+        # where the dead time turns faster than the grid can follow, and above the grid, the size alone must do
+        end = float(self.w[-1])
+        start = min(TURNED / positive.L, end) if positive.L > 0.0 else end
+        self.tail = np.geomspace(start, BEYOND * end, POINTS)
+        self.G_tail = positive.frequency_response(self.tail)
+        self.least: Cost | None = None
+
+    def best(self) -> Best:
+        """Raises Refused, NOT_ROBUST: no gain meets the bounds."""
+        pi = self._pi()
+        if not self.wish.derivative:
+            return pi
+        pid = self._pid()
+        return pid if pid is not None and pid.J < WORTH * pi.J else pi
+
+    def candidates(self, Ti: float, Td: float = 0.0) -> list[tuple[Gains, Cost]]:
+        """The largest gains of these times that are stable, with their cost."""
+        wish = self.wish
+        g = self.G * controller(self.w, Ti, Td, wish.N)
+        cap = math.inf
+        if wish.noise_gain is not None:
+            cap = wish.noise_gain / (1.0 + wish.N if Td > 0.0 else 1.0)
+        size = float(np.max(np.abs(self.G_tail * controller(self.tail, Ti, Td, wish.N))))
+        cap = min(cap, (TRUSTED if Td > 0.0 else 1.0) * (1.0 - 1.0 / wish.Ms) / size)
+        found = []
+        for end in sorted({min(end, cap) for end in largest_gains(g, wish.Ms, wish.Mt)}):
+            if encircles_not(end * g):
+                cost = self.cost(end, Ti, Td, wish.N)
+                found.append((Gains(float(end), float(Ti), float(Td), float(Td) / wish.N), cost))
+        return found
+
+    def _pi(self) -> Best:
+        scanned = [self.candidates(Ti * self.period) for Ti in TI]
+        everything = [each for candidates in scanned for each in candidates]
+        if not everything:
+            raise Refused(Reason.NOT_ROBUST, f"no PI on the model has an Ms of at most {self.wish.Ms:g}")
+        self.least = Cost(
+            min(cost.setpoint for _, cost in everything), min(cost.load for _, cost in everything)
+        )
+        best = min((self._judged(each) for each in everything), key=_value)
+        step = math.log(TI[1] / TI[0])
+        for _ in range(HALVINGS):
+            step *= 0.5
+            middle = best.gains.Ti
+            for Ti in (middle * math.exp(-step), middle * math.exp(step)):
+                best = min((best, *map(self._judged, self.candidates(Ti))), key=_value)
+        self._require_stable(best)
+        return best
+
+    def _pid(self) -> Best | None:
+        grid = [
+            (each, (math.log(Ti * self.period), math.log(ratio * Ti * self.period)))
+            for Ti in PID_TI
+            for ratio in PID_TD
+            if (each := self._at(Ti * self.period, ratio * Ti * self.period)) is not None
+        ]
+        grid.sort(key=lambda found: found[0].J)
+        starts: list[tuple[float, float]] = []
+        for _, at in grid:
+            if all(abs(at[0] - other[0]) + abs(at[1] - other[1]) > 0.8 for other in starts):
+                starts.append(at)
+            if len(starts) == 2:
+                break
+        best = grid[0][0] if grid else None
+        for start in starts:
+
+            def J(at: Reals) -> float:
+                nonlocal best
+                found = self._at(math.exp(at[0]), math.exp(at[1]))
+                if found is None:
+                    return 1e6
+                if best is None or found.J < best.J:
+                    best = found
+                return found.J
+
+            simplex = np.array(start) + np.array([[0.0, 0.0], [0.25, 0.0], [0.0, 0.25]])
+            minimize(
+                J, start, method="Nelder-Mead",
+                options={"maxiter": PID_STEPS, "initial_simplex": simplex, "fatol": 1e-5, "xatol": 1e-3},
+            )  # fmt: skip
+        if best is not None:
+            self._require_stable(best)
+        return best
+
+    def _at(self, Ti: float, Td: float) -> Best | None:
+        """The best gain of these times, None where they are not permitted or have none."""
+        if Td < LEAST_TD * self.period or Ti < LEAST_TI * self.period or Td > MOST_TD * Ti or Ti > 40.0 * self.period:
+            return None
+        return min(map(self._judged, self.candidates(Ti, Td)), key=_value, default=None)
+
+    def _judged(self, each: tuple[Gains, Cost]) -> Best:
+        gains, cost = each
+        assert self.least is not None  # the PI comes first
+        return Best(gains, 0.5 * cost.setpoint / self.least.setpoint + 0.5 * cost.load / self.least.load, cost)
+
+    def _require_stable(self, best: Best) -> None:
+        if not is_stable(self.model, best.gains):
+            raise Refused(Reason.NOT_ROBUST, "the best gains on the model are not stable by the exact count of poles")
+
+
+def controller(w: Reals, Ti: float, Td: float, N: float) -> Complexes:
+    """C(jw)/Kp."""
+    s = 1j * w
+    return np.asarray(1.0 + 1.0 / (s * Ti) + (s * Td / (1.0 + s * Td / N) if Td > 0.0 else 0.0))
+
+
+def frequencies(period: float) -> Reals:
+    return np.asarray(np.geomspace(LOWEST, HIGHEST, POINTS) * 2.0 * math.pi / period)
+
+
+def own_period(model: Model, relay_period: float) -> float:
+    """The model's ultimate period, s, within limits around the relay's, which a load makes longer."""
+    w = frequencies(relay_period)
+    G = model.frequency_response(w)
+    crossing = np.flatnonzero((G.imag[:-1] < 0.0) & (G.imag[1:] >= 0.0) & (G.real[:-1] < 0.0))
+    if not len(crossing):
+        return relay_period
+    i = int(crossing[np.argmax(np.abs(G[crossing]))])
+    part = -G.imag[i] / (G.imag[i + 1] - G.imag[i])
+    at = float(w[i] * (w[i + 1] / w[i]) ** part)
+    return min(max(2.0 * math.pi / at, SHORTEST * relay_period), LONGEST * relay_period)
+
+
+def _value(best: Best) -> float:
+    return best.J

@@ -1,0 +1,101 @@
+"""The record of a fast experiment, in the units of its fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tuning.models import Reals
+from tuning.reasons import Reason, Refused
+
+LEAST_LISTENED = 60
+"""Averages in which the time at rest must still be told, for noise and offset."""
+AVERAGES_PER_PERIOD = 80
+LEAST_SWITCHES = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """What a fast experiment has shown so far: time at rest first, then the relay, then perhaps a set-point step.
+
+    Ts: s.  u: MV that held from each sample to the next, y: PV at it, both shape (N,) and as deviations from rest.
+    direction: +1 where PV finally rises with MV, else -1: known from the controller's action.
+    listened: samples at rest.  relayed: samples up to the end of the relay.  switches: samples at which it switched,
+    its start not among them.
+    """
+
+    Ts: float
+    u: Reals
+    y: Reals
+    direction: float
+    listened: int
+    relayed: int
+    switches: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.switches) < LEAST_SWITCHES:
+            raise Refused(
+                Reason.CANNOT_OSCILLATE, f"the relay switched {len(self.switches)} times; {LEAST_SWITCHES} are needed"
+            )
+        if self.listened < LEAST_LISTENED:
+            raise Refused(
+                Reason.BAD_INPUT, f"{self.listened} samples at rest; at least {LEAST_LISTENED} are needed"
+            )
+        if not self.span > 0.0:
+            raise Refused(Reason.NO_RESPONSE, "PV did not move at all under the relay")
+
+    @property
+    def period(self) -> float:
+        """Samples: half the sum of the last four half periods of the relay (of the last two, if there are no more)."""
+        return float(period(self.switches))
+
+    @property
+    def span(self) -> float:
+        """Of PV under the relay, PV units."""
+        return float(np.ptp(self.y[self.listened : self.relayed]))
+
+    @property
+    def swing(self) -> float:
+        """The largest move of MV, MV units."""
+        return float(np.max(np.abs(self.u)))
+
+    @property
+    def block(self) -> int:
+        """Samples averaged into one for the fit: sampling faster than this tells nothing more."""
+        return max(1, min(int(self.period / AVERAGES_PER_PERIOD), self.listened // LEAST_LISTENED))
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of what is fitted at rest, PV units: of its fast part, or of all but a parabola."""
+        rest = averaged(self.y[: self.listened], self.block)
+        return noise_of(rest)
+
+    @property
+    def colour(self) -> float:
+        """Variance at rest over that of the fast part: about 1 for white noise."""
+        rest = averaged(self.y[: self.listened], self.block)
+        fast = 0.5 * float(np.mean(np.diff(rest) ** 2))
+        return float(np.var(rest)) / fast if fast > 0.0 else 1.0
+
+
+def period(switches: tuple[int, ...]) -> float:
+    """Samples, see `Evidence.period`."""
+    halves = np.diff(switches)[-4:]
+    return float(np.sum(halves)) / 2.0 if len(halves) == 4 else float(np.sum(halves[-2:]))
+
+
+def noise_of(rest: Reals) -> float:
+    """Standard deviation: the larger of that of neighbours' differences and of what a parabola leaves."""
+    fast = float(np.sqrt(0.5 * np.mean(np.diff(rest) ** 2)))
+    t = np.linspace(-1.0, 1.0, len(rest))
+    slow = rest - np.polyval(np.polyfit(t, rest, 2), t)
+    return max(fast, float(np.std(slow, ddof=3)))
+
+
+def averaged(columns: Reals, block: int) -> Reals:
+    """Means of `block` rows each; rows left over at the end are dropped."""
+    if block == 1:
+        return columns
+    rows = len(columns) // block
+    return np.asarray(columns[: rows * block].reshape(rows, block, *columns.shape[1:]).mean(axis=1))

@@ -1,0 +1,265 @@
+"""The structures fitted to a whole fast record, with steps of the load at free times and a drift if need be.
+
+Variable projection with Kaufman's derivative (BIT 15, 1975): the slope of the projected residual without the term that
+vanishes with the residual, so that all slopes cost one solution of the linear part.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tuning.fast.evidence import Evidence, averaged
+from tuning.models import Reals, TransferFunction
+from tuning.sampled import pulses
+from tuning.structures import Structure
+from tuning.varpro import Linear, search, solve
+
+FLOOR = 2e-4
+"""Of the residual in spans of PV: data without noise would ask for ever more parameters."""
+LOG_LOW, LOG_HIGH = -8.5, 9.5
+"""Of a rate in 1/period (a product of two: its square)."""
+LONGEST_DEAD_TIME = 0.75  # periods
+DEAD_TIMES = (0.01, 0.06, 0.14, 0.23, 0.32, 0.41, 0.49)
+LAGS = (0.02, 0.08, 0.25, 0.8, 4.0, 40.0)
+COMPLEX = ((3.0, 0.5), (6.0, 0.5), (10.0, 0.3))
+MOST_STEPS = 25
+FIRST_STEPS, LONG_SEARCHES = 5, 2
+"""Of many starts, all are followed so far, and so many to the end."""
+RELATIVE_DECREASE = 1e-6
+LOG_STEP = 1e-4
+LOG_REACH = 1.5
+REDUNDANT = 1e-10
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """What moved PV beside MV. loads: steps of the load at times to be found.  drift: PV drifts at a steady rate."""
+
+    loads: int = 0
+    drift: bool = False
+
+
+QUIET = Hypothesis()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fitted:
+    """theta: the structure's, then the times of the loads, in samples.  columns: regressors there, averaged.
+
+    linear: their coefficients (MV in swings, PV in spans) and the residual in spans.
+    """
+
+    structure: Structure
+    hypothesis: Hypothesis
+    theta: Reals
+    columns: Reals
+    linear: Linear
+    bic: float
+
+    @property
+    def rms(self) -> float:
+        return math.sqrt(self.linear.rss / len(self.linear.residual))
+
+    @property
+    def parameters(self) -> int:
+        return len(self.theta) + int(self.columns.shape[1])
+
+
+class Fit:
+    """Fits one record. Time in samples, MV in swings, PV in spans."""
+
+    def __init__(self, evidence: Evidence) -> None:
+        self.evidence = evidence
+        self.block = evidence.block
+        self.u = evidence.u / evidence.swing
+        self.y = averaged(evidence.y / evidence.span, self.block)
+        self.samples = len(self.y)
+        self.period = evidence.period
+        self._step = np.ones(len(self.u))
+        self._always = averaged(np.column_stack((self._step, np.linspace(-1.0, 1.0, len(self.u)))), self.block)
+        self._rate = math.log(1.0 / self.period)
+
+    # what is fitted
+
+    def regressors(self, structure: Structure, hypothesis: Hypothesis, thetas: Sequence[Reals]) -> Reals:
+        """Columns of everything linear for each theta, shape (thetas, rows, columns)."""
+        count, searched = structure.zeros + 1, structure.searched
+        monics = np.array([structure.monic(theta[:searched]) for theta in thetas])
+        # one call for MV and every load: what it costs is mostly the call
+        times = np.array(thetas)[:, structure.lags :].T
+        answers = pulses(np.tile(monics, (len(times), 1)), times.ravel(), structure.order)
+        driven, loads = answers[: len(thetas)], answers[len(thetas) :]
+        always = self._always[:, : 1 + hypothesis.drift]
+        width = structure.inputs + always.shape[1] + structure.order * hypothesis.loads
+        out = np.empty((len(thetas), self.samples, width))
+        for k, each in enumerate(driven):
+            out[k, :, :count] = averaged(each.first(count).drive(self.u), self.block)
+            if structure.feed_through:
+                delayed = np.zeros(len(self.u))
+                delayed[each.delay + 1 :] = self.u[: len(self.u) - each.delay - 1]
+                out[k, :, count] = averaged(delayed, self.block)
+            at = structure.inputs
+            out[k, :, at : at + always.shape[1]] = always
+            at += always.shape[1]
+            for load in loads[k :: len(thetas)]:
+                out[k, :, at : at + structure.order] = averaged(load.drive(self._step), self.block)
+                at += structure.order
+        return out
+
+    def fitted(self, structure: Structure, hypothesis: Hypothesis, theta: Reals) -> Fitted:
+        """The best linear part for this theta."""
+        columns = self.regressors(structure, hypothesis, [theta])[0]
+        linear = solve(columns, self.y)
+        # a load's time was chosen among many: it counts twice
+        parameters = len(theta) + columns.shape[1] + hypothesis.loads
+        bic = self.samples * math.log(linear.rss / self.samples + FLOOR**2) + parameters * math.log(self.samples)
+        return Fitted(structure, hypothesis, theta, columns, linear, bic)
+
+    def search(
+        self, structure: Structure, hypothesis: Hypothesis, starts: Sequence[Reals], most_steps: int = MOST_STEPS
+    ) -> Fitted:
+        """The best local minimum from these starts."""
+        low, high = self.bounds(structure, hypothesis)
+        times = 1 + hypothesis.loads
+        reach = np.append(np.full(structure.lags, LOG_REACH), np.full(times, 0.25 * self.period))
+        step = np.append(np.full(structure.lags, LOG_STEP), np.full(times, LOG_STEP * self.period))
+        projection = _Projection(self, structure, hypothesis)
+
+        def descend(starts: Sequence[Reals], most_steps: int) -> list[Reals]:
+            found = [
+                search(
+                    projection.residual, start, low, high, reach, step, projection.slopes, most_steps,
+                    RELATIVE_DECREASE,
+                )
+                for start in starts
+            ]  # fmt: skip
+            return [theta for theta, _ in sorted(found, key=lambda each: each[1])]
+
+        if len(starts) > LONG_SEARCHES:
+            starts = descend(starts, FIRST_STEPS)[:LONG_SEARCHES]
+        return self.fitted(structure, hypothesis, descend(starts, most_steps)[0])
+
+    def bounds(self, structure: Structure, hypothesis: Hypothesis) -> tuple[Reals, Reals]:
+        powers = np.array([1.0, 2.0, 1.0][: structure.lags] if structure.lags > 1 else [1.0])
+        low = np.concatenate((LOG_LOW + powers * self._rate, np.zeros(1 + hypothesis.loads)))
+        high = np.concatenate((LOG_HIGH + powers * self._rate, [LONGEST_DEAD_TIME * self.period]))
+        return low, np.append(high, np.full(hypothesis.loads, len(self.u) - 2.0 * self.block))
+
+    # where to begin
+
+    def denominators(self, structure: Structure) -> list[Reals]:
+        """Logs of the rates to begin with, of the first or second order."""
+        unit = self.period
+        if structure.lags == 1:
+            return [np.log([1.0 / (T * unit)]) for T in LAGS]
+        pairs = [(T1 * unit, T2 * unit) for i, T1 in enumerate(LAGS) for T2 in LAGS[: i + 1]]
+        real = [np.log([1.0 / T1 + 1.0 / T2, 1.0 / (T1 * T2)]) for T1, T2 in pairs]
+        return real + [np.log([2.0 * zeta * w / unit, (w / unit) ** 2]) for w, zeta in COMPLEX]
+
+    def grid(self, structure: Structure, keep: int, load_at: float | None = None) -> list[Reals]:
+        """The `keep` best theta that differ, best first. load_at: with one step of the load at this sample."""
+        thetas = [
+            np.append(logs, L * self.period) for logs in self.denominators(structure) for L in DEAD_TIMES
+        ]
+        hypothesis = QUIET
+        if load_at is not None:
+            hypothesis = Hypothesis(loads=1)
+            thetas = [np.append(theta, load_at) for theta in thetas]
+        rss = left_over(self.regressors(structure, hypothesis, thetas), self.y)
+        return self.differing([thetas[i] for i in np.argsort(rss)], structure, keep)
+
+    def differing(self, ranked: Sequence[Reals], structure: Structure, keep: int) -> list[Reals]:
+        """The first few that are not near another."""
+        kept: list[Reals] = []
+        for theta in ranked:
+            if all(self._differ(theta, other, structure.lags) for other in kept):
+                kept.append(theta)
+                if len(kept) == keep:
+                    break
+        return kept
+
+    def _differ(self, a: Reals, b: Reals, lags: int) -> bool:
+        apart = np.abs(a - b)
+        return bool(np.any(apart[:lags] > 1.0) or np.any(apart[lags:] > 0.05 * self.period))
+
+    # what it means
+
+    def goes_right(self, fit: Fitted) -> bool:
+        """The static gain has the sign that the controller's action says."""
+        structure, c = fit.structure, fit.linear.coefficients
+        gain = float(c[0] / structure.monic(fit.theta[: structure.searched])[-1])
+        if structure.feed_through:
+            gain += float(c[structure.zeros + 1])
+        return gain * self.evidence.direction > 0.0
+
+    def model(self, fit: Fitted) -> TransferFunction:
+        """In s and the units of the record."""
+        return self.transfer(fit.structure, fit.theta, fit.linear.coefficients)
+
+    def transfer(self, structure: Structure, theta: Reals, coefficients: Reals) -> TransferFunction:
+        """The plant of these parameters; coefficients as fitted, those of no input ignored."""
+        evidence = self.evidence
+        Ts, unit = evidence.Ts, evidence.span / evidence.swing
+        order = structure.order
+        monic = structure.monic(theta[: structure.searched])
+        den = np.append(1.0, monic) * Ts ** -np.arange(order + 1.0)
+        b = coefficients[: structure.zeros + 1]
+        num = np.zeros(order + 1)
+        # the i-th state is s^i/den with s counted in samples
+        for i, value in enumerate(b):
+            num[order - i] = unit * value * Ts ** (i - order)
+        if structure.feed_through:
+            num += unit * coefficients[structure.zeros + 1] * den
+        return TransferFunction(tuple(num), tuple(den), max(float(theta[structure.lags]), 0.0) * Ts)
+
+
+class _Projection:
+    """Residual and slopes of one structure; remembers the last factors, which both need."""
+
+    def __init__(self, fit: Fit, structure: Structure, hypothesis: Hypothesis) -> None:
+        self._fit, self._structure, self._hypothesis = fit, structure, hypothesis
+        self._known: dict[bytes, tuple[Reals, Reals, Reals]] = {}
+
+    def residual(self, theta: Reals) -> Reals:
+        columns = self._fit.regressors(self._structure, self._hypothesis, [theta])[0]
+        lengths = np.sqrt(np.einsum("ij,ij->j", columns, columns))
+        lengths[lengths == 0.0] = 1.0
+        q, r = np.linalg.qr(columns / lengths)
+        along = q.T @ self._fit.y
+        found = self._fit.y - q @ along
+        if len(self._known) > 2:
+            self._known.clear()
+        self._known[theta.tobytes()] = (columns, q, _back(r, along) / lengths)
+        return found
+
+    def slopes(self, theta: Reals, residual: Reals, high: Reals, step: Reals) -> Reals:
+        key = theta.tobytes()
+        if key not in self._known:
+            self.residual(theta)
+        columns, q, c = self._known[key]
+        signed = np.where(theta + step <= high, step, -step)
+        moved = self._fit.regressors(self._structure, self._hypothesis, list(theta + np.diag(signed)))
+        change = ((moved @ c - columns @ c) / signed[:, None]).T
+        return np.asarray(q @ (q.T @ change) - change)
+
+
+def _back(r: Reals, along: Reals) -> Reals:
+    """R c = along, a direction that the columns do not have left out."""
+    if np.min(np.abs(np.diag(r))) > REDUNDANT:
+        return np.asarray(np.linalg.solve(r, along))
+    return np.asarray(np.linalg.lstsq(r, along, rcond=REDUNDANT)[0])
+
+
+def left_over(columns: Reals, y: Reals) -> Reals:
+    """Sum of squares left of y by each set of columns, shape (sets,)."""
+    lengths = np.sqrt(np.einsum("bij,bij->bj", columns, columns))
+    lengths[lengths == 0.0] = 1.0
+    turned = np.swapaxes(columns / lengths[:, None, :], 1, 2)
+    gram = turned @ np.swapaxes(turned, 1, 2) + REDUNDANT * np.eye(columns.shape[2])
+    along = turned @ y
+    weights = np.linalg.solve(gram, along[:, :, None])[:, :, 0]
+    return np.asarray(y @ y - np.einsum("bi,bi->b", weights, along))

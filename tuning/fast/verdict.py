@@ -1,0 +1,110 @@
+"""Identification, design and verdict of a fast record in one call."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from tuning.fast.choice import Chosen, choose
+from tuning.fast.design import Best, Design, Wish
+from tuning.fast.evidence import Evidence
+from tuning.fast.fit import Fit
+from tuning.fast.spread import colour, difference_of_rivals, peak, uncertainty_of_Ms
+from tuning.gains import Gains
+from tuning.models import TransferFunction
+
+MOST_RESIDUAL, UNIMPORTANT = 1.35, 0.004
+"""Of the residual: in noises at rest; in spans of PV, below which it does not matter."""
+MOST_COLOUR = 1.35
+MOST_UNCERTAINTY = 0.10
+"""Of Ms, by the delta method and among the rivals."""
+SURPRISE, SURPRISE_OF_A_STORY = 0.5, 0.2
+"""Of Ms from what was asked, of the tested controller on the new model and the new one on the earlier model; where the
+load is said to have moved twice."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """cause: the value of the reason why the result is not to be trusted, None if it is.
+
+    model: without the delay of the sampling, which is in `design_delay` (s).  Ms: on the model.
+    uncertainty, ambiguity: of Ms.  residual: its rms in noises at rest.
+    """
+
+    cause: str | None
+    detail: str
+    model: TransferFunction
+    structure: str
+    best: Best
+    Ms: float
+    uncertainty: float
+    ambiguity: float
+    residual: float
+    chosen: Chosen
+    fit: Fit
+    design_delay: float
+
+
+def judge(evidence: Evidence, wish: Wish, earlier: Judged | None = None) -> Judged:
+    """earlier: of a first part of the record, whose gains were tested in the rest of it.
+
+    Raises Refused, NOT_ROBUST, where the model allows no such controller.
+    """
+    fit = Fit(evidence)
+    chosen = choose(fit, earlier.chosen.fits if earlier else ())
+    found = chosen.best
+    model = fit.model(found)
+    delay = 0.5 * evidence.Ts
+    design = Design(replace(model, L=model.L + delay), wish, evidence.period * evidence.Ts)
+    best = design.best()
+    spread = uncertainty_of_Ms(fit, found, best.gains, design.w, wish.N, delay)
+    rivals = difference_of_rivals(fit, found, chosen.rivals, best.gains, design.w, delay)
+    noise = evidence.noise / evidence.span
+    whiteness = colour(found.linear.residual)
+    cause, detail = None, ""
+    if found.rms > max(MOST_RESIDUAL * noise, UNIMPORTANT):
+        cause = "unexplained"
+        rms = 100.0 * found.rms
+        detail = f"the model leaves {rms:.2g} % of PV's span unexplained, the noise is {100.0 * noise:.2g} %"
+    elif found.rms > UNIMPORTANT and whiteness > MOST_COLOUR * max(evidence.colour, 1.0):
+        cause = "disturbed"
+        at_rest = f"{evidence.colour:.2f} at rest"
+        detail = f"what the model leaves varies slowly: {whiteness:.2f} times white noise, {at_rest}"
+    elif spread > MOST_UNCERTAINTY:
+        cause = "uncertain"
+        detail = f"Ms is known to +{spread:.2g} only"
+    elif rivals > MOST_UNCERTAINTY:
+        cause = "ambiguous"
+        detail = f"another model that explains the record as well gives an Ms off by {rivals:.2g}"
+    elif earlier is not None:
+        cause, detail = _surprise(earlier, model, best.gains, wish, design, found.hypothesis.loads)
+    return Judged(
+        cause=cause,
+        detail=detail,
+        model=model,
+        structure=found.structure.name,
+        best=best,
+        Ms=peak(model, best.gains, design.w, delay),
+        uncertainty=spread,
+        ambiguity=rivals,
+        residual=found.rms / noise if noise > 0.0 else math.inf,
+        chosen=chosen,
+        fit=fit,
+        design_delay=delay,
+    )
+
+
+def _surprise(
+    earlier: Judged, model: TransferFunction, gains: Gains, wish: Wish, design: Design, loads: int
+) -> tuple[str | None, str]:
+    """Both models must agree roughly on both controllers: one of them may be a story told of a disturbance."""
+    most = SURPRISE_OF_A_STORY if loads > 1 else SURPRISE
+    tested = peak(model, earlier.best.gains, design.w, earlier.design_delay)
+    again = peak(earlier.model, gains, design.w, earlier.design_delay)
+    if abs(tested - wish.Ms) > most:
+        text = f"the controller that was tested has Ms {tested:.2f} on the model of the whole record, not {wish.Ms:g}"
+        return "surprise", text
+    if abs(again - wish.Ms) > most:
+        text = f"the controller designed on the whole record has Ms {again:.2f} on the relay's model, not {wish.Ms:g}"
+        return "surprise", text
+    return None, ""
