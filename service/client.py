@@ -35,6 +35,8 @@ class Client:
 
     def pages(self, path: str) -> list[Any]:
         """The whole of a list that comes in pages."""
+        import httpx
+
         found, following = [], httpx.URL(path)
         while True:
             answer = self._answer("GET", following)

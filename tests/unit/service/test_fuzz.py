@@ -204,6 +204,7 @@ def _refusal(key: str, label: str) -> int | None:
     """Written from the table in docs/operations.md, not from the code."""
     if key not in list(Scope):
         return 401
-    needs = "admin" if label == "GET /audit" else "read" if label.startswith("GET ") else "operate"
+    reads = label.startswith("GET ") or label == "POST /tunings"
+    needs = "admin" if label == "GET /audit" else "read" if reads else "operate"
     permitted = {"read": ("read",), "operate": ("read", "operate"), "admin": ("read", "operate", "admin")}
     return None if needs in permitted[key] else 403
