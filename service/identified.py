@@ -6,15 +6,15 @@ from dataclasses import asdict
 from typing import Any
 
 from service.model_forms import dump_model
+from service.plain import plain
 from service.record import Record
-from service.tunings import finite
 from tuning.identify import Identified
 from tuning.reasons import Refused
 
 
 def identified(found: Identified, record: Record) -> dict[str, Any]:
     """Errors, noise_std and rms in the units of what they are of; fits in percent."""
-    answer: dict[str, Any] = finite(
+    answer: dict[str, Any] = plain(
         {
             "outcome": "identified",
             "reason": None,

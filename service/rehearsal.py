@@ -17,6 +17,7 @@ from controller.channel import Cause, Channel, Settings
 from controller.pid import Parameters
 from plantsim.plant import LinearPlant, Plant
 from service.loop import LoopState
+from service.plain import plain
 from service.runner import RunResult, Watch, run
 from tuning.fast.procedure import FAST, FAST_STAGES, FastOptions, FastProposal, fast
 from tuning.five_stage import PROCEDURE, STAGES, Facts, Options, Proposal, five_stage
@@ -286,7 +287,7 @@ def _answer(
         "predicted": None,
         "measured": None,
         "plant_time_s": {**times, "total": sum(times.values())},
-        "stages": {stage: _plain(result) for stage, result in results.items()},
+        "stages": results,
         "input": file.model_dump() if file else None,
         "form": "ISA: u = Kp*(e + integral(e)/Ti + Td*de/dt); Kp in MV per PV unit, times in s",
     }
@@ -304,7 +305,7 @@ def _answer(
                 "after": asdict(proposal.verification) if proposal.verification else None,
             }
         answer["notes"] = list(proposal.notes)
-    clean: dict[str, Any] = _finite(answer)
+    clean: dict[str, Any] = plain(answer)
     return clean
 
 
@@ -322,20 +323,3 @@ def _model(proposal: Proposal | FastProposal) -> dict[str, Any]:
         "zeta": model.zeta,
         "fit_pct": model.fit_pct,
     }
-
-
-def _plain(result: object) -> Any:
-    if isinstance(result, tuple):
-        return [_plain(item) for item in result]
-    return asdict(result) if hasattr(result, "__dataclass_fields__") else result  # type: ignore[call-overload]
-
-
-def _finite(value: Any) -> Any:
-    """JSON has no nan or inf: null says that there is no number."""
-    if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -10,9 +10,9 @@ from typing import Any
 from service.journal import Journal
 from service.metrics import STAGE_SECONDS
 from service.observed import ObservedLoop
+from service.plain import plain_object
 from service.progress import Progress
 from service.store.store import block_of, event_of
-from service.work import plain
 from tuning.plan import Event, Note, Sample, StageDone, StageStarted
 from tuning.reasons import Reason
 
@@ -55,7 +55,7 @@ class Running:
             if self.loop is not None:  # a rehearsal has no plant whose time it takes
                 STAGE_SECONDS.labels(event.stage).observe(self.progress.stage_time_s)
             took = {"stage_time_s": self.progress.stage_time_s}
-            self.tell("stage_done", {"stage": event.stage, "result": plain(event.result), **took})
+            self.tell("stage_done", {"stage": event.stage, "result": plain_object(event.result), **took})
         elif isinstance(event, Note):
             self.tell("note", {"stage": self.progress.stage, "text": event.text})
 

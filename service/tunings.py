@@ -6,12 +6,12 @@ just these, on the model as given with its exact dead time.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from service.model_forms import dump_model
+from service.plain import plain
 from tuning.assess import Assessment, assess
 from tuning.design import realisable
 from tuning.figures import StepFigures
@@ -114,7 +114,7 @@ def as_json(found: Tuned) -> dict[str, Any]:
         "setpoint": _figures(assessed.setpoint) if assessed else None,
         "load": _figures(assessed.load) if assessed else None,
     }
-    clean: dict[str, Any] = finite(told)
+    clean: dict[str, Any] = plain(told)
     return clean
 
 
@@ -132,14 +132,6 @@ def methods_json() -> list[dict[str, Any]]:
         for method in METHODS.values()
     ]
 
-
-def finite(value: Any) -> Any:
-    """JSON has no NaN and no infinity: null says that there is no number."""
-    if isinstance(value, dict):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _check(methods: list[Method], name: str, value: object) -> None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, Protocol, cast
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 from service.config import LoopConfig
 from service.loop import Loop, LoopState
+from service.plain import plain_object
 from service.request import RetuneRequest
 from service.store.tables import EventRow
 from tuning.plan import Event, Sample
@@ -91,7 +91,7 @@ def tune(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopStat
         stop=hooks.stop,
         start_work=lambda work: threading.Thread(target=work, daemon=True, name="computation").start(),
     )
-    return Outcome(plain(ran.value), ran.ended, ran.restored, dict(ran.plant_time_s))
+    return Outcome(plain_object(ran.value), ran.ended, ran.restored, dict(ran.plant_time_s))
 
 
 def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:
@@ -171,26 +171,6 @@ def rehearsal_spec(config: LoopConfig, request: RetuneRequest) -> dict[str, Any]
     dead_time = 0.2 * config.t95_s
     gain = config.sp_deviation / (0.1 * (config.mv_limits.high - config.mv_limits.low))
     return spec | {"num": [gain], "den": [(config.t95_s - dead_time) / 3.0, 1.0], "dead_time_s": dead_time}
-
-
-def plain(value: object) -> dict[str, Any] | None:
-    """A result (a dataclass with plain fields, or several) as a JSON object."""
-    if value is None:
-        return None
-    found = _plain(value)
-    return cast(dict[str, Any], found) if isinstance(found, dict) else {"value": found}
-
-
-def _plain(value: Any) -> Any:
-    """Dataclasses, tuples and numpy scalars become what JSON knows; a number that is none becomes null."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return _plain({f.name: getattr(value, f.name) for f in fields(value)})
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    value = value.item() if hasattr(value, "item") else value
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _reason(text: object) -> Reason:

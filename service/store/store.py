@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import secrets
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -14,6 +13,7 @@ from sqlalchemy import delete, func, select, text, update
 from sqlalchemy.exc import IntegrityError, TimeoutError
 from sqlalchemy.orm import Session, sessionmaker
 
+from service.plain import plain
 from service.security import audit
 from service.states import ACTIVE, JobState, check
 from service.store import chunks, retunes
@@ -24,7 +24,7 @@ from service.store.tables import ChunkRow, EventRow, JobRow, LoopRow, RetuneRow
 from tuning.plan import Sample
 from tuning.reasons import Reason
 
-__all__ = ["Busy", "FolderInUse", "ForeignLoop", "NoSuchJob", "Store", "WithJob", "Write", "clean", "now"]
+__all__ = ["Busy", "FolderInUse", "ForeignLoop", "NoSuchJob", "Store", "WithJob", "Write", "now"]
 
 Write = Callable[[Session], None]
 """A piece of a transaction, for the journal."""
@@ -176,7 +176,7 @@ class Store:
             loop=loop,
             state=JobState.QUEUED.value,
             dry_run=dry_run,
-            request=clean(request),
+            request=plain(request),
             requested_by=requested_by,
             created_at=now(),
             host=host or self.host,
@@ -342,20 +342,9 @@ class Store:
         return [(row.stage, chunks.unpack(row.data, row.count, row.first_t_s)) for row in rows]
 
 
-def clean(value: Any) -> Any:
-    """The same JSON value with NaN and infinities as null, which JSON has no words for."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {str(key): clean(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [clean(item) for item in value]
-    return value
-
-
 def event_of(job_id: str, kind: str, data: dict[str, Any], plant_time_s: float, **columns: Any) -> Write:
     """An event, at the time it happened, and what it changes in the job's row."""
-    at, told = now(), clean(data)
+    at, told = now(), plain(data)
 
     def write(session: Session) -> None:
         row = _find(session, job_id, lock=True)
@@ -388,7 +377,7 @@ def _find(session: Session, job_id: str, lock: bool = False) -> JobRow:
 
 def set_columns(row: JobRow, columns: dict[str, Any]) -> None:
     for name, value in columns.items():
-        setattr(row, name, clean(value))
+        setattr(row, name, plain(value))
 
 
 def _audit_decision(session: Session, row: JobRow, previous: JobState, wanted: JobState, by: str) -> None:
@@ -411,6 +400,6 @@ def append(
     """The next event of a job whose row this transaction has locked."""
     seq = session.scalar(select(func.max(EventRow.seq)).where(EventRow.job_id == job_id)) or 0
     session.add(
-        EventRow(job_id=job_id, seq=seq + 1, at=at or now(), plant_time_s=plant_time_s, kind=kind, data=clean(data))
+        EventRow(job_id=job_id, seq=seq + 1, at=at or now(), plant_time_s=plant_time_s, kind=kind, data=plain(data))
     )
     session.flush()

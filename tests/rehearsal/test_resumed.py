@@ -11,9 +11,9 @@ import pytest
 from controller.channel import Channel, Settings
 from plantsim.plant import LinearPlant
 from service.checkpoints import finished
+from service.plain import plain_object
 from service.rehearsal import RehearsedLoop, _parameters
 from service.runner import Watch, run
-from service.work import plain
 from tuning.five_stage import STAGES, Facts, Finished, Options, five_stage
 from tuning.gains import Gains
 from tuning.plan import Event, Mode, StageDone, StageStarted
@@ -40,7 +40,7 @@ def stored(events: list[Event]) -> list[tuple[str, Any]]:
             return [null(v) for v in value]
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
-    done = [(event.stage, null(plain(event.result))) for event in events if isinstance(event, StageDone)]
+    done = [(event.stage, null(plain_object(event.result))) for event in events if isinstance(event, StageDone)]
     result: list[tuple[str, Any]] = json.loads(json.dumps(done))
     return result
 
