@@ -48,9 +48,6 @@ def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, int | float | str]
     if isinstance(value, dict):
         for name, item in value.items():
             yield from _leaves(item, name)
-    elif isinstance(value, list):
-        for item in value:
-            yield from _leaves(item, key)
     elif isinstance(value, int | float | str):
         yield key, value
 
