@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,7 +16,19 @@ from service.loop import LoopState
 from service.rehearsal import RehearsedLoop
 from service.runner import RunResult, Watch, run
 from tuning.gains import Gains
-from tuning.plan import Command, Mode, Plan, Sample, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint, StageStarted
+from tuning.plan import (
+    Command,
+    Mode,
+    Plan,
+    Sample,
+    SetGains,
+    SetMode,
+    SetOutput,
+    SetRelay,
+    SetSetpoint,
+    StageStarted,
+    worked,
+)
 from tuning.reasons import Failed, Reason, Refused
 
 TS = 0.1
@@ -130,6 +143,55 @@ def test_mv_is_not_judged_before_the_plan_has_commanded_anything() -> None:
         return "heard"
 
     assert run(listen(), Meddled(), watch=Watch(mv_low=0.5, mv_high=0.6)).value == "heard"
+
+
+class TestWorkBesideTheSamples:
+    """A live loop is pumped and guarded while something long is computed."""
+
+    @staticmethod
+    def beside(work: Callable[[], None]) -> None:
+        threading.Thread(target=work, daemon=True).start()
+
+    def test_samples_go_on_until_it_is_done(self) -> None:
+        enough = threading.Event()
+        seen: list[Sample] = []
+
+        def heard(samples: list[Sample]) -> None:
+            seen.extend(samples)
+            enough.set()
+
+        result = run(
+            worked(lambda: enough.wait(10)), Meddled(), watch=Watch(), on_samples=heard, start_work=self.beside
+        )
+        assert (result.value, len(seen) >= 200) == (True, True)
+
+    def test_an_abort_does_not_wait_for_it(self) -> None:
+        never = threading.Event()
+        loop = Meddled()
+
+        def plan() -> Plan[bool]:
+            yield (SetGains(Gains(Kp=0.5, Ti=3.0)), SetSetpoint(0.3))
+            return (yield from worked(lambda: never.wait(30)))
+
+        asked = iter([None] * 50)
+        result = run(plan(), loop, watch=Watch(), stop=lambda: next(asked, Reason.OPERATOR), start_work=self.beside)
+        assert result.ended is not None
+        assert result.ended.reason is Reason.OPERATOR
+        assert_home(loop, result)
+        never.set()
+
+    @pytest.mark.parametrize(
+        ("error", "reason"),
+        [(Refused(Reason.NOT_ROBUST, "Ms 3"), Reason.NOT_ROBUST), (ZeroDivisionError("0"), Reason.INTERNAL)],
+    )
+    def test_what_it_raises_ends_the_run(self, error: Exception, reason: Reason) -> None:
+        def fail() -> None:
+            raise error
+
+        result = run(worked(fail), loop := Meddled(), watch=Watch(), start_work=self.beside)
+        assert result.ended is not None
+        assert result.ended.reason is reason
+        assert_home(loop, result)
 
 
 def test_a_frozen_pv_is_noticed_once_mv_has_moved() -> None:
