@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from service.jobs import Conflict
+from service.errors import Conflict
 from service.request import ProcessModel
 from service.states import ACTIVE, JobState
 from service.store.tables import EventRow, JobRow

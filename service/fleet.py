@@ -17,7 +17,8 @@ from pydantic import Field, model_validator
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.config import BusConfig, LoopConfig
-from service.jobs import Jobs, Stopping, UnknownLoop
+from service.errors import Stopping, UnknownLoop
+from service.jobs import Jobs
 from service.request import BadLimits, RetuneRequest, within
 from service.states import IllegalMove
 from service.store import retunes

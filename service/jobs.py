@@ -19,19 +19,22 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.config import BusConfig, LoopConfig
 from service.engine import WORKFLOW_VERSION, Engine
+from service.errors import Conflict, Stopping, UnknownLoop
+from service.exchange import exchange
 from service.journal import Journal, temporary
 from service.logs import about
 from service.loop import Loop, LoopState
 from service.observed import ObservedLoop
+from service.recovery import Recovery
 from service.request import BadLimits, RetuneRequest, within
 from service.running import Running
-from service.safe import PATIENCE_S, Safe, make_safe, same
+from service.safe import PATIENCE_S, make_safe
+from service.state_json import gains_of, loop_state, state_json
 from service.states import ACTIVE, IllegalMove, JobState, state_after
 from service.store.store import Busy, FolderInUse, NoSuchJob, Store, WithJob
 from service.store.tables import JobRow
 from service.work import Hooks, Outcome, Rehearse, Tune
-from tuning.gains import Gains
-from tuning.plan import Event, Mode
+from tuning.plan import Event
 from tuning.reasons import Aborted, Ended, Failed, Reason
 
 log = logging.getLogger(__name__)
@@ -39,27 +42,10 @@ T = TypeVar("T")
 
 LoopFactory = Callable[[LoopConfig], Loop]
 REHEARSALS_AT_ONCE = 4
-MOST_ATTEMPTS = 10
 _WATCH_S = 0.2
 _RECONCILE_S = 15.0
 _AT_BOOT = 16
 _STOP_PATIENCE_S = 20.0
-
-
-class UnknownLoop(Exception):
-    """No loop of that tag is configured."""
-
-    def __init__(self, tag: str) -> None:
-        super().__init__(f"there is no loop {tag}")
-        self.tag = tag
-
-
-class Stopping(Exception):
-    """The service is shutting down and takes no new work."""
-
-
-class Conflict(Exception):
-    """The job or its loop is not as the wish supposes."""
 
 
 class Jobs:
@@ -110,64 +96,13 @@ class Jobs:
         """
         self.store.own_loops({tag: config.model_dump(mode="json") for tag, config in self.loops.items()})
         with ThreadPoolExecutor(_AT_BOOT, "boot") as pool:
-            for _ in pool.map(self._recover, self.store.unfinished()):
+            recovery = Recovery(self.loops, self.store, self._open_loop, self.resumes, self._patience_s)
+            for _ in pool.map(recovery.recover, self.store.unfinished()):
                 pass
         queues = {self._queue(config): self.at_once(config.bus) for config in self.loops.values()}
         self.engine.launch(self.work, queues | {self._rehearsals(self.store.host): REHEARSALS_AT_ONCE})
         self.reconcile(at_once=True)
         self._watcher.start()
-
-    def _recover(self, row: JobRow) -> None:
-        """Makes the loop of a job that a dead service left safe, and ends the job if it is not to go on."""
-        safe: Safe | None = None
-        if row.found is not None:
-            safe = self._safe(row)
-            self.store.append(row.id, "loop_found", {"text": safe.text}, row.plant_time_s)
-        restored: dict[str, Any] = {}
-        if safe is not None and safe.state is not None:
-            restored = {"restored": state_json(safe.state)}
-        if row.stop_reason is not None:
-            detail = "asked to stop before the service ended; " + _loop_words(safe)
-            self.store.move(row.id, JobState.ABORTED, reason=row.stop_reason, detail=detail, **restored)
-            return
-        why = self._why_not(row, safe)
-        if why is not None:
-            reason, text = why
-            detail = f"cut off by the end of the service, and not resumed: {text}; {_loop_words(safe)}"
-            self.store.move(row.id, JobState.INTERRUPTED, reason=reason.value, detail=detail, **restored)
-
-    def _safe(self, row: JobRow) -> Safe:
-        config = self.loops.get(row.loop)
-        if config is None:
-            return Safe(None, "the loop is no longer configured here", Reason.SERVICE_STOPPED)
-        try:
-            loop = self._open_loop(config)
-            try:
-                return make_safe(loop, loop_state(row.found or {}), self._patience_s)
-            finally:
-                loop.close()
-        except Exception as error:  # one loop must not keep the service of the others from starting
-            log.exception("loop %s", row.loop)
-            return Safe(None, f"not reached: {error}; the controller goes back by itself", Reason.BUS_LOST)
-
-    def _why_not(self, row: JobRow, safe: Safe | None) -> tuple[Reason, str] | None:
-        """Why a job is not to be resumed, if so."""
-        config = self.loops.get(row.loop)
-        if row.version != WORKFLOW_VERSION:
-            return Reason.SERVICE_STOPPED, "it was begun by another version of Loopwright"
-        if config is None:
-            return Reason.SERVICE_STOPPED, "its loop is no longer configured here"
-        if not self.resumes:
-            return Reason.SERVICE_STOPPED, "the service was started with --no-resume"
-        if safe is not None and safe.reason is not None:
-            return safe.reason, "the loop is not as the job had found it" if safe.state else "the loop is not reached"
-        if row.attempt >= MOST_ATTEMPTS:
-            return Reason.SERVICE_STOPPED, f"that was attempt {row.attempt} of at most {MOST_ATTEMPTS}"
-        try:
-            within(config, RetuneRequest.model_validate(row.request))
-        except ValueError as error:  # BadLimits too
-            return Reason.BAD_LIMITS, f"the loop's configuration has changed: {error}"
-        return None
 
     def reconcile(self, at_once: bool = False) -> None:
         """Hands the engine what it has lost (an enqueue that failed, a file that was deleted or is older than ours).
@@ -348,27 +283,15 @@ class Jobs:
             old, new = gains_of(row.old_gains), gains_of((row.result or {}).get("gains"))
             before, after = (old, new) if wanted is JobState.ACCEPTED else (new, old)
             try:
-                state = self._exchange(config, before, after)
+                loop = self._open_loop(config)
+                try:
+                    state = exchange(loop, before, after)
+                finally:
+                    loop.close()
             except Ended as ended:
                 self.store.decision_failed(job_id, wanted, by, f"{ended.reason.value}: {ended.detail}")
                 raise
             return self.store.move(job_id, wanted, by=by, restored=state_json(state))
-
-    def _exchange(self, config: LoopConfig, before: Gains, after: Gains) -> LoopState:
-        loop = self._open_loop(config)
-        try:
-            present = loop.read().gains
-            if not same(present, before):
-                raise Conflict(
-                    f"the controller holds {present}, not the {before} this decision is about: "
-                    "somebody changed the gains in between; retune instead"
-                )
-            state = loop.accept(after)
-            if not same(state.gains, after):
-                raise Failed(Reason.RESTORE_UNCONFIRMED, f"wrote {after}, read back {state.gains}")
-            return state
-        finally:
-            loop.close()
 
     # the thread of a job
     def work(self, job_id: str) -> None:
@@ -502,25 +425,3 @@ class Jobs:
                 if not temporary(error) or (self.stopping and time.monotonic() - since > _STOP_PATIENCE_S):
                     raise
                 time.sleep(0.5)
-
-
-def _loop_words(safe: Safe | None) -> str:
-    return "the loop had not been touched" if safe is None else f"the loop: {safe.text}"
-
-
-def gains_of(data: dict[str, Any] | None) -> Gains:
-    """Gains from a job's JSON."""
-    if not data:
-        raise Conflict("the job has no gains to put")
-    return Gains(**{name: float(data[name]) for name in Gains.__dataclass_fields__ if data.get(name) is not None})
-
-
-def state_json(state: LoopState) -> dict[str, Any]:
-    """A loop's state as JSON, the mode by name."""
-    return asdict(state) | {"mode": state.mode.name.lower()}
-
-
-def loop_state(data: dict[str, Any]) -> LoopState:
-    """A loop's state from its JSON. PV and MV that were not numbers are of no account."""
-    numbers = {name: 0.0 if data[name] is None else data[name] for name in ("pv", "mv")}
-    return LoopState(**data | numbers | {"mode": Mode[data["mode"].upper()], "gains": gains_of(data["gains"])})

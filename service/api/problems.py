@@ -12,7 +12,7 @@ from pydantic import BaseModel, Field
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 
-from service.jobs import Conflict, Stopping, UnknownLoop
+from service.errors import Conflict, Stopping, UnknownLoop
 from service.journal import temporary
 from service.model_forms import BadModel
 from service.request import BadLimits

@@ -19,10 +19,10 @@ from pathlib import Path
 import yaml
 
 from service.config import LoopConfig
-from service.jobs import loop_state, state_json
 from service.loop import Loop, LoopState
 from service.request import RetuneRequest
 from service.serving import Setup, serve
+from service.state_json import loop_state, state_json
 from service.store import store
 from service.work import Hooks, Outcome
 from tests.unit.service.fakes import NEW, OLD, RESULT, Found, loop_entry

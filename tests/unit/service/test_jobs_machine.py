@@ -21,7 +21,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
 
 from service.config import LoopConfig, parse_site
-from service.jobs import Conflict, Jobs
+from service.errors import Conflict
+from service.jobs import Jobs
 from service.loop import Loop, LoopState
 from service.request import RetuneRequest
 from service.states import IllegalMove

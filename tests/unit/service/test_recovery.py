@@ -12,9 +12,11 @@ from sqlalchemy.exc import OperationalError
 
 from service.config import parse_site
 from service.engine import WORKFLOW_VERSION
-from service.jobs import MOST_ATTEMPTS, Jobs, state_json
+from service.jobs import Jobs
 from service.loop import LoopState
+from service.recovery import MOST_ATTEMPTS
 from service.request import RetuneRequest
+from service.state_json import state_json
 from service.states import JobState
 from service.store.store import Store
 from service.store.tables import JobRow

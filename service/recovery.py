@@ -1,0 +1,90 @@
+"""A job that a dead service left: its loop made safe, and whether the job may go on."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from service.config import LoopConfig
+from service.engine import WORKFLOW_VERSION
+from service.loop import Loop
+from service.request import RetuneRequest, within
+from service.safe import Safe, make_safe
+from service.state_json import loop_state, state_json
+from service.states import JobState
+from service.store.store import Store
+from service.store.tables import JobRow
+from tuning.reasons import Reason
+
+log = logging.getLogger(__name__)
+
+MOST_ATTEMPTS = 10
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """resumes: whether such jobs go on.  patience_s: wall time a loop gets to come back by itself, s."""
+
+    loops: Mapping[str, LoopConfig]
+    store: Store
+    open_loop: Callable[[LoopConfig], Loop]
+    resumes: bool
+    patience_s: float
+
+    def recover(self, row: JobRow) -> None:
+        """Makes the loop of the job safe, and ends the job if it is not to go on."""
+        safe: Safe | None = None
+        if row.found is not None:
+            safe = self._safe(row)
+            self.store.append(row.id, "loop_found", {"text": safe.text}, row.plant_time_s)
+        restored: dict[str, Any] = {}
+        if safe is not None and safe.state is not None:
+            restored = {"restored": state_json(safe.state)}
+        if row.stop_reason is not None:
+            detail = "asked to stop before the service ended; " + _loop_words(safe)
+            self.store.move(row.id, JobState.ABORTED, reason=row.stop_reason, detail=detail, **restored)
+            return
+        why = self._why_not(row, safe)
+        if why is not None:
+            reason, text = why
+            detail = f"cut off by the end of the service, and not resumed: {text}; {_loop_words(safe)}"
+            self.store.move(row.id, JobState.INTERRUPTED, reason=reason.value, detail=detail, **restored)
+
+    def _safe(self, row: JobRow) -> Safe:
+        config = self.loops.get(row.loop)
+        if config is None:
+            return Safe(None, "the loop is no longer configured here", Reason.SERVICE_STOPPED)
+        try:
+            loop = self.open_loop(config)
+            try:
+                return make_safe(loop, loop_state(row.found or {}), self.patience_s)
+            finally:
+                loop.close()
+        except Exception as error:  # one loop must not keep the service of the others from starting
+            log.exception("loop %s", row.loop)
+            return Safe(None, f"not reached: {error}; the controller goes back by itself", Reason.BUS_LOST)
+
+    def _why_not(self, row: JobRow, safe: Safe | None) -> tuple[Reason, str] | None:
+        """Why a job is not to be resumed, if so."""
+        config = self.loops.get(row.loop)
+        if row.version != WORKFLOW_VERSION:
+            return Reason.SERVICE_STOPPED, "it was begun by another version of Loopwright"
+        if config is None:
+            return Reason.SERVICE_STOPPED, "its loop is no longer configured here"
+        if not self.resumes:
+            return Reason.SERVICE_STOPPED, "the service was started with --no-resume"
+        if safe is not None and safe.reason is not None:
+            return safe.reason, "the loop is not as the job had found it" if safe.state else "the loop is not reached"
+        if row.attempt >= MOST_ATTEMPTS:
+            return Reason.SERVICE_STOPPED, f"that was attempt {row.attempt} of at most {MOST_ATTEMPTS}"
+        try:
+            within(config, RetuneRequest.model_validate(row.request))
+        except ValueError as error:  # BadLimits too
+            return Reason.BAD_LIMITS, f"the loop's configuration has changed: {error}"
+        return None
+
+
+def _loop_words(safe: Safe | None) -> str:
+    return "the loop had not been touched" if safe is None else f"the loop: {safe.text}"

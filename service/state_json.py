@@ -1,0 +1,29 @@
+"""A loop's state and gains as a job's JSON, and back."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from service.errors import Conflict
+from service.loop import LoopState
+from tuning.gains import Gains
+from tuning.plan import Mode
+
+
+def gains_of(data: dict[str, Any] | None) -> Gains:
+    """Gains from a job's JSON."""
+    if not data:
+        raise Conflict("the job has no gains to put")
+    return Gains(**{name: float(data[name]) for name in Gains.__dataclass_fields__ if data.get(name) is not None})
+
+
+def state_json(state: LoopState) -> dict[str, Any]:
+    """A loop's state as JSON, the mode by name."""
+    return asdict(state) | {"mode": state.mode.name.lower()}
+
+
+def loop_state(data: dict[str, Any]) -> LoopState:
+    """A loop's state from its JSON. PV and MV that were not numbers are of no account."""
+    numbers = {name: 0.0 if data[name] is None else data[name] for name in ("pv", "mv")}
+    return LoopState(**data | numbers | {"mode": Mode[data["mode"].upper()], "gains": gains_of(data["gains"])})
