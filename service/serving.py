@@ -133,7 +133,7 @@ def serve(setup: Setup, open_loop: LoopFactory = open_bus_loop, tune: Tune = tun
                 server_header=False,
                 timeout_graceful_shutdown=_GRACE_S,
             )
-            retention = Retention(store, setup.keep)
+            retention = Retention(store, engine, setup.keep)
             try:
                 jobs.boot()
                 retention.start()
