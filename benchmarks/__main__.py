@@ -51,6 +51,15 @@ def table(
         low, high = bus[f"{name}_ratio_range"]
         return f"{bus[f'{name}_per_s']:,.0f}/s, {bus[f'{name}_ratio']:.2f} of bare ({low:.2f} to {high:.2f})"
 
+    def rates(by_gateways: dict[str, Any]) -> str:
+        return "/".join(f"{each['per_min']:.0f}" for each in by_gateways.values())
+
+    def growth(by_gateways: dict[str, Any]) -> float:
+        return float(by_gateways[max(by_gateways, key=int)]["per_min"] / by_gateways["1"]["per_min"])
+
+    def busy(by_gateways: dict[str, Any]) -> str:
+        return "/".join(f"{each['busy']:.1f}" for each in by_gateways.values())
+
     timed, speed = bus["real_time_100_loops"], bus["speed_factor"]
     return [
         "| what | figure | goal | |",
@@ -141,9 +150,15 @@ def table(
             engine["stage_of_shortest_pct"] < 1.0,
         ),
         row(
-            f"{engine['loops']:,} rehearsed loops on one PostgreSQL, {'/'.join(engine['jobs_per_min'])} gateways, "
-            f"{engine['processors']} processors, {engine['sample']} jobs each time",
-            "/".join(f"{rate:.0f}" for rate in engine["jobs_per_min"].values()) + " jobs per minute",
+            f"{engine['loops']:,} rehearsed loops on one PostgreSQL, {'/'.join(engine['paced'])} gateways, "
+            f"{engine['at_once']} jobs at once each, plants at {engine['pace']:g} times real time",
+            f"{rates(engine['paced'])} jobs per minute, {growth(engine['paced']):.2f} times as many with "
+            f"{max(engine['paced'], key=int)} gateways as with 1",
+        ),
+        row(
+            f"the same, plants as fast as {engine['processors']} processors go",
+            f"{rates(engine['unpaced'])} jobs per minute, {busy(engine['unpaced'])} processors busy, "
+            f"{1e3 * engine['unpaced']['1']['processor_s']:.0f} ms of processor for a job",
         ),
         row(
             f"fast: identification, design and verdict of one record of {fast['samples']} samples",

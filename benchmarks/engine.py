@@ -3,7 +3,8 @@
     python -m benchmarks.engine
 
 The fleet: 1, 2 and 4 gateway processes share 1,000 configured loops; a sample of them is retuned, by the whole
-procedure on a plant in memory, and the jobs are counted per minute of wall time.
+procedure on a plant in memory, and the jobs are counted per minute of wall time: once with plants that take their time,
+as real ones do, which shows what gateways add, and once without, which shows what the processors have room for.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+from sqlalchemy import Engine, create_engine, text
 
 from benchmarks.rehearsed import entry, open_loop
 from service.config import LoopConfig, parse_site
@@ -35,7 +37,9 @@ from tuning.plan import StageDone, StageStarted
 
 LOOPS = 1000
 GATEWAYS = (1, 2, 4)
-SAMPLE = 48
+PACE, AT_ONCE, PACED_JOBS = 60.0, 4, 16
+"""A job of 4.5 s, so many of a gateway at once, so many of each gateway."""
+UNPACED_AT_ONCE, UNPACED_JOBS = 8, 48
 STAGES = 500
 NO_WORK = 60
 SHORTEST_STAGE_S = 5.0
@@ -82,40 +86,68 @@ def cost(folder: Path) -> dict[str, float]:
     }
 
 
-def fleet(folder: Path, gateways: int, database: str) -> float:
-    """Jobs per minute with so many gateways."""
+def processor_s(pid: int) -> float:
+    """Of a process and of its children that have ended."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
+
+
+def of_server(server: Server) -> float:
+    """Processor time of all processes of the database, s."""
+    chief = int((server.folder / "data" / "postmaster.pid").read_text().split()[0])
+    children = Path(f"/proc/{chief}/task/{chief}/children").read_text().split()
+    return processor_s(chief) + sum(processor_s(int(child)) for child in children)
+
+
+def fleet(folder: Path, gateways: int, server: Server, pace: float, at_once: int, jobs_each: int) -> dict[str, float]:
+    """Jobs per minute with so many gateways, and the processor time of one. pace: of the plants; 0: no limit."""
+    database, name = server.database(), f"{gateways}-{pace:g}"
     with ExitStack() as stack:
         processes = []
         for n in range(gateways):
-            name = f"gw{n}"
-            home = folder / f"{gateways}-{name}"
+            home = folder / f"{name}-gw{n}"
             home.mkdir()
-            arguments = ("benchmarks.rehearsed", str(home), name, str(LOOPS // gateways), "2", database)
-            processes.append(Process(name, arguments, home / "log"))
+            settings = (str(LOOPS // gateways), str(at_once), str(pace), database)
+            processes.append(Process(name, ("benchmarks.rehearsed", str(home), f"gw{n}", *settings), home / "log"))
             stack.callback(processes[-1].stop)
         urls = [process.wait_ready(120).split()[1] for process in processes]
         clients = [stack.enter_context(httpx.Client(base_url=url, timeout=60, trust_env=False)) for url in urls]
-        tags = [f"gw{n % gateways}-{n // gateways}" for n in range(SAMPLE)]
+        # Counted by SQL: who asks the gateways is a load on them.
+        engine = create_engine(database.replace("postgresql:", "postgresql+psycopg:"))
+        stack.callback(engine.dispose)
 
-        def retune(n: int) -> str:
+        def retune(n: int) -> None:
             # Each asked at another gateway than the one that runs it, where there is another.
-            answer = clients[(n + 1) % gateways].post(f"/loops/{tags[n]}/retune", json={"baseline": False})
-            answer.raise_for_status()
-            return str(answer.json()["url"])
+            at, loop = clients[(n + 1) % gateways], f"gw{n % gateways}-{n // gateways}"
+            at.post(f"/loops/{loop}/retune", json={"baseline": False}).raise_for_status()
 
-        began = time.perf_counter()
+        def used() -> float:
+            return of_server(server) + sum(processor_s(process.pid) for process in processes)
+
+        count = jobs_each * gateways
+        for n in range(gateways):  # what is imported by the first job is no part of the others
+            retune(n)
+        states = _states(engine, gateways)
+        began, before = time.perf_counter(), used()
         with ThreadPoolExecutor(4) as pool:
-            waiting = list(pool.map(retune, range(SAMPLE)))
-        while waiting:
-            jobs = [clients[0].get(url).json() for url in waiting[:4]]
-            over = [job for job in jobs if job["state"] not in tuple(ACTIVE)]
-            if wrong := [job for job in over if job["state"] != "proposed"]:
-                raise RuntimeError(f"{wrong[0]['state']}: {wrong[0]['detail']}")
-            gone = {job["url"] for job in over}
-            waiting = [url for url in waiting if url not in gone]
-            if not over:
-                time.sleep(0.1)
-        return 60 * SAMPLE / (time.perf_counter() - began)
+            list(pool.map(retune, range(gateways, gateways + count)))
+        states = _states(engine, gateways + count)
+        wall, after = time.perf_counter() - began, used()
+        if set(states) != {"proposed"}:
+            raise RuntimeError(f"the jobs ended as {states}")
+        return {"per_min": 60 * count / wall, "processor_s": (after - before) / count, "busy": (after - before) / wall}
+
+
+def _states(engine: Engine, jobs: int) -> dict[str, int]:
+    """How many jobs there are in which state, once as many as that have ended."""
+    while True:
+        with engine.connect() as connection:
+            found = {
+                row[0]: int(row[1]) for row in connection.execute(text("SELECT state, count(*) FROM jobs GROUP BY 1"))
+            }
+        if not found.keys() & {str(state.value) for state in ACTIVE} and sum(found.values()) == jobs:
+            return found
+        time.sleep(0.1)
 
 
 def run() -> dict[str, Any]:
@@ -125,7 +157,8 @@ def run() -> dict[str, Any]:
         found: dict[str, Any] = {
             **cost(folder / "cost"),
             "loops": LOOPS,
-            "sample": SAMPLE,
+            "pace": PACE,
+            "at_once": AT_ONCE,
             "processors": os.cpu_count(),
         }
         where = binaries()
@@ -133,7 +166,10 @@ def run() -> dict[str, Any]:
             raise RuntimeError("the benchmark of a fleet needs the package postgresql")
         server = Server(where)
         try:
-            found["jobs_per_min"] = {str(n): fleet(folder, n, server.database()) for n in GATEWAYS}
+            found["paced"] = {str(n): fleet(folder, n, server, PACE, AT_ONCE, PACED_JOBS) for n in GATEWAYS}
+            found["unpaced"] = {
+                str(n): fleet(folder, n, server, 0.0, UNPACED_AT_ONCE, UNPACED_JOBS // n) for n in GATEWAYS
+            }
         finally:
             server.close()
     return found

@@ -2,12 +2,17 @@
 
 A gateway of its own process, which tunes so many of them:
 
-    python -m benchmarks.rehearsed FOLDER HOST LOOPS AT_ONCE URL
+    python -m benchmarks.rehearsed FOLDER HOST LOOPS AT_ONCE PACE URL
+
+PACE: plant time in times of real time; 0: as fast as the processor goes.
 """
 
 from __future__ import annotations
 
 import sys
+import time
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +24,7 @@ from plantsim.plant import LinearPlant
 from service.config import LoopConfig
 from service.rehearsal import RehearsedLoop
 from service.serving import Setup, serve
-from tuning.plan import Mode
+from tuning.plan import Command, Mode, Sample
 
 TS = 0.1
 MIDDLE = 50.0
@@ -48,20 +53,41 @@ def entry(tag: str, bus: str = "virtual:rehearsed", channel: int = 1, node: int 
     }  # fmt: skip
 
 
-def open_loop(_config: LoopConfig) -> RehearsedLoop:
+class Paced(RehearsedLoop):
+    """Its samples come by a clock, a handful at a time."""
+
+    pace = 0.0
+    _began: float | None = None
+
+    def step(self, commands: Sequence[Command]) -> Sample:
+        sample = super().step(commands)
+        if self.pace:
+            now = time.monotonic()
+            if self._began is None:
+                self._began = now - sample.t / self.pace
+            early = sample.t / self.pace + self._began - now
+            if early > 0.02:
+                time.sleep(early)
+        return sample
+
+
+def open_loop(_config: LoopConfig, pace: float = 0.0) -> RehearsedLoop:
     settings = Settings(mv_low=0.0, mv_high=100.0, safe_output=MIDDLE, pv_low=-200.0, pv_high=200.0, reverse=True)
     channel = Channel(TS, settings, Parameters(0.2, 6.0), 0.0, int(Mode.AUTOMATIC), MIDDLE)
-    return RehearsedLoop(AroundTheMiddle(), channel, TS)
+    loop = Paced(AroundTheMiddle(), channel, TS)
+    loop.pace = pace
+    return loop
 
 
 def main() -> None:
-    folder, (host, count, at_once, database) = Path(sys.argv[1]), sys.argv[2:]
+    folder, (host, count, at_once, pace, database) = Path(sys.argv[1]), sys.argv[2:]
     folder.mkdir(parents=True, exist_ok=True)
     bus = "virtual:rehearsed"
     entries = [entry(f"{host}-{n}", bus, n % 199 + 1, 1 + n // 199) for n in range(int(count))]
     file = folder / "loops.yaml"
     file.write_text(yaml.safe_dump({"loops": entries, "buses": {bus: {"at_once": int(at_once)}}}))
-    serve(Setup(file, folder / "data", "127.0.0.1", 0, database or None, host, poll_s=0.1), open_loop)
+    setup = Setup(file, folder / "data", "127.0.0.1", 0, database or None, host)
+    serve(setup, partial(open_loop, pace=float(pace)))
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ from protocol.profile import (
     sdo_request_id,
     sdo_response_id,
 )
+from protocol.turns import Turns
 
 HEARTBEAT_S = 0.1
 _WAIT_S = 0.05  # one wait on the bus: short enough to beat in time; always the same, which RawBus makes cheap
@@ -81,16 +82,16 @@ class BusSample(NamedTuple):
 
 
 # The SDO server answers one request at a time, whoever asks: loops of one process on one node take turns.
-_turns: dict[tuple[str, int], threading.RLock] = {}
+_turns: dict[tuple[str, int], Turns] = {}
 _turns_guard = threading.Lock()
 
 sdo_retries: Counter[str] = Counter()
 """By bus: SDO requests that this process sent again because no answer came."""
 
 
-def _turn(url: str, node: int) -> threading.RLock:
+def _turn(url: str, node: int) -> Turns:
     with _turns_guard:
-        return _turns.setdefault((url, node), threading.RLock())
+        return _turns.setdefault((url, node), Turns())
 
 
 class Tuner:

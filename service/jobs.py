@@ -114,7 +114,7 @@ class Jobs:
         lost = {row.id for row in idle} - self.engine.known([row.id for row in idle])
         for row in idle:
             if row.id in lost and (at_once or row.id in self._lost):
-                self.engine.forget(row.id)
+                self.engine.forget([row.id])
                 self.engine.enqueue(row.id, self._queue_of(row))
         self._lost = lost
 

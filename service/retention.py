@@ -1,6 +1,7 @@
-"""How long samples are kept: those of old jobs are deleted, at the start of the service and once an hour.
+"""What need not be kept is deleted, at the start of the service and once an hour: the samples of old jobs, as it is
+told, and what the engine still knows of jobs that are over, always.
 
-Jobs, their events and results stay. What is deleted is in the audit log, and each job has an event of it.
+Jobs, their events and results stay. Which samples are deleted is in the audit log, and each job has an event of it.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from datetime import UTC, datetime, timedelta
 from sqlalchemy import ColumnElement, delete, func, select
 from sqlalchemy.exc import SQLAlchemyError
 
+from service.engine import Engine
 from service.security import audit
 from service.states import ACTIVE, JobState
 from service.store.clock import stamp
@@ -23,6 +25,8 @@ log = logging.getLogger(__name__)
 
 EVERY_S = 3600.0
 _AT_ONCE = 50
+_FORGOTTEN_AT_ONCE = 500
+_STOP_S = 5.0
 _KEPT = [state.value for state in (*ACTIVE, JobState.PROPOSED)]
 
 
@@ -43,6 +47,22 @@ def tidy(store: Store, keep: Keep, at: datetime | None = None) -> int:
     count = 0
     while keep and (jobs := _some(store, keep, at or datetime.now(UTC))):
         count += len(jobs)
+    return count
+
+
+def forget(store: Store, engine: Engine) -> int:
+    """Has the engine forget the jobs that are over: our own tables have all of them. Returns how many."""
+    count = 0
+    while ids := engine.over(_FORGOTTEN_AT_ONCE):
+        # What it takes for over while we do not is given to it anew (Jobs.reconcile), under the same id.
+        active = store.active_among(ids)
+        over = [job_id for job_id in ids if job_id not in active]
+        if not over:
+            break
+        engine.forget(over)
+        count += len(over)
+    if count:
+        log.info("the engine has forgotten %d jobs that are over", count)
     return count
 
 
@@ -88,24 +108,26 @@ def _why(keep: Keep) -> str:
 class Retention:
     """Tidies now and then, in a thread."""
 
-    def __init__(self, store: Store, keep: Keep, every_s: float = EVERY_S) -> None:
-        self._store, self._keep, self._every_s = store, keep, every_s
+    def __init__(self, store: Store, engine: Engine, keep: Keep, every_s: float = EVERY_S) -> None:
+        self._store, self._engine, self._keep, self._every_s = store, engine, keep, every_s
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="retention", daemon=True)
 
     def start(self) -> None:
-        if self._keep:
-            self._thread.start()
+        self._thread.start()
 
     def close(self) -> None:
         self._over.set()
         if self._thread.is_alive():
-            self._thread.join()
+            self._thread.join(_STOP_S)  # the engine waits for a database that is away
 
     def _run(self) -> None:
         while not self._over.is_set():
             try:
                 tidy(self._store, self._keep)
+                forget(self._store, self._engine)
             except SQLAlchemyError as error:
-                log.warning("old samples could not be deleted, they will be later: %s", error)
+                log.warning("what need not be kept could not be deleted, it will be later: %s", error)
+            except Exception:  # whatever it is, it must be tried again
+                log.exception("what need not be kept could not be deleted")
             self._over.wait(self._every_s)

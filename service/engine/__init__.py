@@ -24,8 +24,12 @@ class Engine(Protocol):
         """Those of the jobs that it is running, or will run on a queue of this host."""
         ...
 
-    def forget(self, job_id: str) -> None:
-        """Drops what it knows of a job that is not running."""
+    def over(self, most: int) -> list[str]:
+        """Jobs of this host that it has run to their end and still remembers, the oldest first, so many of them."""
+        ...
+
+    def forget(self, job_ids: Collection[str]) -> None:
+        """Drops what it knows of jobs that are not running."""
         ...
 
     def alive(self) -> bool:

@@ -23,6 +23,7 @@ FILE = "engine.sqlite"
 """Nothing in it that our own tables would not restore: it may be deleted while the service is stopped."""
 POLL_S = 0.5
 _ALIVE = ("PENDING", "ENQUEUED", "DELAYED")
+_OVER = ("SUCCESS", "ERROR", "CANCELLED", "MAX_RECOVERY_ATTEMPTS_EXCEEDED")
 
 _run: Callable[[str], None] | None = None
 
@@ -43,7 +44,7 @@ class DurableEngine:
         self._host = host
         self._poll_s = poll_s
         self._own = sqlite(folder / FILE) if database is None else None
-        self._database = self._own if database is None else database
+        self.database = self._own if database is None else database
         self._queues: frozenset[str] = frozenset()
         self._launched = False
 
@@ -55,7 +56,7 @@ class DurableEngine:
             os.environ.pop(name, None)
         config: DBOSConfig = {
             "name": "loopwright",
-            "system_database_engine": self._database,
+            "system_database_engine": self.database,
             "application_version": WORKFLOW_VERSION,
             "executor_id": self._host,
             "log_level": "WARNING",
@@ -86,8 +87,17 @@ class DurableEngine:
         )
         return {one.workflow_id for one in found if one.queue_name in self._queues}
 
-    def forget(self, job_id: str) -> None:
-        DBOS.delete_workflow(job_id)
+    def over(self, most: int) -> list[str]:
+        # A file has one host, whatever it was called before.
+        host = None if self._own is not None else self._host
+        found = DBOS.list_workflows(
+            status=list(_OVER), executor_id=host, limit=most, load_input=False, load_output=False
+        )
+        return [one.workflow_id for one in found]
+
+    def forget(self, job_ids: Collection[str]) -> None:
+        if job_ids:
+            DBOS.delete_workflows(list(job_ids))
 
     def alive(self) -> bool:
         return self._launched

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -244,6 +244,11 @@ class Store:
         mine = (JobRow.host == self.host, JobRow.state.in_(_ACTIVE))
         with self._session() as session:
             return list(session.scalars(select(JobRow).where(*mine).order_by(JobRow.number)))
+
+    def active_among(self, job_ids: Collection[str]) -> set[str]:
+        """Those of the jobs that are in an active state."""
+        with self._session() as session:
+            return set(session.scalars(select(JobRow.id).where(JobRow.id.in_(job_ids), JobRow.state.in_(_ACTIVE))))
 
     def wishes_to_stop(self) -> dict[str, str]:
         """The reason by job, for the active jobs of this host that somebody wants to stop."""

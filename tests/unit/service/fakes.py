@@ -160,8 +160,12 @@ class ThreadEngine:
     def known(self, job_ids: Collection[str]) -> set[str]:
         return {job_id for job_id in job_ids if job_id in self._threads and self._threads[job_id].is_alive()}
 
-    def forget(self, job_id: str) -> None:
-        self._threads.pop(job_id, None)
+    def over(self, most: int) -> list[str]:
+        return [job_id for job_id, thread in self._threads.items() if not thread.is_alive()][:most]
+
+    def forget(self, job_ids: Collection[str]) -> None:
+        for job_id in job_ids:
+            self._threads.pop(job_id, None)
 
     def alive(self) -> bool:
         return self._run is not None

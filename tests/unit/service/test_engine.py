@@ -72,7 +72,9 @@ def test_a_job_is_run_once_and_no_more_than_so_many_at_once(make: Make) -> None:
     while engine.known(["1", "2", "3"]) and time.monotonic() < deadline:
         time.sleep(0.01)
     engine.enqueue("1", "a:bus")  # over: not again
-    engine.forget("1")
+    assert sorted(engine.over(9)) == ["1", "2", "3"] and len(engine.over(2)) == 2
+    engine.forget(["1"])
+    assert sorted(engine.over(9)) == ["2", "3"]
     engine.enqueue("1", "a:bus")
     assert runs.until(4)[3] == "1"
     time.sleep(0.2)

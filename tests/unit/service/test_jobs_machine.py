@@ -109,7 +109,10 @@ class HandEngine:
     def known(self, job_ids: Collection[str]) -> set[str]:
         return set(job_ids) & (set(self.queued) | self.threads.keys())
 
-    def forget(self, job_id: str) -> None:
+    def over(self, most: int) -> list[str]:
+        return []
+
+    def forget(self, job_ids: Collection[str]) -> None:
         """There is nothing to forget."""
 
     def alive(self) -> bool:

@@ -100,6 +100,12 @@ def machine(tmp_path: Path) -> Iterator[Machine]:
 def test_no_section_with_commands_is_left_out() -> None:
     tried = {"Install", "Keys", "Rotate a key", "Back up", "Restore", "Upgrade", "Add a gateway", "Watch", "Many loops"}
     assert {section for section in SECTIONS if blocks(section)} == tried
+    # Nor is anything fenced or indented that is no block of commands: each of these is taken up by name below.
+    fences = re.findall(r"^ *(```.*)$", PAGE, flags=re.MULTILINE)
+    assert fences == ["```sh", "```"] * sum(len(blocks(section)) for section in tried)
+    assert not re.search(
+        r"^(    |\t)\S", re.sub(r"^```sh\n.*?^```$", "", PAGE, flags=re.MULTILINE | re.DOTALL), re.MULTILINE
+    )
 
 
 def test_one_machine(machine: Machine) -> None:

@@ -1,16 +1,20 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from sqlalchemy import MetaData, Table, func, inspect, select
 
-from service.retention import Keep, Retention, tidy
+from service.engine.durable import DurableEngine
+from service.retention import Keep, Retention, forget, tidy
 from service.security import audit
 from service.states import JobState
 from service.store.store import Store
+from tests.unit.service.fakes import ThreadEngine
 from tuning.plan import Sample
 
 NOW = datetime.now(UTC)
@@ -83,6 +87,59 @@ def test_what_is_deleted_is_written_down_and_the_rest_of_the_job_stays(store: St
     assert store.get(ids[0]).state == "failed"
 
 
+def rows_of_the_engine(engine: DurableEngine) -> dict[str, dict[str, int]]:
+    """By job, how many rows each table of the engine has of it: read with SQL, not with the engine's own words."""
+    found: dict[str, dict[str, int]] = {}
+    schema = None if engine.database.dialect.name == "sqlite" else "dbos"
+    with engine.database.connect() as connection:
+        for name in inspect(engine.database).get_table_names(schema=schema):
+            table = Table(name, MetaData(), schema=schema, autoload_with=connection)
+            if "workflow_uuid" in table.c:
+                job_id = table.c.workflow_uuid
+                for row in connection.execute(select(job_id, func.count()).group_by(job_id)):
+                    found.setdefault(row[0], {})[name] = row[1]
+    return found
+
+
+def test_the_engine_forgets_jobs_that_are_over_and_no_others(store: Store, tmp_path: Path) -> None:
+    engine = DurableEngine(tmp_path, store.engine if store.shared else None, store.host, 0.02)
+    hold, begun = threading.Event(), []
+
+    def run(job_id: str) -> None:
+        begun.append(job_id)
+        if job_id in (running, lost):
+            hold.wait(20)
+        if job_id != lost:  # its end was not written: for us it is active
+            store.move(job_id, R)
+            store.move(job_id, X)
+
+    over = [store.create(f"L{n}", {}, "me", False, None).id for n in range(3)]
+    running, lost, queued = (store.create(tag, {}, "me", False, None).id for tag in ("R", "U", "Q"))
+    foreign = store.create("F", {}, "me", False, "other").id
+    try:
+        engine.launch(run, {"mine": 2})
+        for job_id in (*over, lost, running, queued):
+            engine.enqueue(job_id, "mine")
+        engine.enqueue(foreign, "theirs")
+        deadline = time.monotonic() + 20
+        while (len(begun) < 5 or len(engine.over(9)) < 3) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        before = rows_of_the_engine(engine)
+        assert set(before) == {*over, running, lost, queued, foreign}
+        assert forget(store, engine) == 3
+        assert set(rows_of_the_engine(engine)) == {running, lost, queued, foreign}
+        assert [store.get(job_id).state for job_id in over] == ["failed"] * 3, "ours stay"
+        hold.set()
+        while engine.known([running, lost, queued]) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert forget(store, engine) == 2, "the lost one is still active for us"
+        assert set(rows_of_the_engine(engine)) == {lost, foreign}
+        assert forget(store, engine) == 0
+    finally:
+        hold.set()
+        engine.close()
+
+
 def test_it_is_done_at_the_start_and_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = Store(tmp_path)
     times, twice = [], threading.Event()
@@ -94,11 +151,11 @@ def test_it_is_done_at_the_start_and_again(tmp_path: Path, monkeypatch: pytest.M
         return 0
 
     monkeypatch.setattr("service.retention.tidy", count)
-    retention = Retention(store, Keep(jobs=1), every_s=0.001)
+    retention = Retention(store, ThreadEngine(), Keep(jobs=1), every_s=0.001)
     retention.start()
     assert twice.wait(5)
     retention.close()
-    for_ever = Retention(store, Keep(), every_s=0.001)
+    for_ever = Retention(store, ThreadEngine(), Keep(), every_s=0.001)
     for_ever.start()
     for_ever.close()
     store.close()

@@ -1,0 +1,230 @@
+"""Fifty loops of one bus retuned at the same time by the real service: time, memory, and how fast it still answers.
+
+Plant, controller and service are processes as a user starts them; one plant and one controller node carry all loops.
+The data folder is in memory: under user-mode Linux every write to a disk would hold the whole guest up. What the
+writes cost is a row of `benchmarks.engine`. Needs vcan0:
+
+    tools/with-vcan -- .venv/bin/python -m benchmarks.load
+"""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from contextlib import ExitStack
+from pathlib import Path
+from statistics import median
+from typing import Any
+from urllib.parse import urlsplit
+
+import httpx
+import yaml
+
+from benchmarks.bus import URL, device_samples_per_s, devices
+from plantsim.catalogue import find
+from protocol.profile import CONTROLLER_NODE, PLANT_NODE
+from protocol.tuner import Tuner
+from service.processes import Process
+from service.states import ACTIVE
+
+TS = 0.1
+MANY = 50
+PACE = 2.0
+FEW = {1: 10.0, 10: 10.0}
+"""Loops for the memory of few of them, and the pace of their plant, times real time."""
+MODELS = (18, 29, 12, 14)
+"""Of the 50, the quickest to retune; they take about as long as each other, so that all are under test to the end."""
+FRACTION_OF_KU, FRACTION_OF_PU = 0.3, 0.8
+LISTEN_S = 5.0
+RATE_PER_S, ASK_S, CONNECTIONS = 100, 20.0, 16
+
+
+def told(what: str) -> None:
+    print(f"  {what}", file=sys.stderr, flush=True)
+
+
+class Site:
+    """The three processes with so many loops."""
+
+    def __init__(self, stack: ExitStack, folder: Path, loops: int, pace: float) -> None:
+        self.loops = loops
+        entries: list[dict[str, Any]] = []
+        gains: list[dict[str, Any]] = []
+        plants: list[str] = []
+        for n in range(loops):
+            name = f"model-{MODELS[n % len(MODELS)]}"
+            facts = find(name).facts
+            assert facts.Ku_on_bus and facts.Pu_s and facts.T95_s and facts.static_gain
+            step = 5.0 * facts.static_gain / facts.mv_per_unit  # of the set-point: MV moves by 5 percent
+            entries.append({
+                "tag": f"T-{n}", "bus": URL, "controller_node": CONTROLLER_NODE, "plant_node": PLANT_NODE,
+                "channel": n + 1, "pv_unit": "unit", "pv_limits": {"low": 50 - 10 * step, "high": 50 + 10 * step},
+                "t95_s": facts.T95_s, "sp_deviation": step,
+            })  # fmt: skip
+            gains.append({"kp": FRACTION_OF_KU * facts.Ku_on_bus, "ti": FRACTION_OF_PU * facts.Pu_s, "sp": 50.0})
+            plants.append(f"--model={name}")
+        folder.mkdir()
+        site = {"loops": entries, "buses": {URL: {"at_once": loops}}}
+        (folder / "loops.yaml").write_text(yaml.safe_dump(site))
+        (folder / "channels.yaml").write_text(yaml.safe_dump(gains))
+        common = ("--bus", URL, "--ts", str(TS))
+        where = ("--loops", str(folder / "loops.yaml"), "--data", str(folder / "data"), "--port", "0")
+        arguments = {
+            "controller": ("controller", *common, "--config", str(folder / "channels.yaml")),
+            "plant": ("plantsim", *common, *plants, "--speed", str(pace)),
+            "service": ("service", "serve", *where),
+        }
+        for name, command in arguments.items():
+            process = Process(name, command, folder / f"{name}.log")
+            stack.callback(process.stop)
+            self.url = process.wait_ready().split()[1]
+        self.service = process
+        self.http = stack.enter_context(httpx.Client(base_url=self.url, timeout=60.0, trust_env=False))
+
+    def retune_all(self) -> list[str]:
+        answers = [self.http.post(f"/loops/T-{n}/retune", json={}).raise_for_status() for n in range(self.loops)]
+        return [answer.headers["location"] for answer in answers]
+
+    def memory_MB(self) -> float:
+        """Of the service: what it has for itself, and its share of what it has with others."""
+        rollup = Path(f"/proc/{self.service.pid}/smaps_rollup").read_text()
+        return next(int(line.split()[1]) for line in rollup.splitlines() if line.startswith("Pss:")) * 1024 / 1e6
+
+    def until_over(self, urls: list[str], patience_s: float) -> tuple[list[dict[str, Any]], float]:
+        """The jobs as they ended, and the largest memory seen meanwhile. It looks seldom: it is not to be the load."""
+        give_up, most, ended = time.monotonic() + patience_s, 0.0, []
+        while urls:
+            job = self.http.get(urls[0]).json()
+            if job["state"] not in tuple(ACTIVE):
+                ended.append(job)
+                urls = urls[1:]
+                continue
+            most = max(most, self.memory_MB())
+            if time.monotonic() > give_up:
+                raise RuntimeError(f"{len(urls)} jobs have not ended in {patience_s:g} s")
+            time.sleep(0.5)
+        return ended, most
+
+
+def retuned(folder: Path, loops: int, pace: float) -> dict[str, Any]:
+    """All loops at once, from asking for the first to the end of the last."""
+    with ExitStack() as stack:
+        site = Site(stack, folder, loops, pace)
+        began = time.monotonic()
+        jobs, most = site.until_over(site.retune_all(), 600.0)
+        wall = time.monotonic() - began
+    ends = Counter(job["reason"] or job["state"] for job in jobs)
+    told(f"{loops} loops at {pace:g} times real time: {wall:.1f} s, {dict(ends)}")
+    return {
+        "loops": loops,
+        "pace": pace,
+        "wall_s": wall,
+        "longest_plant_s": max(job["plant_time_s"] for job in jobs),
+        "ends": dict(ends),
+        "memory_MB": most,
+    }
+
+
+def heard_per_s(loops: int) -> float:
+    """Samples/s of each loop that as many bare listeners in one process take of a plant that runs freely: what the
+    processor leaves when a tuner does nothing but listen and beat."""
+    over, heard = threading.Event(), [0] * loops
+
+    def listen(at: int) -> None:
+        tuner = Tuner(URL, CONTROLLER_NODE, PLANT_NODE, at + 1)
+        tuner.beating = True
+        while not over.is_set():
+            if tuner.sample(0.2) is not None:
+                heard[at] += 1
+        tuner.close()
+
+    with devices(loops, "max"):
+        threads = [threading.Thread(target=listen, args=(at,)) for at in range(loops)]
+        for thread in threads:
+            thread.start()
+        time.sleep(1.0)
+        first, began = sum(heard), time.monotonic()
+        time.sleep(LISTEN_S)
+        rate = (sum(heard) - first) / (time.monotonic() - began) / loops
+        over.set()
+        for thread in threads:
+            thread.join()
+    return rate
+
+
+def answered_ms(url: str, paths: list[str]) -> list[float]:
+    """Waiting times for GETs sent by the clock, ms, sorted: from when each was due, so that a slow answer is not
+    excused by the requests it kept from being sent."""
+    place = urlsplit(url)
+    began, found = time.perf_counter() + 0.2, list[float]()
+
+    def ask(first: int) -> None:
+        connection = http.client.HTTPConnection(str(place.hostname), place.port, timeout=30)
+        for n in range(first, int(ASK_S * RATE_PER_S), CONNECTIONS):
+            due = began + n / RATE_PER_S
+            time.sleep(max(0.0, due - time.perf_counter()))
+            connection.request("GET", paths[n % len(paths)])
+            answer = connection.getresponse()
+            answer.read()
+            found.append(1e3 * (time.perf_counter() - due) if answer.status == 200 else float("inf"))
+        connection.close()
+
+    threads = [threading.Thread(target=ask, args=(first,)) for first in range(CONNECTIONS)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return sorted(found)
+
+
+def answers(folder: Path) -> dict[str, Any]:
+    """GET /jobs/{id} with no job and with all loops under test in real time. The plant runs in both."""
+    found: dict[str, Any] = {"rate_per_s": RATE_PER_S}
+    with ExitStack() as stack:
+        site = Site(stack, folder, MANY, 1.0)
+        urls = site.retune_all()
+        time.sleep(5.0)
+        began = time.monotonic()
+        for url in urls:
+            site.http.post(f"{url}/abort", json={}).raise_for_status()
+        site.until_over(urls, 60.0)
+        found["abort_all_s"] = time.monotonic() - began
+        for name in ("idle", "busy"):
+            if name == "busy":
+                urls = site.retune_all()
+                time.sleep(5.0)
+            times = answered_ms(site.url, urls)
+            found[f"{name}_p95_ms"] = times[int(0.95 * len(times))]
+            found[f"{name}_median_ms"] = median(times)
+            told(f"{name}: {found[f'{name}_median_ms']:.1f} ms (median), {found[f'{name}_p95_ms']:.1f} ms (p95)")
+        found["running"] = sum(site.http.get(url).json()["state"] == "running" for url in urls)
+    return found | {"ratio": found["busy_p95_ms"] / found["idle_p95_ms"]}
+
+
+def run() -> dict[str, Any]:
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as temporary:
+        folder = Path(temporary)
+        alone, heard = TS * device_samples_per_s(MANY), TS * heard_per_s(MANY)
+        told(f"devices alone {alone:.1f} times real time, {MANY} listeners {heard:.1f}")
+        few = [retuned(folder / f"{loops}", loops, pace) for loops, pace in FEW.items()]
+        many = retuned(folder / "many", MANY, PACE)
+        return {
+            "vcan": os.environ.get("LOOPWRIGHT_VCAN", "host"),
+            "devices_alone": alone,
+            "listeners": heard,
+            "retunes": [*few, many],
+            "of_plant_time": many["wall_s"] * PACE / many["longest_plant_s"],
+            "proposed": many["ends"].get("proposed", 0),
+            "MB_per_loop": (many["memory_MB"] - few[0]["memory_MB"]) / (MANY - few[0]["loops"]),
+            "answers": answers(folder / "answers"),
+        }
+
+
+if __name__ == "__main__":
+    print(json.dumps(run(), indent=1))
