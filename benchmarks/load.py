@@ -1,4 +1,4 @@
-"""Fifty loops of one bus retuned at the same time by the real service: time, memory, and how fast it still answers.
+"""Fifty loops of one bus retuned at the same time by the real service: time and memory.
 
 Plant, controller and service are processes as a user starts them; one plant and one controller node carry all loops.
 The data folder is in memory: under user-mode Linux every write to a disk would hold the whole guest up. What the
@@ -9,7 +9,6 @@ writes cost is a row of `benchmarks.engine`. Needs vcan0:
 
 from __future__ import annotations
 
-import http.client
 import json
 import os
 import sys
@@ -19,13 +18,12 @@ import time
 from collections import Counter
 from contextlib import ExitStack
 from pathlib import Path
-from statistics import median
 from typing import Any
-from urllib.parse import urlsplit
 
 import httpx
 import yaml
 
+from benchmarks.answers import memory_MB
 from benchmarks.bus import URL, device_samples_per_s, devices
 from plantsim.catalogue import find
 from protocol.profile import CONTROLLER_NODE, PLANT_NODE
@@ -42,7 +40,6 @@ MODELS = (18, 29, 12, 14)
 """Of the 50, the quickest to retune; they take about as long as each other, so that all are under test to the end."""
 FRACTION_OF_KU, FRACTION_OF_PU = 0.3, 0.8
 LISTEN_S = 5.0
-RATE_PER_S, ASK_S, CONNECTIONS = 100, 20.0, 16
 
 
 def told(what: str) -> None:
@@ -91,11 +88,6 @@ class Site:
         answers = [self.http.post(f"/loops/T-{n}/retune", json={}).raise_for_status() for n in range(self.loops)]
         return [answer.headers["location"] for answer in answers]
 
-    def memory_MB(self) -> float:
-        """Of the service: what it has for itself, and its share of what it has with others."""
-        rollup = Path(f"/proc/{self.service.pid}/smaps_rollup").read_text()
-        return next(int(line.split()[1]) for line in rollup.splitlines() if line.startswith("Pss:")) * 1024 / 1e6
-
     def until_over(self, urls: list[str], patience_s: float) -> tuple[list[dict[str, Any]], float]:
         """The jobs as they ended, and the largest memory seen meanwhile. It looks seldom: it is not to be the load."""
         give_up, most, ended = time.monotonic() + patience_s, 0.0, []
@@ -105,7 +97,7 @@ class Site:
                 ended.append(job)
                 urls = urls[1:]
                 continue
-            most = max(most, self.memory_MB())
+            most = max(most, memory_MB(self.service.pid))
             if time.monotonic() > give_up:
                 raise RuntimeError(f"{len(urls)} jobs have not ended in {patience_s:g} s")
             time.sleep(0.5)
@@ -158,55 +150,6 @@ def heard_per_s(loops: int) -> float:
     return rate
 
 
-def answered_ms(url: str, paths: list[str]) -> list[float]:
-    """Waiting times for GETs sent by the clock, ms, sorted: from when each was due, so that a slow answer is not
-    excused by the requests it kept from being sent."""
-    place = urlsplit(url)
-    began, found = time.perf_counter() + 0.2, list[float]()
-
-    def ask(first: int) -> None:
-        connection = http.client.HTTPConnection(str(place.hostname), place.port, timeout=30)
-        for n in range(first, int(ASK_S * RATE_PER_S), CONNECTIONS):
-            due = began + n / RATE_PER_S
-            time.sleep(max(0.0, due - time.perf_counter()))
-            connection.request("GET", paths[n % len(paths)])
-            answer = connection.getresponse()
-            answer.read()
-            found.append(1e3 * (time.perf_counter() - due) if answer.status == 200 else float("inf"))
-        connection.close()
-
-    threads = [threading.Thread(target=ask, args=(first,)) for first in range(CONNECTIONS)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return sorted(found)
-
-
-def answers(folder: Path) -> dict[str, Any]:
-    """GET /jobs/{id} with no job and with all loops under test in real time. The plant runs in both."""
-    found: dict[str, Any] = {"rate_per_s": RATE_PER_S}
-    with ExitStack() as stack:
-        site = Site(stack, folder, MANY, 1.0)
-        urls = site.retune_all()
-        time.sleep(5.0)
-        began = time.monotonic()
-        for url in urls:
-            site.http.post(f"{url}/abort", json={}).raise_for_status()
-        site.until_over(urls, 60.0)
-        found["abort_all_s"] = time.monotonic() - began
-        for name in ("idle", "busy"):
-            if name == "busy":
-                urls = site.retune_all()
-                time.sleep(5.0)
-            times = answered_ms(site.url, urls)
-            found[f"{name}_p95_ms"] = times[int(0.95 * len(times))]
-            found[f"{name}_median_ms"] = median(times)
-            told(f"{name}: {found[f'{name}_median_ms']:.1f} ms (median), {found[f'{name}_p95_ms']:.1f} ms (p95)")
-        found["running"] = sum(site.http.get(url).json()["state"] == "running" for url in urls)
-    return found | {"ratio": found["busy_p95_ms"] / found["idle_p95_ms"]}
-
-
 def run() -> dict[str, Any]:
     with tempfile.TemporaryDirectory(dir="/dev/shm") as temporary:
         folder = Path(temporary)
@@ -222,7 +165,6 @@ def run() -> dict[str, Any]:
             "of_plant_time": many["wall_s"] * PACE / many["longest_plant_s"],
             "proposed": many["ends"].get("proposed", 0),
             "MB_per_loop": (many["memory_MB"] - few[0]["memory_MB"]) / (MANY - few[0]["loops"]),
-            "answers": answers(folder / "answers"),
         }
 
 

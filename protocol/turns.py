@@ -1,4 +1,4 @@
-"""Turns: a lock that is had in the order in which it was asked for.
+"""Turns: a lock that is had in the order in which it was asked for, what is urgent first.
 
 Python's locks are not fair: who gives one back and asks again at once has it again. Of fifty loops that begin together
 some would not be heard for seconds, and lose their lease for it.
@@ -8,32 +8,42 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from types import TracebackType
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 class Turns:
-    """A context manager; not to be entered again by who is inside."""
+    """`with turns.take(): ...`; not to be taken again by who is inside."""
 
     def __init__(self) -> None:
         self._guard = threading.Lock()
         self._taken = False
         self._waiting: deque[threading.Lock] = deque()
 
-    def __enter__(self) -> None:
+        self._urgent: deque[threading.Lock] = deque()
+
+    @contextmanager
+    def take(self, urgent: bool = False) -> Iterator[None]:
+        self._enter(self._urgent if urgent else self._waiting)
+        try:
+            yield
+        finally:
+            self._leave()
+
+    def _enter(self, queue: deque[threading.Lock]) -> None:
         with self._guard:
             if not self._taken:
                 self._taken = True
                 return
             mine = threading.Lock()
             mine.acquire()
-            self._waiting.append(mine)
+            queue.append(mine)
         mine.acquire()  # until who was before us hands its turn on
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def _leave(self) -> None:
         with self._guard:
-            if self._waiting:
-                self._waiting.popleft().release()
+            queue = self._urgent or self._waiting
+            if queue:
+                queue.popleft().release()
             else:
                 self._taken = False
