@@ -1,6 +1,7 @@
 """`make bench`: every benchmark in a process of its own, then one table in Markdown.
 
-python -m benchmarks
+    python -m benchmarks
+    python -m benchmarks answers engine     # only the figures of these, as JSON
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ import sys
 from datetime import date
 from typing import Any
 
-WITH_VCAN = ("tools/with-vcan", "--timeout", "400", "--")
-BENCHMARKS = {"bus": WITH_VCAN} | dict.fromkeys(
-    ("rehearsal", "criterion", "response", "me_pso", "tune", "engine", "fast"), ()
+WITH_VCAN = ("tools/with-vcan", "--timeout", "900", "--")
+BENCHMARKS = dict.fromkeys(("bus", "load"), WITH_VCAN) | dict.fromkeys(
+    ("rehearsal", "criterion", "response", "me_pso", "tune", "engine", "answers", "fast"), ()
 )
 
 
@@ -36,12 +37,14 @@ def figures(name: str) -> dict[str, Any]:
 
 def table(
     bus: dict[str, Any],
+    load: dict[str, Any],
     rehearsal: dict[str, Any],
     criterion: dict[str, Any],
     response: dict[str, Any],
     me_pso: dict[str, Any],
     tune: dict[str, Any],
     engine: dict[str, Any],
+    answers: dict[str, Any],
     fast: dict[str, Any],
 ) -> list[str]:
     def row(what: str, figure: str, goal: str = "", met: bool | None = None) -> str:
@@ -61,6 +64,8 @@ def table(
         return "/".join(f"{each['busy']:.1f}" for each in by_gateways.values())
 
     timed, speed = bus["real_time_100_loops"], bus["speed_factor"]
+    many = load["retunes"][-1]
+    proposed, of_plant_time = load["proposed"], load["of_plant_time"]
     return [
         "| what | figure | goal | |",
         "| --- | --- | --- | --- |",
@@ -85,6 +90,25 @@ def table(
         row(
             "the same, SYNC to last MV",
             f"{timed['sync_to_last_mv_median_ms']:.1f} ms (median), {timed['sync_to_last_mv_max_ms']:.1f} ms (worst)",
+        ),
+        row(
+            f"{many['loops']} loops of one node retuned at the same time by the service, Ts = 0.1 s, plant at "
+            f"{many['pace']:g} times real time",
+            f"{proposed} of {many['loops']} proposed in {many['wall_s']:.0f} s, {of_plant_time:.2f} times the plant's "
+            f"{many['longest_plant_s'] / many['pace']:.0f} s",
+            "all, 1.3 times",
+            proposed == many["loops"] and of_plant_time <= 1.3,
+        ),
+        row(
+            "the same: what the processor lets the bus do, devices alone / with as many bare listeners",
+            f"{load['devices_alone']:.1f} / {load['listeners']:.1f} times real time",
+        ),
+        row(
+            f"the same: memory of the service with {'/'.join(str(each['loops']) for each in load['retunes'])} loops",
+            f"{'/'.join(format(each['memory_MB'], '.0f') for each in load['retunes'])} MB, "
+            f"{load['MB_per_loop']:.2f} MB for a loop more",
+            "under 5 MB",
+            load["MB_per_loop"] < 5.0,
         ),
         row(
             f"rehearsal, {rehearsal['proposed']:.0f} of {rehearsal['models']} models proposed, Ts = 0.1 s",
@@ -161,6 +185,21 @@ def table(
             f"{1e3 * engine['unpaced']['1']['processor_s']:.0f} ms of processor for a job",
         ),
         row(
+            f"GET /jobs/ID, {answers['rate_per_s']}/s, while {answers['loops']} loops are retuned, "
+            f"p95 of {answers['rounds']} rounds",
+            f"{answers['busy_p95_ms']:.1f} ms, idle {answers['idle_p95_ms']:.1f} ms: {answers['ratio']:.1f} times "
+            f"({answers['ratio_range'][0]:.1f} to {answers['ratio_range'][1]:.1f})",
+            "3 times",
+            answers["ratio"] <= 3.0,
+        ),
+        row(
+            f"the same service with {'/'.join(answers['memory_MB'])} loops under test; all aborted and restored",
+            f"{'/'.join(format(each, '.0f') for each in answers['memory_MB'].values())} MB, "
+            f"{answers['MB_per_loop']:.2f} MB for a loop more; {answers['abort_all_s']:.1f} s",
+            "under 5 MB",
+            answers["MB_per_loop"] < 5.0,
+        ),
+        row(
             f"fast: identification, design and verdict of one record of {fast['samples']} samples",
             f"{fast['ours_s']:.2f} s of processor (median)",
             "1 s",
@@ -183,6 +222,9 @@ def table(
 
 
 def main() -> None:
+    if only := sys.argv[1:]:
+        print(json.dumps({name: figures(name) for name in only}, indent=1))
+        return
     loads = [os.getloadavg()[0]]
     found = {}
     for name in BENCHMARKS:

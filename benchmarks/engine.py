@@ -21,6 +21,7 @@ from typing import Any
 import httpx
 from sqlalchemy import Engine, create_engine, text
 
+from benchmarks.answers import processor_s
 from benchmarks.rehearsed import entry, open_loop
 from service.config import LoopConfig, parse_site
 from service.engine.durable import DurableEngine
@@ -84,12 +85,6 @@ def cost(folder: Path) -> dict[str, float]:
         "stage_written_ms": 1e3 * written / STAGES,
         "stage_of_shortest_pct": 100 * written / STAGES / SHORTEST_STAGE_S,
     }
-
-
-def processor_s(pid: int) -> float:
-    """Of a process and of its children that have ended."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
 
 def of_server(server: Server) -> float:
