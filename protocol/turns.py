@@ -19,7 +19,6 @@ class Turns:
         self._guard = threading.Lock()
         self._taken = False
         self._waiting: deque[threading.Lock] = deque()
-
         self._urgent: deque[threading.Lock] = deque()
 
     @contextmanager
