@@ -72,7 +72,8 @@ def _record(pv: Axes, rest: Axes, mv: Axes, record: Kept, found: dict[str, Any] 
         if record.relayed < len(t):
             axes.axvline(t[record.relayed], color="0.3", linewidth=0.8, linestyle="--")
     pv.legend(loc="best", fontsize=8)
-    mv.set_xlabel("plant time since the relay began, s; the new gains take over at the second dashed line")
+    taken_over = "; the new gains take over at the second dashed line" if record.relayed < len(t) else ""
+    mv.set_xlabel(f"plant time since the relay began, s{taken_over}")
 
 
 def _before_after(top: Axes, bottom: Axes, job: dict[str, Any], pv_unit: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -205,7 +206,8 @@ class Experiment:
         passed = len(self.trace) - self.listened
         if len(self.switches) < 2:
             if passed * self.facts.sample_time_s > max(3.0 * self.facts.T95_s, 40 * self.facts.sample_time_s):
-                raise no_oscillation(self.facts, self.point, self._since(), len(self.switches))
+                point = replace(self.point, room=self.amplitude)  # what it tells is what the relay moved
+                raise no_oscillation(self.facts, point, self._since(), len(self.switches))
             return False
         halves = np.diff(self.switches)
         known = period(tuple(self.switches)) if len(halves) >= 2 else 2.0 * float(halves[0])
