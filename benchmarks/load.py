@@ -36,6 +36,8 @@ from service.states import ACTIVE
 TS = 0.1
 MANY = 50
 PACE = 2.0
+FIVE = {"method": "five-stage"}
+"""What the figures are of."""
 FEW = {1: 10.0, 10: 10.0}
 """Loops for the memory of few of them, and the pace of their plant, times real time."""
 MODELS = (18, 29, 12, 14)
@@ -88,7 +90,7 @@ class Site:
         self.http = stack.enter_context(httpx.Client(base_url=self.url, timeout=60.0, trust_env=False))
 
     def retune_all(self) -> list[str]:
-        answers = [self.http.post(f"/loops/T-{n}/retune", json={}).raise_for_status() for n in range(self.loops)]
+        answers = [self.http.post(f"/loops/T-{n}/retune", json=FIVE).raise_for_status() for n in range(self.loops)]
         return [answer.headers["location"] for answer in answers]
 
     def memory_MB(self) -> float:
