@@ -54,15 +54,22 @@ class Kept:
 
 def kept(columns: Mapping[str, Sequence[Any]]) -> Kept | None:
     """columns: as of GET /jobs/{id}/samples. None where no relay was run."""
-    stage = list(columns["stage"])
+    stage = columns["stage"]
     first = max((i for i, name in enumerate(stage) if name == "preflight" and stage[max(i - 1, 0)] != name), default=0)
     t, sp, pv, mv, mode = (np.asarray(columns[name][first:], dtype=float) for name in ("t_s", "sp", "pv", "mv", "mode"))
-    tested = np.flatnonzero(mode == Mode.EXPERIMENT)
-    if not len(tested) or len(t) < 2:
+    if len(t) < 2 or not np.any(mode == Mode.EXPERIMENT):
         return None
-    listened = int(tested[0])
+    Ts = float(np.median(np.diff(t)))
+    # samples lost on the way are made up: PV in between, all else as it was
+    number = np.round((t - t[0]) / Ts).astype(np.int64)
+    whole = np.arange(number[-1] + 1)
+    before = np.searchsorted(number, whole, side="right") - 1
+    pv = np.interp(whole, number, pv)
+    sp, mv, mode = sp[before], mv[before], mode[before]
+    listened = int(np.argmax(mode == Mode.EXPERIMENT))
     after = np.flatnonzero(mode[listened:] != Mode.EXPERIMENT)
-    relayed = listened + int(after[0]) if len(after) else len(t)
-    high = np.append(True, mv[listened:relayed] > np.mean(mv[:listened])) if listened else np.array([True])
+    relayed = listened + int(after[0]) if len(after) else len(mode)
+    # the relay begins high
+    high = np.append(True, mv[listened:relayed] > np.mean(mv[: max(listened, 1)]))
     switches = tuple(int(i) + listened for i in np.flatnonzero(high[1:] != high[:-1]))
-    return Kept(float(np.median(np.diff(t))), t - t[listened], sp, pv, mv, listened, relayed, switches)
+    return Kept(Ts, (whole - listened) * Ts, sp, pv, mv, listened, relayed, switches)
