@@ -59,7 +59,7 @@ def proposal(folder: Path, size: float, at_s: float, **options: Any) -> tuple[di
     store, engine = Store(folder), ThreadEngine()
     jobs = Jobs(loops, store, open_loop, tune, rehearse, engine=engine)
     jobs.boot()
-    row = jobs.start(TAG, RetuneRequest(amplitude_pct=AMPLITUDE, **options))
+    row = jobs.start(TAG, RetuneRequest(**{"amplitude_pct": AMPLITUDE, **options}))
     for thread in list(engine._threads.values()):
         thread.join(100)
     jobs.stop()
@@ -91,3 +91,16 @@ def test_without_a_load_none_is_found(tmp_path: Path) -> None:
     assert job["evidence"]["loads"] == [] and not job["evidence"]["drift"]
     gains = Gains(job["new_gains"]["Kp"], job["new_gains"]["Ti"])
     assert margins(FOPDT(K, T, L + TS / 2), gains).Ms == pytest.approx(1.4, abs=0.05)
+
+
+def test_gains_for_another_Ms_are_tried_without_another_relay(tmp_path: Path) -> None:
+    model = {"num": [K], "den": [T, 1.0], "dead_time_s": L}
+    job, samples = proposal(tmp_path, 0.0, 0.0, amplitude_pct=None, start="design", model=model, ms=1.4)
+    assert job["state"] == "proposed", job["detail"]
+    assert int(Mode.EXPERIMENT) not in samples["mode"]
+    assert [stage["stage"] for stage in job["stages"]] == ["preflight", "design", "verify"]
+    gains = Gains(job["new_gains"]["Kp"], job["new_gains"]["Ti"])
+    assert margins(FOPDT(K, T, L + TS / 2), gains).Ms == pytest.approx(1.4, abs=0.01)
+    assert job["after"]["settled"] and job["after"]["overshoot_pct"] < 40
+    assert job["predicted_before"] and job["evidence"] is None and job["before"] is None
+    assert job["restored"]["gains"]["Kp"] == pytest.approx(0.2) and job["restored"]["on_trial"] is False

@@ -211,6 +211,12 @@ def proposed(
         f"the relay (at {relay_at_s + load.t_s:.4g} s), and allowed for."
         for load in found.loads
     ]
+    swing = judged.fit.evidence.swing
+    if any(abs(load.size) > swing for load in found.loads):
+        notes.append(
+            f"Such a load is larger than what the relay moved MV by ({swing:.3g}): a change of the plant would look so "
+            "too. Look at the record before accepting."
+        )
     if found.drift:
         notes.append("PV drifted at a steady rate during the test; this was allowed for.")
     return FastProposal(
