@@ -114,7 +114,8 @@ def fleet(folder: Path, gateways: int, server: Server, pace: float, at_once: int
         def retune(n: int) -> None:
             # Each asked at another gateway than the one that runs it, where there is another.
             at, loop = clients[(n + 1) % gateways], f"gw{n % gateways}-{n // gateways}"
-            at.post(f"/loops/{loop}/retune", json={"baseline": False}).raise_for_status()
+            asked = {"method": "five-stage", "baseline": False}
+            at.post(f"/loops/{loop}/retune", json=asked).raise_for_status()
 
         def used() -> float:
             return of_server(server) + sum(processor_s(process.pid) for process in processes)

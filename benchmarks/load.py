@@ -32,6 +32,8 @@ from service.processes import Process
 from service.states import ACTIVE
 
 TS = 0.1
+FIVE = {"method": "five-stage"}
+"""What the figures are of."""
 MANY, PACE = 50, 1.0
 FEW = {1: 10.0, 10: 5.0}
 """Loops for the memory of few of them, and the pace of their plant, times real time."""
@@ -85,7 +87,7 @@ class Site:
         self.http = stack.enter_context(httpx.Client(base_url=self.url, timeout=60.0, trust_env=False))
 
     def retune_all(self) -> list[str]:
-        answers = [self.http.post(f"/loops/T-{n}/retune", json={}).raise_for_status() for n in range(self.loops)]
+        answers = [self.http.post(f"/loops/T-{n}/retune", json=FIVE).raise_for_status() for n in range(self.loops)]
         return [answer.headers["location"] for answer in answers]
 
     def until_over(self, urls: list[str], patience_s: float) -> tuple[list[dict[str, Any]], float]:

@@ -32,7 +32,8 @@ def run() -> dict[str, float]:
                 "den": model["den"],
                 "dead_time_s": model["delay"],
                 "sample_time_s": TS,
-            }
+            },
+            "five-stage",
         )
         plant_s += answer["plant_time_s"]["total"]
         proposed += answer["outcome"] == "proposed"

@@ -41,14 +41,21 @@ def _demonstrate(client: Client) -> int:
 
 def _proof(job: dict[str, Any], loop: dict[str, Any], seconds: float) -> list[str]:
     live = loop["live"]
-    before, after = job["before"] or {}, job["after"] or {}
+    # fast measures one step, under the new gains, to prove the model that tells of both
+    how, names = "measured", (("overshoot", "overshoot_pct", " %"), ("IAE", "IAE", f" {loop['pv_unit']} s"))
+    before, after = job["before"], job["after"]
+    if before is None:
+        how, names = "predicted", (("overshoot", "overshoot_pct", " %"), ("Ms", "Ms", ""))
+        before, after = job["predicted_before"], job["predicted"]
     changes = [
-        f"{label} {show.cell(before.get(name))} -> {show.cell(after.get(name))}{unit}"
-        for label, name, unit in (("overshoot", "overshoot_pct", " %"), ("IAE", "IAE", f" {loop['pv_unit']} s"))
+        f"{label} {show.cell((before or {}).get(name))} -> {show.cell((after or {}).get(name))}{unit}"
+        for label, name, unit in names
     ]
+    if job["verification"]:
+        changes.append(f"{job['verification']['fit_pct']:.1f} % of the measured step explained")
     held = ", ".join(f"{name} {show.cell(live['gains'][name])}" for name in ("Kp", "Ti"))
     return [
-        f"proof       {', '.join(changes)}",
+        f"proof       {how}: {', '.join(changes)}",
         f"controller  {live['mode']}, {held}, set-point {show.cell(live['sp'])}: its own until a proposal is accepted",
         f"time        {job['plant_time_s']:.0f} s of plant time in {seconds:.1f} s",
         f"state       {job['state']}",

@@ -1,4 +1,4 @@
-"""What other methods would make of the model that a job found, each with the wish that tries it on the loop."""
+"""What other methods, or another Ms, would make of what a job found, each with the wish that tries it on the loop."""
 
 from __future__ import annotations
 
@@ -6,13 +6,38 @@ from collections.abc import Sequence
 from typing import Any
 
 from service.errors import Conflict
+from service.fast_record import Kept
 from service.request import ProcessModel
 from service.states import ACTIVE, JobState
 from service.store.tables import EventRow, JobRow
 from service.tunings import Tuned, answer, tune_each
+from tuning.assess import Assessment, assess
 from tuning.design import LEAST_GM, MOST_Ms
-from tuning.methods import METHODS
-from tuning.models import FOPDT, SOPDT
+from tuning.fast.design import Wish
+from tuning.fast.procedure import FAST, FastOptions
+from tuning.fast.results import delayed
+from tuning.fast.trial import designed_on
+from tuning.fast.verdict import judge
+from tuning.gains import Gains
+from tuning.methods import METHODS, Method
+from tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
+from tuning.reasons import Ended, Reason, Refused
+from tuning.setting import Setting
+
+
+def _rule(model: Model, Ms: float = 1.6, derivative: bool = False) -> Setting:
+    return Setting(designed_on(model, FastOptions(Ms=Ms, derivative=derivative), 0.0)[0].gains, {"Ms": Ms})
+
+
+FAST_DESIGN = Method(
+    name=FAST,
+    title="The design of fast",
+    source="docs/fast.md",
+    for_what="The best set-point and load answers for a robustness that is asked for.",
+    needs="any stable model, or integrating",
+    takes=(FOPDT, SOPDT, Integrating, TransferFunction),
+    rule=_rule,
+)
 
 
 def alternatives(row: JobRow, events: Sequence[EventRow], method: str | None = None) -> dict[str, Any]:
@@ -25,11 +50,50 @@ def alternatives(row: JobRow, events: Sequence[EventRow], method: str | None = N
     found = tune_each(model, names)
     told = answer(model, found)
     for each, shown in zip(found, told["methods"], strict=True):
-        shown["retune"] = _retune(each, model)
+        shown |= {"retune": _retune(each, model), "uncertainty": None, "ambiguity": None}
     return {"job": row.id, "loop": row.loop, **told}
 
 
-def job_model(row: JobRow, events: Sequence[EventRow]) -> FOPDT | SOPDT:
+def redesigned(
+    row: JobRow, events: Sequence[EventRow], record: Kept | None, ms: float, derivative: bool
+) -> dict[str, Any]:
+    """The same object with the gains of fast for another Ms: no new experiment.
+
+    record: the job's, if it is kept; else, and for a job of another method, the model that it found is designed on.
+    """
+    model = job_model(row, events)
+    doubt: dict[str, float | None] = {"uncertainty": None, "ambiguity": None}
+    evidence = record.evidence() if record and row.request.get("method") == FAST else None
+    try:
+        if evidence is not None:
+            judged = judge(evidence, Wish(ms, derivative))
+            model, gains = judged.model, judged.best.gains
+            doubt = {"uncertainty": judged.uncertainty, "ambiguity": judged.ambiguity}
+            if judged.cause is not None:
+                raise Refused(Reason(judged.cause), judged.detail)
+            sampled: Model = delayed(model, judged.design_delay)
+        else:
+            Ts = (row.found or {}).get("sample_time_s") or 0.0
+            sampled = delayed(model, 0.5 * Ts)
+            gains = designed_on(model, FastOptions(Ms=ms, derivative=derivative), Ts)[0].gains
+        found = _tuned(gains, ms, assess(sampled, gains))
+    except Ended as refusal:
+        found = Tuned(FAST_DESIGN, refusal=refusal)
+    told = answer(model, [found])
+    retune = None
+    if found.gains is not None:
+        asked = {"num": list(model.num), "den": list(model.den), "dead_time_s": model.L}
+        retune = {"method": FAST, "start": "design", "ms": ms, "derivative": derivative, "model": asked}
+    told["methods"][0] |= {"retune": retune, **doubt}
+    return {"job": row.id, "loop": row.loop, **told}
+
+
+def _tuned(gains: Gains, ms: float, assessed: Assessment) -> Tuned:
+    notes = ("Margins and figures are of the model and half a sample's delay.",)
+    return Tuned(FAST_DESIGN, gains, {"Ms": ms}, notes, assessed)
+
+
+def job_model(row: JobRow, events: Sequence[EventRow]) -> FOPDT | SOPDT | TransferFunction:
     """The model of the job's result, else the last that a stage found, else the one typed in; or Conflict."""
     if JobState(row.state) in ACTIVE:
         raise Conflict(f"job {row.id} is not over: it has no model to compare methods on yet")
@@ -38,12 +102,16 @@ def job_model(row: JobRow, events: Sequence[EventRow]) -> FOPDT | SOPDT:
         if data and all(isinstance(data.get(name), int | float) for name in ("K", "T_s", "L_s")):
             K, T, L, zeta = data["K"], data["T_s"], data["L_s"], data.get("zeta")
             return FOPDT(K, T, L) if zeta is None else SOPDT(K, T, zeta, L)
+        if data and data.get("num") and data.get("den") and not data.get("cause"):
+            dead_time = data.get("dead_time_s", data.get("L_s", 0.0))
+            return TransferFunction(tuple(data["num"]), tuple(data["den"]), dead_time)
     raise Conflict(f"job {row.id} ended as {row.state} before it had a model")
 
 
-def _retune(found: Tuned, model: FOPDT | SOPDT) -> dict[str, Any] | None:
-    """None for gains that the service would not try on a loop (see `tuning.design`)."""
-    if found.assessment is None:
+def _retune(found: Tuned, model: FOPDT | SOPDT | TransferFunction) -> dict[str, Any] | None:
+    """None for gains that the service would not try on a loop (see `tuning.design`), and for those of a rule on a model
+    that the five stages do not take."""
+    if found.assessment is None or isinstance(model, TransferFunction):
         return None
     m = found.assessment.margins
     if not (m.stable and m.Ms <= MOST_Ms and (m.GM is None or m.GM >= LEAST_GM)):

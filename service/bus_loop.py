@@ -118,6 +118,10 @@ class BusLoop:
             self._release()
             raise
 
+    @property
+    def waits(self) -> bool:
+        return self._in_blocks
+
     def step(self, commands: Sequence[Command]) -> Sample:
         with self._translated() as tuner:
             self._commands += commands

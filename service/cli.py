@@ -163,6 +163,12 @@ def retune(
     sp_deviation: Annotated[float | None, typer.Option(help="Permitted set-point step, PV units.")] = None,
     mv_low: Annotated[float | None, typer.Option(help="Lowest MV during the test, percent.")] = None,
     mv_high: Annotated[float | None, typer.Option(help="Highest MV during the test, percent.")] = None,
+    method: Annotated[str | None, typer.Option(help="fast, five-stage or a rule; default: fast.")] = None,
+    ms: Annotated[float | None, typer.Option(help="Of fast: 1.2 robust .. 1.6 .. 2.0 fast.")] = None,
+    derivative: Annotated[bool, typer.Option("--derivative", help="Of fast: a PID, where it pays.")] = False,
+    amplitude: Annotated[float | None, typer.Option(help="Of fast's relay, percent of MV.")] = None,
+    careful: Annotated[bool, typer.Option("--careful", help="Of fast: six switches at least.")] = False,
+    verify: Annotated[bool, typer.Option(help="The set-point step under the new gains.")] = True,
     wait: Annotated[bool, typer.Option(help="Show progress until the job is over.")] = True,
     url: Url = DEFAULT_URL,
     as_json: AsJson = False,
@@ -171,7 +177,11 @@ def retune(
     from service import show
 
     client = Client(url)
-    wishes = {"sp_deviation": sp_deviation, "mv_low": mv_low, "mv_high": mv_high, "dry_run": dry_run or None}
+    wishes = {
+        "sp_deviation": sp_deviation, "mv_low": mv_low, "mv_high": mv_high, "dry_run": dry_run or None,
+        "method": method, "ms": ms, "derivative": derivative or None, "amplitude_pct": amplitude,
+        "careful": careful or None, "verify": None if verify else False,
+    }  # fmt: skip
     options = {name: value for name, value in wishes.items() if value is not None}
     job = client.post(f"/loops/{loop}/retune", {**options, "requested_by": "cli"})
     if wait and as_json:
@@ -212,6 +222,7 @@ def one_job(
     abort: Annotated[bool, typer.Option("--abort", help="Stop it; its loop is restored.")] = False,
     accept: Annotated[bool, typer.Option("--accept", help="Put the proposed gains into the controller.")] = False,
     rollback: Annotated[bool, typer.Option("--rollback", help="Decline, or put the old gains back.")] = False,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Its picture: .png, .svg or .pdf.")] = None,
     url: Url = DEFAULT_URL,
     as_json: AsJson = False,
 ) -> None:
@@ -226,16 +237,50 @@ def one_job(
     job = client.post(f"{path}/{wishes[0]}", {"by": "cli"}) if wishes else client.get(path)
     if follow:
         job = show.follow(client, path)
+    if plot is not None:
+        from service.picture import NoPicture, job_picture
+
+        cli_tuning.check_plot(plot)
+        unit = client.get(f"/loops/{job['loop']}")["pv_unit"]
+        try:
+            job_picture(plot, client, job, unit)
+        except NoPicture as error:
+            die(str(error), 1)
+        except OSError as error:
+            die(f"{plot}: {error.strerror}", 2)
     if as_json:
         print_json(job)
     else:
         show.job_report(job)
 
 
+@app.command("alternatives")
+def alternatives_of_job(
+    job_id: Annotated[str, typer.Argument(metavar="ID", help="Id of the job.")],
+    ms: Annotated[float | None, typer.Option(help="Gains of fast for this Ms, from the same record.")] = None,
+    derivative: Annotated[bool | None, typer.Option(help="With --ms: a PID where it pays.")] = None,
+    method: Annotated[str | None, typer.Option(help="Only this method.")] = None,
+    url: Url = DEFAULT_URL,
+    as_json: AsJson = False,
+) -> None:
+    """Other gains for what a job found, and what they would do; no experiment."""
+    wishes = {"ms": ms, "derivative": None if derivative is None else str(derivative).lower(), "method": method}
+    found = Client(url).get(f"/jobs/{job_id}/alternatives", **wishes)
+    if as_json:
+        print_json(found)
+        return
+    from service import show_tunings
+
+    show_tunings.tunings(found)
+    show_tunings.to_try(found)
+
+
 @app.command("rehearse")
 def rehearse_file(
     plant_file: Annotated[Path, typer.Argument(metavar="PLANT.json", help="The plant, see docs.")],
-    method: Annotated[str, typer.Option(help="Tuning procedure.")] = "five-stage",
+    method: Annotated[str, typer.Option(help="fast, five-stage, or a rule of `loopwright methods`.")] = "fast",
+    ms: Annotated[float | None, typer.Option(help="Of fast: 1.2 robust .. 1.6 .. 2.0 fast.")] = None,
+    derivative: Annotated[bool, typer.Option("--derivative", help="Of fast: a PID, where it pays.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """The whole procedure on a plant model, in memory at full speed. Exits 0 whenever it answered."""
@@ -251,7 +296,11 @@ def rehearse_file(
 
     # With --json the answer is all there is on standard output.
     listener = None if as_json else tell
-    answer = rehearse(spec, method=method, on_event=listener)
+    wishes = {"Ms": ms, "derivative": derivative or None}
+    options: dict[str, Any] = {name: value for name, value in wishes.items() if value is not None}
+    if options and method != "fast":
+        die(f"--ms and --derivative are of the method fast, not of {method}", 2)
+    answer = rehearse(spec, method=method, on_event=listener, **options)
     if as_json:
         print_json(answer)
     else:

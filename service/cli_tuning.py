@@ -43,7 +43,7 @@ def tune(
     from service import tunings
     from service.model_forms import BadModel, parse_model
 
-    _check(plot)
+    check_plot(plot)
     try:
         typed = model.lstrip().startswith(("{", "["))
         given = json_object(model, "--model") if typed else read_json_object(Path(model))
@@ -80,7 +80,7 @@ def identify(
     from tuning.identify import identify as fit
     from tuning.reasons import Reason, Refused
 
-    _check(plot)
+    check_plot(plot)
     try:
         record = load_record(data)
     except RecordError as error:
@@ -107,7 +107,7 @@ def identify(
         raise typer.Exit(3)
 
 
-def _check(plot: Path | None) -> None:
+def check_plot(plot: Path | None) -> None:
     """Before the work, not after it."""
     if plot is not None and plot.suffix.lower() not in PICTURES:
         die(f"--plot must end in {', '.join(PICTURES)}, not {plot}", 2)

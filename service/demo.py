@@ -13,13 +13,15 @@ import yaml
 
 from service import show
 from service.client import ApiError, Client
-from service.picture import before_after
+from service.picture import NoPicture, job_picture
 from service.processes import NotReady, Process
 
 TAG = "TIC-101"
 PV_UNIT = "degC"
 SAMPLE_TIME_S = 0.02
 """A 150th of model 14's ultimate period, 3.3 s."""
+NOISE = "0.002"
+"""Standard deviation of PV, degC: 1 % of what the relay moves it by."""
 BAD_GAINS = ("80", "1.2")
 """Kp in % per PV unit, Ti in s: model 14 (Ku 205, Pu 3.3 s) swings for a long time with these."""
 
@@ -69,8 +71,8 @@ def run_demo(folder: Path | None, speed: str, hub_only: bool) -> None:
             client = _start(stack, kept, speed, hub_only)
             job, seconds = _retune(client)
             picture = kept / "before-after.png"
-            _draw(client, job, picture)
-        except (NotReady, ApiError) as error:
+            job_picture(picture, client, job, PV_UNIT)
+        except (NotReady, ApiError, NoPicture) as error:
             raise DemoFailed(f"{error}\n(logs are in {kept})") from error
     _tell(job, seconds, kept, picture)
     if job["state"] != "proposed":
@@ -91,7 +93,7 @@ def _start(stack: ExitStack, folder: Path, speed: str, hub_only: bool) -> Client
     else:
         bus = process("hub", "protocol.hub", "--port", "0").split()[1]
     ts = str(SAMPLE_TIME_S)
-    plant = ["--bus", bus, "--model", "model-14", "--ts", ts, "--speed", speed]
+    plant = ["--bus", bus, "--model", "model-14", "--ts", ts, "--speed", speed, "--noise", NOISE]
     kp, ti = BAD_GAINS
     # The plant last: at full speed it waits for nobody, and takes what the processor gives.
     tuning = ["--kp", kp, "--ti", ti, "--sp", "50", "--ts", ts]
@@ -110,12 +112,6 @@ def _retune(client: Client) -> tuple[dict[str, Any], float]:
     job = client.post(f"/loops/{TAG}/retune", {"requested_by": "demo"})
     job = show.follow(client, job["url"])
     return job, time.monotonic() - started
-
-
-def _draw(client: Client, job: dict[str, Any], picture: Path) -> None:
-    named = {"before": "baseline", "after": "verify"}
-    stages = {label: client.get(f"{job['url']}/samples", stage=stage) for label, stage in named.items()}
-    before_after(picture, f"{job['loop']}: the same set-point step before and after", PV_UNIT, stages)
 
 
 def _tell(job: dict[str, Any], seconds: float, folder: Path, picture: Path) -> None:

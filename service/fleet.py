@@ -136,7 +136,7 @@ class Fleet:
                 wrong.append(str(error) if tag not in known else f"{tag}: {error}")
         if wrong:
             raise BadFleet("; ".join(wrong))
-        asked = request.model_dump(mode="json", exclude_none=True, exclude={"loops"})
+        asked = {name: value for name, value in request.asked().items() if name != "loops"}
         with self._store.writing() as session:
             row = retunes.add(session, self._store.host, asked, tags, request.requested_by)
         self._wake.set()

@@ -180,7 +180,7 @@ class Jobs:
         within(config, request)
         if self.stopping:
             raise Stopping("the service is shutting down")
-        asked = request.model_dump(mode="json", exclude_none=True)
+        asked = request.asked()
         row = self.store.create(tag, asked, request.requested_by, request.dry_run, host, WORKFLOW_VERSION, also)
         try:
             self.engine.enqueue(row.id, self._rehearsals(host) if row.dry_run else self._queue(config, host))

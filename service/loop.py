@@ -34,6 +34,11 @@ class LoopState:
 class Loop(Protocol):
     """Pumped by one thread: the heartbeat and the lease go out from `step`, so a hung service loses the loop."""
 
+    @property
+    def waits(self) -> bool:
+        """The plant stands still between two steps, as a simulated one at full speed does."""
+        ...
+
     def read(self) -> LoopState:
         """The present state, read from the controller. Raises Failed(NODE_LOST | BUS_LOST)."""
         ...

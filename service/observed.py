@@ -37,6 +37,10 @@ class ObservedLoop:
         """Plant time of the latest sample, s."""
         return None if self._sample is None else self._sample.t
 
+    @property
+    def waits(self) -> bool:
+        return self._loop.waits
+
     def read(self) -> LoopState:
         self._state = self._loop.read()
         return self._state

@@ -1,4 +1,4 @@
-"""The before/after picture of a job, from its samples."""
+"""The picture of a job, from its samples."""
 
 from __future__ import annotations
 
@@ -8,8 +8,33 @@ from typing import Any
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from service.client import Client
+from service.fast_record import kept
+
 LEAD_IN = 20
 """Samples shown before the step."""
+
+
+class NoPicture(Exception):
+    """There is nothing to be shown yet."""
+
+
+def job_picture(path: Path, client: Client, job: dict[str, Any], pv_unit: str) -> None:
+    """Of fast: its record, fit and residual, and the loop before and after; else the step before and after.
+
+    Raises NoPicture.
+    """
+    if job["method"] == "fast" and (record := kept(client.get(f"{job['url']}/samples"))) is not None:
+        from service.fast_picture import fast_job
+
+        fast_job(path, job, record, pv_unit)
+        return
+    named = {"before": "baseline", "after": "verify"}
+    stages = {label: client.get(f"{job['url']}/samples", stage=stage) for label, stage in named.items()}
+    stages = {label: columns for label, columns in stages.items() if columns["t_s"]}
+    if not stages:
+        raise NoPicture(f"job {job['id']} has neither a relay's record nor a set-point step to show")
+    before_after(path, f"{job['loop']}: the same set-point step before and after", pv_unit, stages)
 
 
 def before_after(path: Path, title: str, pv_unit: str, stages: dict[str, dict[str, Any]]) -> None:

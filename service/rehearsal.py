@@ -20,10 +20,11 @@ from service.loop import LoopState
 from service.plain import plain
 from service.runner import RunResult, Watch, run
 from tuning.fast.procedure import FAST, FAST_STAGES, FastOptions, FastProposal, fast
-from tuning.five_stage import PROCEDURE, STAGES, Facts, Options, Proposal, five_stage
+from tuning.fast.trial import trial
+from tuning.five_stage import STAGES, Facts, Options, Proposal, five_stage
 from tuning.gains import Gains
 from tuning.margins import ultimate_point
-from tuning.models import TransferFunction
+from tuning.models import FOPDT, SOPDT, Model, TransferFunction
 from tuning.plan import (
     Command,
     Event,
@@ -43,6 +44,8 @@ LEASE_SAMPLES = 1_000_000
 
 class RehearsedLoop:
     """A `Loop` in memory, as fast as the machine goes. Commands act on the next sample."""
+
+    waits = True
 
     def __init__(self, plant: Plant, channel: Channel, sample_time_s: float) -> None:
         self._plant = plant
@@ -205,12 +208,18 @@ def _t95(file: PlantFile) -> float:
 
 
 def rehearse(
-    spec: dict[str, Any], method: str = PROCEDURE, on_event: Callable[[Event], None] | None = None, **options: Any
+    spec: dict[str, Any],
+    method: str = FAST,
+    on_event: Callable[[Event], None] | None = None,
+    on_samples: Callable[[list[Sample]], None] | None = None,
+    model: Model | None = None,
+    **options: Any,
 ) -> dict[str, Any]:
     """Preflight to verification on a model in memory. Returns the JSON object of `loopwright rehearse`.
 
     spec: the fields of `PlantFile`.  method: "fast", "five-stage", or the five stages with a rule of `tuning.methods`.
-    options: those of `tuning.fast.procedure.FastOptions`, or of `tuning.five_stage.Options`.
+    model: what to design for; fast then needs no relay.  options: those of `tuning.fast.procedure.FastOptions`, or of
+    `tuning.five_stage.Options`.
     A spec that cannot be used gives outcome "refused", reason "bad_input".
     """
     results: dict[str, object] = {}
@@ -226,16 +235,26 @@ def rehearse(
         loop, facts = _loop(file)
         outcome: RunResult[Proposal] | RunResult[FastProposal]
         watch = _watch(facts, _reach(file))
+        hear = on_samples or (lambda samples: None)
         if method == FAST:
-            outcome = run(fast(facts, FastOptions(**options)), loop, watch=watch, on_event=listen)
+            wishes = FastOptions(**options)
+            plan = fast(facts, wishes) if model is None else trial(facts, wishes, model)
+            outcome = run(plan, loop, watch=watch, on_event=listen, on_samples=hear)
         else:
-            outcome = run(five_stage(facts, Options(method=method, **options)), loop, watch=watch, on_event=listen)
+            entered = Options(method=method, model=_entered(model), **options)
+            outcome = run(five_stage(facts, entered), loop, watch=watch, on_event=listen, on_samples=hear)
     except ValidationError as error:
         lines = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'file'}: {e['msg']}" for e in error.errors())
         return _answer(None, RunResult(ended=Refused(Reason.BAD_INPUT, lines)), results)
     except Ended as ended:
         return _answer(None, RunResult(ended=ended), results)
     return _answer(file, outcome, results)
+
+
+def _entered(model: Model | None) -> FOPDT | SOPDT | None:
+    if model is not None and not isinstance(model, FOPDT | SOPDT):
+        raise Refused(Reason.BAD_INPUT, "five-stage takes a model of the form K, T, L, perhaps with zeta")
+    return model
 
 
 def _loop(file: PlantFile) -> tuple[RehearsedLoop, Facts]:
@@ -299,21 +318,19 @@ def _answer(
         gains = proposal.gains
         answer["gains"] = {"Kp": gains.Kp, "Ti": gains.Ti, "Td": gains.Td, "Tf": gains.Tf}
         answer["predicted"] = asdict(proposal.predicted)
-        if isinstance(proposal, Proposal):
-            answer["measured"] = {
-                "before": asdict(proposal.baseline) if proposal.baseline else None,
-                "after": asdict(proposal.verification) if proposal.verification else None,
-            }
+        baseline = proposal.baseline if isinstance(proposal, Proposal) else None
+        answer["measured"] = {"before": baseline, "after": proposal.verification}
+        if isinstance(proposal, FastProposal):
+            answer |= {name: getattr(proposal, name) for name in ("predicted_before", "found", "verified")}
         answer["notes"] = list(proposal.notes)
     clean: dict[str, Any] = plain(answer)
     return clean
 
 
-def _model(proposal: Proposal | FastProposal) -> dict[str, Any]:
+def _model(proposal: Proposal | FastProposal) -> object:
     """What the gains were made on."""
     if isinstance(proposal, FastProposal):
-        found = proposal.found
-        return {"num": found.num, "den": found.den, "dead_time_s": found.L_s, "structure": found.structure}
+        return proposal.model
     model = proposal.model
     return {
         "K": model.K,

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from service.config import LoopConfig
+from tuning.fast.procedure import FAST
 from tuning.five_stage import PROCEDURE, rule_of
 from tuning.methods import METHODS
-from tuning.models import FOPDT, SOPDT
+from tuning.models import FOPDT, SOPDT, TransferFunction
 from tuning.reasons import Refused
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -44,14 +45,29 @@ class ProcessModel(BaseModel):
         return self
 
 
-class PlantModel(BaseModel):
-    """A transfer function for a dry run, coefficients by falling powers of s, deviation variables."""
-
+class _Coefficients(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
-    num: list[Finite] = Field(min_length=1, description="Numerator", examples=[[3.0, 2.0]])
-    den: list[Finite] = Field(min_length=1, description="Denominator", examples=[[3.0, 4.0, 1.0]])
+    num: list[Finite] = Field(min_length=1, max_length=12, description="Numerator", examples=[[3.0, 2.0]])
+    den: list[Finite] = Field(min_length=1, max_length=12, description="Denominator", examples=[[3.0, 4.0, 1.0]])
     dead_time_s: NotNegative = Field(default=0.0, description="Dead time, s", examples=[1.0])
+
+
+class TransferModel(_Coefficients):
+    """num(s)/den(s) exp(-dead_time_s s), coefficients by falling powers of s, PV units over MV percent."""
+
+    def plant(self) -> TransferFunction:
+        return TransferFunction(tuple(self.num), tuple(self.den), self.dead_time_s)
+
+    @model_validator(mode="after")
+    def _is_one(self) -> Self:
+        self.plant()
+        return self
+
+
+class PlantModel(_Coefficients):
+    """A transfer function for a dry run, coefficients by falling powers of s, deviation variables."""
+
     noise_std: NotNegative = Field(
         default=0.0, description="Standard deviation of the PV noise, PV units", examples=[0.0]
     )
@@ -59,26 +75,9 @@ class PlantModel(BaseModel):
     sample_time_s: Positive | None = Field(default=None, description="Sampling period, s", examples=[0.1])
 
 
-class RetuneRequest(BaseModel):
-    """Options of a retune; what is left out comes from the loop's configuration."""
+class Bounds(BaseModel):
+    """What the test may do; at most what loops.yaml permits."""
 
-    model_config = ConfigDict(extra="forbid")
-
-    method: str = Field(
-        default=PROCEDURE,
-        description="What gives the gains once the experiment has given the model: the five-stage procedure's own "
-        "optimisation, or any of GET /methods",
-        json_schema_extra={"enum": [PROCEDURE, *METHODS]},
-    )
-    method_options: dict[str, bool | float | str] = Field(
-        default_factory=dict, description="Options of the method, by name", examples=[{"lambda_s": 12.0}]
-    )
-    model_from: Literal["overshoot", "record"] | None = Field(
-        default=None,
-        description="Model for the method: the estimate from the overshoot, or one identified from the set-point step; "
-        "by default the first for five-stage, the second for the others if it explains the step",
-    )
-    dry_run: bool = Field(default=False, description="Rehearse in memory; the loop is not touched")
     sp_deviation: Positive | None = Field(
         default=None, description="Permitted set-point step, PV units; at most the loop's own", examples=[2.0]
     )
@@ -87,10 +86,40 @@ class RetuneRequest(BaseModel):
     pv_low: Finite | None = Field(default=None, description="Abort below this PV, PV units", examples=[40.0])
     pv_high: Finite | None = Field(default=None, description="Abort above this PV, PV units", examples=[60.0])
     max_time_s: Positive | None = Field(
-        default=None, description="Budget of plant time, s; by default 500 times the loop's T95", examples=[3600.0]
+        default=None,
+        description="Budget of plant time, s; by default 100 times the loop's T95 for fast, 500 times for five-stage",
+        examples=[3600.0],
     )
-    start: Literal["relay", "zn_pi", "estimate", "optimise"] = Field(
-        default="relay", description="Stage to enter at; what earlier stages would have found is then typed in"
+
+
+class FastWishes(BaseModel):
+    """Options of method fast."""
+
+    ms: Annotated[float, Field(ge=1.2, le=2.0, allow_inf_nan=False)] = Field(
+        default=1.6, description="fast: largest peak of the sensitivity: 1.2 robust .. 1.6 .. 2.0 fast", examples=[1.4]
+    )
+    derivative: bool = Field(default=False, description="fast: a PID, where a derivative pays")
+    amplitude_pct: Positive | None = Field(
+        default=None,
+        description="fast: MV under the relay goes so far up, and half as far down, percent; by default half of what "
+        "the limits of MV allow, adapted after the first wave",
+        examples=[10.0],
+    )
+    careful: bool = Field(default=False, description="fast: at least six switches of the relay, not four")
+
+
+class FiveStageWishes(BaseModel):
+    """Options of the five-stage experiment, which the rules of GET /methods share."""
+
+    method_options: dict[str, bool | float | str] = Field(
+        default_factory=dict,
+        description="Options of a method of GET /methods, by name",
+        examples=[{"lambda_s": 12.0}],
+    )
+    model_from: Literal["overshoot", "record"] | None = Field(
+        default=None,
+        description="Model for the method: the estimate from the overshoot, or one identified from the set-point step; "
+        "by default the first for five-stage, the second for the rules if it explains the step",
     )
     Ku: Positive | None = Field(
         default=None, description="Ultimate gain, MV percent per PV unit, for start=zn_pi", examples=[2.05]
@@ -102,9 +131,6 @@ class RetuneRequest(BaseModel):
     Ti_s: Positive | None = Field(default=None, description="Integral time of the recorded PI step, s", examples=[2.8])
     overshoot_pct: Positive | None = Field(
         default=None, description="Overshoot of the recorded PI step, percent, for start=estimate", examples=[25.0]
-    )
-    model: ProcessModel | None = Field(
-        default=None, description="Model for start=optimise; in a dry run without `plant` the plant itself"
     )
     k_source: Literal["k5", "ke"] = Field(
         default="k5",
@@ -118,15 +144,57 @@ class RetuneRequest(BaseModel):
         description="Overshoot that the PI step must show, percent: low, high; 0 < low < high < 74",
         examples=[[8.0, 50.0]],
     )
-    baseline: bool = Field(default=True, description="Record the set-point step with the old gains")
+
+
+STARTS = {"fast": ("relay", "design"), "five-stage": ("relay", "zn_pi", "estimate", "optimise")}
+
+
+class RetuneRequest(FiveStageWishes, FastWishes, Bounds):
+    """Options of a retune; what is left out comes from the loop's configuration."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    method: str = Field(
+        default=FAST,
+        description="fast: one short relay record, fitted as a whole, the best gains for the Ms asked. five-stage: the "
+        "procedure of the paper with its own optimisation. Any of GET /methods: the experiment of five-stage, gains by "
+        "that rule",
+        json_schema_extra={"enum": [FAST, PROCEDURE, *METHODS]},
+    )
+    start: Literal["relay", "zn_pi", "estimate", "optimise", "design"] = Field(
+        default="relay",
+        description="Stage to enter at; what earlier stages would have found is then typed in. fast: relay, design; "
+        "five-stage and the rules: relay, zn_pi, estimate, optimise",
+    )
+    model: ProcessModel | TransferModel | None = Field(
+        default=None,
+        description="Model for start=design, or (K, T_s, L_s) for start=optimise; in a dry run without `plant` the "
+        "plant itself",
+    )
+    baseline: bool | None = Field(
+        default=None,
+        description="Record the set-point step with the old gains: five-stage does unless told not to; fast never does",
+    )
     verify: bool = Field(default=True, description="Record the set-point step with the new gains")
+    dry_run: bool = Field(default=False, description="Rehearse in memory; the loop is not touched")
     plant: PlantModel | None = Field(default=None, description="Plant to rehearse on; only with dry_run")
     requested_by: str = Field(default="api", max_length=100, description="Who asks", examples=["night shift"])
 
+    @property
+    def fast(self) -> bool:
+        return self.method == FAST
+
+    def asked(self) -> dict[str, Any]:
+        """As JSON, without the other procedure's options."""
+        foreign = FiveStageWishes if self.fast else FastWishes
+        return self.model_dump(mode="json", exclude_none=True, exclude=set(foreign.model_fields))
+
     @model_validator(mode="after")
     def _known_method(self) -> Self:
+        if self.fast:
+            return self
         if self.method != PROCEDURE and self.method not in METHODS:
-            raise ValueError(f"method must be one of {PROCEDURE}, {', '.join(METHODS)}, not {self.method!r}")
+            raise ValueError(f"method must be one of {FAST}, {PROCEDURE}, {', '.join(METHODS)}, not {self.method!r}")
         if self.model_from == "record" and self.start in ("estimate", "optimise"):
             raise ValueError(f"model_from=record needs the step of stage zn_pi; the start is {self.start}")
         try:
@@ -136,12 +204,33 @@ class RetuneRequest(BaseModel):
         return self
 
     @model_validator(mode="after")
+    def _of_the_method(self) -> Self:
+        """Options of one procedure say nothing to the other: better refused than ignored."""
+        if self.fast:
+            foreign = _given(self, FiveStageWishes) + ["baseline"] * bool(self.baseline)
+            foreign += ["start"] * (self.start not in STARTS[FAST])
+            if foreign:
+                add = "" if "method" in self.model_fields_set else ', which is used unless a "method" is named'
+                raise ValueError(
+                    f"{', '.join(foreign)}: of the five-stage experiment, not of fast{add}; "
+                    'add "method": "five-stage" (or a rule of GET /methods), or leave it out'
+                )
+            return self
+        foreign = _given(self, FastWishes) + ["start"] * (self.start not in STARTS[PROCEDURE])
+        if foreign:
+            raise ValueError(f'{", ".join(foreign)}: of "method": "fast", not of {self.method}')
+        if self.start == "optimise" and isinstance(self.model, TransferModel):
+            raise ValueError(f"{self.method} takes a model of the form K, T_s, L_s, perhaps with zeta")
+        return self
+
+    @model_validator(mode="after")
     def _complete(self) -> Self:
         needed = {
             "relay": (),
             "zn_pi": ("Ku", "Pu_s"),
             "estimate": ("Kp", "Ti_s", "overshoot_pct"),
             "optimise": ("model",),
+            "design": ("model",),
         }[self.start]
         missing = [name for name in needed if getattr(self, name) is None]
         if missing:
@@ -151,7 +240,15 @@ class RetuneRequest(BaseModel):
             raise ValueError(f"overshoot_window_pct: {low:g} must be less than {high:g}")
         if self.plant is not None and not self.dry_run:
             raise ValueError("plant is for a dry run only")
+        if self.fast and self.start == "relay" and self.model is not None and not self.dry_run:
+            raise ValueError("model is for start=design, or for a dry run: the relay finds its own")
         return self
+
+
+def _given(request: BaseModel, options: type[BaseModel]) -> list[str]:
+    """Those of the options that are not left at their default."""
+    fields = options.model_fields.items()
+    return [name for name, field in fields if getattr(request, name) != field.get_default(call_default_factory=True)]
 
 
 def within(loop: LoopConfig, request: RetuneRequest) -> LoopConfig:
@@ -169,6 +266,12 @@ def within(loop: LoopConfig, request: RetuneRequest) -> LoopConfig:
         if not low < high:
             problems.append(f"{name}_low {low:g} must be less than {name}_high {high:g} {unit}")
         limits[f"{name}_limits"] = allowed.model_copy(update={"low": low, "high": high})
+    mv, amplitude = limits["mv_limits"], request.amplitude_pct
+    if amplitude is not None and 1.5 * amplitude > mv.high - mv.low and not problems:
+        problems.append(
+            f"a relay of amplitude_pct {amplitude:g} needs {1.5 * amplitude:g} % of MV between its limits, "
+            f"there are {mv.high - mv.low:g} %"
+        )
     deviation = request.sp_deviation or loop.sp_deviation
     if deviation > loop.sp_deviation:
         problems.append(f"sp_deviation {deviation:g} is more than the configured {loop.sp_deviation:g} {loop.pv_unit}")

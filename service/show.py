@@ -12,6 +12,13 @@ from rich.table import Table
 from service.client import Client
 
 console = Console()
+_MARGINS = (("GM", "GM", ""), ("PM", "PM_deg", "deg"), ("Ms", "Ms", ""))
+_PREDICTED = (
+    ("overshoot", "overshoot_pct", "%"),
+    ("settling", "settling_s", "s"),
+    ("IAE, unit step", "IAE_per_unit", "s"),
+    *_MARGINS,
+)
 
 
 def follow(client: Client, job_url: str) -> dict[str, Any]:
@@ -48,7 +55,7 @@ def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, int | float | str]
     if isinstance(value, dict):
         for name, item in value.items():
             yield from _leaves(item, name)
-    elif isinstance(value, int | float | str):
+    elif isinstance(value, int | float | str) and value != "":
         yield key, value
 
 
@@ -66,27 +73,55 @@ def job_report(job: dict[str, Any], pv_unit: str = "PV unit") -> None:
     for name, unit in (("Kp", f"{per} (ISA)"), ("Ti", "s"), ("Td", "s")):
         table.add_row(f"gain {name}", cell(old.get(name)), cell(new.get(name)), unit)
     before, after = job["before"] or {}, job["after"] or {}
-    for label, name, unit in (
-        ("measured IAE", "IAE", f"{pv_unit} s"),
-        ("measured overshoot", "overshoot_pct", "%"),
-        ("measured settling", "settling_s", "s"),
-    ):
-        table.add_row(label, cell(before.get(name)), cell(after.get(name)), unit)
-    for label, name, unit in (
-        ("predicted GM", "GM", ""),
-        ("predicted PM", "PM_deg", "deg"),
-        ("predicted Ms", "Ms", ""),
-    ):
-        table.add_row(label, "", cell((job["predicted"] or {}).get(name)), unit)
-    model, ultimate = job["model"] or {}, job["ultimate"] or {}
-    table.add_row(
-        "model K, T, L", "", ", ".join(cell(model.get(n)) for n in ("K", "T_s", "L_s")), f"{pv_unit} per %, s, s"
-    )
+    if before or after:
+        for label, name, unit in (
+            ("measured IAE", "IAE", f"{pv_unit} s"),
+            ("measured overshoot", "overshoot_pct", "%"),
+            ("measured settling", "settling_s", "s"),
+        ):
+            table.add_row(label, cell(before.get(name)), cell(after.get(name)), unit)
+    predicted, earlier = job["predicted"] or {}, job["predicted_before"] or {}
+    for label, name, unit in _PREDICTED if earlier or not after else _MARGINS:
+        table.add_row(f"predicted {label}", cell(earlier[name]) if earlier else "", cell(predicted.get(name)), unit)
+    for label, value, unit in (*_model(job["model"], pv_unit), *_certainty(job)):
+        table.add_row(label, "", value, unit)
+    ultimate = job["ultimate"] or {}
     table.add_row("ultimate Ku, Pu", "", ", ".join(cell(ultimate.get(n)) for n in ("Ku", "Pu_s")), f"{per}, s")
     table.add_row("plant time", "", cell(job["plant_time_s"]), "s")
     console.print(table)
     if job["reason"]:
         console.print(f"[bold]{job['reason']}[/bold]: {job['detail']}\n{job['advice']}", highlight=False)
+
+
+def _model(model: dict[str, Any] | None, pv_unit: str) -> Iterator[tuple[str, str, str]]:
+    """Lines of the table: label, value, unit."""
+    if model is None or "num" not in model:
+        known = model or {}
+        yield "model K, T, L", ", ".join(cell(known.get(n)) for n in ("K", "T_s", "L_s")), f"{pv_unit} per %, s, s"
+        return
+    for label, name, error, unit in (
+        ("model num", "num", "num_errors", f"{pv_unit} per %"),
+        ("model den", "den", "den_errors", ""),
+    ):
+        yield label, " ".join(map(_with_error, model[name], model[error] or [None] * len(model[name]))), unit
+    yield "model dead time", _with_error(model["dead_time_s"], model["dead_time_error_s"]), "s"
+
+
+def _with_error(value: float, error: float | None) -> str:
+    """With its standard error, where that says something."""
+    return cell(value) if not error or error < 1e-4 * abs(value) else f"{cell(value)}±{error:.1g}"
+
+
+def _certainty(job: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+    """What the record of fast says of itself."""
+    found, step = job["evidence"], job["verification"]
+    if found is not None:
+        yield "Ms uncertain by", cell(found["uncertainty"]), "(2 std. dev.)"
+        yield "on rival models by", cell(found["ambiguity"]), ""
+        for load in found["loads"]:
+            yield "load step found", f"{load['size']:+.4g} at {load['t_s']:.4g}", "%, s into the relay"
+    if step is not None:
+        yield "measured step explained", f"{step['fit_pct']:.1f}", "%"
 
 
 def cell(value: object) -> str:

@@ -79,6 +79,15 @@ def tunings(answer: dict[str, Any]) -> None:
         _hanging([(", ".join(who), note) for note, who in notes.items()])
 
 
+def to_try(found: dict[str, Any]) -> None:
+    """How the gains of one method, or Ms, are tried on the loop."""
+    if len(found["methods"]) == 1 and (wish := found["methods"][0]["retune"]):
+        console.print(
+            f"\nTo try them on the loop: POST /loops/{escape(found['loop'])}/retune with\n{json.dumps(wish)}",
+            markup=False, soft_wrap=True,
+        )  # fmt: skip
+
+
 def identified(answer: dict[str, Any]) -> None:
     """The model with its standard errors, how well it fits, and its rivals."""
     if answer["outcome"] == "refused":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -10,12 +9,18 @@ from typing import Any, Protocol
 from service.config import LoopConfig
 from service.loop import Loop, LoopState
 from service.plain import plain_object
-from service.request import RetuneRequest
+from service.request import ProcessModel, RetuneRequest
 from service.store.tables import EventRow
-from tuning.plan import Event, Sample
+from tuning.fast.procedure import FAST
+from tuning.models import Model
+from tuning.plan import Event, Plan, Sample
 from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
+from tuning.stages.common import Facts
 
-TIME_BUDGET_T95 = 500.0
+TIME_BUDGET_T95 = {FAST: 100.0}
+OTHER_BUDGET_T95 = 500.0
+LEAST_BUDGET_SAMPLES = 1000
+"""Of a loop whose T95 is a few samples: the time at rest alone is counted in samples."""
 FROZEN_T95 = 3.0
 _STOPPED = (Reason.OPERATOR, Reason.SERVICE_STOPPED)
 
@@ -58,10 +63,9 @@ class Rehearse(Protocol):
 
 
 def tune(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks) -> Outcome:
-    """The five stages on the live loop."""
-    from service.checkpoints import finished
+    """The procedure asked for on the live loop."""
+    from service.computing import Computing
     from service.runner import Watch, run
-    from tuning.five_stage import Facts, Options, five_stage
 
     facts = Facts(
         sample_time_s=state.sample_time_s,
@@ -72,35 +76,61 @@ def tune(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopStat
         old_gains=state.gains,
         reverse=state.reverse_acting,
     )
-    options = Options(**_options(request))
     watch = Watch(
         pv_low=config.pv_limits.low,
         pv_high=config.pv_limits.high,
         mv_low=facts.mv_low,
         mv_high=facts.mv_high,
-        max_time_s=request.max_time_s or TIME_BUDGET_T95 * config.t95_s,
+        max_time_s=request.max_time_s or time_budget_s(request.method, facts),
         max_frozen_s=FROZEN_T95 * config.t95_s,
     )
-    done = ((event.data["stage"], event.data["result"]) for event in hooks.earlier if event.kind == "stage_done")
+    computing = Computing(loop)
     ran = run(
-        five_stage(facts, options, finished(done)),
-        loop,
+        plan(request, facts, hooks.earlier),
+        computing,
         watch=watch,
         on_event=hooks.on_event,
         on_samples=hooks.on_samples,
         stop=hooks.stop,
-        start_work=lambda work: threading.Thread(target=work, daemon=True, name="computation").start(),
+        start_work=computing.start,
     )
     return Outcome(plain_object(ran.value), ran.ended, ran.restored, dict(ran.plant_time_s))
 
 
+def plan(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow] = ()) -> Plan[Any]:
+    """earlier: events of attempts that were cut off. What fast had recorded by then is not gone on with: relay and
+    set-point step are one record, of a loop that was not touched in between.
+    """
+    if request.fast:
+        from tuning.fast.procedure import FastOptions, fast
+        from tuning.fast.trial import trial
+
+        wishes = FastOptions(**_options(request))
+        known = _known_model(request)
+        return fast(facts, wishes) if known is None else trial(facts, wishes, known)
+    from service.checkpoints import finished
+    from tuning.five_stage import Options, five_stage
+
+    done = ((event.data["stage"], event.data["result"]) for event in earlier if event.kind == "stage_done")
+    return five_stage(facts, Options(**_options(request)), finished(done))
+
+
+def time_budget_s(method: str, facts: Facts) -> float:
+    """Plant time, s: several times what a loop of this T95 takes."""
+    budget = TIME_BUDGET_T95.get(method, OTHER_BUDGET_T95) * facts.T95_s
+    return max(budget, LEAST_BUDGET_SAMPLES * facts.sample_time_s)
+
+
 def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:
-    """The five stages on a model in memory; answers as the live loop would."""
+    """The same on a model in memory; answers as the live loop would."""
     from service.rehearsal import rehearse as rehearse_spec
 
     spec = rehearsal_spec(config, request)
+    options = _options(request)
+    if request.fast:
+        options["model"] = _known_model(request)
     # A model typed in for a dry run is the plant itself; the procedure still starts where the request says.
-    answer = rehearse_spec(spec, on_event=hooks.on_event, **_options(request))
+    answer = rehearse_spec(spec, on_event=hooks.on_event, on_samples=hooks.on_samples, **options)
     times = {name: float(value) for name, value in (answer.get("plant_time_s") or {}).items() if name != "total"}
     if answer["outcome"] == "proposed":
         return Outcome(_as_proposal(answer), None, None, times)
@@ -109,8 +139,21 @@ def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcom
     return Outcome(None, kind(reason, str(answer.get("detail") or "")), None, times)
 
 
+def _known_model(request: RetuneRequest) -> Model | None:
+    """What fast designs for without a relay."""
+    return request.model.plant() if request.start == "design" and request.model else None
+
+
 def _options(request: RetuneRequest) -> dict[str, Any]:
-    """The request in the words of tuning.five_stage.Options."""
+    """The request in the words of tuning.fast.procedure.FastOptions or tuning.five_stage.Options."""
+    if request.fast:
+        return {
+            "Ms": request.ms,
+            "derivative": request.derivative,
+            "amplitude": request.amplitude_pct,
+            "careful": request.careful,
+            "verify": request.verify,
+        }
     model = request.model
     return {
         "start": request.start,
@@ -119,14 +162,14 @@ def _options(request: RetuneRequest) -> dict[str, Any]:
         "Kp": request.Kp,
         "Ti_s": request.Ti_s,
         "overshoot_pct": request.overshoot_pct,
-        "model": model.plant() if model else None,
+        "model": model.plant() if isinstance(model, ProcessModel) else None,
         "k_source": request.k_source,
         "kp_step_factor": request.kp_step_factor,
         "overshoot_window_pct": request.overshoot_window_pct,
         "method": request.method,
         "method_options": request.method_options,
         "model_from": request.model_from,
-        "baseline": request.baseline,
+        "baseline": request.baseline is not False,
         "verify": request.verify,
     }
 
@@ -134,12 +177,10 @@ def _options(request: RetuneRequest) -> dict[str, Any]:
 def _as_proposal(answer: dict[str, Any]) -> dict[str, Any]:
     """A rehearsal's answer under the names of a live job's result."""
     ultimate, model, measured = (answer.get(key) or {} for key in ("ultimate", "model", "measured"))
-    return {
+    told = {
         "ultimate": {"Ku": ultimate["Ku"], "Pu_s": ultimate["Pu"]} if ultimate else None,
         "method": answer.get("method"),
         "chosen": answer.get("chosen") or {},
-        "model": model and {"K": model["K"], "T_s": model["T"], "L_s": model["L"]}
-        | {key: model.get(key) for key in ("zeta", "k_source", "fit_pct")},
         "old_gains": (answer.get("input") or {}).get("gains"),
         "gains": answer.get("gains"),
         "predicted": answer.get("predicted"),
@@ -148,6 +189,10 @@ def _as_proposal(answer: dict[str, Any]) -> dict[str, Any]:
         "notes": answer.get("notes") or [],
         "input": answer.get("input"),
     }
+    if answer["method"] == FAST:
+        return told | {name: answer.get(name) for name in ("model", "predicted_before", "found", "verified")}
+    known = {"K": model["K"], "T_s": model["T"], "L_s": model["L"]}
+    return told | {"model": known | {key: model.get(key) for key in ("zeta", "k_source", "fit_pct")}}
 
 
 def rehearsal_spec(config: LoopConfig, request: RetuneRequest) -> dict[str, Any]:

@@ -21,13 +21,14 @@ from tuning.gains import Gains
 from tuning.identify import identify
 from tuning.methods import METHODS
 from tuning.models import FOPDT, SOPDT, Integrating
-from tuning.plan import Mode, Plan, SetGains, SetMode, SetSetpoint, StageDone, StageStarted, worked
+from tuning.plan import Plan, StageDone, StageStarted, worked
 from tuning.reasons import Reason, Refused
-from tuning.stages.common import Facts, OperatingPoint, Trace, settle, to_rest
+from tuning.stages.common import Facts, OperatingPoint, Trace, to_rest
 from tuning.stages.preflight import preflight
 from tuning.stages.relay import RelayResult, relay_test
-from tuning.stages.step_test import StepResult, step_test, unlimited
+from tuning.stages.step_test import StepResult, step_test
 from tuning.stages.ultimate import UltimateResult, ultimate_gain
+from tuning.stages.verification import verification
 from tuning.stages.zn_pi import ZnResult, allowed_step, zn_pi
 
 __all__ = ["STAGES", "Facts", "Options", "Proposal", "five_stage"]
@@ -233,10 +234,12 @@ def five_stage(facts: Facts, options: Options, finished: Finished = Finished()) 
     designed = yield from stage("optimise", finished.optimise, lambda: _designed(options, model, ultimate))
     notes += designed.notes
 
-    verification: StepResult | None = None
+    verified: StepResult | None = None
     if options.verify:
         gains, predicted = designed.gains, designed.predicted
-        verification = yield from stage("verify", None, lambda: _verified(facts, point, gains, predicted, model))
+        verified = yield from stage(
+            "verify", None, lambda: verification(facts, point, gains, predicted, model.K, model.L_s)
+        )
     return Proposal(
         method=options.method,
         chosen=designed.chosen,
@@ -246,7 +249,7 @@ def five_stage(facts: Facts, options: Options, finished: Finished = Finished()) 
         predicted=designed.predicted,
         ultimate=ultimate,
         baseline=baseline,
-        verification=verification,
+        verification=verified,
         notes=tuple(notes),
     )
 
@@ -341,26 +344,3 @@ def _designed(options: Options, model: Model, ultimate: Ultimate | None) -> Plan
     if METHODS[rule].slow:
         return (yield from worked(compute))
     return compute()
-
-
-def _verified(
-    facts: Facts, point: OperatingPoint, gains: Gains, predicted: Predicted, model: Model
-) -> Plan[StepResult]:
-    """The baseline's step again, under the new gains."""
-    step = min(
-        allowed_step(facts, point, gains.Kp, abs(model.K)), allowed_step(facts, point, facts.old_gains.Kp, math.nan)
-    )
-    commands = (SetGains(gains), SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp))
-    yield from settle(point.sp, 0.02 * step, facts.T95_s / 5, 3 * facts.T95_s, point.noise, commands)
-    result = yield from step_test(facts, point, step, band=0.05, most_s=5 * facts.T95_s, smooth_s=model.L_s / 2)
-    unlimited(facts, result, gains)
-    most = max(40.0, predicted.overshoot_pct + 25.0)
-    if not result.settled or result.overshoot_pct > most:
-        raise Refused(
-            Reason.NOT_CONFIRMED,
-            f"under the new gains the loop {'settled' if result.settled else 'did not settle'} with an overshoot of "
-            f"{result.overshoot_pct:.1f} % (predicted {predicted.overshoot_pct:.1f} %, at most {most:.0f} %)",
-        )
-    # home under the new gains, so that the old ones take over a loop at rest
-    yield from settle(point.sp, 0.05 * step, facts.T95_s / 5, 3 * facts.T95_s, point.noise, (SetSetpoint(point.sp),))
-    return result

@@ -14,6 +14,7 @@ from fastapi.responses import PlainTextResponse, StreamingResponse
 
 from service.api import contract, fleet, operations, problems, tunings
 from service.api.access import Access
+from service.api.samples import sample_columns
 from service.api.stream import event_stream
 from service.api.views import (
     Decision,
@@ -141,16 +142,7 @@ def create_app(
         blocks = jobs.store.samples(job_id, stage)
         if format == "csv":
             return PlainTextResponse(_csv(blocks), media_type="text/csv")
-        flat = [sample for _, block in blocks for sample in block]
-        return SamplesView(
-            job=job_id,
-            stage=[name for name, block in blocks for _ in block],
-            t_s=[sample.t for sample in flat],
-            sp=[sample.sp for sample in flat],
-            pv=[sample.pv for sample in flat],
-            mv=[sample.mv for sample in flat],
-            mode=[sample.mode for sample in flat],
-        )
+        return SamplesView(job=job_id, **sample_columns(blocks))
 
     @app.post(
         "/jobs/{job_id}/abort",

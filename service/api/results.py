@@ -27,8 +27,65 @@ class ModelView(BaseModel):
     fit_pct: float | None = Field(default=None, description="Fit of an identified model to its record, NRMSE, percent")
 
 
+class TransferModelView(BaseModel):
+    """num(s)/den(s) exp(-dead_time_s s), highest power of s first, as method fast finds it; den begins with 1.
+
+    Static gain and time constants are not given: a short record of a slow plant hardly shows them, and the gains do
+    not depend on them.
+    """
+
+    structure: str = Field(description="The structure that the record supports best; or typed in", examples=["sopdt"])
+    num: list[float] = Field(description="PV units per MV percent, times in s")
+    den: list[float]
+    dead_time_s: float = Field(description="Dead time, s")
+    num_errors: list[float] | None = Field(default=None, description="Standard errors; null: typed in")
+    den_errors: list[float] | None = Field(default=None, description="Standard errors; null: typed in")
+    dead_time_error_s: float | None = Field(default=None, description="Standard error, s; null: typed in")
+
+
+class LoadStepView(BaseModel):
+    """A step of the load during the test, found in the record and allowed for."""
+
+    t_s: float = Field(description="Since the relay's start, s")
+    size: float = Field(description="At the plant's input, MV percent")
+
+
+class EvidenceView(BaseModel):
+    """What the record of method fast says, and how sure it is."""
+
+    structure: str = Field(description="Of the model", examples=["sopdt"])
+    Ms: float = Field(description="Of the gains designed, half a sample's delay included", examples=[1.6])
+    uncertainty: float | None = Field(
+        description="So much larger Ms would be with the model two standard deviations off", examples=[0.02]
+    )
+    ambiguity: float = Field(
+        description="Largest difference of Ms on a rival model that explains the record as well", examples=[0.01]
+    )
+    residual: float | None = Field(description="What the model leaves, in noises at rest", examples=[1.0])
+    loads: list[LoadStepView]
+    drift: bool = Field(description="PV drifted at a steady rate, which was allowed for")
+    switches: int = Field(description="Of the relay", examples=[4])
+    period_s: float = Field(description="Of PV under the relay, s", examples=[12.5])
+    cause: str | None = Field(description="Why that is not enough for a proposal, from the closed list")
+    detail: str = Field(description="The cause's numbers")
+
+
+class VerificationView(BaseModel):
+    """The set-point step of method fast under the gains of the first design. It begins while PV still swings; the gains
+    proposed are designed on this record too."""
+
+    Kp: float = Field(description="As tested, MV percent per PV unit")
+    Ti: float = Field(description="As tested, s")
+    Td: float = Field(description="As tested, s")
+    Ms: float = Field(description="Of the tested gains on the model of the whole record")
+    step: float = Field(description="PV units")
+    duration_s: float
+    fit_pct: float = Field(description="How much of the measured step the model explains, NRMSE, percent")
+    rms: float = Field(description="What it leaves, PV units")
+
+
 class PredictedView(BaseModel):
-    """The new gains on the model."""
+    """Gains on the model: computed, not measured."""
 
     Ms: float
     GM: float | None = Field(description="Ratio; null: no crossing")
@@ -50,6 +107,19 @@ class StepView(BaseModel):
     mv_at_limit_s: float = Field(default=0.0, description="How long MV was at the end of its permitted range, s")
     settled: bool
     duration_s: float
+
+
+def model_view(stored: dict[str, Any] | None) -> ModelView | TransferModelView | None:
+    """Of either procedure."""
+    found: ModelView | TransferModelView | None = known(
+        TransferModelView if stored and "num" in stored else ModelView, stored
+    )
+    return found
+
+
+def verification_view(stored: dict[str, Any] | None) -> VerificationView | None:
+    found: VerificationView | None = known(VerificationView, stored and stored | stored["tested"])
+    return found
 
 
 def known(kind: type[BaseModel], stored: dict[str, Any] | None) -> Any:

@@ -123,13 +123,22 @@ class TuningsView(BaseModel):
 class AlternativeView(TunedView):
     retune: dict[str, Any] | None = Field(
         description="Body for POST /loops/{tag}/retune, which tries these gains on the loop without another "
-        f"experiment; null without gains, or where Ms is above {MOST_Ms:g} or GM below {LEAST_GM:g}",
+        f"experiment; null without gains, where Ms is above {MOST_Ms:g} or GM below {LEAST_GM:g}, and for a rule on a "
+        "model that is not K, T, L",
         examples=[{"start": "optimise", "method": "simc", "model": {"K": 0.8, "T_s": 3.0, "L_s": 1.0}}],
     )
 
 
+    uncertainty: float | None = Field(
+        description="With `ms`: so much larger Ms would be with the model two standard deviations off; null: no record"
+    )
+    ambiguity: float | None = Field(
+        description="With `ms`: largest difference of Ms on a rival model of the same record; null: no record"
+    )
+
+
 class AlternativesView(BaseModel):
-    """What the methods say of the model that a job found."""
+    """What the methods, or fast for another Ms, say of the model that a job found."""
 
     job: str = Field(examples=["4f0c2a9be113"])
     loop: str = Field(examples=["TIC-101"])

@@ -9,11 +9,14 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Query
 
 from service import tunings
-from service.alternatives import alternatives
+from service.alternatives import alternatives, redesigned
 from service.api import problems
+from service.api.samples import sample_columns
 from service.api.tuning_views import AlternativesView, MethodView, TuningRequest, TuningsView
+from service.fast_record import kept
 from service.jobs import Jobs
 from service.model_forms import parse_model
+from tuning.fast.procedure import FAST
 
 
 def router(jobs: Jobs) -> APIRouter:
@@ -43,7 +46,7 @@ def router(jobs: Jobs) -> APIRouter:
     @routes.get(
         "/jobs/{job_id}/alternatives",
         tags=["jobs"],
-        summary="What other methods make of the job's model",
+        summary="What other methods, or fast for another Ms, make of what the job found",
         responses=problems.responses(404, 409, 422),
     )
     async def job_alternatives(
@@ -51,9 +54,27 @@ def router(jobs: Jobs) -> APIRouter:
         method: Annotated[
             str | None, Query(description="Only this one; without it all but the slow one, me-pso", examples=["me-pso"])
         ] = None,
-    ) -> AlternativesView:
+        ms: Annotated[
+            float | None,
+            Query(
+                ge=1.2, le=2.0, allow_inf_nan=False, examples=[1.4],
+                description="The gains of fast for this Ms instead, from the same record; without `method`",
+            ),
+        ] = None,
+        derivative: Annotated[
+            bool | None, Query(description="With `ms`: a PID where it pays; by default as the job had it")
+        ] = None,
+    ) -> AlternativesView:  # fmt: skip
         def work() -> dict[str, Any]:
-            return alternatives(jobs.store.get(job_id), jobs.store.events(job_id), method)
+            row, events = jobs.store.get(job_id), jobs.store.events(job_id)
+            if ms is None:
+                if derivative is not None:
+                    raise tunings.BadTuning("derivative is for another ms: give that too")
+                return alternatives(row, events, method)
+            if method not in (None, FAST):
+                raise tunings.BadTuning(f"ms is for the method fast, not for {method}: leave one of them out")
+            wanted = bool(row.request.get("derivative")) if derivative is None else derivative
+            return redesigned(row, events, kept(sample_columns(jobs.store.samples(job_id))), ms, wanted)
 
         return AlternativesView(**await computed(work))
 

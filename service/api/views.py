@@ -7,7 +7,18 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from service.api.results import ModelView, PredictedView, StepView, UltimateView, known
+from service.api.results import (
+    EvidenceView,
+    ModelView,
+    PredictedView,
+    StepView,
+    TransferModelView,
+    UltimateView,
+    VerificationView,
+    known,
+    model_view,
+    verification_view,
+)
 from service.config import Limits, LoopConfig
 from service.loop import LoopState
 from service.running import Running
@@ -97,15 +108,20 @@ class JobView(BaseModel):
     remaining_plant_time_s: float | None = Field(description="Expected plant time to the end, s", examples=[310.0])
     plant_time_s: float = Field(description="Plant time so far, s", examples=[224.0])
     stages: list[StageView]
-    method: str = Field(description="What gives the gains", examples=["five-stage"])
+    method: str = Field(description="What gives the gains", examples=["fast"])
     chosen: dict[str, float] = Field(description="The method's design parameters in effect, by name with unit")
     ultimate: UltimateView | None
-    model: ModelView | None
+    model: ModelView | TransferModelView | None = Field(description="As five-stage finds it, or as fast does")
     old_gains: GainsView | None
     new_gains: GainsView | None
-    predicted: PredictedView | None
-    before: StepView | None = Field(description="Set-point step with the old gains")
-    after: StepView | None = Field(description="The same step with the new gains")
+    predicted: PredictedView | None = Field(description="The new gains on the model")
+    predicted_before: PredictedView | None = Field(
+        description="fast: the old gains on the same model, in place of a measured step; null: not stable there"
+    )
+    evidence: EvidenceView | None = Field(description="fast: what its record says; of a refused job too")
+    verification: VerificationView | None = Field(description="fast: the measured step that proves the model")
+    before: StepView | None = Field(description="Set-point step with the old gains, measured; five-stage only")
+    after: StepView | None = Field(description="The same step with the new gains, from rest, measured")
     notes: list[str]
     reason: str | None = Field(description="Why there is no proposal, from the closed list", examples=["not_at_rest"])
     detail: str | None = Field(description="The reason's numbers")
@@ -183,10 +199,13 @@ def job_view(row: JobRow, events: Sequence[EventRow], running: Running | None) -
         method=row.request.get("method", PROCEDURE),
         chosen=result.get("chosen") or {},
         ultimate=known(UltimateView, result.get("ultimate")),
-        model=known(ModelView, result.get("model")),
+        model=model_view(result.get("model")),
         old_gains=_stored_gains(row.old_gains or result.get("old_gains")),
         new_gains=_stored_gains(new),
         predicted=known(PredictedView, result.get("predicted")),
+        predicted_before=known(PredictedView, result.get("predicted_before")),
+        evidence=known(EvidenceView, result.get("found") or _told(events, ("redesign", "design"), "cause")),
+        verification=verification_view(result.get("verified") or _told(events, ("verify",), "tested")),
         before=known(StepView, result.get("baseline")),
         after=known(StepView, result.get("verification")),
         notes=[e.data["text"] for e in events if e.kind == "note"] + list(result.get("notes") or ()),
@@ -228,6 +247,17 @@ def _stages(events: Sequence[EventRow], row: JobRow) -> list[StageView]:
         elif event.kind == "stage_done" and name in stages:
             stages[name].state, stages[name].result = "done", event.data.get("result")
     return list(stages.values())
+
+
+def _told(events: Sequence[EventRow], stages: Sequence[str], sign: str) -> dict[str, Any] | None:
+    """The last result of the first of these stages that has one; `sign` is a field that others' results lack."""
+    for stage in stages:
+        for event in reversed(events):
+            data = event.data.get("result")
+            if event.kind == "stage_done" and event.data.get("stage") == stage and data and sign in data:
+                found: dict[str, Any] = data
+                return found
+    return None
 
 
 def _stored_gains(data: dict[str, Any] | None) -> GainsView | None:

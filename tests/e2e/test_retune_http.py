@@ -20,15 +20,22 @@ def site(tmp_path: Path) -> Iterator[Callable[[Case], Plantsite]]:
         yield lambda case: Plantsite(stack, tmp_path, case)
 
 
+@pytest.mark.parametrize("method", ["fast", "five-stage"])
 @pytest.mark.parametrize("case", [MODEL_14, MODEL_41], ids=lambda case: case.model)
-def test_a_live_loop_is_retuned_and_the_change_taken_back(site: Callable[[Case], Plantsite], case: Case) -> None:
+def test_a_live_loop_is_retuned_and_the_change_taken_back(
+    site: Callable[[Case], Plantsite], case: Case, method: str
+) -> None:
     here = site(case)
-    url = here.retune()
+    url = here.retune(**({} if method == "fast" else {"method": method}))
     job = here.finished(url)
-    assert job["state"] == "proposed", (job["reason"], job["detail"])
+    assert (job["state"], job["method"]) == ("proposed", method), (job["reason"], job["detail"])
     assert job["ultimate"]["Ku"] == pytest.approx(case.Ku, rel=0.015)
     assert job["ultimate"]["Pu_s"] == pytest.approx(case.Pu_s, rel=0.02)
     assert job["predicted"]["Ms"] <= 2.0
+    if method == "fast":
+        assert job["predicted"]["Ms"] == pytest.approx(1.6, abs=0.02) and job["evidence"]["uncertainty"] < 0.1
+        assert job["verification"]["fit_pct"] > 95 and job["predicted_before"]
+        assert job["plant_time_s"] < 12 * case.Pu_s + case.t95_s
     assert job["old_gains"]["Kp"] == pytest.approx(case.kp) and job["restored"]["mode"] == "automatic"
     assert here.is_home()
     samples = here.http.get(f"{url}/samples?stage=verify").json()
@@ -67,7 +74,7 @@ def test_another_method_on_a_model_of_the_jobs_own_samples(method: str, site: Ca
 def test_the_reactor_gets_the_optimum_of_the_paper(site: Callable[[Case], Plantsite]) -> None:
     here = site(REACTOR)
     options: dict[str, Any] = {"overshoot_window_pct": [8, 50], "kp_step_factor": 1.5, "mv_low": 40, "mv_high": 60}
-    job = here.finished(here.retune(**options))
+    job = here.finished(here.retune(method="five-stage", **options))
     assert job["state"] == "proposed", (job["reason"], job["detail"])
     assert job["ultimate"]["Ku"] == pytest.approx(REACTOR.Ku, rel=0.015)
     assert job["ultimate"]["Pu_s"] == pytest.approx(REACTOR.Pu_s, rel=0.02)

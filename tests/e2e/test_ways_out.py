@@ -25,14 +25,23 @@ pytestmark = NEEDS_VCAN
 PACE = 5.0
 BACK_WITHIN_S = 2.0
 """1 s of heartbeat time, and what the device's tick and reading it all back by SDO take on a slow machine."""
-STAGES: dict[str, dict[str, Any]] = {
-    "baseline": {},
-    "relay": {"baseline": False},
-    "ultimate": {"baseline": False},
-    "zn_pi": {"baseline": False, "start": "zn_pi", "Ku": 205.0, "Pu_s": 3.32},
-    "verify": {"baseline": False, "start": "optimise", "model": {"K": 0.02, "T_s": 2.0, "L_s": 1.0}},
-}
-"""How to come to each stage soon."""
+FIVE: dict[str, Any] = {"method": "five-stage"}
+SOON: dict[str, Any] = {**FIVE, "baseline": False}
+STAGES: dict[str, tuple[str, dict[str, Any]]] = {
+    "five-stage, baseline": ("baseline", FIVE),
+    "five-stage, relay": ("relay", SOON),
+    "five-stage, ultimate": ("ultimate", SOON),
+    "five-stage, zn_pi": ("zn_pi", {**SOON, "start": "zn_pi", "Ku": 205.0, "Pu_s": 3.32}),
+    "five-stage, verify": (
+        "verify", {**SOON, "start": "optimise", "model": {"K": 0.02, "T_s": 2.0, "L_s": 1.0}}
+    ),
+    "fast, preflight": ("preflight", {}),
+    "fast, relay": ("relay", {}),
+    "fast, verify": ("verify", {}),
+}  # fmt: skip
+"""Each stage of each procedure, and how to come to it soon."""
+EARLY = {"fast": STAGES["fast, relay"], "five-stage": STAGES["five-stage, baseline"]}
+"""The first stage of each that moves the loop."""
 MORE_LOOPS = (
     {"tag": "NO-BUS", "bus": "socketcan:vcan9"},
     {"tag": "ABSENT", "controller_node": 0x55},
@@ -45,6 +54,12 @@ MORE_LOOPS = (
 def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plantsite]:
     with ExitStack() as stack:
         yield Plantsite(stack, tmp_path_factory.mktemp("site"), MODEL_14, MORE_LOOPS)
+
+
+@pytest.fixture(params=EARLY)
+def early(request: pytest.FixtureRequest) -> tuple[str, dict[str, Any]]:
+    """A stage and the options of a retune that comes to it, of either procedure."""
+    return EARLY[request.param]
 
 
 @pytest.fixture
@@ -71,12 +86,12 @@ def here(processes: Plantsite) -> Plantsite:
     return processes
 
 
-def in_stage(here: Plantsite, stage: str, **options: Any) -> str:
-    """A job in the middle of this stage: the loop is no longer as it was."""
+def in_stage(here: Plantsite, stage: str, options: dict[str, Any]) -> str:
+    """A job in the middle of this stage: the loop is no longer as it was, unless it is only listened to."""
     url = here.retune(**options)
     here.until(url, lambda job: job["stage"] == stage)
     deadline = time.monotonic() + 10
-    while here.is_home() and time.monotonic() < deadline:
+    while stage != "preflight" and here.is_home() and time.monotonic() < deadline:
         time.sleep(0.02)
     job = here.job(url)
     assert (job["state"], job["stage"]) == ("running", stage)
@@ -89,15 +104,15 @@ def ended(here: Plantsite, url: str) -> tuple[str, str]:
     return job["state"], job["reason"]
 
 
-def test_a_foreign_setpoint_stays(here: Plantsite) -> None:
-    url = in_stage(here, "baseline")
+def test_a_foreign_setpoint_stays(here: Plantsite, early: tuple[str, dict[str, Any]]) -> None:
+    url = in_stage(here, *early)
     here.write("controller_setpoint", 50.03)
     assert ended(here, url) == ("aborted", "setpoint_changed")
     assert here.is_home(sp=50.03)
 
 
-def test_a_mode_changed_by_another(here: Plantsite) -> None:
-    url = in_stage(here, "baseline")
+def test_a_mode_changed_by_another(here: Plantsite, early: tuple[str, dict[str, Any]]) -> None:
+    url = in_stage(here, *early)
     here.write("controller_mode_command", Mode.MANUAL)
     assert ended(here, url) == ("aborted", "mode_changed")
     state = here.state()
@@ -108,28 +123,28 @@ def test_a_mode_changed_by_another(here: Plantsite) -> None:
     assert here.is_home()
 
 
-def test_pv_at_its_limit(here: Plantsite) -> None:
-    assert ended(here, here.retune(pv_high=50.05)) == ("failed", "pv_limit")
+def test_pv_at_its_limit(here: Plantsite, early: tuple[str, dict[str, Any]]) -> None:
+    assert ended(here, here.retune(pv_high=50.05, **early[1])) == ("failed", "pv_limit")
     assert here.is_home()
 
 
-def test_noise_too_high(here: Plantsite) -> None:
+def test_noise_too_high(here: Plantsite, early: tuple[str, dict[str, Any]]) -> None:
     here.write("plant_noise", 0.05)
-    assert ended(here, here.retune()) == ("refused", "noise_too_high")
+    assert ended(here, here.retune(**early[1])) == ("refused", "noise_too_high")
     assert here.is_home()
 
 
-def test_not_at_rest(here: Plantsite) -> None:
+def test_not_at_rest(here: Plantsite, early: tuple[str, dict[str, Any]]) -> None:
     here.write("plant_pace", 2.0)
-    url = here.retune()
+    url = here.retune(**early[1])
     here.until(url, lambda job: job["state"] == "running" and job["stage"] == "preflight")
     here.write("plant_disturbance", 10.0)
     assert ended(here, url) == ("refused", "not_at_rest")
     assert here.is_home()
 
 
-def test_mv_without_room(here: Plantsite) -> None:
-    assert ended(here, here.retune(mv_low=49.9, mv_high=60)) == ("refused", "saturated")
+def test_mv_without_room(here: Plantsite, early: tuple[str, dict[str, Any]]) -> None:
+    assert ended(here, here.retune(mv_low=49.9, mv_high=60, **early[1])) == ("refused", "saturated")
     assert here.is_home()
 
 
@@ -162,8 +177,8 @@ def test_nan_by_sdo_is_refused_and_the_loop_goes_on(here: Plantsite) -> None:
     assert here.read("sample_number") > before and here.state().pv == pytest.approx(50.0, abs=1e-3)
 
 
-def test_a_plant_that_falls_silent(here: Plantsite) -> None:
-    url = in_stage(here, "baseline")
+def test_a_plant_that_falls_silent(here: Plantsite, early: tuple[str, dict[str, Any]]) -> None:
+    url = in_stage(here, *early)
     os.kill(here.plant.pid, signal.SIGSTOP)
     try:
         assert ended(here, url) == ("failed", "node_lost")
@@ -172,8 +187,16 @@ def test_a_plant_that_falls_silent(here: Plantsite) -> None:
         os.kill(here.plant.pid, signal.SIGCONT)
 
 
+@pytest.mark.parametrize("stage", STAGES)
+def test_aborted_by_the_operator_in_each_stage(here: Plantsite, stage: str) -> None:
+    url = in_stage(here, *STAGES[stage])
+    assert here.http.post(f"{url}/abort").status_code == 202
+    assert ended(here, url) == ("aborted", "operator")
+    assert here.is_home()
+
+
 def test_busy_then_aborted_by_the_operator(here: Plantsite) -> None:
-    url = in_stage(here, "baseline")
+    url = in_stage(here, *EARLY["fast"])
     busy = here.http.post(f"/loops/{TAG}/retune", json={})
     assert busy.status_code == 409 and busy.json()["job"] == url
     assert here.http.post(f"{url}/abort").status_code == 202
@@ -181,8 +204,9 @@ def test_busy_then_aborted_by_the_operator(here: Plantsite) -> None:
     assert here.is_home()
 
 
-def test_sigterm_of_the_service(here: Plantsite) -> None:
-    url = in_stage(here, "relay", **STAGES["relay"])
+@pytest.mark.parametrize("stage", ["five-stage, relay", "fast, relay"])
+def test_sigterm_of_the_service(here: Plantsite, stage: str) -> None:
+    url = in_stage(here, *STAGES[stage])
     here.service.stop()
     assert here.is_home()
     here.serve()
@@ -191,7 +215,7 @@ def test_sigterm_of_the_service(here: Plantsite) -> None:
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_kill_9_of_the_service_leaves_the_controller_to_itself_and_the_job_resumes(here: Plantsite, stage: str) -> None:
-    url = in_stage(here, stage, **STAGES[stage])
+    url = in_stage(here, *STAGES[stage])
     here.service.kill()
     deadline = time.monotonic() + BACK_WITHIN_S
     while not here.is_home() and time.monotonic() < deadline:
@@ -205,7 +229,8 @@ def test_kill_9_of_the_service_leaves_the_controller_to_itself_and_the_job_resum
     assert here.is_home()
 
 
-def test_sample_times_that_differ_and_a_wrong_action(here: Plantsite) -> None:
+@pytest.mark.parametrize("options", [SOON, {}], ids=["five-stage", "fast"])
+def test_sample_times_that_differ_and_a_wrong_action(here: Plantsite, options: dict[str, Any]) -> None:
     """A second pair beside the first, whose plant is held."""
     here.write("plant_samples_to_run", 0)
     own = ("--bus", BUS, "--ts", "0.05", "--node")
@@ -224,7 +249,8 @@ def test_sample_times_that_differ_and_a_wrong_action(here: Plantsite) -> None:
         detail = here.job(url)["detail"]
         assert "0.02 s" in detail and "0.05 s" in detail
         assert here.is_home()
-        url = here.retune("DIRECT", baseline=False)
+        # a loop that acts the wrong way runs away from rest: each procedure finds one just started
+        url = here.retune("DIRECT", **options)
         assert ended(here, url) == ("refused", "wrong_sign")
     finally:
         plant.stop()
@@ -233,7 +259,7 @@ def test_sample_times_that_differ_and_a_wrong_action(here: Plantsite) -> None:
 
 def test_a_controller_that_dies(here: Plantsite) -> None:
     """The last one: there is no controller after it."""
-    url = in_stage(here, "baseline")
+    url = in_stage(here, *EARLY["fast"])
     here.controller.kill()
     state, reason = ended(here, url)
     assert state == "failed" and reason in ("node_lost", "samples_lost")

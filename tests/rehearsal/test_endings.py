@@ -13,63 +13,76 @@ from tuning.reasons import ADVICE, Reason
 LAG = {"num": [2], "den": [5, 1], "dead_time_s": 1}
 
 
+BOTH = ("fast", "five-stage")
+FIVE = "five-stage"
+ONLY_FIVE = (FIVE,)
+"""What the five stages are not made for: `fast` proposes here, see test_fast.py."""
+
+
 @pytest.mark.parametrize(
-    ("spec", "outcome", "reasons"),
+    ("spec", "methods", "outcome", "reason"),
     [
-        ({"num": [1], "den": [5, 1]}, "refused", {"cannot_oscillate"}),
-        ({"num": [1], "den": [25, 10, 1]}, "refused", {"cannot_oscillate"}),
-        ({"num": [1], "den": [10, 0], "dead_time_s": 1}, "refused", {"not_self_regulating"}),
-        ({"num": [0.2], "den": [10, 1, 0], "dead_time_s": 3}, "refused", {"not_self_regulating"}),
-        ({"num": [1], "den": [-5, 1], "dead_time_s": 1}, "failed", {"pv_limit"}),
-        (LAG | {"noise_std": 0.1}, "refused", {"noise_too_high"}),
-        (LAG | {"mv_limits": [-0.001, 0.5]}, "refused", {"saturated"}),
-        (LAG | {"sample_time_s": 1.0}, "refused", {"cannot_oscillate"}),
-        (LAG | {"mv_limits": [5, 1]}, "refused", {"bad_input"}),
-        (LAG | {"num": [float("nan")]}, "refused", {"bad_input"}),
-        (LAG | {"den": [0, 1]}, "refused", {"bad_input"}),
-        (LAG | {"num": [1, 2, 3]}, "refused", {"bad_input"}),
-        (LAG | {"dead_time_s": -1}, "refused", {"bad_input"}),
-        (LAG | {"colour": 3}, "refused", {"bad_input"}),
-        ({}, "refused", {"bad_input"}),
+        ({"num": [1], "den": [5, 1]}, ONLY_FIVE, "refused", "cannot_oscillate"),
+        ({"num": [1], "den": [25, 10, 1]}, ONLY_FIVE, "refused", "cannot_oscillate"),
+        ({"num": [1], "den": [10, 0], "dead_time_s": 1}, ONLY_FIVE, "refused", "not_self_regulating"),
+        ({"num": [0.2], "den": [10, 1, 0], "dead_time_s": 3}, ONLY_FIVE, "refused", "not_self_regulating"),
+        (LAG | {"sample_time_s": 1.0}, ONLY_FIVE, "refused", "cannot_oscillate"),
+        ({"num": [1], "den": [-5, 1], "dead_time_s": 1}, BOTH, "failed", "pv_limit"),
+        (LAG | {"noise_std": 0.1}, BOTH, "refused", "noise_too_high"),
+        (LAG | {"mv_limits": [-0.001, 0.5]}, BOTH, "refused", "saturated"),
+        (LAG | {"mv_limits": [5, 1]}, BOTH, "refused", "bad_input"),
+        (LAG | {"num": [float("nan")]}, BOTH, "refused", "bad_input"),
+        (LAG | {"den": [0, 1]}, BOTH, "refused", "bad_input"),
+        (LAG | {"num": [1, 2, 3]}, BOTH, "refused", "bad_input"),
+        (LAG | {"dead_time_s": -1}, BOTH, "refused", "bad_input"),
+        (LAG | {"colour": 3}, BOTH, "refused", "bad_input"),
+        ({}, BOTH, "refused", "bad_input"),
     ],
 )
-def test_it_ends_with_a_reason(spec: dict[str, Any], outcome: str, reasons: set[str]) -> None:
-    answer = rehearse(spec)
-    assert (answer["outcome"], answer["reason"] in reasons) == (outcome, True), answer["detail"]
-    assert answer["detail"]
-    assert answer["advice"]
-    assert answer["gains"] is None
+def test_it_ends_with_a_reason(spec: dict[str, Any], methods: tuple[str, ...], outcome: str, reason: str) -> None:
+    for method in methods:
+        answer = rehearse(spec, method)
+        assert (answer["outcome"], answer["reason"]) == (outcome, reason), (method, answer["detail"])
+        assert answer["detail"]
+        assert answer["advice"]
+        assert answer["gains"] is None
 
 
 def test_every_reason_has_its_advice() -> None:
     assert set(ADVICE) == set(Reason)
 
 
-def test_a_negative_gain_gives_the_mirror_image() -> None:
-    up, down = rehearse(LAG), rehearse(LAG | {"num": [-2]})
+@pytest.mark.parametrize("method", BOTH)
+def test_a_negative_gain_gives_the_mirror_image(method: str) -> None:
+    up, down = rehearse(LAG, method), rehearse(LAG | {"num": [-2]}, method)
     assert down["gains"] == pytest.approx(up["gains"], rel=1e-3)  # the relay starts high in both
-    assert down["model"]["K"] == pytest.approx(-up["model"]["K"], rel=1e-3)
+    gain = (lambda model: model["num"][-1]) if method == "fast" else (lambda model: model["K"])
+    assert gain(down["model"]) == pytest.approx(-gain(up["model"]), rel=1e-3)
 
 
+@pytest.mark.parametrize("method", BOTH)
 @pytest.mark.parametrize("factor", [1e-3, 60.0])
-def test_scaling_time_scales_the_times_and_nothing_else(factor: float) -> None:
+def test_scaling_time_scales_the_times_and_nothing_else(factor: float, method: str) -> None:
     slow = {"num": [2], "den": [500, 1], "dead_time_s": 150, "sample_time_s": 2.0, "t95_s": 1800}
-    base = rehearse(slow)
+    base = rehearse(slow, method)
     scaled = rehearse(
-        slow | {k: v * factor for k, v in slow.items() if k.endswith("_s")} | {"den": [500 * factor, 1]}  # type: ignore[operator]
+        slow | {k: v * factor for k, v in slow.items() if k.endswith("_s")} | {"den": [500 * factor, 1]},  # type: ignore[operator]
+        method,
     )
     assert scaled["ultimate"]["Ku"] == pytest.approx(base["ultimate"]["Ku"], rel=2e-3)
     assert scaled["ultimate"]["Pu"] == pytest.approx(factor * base["ultimate"]["Pu"], rel=2e-3)
 
 
 def test_the_procedure_can_be_entered_at_each_stage_by_hand() -> None:
-    whole = rehearse(LAG)
+    whole = rehearse(LAG, FIVE)
     stages = whole["stages"]
-    from_ultimate = rehearse(LAG, start="zn_pi", Ku=whole["ultimate"]["Ku"], Pu_s=whole["ultimate"]["Pu"])
+    from_ultimate = rehearse(LAG, FIVE, start="zn_pi", Ku=whole["ultimate"]["Ku"], Pu_s=whole["ultimate"]["Pu"])
     zn = stages["zn_pi"]
-    from_overshoot = rehearse(LAG, start="estimate", Kp=zn["Kp"], Ti_s=zn["Ti_s"], overshoot_pct=zn["overshoot_pct"])
+    from_overshoot = rehearse(
+        LAG, FIVE, start="estimate", Kp=zn["Kp"], Ti_s=zn["Ti_s"], overshoot_pct=zn["overshoot_pct"]
+    )
     model = whole["model"]
-    from_model = rehearse(LAG, start="optimise", model=FOPDT(model["K"], model["T"], model["L"]))
+    from_model = rehearse(LAG, FIVE, start="optimise", model=FOPDT(model["K"], model["T"], model["L"]))
     for entered in (from_ultimate, from_overshoot, from_model):
         assert entered["outcome"] == "proposed", entered["detail"]
         assert entered["gains"] == pytest.approx(whole["gains"], rel=0.02)
@@ -77,5 +90,7 @@ def test_the_procedure_can_be_entered_at_each_stage_by_hand() -> None:
 
 
 def test_values_typed_in_are_checked() -> None:
-    assert rehearse(LAG, start="zn_pi", Ku=4.0)["reason"] == "bad_input"
-    assert rehearse(LAG, start="optimise", model=FOPDT(-2.0, 5.0, 1.0))["reason"] == "wrong_sign"
+    assert rehearse(LAG, FIVE, start="zn_pi", Ku=4.0)["reason"] == "bad_input"
+    assert rehearse(LAG, FIVE, start="optimise", model=FOPDT(-2.0, 5.0, 1.0))["reason"] == "wrong_sign"
+    assert rehearse(LAG, "fast", model=FOPDT(-2.0, 5.0, 1.0))["reason"] == "wrong_sign"
+    assert rehearse(LAG, "fast", Ms=0.9)["reason"] == "bad_input"

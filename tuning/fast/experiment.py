@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 
 from tuning.fast.evidence import LEAST_SWITCHES, Evidence, noise_of, period
+from tuning.fast.results import Recorded
 from tuning.gains import Gains
 from tuning.plan import Command, Event, Mode, Plan, Sample, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint, Work
 from tuning.reasons import Reason, Refused
@@ -54,6 +56,24 @@ class Experiment:
         self._high = True
         self._raise_at = 0
         self._commands: tuple[Command, ...] = ()
+        self._step = 0.0
+
+    def recorded(self) -> Recorded:
+        """The relay's record so far, in numbers."""
+        evidence = self.evidence()
+        return Recorded(
+            switches=len(evidence.switches),
+            period_s=evidence.period * evidence.Ts,
+            span=evidence.span,
+            noise=self.noise,
+            amplitude=self.amplitude,
+            samples=len(evidence.y),
+        )
+
+    @property
+    def stepped(self) -> tuple[float, float]:
+        """The set-point step, PV units, and how long ago it was made, s."""
+        return self._step, self.trace.t[-1] - self.trace.t[self.relayed]
 
     def tell(self, *events: Event) -> Plan[None]:
         """The sample that an event takes belongs to the record."""
@@ -87,6 +107,7 @@ class Experiment:
         error = (point.pv - self.trace.pv[-1]) * (1.0 if facts.reverse else -1.0)
         output = min(max(point.mv + gains.Kp * error, facts.mv_low), facts.mv_high)
         self.trace.add((yield (SetMode(Mode.MANUAL), SetOutput(output), SetGains(gains))))
+        self._step = size
         yield from self._follow((SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp + size)), span)
 
     def step_back(self) -> Plan[None]:
@@ -185,7 +206,8 @@ class Experiment:
         passed = len(self.trace) - self.listened
         if len(self.switches) < 2:
             if passed * self.facts.sample_time_s > max(3.0 * self.facts.T95_s, 40 * self.facts.sample_time_s):
-                raise no_oscillation(self.facts, self.point, self._since(), len(self.switches))
+                point = replace(self.point, room=self.amplitude)  # what it tells is what the relay moved
+                raise no_oscillation(self.facts, point, self._since(), len(self.switches))
             return False
         halves = np.diff(self.switches)
         known = period(tuple(self.switches)) if len(halves) >= 2 else 2.0 * float(halves[0])

@@ -9,21 +9,17 @@ on the whole record, relay and set-point step.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
-from tuning.assess import assess
-from tuning.design import Predicted, Ultimate
 from tuning.fast.design import Wish
 from tuning.fast.evidence import LEAST_LISTENED
 from tuning.fast.experiment import Experiment
+from tuning.fast.results import FastProposal, Verified, found_of, proposed, verified
 from tuning.fast.verdict import Judged, judge
-from tuning.gains import Gains
-from tuning.margins import ultimate_point
 from tuning.models import sign
 from tuning.plan import Note, Plan, StageDone, StageStarted
-from tuning.reasons import Ended, Reason, Refused
+from tuning.reasons import Reason, Refused
 from tuning.stages.common import Facts, Trace
 from tuning.stages.preflight import preflight
 
@@ -64,53 +60,6 @@ class FastOptions:
             raise Refused(Reason.BAD_INPUT, f"amplitude must be a positive number, not {self.amplitude!r}")
 
 
-@dataclass(frozen=True, slots=True)
-class LoadStep:
-    """A step of the load that the record shows. t_s: since the relay's start.  size: MV units at the plant's input."""
-
-    t_s: float
-    size: float
-
-
-@dataclass(frozen=True, slots=True)
-class Found:
-    """What one evaluation of the record came to.
-
-    num, den (highest power first), L_s: the plant.  cause: why it is not enough, None if it is.  uncertainty,
-    ambiguity: of Ms.  residual: in noises at rest.
-    """
-
-    structure: str
-    num: tuple[float, ...]
-    den: tuple[float, ...]
-    L_s: float
-    gains: Gains
-    Ms: float
-    uncertainty: float
-    ambiguity: float
-    residual: float
-    loads: tuple[LoadStep, ...]
-    drift: bool
-    switches: int
-    period_s: float
-    cause: str | None
-    detail: str
-
-
-@dataclass(frozen=True, slots=True)
-class FastProposal:
-    """What the operator decides on. Gains in ISA form, MV per PV unit and seconds."""
-
-    method: str
-    chosen: Mapping[str, float]
-    found: Found
-    old_gains: Gains
-    gains: Gains
-    predicted: Predicted
-    ultimate: Ultimate | None
-    notes: tuple[str, ...]
-
-
 def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
     """The whole procedure on a loop in automatic and at rest. Raises Refused; restores nothing (the runner does)."""
     T95, wish = facts.T95_s, options.wish()
@@ -133,6 +82,7 @@ def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
     careful = options.careful or not options.verify
     for switches in SWITCHES[careful:]:
         in_time = yield from experiment.relay(switches)
+        judged = None
         try:
             judged = yield from experiment.computed(partial(judge, experiment.evidence(), wish))
             ended = _wrong(facts, judged)
@@ -141,37 +91,34 @@ def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
         if ended is None or not in_time:
             break
         yield from experiment.tell(Note(f"after {switches} switches: {ended.detail}"))
+    # refused or not, what the record came to is told: it says why
+    yield from experiment.tell(StageDone("relay", experiment.recorded()), *started("design"))
+    if judged is not None:
+        yield from experiment.tell(StageDone("design", found_of(judged)))
     if ended is not None or judged is None:
         raise ended or Refused(Reason.STALLED, "the relay came to nothing")
-    found = _found(judged)
-    yield from experiment.tell(StageDone("relay", found), *started("design"), StageDone("design", found))
 
+    shown: Verified | None = None
     if options.verify:
         yield from experiment.tell(*started("verify"))
-        yield from experiment.step(judged.best.gains)
         first = judged
+        tested = first.best.gains
+        yield from experiment.step(tested)
         judged = yield from experiment.computed(partial(judge, experiment.evidence(), wish, first))
         ended = _wrong(facts, judged)
+        shown = verified(judged, tested, *experiment.stepped)
         if ended is not None and ended.reason in NOT_YET:
             yield from experiment.tell(Note(f"after the set-point step: {ended.detail}; it is stepped back"))
             yield from experiment.step_back()
             judged = yield from experiment.computed(partial(judge, experiment.evidence(), wish, first))
             ended = _wrong(facts, judged)
-        found = _found(judged)
-        yield (StageDone("verify", found), *started("redesign"), StageDone("redesign", found))
+            shown = verified(judged, tested, *experiment.stepped)
+        yield (StageDone("verify", shown), *started("redesign"), StageDone("redesign", found_of(judged)))
         if ended is not None:
             raise ended
-    gains = judged.best.gains
-    return FastProposal(
-        method=FAST,
-        chosen={"Ms": wish.Ms, **({"N": wish.N} if gains.Td else {})},
-        found=found,
-        old_gains=facts.old_gains,
-        gains=gains,
-        predicted=_predicted(judged),
-        ultimate=_ultimate(judged),
-        notes=tuple(_notes(found, experiment.trace.t[experiment.listened])),
-    )
+    chosen = {"Ms": wish.Ms, **({"N": wish.N} if judged.best.gains.Td else {})}
+    relay_at_s = experiment.trace.t[experiment.listened]
+    return (yield from experiment.computed(partial(proposed, facts, chosen, judged, shown, relay_at_s)))
 
 
 def _wrong(facts: Facts, judged: Judged) -> Refused | None:
@@ -184,60 +131,3 @@ def _wrong(facts: Facts, judged: Judged) -> Refused | None:
             f"{'reverse' if facts.reverse else 'direct'}",
         )
     return None if judged.cause is None else Refused(Reason(judged.cause), judged.detail)
-
-
-def _found(judged: Judged) -> Found:
-    fit, best = judged.fit, judged.chosen.best
-    evidence, structure, theta, c = fit.evidence, best.structure, best.theta, best.linear.coefficients
-    order, count = structure.order, best.hypothesis.loads
-    first = len(c) - order * count
-    loads = tuple(
-        LoadStep(
-            (float(theta[structure.searched + i] - theta[structure.lags]) - evidence.listened) * evidence.Ts,
-            float(c[first + i * order] / c[0]) * evidence.swing,
-        )
-        for i in range(count)
-    )
-    return Found(
-        structure=structure.name,
-        num=judged.model.num,
-        den=judged.model.den,
-        L_s=judged.model.L,
-        gains=judged.best.gains,
-        Ms=judged.Ms,
-        uncertainty=judged.uncertainty,
-        ambiguity=judged.ambiguity,
-        residual=judged.residual,
-        loads=loads,
-        drift=best.hypothesis.drift,
-        switches=len(evidence.switches),
-        period_s=evidence.period * evidence.Ts,
-        cause=judged.cause,
-        detail=judged.detail,
-    )
-
-
-def _predicted(judged: Judged) -> Predicted:
-    found = assess(judged.model, judged.best.gains, band=0.05)
-    m, figures = found.margins, found.setpoint
-    if figures is None:
-        raise Refused(Reason.NOT_ROBUST, "the gains designed are not stable on their own model")
-    return Predicted(m.Ms, m.GM, m.PM_deg, figures.overshoot_pct, figures.settling_s, figures.IAE)
-
-
-def _ultimate(judged: Judged) -> Ultimate | None:
-    try:
-        return Ultimate(*ultimate_point(judged.model))
-    except Ended:
-        return None
-
-
-def _notes(found: Found, start_s: float) -> list[str]:
-    notes = [
-        f"A step of the load of {load.size:+.3g} at the plant's input was found {load.t_s:.4g} s after the start of "
-        f"the relay (at {start_s + load.t_s:.4g} s), and allowed for."
-        for load in found.loads
-    ]
-    if found.drift:
-        notes.append("PV drifted at a steady rate during the test; this was allowed for.")
-    return notes

@@ -193,9 +193,9 @@ class Service:
         jobs.boot()
         return jobs
 
-    def wait(self, job_id: str) -> None:
+    def wait(self, job_id: str, most_s: float = 10.0) -> None:
         """Until the job is over."""
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + most_s
         while JobState(self.store.get(job_id).state) in ACTIVE and time.monotonic() < deadline:
             time.sleep(0.005)
 

@@ -142,7 +142,26 @@ def test_absent_node(service: Service, client: TestClient) -> None:
         ({"sp_deviation": 3}, "bad_limits", "more than"),
         ({"pv_low": 49, "pv_high": 51}, "bad_limits", "twice"),
         ({"sp_deviation": -1}, "bad_input", "sp_deviation"),
-        ({"start": "zn_pi"}, "bad_input", "Ku, Pu_s"),
+        ({"method": "five-stage", "start": "zn_pi"}, "bad_input", "Ku, Pu_s"),
+        # options of one procedure with the other
+        ({"start": "zn_pi", "Ku": 2, "Pu_s": 3}, "bad_input", "Ku, Pu_s, start: of the five-stage experiment, not of"),
+        ({"overshoot_window_pct": [8, 50]}, "bad_input", 'add "method": "five-stage"'),
+        ({"baseline": True}, "bad_input", "baseline: of the five-stage"),
+        ({"method": "fast", "method_options": {"Ms": 1.4}}, "bad_input", "method_options: of the five-stage"),
+        ({"method": "five-stage", "ms": 1.4, "careful": True}, "bad_input", 'ms, careful: of "method": "fast"'),
+        ({"method": "simc", "amplitude_pct": 5}, "bad_input", 'amplitude_pct: of "method": "fast", not of simc'),
+        ({"method": "simc", "start": "design"}, "bad_input", 'start: of "method": "fast"'),
+        ({"start": "design"}, "bad_input", "start=design needs model"),
+        ({"model": {"K": 1, "T_s": 3, "L_s": 1}}, "bad_input", "model is for start=design"),
+        (
+            {"method": "five-stage", "start": "optimise", "model": {"num": [1], "den": [3, 1]}},
+            "bad_input",
+            "five-stage takes a model of the form K, T_s, L_s",
+        ),
+        ({"start": "design", "model": {"num": [1], "den": [1]}}, "bad_input", "needs a pole"),
+        ({"ms": 1.1}, "bad_input", "ms"),
+        ({"ms": 2.1}, "bad_input", "ms"),
+        ({"amplitude_pct": 70}, "bad_limits", "needs 105 % of MV between its limits, there are 100 %"),
         ({"sp_devation": 1}, "bad_input", "sp_devation"),
         ({"plant": {"num": [1], "den": [1, 1]}}, "bad_input", "dry run"),
     ],
@@ -151,6 +170,13 @@ def test_bad_requests(client: TestClient, body: dict[str, Any], reason: str, wor
     problem = assert_problem(client.post(f"/loops/{TAG}/retune", json=body), 422)
     assert problem["reason"] == reason and words in problem["detail"]
     assert client.get("/jobs").json() == []
+
+
+def test_the_request_kept_has_the_options_of_its_method_alone(service: Service, client: TestClient) -> None:
+    asked = finished(service, client, baseline=False)["request"]
+    assert asked["method"] == "fast" and asked["ms"] == 1.6 and "overshoot_window_pct" not in asked
+    asked = finished(service, client, method="simc", method_options={"tau_c_s": 2})["request"]
+    assert asked["method"] == "simc" and asked["method_options"] == {"tau_c_s": 2.0} and "ms" not in asked
 
 
 @pytest.mark.parametrize("body", ['{"sp_deviation": NaN}', '{"mv_low": Infinity}', "{", "[]"])

@@ -9,13 +9,16 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.model_forms import parse_model
-from service.request import RetuneRequest
+from service.request import PlantModel, RetuneRequest
 from service.tunings import tunings
-from tests.unit.service.fakes import RESULT, Service
+from service.work import rehearse
+from tests.unit.service.fakes import RESULT, TAG, FakeLoop, Service
 from tests.unit.service.test_api import assert_problem, finished, start
 from tuning.design import design
+from tuning.gains import Gains
+from tuning.margins import margins
 from tuning.methods import METHODS
-from tuning.models import FOPDT, SOPDT
+from tuning.models import FOPDT, SOPDT, TransferFunction
 from tuning.reasons import Reason, Refused
 
 FAST = [name for name, method in METHODS.items() if not method.slow]
@@ -104,7 +107,8 @@ def test_alternatives_to_a_proposal(service: Service, client: TestClient) -> Non
             assert asked.model and asked.model.plant() == FOPDT(2.0, 3.0, 1.0)
     direct = client.post("/tunings", json={"model": found["model"], "method": "amigo"}).json()["methods"][0]
     (amigo,) = [each for each in found["methods"] if each["method"] == "amigo"]
-    assert {name: value for name, value in amigo.items() if name != "retune"} == direct
+    assert {name: value for name, value in amigo.items() if name in direct} == direct
+    assert amigo["uncertainty"] is None and amigo["ambiguity"] is None
     client.post(f"{job['url']}/accept")
     assert client.get(f"{job['url']}/alternatives").json() == found
 
@@ -123,7 +127,6 @@ def test_unstable_gains_are_not_to_be_tried(
 ) -> None:
     from service import tunings as module
     from tuning.assess import assess
-    from tuning.gains import Gains
 
     # a hundred times the gains that the method found
     monkeypatch.setattr(module, "realisable", lambda gains, _filter: (Gains(100.0 * gains.Kp, gains.Ti), ()))
@@ -157,9 +160,62 @@ def test_a_refused_job_whose_stages_found_a_model(service: Service, client: Test
 def test_a_refused_job_whose_model_was_typed_in(service: Service, client: TestClient) -> None:
     service.tune.ends = Refused(Reason.NOT_CONFIRMED, "overshoot 60 %")
     model = {"K": 2.0, "T_s": 6.0, "L_s": 3.0, "zeta": 0.5}
-    job = finished(service, client, start="optimise", model=model)
+    job = finished(service, client, method="five-stage", start="optimise", model=model)
     found = client.get(f"{job['url']}/alternatives?method=direct-synthesis").json()
     assert job["state"] == "refused" and found["model"] == {"K": 2.0, "T": 6.0, "zeta": 0.5, "L": 3.0}
+
+
+@pytest.mark.parametrize(("Ms", "derivative"), [(1.2, False), (1.4, True), (2.0, False)])
+def test_gains_of_fast_for_another_Ms(service: Service, client: TestClient, Ms: float, derivative: bool) -> None:
+    """Of a job whose record is not kept: on its model."""
+    job = finished(service, client)
+    query = f"ms={Ms}&derivative={str(derivative).lower()}"
+    found = client.get(f"{job['url']}/alternatives?{query}").json()
+    (fast,) = found["methods"]
+    assert (fast["method"], fast["outcome"], fast["uncertainty"]) == ("fast", "tuned", None)
+    gains = Gains(fast["gains"]["Kp"], fast["gains"]["Ti"], fast["gains"]["Td"], fast["gains"]["Tf"])
+    # the fake loop samples every 0.1 s
+    assert margins(FOPDT(2.0, 3.0, 1.05), gains).Ms == pytest.approx(Ms, abs=0.01)
+    assert fast["margins"]["Ms"] == pytest.approx(Ms, abs=0.01) and fast["setpoint"]["IAE"] > 0
+    assert (gains.Td > 0) == derivative
+    asked = RetuneRequest(**fast["retune"])
+    assert (asked.method, asked.start, asked.ms, asked.derivative) == ("fast", "design", Ms, derivative)
+    assert asked.model is not None
+    plant = asked.model.plant()
+    assert plant.num[-1] / plant.den[-1] == pytest.approx(2.0) and plant.L == 1.0
+    assert client.post(f"/loops/{job['loop']}/retune", json=fast["retune"]).status_code == 202
+
+
+@pytest.mark.parametrize(
+    "query", ["ms=1.1", "ms=2.5", "ms=nan", "ms=1.4&method=simc", "derivative=true", "ms=1.4&derivative=x"]
+)
+def test_bad_wishes_for_another_Ms(service: Service, client: TestClient, query: str) -> None:
+    job = finished(service, client)
+    assert assert_problem(client.get(f"{job['url']}/alternatives?{query}"), 422)["reason"] == "bad_input"
+
+
+def test_another_Ms_from_the_record_of_a_job(service: Service, client: TestClient) -> None:
+    """The same gains as a job that was asked for it from the start, without its experiment."""
+    jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
+    plant = {"num": [1.0], "den": [8.0, 6.0, 1.0], "dead_time_s": 1.0, "noise_std": 0.02, "sample_time_s": 0.1}
+    rows = [
+        jobs.start(TAG, RetuneRequest(dry_run=True, plant=PlantModel(**plant), ms=ms, verify=False))
+        for ms in (1.4, 1.6)
+    ]
+    for row in rows:
+        service.wait(row.id, 60)
+    asked, other = (client.get(f"/jobs/{row.id}").json() for row in rows)
+    assert asked["state"] == other["state"] == "proposed", (asked["detail"], other["detail"])
+    (found,) = client.get(f"{other['url']}/alternatives?ms=1.4").json()["methods"]
+    assert found["outcome"] == "tuned" and 0 < found["uncertainty"] < 0.1
+    for gain in ("Kp", "Ti"):
+        assert found["gains"][gain] == pytest.approx(asked["new_gains"][gain], rel=0.01)
+        assert found["gains"][gain] != pytest.approx(other["new_gains"][gain], rel=0.01)
+    true = TransferFunction((1.0,), (8.0, 6.0, 1.0), 1.05)
+    assert margins(true, Gains(found["gains"]["Kp"], found["gains"]["Ti"])).Ms == pytest.approx(1.4, abs=0.05)
+    (same,) = client.get(f"{other['url']}/alternatives?ms=1.6").json()["methods"]
+    assert same["gains"]["Kp"] == pytest.approx(other["new_gains"]["Kp"], rel=0.01)
+    jobs.stop()
 
 
 def test_jobs_without_a_model(service: Service, client: TestClient) -> None:

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from service.api.results import ModelView, TransferModelView
+from service.api.views import job_view
 from service.progress import Progress
 from service.request import RetuneRequest
 from service.states import JobState
@@ -71,12 +73,41 @@ def test_a_dry_run_guesses_a_plant_that_fits_the_loop(service: Service) -> None:
     assert spec["mv_limits"] == [-50.0, 50.0]
 
 
-def test_a_real_rehearsal_through_a_job(service: Service) -> None:
+@pytest.mark.parametrize("method", ["fast", "five-stage"])
+def test_a_real_rehearsal_through_a_job(service: Service, method: str) -> None:
     jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
-    row = jobs.start(TAG, RetuneRequest(dry_run=True))
-    service.wait(row.id)
+    row = jobs.start(TAG, RetuneRequest(dry_run=True, method=method))
+    service.wait(row.id, 60)
     jobs.stop()
     row = service.store.get(row.id)
     assert (row.state, row.reason) == ("proposed", None), row.detail
-    assert row.result is not None
-    assert row.result["gains"]["Kp"] > 0 and row.result["model"]["T_s"] > 0 and row.result["predicted"]["Ms"] < 2.1
+    view = job_view(row, service.store.events(row.id), None)
+    assert row.result is not None and view.method == method
+    assert view.new_gains is not None and view.new_gains.Kp > 0
+    assert view.predicted is not None and view.predicted.Ms < 2.1
+    # the plant that is guessed: a tenth of MV for the step, T95 = L + 3 T
+    K, T, L = 0.2, 2.4, 1.8
+    if method == "five-stage":
+        assert isinstance(view.model, ModelView) and view.model.T_s > 0
+        assert view.before and view.after and view.before.settled and view.after.settled
+        return
+    model = view.model
+    assert isinstance(model, TransferModelView) and model.num_errors is not None
+    assert model.num[-1] / model.den[-1] == pytest.approx(K, rel=1e-3)
+    assert model.den[0] / model.den[-1] == pytest.approx(T, rel=1e-3)
+    assert model.dead_time_s == pytest.approx(L, rel=1e-3)
+    assert view.predicted.Ms == pytest.approx(1.6, abs=0.01)
+    assert view.predicted_before and view.evidence and view.verification
+    assert view.evidence.cause is None and view.evidence.switches >= 4
+    assert view.verification.fit_pct > 99.9 and view.verification.Ms == pytest.approx(1.6, abs=0.05)
+    assert view.before is None and view.after is None
+    assert "overshoot_window_pct" not in row.request and row.request["ms"] == 1.6
+
+
+def test_samples_of_a_rehearsal_are_kept(service: Service) -> None:
+    jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
+    row = jobs.start(TAG, RetuneRequest(dry_run=True, ms=1.4))
+    service.wait(row.id, 60)
+    jobs.stop()
+    stages = [stage for stage, _ in service.store.samples(row.id)]
+    assert {"preflight", "relay", "verify"} <= set(stages)

@@ -45,6 +45,14 @@ ENDS: dict[str, Ended | None] = {
 }
 MOST_ATTEMPTS = 10
 WHICH = st.integers(0, 15)
+OPTIONS: tuple[dict[str, Any], ...] = (
+    {},
+    {"ms": 1.4, "derivative": True, "amplitude_pct": 10.0, "careful": True, "verify": False},
+    {"start": "design", "model": {"num": [1.0], "den": [3.0, 1.0], "dead_time_s": 1.0}},
+    {"method": "five-stage", "overshoot_window_pct": (8.0, 50.0), "baseline": False},
+    {"method": "simc", "method_options": {"tau_c_s": 2.0}},
+)
+"""A job is read back from its row after a crash: with the options of its method alone."""
 RULES = {
     "submit: queued", "submit: busy", "begin: running", "begin: again", "end: proposed", "end: refused", "end: failed",
     "end: aborted", "abort: aborted", "abort: illegal", "accept: accepted", "accept: illegal", "accept: conflict",
@@ -194,12 +202,15 @@ class JobsMachine(RuleBasedStateMachine):
         assert not self.engine.threads[job.id].is_alive()
 
     # rules
-    @rule(loop=st.sampled_from(TAGS), dry=st.sampled_from((False, False, False, True)), begins=st.booleans())
-    def submit(self, loop: str, dry: bool, begins: bool) -> None:
+    @rule(
+        loop=st.sampled_from(TAGS), dry=st.sampled_from((False, False, False, True)), begins=st.booleans(),
+        options=st.sampled_from(OPTIONS),
+    )  # fmt: skip
+    def submit(self, loop: str, dry: bool, begins: bool, options: dict[str, Any]) -> None:
         n = len(self.acts)
         name = f"wish {n}"
         self.acts[name] = act = Act(Gains(0.6 + 0.01 * n, 3.0))
-        request = RetuneRequest(requested_by=name, dry_run=dry)
+        request = RetuneRequest(requested_by=name, dry_run=dry, **options)
         other = None if dry else self.having(loop)
         if other is not None:
             with pytest.raises(Busy) as busy:
@@ -243,7 +254,7 @@ class JobsMachine(RuleBasedStateMachine):
     def propose(self, loop: str) -> None:
         """A job from its beginning to its end, where the loop is free: decisions are what is then tried."""
         if self.having(loop) is None:
-            self.submit(loop, dry=False, begins=True)
+            self.submit(loop, dry=False, begins=True, options={})
             self.ended(self.jobs[-1], "proposed")
 
     @precondition(lambda self: len(self.jobs) > 1)

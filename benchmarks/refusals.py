@@ -1,0 +1,191 @@
+"""A rehearsal of fast that is refused, for each cause that can be provoked, with the picture of its job.
+
+python -m benchmarks.refusals docs/refusals
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from controller.channel import Channel, Settings
+from plantsim.plant import LinearPlant
+from service.fast_picture import fast_job
+from service.fast_record import kept
+from service.plain import plain
+from service.rehearsal import RehearsedLoop, _parameters
+from service.runner import Watch, run
+from tuning.fast.procedure import FastOptions, fast
+from tuning.fast.results import Found
+from tuning.gains import Gains
+from tuning.plan import Event, Mode, Sample, StageDone, StageStarted
+from tuning.stages.common import Facts
+
+TS, T95, MIDDLE, SP = 0.1, 26.0, 50.0, 20.0
+OLD = Gains(1.0, 10.0)
+COLOURS = 48
+"""Of a picture that goes into the documents: a third of the bytes."""
+Change = Callable[[float, float], float]
+"""A signal and the time in s since the stage began that the change is of."""
+
+
+def _same(value: float, t: float) -> float:
+    return value
+
+
+@dataclass
+class Case:
+    """why: what is wrong with the plant, in words. of: the stage from which on it is."""
+
+    why: str
+    mv: Change = _same
+    pv: Change = _same
+    of: str = "relay"
+    options: dict[str, Any] = field(default_factory=dict)
+    num: tuple[float, ...] = (0.5,)
+    den: tuple[float, ...] = (8.0, 1.0)
+    dead_time_s: float = 2.0
+    noise: float = 0.02
+    reverse: bool = True
+    gains: Gains = OLD
+    seed: int = 1
+
+
+class Odd:
+    """A linear plant around an operating point, whose input and output are tampered with from a stage on."""
+
+    def __init__(self, case: Case) -> None:
+        self._case = case
+        self._plant = LinearPlant(
+            list(case.num), list(case.den), case.dead_time_s, TS, noise_std=case.noise, seed=case.seed
+        )
+        self.t: float | None = None
+
+    @property
+    def pv(self) -> float:
+        return SP + self._plant.pv
+
+    def step(self, mv: float) -> float:
+        case, t = self._case, self.t
+        if t is None:
+            return SP + self._plant.step(mv - MIDDLE)
+        self.t = t + TS
+        return SP + case.pv(self._plant.step(case.mv(mv - MIDDLE, t)), t)
+
+
+class Sticking:
+    """A valve that moves only when it is pushed by more than its stiction."""
+
+    def __init__(self, stiction: float) -> None:
+        self._stiction, self._at = stiction, 0.0
+
+    def __call__(self, mv: float, t: float) -> float:
+        if abs(mv - self._at) > self._stiction:
+            self._at = mv - math.copysign(0.5 * self._stiction, mv - self._at)
+        return self._at
+
+
+def _load(size: float, at: float) -> Change:
+    return lambda mv, t: mv + (size if t >= at else 0.0)
+
+
+def cases() -> dict[str, Case]:
+    """By the cause that each is meant to end with."""
+    return {
+        "no_response": Case("the valve is shut: MV reaches nothing", mv=lambda mv, t: 0.0),
+        "wrong_sign": Case(
+            "the controller is set to direct action on a plant of positive gain", reverse=False, gains=Gains(1e-6, 0.0)
+        ),
+        "cannot_oscillate": Case("a load as large as the relay comes right after its start", mv=_load(20.0, 3.0)),
+        "stalled": Case("a load of twice the relay comes in its second period", mv=_load(60.0, 12.0)),
+        "unexplained": Case("the valve sticks: it moves only when pushed by 12 %", mv=Sticking(12.0)),
+        "disturbed": Case(
+            "another loop swings, and moves PV by a little more than its noise",
+            pv=lambda pv, t: pv + 0.03 * math.sin(3.0 * t), noise=0.03,
+        ),
+        "uncertain": Case("the relay is too small for the noise", options={"amplitude": 1.0}, noise=0.1),
+        "diverges": Case("the sensor's range is switched as the new gains are tried", pv=lambda pv, t: 100.0 * pv,
+                         of="verify"),
+    }  # fmt: skip
+
+
+def rehearsed(cause: str, case: Case) -> dict[str, Any]:
+    """The job, as GET /jobs/{id} would show it, with its samples as columns."""
+    plant = Odd(case)
+    settings = Settings(mv_low=0.0, mv_high=100.0, safe_output=MIDDLE, pv_low=-1e9, pv_high=1e9, reverse=case.reverse)
+    loop = RehearsedLoop(plant, Channel(TS, settings, _parameters(case.gains), SP, int(Mode.AUTOMATIC), MIDDLE), TS)
+    stages: list[tuple[float, str]] = []
+    samples: list[Sample] = []
+    found: dict[str, Any] | None = None
+
+    def hear(event: Event) -> None:
+        nonlocal found
+        if isinstance(event, StageStarted):
+            stages.append((len(samples), event.stage))
+            if event.stage == case.of:
+                plant.t = 0.0
+        elif isinstance(event, StageDone) and isinstance(event.result, Found):
+            found = plain(event.result)
+
+    class Heard:
+        def __getattr__(self, name: str) -> Any:
+            return getattr(loop, name)
+
+        def step(self, commands: Any) -> Sample:
+            samples.append(loop.step(commands))
+            return samples[-1]
+
+    facts = Facts(TS, T95, 0.0, 100.0, 2.0, case.gains, case.reverse)
+    ran = run(fast(facts, FastOptions(**case.options)), Heard(), watch=Watch(), on_event=hear)  # type: ignore[arg-type]
+    names = [next(name for first, name in reversed(stages) if first <= i) for i in range(len(samples))]
+    ended = ran.ended
+    return {
+        "loop": case.why,
+        "state": "proposed" if ran.value else "refused",
+        "reason": ended.reason.value if ended else None,
+        "detail": ended.detail if ended else None,
+        "advice": ended.advice if ended else None,
+        "new_gains": plain(ran.value.gains) if ran.value else None,
+        "old_gains": plain(case.gains),
+        "evidence": found,
+        "model": plain(ran.value.model) if ran.value else None,
+        "verification": None,
+        "samples": {
+            "stage": names,
+            **{key: [getattr(s, name) for s in samples]
+               for key, name in (("t_s", "t"), ("sp", "sp"), ("pv", "pv"), ("mv", "mv"), ("mode", "mode"))},
+        },
+    }  # fmt: skip
+
+
+def draw(folder: Path, cause: str, job: dict[str, Any]) -> Path:
+    record = kept(job["samples"])
+    assert record is not None
+    path = folder / f"{cause.replace('_', '-')}.png"
+    fast_job(path, job, record, "degC")
+    Image.open(path).convert("RGB").quantize(COLOURS).save(path, optimize=True)
+    return path
+
+
+def main() -> None:
+    folder = Path(sys.argv[1])
+    folder.mkdir(parents=True, exist_ok=True)
+    only = sys.argv[2:]
+    for cause, case in cases().items():
+        if only and cause not in only:
+            continue
+        job = rehearsed(cause, case)
+        path = draw(folder, cause, job)
+        print(
+            f"{cause}: {job['state']} {job['reason']}: {job['detail']} ({path.stat().st_size // 1000} kB)", flush=True
+        )
+
+
+if __name__ == "__main__":
+    main()

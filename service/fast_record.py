@@ -1,0 +1,75 @@
+"""The record of a fast experiment, read again from the samples of its job: for another Ms, or for a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tuning.fast.evidence import LEAST_LISTENED, LEAST_SWITCHES, Evidence
+from tuning.models import Reals
+from tuning.plan import Mode
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Kept:
+    """Columns of the last attempt of a job. t: s since the relay began.  sp, pv, mv: as they were.
+
+    listened: samples before the relay.  relayed: up to its end.  switches: samples at which it switched.
+    """
+
+    Ts: float
+    t: Reals
+    sp: Reals
+    pv: Reals
+    mv: Reals
+    listened: int
+    relayed: int
+    switches: tuple[int, ...]
+
+    @property
+    def rest(self) -> tuple[float, float]:
+        """MV and PV at rest."""
+        return float(np.mean(self.mv[: self.listened])), float(np.mean(self.pv[: self.listened]))
+
+    def evidence(self) -> Evidence | None:
+        """None where the relay did not come far enough for a fit."""
+        if len(self.switches) < LEAST_SWITCHES or self.listened < LEAST_LISTENED:
+            return None
+        mv, pv = self.rest
+        y = self.pv - pv
+        return Evidence(
+            Ts=self.Ts,
+            u=self.mv - mv,
+            y=y,
+            # the relay begins high, and switches where PV has gone the way that MV drives it
+            direction=1.0 if y[self.switches[0]] > 0.0 else -1.0,
+            listened=self.listened,
+            relayed=self.relayed,
+            switches=self.switches,
+        )
+
+
+def kept(columns: Mapping[str, Sequence[Any]]) -> Kept | None:
+    """columns: as of GET /jobs/{id}/samples. None where no relay was run."""
+    stage = columns["stage"]
+    first = max((i for i, name in enumerate(stage) if name == "preflight" and stage[max(i - 1, 0)] != name), default=0)
+    t, sp, pv, mv, mode = (np.asarray(columns[name][first:], dtype=float) for name in ("t_s", "sp", "pv", "mv", "mode"))
+    if len(t) < 2 or not np.any(mode == Mode.EXPERIMENT):
+        return None
+    Ts = float(np.median(np.diff(t)))
+    # samples lost on the way are made up: PV in between, all else as it was
+    number = np.round((t - t[0]) / Ts).astype(np.int64)
+    whole = np.arange(number[-1] + 1)
+    before = np.searchsorted(number, whole, side="right") - 1
+    pv = np.interp(whole, number, pv)
+    sp, mv, mode = sp[before], mv[before], mode[before]
+    listened = int(np.argmax(mode == Mode.EXPERIMENT))
+    after = np.flatnonzero(mode[listened:] != Mode.EXPERIMENT)
+    relayed = listened + int(after[0]) if len(after) else len(mode)
+    # the relay begins high
+    high = np.append(True, mv[listened:relayed] > np.mean(mv[: max(listened, 1)]))
+    switches = tuple(int(i) + listened for i in np.flatnonzero(high[1:] != high[:-1]))
+    return Kept(Ts, (whole - listened) * Ts, sp, pv, mv, listened, relayed, switches)

@@ -1,0 +1,29 @@
+"""Each cause for which fast refuses, provoked in a rehearsal, with its picture and its place in the documents."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.refusals import cases, draw, rehearsed
+from tuning.reasons import ADVICE, Reason
+
+PAGE = (Path(__file__).parents[2] / "docs" / "refusals.md").read_text(encoding="utf-8")
+WITH_FIT = {"unexplained", "disturbed", "uncertain", "diverges"}
+
+
+@pytest.mark.parametrize("cause", cases())
+def test_a_fault_is_refused_with_its_cause_and_shown(cause: str, tmp_path: Path) -> None:
+    job = rehearsed(cause, cases()[cause])
+    assert (job["state"], job["reason"]) == ("refused", cause), job["detail"]
+    assert job["detail"] and job["advice"] == ADVICE[Reason(cause)]
+    # what the record came to is told wherever it was enough for a fit
+    assert (job["evidence"] is not None) == (cause in WITH_FIT)
+    if cause in WITH_FIT - {"diverges"}:
+        assert job["evidence"]["cause"] == cause
+    picture = draw(tmp_path, cause, job)
+    assert 5_000 < picture.stat().st_size < 60_000
+    name = cause.replace("_", "-")
+    assert f"## {cause}\n" in PAGE and f"refusals/{name}.png" in PAGE
+    assert " ".join(ADVICE[Reason(cause)].split()) in " ".join(PAGE.split())

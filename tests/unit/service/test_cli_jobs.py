@@ -1,0 +1,114 @@
+"""`loopwright retune`, `job`, `alternatives` and `rehearse`: the options of fast, the picture, another Ms."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from typer.testing import CliRunner, Result
+
+from service import cli
+from tests.unit.service.fakes import TAG, FakeLoop, Service
+
+PLANT = {"num": [1.0], "den": [8.0, 6.0, 1.0], "dead_time_s": 1.0, "noise_std": 0.002, "sample_time_s": 0.1}
+
+
+class Through:
+    """The command line's client, on the service of the test."""
+
+    def __init__(self, client: TestClient) -> None:
+        self._client = client
+        self.posted: list[dict[str, Any]] = []
+
+    def get(self, path: str, **query: Any) -> Any:
+        return self._checked(self._client.get(path, params={k: v for k, v in query.items() if v is not None}))
+
+    def post(self, path: str, body: dict[str, Any] | None = None) -> Any:
+        self.posted.append(body or {})
+        return self._checked(self._client.post(path, json=body or {}))
+
+    @staticmethod
+    def _checked(answer: Any) -> Any:
+        assert answer.status_code < 300, answer.text
+        return answer.json()
+
+
+@pytest.fixture
+def through(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> Through:
+    through = Through(client)
+    monkeypatch.setattr(cli, "Client", lambda _url: through)
+    return through
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(cli.app, list(arguments))
+
+
+def test_the_options_of_fast_are_asked_for(service: Service, through: Through) -> None:
+    options = ("--ms", "1.4", "--derivative", "--amplitude", "10", "--careful", "--no-verify", "--no-wait", "--json")
+    result = run("retune", TAG, *options)
+    assert result.exit_code == 0, result.output
+    (body,) = through.posted
+    assert body == {
+        "ms": 1.4, "derivative": True, "amplitude_pct": 10.0, "careful": True, "verify": False, "requested_by": "cli",
+    }  # fmt: skip
+    job = json.loads(result.stdout)
+    service.wait(job["id"])
+    assert job["method"] == "fast" and job["request"]["ms"] == 1.4
+
+
+def test_five_stage_is_asked_for_by_its_name(service: Service, through: Through) -> None:
+    result = run("retune", TAG, "--method", "five-stage", "--no-wait", "--json")
+    assert result.exit_code == 0 and json.loads(result.stdout)["method"] == "five-stage"
+    service.wait(json.loads(result.stdout)["id"])
+
+
+@pytest.fixture
+def rehearsed(service: Service, through: Through) -> str:
+    """The id of a job that has rehearsed."""
+    from service.work import rehearse
+
+    jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
+    from service.request import PlantModel, RetuneRequest
+
+    row = jobs.start(TAG, RetuneRequest(dry_run=True, plant=PlantModel(**PLANT)))
+    service.wait(row.id, 60)
+    jobs.stop()
+    assert service.store.get(row.id).state == "proposed", service.store.get(row.id).detail
+    return row.id
+
+
+def test_a_job_and_its_picture_and_another_Ms(rehearsed: str, tmp_path: Path) -> None:
+    picture = tmp_path / "job.png"
+    shown = run("job", rehearsed, "--plot", str(picture))
+    assert shown.exit_code == 0, shown.output
+    assert picture.stat().st_size > 20_000
+    for words in ("predicted overshoot", "model num", "Ms uncertain by", "explained"):
+        assert words in shown.output
+    found = run("alternatives", rehearsed, "--ms", "1.4", "--json")
+    (fast,) = json.loads(found.stdout)["methods"]
+    assert fast["retune"]["start"] == "design" and fast["retune"]["ms"] == 1.4 and fast["uncertainty"] < 0.1
+    told = run("alternatives", rehearsed, "--ms", "1.4")
+    assert told.exit_code == 0 and '"start": "design"' in told.output.replace("\n", " ")
+    assert run("job", rehearsed, "--plot", "job.doc").exit_code == 2
+
+
+def test_a_job_without_a_record_has_no_picture(service: Service, through: Through, tmp_path: Path) -> None:
+    job = through.post(f"/loops/{TAG}/retune")["id"]
+    service.wait(job)
+    result = run("job", job, "--plot", str(tmp_path / "job.png"))
+    assert result.exit_code == 1 and "neither a relay's record nor a set-point step" in result.output
+
+
+def test_rehearse_is_fast_unless_told_otherwise(tmp_path: Path) -> None:
+    file = tmp_path / "plant.json"
+    file.write_text(json.dumps(PLANT))
+    answer = json.loads(run("rehearse", str(file), "--ms", "1.4", "--json").stdout)
+    assert (answer["method"], answer["chosen"]) == ("fast", {"Ms": 1.4})
+    assert answer["predicted"]["Ms"] == pytest.approx(1.4, abs=0.01)
+    assert answer["predicted_before"]["Ms"] < 1.4
+    assert json.loads(run("rehearse", str(file), "--method", "five-stage", "--json").stdout)["method"] == "five-stage"
+    assert run("rehearse", str(file), "--method", "five-stage", "--ms", "1.4").exit_code == 2

@@ -1,0 +1,87 @@
+"""The record of a fast job, read again from its samples."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.fast_record import kept
+from service.rehearsal import rehearse
+from tuning.fast.choice import choose
+from tuning.fast.fit import Fit
+from tuning.plan import Event, Mode, Sample, StageStarted
+
+SPEC = {"num": [-1.5], "den": [8.0, 1.0], "dead_time_s": 2.0, "sample_time_s": 0.1, "noise_std": 0.002, "t95_s": 26.0}
+
+
+def rehearsed(**options: Any) -> tuple[dict[str, Any], dict[str, list[Any]]]:
+    """The answer, and the samples as the API gives them."""
+    starts: list[str] = []
+    taken: list[Sample] = []
+
+    def hear(event: Event) -> None:
+        if isinstance(event, StageStarted):
+            starts.append(event.stage)
+
+    answer = rehearse(SPEC, on_event=hear, on_samples=taken.extend, **options)
+    times = answer["plant_time_s"]
+    stage = [name for name in starts for _ in range(round(times[name] / SPEC["sample_time_s"]))]  # type: ignore[operator]
+    stage += stage[-1:] * (len(taken) - len(stage))
+    columns = {
+        "stage": stage[: len(taken)], "t_s": [s.t for s in taken], "sp": [s.sp for s in taken],
+        "pv": [s.pv for s in taken], "mv": [s.mv for s in taken], "mode": [s.mode for s in taken],
+    }  # fmt: skip
+    return answer, columns
+
+
+@pytest.fixture(scope="module")
+def job() -> tuple[dict[str, Any], dict[str, list[Any]]]:
+    answer, columns = rehearsed()
+    assert answer["outcome"] == "proposed"
+    return answer, columns
+
+
+def without(columns: dict[str, list[Any]], lost: set[int]) -> dict[str, list[Any]]:
+    return {name: [x for i, x in enumerate(values) if i not in lost] for name, values in columns.items()}
+
+
+@pytest.mark.parametrize("lost", [(), (300, 301, 302), (40, 250, 420, 421)])
+def test_the_same_model_comes_out_of_it_again(
+    job: tuple[dict[str, Any], dict[str, list[Any]]], lost: tuple[int, ...]
+) -> None:
+    answer, columns = job
+    record = kept(without(columns, set(lost)))
+    assert record is not None and len(record.t) == len(columns["t_s"])
+    assert record.Ts == pytest.approx(0.1) and record.t[record.listened] == 0.0
+    evidence = record.evidence()
+    assert evidence is not None
+    assert len(evidence.switches) == answer["found"]["switches"]
+    assert evidence.direction == -1.0  # the plant's gain is negative
+    fit = Fit(evidence)
+    model = fit.model(choose(fit).best)
+    assert model.num[-1] / model.den[-1] == pytest.approx(-1.5, rel=0.01)
+    assert abs(model.L - 2.0) < 0.05
+
+
+def test_the_last_attempt_counts(job: tuple[dict[str, Any], dict[str, list[Any]]]) -> None:
+    columns = job[1]
+    half = len(columns["t_s"]) // 2
+    cut = {name: values[:half] for name, values in columns.items()}
+    later = cut["t_s"][-1] + 0.1
+    both = {name: cut[name] + values for name, values in columns.items() if name != "t_s"}
+    both["t_s"] = cut["t_s"] + [t + later for t in columns["t_s"]]
+    again, once = kept(both), kept(columns)
+    assert again is not None and once is not None
+    assert again.switches == once.switches and np.array_equal(again.pv, once.pv)
+
+
+def test_no_relay_no_record(job: tuple[dict[str, Any], dict[str, list[Any]]]) -> None:
+    columns = job[1]
+    quiet = [i for i, mode in enumerate(columns["mode"]) if mode != Mode.EXPERIMENT]
+    assert kept({name: [values[i] for i in quiet] for name, values in columns.items()}) is None
+    assert kept({name: [] for name in columns}) is None
+    first = columns["mode"].index(Mode.EXPERIMENT)
+    begun = kept({name: values[: first + 5] for name, values in columns.items()})
+    assert begun is not None and begun.evidence() is None

@@ -1,0 +1,79 @@
+"""Gains for another Ms on a model that is known already, tried on the loop: no relay."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+from tuning.design import Predicted
+from tuning.fast.design import Best, Design
+from tuning.fast.procedure import FAST, FastOptions
+from tuning.fast.results import FastProposal, FoundModel, delayed, predicted, predicted_before, ultimate
+from tuning.models import Model, TransferFunction, sign, time_constants
+from tuning.plan import Plan, StageDone, StageStarted, worked
+from tuning.reasons import Reason, Refused
+from tuning.stages.common import Facts
+from tuning.stages.preflight import preflight
+from tuning.stages.step_test import StepResult
+from tuning.stages.verification import verification
+
+__all__ = ["TRIAL_STAGES", "designed_on", "trial"]
+
+TRIAL_STAGES = ("preflight", "design", "verify")
+
+
+def designed_on(model: Model, options: FastOptions, sample_time_s: float) -> tuple[Best, Predicted]:
+    """The best gains on the model and what it predicts of them. Raises Refused, NOT_ROBUST."""
+    known = ultimate(model)
+    # without an ultimate point the loop's time is that of its lags and dead time
+    period = known.Pu_s if known else 4.0 * (model.L + float(max(time_constants(model), default=0.0)))
+    sampled = delayed(model, 0.5 * sample_time_s)
+    best = Design(sampled, options.wish(), period).best()
+    return best, predicted(sampled, best.gains)
+
+
+def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal]:
+    """On a loop in automatic and at rest. Raises Refused; restores nothing (the runner does)."""
+    expected = {"preflight": facts.T95_s / 2, "design": 0.0, "verify": 6 * facts.T95_s}
+    todo = TRIAL_STAGES if options.verify else TRIAL_STAGES[:2]
+
+    def started(stage: str) -> tuple[StageStarted]:
+        after = todo[todo.index(stage) + 1 :]
+        return (StageStarted(stage, expected[stage], sum(expected[s] for s in after)),)
+
+    yield started("preflight")
+    point = yield from preflight(facts)
+    yield (StageDone("preflight", point), *started("design"))
+    if (sign(model) > 0.0) != facts.reverse:
+        raise Refused(
+            Reason.WRONG_SIGN,
+            f"the model's gain is {'positive' if sign(model) > 0.0 else 'negative'}; the controller acts "
+            f"{'reverse' if facts.reverse else 'direct'}",
+        )
+    best, promised = yield from worked(partial(designed_on, model, options, facts.sample_time_s))
+    sampled = delayed(model, 0.5 * facts.sample_time_s)
+    before = yield from worked(partial(predicted_before, sampled, facts.old_gains))
+    gains = best.gains
+    yield (StageDone("design", gains),)
+    shown: StepResult | None = None
+    if options.verify:
+        yield started("verify")
+        gain = model.static_gain if math.isfinite(model.static_gain) else math.nan
+        shown = yield from verification(facts, point, gains, promised, gain, model.L)
+        yield (StageDone("verify", shown),)
+    wish = options.wish()
+    given = TransferFunction(model.num, model.den, model.L)
+    return FastProposal(
+        method=FAST,
+        chosen={"Ms": wish.Ms, **({"N": wish.N} if gains.Td else {})},
+        model=FoundModel("typed in", given.num, given.den, given.L),
+        old_gains=facts.old_gains,
+        gains=gains,
+        predicted=promised,
+        predicted_before=before,
+        ultimate=ultimate(model),
+        found=None,
+        verified=None,
+        verification=shown,
+        notes=(),
+    )
