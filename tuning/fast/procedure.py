@@ -148,7 +148,7 @@ def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
 
     if options.verify:
         yield from experiment.tell(*started("verify"))
-        yield from experiment.step(judged.best.gains)
+        yield from experiment.step(judged.best.gains, judged.period)
         first = judged
         judged = yield from experiment.computed(partial(judge, experiment.evidence(), wish, first))
         ended = _wrong(facts, judged)
