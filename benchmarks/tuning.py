@@ -1,6 +1,6 @@
 """How well the fast procedure tunes: many plants, several seeds, noise and load steps, judged on the true plant.
 
-    python -m benchmarks.tuning [--plants N] [--part I/N] [--seeds N] [--cases "PI 1 %,..."] [--save FILE] [--of FILE]
+    python -m benchmarks.tuning [--plants N] [--part I/N] [--seeds N] [--cases "PI 1 %;..."] [--save FILE] [--of FILE]
 
 The plants are 70 of the Astrom-Hagglund batch, the 50 models of the five-stage paper and the linearised reactor (every
 n-th with --plants N). Each run is a rehearsal: listening, relay, fit, step, fit. Noise is white, its standard deviation
@@ -340,7 +340,7 @@ def main() -> None:
     parser.add_argument("--part", default="0/1", help="i/n: every n-th of these plants, from the i-th on")
     parser.add_argument("--seeds", default="1", help="so many, or first-last")
     parser.add_argument("--cases", default=";".join(CASES), help="names, separated by ';', or 'further'")
-    parser.add_argument("--save", type=Path, help="adds a line of JSON for every run to this file")
+    parser.add_argument("--save", type=Path, help="a line of JSON for every run; what it holds is not run again")
     parser.add_argument("--of", type=Path, help="the table of such a file, nothing is run")
     given = parser.parse_args()
     runs = _saved(given.of) if given.of else list(_runs(given))
@@ -358,7 +358,7 @@ def main() -> None:
 
 
 def _saved(file: Path) -> list[Ran]:
-    return [Ran(**json.loads(text)) for text in file.read_text().splitlines()]
+    return [Ran(**json.loads(text)) for text in file.read_text().splitlines()] if file.exists() else []
 
 
 def _runs(given: argparse.Namespace) -> Iterator[Ran]:
@@ -367,15 +367,20 @@ def _runs(given: argparse.Namespace) -> Iterator[Ran]:
     part, parts = map(int, given.part.split("/"))
     chosen = [everything[int(i * step)] for i in range(round(len(everything) / step))][part::parts]
     first, _, last = given.seeds.rpartition("-")
-    for name in FURTHER if given.cases == "further" else given.cases.split(";"):
-        case = (CASES | FURTHER)[name]
-        for plant in [everything[-1]] if case.nonlinear else chosen:
-            for seed in range(int(first or 1), int(last) + 1):
-                ran = measure(case, plant, seed)
-                if given.save:
-                    with given.save.open("a") as file:
-                        file.write(json.dumps(asdict(ran)) + "\n")
-                yield ran
+    cases = FURTHER if given.cases == "further" else given.cases.split(";")
+    done = {(ran.case, ran.plant, ran.seed): ran for ran in _saved(given.save)} if given.save else {}
+    # a run that is stopped leaves whole rows of fewer seeds
+    for seed in range(int(first or 1), int(last) + 1):
+        for case in ((CASES | FURTHER)[name] for name in cases):
+            for plant in [everything[-1]] if case.nonlinear else chosen:
+                yield done.get((case.name, plant.name, seed)) or _kept(measure(case, plant, seed), given.save)
+
+
+def _kept(ran: Ran, file: Path | None) -> Ran:
+    if file:
+        with file.open("a") as out:
+            out.write(json.dumps(asdict(ran)) + "\n")
+    return ran
 
 
 if __name__ == "__main__":
