@@ -52,6 +52,7 @@ SAMPLES_PER_PERIOD = 80
 T95_PERIODS = 3.0
 ASKED = 1.6
 WRONG = 0.1
+REACTOR = "reactor"
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +161,7 @@ def plants() -> list[Plant]:
     found = [Plant(p["id"], tuple(p["num"]), tuple(p["den"]), p["delay"], p["Ku"], p["Tu"]) for p in batch]
     for m in json.loads((files("plantsim") / "models-50.json").read_text())["models"]:
         found.append(_of(f"model-{m['id']}", TransferFunction(tuple(m["num"]), tuple(m["den"]), m["delay"])))
-    found.append(_of("reactor", linear_reactor()))
+    found.append(_of(REACTOR, linear_reactor()))
     return found
 
 
@@ -193,8 +194,8 @@ def loop_of(
         process = Reactor(plant.Ts, noise, seed)
     if case.how != UNDISTURBED or case.nonlinear:
         nominal = (reactor.MV_NOMINAL, reactor.STEADY_STATE[2]) if case.nonlinear else (0.0, 0.0)
-        loads = _loads(plant, amplitude, seed, case)
-        process = Disturbed(process, case.how, noise, loads, 2.0 * deviation, plant.samples, amplitude, seed, nominal)
+        steps = loads(plant, amplitude, seed, case)
+        process = Disturbed(process, case.how, noise, steps, 2.0 * deviation, plant.samples, amplitude, seed, nominal)
     reverse = sign(plant.model()) > 0.0
     limit = case.limits * amplitude
     settings = Settings(mv_low=-limit, mv_high=limit, pv_low=-1e9, pv_high=1e9, reverse=reverse)
@@ -205,7 +206,8 @@ def loop_of(
     return Losing(process, channel, plant.Ts, case.lost, seed) if case.lost else loop, facts
 
 
-def _loads(plant: Plant, amplitude: float, seed: int, case: Case) -> list[tuple[int, float]]:
+def loads(plant: Plant, amplitude: float, seed: int, case: Case) -> list[tuple[int, float]]:
+    """Of each step of the load: its sample, its size."""
     random = np.random.default_rng([seed, len(plant.name), int(1e6 * plant.Pu)])
     found = []
     for i in range(case.how.loads):
@@ -289,15 +291,17 @@ def measure(case: Case, plant: Plant, seed: int) -> Ran:
     start = time.process_time()
     result, passed = fast_run(plant, case, seed)
     seconds = time.process_time() - start
+    ran = Ran(case.name, plant.name, seed, passed, seconds)
     if result.value is None:
         assert isinstance(result.ended, Ended)
-        return Ran(case.name, plant.name, seed, passed, seconds, result.ended.reason.value, result.ended.detail)
-    gains = result.value.gains
+        return replace(ran, reason=result.ended.reason.value, detail=result.ended.detail)
+    return judged(ran, plant, result.value.gains, case.derivative)
+
+
+def judged(ran: Ran, plant: Plant, gains: Gains, derivative: bool = False) -> Ran:
+    """With what the gains are worth on the true plant."""
     true = margins(plant.model(), gains)
-    if not true.stable:
-        return Ran(case.name, plant.name, seed, passed, seconds)
-    ratio = cost_over_best(plant, gains, case.derivative)
-    return Ran(case.name, plant.name, seed, passed, seconds, Ms=true.Ms, ratio=ratio)
+    return replace(ran, Ms=true.Ms, ratio=cost_over_best(plant, gains, derivative)) if true.stable else ran
 
 
 def cost_over_best(plant: Plant, gains: Gains, derivative: bool = False) -> float:
@@ -314,8 +318,8 @@ def line(name: str, runs: Sequence[Ran]) -> str:
     errors = [each.error for each in proposed if each.Ms is not None]
     within = " / ".join(f"{100.0 * sum(e <= limit for e in errors) / max(len(errors), 1):.1f}" for limit in (0.1, 0.05))
     return (
-        f"| {name} | {len(proposed)}/{len(runs)} | {_spread([each.passed for each in proposed], 2)} | "
-        f"{_spread(errors, 3)} | {within} | {_spread([each.ratio for each in proposed if each.ratio], 3)} | "
+        f"| {name} | {len(proposed)}/{len(runs)} | {spread([each.passed for each in proposed], 2)} | "
+        f"{spread(errors, 3)} | {within} | {spread([each.ratio for each in proposed if each.ratio], 3)} | "
         f"{sum(error > WRONG for error in errors)} | {len(proposed) - len(errors)} | "
         f"{', '.join(f'{cause} {count}' for cause, count in causes) or '-'} |"
     )
@@ -328,22 +332,28 @@ HEAD = (
 )
 
 
-def _spread(values: Sequence[float], digits: int) -> str:
+def spread(values: Sequence[float], digits: int) -> str:
     if not values:
         return "-"
     return " / ".join(f"{v:.{digits}f}" for v in (*np.percentile(values, (50, 90)), max(values)))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+def parser_of(doc: str | None) -> argparse.ArgumentParser:
+    """With what every table of runs asks for."""
+    parser = argparse.ArgumentParser(description=(doc or "").splitlines()[0])
     parser.add_argument("--plants", type=int, help="so many, spread over the list; by default all")
     parser.add_argument("--part", default="0/1", help="i/n: every n-th of these plants, from the i-th on")
     parser.add_argument("--seeds", default="1", help="so many, or first-last")
-    parser.add_argument("--cases", default=";".join(CASES), help="names, separated by ';', or 'further'")
     parser.add_argument("--save", type=Path, help="a line of JSON for every run; what it holds is not run again")
     parser.add_argument("--of", type=Path, help="the table of such a file, nothing is run")
+    return parser
+
+
+def main() -> None:
+    parser = parser_of(__doc__)
+    parser.add_argument("--cases", default=";".join(CASES), help="names, separated by ';', or 'further'")
     given = parser.parse_args()
-    runs = _saved(given.of) if given.of else list(_runs(given))
+    runs = saved(given.of) if given.of else list(_runs(given))
     print(HEAD)
     for name in CASES | FURTHER:
         if of_case := [each for each in runs if each.case == name]:
@@ -357,26 +367,35 @@ def main() -> None:
             print(f"{each.case}, {each.plant}, seed {each.seed}: Ms {each.Ms}")
 
 
-def _saved(file: Path) -> list[Ran]:
+def some(given: argparse.Namespace) -> tuple[list[Plant], range]:
+    """The plants and seeds that were asked for."""
+    everything = plants()
+    step = len(everything) / min(given.plants or len(everything), len(everything))
+    part, parts = map(int, given.part.split("/"))
+    first, _, last = given.seeds.rpartition("-")
+    chosen = [everything[int(i * step)] for i in range(round(len(everything) / step))]
+    return chosen[part::parts], range(int(first or 1), int(last) + 1)
+
+
+def saved(file: Path) -> list[Ran]:
     return [Ran(**json.loads(text)) for text in file.read_text().splitlines()] if file.exists() else []
 
 
 def _runs(given: argparse.Namespace) -> Iterator[Ran]:
-    everything = plants()
-    step = len(everything) / min(given.plants or len(everything), len(everything))
-    part, parts = map(int, given.part.split("/"))
-    chosen = [everything[int(i * step)] for i in range(round(len(everything) / step))][part::parts]
-    first, _, last = given.seeds.rpartition("-")
+    chosen, seeds = some(given)
     cases = FURTHER if given.cases == "further" else given.cases.split(";")
-    done = {(ran.case, ran.plant, ran.seed): ran for ran in _saved(given.save)} if given.save else {}
-    # a run that is stopped leaves whole rows of fewer seeds
-    for seed in range(int(first or 1), int(last) + 1):
-        for case in ((CASES | FURTHER)[name] for name in cases):
-            for plant in [everything[-1]] if case.nonlinear else chosen:
-                yield done.get((case.name, plant.name, seed)) or _kept(measure(case, plant, seed), given.save)
+    done = {(ran.case, ran.plant, ran.seed): ran for ran in saved(given.save)} if given.save else {}
+    # a batch that is stopped leaves rows of the same plants, drawn at random
+    for seed in seeds:
+        shuffled = [chosen[i] for i in np.random.default_rng(seed).permutation(len(chosen))]
+        for plant in shuffled:
+            for case in ((CASES | FURTHER)[name] for name in cases):
+                if case.nonlinear and plant.name != REACTOR:
+                    continue
+                yield done.get((case.name, plant.name, seed)) or kept(measure(case, plant, seed), given.save)
 
 
-def _kept(ran: Ran, file: Path | None) -> Ran:
+def kept(ran: Ran, file: Path | None) -> Ran:
     if file:
         with file.open("a") as out:
             out.write(json.dumps(asdict(ran)) + "\n")
