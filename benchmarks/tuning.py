@@ -1,6 +1,6 @@
 """How well the fast procedure tunes: many plants, several seeds, noise and load steps, judged on the true plant.
 
-    python -m benchmarks.tuning [--plants N] [--part I/N] [--seeds N] [--cases "PI 1 %,..."] [--save FILE] [--of FILE]
+    python -m benchmarks.tuning [--plants N] [--part I/N] [--seeds N] [--cases "PI 1 %;..."] [--save FILE] [--of FILE]
 
 The plants are 70 of the Astrom-Hagglund batch, the 50 models of the five-stage paper and the linearised reactor (every
 n-th with --plants N). Each run is a rehearsal: listening, relay, fit, step, fit. Noise is white, its standard deviation
@@ -19,7 +19,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -28,10 +28,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import ss2tf
 
+from benchmarks.disturbances import Disturbance, Disturbed
 from controller.channel import Channel, Settings
 from controller.pid import Parameters
 from plantsim import reactor
 from plantsim.plant import LinearPlant
+from plantsim.plant import Plant as Process
+from plantsim.reactor import Reactor
 from service.rehearsal import RehearsedLoop
 from service.runner import RunResult, Watch, run
 from tuning.fast.design import Design, Wish
@@ -40,7 +43,7 @@ from tuning.fast.procedure import LEAST_SAMPLES, FastOptions, FastProposal, fast
 from tuning.gains import Gains
 from tuning.margins import margins, ultimate_point
 from tuning.models import TransferFunction, sign
-from tuning.plan import Mode, Plan
+from tuning.plan import Command, Mode, Plan, Sample
 from tuning.reasons import Ended
 from tuning.stages.common import Facts, Trace
 from tuning.stages.preflight import preflight
@@ -49,6 +52,7 @@ SAMPLES_PER_PERIOD = 80
 T95_PERIODS = 3.0
 ASKED = 1.6
 WRONG = 0.1
+REACTOR = "reactor"
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,50 +63,97 @@ class Plant:
     L: float
     Ku: float
     Pu: float
+    samples: int = SAMPLES_PER_PERIOD
 
     @property
     def Ts(self) -> float:
-        return self.Pu / SAMPLES_PER_PERIOD
+        return self.Pu / self.samples
 
     def model(self) -> TransferFunction:
         """With the sampled controller's half sample."""
         return TransferFunction(self.num, self.den, self.L + 0.5 * self.Ts)
 
 
+UNDISTURBED = Disturbance()
+
+
 @dataclass(frozen=True, slots=True)
 class Case:
-    """noise: of the span.  derivative: PID."""
+    """noise: of the span.  derivative: PID.  lost: share of the samples that do not arrive.
+
+    samples: in Pu.  known: T95 as it is said over 3 Pu.  adapted: so many times the amplitude is where MV ends, and the
+    procedure finds the amplitude itself.  limits: of MV, amplitudes.
+    """
 
     name: str
     noise: float
-    load: bool = False
+    how: Disturbance = UNDISTURBED
     derivative: bool = False
+    samples: int = SAMPLES_PER_PERIOD
+    known: float = 1.0
+    limits: float = 2.0
+    adapted: bool = False
+    lost: float = 0.0
+    amplitude: float = 1.0
+    nonlinear: bool = False
 
 
+PLAIN = Case("", 0.0)
+ONE, TWO = Disturbance(loads=1), Disturbance(loads=2)
 CASES = {
     case.name: case
     for case in (
         Case("PI 0.5 %", 0.005),
         Case("PI 1 %", 0.01),
         Case("PI 2 %", 0.02),
-        Case("PI 0.5 % + load", 0.005, load=True),
-        Case("PI 1 % + load", 0.01, load=True),
-        Case("PI 2 % + load", 0.02, load=True),
+        Case("PI 0.5 % + load", 0.005, ONE),
+        Case("PI 1 % + load", 0.01, ONE),
+        Case("PI 2 % + load", 0.02, ONE),
         Case("PID 1 %", 0.01, derivative=True),
+    )
+}
+FURTHER = {
+    case.name: case
+    for case in (
+        Case("noise 5 %", 0.05),
+        Case("noise of pole 0.5", 0.01, Disturbance(pole=0.5)),
+        Case("noise of pole 0.8", 0.01, Disturbance(pole=0.8)),
+        Case("spikes, 1 in 100", 0.01, Disturbance(spikes=0.01)),
+        Case("PV in steps of span/100", 0.005, Disturbance(quantum=0.01)),
+        Case("PV in steps of span/50", 0.005, Disturbance(quantum=0.02)),
+        Case("PV in steps of span/50, no noise", 0.0, Disturbance(quantum=0.02)),
+        Case("drift 2 % in Pu", 0.01, Disturbance(drift=0.02)),
+        Case("two loads", 0.01, TWO),
+        Case("not at rest", 0.01, Disturbance(loads=1, unrest=True)),
+        Case("valve sticks by 0.1", 0.01, Disturbance(stiction=0.1)),
+        Case("valve sticks by 0.3", 0.01, Disturbance(stiction=0.3)),
+        Case("dead band 0.05", 0.01, Disturbance(dead_band=0.05)),
+        Case("dead band 0.2", 0.01, Disturbance(dead_band=0.2)),
+        Case("actuator ends at 0.7", 0.01, Disturbance(ends=0.7)),
+        Case("MV ends at 1.05", 0.01, limits=1.05),
+        Case("amplitude found, much room", 0.01, limits=20.0, adapted=True),
+        Case("amplitude found, little room", 0.01, limits=0.8, adapted=True),
+        Case("T95 a tenth", 0.01, known=0.1),
+        Case("T95 ten times", 0.01, known=10.0),
+        Case("Ts = Pu/30", 0.01, samples=30),
+        Case("Ts = Pu/100", 0.01, samples=100),
+        Case("2 % of samples lost", 0.01, lost=0.02),
+        Case("nonlinear reactor, 5 %", 0.01, amplitude=5.0, nonlinear=True),
+        Case("nonlinear reactor, 15 %", 0.01, amplitude=15.0, nonlinear=True),
     )
 }
 
 
-class Loaded(LinearPlant):
-    """A plant whose load steps at one sample."""
+class Losing(RehearsedLoop):
+    """A loop of which some samples do not arrive, never two in a row."""
 
-    at, size, n = -1, 0.0, 0
+    def __init__(self, plant: Process, channel: Channel, sample_time_s: float, share: float, seed: int) -> None:
+        super().__init__(plant, channel, sample_time_s)
+        self._share, self._random = share, np.random.default_rng([seed, 2])
 
-    def step(self, mv: float) -> float:
-        if self.n == self.at:
-            self.disturbance = self.size
-        self.n += 1
-        return super().step(mv)
+    def step(self, commands: Sequence[Command]) -> Sample:
+        sample = super().step(commands)
+        return super().step(()) if self._random.random() < self._share else sample
 
 
 def plants() -> list[Plant]:
@@ -110,7 +161,7 @@ def plants() -> list[Plant]:
     found = [Plant(p["id"], tuple(p["num"]), tuple(p["den"]), p["delay"], p["Ku"], p["Tu"]) for p in batch]
     for m in json.loads((files("plantsim") / "models-50.json").read_text())["models"]:
         found.append(_of(f"model-{m['id']}", TransferFunction(tuple(m["num"]), tuple(m["den"]), m["delay"])))
-    found.append(_of("reactor", linear_reactor()))
+    found.append(_of(REACTOR, linear_reactor()))
     return found
 
 
@@ -135,17 +186,41 @@ def linear_reactor() -> TransferFunction:
 
 
 def loop_of(
-    plant: Plant, amplitude: float, span: float, noise: float, seed: int
-) -> tuple[RehearsedLoop, Facts, Loaded]:
-    """A loop at rest under sluggish gains, in deviation variables."""
-    process = Loaded(plant.num, plant.den, plant.L, plant.Ts, noise_std=noise, seed=seed)
+    plant: Plant, amplitude: float, deviation: float, noise: float, seed: int, case: Case = PLAIN
+) -> tuple[RehearsedLoop, Facts]:
+    """A loop at rest under sluggish gains, in deviation variables. deviation: the largest permitted set-point step."""
+    process: Process = LinearPlant(plant.num, plant.den, plant.L, plant.Ts, noise_std=noise, seed=seed)
+    if case.nonlinear:
+        process = Reactor(plant.Ts, noise, seed)
+    if case.how != UNDISTURBED or case.nonlinear:
+        nominal = (reactor.MV_NOMINAL, reactor.STEADY_STATE[2]) if case.nonlinear else (0.0, 0.0)
+        steps = loads(plant, amplitude, seed, case)
+        process = Disturbed(process, case.how, noise, steps, 2.0 * deviation, plant.samples, amplitude, seed, nominal)
     reverse = sign(plant.model()) > 0.0
-    limit = 2.0 * amplitude
+    limit = case.limits * amplitude
     settings = Settings(mv_low=-limit, mv_high=limit, pv_low=-1e9, pv_high=1e9, reverse=reverse)
     gains = Gains(Kp=0.15 * plant.Ku, Ti=2.0 * plant.Pu)
     channel = Channel(plant.Ts, settings, Parameters(gains.Kp, gains.Ti), 0.0, int(Mode.AUTOMATIC), 0.0)
-    facts = Facts(plant.Ts, T95_PERIODS * plant.Pu, -limit, limit, span, gains, reverse)
-    return RehearsedLoop(process, channel, plant.Ts), facts, process
+    facts = Facts(plant.Ts, case.known * T95_PERIODS * plant.Pu, -limit, limit, deviation, gains, reverse)
+    loop = RehearsedLoop(process, channel, plant.Ts)
+    return Losing(process, channel, plant.Ts, case.lost, seed) if case.lost else loop, facts
+
+
+def loads(plant: Plant, amplitude: float, seed: int, case: Case) -> list[tuple[int, float]]:
+    """Of each step of the load: its sample, its size."""
+    random = np.random.default_rng([seed, len(plant.name), int(1e6 * plant.Pu)])
+    found = []
+    for i in range(case.how.loads):
+        size = float(random.choice((-1.0, 1.0)) * random.uniform(0.1, 0.3 if i else 0.5))
+        listened = case.known * T95_PERIODS * plant.samples / 2.0
+        if case.how.unrest:
+            at = listened * random.uniform(0.0, 1.0)
+        elif i:
+            at = listened + random.uniform(3.0, 5.5) * plant.samples
+        else:
+            at = listened + random.uniform(0.0, 3.5) * plant.samples
+        found.append((round(at), amplitude * size))
+    return found
 
 
 def relay_span(plant: Plant) -> float:
@@ -158,7 +233,7 @@ def relay_span(plant: Plant) -> float:
         yield from experiment.relay(4)
         return experiment.evidence().span
 
-    loop, facts, _ = loop_of(plant, 1.0, 1.0 / plant.Ku, 0.0, 1)
+    loop, facts = loop_of(plant, 1.0, 1.0 / plant.Ku, 0.0, 1)
     result = run(plan(facts), loop, watch=Watch())
     assert result.value is not None, result.ended
     return result.value
@@ -201,32 +276,32 @@ def span_of(plant: Plant) -> float:
 
 
 def fast_run(plant: Plant, case: Case, seed: int) -> tuple[RunResult[FastProposal], float]:
-    span = span_of(plant)
-    loop, facts, process = loop_of(plant, 1.0, 0.5 * span, case.noise * span, seed)
-    if case.load:
-        random = np.random.default_rng([seed, len(plant.name), int(1e6 * plant.Pu)])
-        process.size = float(random.choice((-1.0, 1.0)) * random.uniform(0.1, 0.5))
-        start = T95_PERIODS * SAMPLES_PER_PERIOD / 2.0
-        process.at = round(start + random.uniform(0.0, 3.5) * SAMPLES_PER_PERIOD)
-    options = FastOptions(Ms=ASKED, derivative=case.derivative, amplitude=1.0)
+    span = case.amplitude * span_of(replace(plant, samples=SAMPLES_PER_PERIOD))
+    # a step that the preflight can tell from the noise
+    deviation = span * max(0.5, 12.0 * case.noise)
+    loop, facts = loop_of(plant, case.amplitude, deviation, case.noise * span, seed, case)
+    options = FastOptions(Ms=ASKED, derivative=case.derivative, amplitude=None if case.adapted else case.amplitude)
     result = run(fast(facts, options), loop, watch=Watch(max_time_s=100.0 * plant.Pu))
     passed = sum(value for stage, value in result.plant_time_s.items() if stage != "preflight")
     return result, passed / plant.Pu
 
 
 def measure(case: Case, plant: Plant, seed: int) -> Ran:
+    plant = replace(plant, samples=case.samples)
     start = time.process_time()
     result, passed = fast_run(plant, case, seed)
     seconds = time.process_time() - start
+    ran = Ran(case.name, plant.name, seed, passed, seconds)
     if result.value is None:
         assert isinstance(result.ended, Ended)
-        return Ran(case.name, plant.name, seed, passed, seconds, result.ended.reason.value, result.ended.detail)
-    gains = result.value.gains
+        return replace(ran, reason=result.ended.reason.value, detail=result.ended.detail)
+    return judged(ran, plant, result.value.gains, case.derivative)
+
+
+def judged(ran: Ran, plant: Plant, gains: Gains, derivative: bool = False) -> Ran:
+    """With what the gains are worth on the true plant."""
     true = margins(plant.model(), gains)
-    if not true.stable:
-        return Ran(case.name, plant.name, seed, passed, seconds)
-    ratio = cost_over_best(plant, gains, case.derivative)
-    return Ran(case.name, plant.name, seed, passed, seconds, Ms=true.Ms, ratio=ratio)
+    return replace(ran, Ms=true.Ms, ratio=cost_over_best(plant, gains, derivative)) if true.stable else ran
 
 
 def cost_over_best(plant: Plant, gains: Gains, derivative: bool = False) -> float:
@@ -243,8 +318,8 @@ def line(name: str, runs: Sequence[Ran]) -> str:
     errors = [each.error for each in proposed if each.Ms is not None]
     within = " / ".join(f"{100.0 * sum(e <= limit for e in errors) / max(len(errors), 1):.1f}" for limit in (0.1, 0.05))
     return (
-        f"| {name} | {len(proposed)}/{len(runs)} | {_spread([each.passed for each in proposed], 2)} | "
-        f"{_spread(errors, 3)} | {within} | {_spread([each.ratio for each in proposed if each.ratio], 3)} | "
+        f"| {name} | {len(proposed)}/{len(runs)} | {spread([each.passed for each in proposed], 2)} | "
+        f"{spread(errors, 3)} | {within} | {spread([each.ratio for each in proposed if each.ratio], 3)} | "
         f"{sum(error > WRONG for error in errors)} | {len(proposed) - len(errors)} | "
         f"{', '.join(f'{cause} {count}' for cause, count in causes) or '-'} |"
     )
@@ -257,24 +332,30 @@ HEAD = (
 )
 
 
-def _spread(values: Sequence[float], digits: int) -> str:
+def spread(values: Sequence[float], digits: int) -> str:
     if not values:
         return "-"
     return " / ".join(f"{v:.{digits}f}" for v in (*np.percentile(values, (50, 90)), max(values)))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+def parser_of(doc: str | None) -> argparse.ArgumentParser:
+    """With what every table of runs asks for."""
+    parser = argparse.ArgumentParser(description=(doc or "").splitlines()[0])
     parser.add_argument("--plants", type=int, help="so many, spread over the list; by default all")
     parser.add_argument("--part", default="0/1", help="i/n: every n-th of these plants, from the i-th on")
     parser.add_argument("--seeds", default="1", help="so many, or first-last")
-    parser.add_argument("--cases", default=",".join(CASES), help="names, comma-separated")
-    parser.add_argument("--save", type=Path, help="adds a line of JSON for every run to this file")
+    parser.add_argument("--save", type=Path, help="a line of JSON for every run; what it holds is not run again")
     parser.add_argument("--of", type=Path, help="the table of such a file, nothing is run")
+    return parser
+
+
+def main() -> None:
+    parser = parser_of(__doc__)
+    parser.add_argument("--cases", default=";".join(CASES), help="names, separated by ';', or 'further'")
     given = parser.parse_args()
-    runs = _saved(given.of) if given.of else list(_runs(given))
+    runs = saved(given.of) if given.of else list(_runs(given))
     print(HEAD)
-    for name in CASES:
+    for name in CASES | FURTHER:
         if of_case := [each for each in runs if each.case == name]:
             print(line(name, of_case))
     seconds = [each.seconds for each in runs]
@@ -286,24 +367,39 @@ def main() -> None:
             print(f"{each.case}, {each.plant}, seed {each.seed}: Ms {each.Ms}")
 
 
-def _saved(file: Path) -> list[Ran]:
-    return [Ran(**json.loads(text)) for text in file.read_text().splitlines()]
-
-
-def _runs(given: argparse.Namespace) -> Iterator[Ran]:
+def some(given: argparse.Namespace) -> tuple[list[Plant], range]:
+    """The plants and seeds that were asked for."""
     everything = plants()
     step = len(everything) / min(given.plants or len(everything), len(everything))
     part, parts = map(int, given.part.split("/"))
-    chosen = [everything[int(i * step)] for i in range(round(len(everything) / step))][part::parts]
     first, _, last = given.seeds.rpartition("-")
-    for name in given.cases.split(","):
-        for plant in chosen:
-            for seed in range(int(first or 1), int(last) + 1):
-                ran = measure(CASES[name], plant, seed)
-                if given.save:
-                    with given.save.open("a") as file:
-                        file.write(json.dumps(asdict(ran)) + "\n")
-                yield ran
+    chosen = [everything[int(i * step)] for i in range(round(len(everything) / step))]
+    return chosen[part::parts], range(int(first or 1), int(last) + 1)
+
+
+def saved(file: Path) -> list[Ran]:
+    return [Ran(**json.loads(text)) for text in file.read_text().splitlines()] if file.exists() else []
+
+
+def _runs(given: argparse.Namespace) -> Iterator[Ran]:
+    chosen, seeds = some(given)
+    cases = FURTHER if given.cases == "further" else given.cases.split(";")
+    done = {(ran.case, ran.plant, ran.seed): ran for ran in saved(given.save)} if given.save else {}
+    # a batch that is stopped leaves rows of the same plants, drawn at random
+    for seed in seeds:
+        shuffled = [chosen[i] for i in np.random.default_rng(seed).permutation(len(chosen))]
+        for plant in shuffled:
+            for case in ((CASES | FURTHER)[name] for name in cases):
+                if case.nonlinear and plant.name != REACTOR:
+                    continue
+                yield done.get((case.name, plant.name, seed)) or kept(measure(case, plant, seed), given.save)
+
+
+def kept(ran: Ran, file: Path | None) -> Ran:
+    if file:
+        with file.open("a") as out:
+            out.write(json.dumps(asdict(ran)) + "\n")
+    return ran
 
 
 if __name__ == "__main__":

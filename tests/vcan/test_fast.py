@@ -60,7 +60,7 @@ def test_the_bus_gives_what_the_rehearsal_gives(start: Start, url: str, number: 
     in_model_units = replace(found.value.gains, Kp=found.value.gains.Kp / PERCENT)
     assert margins(plant.model(), in_model_units).Ms == pytest.approx(ASKED, abs=0.05)
 
-    rehearsed, facts, _ = loop_of(plant, AMPLITUDE, 0.5 * span, NOISE * span, seed=5)
+    rehearsed, facts = loop_of(plant, AMPLITUDE, 0.5 * span, NOISE * span, seed=5)
     expected = run(fast(facts, FastOptions(Ms=ASKED, amplitude=AMPLITUDE)), rehearsed, watch=Watch()).value
     assert expected is not None
     # gains of the same robustness trade Kp for Ti where the criterion is flat: what counts is the loop they give

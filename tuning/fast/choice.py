@@ -39,7 +39,9 @@ UNIMPORTANT = 0.0015
 SLOW = 2.0
 """Periods, of the slowest lag, from which a drift is tried in any case."""
 STARTS = 2
-THIRD_RATES = (1.0, 12.0, 40.0)  # 1/period
+THIRD_RATES = (1.0, 40.0)  # 1/period
+THIRD_STARTS = 3
+THIRD_DEAD_TIMES = (-0.12, -0.04, 0.02)  # periods, from that of two lags
 EVERY = 0.1  # periods, between the first guesses of a load's time
 FIRST_STEPS = 8
 LOAD_DEAD_TIMES = (0.06, 0.14, 0.23, 0.41)  # periods
@@ -98,6 +100,7 @@ def _all(fit: Fit, hypothesis: Hypothesis, known: Sequence[Fitted]) -> list[Fitt
     """Every structure under this hypothesis; those with the same denominator share where they begin."""
     times = _times(hypothesis, known)
     begun: dict[int, list[Reals]] = {}
+    quiet = hypothesis == QUIET
     for plain in (FIRST, SECOND):
         if hypothesis.loads == 1:
             begun[plain.lags] = fit.grid(plain, STARTS, float(times[0]))
@@ -110,6 +113,12 @@ def _all(fit: Fit, hypothesis: Hypothesis, known: Sequence[Fitted]) -> list[Fitt
         starts = [*exact, *same[:STARTS], *begun.get(structure.lags, [])]
         if structure.lags == 3:
             simpler = [each for each in found if each.structure in (SECOND, SECOND_WITH_ZERO)]
+            if quiet and 3 not in begun:
+                # three lags have many local minima: a grid around the dead time that two lags have come to
+                L = min(simpler, key=_bic).theta[2] / fit.period
+                around = [L + change for change in THIRD_DEAD_TIMES]
+                begun[3] = fit.grid(THIRD_WITH_ZEROS, THIRD_STARTS, dead_times=around)
+                starts += begun[3]
             starts += [_third(fit, each, rate) for each in simpler for rate in THIRD_RATES]
             starts += [each.theta for each in found if each.structure is THIRD_WITH_ZERO]
         elif structure is not FIRST and structure is not SECOND:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,9 +68,15 @@ class Evidence:
 
     @property
     def noise(self) -> float:
-        """Standard deviation of what is fitted at rest, PV units: of its fast part, or of all but a parabola."""
+        """Standard deviation of what cannot be fitted, PV units: the noise at rest, and what rounding takes."""
         rest = averaged(self.y[: self.listened], self.block)
-        return noise_of(rest)
+        return math.hypot(noise_of(rest), self.rounding)
+
+    @property
+    def rounding(self) -> float:
+        """Standard deviation of what a coarse sensor rounds away, PV units: at rest it may not show at all."""
+        steps = np.diff(np.unique(np.round(self.y / self.span, 9)))
+        return float(steps.min()) * self.span / math.sqrt(12.0)
 
     @property
     def colour(self) -> float:

@@ -32,6 +32,8 @@ WIDEST_SPAN = 2.0
 """Of PV under the relay, permitted set-point steps."""
 MOST_PERIODS = 8.4
 VERIFIED_PERIODS = 3.0
+SHORTEST = 0.5
+"""Of the relay's period: a model's that is shorter is not believed."""
 FAR = 20.0
 """Spans of PV under the relay, at which the step under the new gains is ended."""
 
@@ -55,6 +57,7 @@ class Experiment:
         self._sides = [BIAS, 1.0]  # low, high, in amplitudes
         self._high = True
         self._raise_at = 0
+        self._follow_s = 0.0
         self._commands: tuple[Command, ...] = ()
         self._step = 0.0
 
@@ -95,8 +98,13 @@ class Experiment:
                 return False
         return True
 
-    def step(self, gains: Gains) -> Plan[None]:
-        """The new gains take over with nothing in the integral, and the set-point steps by up to half the span."""
+    def step(self, gains: Gains, model_period: float) -> Plan[None]:
+        """The new gains take over with nothing in the integral, and the set-point steps by up to half the span.
+
+        model_period: s; a load, or hysteresis, makes the relay's longer.
+        """
+        relay_period = period(tuple(self.switches)) * self.facts.sample_time_s
+        self._follow_s = VERIFIED_PERIODS * min(max(model_period, SHORTEST * relay_period), relay_period)
         facts, point = self.facts, self.point
         span = self.evidence().span
         size = min(0.5 * span, self.amplitude / gains.Kp, facts.sp_deviation)
@@ -106,7 +114,7 @@ class Experiment:
         # from the proportional part alone it begins at rest
         error = (point.pv - self.trace.pv[-1]) * (1.0 if facts.reverse else -1.0)
         output = min(max(point.mv + gains.Kp * error, facts.mv_low), facts.mv_high)
-        self.trace.add((yield (SetMode(Mode.MANUAL), SetOutput(output), SetGains(gains))))
+        self._keep((yield (SetMode(Mode.MANUAL), SetOutput(output), SetGains(gains))))
         self._step = size
         yield from self._follow((SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp + size)), span)
 
@@ -117,11 +125,11 @@ class Experiment:
     def _follow(self, commands: tuple[Command, ...], span: float) -> Plan[None]:
         """Raises Refused, DIVERGES."""
         sample = yield commands
-        self.trace.add(sample)
-        end = sample.t + VERIFIED_PERIODS * period(tuple(self.switches)) * self.facts.sample_time_s
+        self._keep(sample)
+        end = sample.t + self._follow_s
         while sample.t < end:
             sample = yield ()
-            self.trace.add(sample)
+            self._keep(sample)
             if abs(sample.pv - self.point.pv) > FAR * span:
                 raise Refused(
                     Reason.DIVERGES,
@@ -150,14 +158,25 @@ class Experiment:
             switches=tuple(self.switches),
         )
 
+    def _keep(self, sample: Sample) -> None:
+        """Into the record; samples lost before it are made up: PV in between, MV as it was."""
+        trace, Ts = self.trace, self.facts.sample_time_s
+        lost = round((sample.t - trace.t[-1]) / Ts) - 1
+        t, pv = trace.t[-1], trace.pv[-1]
+        for k in range(1, lost + 1):
+            between = pv + (sample.pv - pv) * k / (lost + 1)
+            trace.add(sample._replace(t=t + k * Ts, pv=between, mv=trace.mv[-1]))
+        trace.add(sample)
+
     @property
     def _stepping(self) -> bool:
         return self.relayed > self.listened
 
     def _hear(self, sample: Sample) -> tuple[Command, ...]:
         """One sample under the relay; what is to be commanded for it."""
-        trace, at = self.trace, len(self.trace)
-        trace.add(sample)
+        trace = self.trace
+        self._keep(sample)
+        at = len(trace) - 1
         if sample.mode != Mode.EXPERIMENT or self._stepping:
             return ()
         high = sample.mv > self.point.mv

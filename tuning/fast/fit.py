@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 
 import numpy as np
 
@@ -152,18 +153,32 @@ class Fit:
     # where to begin
 
     def denominators(self, structure: Structure) -> list[Reals]:
-        """Logs of the rates to begin with, of the first or second order."""
+        """Logs of the rates to begin with."""
         unit = self.period
         if structure.lags == 1:
             return [np.log([1.0 / (T * unit)]) for T in LAGS]
+        if structure.lags == 3:
+            return [
+                np.log([1.0 / T1 + 1.0 / T2, 1.0 / (T1 * T2), 1.0 / T3])
+                for T3, T2, T1 in combinations_with_replacement(np.multiply(LAGS, unit), 3)
+            ]
         pairs = [(T1 * unit, T2 * unit) for i, T1 in enumerate(LAGS) for T2 in LAGS[: i + 1]]
         real = [np.log([1.0 / T1 + 1.0 / T2, 1.0 / (T1 * T2)]) for T1, T2 in pairs]
         return real + [np.log([2.0 * zeta * w / unit, (w / unit) ** 2]) for w, zeta in COMPLEX]
 
-    def grid(self, structure: Structure, keep: int, load_at: float | None = None) -> list[Reals]:
-        """The `keep` best theta that differ, best first. load_at: with one step of the load at this sample."""
+    def grid(
+        self,
+        structure: Structure,
+        keep: int,
+        load_at: float | None = None,
+        dead_times: Sequence[float] = DEAD_TIMES,
+    ) -> list[Reals]:
+        """The `keep` best theta that differ, best first.
+
+        load_at: with one step of the load at this sample.  dead_times: periods.
+        """
         thetas = [
-            np.append(logs, L * self.period) for logs in self.denominators(structure) for L in DEAD_TIMES
+            np.append(logs, max(L, 0.0) * self.period) for logs in self.denominators(structure) for L in dead_times
         ]
         hypothesis = QUIET
         if load_at is not None:

@@ -103,7 +103,7 @@ def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
         yield from experiment.tell(*started("verify"))
         first = judged
         tested = first.best.gains
-        yield from experiment.step(tested)
+        yield from experiment.step(tested, first.period)
         judged = yield from experiment.computed(partial(judge, experiment.evidence(), wish, first))
         ended = _wrong(facts, judged)
         shown = verified(judged, tested, *experiment.stepped)

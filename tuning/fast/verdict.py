@@ -10,12 +10,15 @@ from tuning.fast.design import Best, Design, Wish
 from tuning.fast.evidence import Evidence
 from tuning.fast.fit import Fit
 from tuning.fast.spread import colour, difference_of_rivals, peak, uncertainty_of_Ms
+from tuning.fast.valve import suspect
 from tuning.gains import Gains
 from tuning.models import TransferFunction
 
 MOST_RESIDUAL, UNIMPORTANT = 1.35, 0.004
 """Of the residual: in noises at rest; in spans of PV, below which it does not matter."""
 MOST_COLOUR = 1.35
+MOST_ROUNDED = 1.25
+"""Of what rounding leaves on average, which is not quite random and not white."""
 MOST_UNCERTAINTY = 0.10
 """Of Ms, by the delta method and among the rivals."""
 SURPRISE, SURPRISE_OF_A_STORY = 0.5, 0.2
@@ -28,7 +31,7 @@ class Judged:
     """cause: the value of the reason why the result is not to be trusted, None if it is.
 
     model: without the delay of the sampling, which is in `design_delay` (s).  Ms: on the model.
-    uncertainty, ambiguity: of Ms.  residual: its rms in noises at rest.
+    uncertainty, ambiguity: of Ms.  residual: its rms in noises at rest.  period: ultimate, of the model, s.
     """
 
     cause: str | None
@@ -43,6 +46,7 @@ class Judged:
     chosen: Chosen
     fit: Fit
     design_delay: float
+    period: float
 
 
 def judge(evidence: Evidence, wish: Wish, earlier: Judged | None = None) -> Judged:
@@ -59,14 +63,14 @@ def judge(evidence: Evidence, wish: Wish, earlier: Judged | None = None) -> Judg
     best = design.best()
     spread = uncertainty_of_Ms(fit, found, best.gains, design.w, wish.N, delay)
     rivals = difference_of_rivals(fit, found, chosen.rivals, best.gains, design.w, delay)
-    noise = evidence.noise / evidence.span
+    noise, rounding = evidence.noise / evidence.span, evidence.rounding / evidence.span
     whiteness = colour(found.linear.residual)
     cause, detail = None, ""
     if found.rms > max(MOST_RESIDUAL * noise, UNIMPORTANT):
         cause = "unexplained"
         rms = 100.0 * found.rms
         detail = f"the model leaves {rms:.2g} % of PV's span unexplained, the noise is {100.0 * noise:.2g} %"
-    elif found.rms > UNIMPORTANT and whiteness > MOST_COLOUR * max(evidence.colour, 1.0):
+    elif found.rms > max(UNIMPORTANT, MOST_ROUNDED * rounding) and whiteness > MOST_COLOUR * max(evidence.colour, 1.0):
         cause = "disturbed"
         at_rest = f"{evidence.colour:.2f} at rest"
         detail = f"what the model leaves varies slowly: {whiteness:.2f} times white noise, {at_rest}"
@@ -78,6 +82,8 @@ def judge(evidence: Evidence, wish: Wish, earlier: Judged | None = None) -> Judg
         detail = f"another model that explains the record as well gives an Ms off by {rivals:.2g}"
     elif earlier is not None:
         cause, detail = _surprise(earlier, model, best.gains, wish, design, found.hypothesis.loads)
+        if cause is None and (suspicion := suspect(fit, found)) is not None:
+            cause, detail = "unexplained", f"{suspicion.fault} explains the record better: have it looked at"
     return Judged(
         cause=cause,
         detail=detail,
@@ -91,6 +97,7 @@ def judge(evidence: Evidence, wish: Wish, earlier: Judged | None = None) -> Judg
         chosen=chosen,
         fit=fit,
         design_delay=delay,
+        period=design.period,
     )
 
 

@@ -1,0 +1,109 @@
+"""What an ideal plant leaves out: loads, drift, noise with a colour, spikes, a coarse sensor, a valve that sticks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from plantsim.plant import Plant
+
+SPIKE = 10.0
+"""Standard deviations of the noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class Disturbance:
+    """loads: steps of 10 to 50 % of the relay (the second and further ones of 10 to 30 %).  unrest: the first load
+    steps while the loop is listened to.
+
+    drift: PV spans in Pu.  pole: of the noise's colour, per sample.  quantum: of PV, spans.  spikes: share of
+    samples.  stiction: the valve stays where it is until MV is off by so much, then jumps there; dead_band: it follows
+    so far behind; both in amplitudes of the relay.  ends: how far the actuator goes, amplitudes.
+    """
+
+    loads: int = 0
+    unrest: bool = False
+    drift: float = 0.0
+    pole: float = 0.0
+    quantum: float = 0.0
+    spikes: float = 0.0
+    stiction: float = 0.0
+    dead_band: float = 0.0
+    ends: float = math.inf
+
+
+class Disturbed:
+    """A plant with a disturbance, in deviations from `nominal` (MV, PV).
+
+    noise: its standard deviation, of which a white one is the plant's own.
+
+    loads: (sample, size) of each, MV units.  span: of PV.  period: samples.  amplitude: MV units.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        how: Disturbance,
+        noise: float,
+        loads: Sequence[tuple[int, float]],
+        span: float,
+        period: float,
+        amplitude: float,
+        seed: int,
+        nominal: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        self._plant, self._how, self._loads = plant, how, tuple(loads)
+        self._mv_nominal, self._pv_nominal = nominal
+        self._drift, self._quantum = how.drift * span / period, how.quantum * span
+        self._stiction, self._dead_band, self._ends = (
+            amplitude * each for each in (how.stiction, how.dead_band, how.ends)
+        )
+        self._random = np.random.default_rng([seed, 1])
+        self._spike = SPIKE * noise
+        self._coloured = noise if how.pole else 0.0
+        self._colour = self._coloured * self._random.standard_normal()
+        plant.noise_std = self.noise_std = 0.0 if how.pole else noise
+        # where in its slack the valve stands
+        self._slack = self._dead_band * self._random.uniform(-1.0, 1.0)
+        self._n, self._position = 0, 0.0
+        self._pv = self._measured(plant.pv)
+
+    @property
+    def disturbance(self) -> float:
+        return self._plant.disturbance
+
+    @disturbance.setter
+    def disturbance(self, value: float) -> None:
+        self._plant.disturbance = value
+
+    @property
+    def pv(self) -> float:
+        return self._pv
+
+    def step(self, mv: float) -> float:
+        for at, size in self._loads:
+            if at == self._n:
+                self._plant.disturbance += size
+        self._n += 1
+        self._pv = self._measured(self._plant.step(self._mv_nominal + self._moved(mv)))
+        return self._pv
+
+    def _moved(self, mv: float) -> float:
+        """Where the valve is."""
+        away = mv + self._slack - self._position
+        if abs(away) > self._stiction:
+            self._position += away if self._stiction else math.copysign(max(abs(away) - self._dead_band, 0.0), away)
+        return min(max(self._position, -self._ends), self._ends)
+
+    def _measured(self, pv: float) -> float:
+        how, random = self._how, self._random
+        if how.pole:
+            fresh = math.sqrt(1.0 - how.pole**2) * self._coloured
+            self._colour = how.pole * self._colour + fresh * random.standard_normal()
+        pv += self._colour - self._pv_nominal + self._drift * self._n
+        if how.spikes and random.random() < how.spikes:
+            pv += self._spike * random.choice((-1.0, 1.0))
+        return round(pv / self._quantum) * self._quantum if self._quantum else pv
