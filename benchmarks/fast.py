@@ -4,7 +4,7 @@ The plain way: each of the seven structures is simulated step by step in Python 
 its whole samples) and fitted with scipy's least_squares from the same kind of starts; the PI comes from a search over
 Kp and Ti of simulated step responses under a penalty on Ms.
 
-    python -m benchmarks.fast
+    python -m benchmarks.fast [records]
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ def plain_design(model: TransferFunction, period: float) -> Gains:
     return Gains(float(np.exp(found.x[0])), float(np.exp(found.x[1])))
 
 
-def run() -> dict[str, float]:
+def run(records: int = MANY) -> dict[str, float]:
     """Times in s of processor; memory in MB of the whole process."""
     evidence = record()
     wish = Wish(1.6)
@@ -161,9 +161,9 @@ def run() -> dict[str, float]:
     unit = 1 if sys.platform == "darwin" else 1024
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     start = time.process_time()
-    for seed in range(MANY):
+    for seed in range(records):
         judge(record(seed + 1), wish)
-    each_s = (time.process_time() - start) / MANY
+    each_s = (time.process_time() - start) / records
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     true = TransferFunction(NUM, DEN, L + 0.5 * TS)
     return {
@@ -173,11 +173,11 @@ def run() -> dict[str, float]:
         "ratio": plain_s / median(times),
         "ours_Ms": margins(true, ours.best.gains).Ms,
         "plain_Ms": margins(true, gains).Ms,
-        "records": MANY,
+        "records": records,
         "each_s": each_s,
         "grown_MB": (after - before) * unit / 1e6,
     }
 
 
 if __name__ == "__main__":
-    print(json.dumps(run(), indent=1))
+    print(json.dumps(run(int(sys.argv[1]) if len(sys.argv) > 1 else MANY), indent=1))

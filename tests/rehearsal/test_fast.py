@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.tuning import ASKED, FURTHER, fast_run, plants
 from service.rehearsal import rehearse
 from tuning.gains import Gains
 from tuning.margins import margins, ultimate_point
@@ -90,3 +91,29 @@ def test_what_cannot_be_tuned_is_refused_with_its_cause(case: str) -> None:
     assert answer["reason"] != "internal", answer["detail"]
     if reason is not None:
         assert answer["reason"] == reason
+
+
+FAULTY = {
+    ("dead band 0.2", "P2_T=0.5"): "follows about 0.2",
+    ("valve sticks by 0.3", "P1_T=0.3"): "sticks until MV is off by about 0.3",
+    ("actuator ends at 0.7", "P3_T=0.01"): "goes about 0.7",
+}
+
+
+@pytest.mark.parametrize(("case", "name"), FAULTY)
+def test_a_faulty_valve_is_told_from_the_plant(case: str, name: str) -> None:
+    """Without that these gains would be off by 0.2 to 0.5 of Ms."""
+    plant = next(plant for plant in plants() if plant.name == name)
+    result, _ = fast_run(plant, FURTHER[case], seed=1)
+    assert result.value is None and result.ended is not None
+    assert result.ended.reason == "unexplained"
+    assert FAULTY[case, name] in result.ended.detail
+
+
+@pytest.mark.parametrize("case", ["PV in steps of span/50", "2 % of samples lost", "two loads", "drift 2 % in Pu"])
+def test_what_can_be_allowed_for_does_not_hinder(case: str) -> None:
+    plant = next(plant for plant in plants() if plant.name == "P4_n=4")
+    result, _ = fast_run(plant, FURTHER[case], seed=1)
+    assert result.value is not None, result.ended
+    gains = result.value.gains
+    assert abs(margins(plant.model(), gains).Ms - ASKED) < 0.05
