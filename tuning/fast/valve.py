@@ -80,7 +80,9 @@ def suspect(fit: Fit, best: Fitted) -> Suspicion | None:
         near = [(under(fault, each, found.theta, FIRST_STEPS), fault, each) for each in (size / factor, size * factor)]
         found, fault, size = min([(found, fault, size), *near], key=_bic)
     found = under(fault, size, found.theta, STEPS)
-    gain = best.bic - found.bic
+    # that freedom alone may explain as much: MV at rest is known only as well as the noise lets it be
+    sound = fit.search(structure, slack, [start], FIRST_STEPS + STEPS)
+    gain = min(best.bic, sound.bic) - found.bic
     return Suspicion(FAULTS[fault][1].format(size * evidence.swing), gain) if gain > EARNED else None
 
 

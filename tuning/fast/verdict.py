@@ -83,7 +83,7 @@ def judge(evidence: Evidence, wish: Wish, earlier: Judged | None = None) -> Judg
     elif earlier is not None:
         cause, detail = _surprise(earlier, model, best.gains, wish, design, found.hypothesis.loads)
         if cause is None and (suspicion := suspect(fit, found)) is not None:
-            cause, detail = "unexplained", f"{suspicion.fault} explains the record better: have it looked at"
+            cause, detail = "unexplained", f"{suspicion.fault} explains the record better, or the plant is not linear"
     return Judged(
         cause=cause,
         detail=detail,
