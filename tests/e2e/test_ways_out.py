@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -25,6 +26,8 @@ pytestmark = NEEDS_VCAN
 PACE = 5.0
 BACK_WITHIN_S = 2.0
 """1 s of heartbeat time, and what the device's tick and reading it all back by SDO take on a slow machine."""
+OUTAGE_S = 1.5
+"""Of wall time: longer than the heartbeat time, shorter than the patience of who restores."""
 FIVE: dict[str, Any] = {"method": "five-stage"}
 SOON: dict[str, Any] = {**FIVE, "baseline": False}
 STAGES: dict[str, tuple[str, dict[str, Any]]] = {
@@ -201,6 +204,21 @@ def test_busy_then_aborted_by_the_operator(here: Plantsite) -> None:
     assert busy.status_code == 409 and busy.json()["job"] == url
     assert here.http.post(f"{url}/abort").status_code == 202
     assert ended(here, url) == ("aborted", "operator")
+    assert here.is_home()
+
+
+@pytest.mark.parametrize("stage", ["five-stage, baseline", "fast, preflight", "fast, relay", "fast, verify"])
+def test_a_bus_that_goes_down(here: Plantsite, stage: str) -> None:
+    def link(state: str) -> None:
+        subprocess.run(["ip", "link", "set", "vcan0", state], check=True)
+
+    url = in_stage(here, *STAGES[stage])
+    link("down")
+    try:
+        time.sleep(OUTAGE_S)
+    finally:
+        link("up")
+    assert ended(here, url) == ("failed", "bus_lost")
     assert here.is_home()
 
 
