@@ -1,6 +1,7 @@
 # make demo    a loop is retuned before your eyes      make test    every test and every check
 # make setup   the Python environment in .venv         make check   types, style, import directions, packages
 # make bench   every benchmark, in one table           make validate    the five papers, recomputed
+# make faults  every fault in every stage, live: 30 min
 # make compose-test    the containers, with a real engine      make bench-tuning    how well "fast" tunes 121 plants
 
 PYTHON ?= python3
@@ -9,7 +10,7 @@ BIN := $(VENV)/bin
 DEBIAN := user-mode-linux tshark can-utils iproute2 postgresql
 ENGINE := docker.io docker-compose debootstrap user-mode-linux iproute2
 
-.PHONY: setup demo test compose-test check bench bench-tuning validate system clean
+.PHONY: setup demo test compose-test check bench bench-tuning validate faults system clean
 
 setup: $(VENV)/.installed
 
@@ -49,6 +50,11 @@ bench: setup
 # Writes docs/validation.md and its plots; fails when a number of a paper leaves its tolerance.
 validate: setup
 	$(BIN)/python -m validation
+
+# Writes docs/faults.md; fails on an unsafe ending. FAULTS="--faults locked --stages relay" repeats a part of the table.
+faults: setup
+	@sh tools/system-packages postgresql
+	$(BIN)/python -m tests.faults $(FAULTS)
 
 # Long; BENCH="--plants 20 --seeds 1" limits it.
 bench-tuning: setup

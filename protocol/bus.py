@@ -7,10 +7,12 @@ import select
 import socket
 import struct
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from functools import partial
 from typing import Any, Protocol
 
 import can
+from can.interfaces.socketcand import SocketCanDaemonBus
 
 Frame = tuple[int, bytes]
 
@@ -21,6 +23,7 @@ _RECEIVE_BUFFER = 4 << 20  # the default holds about 275 frames, then frames van
 _SHORTEST_ARMED_S = 0.02  # SO_RCVTIMEO counts in kernel ticks (up to 10 ms): shorter waits go through poll
 _SEND_PATIENCE_S = 1.0
 SO_RCVBUFFORCE = 33
+_PASSED_OVER_S = 0.05  # how long frames that nobody wants may keep us beyond a time-out
 
 
 class BusError(Exception):
@@ -146,15 +149,31 @@ def _enlarge(sock: socket.socket) -> None:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
 
 
+class _Socketcand(SocketCanDaemonBus):
+    """Takes the server's greetings one by one. The library expects "< ok >" alone in one read; on a busy machine the
+    first frames are behind it by then, and the bus would be told to be gone."""
+
+    def _expect_msg(self, msg: str) -> None:
+        server: socket.socket = vars(self)["_SocketCanDaemonBus__socket"]
+        found = server.recv(len(msg), socket.MSG_WAITALL)
+        if found != msg.encode():
+            raise can.CanError(f"expected {msg!r}, got {found!r}")
+
+
+_OPENED_BY: dict[str, Callable[..., can.BusABC]] = {"socketcand": _Socketcand}
+
+
 class LibraryBus:
     """Any interface of python-can; its message objects make it about four times slower than the raw socket."""
 
     def __init__(self, url: str, interface: str, rest: str) -> None:
         try:
-            self._bus = can.Bus(interface=interface, **_library_arguments(interface, rest))
+            arguments = _library_arguments(interface, rest)
+            self._bus: can.BusABC = _OPENED_BY.get(interface, partial(can.Bus, interface=interface))(**arguments)
         except (OSError, ValueError, can.CanError) as error:
             raise BusError(f"bus {url!r} cannot be opened: {error}") from error
         self._url = url
+        self._wanted: frozenset[int] | None = None
 
     def send(self, can_id: int, data: bytes) -> None:
         try:
@@ -163,15 +182,34 @@ class LibraryBus:
             raise BusError(f"cannot send on {self._url!r}: {error}") from error
 
     def recv(self, timeout: float | None) -> Frame | None:
-        try:
-            message = self._bus.recv(timeout)
-        except (OSError, can.CanError) as error:
-            raise BusError(f"cannot receive on {self._url!r}: {error}") from error
-        if message is None or message.is_error_frame or message.is_remote_frame or message.is_extended_id:
-            return None
-        return message.arbitration_id, bytes(message.data)
+        give_up = None if timeout is None else time.monotonic() + timeout
+        left = timeout
+        while True:
+            try:
+                message = self._bus.recv(left)
+            except (OSError, can.CanError) as error:
+                raise BusError(f"cannot receive on {self._url!r}: {error}") from error
+            if message is None and timeout is not None:
+                return None
+            if message is not None and self._wants(message):
+                return message.arbitration_id, bytes(message.data)
+            if give_up is not None:
+                # Behind a frame that nobody wants there may be one that is here already.
+                over = time.monotonic() - give_up
+                if over > _PASSED_OVER_S:
+                    return None
+                left = max(0.0, -over)
+
+    def _wants(self, message: can.Message) -> bool:
+        if message.is_error_frame or message.is_remote_frame or message.is_extended_id:
+            return False
+        return self._wanted is None or message.arbitration_id in self._wanted
 
     def set_filters(self, ids: Collection[int]) -> None:
+        self._wanted = frozenset(ids)
+        if isinstance(self._bus, _Socketcand):
+            # It filters in software, and takes a frame that is filtered out for a time-out that has passed.
+            return
         # An empty list means "everything" to python-can: an identifier that cannot occur stands for "nothing".
         wanted = sorted(ids) or [0x20000000]
         self._bus.set_filters([{"can_id": can_id, "can_mask": 0x3FFFFFFF, "extended": False} for can_id in wanted])

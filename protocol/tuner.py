@@ -36,6 +36,7 @@ from protocol.turns import Turns
 
 HEARTBEAT_S = 0.1
 _WAIT_S = 0.05  # one wait on the bus: short enough to beat in time; always the same, which RawBus makes cheap
+_TAKE_IN_S = 0.1
 _ABORT = 0x80
 _LEASE = "controller_lease"
 
@@ -155,6 +156,7 @@ class Tuner:
     def sample(self, timeout_s: float) -> BusSample | None:
         """The next sample in order; None when none came within `timeout_s` of wall time."""
         give_up = time.monotonic() + timeout_s
+        self.heartbeat()  # also while there are samples at hand: who catches up is alive
         while not self._samples:
             self.heartbeat()
             wait = _WAIT_S if time.monotonic() < give_up else 0.0  # then only what is here already
@@ -164,9 +166,15 @@ class Tuner:
 
     def drain(self) -> None:
         """Takes what has arrived and forgets its samples: the next sample is one from now on."""
-        while self._receive(0.0):
-            pass
+        self._take_in()
         self._samples.clear()
+
+    def _take_in(self) -> None:
+        """What has arrived, in its order. Where more arrives than we can take, that is no reason to stay here for
+        ever or to fall silent: the rest is taken later."""
+        give_up = time.monotonic() + _TAKE_IN_S
+        while self._receive(0.0) and time.monotonic() < give_up:
+            self.heartbeat()
 
     def _receive(self, timeout_s: float) -> bool:
         frame = self._bus.recv(timeout_s)
@@ -239,8 +247,7 @@ class Tuner:
         address = struct.pack("<HB", entry.index, sub)
         request = bytes([command]) + address + payload
         expected = 0x40 if command == 0x40 else 0x60
-        while self._receive(0.0):
-            pass
+        self._take_in()
         self._answers.clear()
         for attempt in range(self._sdo_tries):
             if attempt:

@@ -83,6 +83,7 @@ class BusLoop:
         self._until_renewal = 0
         self._until_look = 0
         self._mode_found: Mode | None = None
+        self._tried: Gains | None = None
         self._first_n: int | None = None
         self._last_n = 0
 
@@ -111,7 +112,7 @@ class BusLoop:
                 tuner.restarted = False
                 self._until_renewal = self._until_look = self._lease // 3
                 self._mode_found = state.mode
-                self._first_n, self._left = None, 0
+                self._first_n, self._left, self._tried = None, 0, None
                 self._commands.clear()
                 return state
         except BaseException:
@@ -145,6 +146,8 @@ class BusLoop:
                 self._hear(tuner)
             if found is None:
                 raise self._silent(tuner)
+            if found.on_trial and self._tried is None:
+                raise Aborted(Reason.GAINS_CHANGED, "gains are on trial that this test has not given")
             return self._count(found)
 
     def restore(self, state: LoopState) -> LoopState:
@@ -260,6 +263,7 @@ class BusLoop:
                 tuner.write("controller_mode_command", mode)
             case SetGains(gains):
                 self._try(tuner, gains)
+                self._tried = gains
             case SetOutput(value):
                 tuner.write("controller_manual_output", value)
             case SetRelay(amplitude, hysteresis, working_output, parallel_gain, amplitude_low, average):
@@ -289,9 +293,15 @@ class BusLoop:
         self._until_renewal = self._lease // 3
 
     def _look(self, tuner: Tuner) -> None:
-        """Asks for what the status frames tell: one of them may have been lost."""
+        """Asks for what the status frames tell (one of them may have been lost), and for what none tells: whether the
+        gains on trial are still ours."""
         tuner.sp = tuner.number("controller_setpoint")
         tuner.mode = int(tuner.number("controller_mode"))
+        if self._tried is not None:
+            Kp, Ti = (tuner.number(f"controller_staged_{name}") for name in ("kp", "ti"))
+            if not (_same(Kp, self._tried.Kp) and _same(Ti, self._tried.Ti)):
+                text = f"somebody else has put Kp {Kp:.6g}, Ti {Ti:.6g} s in the place of the gains on trial"
+                raise Aborted(Reason.GAINS_CHANGED, text)
         self._until_look = self._lease // 3
 
     def _hear(self, tuner: Tuner) -> None:
@@ -299,14 +309,19 @@ class BusLoop:
         codes, tuner.emergencies = tuner.emergencies, []
         if tuner.restarted:
             tuner.restarted = False
-            raise Failed(Reason.NODE_LOST, f"controller node {self._node:02X}h restarted")
+            raise self._restarted()
         if any(code in _WENT_BACK for code in codes) and not tuner.number("controller_lease"):
             raise self._gone_back(tuner)
+
+    def _restarted(self) -> Failed:
+        return Failed(Reason.NODE_LOST, f"controller node {self._node:02X}h restarted")
 
     def _gone_back(self, tuner: Tuner) -> Failed:
         cause = Cause(int(tuner.number("controller_cause")))
         if cause is Cause.PV_LIMIT:
             return Failed(Reason.PV_LIMIT, "PV left its span during the experiment; the controller ended it")
+        if cause is Cause.NONE:  # it has never held a lease of ours
+            return self._restarted()
         name = cause.name.lower().replace("_", " ")
         return Failed(Reason.DEVICE_WENT_BACK, f"the controller ended the trial by itself (cause: {name})")
 

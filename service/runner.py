@@ -24,6 +24,7 @@ from tuning.plan import (
     SetOutput,
     SetRelay,
     SetSetpoint,
+    StageDone,
     StageStarted,
     Work,
 )
@@ -32,6 +33,8 @@ from tuning.stages.common import same
 
 T = TypeVar("T")
 CHUNK = 200
+CHUNK_S = 1.0
+"""Samples are handed on by so many, or by so much plant time: what a service that dies takes with it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +154,12 @@ def run(
     guard: Guard | None = None
     stage, since, now = "", 0.0, 0.0
 
+    def hand_on() -> None:
+        nonlocal samples
+        if samples:
+            on_samples(samples)
+            samples = []
+
     def clock(next_stage: str) -> None:
         nonlocal stage, since
         if stage:
@@ -160,6 +169,7 @@ def run(
     try:
         state = loop.begin(stop)
         guard = Guard(watch, state)
+        chunk = min(CHUNK, max(1, round(CHUNK_S / state.sample_time_s)))
         answer = next(plan)
         commands: list[Command] = []
         while True:
@@ -173,6 +183,8 @@ def run(
                     else:
                         if isinstance(item, StageStarted):
                             clock(item.stage)
+                        elif isinstance(item, StageDone):
+                            hand_on()  # a stage that is done never runs again: its samples go before the word
                         on_event(item)
                 if commands:
                     guard.commanded(commands)
@@ -183,9 +195,8 @@ def run(
                 since = sample.t - state.sample_time_s
             now = sample.t
             samples.append(sample)
-            if len(samples) >= CHUNK:
-                on_samples(samples)
-                samples = []
+            if len(samples) >= chunk:
+                hand_on()
             guard.check(sample)
             reason = stop()
             if reason is not None:
@@ -214,6 +225,5 @@ def run(
             on_event(Note(f"restore: {ended}"))
             if result.ended is None or result.ended.reason not in (Reason.NODE_LOST, Reason.BUS_LOST):
                 result.value, result.ended = None, ended
-    if samples:
-        on_samples(samples)
+    hand_on()
     return result

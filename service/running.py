@@ -52,6 +52,7 @@ class Running:
             }  # fmt: skip
             self.tell("stage_started", data, stage=event.stage)
         elif isinstance(event, StageDone):
+            self.flush()  # what is done never runs again: its samples are stored before that is
             if self.loop is not None:  # a rehearsal has no plant whose time it takes
                 STAGE_SECONDS.labels(event.stage).observe(self.progress.stage_time_s)
             took = {"stage_time_s": self.progress.stage_time_s}

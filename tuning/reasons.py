@@ -55,6 +55,7 @@ class Reason(StrEnum):
     # aborted: by another's hand on the loop, on request, or with the service
     SETPOINT_CHANGED = "setpoint_changed"
     MODE_CHANGED = "mode_changed"
+    GAINS_CHANGED = "gains_changed"
     OPERATOR = "operator"
     SERVICE_STOPPED = "service_stopped"
 
@@ -100,6 +101,7 @@ ADVICE: dict[Reason, str] = {
     Reason.PV_FROZEN: "PV did not change at all while MV did: check the sensor.",
     Reason.SETPOINT_CHANGED: "Somebody else moved the set-point during the test; agree on the time and repeat.",
     Reason.MODE_CHANGED: "Somebody else changed the mode during the test; agree on the time and repeat.",
+    Reason.GAINS_CHANGED: "Somebody else tried other gains during the test; agree on the time and repeat.",
     Reason.NODE_LOST: "The device fell silent: check power and cable; it goes back to its accepted gains.",
     Reason.BUS_LOST: "The CAN bus is gone: check the interface; the device goes back to its accepted gains.",
     Reason.DEVICE_WENT_BACK: "The controller ended the trial by itself (lease, heartbeat): check this machine's load.",

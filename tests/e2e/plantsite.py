@@ -1,10 +1,10 @@
-"""Plant, controller and service as three processes on vcan0, for the tests that drive them through HTTP."""
+"""Plant, controller and service as three processes on one bus, for the tests that drive them through HTTP."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +14,7 @@ import httpx
 import pytest
 import yaml
 
+from protocol.profile import FOREVER
 from protocol.tuner import Tuner
 from service.bus_loop import BusLoop
 from service.demo import vcan_usable
@@ -53,8 +54,41 @@ SOPDT = Case("sopdt", 0.1, 100.0, 12.0, 50.0, (49.0, 51.0), 37.8, 0.1, 787.57, 1
 REACTOR = Case("reactor", 0.25, 0.5, 30.0, 49.2838831323648137, (30.0, 70.0), 31.8, 1.0, 1.529, 42.5)
 
 
+@dataclass(frozen=True)
+class Stage:
+    """How to come to a stage soon. pace: of the plant, where the stage is too short for the usual one (as a factor).
+    untouched: in this stage the loop is held, but as it was."""
+
+    stage: str
+    options: dict[str, Any]
+    pace: float = 1.0
+    untouched: bool = False
+
+
+_FIVE: dict[str, Any] = {"method": "five-stage"}
+_SOON = {**_FIVE, "baseline": False}
+_TO_VERIFY = {**_SOON, "start": "optimise", "model": {"K": 0.02, "T_s": 2.0, "L_s": 1.0}}
+STAGES = {
+    "preflight": Stage("preflight", _TO_VERIFY, 0.3, untouched=True),
+    "baseline": Stage("baseline", _FIVE),
+    "relay": Stage("relay", _SOON),
+    "ultimate": Stage("ultimate", _SOON),
+    "zn_pi": Stage("zn_pi", {**_SOON, "start": "zn_pi", "Ku": 205.0, "Pu_s": 3.32}),
+    "verify": Stage("verify", _TO_VERIFY),
+    "fast, preflight": Stage("preflight", {}, 0.3, untouched=True),
+    "fast, relay": Stage("relay", {}),
+    "fast, verify": Stage("verify", {}),
+}
+"""Of model 14."""
+
+
 class Plantsite:
-    """The three processes of one case. more_loops: further entries of loops.yaml, what they change of the first."""
+    """The three processes of one case.
+
+    more_loops: further entries of loops.yaml, what they change of the first.  launcher: a module that starts the
+    service.  served_with: more options of the service.  speed: of the plant as it starts; one that starts at "max"
+    makes way for others on its processor.  on_answer: told of each answer.
+    """
 
     def __init__(
         self,
@@ -63,16 +97,26 @@ class Plantsite:
         case: Case,
         more_loops: tuple[dict[str, Any], ...] = (),
         bus: str = BUS,
+        launcher: Sequence[str] = (),
+        served_with: Sequence[str] = (),
+        speed: str = "max",
+        on_answer: Callable[[httpx.Response], None] = lambda answer: None,
     ) -> None:
         self.case, self.bus = case, bus
         self._stack, self._folder, self._more_loops = stack, folder, more_loops
+        self._launcher, self._served_with, self._speed, self._on_answer = launcher, served_with, speed, on_answer
+        self.data = folder / "data"
         self.start_controller()
-        self._service = self._launch_service()
+        self._service = self.launch_service()
         self.controller.wait_ready()
-        model = ("--model", case.model, "--ts", str(case.ts), "--speed", "max")
-        self.plant = self.launch("plant", "plantsim", "--bus", self.bus, *model)
+        self.start_plant()
         self.plant.wait_ready()
         self._connect()
+
+    def start_plant(self) -> None:
+        case = self.case
+        model = ("--model", case.model, "--ts", str(case.ts), "--speed", self._speed)
+        self.plant = self.launch("plant", "plantsim", "--bus", self.bus, *model)
 
     def start_controller(self) -> None:
         case = self.case
@@ -89,10 +133,11 @@ class Plantsite:
 
     def serve(self) -> None:
         """The service anew on the same data."""
-        self._service = self._launch_service()
+        self._service = self.launch_service()
         self._connect()
 
-    def _launch_service(self) -> Process:
+    def launch_service(self) -> Process:
+        """A service on our data, not waited for."""
         case = self.case
         low, high = case.pv_limits
         loop = {
@@ -101,13 +146,53 @@ class Plantsite:
         }  # fmt: skip
         loops = self._folder / "loops.yaml"
         loops.write_text(yaml.safe_dump({"loops": [loop, *(loop | change for change in self._more_loops)]}))
-        data = str(self._folder / "data")
-        return self.launch("service", "service", "serve", "--loops", str(loops), "--data", data, "--port", "0")
+        serve = ("serve", "--loops", str(loops), "--data", str(self.data), "--port", "0", *self._served_with)
+        return self.launch("service", *self._launcher, "service", *serve)
 
     def _connect(self) -> None:
         self.service = self._service
-        self.http = httpx.Client(base_url=self.service.wait_ready().split()[1], timeout=30.0, trust_env=False)
+        self.url = self.service.wait_ready().split()[1]
+        self.http = self.client()
         self._stack.callback(self.http.close)
+
+    def client(self) -> httpx.Client:
+        told = {"response": [self._on_answer]}
+        return httpx.Client(base_url=self.url, timeout=30.0, trust_env=False, event_hooks=told)
+
+    def at_rest(self, pace: float) -> None:
+        """Everything well and alive again, PV at its set-point, and the plant at that pace."""
+        if self._service.poll() is not None:
+            self.serve()
+        for name, value in (
+            ("plant_noise", 0.0),
+            ("plant_disturbance", 0.0),
+            ("controller_mode_command", Mode.AUTOMATIC),
+            ("controller_setpoint", self.case.sp),
+            ("plant_pace", 0.0),
+            ("plant_samples_to_run", FOREVER),
+        ):
+            self.write(name, value)
+        deadline = time.monotonic() + 30
+        near = 0
+        while near < 5:
+            state = self.state()
+            assert time.monotonic() < deadline, state
+            near = near + 1 if abs(state.pv - self.case.sp) < 2e-4 else 0
+            time.sleep(0.05)
+        self.write("plant_pace", pace)
+        assert self.is_home()
+
+    def in_stage(self, stage: Stage, **options: Any) -> str:
+        """A job in the middle of this stage: the loop is held, and no longer as it was where the stage moves it."""
+        url = self.retune(**stage.options | options)
+        self.until(url, lambda job: job["stage"] == stage.stage and job["attempts"] == 1)
+        deadline = time.monotonic() + 10
+        while not (self.read("controller_lease") if stage.untouched else not self.is_home()):
+            assert time.monotonic() < deadline, self.job(url)
+            time.sleep(0.02)
+        job = self.job(url)
+        assert (job["state"], job["stage"]) == ("running", stage.stage)
+        return url
 
     def retune(self, tag: str = TAG, **options: Any) -> str:
         answer = self.http.post(f"/loops/{tag}/retune", json=options)
@@ -115,11 +200,15 @@ class Plantsite:
         return answer.headers["location"]
 
     def job(self, url: str) -> dict[str, Any]:
-        job: dict[str, Any] = self.http.get(url).json()
+        """Asked again while the database does not answer."""
+        give_up = time.monotonic() + 60
+        while (answer := self.http.get(url)).status_code == 503 and time.monotonic() < give_up:
+            time.sleep(0.5)
+        job: dict[str, Any] = answer.json()
         return job
 
-    def until(self, url: str, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-        deadline = time.monotonic() + 200
+    def until(self, url: str, wanted: Callable[[dict[str, Any]], bool], patience_s: float = 200.0) -> dict[str, Any]:
+        deadline = time.monotonic() + patience_s
         while time.monotonic() < deadline:
             job = self.job(url)
             if wanted(job):
@@ -128,8 +217,8 @@ class Plantsite:
             time.sleep(0.05)
         raise AssertionError(f"still {job}")
 
-    def finished(self, url: str) -> dict[str, Any]:
-        return self.until(url, lambda job: job["state"] not in ("queued", "running"))
+    def finished(self, url: str, patience_s: float = 200.0) -> dict[str, Any]:
+        return self.until(url, lambda job: job["state"] not in ("queued", "running"), patience_s)
 
     def state(self) -> LoopState:
         """Read from the controller itself, not through the service."""

@@ -1,4 +1,8 @@
-"""The hub with faults: frames lost, late or twice, as a test asks for while it runs."""
+"""The hub with faults: frames lost, late or twice, as a test asks for while it runs.
+
+Two look on. The witness in the hub counts the samples of channel 1 as the bus carried them. The onlooker is a member
+whose SDO dialogue no fault touches: through it a loop is read while its bus is down for everybody else.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,15 @@ import time
 from collections.abc import Callable, Sequence
 
 from protocol.hub import Hub, _Member
+from protocol.objects import lookup
+from protocol.profile import CONTROLLER_NODE, PLANT_NODE, PV_FRAME, channel_ids, sdo_request_id, sdo_response_id
 
 Fault = Callable[[int], Sequence[float]]
 """Of a frame's COB-ID: the delays in s after which copies are passed on; none: the frame is lost."""
+
+_PV = channel_ids(1).pv
+_ANSWERS = {sdo_response_id(PLANT_NODE), sdo_response_id(CONTROLLER_NODE)}
+_LEASE = lookup("controller_lease").index.to_bytes(2, "little") + b"\x01"
 
 
 def well(can_id: int) -> Sequence[float]:
@@ -19,18 +29,61 @@ class FaultyHub(Hub):
     def __init__(self) -> None:
         super().__init__(port=0)
         self.fault: Fault = well
+        self.sample_number = 0
+        """Of the latest PV, whoever sent it."""
+        self.first_of_session = 0
+        """The number of the first sample after the lease was last taken."""
+        self._taken = self._held = False
+        self._onlooker: _Member | None = None
         self._late: list[tuple[float, _Member, bytes]] = []
 
+    @property
+    def onlooker_url(self) -> str:
+        return f"{self.url}/onlooker"
+
+    def new_job(self) -> None:
+        """The next lease that is taken begins a session."""
+        self._held = False
+
+    def _answer(self, member: _Member, words: list[bytes]) -> None:
+        if words[:2] == [b"open", b"onlooker"]:
+            self._onlooker = member
+        super()._answer(member, words)
+
     def _pass_on(self, sender: _Member, frame: bytes) -> None:
-        for delay in self.fault(int(frame.split()[2], 16)):
+        words = frame.split()
+        can_id = int(words[2], 16)
+        self._witness(can_id, words[4] if len(words) > 5 else b"")
+        onlooker = self._onlooker
+        if sender is onlooker:
+            super()._pass_on(sender, frame)
+            return
+        if onlooker is not None and can_id in _ANSWERS and onlooker.raw_from is not None:
+            onlooker.queue += frame
+        for delay in self.fault(can_id):
             if delay:
                 self._late.append((time.monotonic() + delay, sender, frame))
             else:
-                super()._pass_on(sender, frame)
+                self._to_the_others(sender, frame)
+
+    def _to_the_others(self, sender: _Member, frame: bytes) -> None:
+        for other in self._members:
+            if other is not sender and other is not self._onlooker and other.raw_from is not None:
+                other.queue += frame
+
+    def _witness(self, can_id: int, data: bytes) -> None:
+        if can_id == _PV and len(data) == 2 * PV_FRAME.size:
+            self.sample_number = PV_FRAME.unpack(bytes.fromhex(data.decode()))[1]
+            if self._taken:
+                self._taken, self.first_of_session = False, self.sample_number
+        elif can_id == sdo_request_id(CONTROLLER_NODE) and not self._held:
+            request = bytes.fromhex(data.decode())
+            if request[:1] == b"\x23" and request[1:4] == _LEASE and any(request[4:]):
+                self._taken = self._held = True
 
     def _flush(self, member: _Member) -> None:
         now = time.monotonic()
         for each in [each for each in self._late if each[0] <= now]:
             self._late.remove(each)
-            super()._pass_on(each[1], each[2])
+            self._to_the_others(each[1], each[2])
         super()._flush(member)

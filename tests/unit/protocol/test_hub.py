@@ -12,6 +12,7 @@ from collections.abc import Iterator
 import can
 import pytest
 
+from protocol.bus import open_bus
 from protocol.hub import Hub
 
 
@@ -107,3 +108,25 @@ def test_as_a_process_it_says_where_it_is_and_stops_when_asked() -> None:
         assert hub.stdout.readline().startswith("ready socketcand:127.0.0.1:")
         hub.send_signal(signal.SIGTERM)
         assert hub.wait(10) == 0
+
+
+def test_frames_right_behind_the_greeting_are_frames() -> None:
+    """A server that waits for nobody: on a busy machine the hub's pause is over before a new member has read."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve() -> None:
+            listener.accept()[0].close()  # who asks first whether somebody is there
+            with listener.accept()[0] as member:
+                member.sendall(b"< hi >")
+                member.recv(100)
+                member.sendall(b"< ok >")
+                member.recv(100)
+                member.sendall(b"< ok >< frame 190 1.0 0102 >")
+                member.recv(100)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        bus = open_bus(f"socketcand:127.0.0.1:{listener.getsockname()[1]}")
+        assert bus.recv(5) == (0x190, b"\x01\x02")
+        bus.close()
+        thread.join(5)

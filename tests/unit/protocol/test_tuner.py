@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Collection
 
@@ -196,3 +197,41 @@ def test_only_who_holds_the_loop_beats(tuner: Tuner, bus: ListBus) -> None:
 def test_the_bus_is_asked_for_our_frames_only(tuner: Tuner, bus: ListBus) -> None:
     assert set(IDS) - {IDS.command} <= set(bus.ids)
     assert 0x080 not in bus.ids
+
+
+class Flood(ListBus):
+    """Brings samples faster than anybody can take them; an answer comes as soon as it is due."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.n = 0
+
+    def recv(self, timeout: float | None) -> tuple[int, bytes] | None:
+        if self.incoming:
+            return self.incoming.popleft()
+        time.sleep(0.001)
+        self.n += 1
+        return IDS.mv, MV_FRAME.pack(40.0, self.n)
+
+
+def test_a_bus_that_brings_more_than_can_be_taken_silences_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The watch on our heartbeat is 1 s of wall time: it must go out, and the request too."""
+    bus = Flood()
+    monkeypatch.setattr(tuner_module, "open_bus", lambda url: bus)
+    tuner = Tuner("flood", NODE, PLANT)
+    tuner.beating = True
+    began = time.monotonic()
+    tuner.drain()
+    assert tuner.number("controller_mode") == 0
+    assert time.monotonic() - began < 0.5
+    assert (heartbeat_id(TUNER_NODE), b"\x05") in bus.sent
+
+
+def test_who_takes_samples_that_wait_beats_meanwhile(bus: ListBus, tuner: Tuner) -> None:
+    for n in (1, 2):
+        bus.incoming += [(IDS.pv, PV_FRAME.pack(50.0, n)), (IDS.mv, MV_FRAME.pack(40.0, n))]
+    tuner.number("controller_mode")  # takes both in
+    tuner.beating = True
+    bus.sent.clear()
+    assert tuner.sample(0.0) is not None
+    assert bus.sent == [(heartbeat_id(TUNER_NODE), b"\x05")]

@@ -53,6 +53,11 @@ class Server:
         engine.dispose()
         return self._url(name, "postgresql")
 
+    def tool(self, program: str, *arguments: str) -> None:
+        """One of PostgreSQL's client programs: beside the server's, or in the PATH."""
+        beside = self._bin / program
+        subprocess.run([beside if beside.exists() else program, *arguments], check=True, stdin=subprocess.DEVNULL)
+
     def close(self) -> None:
         self.stop()
         shutil.rmtree(self.folder)

@@ -7,11 +7,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from sqlalchemy import func, select
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
 from service.journal import Journal
-from service.store.store import Store, event_of
+from service.running import Running
+from service.store.store import Store, Write, event_of
+from service.store.tables import ChunkRow
+from tuning.plan import Sample, StageDone, StageStarted
 
 
 @pytest.fixture
@@ -76,3 +80,25 @@ def test_closing_writes_what_waits_and_gives_up_in_time(store: Store) -> None:
     began = time.monotonic()
     journal.close(0.3)
     assert time.monotonic() - began < 2.0
+
+
+def test_a_finished_stage_is_stored_after_its_samples(store: Store) -> None:
+    """Whoever reads the one finds the other, whenever the service died."""
+    row = store.create("A", {}, "me", False)
+    journal = Journal(store)
+    running = Running(row.id, "A", journal)
+    running.on_event(StageStarted("relay", 1.0, 0.0))
+    running.on_samples([Sample(0.1 * n, 50.0, 50.0, 40.0, 2) for n in range(30)])
+    found: list[int] = []
+    put = journal.put
+
+    def look_first(write: Write) -> None:
+        put(lambda session: found.append(session.scalar(select(func.sum(ChunkRow.count))) or 0))
+        put(write)
+
+    journal.put = look_first  # type: ignore[method-assign]
+    running.on_event(StageDone("relay", None))
+    assert journal.flush(10)
+    assert found[-1] == 30  # just before the last write, which is the end of the stage
+    assert store.events(row.id)[-1].kind == "stage_done"
+    journal.close(1)

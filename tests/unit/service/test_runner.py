@@ -18,6 +18,7 @@ from service.runner import RunResult, Watch, run
 from tuning.gains import Gains
 from tuning.plan import (
     Command,
+    Event,
     Mode,
     Plan,
     Sample,
@@ -26,6 +27,7 @@ from tuning.plan import (
     SetOutput,
     SetRelay,
     SetSetpoint,
+    StageDone,
     StageStarted,
     worked,
 )
@@ -192,6 +194,29 @@ class TestWorkBesideTheSamples:
         assert result.ended is not None
         assert result.ended.reason is reason
         assert_home(loop, result)
+
+
+def test_the_samples_of_a_stage_are_told_before_its_end() -> None:
+    """What is done never runs again: a service that dies just after must not take its samples along."""
+
+    def two_stages() -> Plan[None]:
+        for stage, samples in (("one", 47), ("two", 23)):
+            yield (StageStarted(stage, 1.0, 0.0),)
+            for _ in range(samples - 1):
+                yield ()
+            yield (StageDone(stage, None),)
+
+    told: list[float] = []
+    at_end: list[int] = []
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, StageDone):
+            at_end.append(len(told))
+
+    run(two_stages(), Meddled(), watch=Watch(), on_event=on_event, on_samples=lambda s: told.extend(e.t for e in s))
+    # The end of a stage is told with the sample that it was found at; the next one belongs to the next stage.
+    assert at_end == [47, 47 + 1 + 23]
+    assert told == pytest.approx([TS * n for n in range(len(told))]) and len(told) == at_end[1] + 1
 
 
 def test_a_frozen_pv_is_noticed_once_mv_has_moved() -> None:

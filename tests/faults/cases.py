@@ -1,0 +1,60 @@
+"""The table of faults: each is brought into each stage of a job, or into those named."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from protocol.profile import CONTROLLER_NODE, PLANT_NODE
+from tests.e2e.plantsite import STAGES
+from tests.faults import injections as do
+from tests.faults.injections import AWAY_S, CLIENTS, LOCKED_S, Injection
+from tests.faults.stand import Needs
+
+BOTH = ("sqlite", "postgresql")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """words: what the table calls it.  stages: where it does not hang on the stage, those in which it is tried."""
+
+    words: str
+    inject: Injection
+    stages: Sequence[str] = tuple(STAGES)
+    databases: Sequence[str] = ("sqlite",)
+    needs: Needs = field(default_factory=Needs)
+
+
+FAULTS = {
+    "service-killed": Fault("`kill -9` of the service, started again", do.service_killed, databases=BOTH),
+    "plant-killed": Fault("`kill -9` of the plant, started again", do.plant_killed, databases=BOTH),
+    "controller-killed": Fault("`kill -9` of the controller, started again", do.controller_killed, databases=BOTH),
+    "sigterm": Fault("SIGTERM to the service, started again", do.service_stopped),
+    "controller-reset": Fault("NMT reset of the controller", do.reset(CONTROLLER_NODE)),
+    "plant-reset": Fault("NMT reset of the plant", do.reset(PLANT_NODE)),
+    "bus-down-0.1": Fault("bus down for 0.1 s", do.bus_down(0.1)),
+    "bus-down-1": Fault("bus down for 1 s", do.bus_down(1.0)),
+    "bus-down-10": Fault("bus down for 10 s", do.bus_down(10.0)),
+    "lost-1": Fault("1 % of the frames lost", do.frames(do.lost(0.01))),
+    "lost-10": Fault("10 % of the frames lost", do.frames(do.lost(0.1))),
+    "late-0.1": Fault("SDO answers 0.1 s late", do.frames(do.late_answers(0.1))),
+    "late-5": Fault("SDO answers 5 s late", do.frames(do.late_answers(5.0))),
+    "twice": Fault("every frame twice", do.frames(do.twice)),
+    "senseless": Fault("frames that make no sense", do.senseless_frames),
+    "wrong-pv": Fault("a PV of 1e30 and one that is no number", do.wrong_pv),
+    "foreign-gains": Fault("another node tries other gains", do.foreign_gains),
+    "foreign-mode": Fault("another node sets manual", do.foreign_mode),
+    "foreign-setpoint": Fault("another node moves the set-point", do.foreign_setpoint),
+    "deaf-listener": Fault("a listener that never reads", do.deaf_listener),
+    "disk-full": Fault(f"disk full for {AWAY_S:.0f} s", do.disk_full, needs=Needs(small_disk=True)),
+    "locked": Fault(
+        f"database locked by another process for {LOCKED_S:.0f} s", do.database_locked(LOCKED_S), databases=BOTH
+    ),
+    "away": Fault(f"database away for {AWAY_S:.0f} s", do.database_away, databases=BOTH),
+    "restored": Fault(
+        "database restored from a back-up made during the job", do.restored_backup, ("relay", "verify"), BOTH
+    ),
+    "second-service": Fault("a second service on the same data", do.second_service, ("relay",), BOTH),
+    "clock-back": Fault("wall clock set back an hour", do.clock_back, needs=Needs(own_clock=True)),
+    "clients": Fault(f"{CLIENTS} clients ask and abort at random", do.random_clients),
+}

@@ -1,0 +1,177 @@
+"""How a job and its loop ended after a fault, and what of that is unsafe."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from protocol.profile import Mode
+from protocol.tuner import Tuner, TunerError
+from tests.faults.faulty_hub import FaultyHub
+
+
+@dataclass(frozen=True)
+class Home:
+    """What the loop must be in the end: as it was found, but for what another's hand has chosen meanwhile."""
+
+    mode: Mode
+    sp: float
+    Kp: float
+    Ti: float
+    words: str = "as found"
+
+
+@dataclass(frozen=True)
+class Glance:
+    """A loop as its controller tells by SDO. at: monotonic wall time, s.  Kp, Ti: the accepted ones."""
+
+    at: float
+    mode: int
+    sp: float
+    on_trial: bool
+    lease: int
+    Kp: float
+    Ti: float
+
+
+def unsafe(glance: Glance | None, home: Home) -> str:
+    """In what an end is unsafe, in words; empty when it is safe.
+
+    Safe is: the mode found, the set-point found, the accepted gains in effect (not on trial), and no session open.
+    """
+    if glance is None:
+        return "the controller cannot be read"
+    wrong = [
+        f"{name} is {is_}, not {wanted}"
+        for name, is_, wanted, same in (
+            ("mode", glance.mode, int(home.mode), glance.mode == home.mode),
+            ("set-point", glance.sp, home.sp, math.isclose(glance.sp, home.sp, rel_tol=1e-6)),
+            ("Kp", glance.Kp, home.Kp, math.isclose(glance.Kp, home.Kp, rel_tol=1e-6)),
+            ("Ti", glance.Ti, home.Ti, math.isclose(glance.Ti, home.Ti, rel_tol=1e-6)),
+            ("on trial", glance.on_trial, False, not glance.on_trial),
+            ("lease", glance.lease, 0, not glance.lease),
+        )
+        if not same
+    ]
+    return "; ".join(wrong)
+
+
+class Eye:
+    """Reads the loop past all faults of the bus, and can keep looking."""
+
+    def __init__(self, hub: FaultyHub) -> None:
+        self._tuner = Tuner(hub.onlooker_url, 0x20, 0x10, sdo_tries=2)
+        self._turn = threading.Lock()
+
+    def close(self) -> None:
+        self._tuner.close()
+
+    def glance(self) -> Glance | None:
+        """None when the controller does not answer."""
+        number = self._tuner.number
+        with self._turn:
+            try:
+                return Glance(
+                    time.monotonic(),
+                    int(number("controller_mode")),
+                    number("controller_setpoint"),
+                    bool(number("controller_on_trial")),
+                    int(number("controller_lease")),
+                    number("controller_accepted_kp"),
+                    number("controller_accepted_ti"),
+                )
+            except TunerError:
+                return None
+
+    @contextmanager
+    def watching(self, home: Home) -> Iterator[list[float]]:
+        """Whenever the loop is seen safe, the time is added to the list."""
+        safe: list[float] = []
+        over = threading.Event()
+
+        def look() -> None:
+            while not over.wait(0.1):
+                seen = self.glance()
+                if seen is not None and not unsafe(seen, home):
+                    safe.append(seen.at)
+
+        thread = threading.Thread(target=look, daemon=True)
+        thread.start()
+        try:
+            yield safe
+        finally:
+            over.set()
+            thread.join()
+
+    def settled(self, home: Home, within_s: float) -> Glance | None:
+        """The loop as soon as it is safe, or as it is after that time."""
+        give_up = time.monotonic() + within_s
+        while True:
+            seen = self.glance()
+            if not unsafe(seen, home) or time.monotonic() > give_up:
+                return seen
+            time.sleep(0.1)
+
+
+class Stalls:
+    """How long at most this process was not let run, s: what the machine itself does to whoever counts seconds."""
+
+    def __init__(self) -> None:
+        self.longest_s = 0.0
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _look(self) -> None:
+        began = time.monotonic()
+        while not self._over.wait(0.05):
+            now = time.monotonic()
+            self.longest_s = max(self.longest_s, now - began - 0.05)
+            began = now
+
+
+@dataclass
+class Ending:
+    """A line of the campaign. safe_s: from the fault until the controller was seen safe; None: the job went on to its
+    proposal, and no fault had made the loop safe before.  kept: samples taken before the fault that are stored.
+    lost: those that are not.  missing: those that never came over the bus.
+    loop: how the loop had to end.  defects: HTTP answers of 5xx that are not documented, ends that are not.
+    stall_s: how long the machine stood still.
+    """
+
+    database: str
+    fault: str
+    stage: str
+    state: str
+    reason: str | None
+    detail: str | None
+    attempts: int
+    safe_s: float | None
+    kept: int
+    lost: int
+    missing: int
+    unsafe: str
+    loop: str = "as found"
+    defects: list[str] = field(default_factory=list)
+    took_s: float = 0.0
+    stall_s: float = 0.0
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        return self.database, self.fault, self.stage
+
+    @property
+    def active(self) -> bool:
+        return self.state in ("queued", "running")
+
+    @property
+    def bad(self) -> bool:
+        return bool(self.unsafe or self.defects or self.active)

@@ -1,0 +1,117 @@
+"""docs/faults.md from the results of the campaign."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from tests.e2e.plantsite import STAGES
+from tests.faults.cases import BOTH, FAULTS
+from tests.faults.ending import Ending
+from tests.faults.stand import LOOP, PACE, SMALL_DISK_MIB
+
+TABLE = Path(__file__).parents[2] / "docs" / "faults.md"
+NAMES = {"sqlite": "SQLite, a file in the data folder", "postgresql": "PostgreSQL"}
+
+HEAD = """# Every fault in every stage
+
+Written by `make faults`. Real processes (plant, controller, service) on the loopback hub; a job is brought into a
+stage, then one fault is let loose on it. The end of the loop is read from the controller by SDO, past the fault.
+
+**{runs} runs, {unsafe} unsafe endings, {active} jobs that stayed active, {defects} answers that no page describes.**
+{dates}. `make faults` fails unless the last three numbers are 0.
+
+An ending is unsafe unless mode and set-point are those found, the accepted gains are in effect, nothing is on trial and
+no session is open; what another node has chosen for itself during the job has the last word. Unsafe ends and their
+jobs would stand here by name:{bad}
+
+## How to read it
+
+Each cell: how the job ended (from the second attempt on, the number of the attempt), then
+
+- of the samples of the struck attempt: how many from before the fault are stored (*kept*); where there are such, how
+  many from before it are not (*lost*), and how many never came over the bus (*missing*: a plant whose sample nobody has
+  answered goes on after 0.1 s);
+- wall time from the fault until the controller was seen safe (looked at every 0.1 s, through a fault of the bus too).
+  A dash: the job kept the loop, and went on to its proposal.
+
+The loop is model 14 of the 50, sampled at {ts:g} s, run at {pace:g} times real time. *proposed* means that the whole
+procedure came to its end in spite of the fault. What is tried in some stages only does not hang on the stage. A run
+in which the machine itself stood still for 0.4 s is repeated, twice at most, unless its end is bad: the heartbeat time
+is 1 s, and `device_went_back` with no fault in sight is such a machine's.
+"""
+
+TAIL = """## What the faults are
+
+- A process that is killed or ends is started again at once, as a supervisor would, the controller with `--keep` and
+  with gains in its options that are not the accepted ones: it must come back on the accepted ones.
+- The bus and its frames: every frame of everybody, from the hub. Random losses, late answers and doubled frames last
+  until the job ends. Senseless frames: wrong lengths, not a number as set-point, unknown commands; 20 times each.
+- Other gains: Kp 999, written and put on trial; the controller refuses the trial while its relay runs.
+- Disk full: the data folder is a file system of {disk} MiB, filled to its last byte.
+- Database locked, or away with SQLite: `BEGIN EXCLUSIVE` on both files by another process's connection; with PostgreSQL
+  an exclusive lock on our tables, or the server stopped as by a power cut and started again.
+- The back-up is made while the job runs, then the service is killed, the back-up restored (`loopwright restore`, which
+  ends the job; `pg_restore`, after which it resumes unless the service is started with `--no-resume`), the service
+  started.
+- The wall clock is that of the service's Python (`time.time`, `datetime.now`), set back while the job runs; the
+  machine's own is left alone.
+- The clients read jobs, loops, events and samples, hang up in the middle of answers, and each wants the job aborted at
+  some moment within 10 s.
+
+Repeat a part, or one cell: `python -m tests.faults --faults service-killed,locked --stages relay --database sqlite`; it
+takes its place in the table. Every run: `tests/faults/results.json`. A part of the table is in `make test`
+(`tests/faults/test_endings.py`).
+"""
+
+
+def write(entries: Sequence[dict[str, Any]]) -> None:
+    TABLE.write_text(text(entries), encoding="utf-8")
+
+
+def text(entries: Sequence[dict[str, Any]]) -> str:
+    """The page."""
+    found = [(Ending(**{name: entry[name] for name in entry if name != "date"}), entry["date"]) for entry in entries]
+    endings = [one for one, _ in found]
+    dates = sorted({date for _, date in found})
+    bad = "".join(f"\n- {one.database}, {one.fault}, {one.stage}: {_why(one)}" for one in endings if one.bad)
+    head = HEAD.format(
+        runs=len(endings),
+        unsafe=sum(bool(one.unsafe) for one in endings),
+        active=sum(one.active for one in endings),
+        defects=sum(len(one.defects) for one in endings),
+        dates=" to ".join(dict.fromkeys((dates[0], dates[-1]))) if dates else "never run",
+        bad=bad or " there are none.",
+        ts=LOOP.ts,
+        pace=PACE,
+    )
+    tables = "\n".join(_table(database, endings) for database in BOTH)
+    return f"{head}\n{tables}\n{TAIL.format(disk=SMALL_DISK_MIB)}"
+
+
+def _table(database: str, endings: Iterable[Ending]) -> str:
+    cells = {(one.fault, one.stage): one for one in endings if one.database == database}
+    columns = ("fault", "loop", *STAGES)
+    lines = [f"## {NAMES[database]}", "", f"| {' | '.join(columns)} |", "|" + " --- |" * len(columns)]
+    for name, fault in FAULTS.items():
+        row = [cells[name, stage] for stage in STAGES if (name, stage) in cells]
+        if row:
+            loop = " / ".join(dict.fromkeys("**unsafe**" if one.unsafe else one.loop for one in row))
+            shown = [_cell(cells.get((name, stage))) for stage in STAGES]
+            lines.append(f"| {fault.words} | {loop} | {' | '.join(shown)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _cell(one: Ending | None) -> str:
+    if one is None:
+        return ""
+    end = one.state + (f", `{one.reason}`" if one.reason else "") + (f" ({one.attempts})" if one.attempts > 1 else "")
+    safe = "–" if one.safe_s is None else f"{one.safe_s:.1f} s"
+    counts = ((one.kept, "kept"), (one.lost, "lost"), (one.missing, "missing"))
+    samples = ", ".join(f"{count} {what}" for count, what in counts if count) or "none yet"
+    return f"{'**BAD** ' if one.bad else ''}{end}<br>{samples}; {safe}"
+
+
+def _why(one: Ending) -> str:
+    return "; ".join([one.unsafe, *one.defects, "still active" if one.active else ""]).strip("; ").replace("\n", " ")

@@ -1,0 +1,104 @@
+"""A quick part of the table of faults (`make faults`), on live processes: how job and loop must end."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import pytest
+
+from tests.faults import campaign, report
+from tests.faults.cases import FAULTS
+from tests.faults.ending import Glance, unsafe
+from tests.faults.injections import senseless_frames
+from tests.faults.stand import HOME, PACE, Missing, Needs, Stand
+
+pytestmark = pytest.mark.timeout(200)
+
+PROPOSED = "proposed None"
+SILENT = ("failed node_lost", "failed samples_lost", "failed device_went_back")
+EXPECTED: dict[tuple[str, str], tuple[str, ...]] = {
+    ("service-killed", "zn_pi"): (PROPOSED,),
+    ("plant-killed", "ultimate"): ("failed node_lost", "failed samples_lost"),
+    ("controller-killed", "verify"): ("failed node_lost",),
+    ("bus-down-0.1", "verify"): (PROPOSED, "failed samples_lost"),
+    ("bus-down-1", "zn_pi"): SILENT,
+    ("bus-down-10", "baseline"): ("failed node_lost", "failed restore_unconfirmed"),
+    ("lost-1", "verify"): (PROPOSED, *SILENT),
+    ("lost-10", "verify"): (PROPOSED, *SILENT),
+    ("late-0.1", "verify"): (PROPOSED,),
+    ("late-5", "verify"): ("failed node_lost", "failed restore_unconfirmed"),
+    ("twice", "verify"): (PROPOSED,),
+    ("foreign-gains", "baseline"): ("aborted gains_changed",),
+    ("foreign-gains", "verify"): ("aborted gains_changed",),
+    ("deaf-listener", "verify"): (PROPOSED,),
+    ("clients", "ultimate"): ("aborted operator",),
+    ("disk-full", "zn_pi"): (PROPOSED,),
+    ("clock-back", "zn_pi"): (PROPOSED,),
+}
+"""By fault and stage: state and reason of the job."""
+
+
+@pytest.fixture(scope="module")
+def stands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[Needs, Stand]]:
+    with ExitStack() as stack:
+        yield _Stands(stack, tmp_path_factory)
+
+
+class _Stands(dict[Needs, Stand]):
+    """One for each kind of need, when it is first asked for."""
+
+    def __init__(self, stack: ExitStack, folders: pytest.TempPathFactory) -> None:
+        self._stack, self._folders = stack, folders
+
+    def __missing__(self, needs: Needs) -> Stand:
+        try:
+            self[needs] = Stand(self._stack, self._folders.mktemp("stand"), needs=needs)
+        except Missing as missing:
+            pytest.skip(f"needs {missing}; `make faults` fails without")
+        return self[needs]
+
+
+@pytest.mark.parametrize(("fault", "stage"), EXPECTED)
+def test_the_loop_ends_safe_and_the_job_says_why(fault: str, stage: str, stands: dict[Needs, Stand]) -> None:
+    one = campaign.ending(stands[FAULTS[fault].needs], fault, stage)
+    assert not one.bad, one
+    assert f"{one.state} {one.reason}" in EXPECTED[fault, stage], one
+    assert one.kept > 0
+    assert (one.attempts > 1) == (fault == "service-killed")
+    if fault != "service-killed":
+        assert one.lost == 0, one
+
+
+def test_frames_that_make_no_sense_are_passed_over(stands: dict[Needs, Stand]) -> None:
+    stand = stands[Needs()]
+    stand.at_rest(PACE)
+    with senseless_frames(stand, ""):
+        before = stand.site.read("sample_number")
+        assert stand.site.is_home() and stand.site.state().pv == pytest.approx(HOME.sp, abs=2e-3)
+        time.sleep(0.2)
+        assert stand.site.read("sample_number") > before
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"mode": 3}, {"mode": 1}, {"sp": 50.1}, {"on_trial": True}, {"lease": 5}, {"Kp": 40.0}, {"Ti": 2.4}],
+)
+def test_what_is_unsafe(change: dict[str, float]) -> None:
+    well = {"at": 0.0, "mode": 2, "sp": HOME.sp, "on_trial": False, "lease": 0, "Kp": HOME.Kp, "Ti": HOME.Ti}
+    assert unsafe(Glance(**well), HOME) == ""  # type: ignore[arg-type]
+    assert unsafe(Glance(**well | change), HOME)  # type: ignore[arg-type]
+    assert unsafe(None, HOME)
+
+
+def test_the_page_is_that_of_the_results() -> None:
+    entries = campaign.load()
+    assert report.TABLE.read_text(encoding="utf-8") == report.text(entries)
+    assert {(entry["fault"], entry["stage"], entry["database"]) for entry in entries} == {
+        (name, stage, database)
+        for name, fault in FAULTS.items()
+        for stage in fault.stages
+        for database in fault.databases
+    }
+    assert "0 unsafe endings" in report.text(entries)
