@@ -144,7 +144,7 @@ class Ending:
     proposal, and no fault had made the loop safe before.  kept: samples taken before the fault that are stored.
     lost: those that are not.  missing: those that never came over the bus.
     loop: how the loop had to end.  defects: HTTP answers of 5xx that are not documented, ends that are not.
-    stall_s: how long the machine stood still.
+    stall_s: how long the machine stood still.  earlier: kept from a run of an earlier state of this harness.
     """
 
     database: str
@@ -163,6 +163,7 @@ class Ending:
     defects: list[str] = field(default_factory=list)
     took_s: float = 0.0
     stall_s: float = 0.0
+    earlier: bool = False
 
     @property
     def key(self) -> tuple[str, str, str]:

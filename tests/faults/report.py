@@ -12,6 +12,7 @@ from tests.faults.ending import Ending
 from tests.faults.stand import LOOP, PACE, SMALL_DISK_MIB
 
 TABLE = Path(__file__).parents[2] / "docs" / "faults.md"
+MARK = " †"
 NAMES = {"sqlite": "SQLite, a file in the data folder", "postgresql": "PostgreSQL"}
 
 HEAD = """# Every fault in every stage
@@ -40,6 +41,10 @@ The loop is model 14 of the 50, sampled at {ts:g} s, run at {pace:g} times real 
 procedure came to its end in spite of the fault. What is tried in some stages only does not hang on the stage. A run
 in which the machine itself stood still for 0.4 s is repeated, twice at most, unless its end is bad: the heartbeat time
 is 1 s, and `device_went_back` with no fault in sight is such a machine's.
+"""
+
+EARLIER = """
+†: kept from a run before the last corrections of the product and of this harness; the next run replaces it.
 """
 
 TAIL = """## What the faults are
@@ -86,6 +91,8 @@ def text(entries: Sequence[dict[str, Any]]) -> str:
         ts=LOOP.ts,
         pace=PACE,
     )
+    if any(one.earlier for one in endings):
+        head += EARLIER
     tables = "\n".join(_table(database, endings) for database in BOTH)
     return f"{head}\n{tables}\n{TAIL.format(disk=SMALL_DISK_MIB)}"
 
@@ -110,7 +117,7 @@ def _cell(one: Ending | None) -> str:
     safe = "–" if one.safe_s is None else f"{one.safe_s:.1f} s"
     counts = ((one.kept, "kept"), (one.lost, "lost"), (one.missing, "missing"))
     samples = ", ".join(f"{count} {what}" for count, what in counts if count) or "none yet"
-    return f"{'**BAD** ' if one.bad else ''}{end}<br>{samples}; {safe}"
+    return f"{'**BAD** ' if one.bad else ''}{end}{MARK if one.earlier else ''}<br>{samples}; {safe}"
 
 
 def _why(one: Ending) -> str:
