@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -22,6 +23,9 @@ class Disturbance:
     drift: PV spans in Pu.  pole: of the noise's colour, per sample.  quantum: of PV, spans.  spikes: share of
     samples.  stiction: the valve stays where it is until MV is off by so much, then jumps there; dead_band: it follows
     so far behind; both in amplitudes of the relay.  ends: how far the actuator goes, amplitudes.
+
+    gain, later: as the new gains take over, the plant's gain becomes so many times what it was, its dead time longer
+    by so many Pu.
     """
 
     loads: int = 0
@@ -33,14 +37,15 @@ class Disturbance:
     stiction: float = 0.0
     dead_band: float = 0.0
     ends: float = math.inf
+    gain: float = 1.0
+    later: float = 0.0
 
 
 class Disturbed:
     """A plant with a disturbance, in deviations from `nominal` (MV, PV).
 
-    noise: its standard deviation, of which a white one is the plant's own.
-
-    loads: (sample, size) of each, MV units.  span: of PV.  period: samples.  amplitude: MV units.
+    noise: its standard deviation; a white one is the plant's own.  loads: (sample, size) of each, MV units.
+    span: of PV.  period: samples.  amplitude: MV units.
     """
 
     def __init__(
@@ -69,6 +74,8 @@ class Disturbed:
         # where in its slack the valve stands
         self._slack = self._dead_band * self._random.uniform(-1.0, 1.0)
         self._n, self._position = 0, 0.0
+        self._gain, self._line = 1.0, deque([0.0])
+        self._later = round(how.later * period)
         self._pv = self._measured(plant.pv)
 
     @property
@@ -91,12 +98,19 @@ class Disturbed:
         self._pv = self._measured(self._plant.step(self._mv_nominal + self._moved(mv)))
         return self._pv
 
+    def change(self) -> None:
+        """The new gains take over."""
+        self._gain = self._how.gain
+        self._line.extendleft([self._line[0]] * self._later)
+
     def _moved(self, mv: float) -> float:
-        """Where the valve is."""
+        """Where the valve is, as the plant feels it."""
         away = mv + self._slack - self._position
         if abs(away) > self._stiction:
             self._position += away if self._stiction else math.copysign(max(abs(away) - self._dead_band, 0.0), away)
-        return min(max(self._position, -self._ends), self._ends)
+        self._line.append(self._gain * min(max(self._position, -self._ends), self._ends))
+        self._line.popleft()
+        return self._line[0]
 
     def _measured(self, pv: float) -> float:
         how, random = self._how, self._random

@@ -138,22 +138,29 @@ FURTHER = {
         Case("Ts = Pu/30", 0.01, samples=30),
         Case("Ts = Pu/100", 0.01, samples=100),
         Case("2 % of samples lost", 0.01, lost=0.02),
+        Case("gain doubles with the new gains", 0.01, Disturbance(gain=2.0)),
+        Case("gain falls to 0.4 with them", 0.01, Disturbance(gain=0.4)),
+        Case("dead time 0.25 Pu longer with them", 0.01, Disturbance(later=0.25)),
         Case("nonlinear reactor, 5 %", 0.01, amplitude=5.0, nonlinear=True),
         Case("nonlinear reactor, 15 %", 0.01, amplitude=15.0, nonlinear=True),
     )
 }
 
 
-class Losing(RehearsedLoop):
-    """A loop of which some samples do not arrive, never two in a row."""
+class Troubled(RehearsedLoop):
+    """Some samples do not arrive, never two in a row; the plant changes as the new gains take over."""
 
-    def __init__(self, plant: Process, channel: Channel, sample_time_s: float, share: float, seed: int) -> None:
-        super().__init__(plant, channel, sample_time_s)
-        self._share, self._random = share, np.random.default_rng([seed, 2])
+    def __init__(self, process: Disturbed, channel: Channel, sample_time_s: float, lost: float, seed: int) -> None:
+        super().__init__(process, channel, sample_time_s)
+        self._process, self._lost, self._random = process, lost, np.random.default_rng([seed, 2])
+        self._relaying = False
 
     def step(self, commands: Sequence[Command]) -> Sample:
         sample = super().step(commands)
-        return super().step(()) if self._random.random() < self._share else sample
+        if self._relaying and sample.mode != Mode.EXPERIMENT:
+            self._process.change()
+        self._relaying = sample.mode == Mode.EXPERIMENT
+        return super().step(()) if self._random.random() < self._lost else sample
 
 
 def plants() -> list[Plant]:
@@ -190,20 +197,18 @@ def loop_of(
 ) -> tuple[RehearsedLoop, Facts]:
     """A loop at rest under sluggish gains, in deviation variables. deviation: the largest permitted set-point step."""
     process: Process = LinearPlant(plant.num, plant.den, plant.L, plant.Ts, noise_std=noise, seed=seed)
+    nominal = (0.0, 0.0)
     if case.nonlinear:
-        process = Reactor(plant.Ts, noise, seed)
-    if case.how != UNDISTURBED or case.nonlinear:
-        nominal = (reactor.MV_NOMINAL, reactor.STEADY_STATE[2]) if case.nonlinear else (0.0, 0.0)
-        steps = loads(plant, amplitude, seed, case)
-        process = Disturbed(process, case.how, noise, steps, 2.0 * deviation, plant.samples, amplitude, seed, nominal)
+        process, nominal = Reactor(plant.Ts, noise, seed), (reactor.MV_NOMINAL, reactor.STEADY_STATE[2])
     reverse = sign(plant.model()) > 0.0
     limit = case.limits * amplitude
     settings = Settings(mv_low=-limit, mv_high=limit, pv_low=-1e9, pv_high=1e9, reverse=reverse)
     gains = Gains(Kp=0.15 * plant.Ku, Ti=2.0 * plant.Pu)
     channel = Channel(plant.Ts, settings, Parameters(gains.Kp, gains.Ti), 0.0, int(Mode.AUTOMATIC), 0.0)
     facts = Facts(plant.Ts, case.known * T95_PERIODS * plant.Pu, -limit, limit, deviation, gains, reverse)
-    loop = RehearsedLoop(process, channel, plant.Ts)
-    return Losing(process, channel, plant.Ts, case.lost, seed) if case.lost else loop, facts
+    steps = loads(plant, amplitude, seed, case)
+    troubled = Disturbed(process, case.how, noise, steps, 2.0 * deviation, plant.samples, amplitude, seed, nominal)
+    return Troubled(troubled, channel, plant.Ts, case.lost, seed), facts
 
 
 def loads(plant: Plant, amplitude: float, seed: int, case: Case) -> list[tuple[int, float]]:
@@ -295,7 +300,9 @@ def measure(case: Case, plant: Plant, seed: int) -> Ran:
     if result.value is None:
         assert isinstance(result.ended, Ended)
         return replace(ran, reason=result.ended.reason.value, detail=result.ended.detail)
-    return judged(ran, plant, result.value.gains, case.derivative)
+    # a plant that has changed is judged as it is now
+    now = replace(plant, num=tuple(case.how.gain * c for c in plant.num), L=plant.L + case.how.later * plant.Pu)
+    return judged(ran, now, result.value.gains, case.derivative)
 
 
 def judged(ran: Ran, plant: Plant, gains: Gains, derivative: bool = False) -> Ran:

@@ -110,6 +110,14 @@ def test_a_faulty_valve_is_told_from_the_plant(case: str, name: str) -> None:
     assert FAULTY[case, name] in result.ended.detail
 
 
+@pytest.mark.parametrize("case", [case for case in FURTHER if "with the" in case])
+def test_a_plant_that_changes_with_the_new_gains_is_not_taken_for_one_under_a_load(case: str) -> None:
+    plant = next(plant for plant in plants() if plant.name == "model-9")
+    result, _ = fast_run(plant, FURTHER[case], seed=1)
+    assert result.value is None and result.ended is not None
+    assert result.ended.reason in ("surprise", "unexplained", "disturbed")
+
+
 @pytest.mark.parametrize("case", ["PV in steps of span/50", "2 % of samples lost", "two loads", "drift 2 % in Pu"])
 def test_what_can_be_allowed_for_does_not_hinder(case: str) -> None:
     plant = next(plant for plant in plants() if plant.name == "P4_n=4")

@@ -23,7 +23,7 @@ class Evidence:
     Ts: s.  u: MV that held from each sample to the next, y: PV at it, both shape (N,) and as deviations from rest.
     direction: +1 where PV finally rises with MV, else -1: known from the controller's action.
     listened: samples at rest.  relayed: samples up to the end of the relay.  switches: samples at which it switched,
-    its start not among them.
+    its start not among them.  steps: samples at which the set-point stepped under the new gains.
     """
 
     Ts: float
@@ -33,6 +33,7 @@ class Evidence:
     listened: int
     relayed: int
     switches: tuple[int, ...]
+    steps: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.switches) < LEAST_SWITCHES:

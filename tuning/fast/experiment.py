@@ -58,6 +58,7 @@ class Experiment:
         self._high = True
         self._raise_at = 0
         self._follow_s = 0.0
+        self._steps: list[int] = []
         self._commands: tuple[Command, ...] = ()
         self._step = 0.0
 
@@ -124,6 +125,7 @@ class Experiment:
 
     def _follow(self, commands: tuple[Command, ...], span: float) -> Plan[None]:
         """Raises Refused, DIVERGES."""
+        self._steps.append(len(self.trace))
         sample = yield commands
         self._keep(sample)
         end = sample.t + self._follow_s
@@ -156,6 +158,7 @@ class Experiment:
             listened=self.listened,
             relayed=self.relayed if self._stepping else len(trace),
             switches=tuple(self.switches),
+            steps=tuple(self._steps),
         )
 
     def _keep(self, sample: Sample) -> None:

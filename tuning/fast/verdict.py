@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from tuning.fast.choice import Chosen, choose
 from tuning.fast.design import Best, Design, Wish
 from tuning.fast.evidence import Evidence
-from tuning.fast.fit import Fit
+from tuning.fast.fit import Fit, Fitted
 from tuning.fast.spread import colour, difference_of_rivals, peak, uncertainty_of_Ms
 from tuning.fast.valve import suspect
 from tuning.gains import Gains
@@ -24,6 +24,8 @@ MOST_UNCERTAINTY = 0.10
 SURPRISE, SURPRISE_OF_A_STORY = 0.5, 0.2
 """Of Ms from what was asked, of the tested controller on the new model and the new one on the earlier model; where the
 load is said to have moved twice."""
+WITH_A_STEP = (0.15, 0.8)
+"""Periods before and after a step of the set-point, within which a load is said to have come with it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,6 +84,8 @@ def judge(evidence: Evidence, wish: Wish, earlier: Judged | None = None) -> Judg
         detail = f"another model that explains the record as well gives an Ms off by {rivals:.2g}"
     elif earlier is not None:
         cause, detail = _surprise(earlier, model, best.gains, wish, design, found.hypothesis.loads)
+        if cause is None:
+            cause, detail = _excused(fit, found)
         if cause is None and (suspicion := suspect(fit, found)) is not None:
             cause, detail = "unexplained", f"{suspicion.fault} explains the record better, or the plant is not linear"
     return Judged(
@@ -99,6 +103,24 @@ def judge(evidence: Evidence, wish: Wish, earlier: Judged | None = None) -> Judg
         design_delay=delay,
         period=design.period,
     )
+
+
+def _excused(fit: Fit, found: Fitted) -> tuple[str | None, str]:
+    """Loads that came with the new gains explain away what was to be tested: a plant that has changed looks the same.
+
+    One may be true, if the step back is explained without another.
+    """
+    steps, period = fit.evidence.steps, fit.period
+    if not steps:
+        return None, ""
+    before, after = (period * each for each in WITH_A_STEP)
+    loads = [float(at) for at in found.theta[found.structure.searched :] if at > steps[0] - before]
+    with_a_step = any(step - before < at < step + after for at in loads for step in steps)
+    if len(steps) == 1 and (with_a_step or len(loads) > 1):
+        return "ambiguous", "a load seems to have come with the new gains; a plant that has changed would look the same"
+    if len(loads) > 1:
+        return "surprise", "PV answered each step of the new gains as if a load had come with it"
+    return None, ""
 
 
 def _surprise(
