@@ -28,9 +28,9 @@ RUN /opt/loopwright/bin/pip install --no-cache-dir --quiet --no-deps . \
 FROM ${BASE_IMAGE}
 COPY --from=build /opt/loopwright /opt/loopwright
 COPY containers/loops.yaml /etc/loopwright/loops.yaml
-# A new volume takes the owner of the folder it is put on.
+# New volumes take the owners of the folders they are put on.
 RUN echo "loopwright:x:10001:10001::/data:/usr/sbin/nologin" >> /etc/passwd && echo "loopwright:x:10001:" >> /etc/group \
-    && mkdir /data && chown 10001:10001 /data
+    && mkdir --parents /data /run/postgresql && chown 10001:10001 /data /run/postgresql
 ENV PATH=/opt/loopwright/bin:$PATH PYTHONUNBUFFERED=1 MPLCONFIGDIR=/tmp
 USER loopwright
 WORKDIR /data

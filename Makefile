@@ -8,7 +8,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEBIAN := user-mode-linux tshark can-utils iproute2 postgresql
-ENGINE := docker.io docker-compose debootstrap user-mode-linux iproute2
+ENGINE := docker.io docker-compose
+BESIDE := debootstrap user-mode-linux iproute2 e2fsprogs
 
 .PHONY: setup demo test compose-test check bench bench-tuning validate faults system clean
 
@@ -33,10 +34,11 @@ test: setup system check
 	quick=0; $(BIN)/python -m pytest --ignore=tests/vcan --ignore=tests/e2e || quick=$$?; \
 	LOOPWRIGHT_REQUIRE_VCAN=1 tools/with-vcan --timeout 3600 -- $(BIN)/python -m pytest $(wildcard tests/vcan tests/e2e) && exit $$quick
 
-# Where no container engine answers, one is installed as the packages above are, and runs for this test alone.
+# Where there is no container engine, one is installed as the packages above are, and runs for this test alone.
 compose-test:
-	@docker info >/dev/null 2>&1 || sh tools/system-packages $(ENGINE)
-	tools/compose-test
+	@engine=; docker info >/dev/null 2>&1 || engine="$(ENGINE)"; \
+	[ -z "$$engine" ] && [ "$$(id -u)" != 0 ] || sh tools/system-packages $$engine $(BESIDE)
+	$(PYTHON) tools/compose-test
 
 check: setup
 	$(BIN)/ruff check

@@ -12,8 +12,6 @@ import socket
 import struct
 import sys
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Sequence
 
 from containers import keeper
@@ -44,6 +42,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def answers(url: str) -> None:
     """Raises OSError when the service does not answer, or says that it is not well."""
+    import urllib.error  # half of the time that the others take
+    import urllib.request
+
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     try:
         opener.open(f"{url}/healthz", timeout=_WAIT_S).close()

@@ -1,14 +1,15 @@
 """Runs a command on the bus of this network namespace, for as long as there is that bus.
 
-    python -m containers.member [--write TEMPLATE FILE] -- COMMAND...
+    python -m containers.member [--set NAME=VALUE] [--write TEMPLATE FILE] -- COMMAND...
 
-{bus} in an argument, and in TEMPLATE, which is written to FILE, stands for the bus's address. When the bus goes, the
-command is ended as by `docker stop`, and this container with it: started anew, it joins the new bus.
+{bus} in an argument, and in TEMPLATE, which is written to FILE, stands for the bus's address, {NAME} for VALUE. When
+the bus goes, the command is ended as by `docker stop`, and this container with it: started anew, it joins the new bus.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import socket
 import subprocess
@@ -32,19 +33,31 @@ _BUS_RESTARTS_S = 3.0
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m containers.member", description=__doc__.split("\n")[0])
-    parser.add_argument("--write", nargs=2, type=Path, metavar=("TEMPLATE", "FILE"), help="with {bus} filled in")
+    parser.add_argument("--need", metavar="VARIABLE", help="of the environment, without which nothing is started")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="{NAME} filled in too")
+    parser.add_argument("--write", nargs=2, type=Path, metavar=("TEMPLATE", "FILE"), help="with all of them filled in")
     parser.add_argument("command", nargs="+")
     options = parser.parse_args(argv)
+    if options.need and not os.environ.get(options.need):
+        print(f"member: {options.need} is not set; .env.example says what it has to be", file=sys.stderr)
+        return 1
     try:
         url, connection = keeper.join(_JOIN_S)
+        known = dict(word.split("=", 1) for word in options.set) | {"bus": url}
         if options.write:
             template, target = options.write
-            target.write_text(template.read_text(encoding="utf-8").replace("{bus}", url), encoding="utf-8")
+            target.write_text(_filled(template.read_text(encoding="utf-8"), known), encoding="utf-8")
     except (keeper.NoBus, OSError) as error:
         print(f"member: {error}", file=sys.stderr)
         return 1
     with connection:
-        return _run([word.replace("{bus}", url) for word in options.command], connection)
+        return _run([_filled(word, known) for word in options.command], connection)
+
+
+def _filled(text: str, known: dict[str, str]) -> str:
+    for name, value in known.items():
+        text = text.replace(f"{{{name}}}", value)
+    return text
 
 
 def _run(command: list[str], connection: socket.socket) -> int:

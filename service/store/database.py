@@ -10,6 +10,7 @@ from typing import Any
 
 from alembic import command
 from alembic.config import Config
+from alembic.util import CommandError
 from sqlalchemy import Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import ArgumentError
 
@@ -62,7 +63,7 @@ def sqlite(file: Path) -> Engine:
 
 
 def migrate(engine: Engine) -> None:
-    """Makes the tables, or brings them to the present revision."""
+    """Makes the tables, or brings them to the present revision. Raises BadDatabase when they are of a later one."""
     config = Config()
     config.set_main_option("script_location", "service.store:migrations")
     with engine.begin() as connection:
@@ -71,7 +72,13 @@ def migrate(engine: Engine) -> None:
             connection.execute(text("SET LOCAL statement_timeout = 0"))
             connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _MIGRATING})
         config.attributes["connection"] = connection
-        command.upgrade(config, "head")
+        try:
+            command.upgrade(config, "head")
+        except CommandError as error:
+            raise BadDatabase(
+                f"the database was made by a newer version of Loopwright ({error}): install that version again, or "
+                "restore a back-up from before it (docs/operations.md)"
+            ) from error
 
 
 def _pragmas(connection: Any, _record: object) -> None:

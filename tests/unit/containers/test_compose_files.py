@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
-from service.demo import loops_yaml
+from service.demo import TAG, loops_yaml
 
 ROOT = Path(__file__).parents[3]
 FILES = ("docker-compose.yml", "docker-compose.can0.yml")
@@ -29,18 +29,39 @@ def test_every_container_is_confined(name: str) -> None:
         assert one["stop_grace_period"] == "10s"
 
 
-def test_one_container_alone_has_a_right_and_a_port() -> None:
+def test_the_buses_alone_have_a_right_and_a_port() -> None:
     found = services("docker-compose.yml")
-    assert {name for name, one in found.items() if "cap_add" in one or "user" in one or "ports" in one} == {"bus"}
-    assert found["bus"]["cap_add"] == ["NET_ADMIN"]
-    assert [port.split(":")[0] for port in found["bus"]["ports"]] == ["127.0.0.1"]
-    assert {one["network_mode"] for name, one in found.items() if name != "bus"} == {"service:bus"}
+    buses = {name: one for name, one in found.items() if "cap_add" in one or "user" in one or "ports" in one}
+    assert set(buses) == {"bus", "bus-b"}
+    for one in buses.values():
+        assert one["cap_add"] == ["NET_ADMIN"]
+        assert [port.split(":")[0] for port in one["ports"]] == ["127.0.0.1"]
+    assert found["database"]["network_mode"] == "none"
+    for name in set(found) - set(buses) - {"database"}:
+        assert found[name]["network_mode"] == ("service:bus-b" if name.endswith("-b") else "service:bus")
 
 
-def test_the_service_is_stopped_before_the_devices_and_they_before_the_bus() -> None:
+@pytest.mark.parametrize("end", ["", "-b"])
+def test_the_service_is_stopped_before_the_devices_and_they_before_the_bus(end: str) -> None:
     found = services("docker-compose.yml")
-    assert {"bus", "controller", "plant"} <= set(found["service"]["depends_on"])
-    assert "bus" in found["controller"]["depends_on"] and "bus" in found["plant"]["depends_on"]
+    assert {f"bus{end}", f"controller{end}", f"plant{end}"} <= set(found[f"service{end}"]["depends_on"])
+    assert found[f"controller{end}"]["depends_on"] == found[f"plant{end}"]["depends_on"] == [f"bus{end}"]
+
+
+def test_the_second_gateway_is_the_first_but_for_its_names() -> None:
+    found = services("docker-compose.yml")
+    second = {name for name, one in found.items() if one.get("profiles") == ["postgres"]}
+    assert second == {"bus-b", "plant-b", "controller-b", "service-b", "database"}
+    assert not any("profiles" in found[name] for name in set(found) - second)
+    assert "database" in found["service-b"]["depends_on"]
+    a, b = found["service"], found["service-b"]
+    assert b["command"] == [
+        *a["command"][:3], "--need=LOOPWRIGHT_DATABASE", "--set=tag=TIC-201", *a["command"][4:]
+    ]  # fmt: skip
+    assert a["environment"]["LOOPWRIGHT_DATABASE"] == b["environment"]["LOOPWRIGHT_DATABASE"]
+    assert a["environment"]["LOOPWRIGHT_HOST"] != b["environment"]["LOOPWRIGHT_HOST"]
+    for one in (a, b, found["database"]):
+        assert "database-socket:/run/postgresql" in one["volumes"]
 
 
 def test_every_setting_is_in_the_example_with_the_default_that_holds() -> None:
@@ -53,4 +74,6 @@ def test_every_setting_is_in_the_example_with_the_default_that_holds() -> None:
 
 
 def test_the_loops_are_those_of_the_demo_without_containers() -> None:
-    assert yaml.safe_load((ROOT / "containers/loops.yaml").read_text()) == yaml.safe_load(loops_yaml("{bus}"))
+    ours = (ROOT / "containers/loops.yaml").read_text().replace("{tag}", TAG)
+    assert yaml.safe_load(ours) == yaml.safe_load(loops_yaml("{bus}"))
+    assert f"--set=tag={TAG}" in services("docker-compose.yml")["service"]["command"]

@@ -105,12 +105,25 @@ def test_the_status_is_the_commands(bus: Keeper, script: str, status: int) -> No
     assert process.returncode == status
 
 
-def test_a_file_is_written_with_the_bus_filled_in(bus: Keeper, tmp_path: Path) -> None:
+def test_a_file_is_written_with_the_bus_and_more_filled_in(bus: Keeper, tmp_path: Path) -> None:
     template, file = tmp_path / "template", tmp_path / "file"
-    template.write_text("bus: '{bus}'\n")
-    process = start(bus.port, "--write", str(template), str(file), "--", "cat", str(file))
+    template.write_text("bus: '{bus}', tag: '{tag}', {other}\n")
+    process = start(bus.port, "--set=tag=A=B", "--write", str(template), str(file), "--", "cat", str(file))
     output, _ = process.communicate(timeout=20)
-    assert (process.returncode, output) == (0, f"bus: '{URL}'\n")
+    assert (process.returncode, output) == (0, f"bus: '{URL}', tag: 'A=B', {{other}}\n")
+
+
+@pytest.mark.parametrize(("value", "status"), [(None, 1), ("", 1), ("postgresql://", 0)])
+def test_a_variable_without_which_nothing_is_started(
+    bus: Keeper, monkeypatch: pytest.MonkeyPatch, value: str | None, status: int
+) -> None:
+    monkeypatch.delenv("LOOPWRIGHT_NEEDED", raising=False)
+    if value is not None:
+        monkeypatch.setenv("LOOPWRIGHT_NEEDED", value)
+    process = start(bus.port, "--need=LOOPWRIGHT_NEEDED", "--", "true")
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == status
+    assert errors.startswith("member: LOOPWRIGHT_NEEDED is not set") == bool(status)
 
 
 def test_no_bus(bus: Keeper) -> None:

@@ -1,0 +1,1 @@
+"""What tools/compose-test goes through. Standard library only."""
