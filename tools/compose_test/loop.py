@@ -30,8 +30,8 @@ url, _ = keeper.join(5.0)
 Tuner(url, 0x20, 0x10).write("plant_pace", float(sys.argv[1]))
 """
 FULL_SPEED = 0.0
-SLOW = 0.5
-"""A relay stage of 90 s: looking at it from user-mode Linux takes some time to begin."""
+SLOW = 0.2
+"""A relay stage of a minute: looking at it from user-mode Linux takes some time to begin."""
 
 
 def pace(factor: float) -> None:
@@ -47,7 +47,7 @@ def at_rest_soon() -> None:
 def in_mid_stage() -> str:
     """A job in its relay stage, the plant slow enough for that to last; its URL."""
     pace(SLOW)
-    url = str(ask(f"/loops/{TAG}/retune", {"baseline": False, "requested_by": "compose-test"})["url"])
+    url = str(ask(f"/loops/{TAG}/retune", {"requested_by": "compose-test"})["url"])
 
     def there() -> bool:
         job = ask(url)
