@@ -55,6 +55,17 @@ def ending(stand: Stand, name: str, stage: str, database: str = "sqlite") -> End
     )  # fmt: skip
 
 
+def calm_ending(stand: Stand, name: str, stage: str, database: str = "sqlite") -> Ending:
+    """The same, repeated while the machine itself stands still."""
+    one = ending(stand, name, stage, database)
+    for _ in range(REPEATS):
+        if one.bad or one.stall_s < STALL_S:
+            break
+        print(f"repeated, the machine stood still for {one.stall_s:.1f} s: {line(one)}", flush=True)
+        one = ending(stand, name, stage, database)
+    return one
+
+
 def _brought_into(stand: Stand, stage: Stage) -> str:
     """The URL of a job in that stage. A busy machine alone can end a job: then it is tried again."""
     for last_try in (False, False, True):
@@ -117,12 +128,7 @@ def _row(name: str, database: str, stages: Iterable[str]) -> list[Ending]:
             try:
                 stand = Stand(stack, folder, database, FAULTS[name].needs)
                 while waiting:
-                    one = ending(stand, name, waiting[0], database)
-                    for _ in range(REPEATS):
-                        if one.bad or one.stall_s < STALL_S:
-                            break
-                        print(f"repeated, the machine stood still for {one.stall_s:.1f} s: {line(one)}", flush=True)
-                        one = ending(stand, name, waiting[0], database)
+                    one = calm_ending(stand, name, waiting[0], database)
                     add(one)
                     waiting.pop(0)
             except Missing as missing:
