@@ -75,9 +75,9 @@ STAGES = {
     "ultimate": Stage("ultimate", _SOON),
     "zn_pi": Stage("zn_pi", {**_SOON, "start": "zn_pi", "Ku": 205.0, "Pu_s": 3.32}),
     "verify": Stage("verify", _TO_VERIFY),
-    "fast, preflight": Stage("preflight", {}, 0.3, untouched=True),
-    "fast, relay": Stage("relay", {}),
-    "fast, verify": Stage("verify", {}),
+    "fast-preflight": Stage("preflight", {}, 0.3, untouched=True),
+    "fast-relay": Stage("relay", {}),
+    "fast-verify": Stage("verify", {}),
 }
 """Of model 14."""
 

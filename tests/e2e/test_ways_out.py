@@ -27,7 +27,7 @@ BACK_WITHIN_S = 2.0
 """1 s of heartbeat time, and what the device's tick and reading it all back by SDO take on a slow machine."""
 OUTAGE_S = 1.5
 """Of wall time: longer than the heartbeat time, shorter than the patience of who restores."""
-EARLY = {"fast": STAGES["fast, relay"], "five-stage": STAGES["baseline"]}
+EARLY = {"fast": STAGES["fast-relay"], "five-stage": STAGES["baseline"]}
 """The first stage of each procedure that moves the loop."""
 MORE_LOOPS = (
     {"tag": "NO-BUS", "bus": "socketcan:vcan9"},
@@ -162,7 +162,7 @@ def test_busy_then_aborted_by_the_operator(here: Plantsite) -> None:
     assert here.is_home()
 
 
-@pytest.mark.parametrize("stage", ["baseline", "fast, preflight", "fast, relay", "fast, verify"])
+@pytest.mark.parametrize("stage", ["baseline", "fast-preflight", "fast-relay", "fast-verify"])
 def test_a_bus_that_goes_down(here: Plantsite, stage: str) -> None:
     def link(state: str) -> None:
         subprocess.run(["ip", "link", "set", "vcan0", state], check=True)
@@ -179,7 +179,7 @@ def test_a_bus_that_goes_down(here: Plantsite, stage: str) -> None:
     assert here.is_home()
 
 
-@pytest.mark.parametrize("stage", ["relay", "fast, relay"])
+@pytest.mark.parametrize("stage", ["relay", "fast-relay"])
 def test_sigterm_of_the_service(here: Plantsite, stage: str) -> None:
     url = here.in_stage(STAGES[stage])
     here.service.stop()
@@ -204,7 +204,7 @@ def test_kill_9_of_the_service_leaves_the_controller_to_itself_and_the_job_resum
     assert here.is_home()
 
 
-@pytest.mark.parametrize("stage", ["relay", "fast, relay"])
+@pytest.mark.parametrize("stage", ["relay", "fast-relay"])
 def test_sample_times_that_differ_and_a_wrong_action(here: Plantsite, stage: str) -> None:
     """A second pair beside the first, whose plant is held."""
     here.write("plant_samples_to_run", 0)

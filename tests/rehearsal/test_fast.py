@@ -94,7 +94,7 @@ def test_what_cannot_be_tuned_is_refused_with_its_cause(case: str) -> None:
 
 
 FAULTY = {
-    ("dead band 0.2", "P2_T=0.5"): "follows about 0.2",
+    ("dead band 0.2", "P1_T=0.3"): "follows about 0.2",
     ("valve sticks by 0.3", "P1_T=0.3"): "sticks until MV is off by about 0.3",
     ("actuator ends at 0.7", "P3_T=0.01"): "goes about 0.7",
 }

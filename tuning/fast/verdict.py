@@ -84,10 +84,10 @@ def judge(evidence: Evidence, wish: Wish, earlier: Judged | None = None) -> Judg
         detail = f"another model that explains the record as well gives an Ms off by {rivals:.2g}"
     elif earlier is not None:
         cause, detail = _surprise(earlier, model, best.gains, wish, design, found.hypothesis.loads)
-        if cause is None:
-            cause, detail = _excused(fit, found)
         if cause is None and (suspicion := suspect(fit, found)) is not None:
             cause, detail = "unexplained", f"{suspicion.fault} explains the record better, or the plant is not linear"
+        if cause is None:
+            cause, detail = _excused(fit, found)
     return Judged(
         cause=cause,
         detail=detail,
