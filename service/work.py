@@ -16,6 +16,7 @@ from tuning.models import Model
 from tuning.plan import Event, Plan, Sample
 from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 from tuning.stages.common import Facts
+from tuning.stages.settle import after_settling
 
 TIME_BUDGET_T95 = {FAST: 100.0}
 OTHER_BUDGET_T95 = 500.0
@@ -98,9 +99,14 @@ def tune(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopStat
 
 
 def plan(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow] = ()) -> Plan[Any]:
-    """earlier: events of attempts that were cut off. What fast had recorded by then is not gone on with: relay and
-    set-point step are one record, of a loop that was not touched in between.
+    """earlier: events of attempts that were cut off, after which the loop gets time to come to rest. What fast had
+    recorded by then is not gone on with: relay and set-point step are one record, of a loop not touched in between.
     """
+    procedure = _procedure(request, facts, earlier)
+    return after_settling(facts, procedure) if earlier else procedure
+
+
+def _procedure(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow]) -> Plan[Any]:
     if request.fast:
         from tuning.fast.procedure import FastOptions, fast
         from tuning.fast.trial import trial

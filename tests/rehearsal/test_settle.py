@@ -1,0 +1,65 @@
+"""A loop that a cut-off test has left swinging: given time, the next attempt finds it at rest."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks.rehearsed import entry, open_loop
+from service.config import parse_site
+from service.loop import Loop
+from service.request import RetuneRequest
+from service.runner import RunResult, Watch, run
+from service.store.tables import EventRow
+from service.work import plan
+from tuning.plan import Event, Mode, Plan, SetMode, SetOutput, StageStarted
+from tuning.reasons import Reason
+from tuning.stages.common import Facts
+from tuning.stages.settle import LOOKS, SETTLE
+
+TAG = "TIC-1"
+CUT_OFF = [EventRow(kind="loop_found", data={})]
+
+
+def _pushed(facts: Facts, working_output: float) -> Plan[None]:
+    """What a test does to a loop before it is cut off."""
+    commands = (SetMode(Mode.MANUAL), SetOutput(working_output + 10.0))
+    for n in range(round(facts.T95_s / facts.sample_time_s)):
+        yield commands if n == 0 else ()
+
+
+@pytest.fixture
+def swinging() -> tuple[Loop, Facts]:
+    config = parse_site({"loops": [entry(TAG)]}, "test").loops[TAG]
+    loop = open_loop(config)
+    state = loop.read()
+    facts = Facts(
+        state.sample_time_s, config.t95_s, state.mv_low, state.mv_high, config.sp_deviation, state.gains,
+        state.reverse_acting,
+    )  # fmt: skip
+    run(_pushed(facts, state.mv), loop, watch=Watch())
+    return loop, facts
+
+
+def _attempt(loop: Loop, facts: Facts, earlier: list[EventRow], method: str) -> tuple[RunResult[object], list[str]]:
+    stages: list[str] = []
+
+    def hear(event: Event) -> None:
+        if isinstance(event, StageStarted):
+            stages.append(event.stage)
+
+    return run(plan(RetuneRequest(method=method), facts, earlier), loop, watch=Watch(), on_event=hear), stages
+
+
+@pytest.mark.parametrize("method", ["fast", "five-stage"])
+def test_a_second_attempt_gives_the_loop_time_to_come_to_rest(swinging: tuple[Loop, Facts], method: str) -> None:
+    loop, facts = swinging
+    ran, stages = _attempt(loop, facts, CUT_OFF, method)
+    assert ran.value is not None, ran.ended
+    assert stages[:2] == [SETTLE, "preflight"]
+    assert facts.T95_s < ran.plant_time_s[SETTLE] < LOOKS / 2 * facts.T95_s
+
+
+def test_a_first_attempt_is_refused_there(swinging: tuple[Loop, Facts]) -> None:
+    ran, stages = _attempt(*swinging, [], "fast")
+    assert ran.ended is not None and ran.ended.reason is Reason.NOT_AT_REST
+    assert stages == ["preflight"]
