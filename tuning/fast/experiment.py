@@ -32,6 +32,8 @@ WIDEST_SPAN = 2.0
 """Of PV under the relay, permitted set-point steps."""
 MOST_PERIODS = 8.4
 VERIFIED_PERIODS = 3.0
+BACK = 0.5
+"""Of the time of the first step."""
 SHORTEST = 0.5
 """Of the relay's period: a model's that is shorter is not believed."""
 FAR = 20.0
@@ -120,7 +122,8 @@ class Experiment:
         yield from self._follow((SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp + size)), span)
 
     def step_back(self) -> Plan[None]:
-        """The set-point steps home, under the same gains."""
+        """The set-point steps home, under the same gains, for half as long."""
+        self._follow_s *= BACK
         yield from self._follow((SetSetpoint(self.point.sp),), self.evidence().span)
 
     def _follow(self, commands: tuple[Command, ...], span: float) -> Plan[None]:
