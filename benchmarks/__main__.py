@@ -31,7 +31,8 @@ def figures(name: str) -> dict[str, Any]:
     if found.returncode:
         print(found.stdout)
         found.check_returncode()
-    answer: dict[str, Any] = json.JSONDecoder().raw_decode(found.stdout[found.stdout.index("{") :])[0]
+    told = "\n" + found.stdout.replace("\r", "")
+    answer: dict[str, Any] = json.JSONDecoder().raw_decode(told[told.rindex("\n{") + 1 :])[0]
     return answer
 
 
