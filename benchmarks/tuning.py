@@ -5,8 +5,9 @@
 The plants are 70 of the Astrom-Hagglund batch, the 50 models of the five-stage paper and the linearised reactor (every
 n-th with --plants N). Each run is a rehearsal: listening, relay, fit, step, fit. Noise is white, its standard deviation
 a part of PV's span under the noise-free relay; a load step is 10 to 50 % of the relay's larger amplitude, of random
-sign and time within 3.5 Pu after the relay starts. Ms 1.6 is asked for; the sampled controller's Ts/2 counts as dead
-time on the true plant. J is the criterion of `tuning.fast.design`, against the best PI (or PID) on the true plant.
+sign and time within 3.5 Pu after the relay starts. "--cases further" takes the other disturbances. Ms 1.6 is asked
+for; the sampled controller's Ts/2 counts as dead time on the true plant. J is the criterion of `tuning.fast.design`,
+against the best PI (or PID) on the true plant.
 Plant time counts from the start of the relay. A result is silently wrong when it is proposed and Ms is off by more
 than 0.1.
 """
