@@ -10,7 +10,7 @@ from benchmarks.refusals import cases, draw, rehearsed
 from tuning.reasons import ADVICE, Reason
 
 PAGE = (Path(__file__).parents[2] / "docs" / "refusals.md").read_text(encoding="utf-8")
-WITH_FIT = {"unexplained", "disturbed", "uncertain", "diverges"}
+WITH_FIT = {"unexplained", "disturbed", "uncertain", "surprise", "diverges"}
 
 
 @pytest.mark.parametrize("cause", cases())
