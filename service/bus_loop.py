@@ -81,7 +81,9 @@ class BusLoop:
         self._silence_s = SILENCE_S
         self._lease = SHORTEST_LEASE
         self._until_renewal = 0
+        self._paid_at = 0.0
         self._until_look = 0
+        self._relay_written: dict[str, float] = {}
         self._mode_found: Mode | None = None
         self._tried: Gains | None = None
         self._first_n: int | None = None
@@ -106,11 +108,13 @@ class BusLoop:
                     raise Refused(Reason.WRONG_MODE, "an experiment is running in the controller")
                 self._plan_lease()
                 tuner.write("controller_lease", self._lease)
+                self._paid_at = time.monotonic()
                 tuner.drain()
                 tuner.mode, tuner.on_trial, tuner.sp = state.mode, state.on_trial, state.sp
                 tuner.emergencies.clear()
                 tuner.restarted = False
                 self._until_renewal = self._until_look = self._lease // 3
+                self._relay_written.clear()
                 self._mode_found = state.mode
                 self._first_n, self._left, self._tried = None, 0, None
                 self._commands.clear()
@@ -127,6 +131,7 @@ class BusLoop:
         with self._translated() as tuner:
             self._commands += commands
             if self._left <= 0:
+                self._keep(tuner)
                 if self._commands:
                     self._until_look = self._command_lag() // 2
                 for command in self._commands:
@@ -134,8 +139,6 @@ class BusLoop:
                 self._commands.clear()
                 if self._until_look <= 0:
                     self._look(tuner)
-                if self._until_renewal <= 0:
-                    self._renew(tuner)
                 if self._in_blocks:
                     tuner.write("plant_samples_to_run", self._block)
                     self._left = self._block
@@ -266,18 +269,29 @@ class BusLoop:
                 self._tried = gains
             case SetOutput(value):
                 tuner.write("controller_manual_output", value)
-            case SetRelay(amplitude, hysteresis, working_output, parallel_gain, amplitude_low, average):
-                tuner.write("controller_relay_amplitude", amplitude)
-                tuner.write("controller_relay_hysteresis", hysteresis)
-                tuner.write("controller_relay_working_output", working_output)
-                tuner.write("controller_relay_parallel_gain", parallel_gain)
-                tuner.write("controller_relay_amplitude_low", amplitude_low or 0.0)
-                tuner.write("controller_relay_average", average)
-                tuner.write("controller_relay_max_samples", RELAY_LONGEST)
-                tuner.write("controller_relay_pv_low", tuner.number("controller_pv_low"))
-                tuner.write("controller_relay_pv_high", tuner.number("controller_pv_high"))
-                tuner.write("controller_experiment", Experiment.RELAY)
-                tuner.write("controller_mode_command", Mode.EXPERIMENT)
+            case SetRelay():
+                self._start_relay(tuner, command)
+
+    def _start_relay(self, tuner: Tuner, relay: SetRelay) -> None:
+        """Writes what is not as it was written before: a relay that only gets another amplitude soon has it."""
+        wanted = {
+            "amplitude": relay.amplitude,
+            "hysteresis": relay.hysteresis,
+            "working_output": relay.working_output,
+            "parallel_gain": relay.parallel_gain,
+            "amplitude_low": relay.amplitude_low or 0.0,
+            "average": relay.average,
+            "max_samples": RELAY_LONGEST,
+        }
+        if not self._relay_written:
+            wanted |= {name: tuner.number(f"controller_{name}") for name in ("pv_low", "pv_high")}
+        for name, value in wanted.items():
+            if self._relay_written.get(name) != value:
+                self._keep(tuner)
+                tuner.write(f"controller_relay_{name}", value)
+                self._relay_written[name] = value
+        tuner.write("controller_experiment", Experiment.RELAY)
+        tuner.write("controller_mode_command", Mode.EXPERIMENT)
 
     def _try(self, tuner: Tuner, gains: Gains) -> None:
         values = (gains.Kp, gains.Ti, gains.Td, gains.Tf, gains.b, gains.c)
@@ -285,12 +299,19 @@ class BusLoop:
             tuner.write(f"controller_staged_{name}", value)
         tuner.write("controller_parameter_command", ParameterCommand.TRY)
 
+    def _keep(self, tuner: Tuner) -> None:
+        """Pays for more when a third is used up: by samples, or by wall time that went by in waiting for answers of a
+        node that many loops ask."""
+        waited = not self._in_blocks and time.monotonic() - self._paid_at > LEASE_WALL_S / 3
+        if self._until_renewal <= 0 or waited:
+            self._renew(tuner)
+
     def _renew(self, tuner: Tuner) -> None:
         """Looks before it pays: paying for a session that has ended would open another one."""
         if not tuner.number("controller_lease"):
             raise self._gone_back(tuner)
         tuner.write("controller_lease", self._lease)
-        self._until_renewal = self._lease // 3
+        self._until_renewal, self._paid_at = self._lease // 3, time.monotonic()
 
     def _look(self, tuner: Tuner) -> None:
         """Asks for what the status frames tell (one of them may have been lost), and for what none tells: whether the
@@ -302,7 +323,7 @@ class BusLoop:
             if not (_same(Kp, self._tried.Kp) and _same(Ti, self._tried.Ti)):
                 text = f"somebody else has put Kp {Kp:.6g}, Ti {Ti:.6g} s in the place of the gains on trial"
                 raise Aborted(Reason.GAINS_CHANGED, text)
-        self._until_look = self._lease // 3
+        self._until_look = self._lease * 2 // 3
 
     def _hear(self, tuner: Tuner) -> None:
         """An emergency may concern another channel: our own lease tells."""
