@@ -7,7 +7,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-DEBIAN := user-mode-linux tshark can-utils iproute2 postgresql
+DEBIAN := user-mode-linux tshark can-utils iproute2 postgresql systemd
 ENGINE := docker.io docker-compose
 BESIDE := debootstrap user-mode-linux iproute2 e2fsprogs
 
