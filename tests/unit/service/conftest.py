@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from service.api.app import create_app
+from service.store.store import Store
 from tests.unit.service.fakes import Service
 from tests.unit.service.postgres import Server, binaries
 
@@ -40,3 +41,11 @@ def postgres() -> Iterator[Server]:
     server = Server(found)
     yield server
     server.close()
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def store(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Store]:
+    database = None if request.param == "sqlite" else request.getfixturevalue("postgres").database()
+    store = Store(tmp_path, database)
+    yield store
+    store.close()

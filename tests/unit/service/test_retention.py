@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -18,14 +17,6 @@ from tests.unit.service.fakes import ThreadEngine
 from tuning.plan import Sample
 
 NOW = datetime.now(UTC)
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def store(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Store]:
-    database = None if request.param == "sqlite" else request.getfixturevalue("postgres").database()
-    store = Store(tmp_path, database)
-    yield store
-    store.close()
 
 
 def job(store: Store, loop: str, *states: JobState, dry: bool = False, days_ago: float = 0.0, host: str = "") -> str:

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,14 +18,6 @@ from service.store.store import Busy, FolderInUse, ForeignLoop, NoSuchJob, Store
 from service.store.tables import Base
 from tests.unit.service.postgres import Server
 from tuning.plan import Sample
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def store(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Store]:
-    database = None if request.param == "sqlite" else request.getfixturevalue("postgres").database()
-    store = Store(tmp_path, database)
-    yield store
-    store.close()
 
 
 def test_migrations_make_the_tables_of_the_code(store: Store) -> None:
