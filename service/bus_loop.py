@@ -278,7 +278,7 @@ class BusLoop:
             "amplitude": relay.amplitude,
             "hysteresis": relay.hysteresis,
             "working_output": relay.working_output,
-            "parallel_gain": relay.parallel_gain,
+            "parallel_gain": 0.0,  # the controller has one, no procedure wants it
             "amplitude_low": relay.amplitude_low or 0.0,
             "average": relay.average,
             "max_samples": RELAY_LONGEST,

@@ -101,10 +101,10 @@ class RehearsedLoop:
                 channel.try_staged()
             case SetOutput(value):
                 channel.manual_output = value
-            case SetRelay(amplitude, hysteresis, working, parallel, amplitude_low, average):
+            case SetRelay(amplitude, hysteresis, working, amplitude_low, average):
                 low, high = channel.settings.pv_low, channel.settings.pv_high
                 channel.start_relay(
-                    amplitude, hysteresis, working, parallel, 10**9, low, high, amplitude_low or 0.0, average
+                    amplitude, hysteresis, working, 0.0, 10**9, low, high, amplitude_low or 0.0, average
                 )
 
     def restore(self, state: LoopState) -> LoopState:

@@ -70,7 +70,7 @@ class SetOutput:
 class SetRelay:
     """Arm and start the relay inside the controller (mode experiment).
 
-    u = working_output +- amplitude (switching on the action-signed error, with hysteresis) + parallel_gain * error.
+    u = working_output +- amplitude, switching on the action-signed error, with hysteresis.
     amplitude_low: of the lower side, if it is not the same.  average: the mean of so many samples switches.
     While a relay is running it goes on from the side it is on.
     """
@@ -78,7 +78,6 @@ class SetRelay:
     amplitude: float
     hysteresis: float
     working_output: float
-    parallel_gain: float = 0.0
     amplitude_low: float | None = None
     average: int = 1
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing, suppress
 from typing import TypeVar
 
 from tuning.plan import Plan, StageDone, StageStarted
@@ -22,17 +23,15 @@ def after_settling(facts: Facts, plan: Plan[T]) -> Plan[T]:
 
     A loop that is not fit after LOOKS is the plan's own preflight to refuse.
     """
-    items = next(plan)
-    ahead = sum(item.expected_s + item.remaining_s for item in items if isinstance(item, StageStarted))
-    yield (StageStarted(SETTLE, facts.T95_s, ahead),)
-    for _ in range(LOOKS):
-        try:
-            yield from preflight(facts)
-        except Refused:
-            continue
-        break
-    items = (StageDone(SETTLE, None), *items)
-    try:
+    with closing(plan):
+        items = next(plan)
+        ahead = sum(item.expected_s + item.remaining_s for item in items if isinstance(item, StageStarted))
+        yield (StageStarted(SETTLE, facts.T95_s, ahead),)
+        for _ in range(LOOKS):
+            with suppress(Refused):
+                yield from preflight(facts)
+                break
+        items = (StageDone(SETTLE, None), *items)
         while True:
             answer = yield items
             try:
@@ -40,5 +39,3 @@ def after_settling(facts: Facts, plan: Plan[T]) -> Plan[T]:
             except StopIteration as end:
                 value: T = end.value
                 return value
-    finally:
-        plan.close()
