@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from tuning.models import Reals
@@ -23,34 +24,34 @@ from tuning.models import Reals
 _ONE = np.ones(1)
 
 
-@dataclass(frozen=True, slots=True)
-class Pulse:
-    """z^-delay * forward(z)/recursion(z), from the held input to each state, in powers of 1/z.
+@dataclass(frozen=True, slots=True, eq=False)
+class Pulses:
+    """z^-delay * forward(z)/recursion(z), from the held input to each state, in powers of 1/z, of several plants.
 
-    forward: shape (order + 2, states).  recursion: shape (order + 1,).  delay: whole samples.
+    forward: shape (plants, order + 2, states).  recursion: shape (plants, order + 1).  delay: (plants,), whole samples.
     """
 
     forward: Reals
     recursion: Reals
-    delay: int
+    delay: NDArray[np.int64]
 
-    def first(self, count: int) -> Pulse:
-        """Of the first so many states alone."""
-        return Pulse(self.forward[:, :count], self.recursion, self.delay)
+    def of(self, which: slice) -> Pulses:
+        """Of some of the plants."""
+        return Pulses(self.forward[which], self.recursion[which], self.delay[which])
 
-    def drive(self, u: Reals) -> Reals:
-        """The states under u, 0 before the first sample, as columns, shape (len(u), states)."""
-        taps, count = self.forward.shape
-        out = np.zeros((len(u), count))
-        if self.delay < len(u):
-            length = len(u) - self.delay
-            # one recursion for all states; what tells them apart is a short sum over its last values
-            common = lfilter(_ONE, self.recursion, u[:length])
-            last = np.zeros((length, taps - 1))
-            for k in range(1, taps):
-                last[k:, k - 1] = common[:-k]
-            out[self.delay :] = last @ self.forward[1:]
-        return out
+    def drive(self, u: Reals, count: int | None = None) -> Reals:
+        """The first `count` states under u, 0 before the first sample, shape (plants, len(u), states)."""
+        forward = self.forward[:, :, :count]
+        plants, taps = forward.shape[:2]
+        # one recursion for all states of a plant; what tells them apart is a short sum over its last values
+        common = np.zeros((plants, len(u) + taps - 2))
+        for row, recursion, delay in zip(common, self.recursion, self.delay, strict=True):
+            if (length := len(u) - 1 - int(delay)) > 0:
+                row[len(row) - length :] = lfilter(_ONE, recursion, u[:length])
+        out = common[:, : len(u), None] * forward[:, None, -1]
+        for k in range(1, taps - 1):
+            out += common[:, k : k + len(u), None] * forward[:, None, -1 - k]
+        return np.asarray(out)
 
 
 def states(monic: Reals, L: float, u: Reals, count: int) -> Reals:
@@ -59,10 +60,10 @@ def states(monic: Reals, L: float, u: Reals, count: int) -> Reals:
     monic: den without its leading 1, highest power first, time in samples.  L: dead time in samples, >= 0.
     u: shape (N,), held from its sample to the next, 0 before the first. The states are 0 before it.
     """
-    return pulses(monic[None, :], [L], count)[0].drive(u)
+    return np.asarray(pulses(monic[None, :], [L], count).drive(u)[0])
 
 
-def pulses(monics: Reals, dead_times: Sequence[float] | Reals, count: int) -> list[Pulse]:
+def pulses(monics: Reals, dead_times: Sequence[float] | Reals, count: int) -> Pulses:
     """How the first `count` states answer, for each denominator (rows of `monics`) and its dead time, see `states`."""
     many, order = monics.shape
     L = np.asarray(dead_times, dtype=float)
@@ -79,15 +80,15 @@ def pulses(monics: Reals, dead_times: Sequence[float] | Reals, count: int) -> li
     g1 = late[:, :order, :order] @ early[:, :order, order:]
 
     recursion = _characteristic(phi)
-    answers = np.empty((order + 2, many, order, 1))
-    answers[0], answers[1], answers[2] = 0.0, g0, phi @ g0 + g1
+    answers = np.empty((many, order + 2, order))
+    answers[:, 0], answers[:, 1], answers[:, 2] = 0.0, g0[:, :, 0], (phi @ g0 + g1)[:, :, 0]
     for k in range(3, order + 2):
-        answers[k] = phi @ answers[k - 1]
-    answers = answers[:, :, :count, 0]
-    forward = np.zeros_like(answers)
-    for k in range(order + 1):
-        forward[k:] += recursion[:, k, None] * answers[: order + 2 - k]
-    return [Pulse(forward[:, b], recursion[b], int(whole[b])) for b in range(many)]
+        answers[:, k] = (phi @ answers[:, k - 1, :, None])[:, :, 0]
+    answers = answers[:, :, :count]
+    forward = answers.copy()
+    for k in range(1, order + 1):
+        forward[:, k:] += recursion[:, k, None, None] * answers[:, : order + 2 - k]
+    return Pulses(forward, recursion, whole.astype(np.int64))
 
 
 def _characteristic(phi: Reals) -> Reals:

@@ -46,12 +46,14 @@ class Structure:
         return self.zeros + 1 + self.feed_through
 
     def monic(self, theta: Reals) -> Reals:
-        """The denominator without its leading 1, highest power first."""
-        searched = np.exp(theta[: self.lags])
+        """The denominator without its leading 1, highest power first; of each theta, shape (..., order)."""
+        searched = np.exp(theta[..., : self.lags])
         if self.lags == 3:
-            a1, a0, p = searched
-            return np.array([a1 + p, a0 + a1 * p, a0 * p])
-        return np.append(searched, 0.0) if self.integrating else searched
+            a1, a0, p = np.moveaxis(searched, -1, 0)
+            return np.stack((a1 + p, a0 + a1 * p, a0 * p), axis=-1)
+        if self.integrating:
+            return np.concatenate((searched, np.zeros((*searched.shape[:-1], 1))), axis=-1)
+        return np.asarray(searched)
 
     def regressors(self, theta: Reals, u: Reals, load_from: int | None) -> Reals:
         """Columns of everything linear, shape (len(u), columns): the input's, the offset's, then a load step's.

@@ -183,18 +183,18 @@ def _timed(fit: Fit, structure: Structure, loads: int, thetas: Sequence[Reals]) 
         guesses += [(float(rss[i]), np.append(theta, shifts[i] * fit.block)) for i in np.argsort(rss)[:3]]
     guesses.sort(key=lambda each: each[0])
     starts = fit.differing([theta for _, theta in guesses], structure, 6)
-    rough = sorted((fit.search(structure, hypothesis, [start], FIRST_STEPS) for start in starts), key=_bic)
+    rough = sorted(fit.followed(structure, hypothesis, starts, FIRST_STEPS), key=_bic)
     return [fit.search(structure, hypothesis, [each.theta]) for each in rough[:2]]
 
 
 def _by_time(fit: Fit, structure: Structure, theta: Reals, shifts: NDArray[np.int64]) -> Reals:
     """Sum of squares left with one step of the load more at each of these rows; a load only shifts its response."""
     order = structure.order
-    base = fit.regressors(structure, Hypothesis(len(theta) - structure.searched), [theta])[0]
+    base = fit.regressors(structure, Hypothesis(len(theta) - structure.searched), theta[None])[0]
     q = np.linalg.qr(base)[0]
     rest = fit.y - q @ (q.T @ fit.y)
     monic = structure.monic(theta[: structure.searched])[None, :]
-    answer = averaged(pulses(monic, [0.0], order)[0].drive(np.ones(len(fit.u))), fit.block)
+    answer = averaged(pulses(monic, [0.0], order).drive(np.ones(len(fit.u)))[0], fit.block)
     answer = answer / np.max(np.abs(answer), axis=0)
     shifted = np.zeros((len(shifts), fit.samples, order))
     for i, m in enumerate(shifts):

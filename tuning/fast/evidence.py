@@ -101,9 +101,10 @@ def noise_of(rest: Reals) -> float:
     return max(fast, float(np.std(slow, ddof=3)))
 
 
-def averaged(columns: Reals, block: int) -> Reals:
-    """Means of `block` rows each; rows left over at the end are dropped."""
+def averaged(columns: Reals, block: int, axis: int = 0) -> Reals:
+    """Means of `block` rows each, which lie along the axis; rows left over at the end are dropped."""
     if block == 1:
         return columns
-    rows = len(columns) // block
-    return np.asarray(columns[: rows * block].reshape(rows, block, *columns.shape[1:]).mean(axis=1))
+    before, rows, after = columns.shape[:axis], columns.shape[axis] // block, columns.shape[axis + 1 :]
+    kept = columns[(slice(None),) * axis + (slice(rows * block),)]
+    return np.asarray(kept.reshape(*before, rows, block, *after).mean(axis=axis + 1))

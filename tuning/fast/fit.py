@@ -1,8 +1,4 @@
-"""The structures fitted to a whole fast record, with steps of the load at free times and a drift if need be.
-
-Variable projection with Kaufman's derivative (BIT 15, 1975): the slope of the projected residual without the term that
-vanishes with the residual, so that all slopes cost one solution of the linear part.
-"""
+"""The structures fitted to a whole fast record, with steps of the load at free times and a drift if need be."""
 
 from __future__ import annotations
 
@@ -15,9 +11,10 @@ import numpy as np
 
 from tuning.fast.evidence import Evidence, averaged
 from tuning.models import Reals, TransferFunction
+from tuning.projection import Bounded, descend
 from tuning.sampled import pulses
 from tuning.structures import Structure
-from tuning.varpro import Linear, search, solve
+from tuning.varpro import Linear, solve
 
 FLOOR = 2e-4
 """Of the residual in spans of PV: data without noise would ask for ever more parameters."""
@@ -86,34 +83,34 @@ class Fit:
 
     # what is fitted
 
-    def regressors(self, structure: Structure, hypothesis: Hypothesis, thetas: Sequence[Reals]) -> Reals:
+    def regressors(self, structure: Structure, hypothesis: Hypothesis, thetas: Reals) -> Reals:
         """Columns of everything linear for each theta, shape (thetas, rows, columns)."""
-        count, searched = structure.zeros + 1, structure.searched
-        monics = np.array([structure.monic(theta[:searched]) for theta in thetas])
+        many, inputs = len(thetas), structure.zeros + 1
         # one call for MV and every load: what it costs is mostly the call
-        times = np.array(thetas)[:, structure.lags :].T
-        answers = pulses(np.tile(monics, (len(times), 1)), times.ravel(), structure.order)
-        driven, loads = answers[: len(thetas)], answers[len(thetas) :]
+        times = thetas[:, structure.lags :].T
+        answers = pulses(np.tile(structure.monic(thetas), (len(times), 1)), times.ravel(), structure.order)
+        driven, loads = answers.of(slice(many)), answers.of(slice(many, None))
         always = self._always[:, : 1 + hypothesis.drift]
         width = structure.inputs + always.shape[1] + structure.order * hypothesis.loads
-        out = np.empty((len(thetas), self.samples, width))
-        for k, each in enumerate(driven):
-            out[k, :, :count] = averaged(each.first(count).drive(self.u), self.block)
-            if structure.feed_through:
-                delayed = np.zeros(len(self.u))
-                delayed[each.delay + 1 :] = self.u[: len(self.u) - each.delay - 1]
-                out[k, :, count] = averaged(delayed, self.block)
-            at = structure.inputs
-            out[k, :, at : at + always.shape[1]] = always
-            at += always.shape[1]
-            for load in loads[k :: len(thetas)]:
-                out[k, :, at : at + structure.order] = averaged(load.drive(self._step), self.block)
-                at += structure.order
+        out = np.empty((many, self.samples, width))
+        out[:, :, :inputs] = averaged(driven.drive(self.u, inputs), self.block, 1)
+        if structure.feed_through:
+            delayed = np.zeros((many, len(self.u)))
+            for row, delay in zip(delayed, driven.delay, strict=True):
+                row[delay + 1 :] = self.u[: len(self.u) - delay - 1]
+            out[:, :, inputs] = averaged(delayed, self.block, 1)
+        at = structure.inputs
+        out[:, :, at : at + always.shape[1]] = always
+        at += always.shape[1]
+        moved = averaged(loads.drive(self._step), self.block, 1) if hypothesis.loads else out[:0]
+        for k in range(hypothesis.loads):
+            out[:, :, at : at + structure.order] = moved[k * many : (k + 1) * many]
+            at += structure.order
         return out
 
     def fitted(self, structure: Structure, hypothesis: Hypothesis, theta: Reals) -> Fitted:
         """The best linear part for this theta."""
-        columns = self.regressors(structure, hypothesis, [theta])[0]
+        columns = self.regressors(structure, hypothesis, theta[None])[0]
         linear = solve(columns, self.y)
         # a load's time was chosen among many: it counts twice
         parameters = len(theta) + columns.shape[1] + hypothesis.loads
@@ -124,25 +121,30 @@ class Fit:
         self, structure: Structure, hypothesis: Hypothesis, starts: Sequence[Reals], most_steps: int = MOST_STEPS
     ) -> Fitted:
         """The best local minimum from these starts."""
+        if len(starts) > LONG_SEARCHES:
+            starts = self._descend(structure, hypothesis, starts, FIRST_STEPS)[:LONG_SEARCHES]
+        return self.fitted(structure, hypothesis, self._descend(structure, hypothesis, starts, most_steps)[0])
+
+    def followed(
+        self, structure: Structure, hypothesis: Hypothesis, starts: Sequence[Reals], steps: int
+    ) -> list[Fitted]:
+        """Where so many steps lead from each start, the best first."""
+        return [self.fitted(structure, hypothesis, at) for at in self._descend(structure, hypothesis, starts, steps)]
+
+    def _descend(
+        self, structure: Structure, hypothesis: Hypothesis, starts: Sequence[Reals], most_steps: int
+    ) -> list[Reals]:
         low, high = self.bounds(structure, hypothesis)
         times = 1 + hypothesis.loads
         reach = np.append(np.full(structure.lags, LOG_REACH), np.full(times, 0.25 * self.period))
         step = np.append(np.full(structure.lags, LOG_STEP), np.full(times, LOG_STEP * self.period))
-        projection = _Projection(self, structure, hypothesis)
 
-        def descend(starts: Sequence[Reals], most_steps: int) -> list[Reals]:
-            found = [
-                search(
-                    projection.residual, start, low, high, reach, step, projection.slopes, most_steps,
-                    RELATIVE_DECREASE,
-                )
-                for start in starts
-            ]  # fmt: skip
-            return [theta for theta, _ in sorted(found, key=lambda each: each[1])]
+        def columns(thetas: Reals) -> Reals:
+            return self.regressors(structure, hypothesis, thetas)
 
-        if len(starts) > LONG_SEARCHES:
-            starts = descend(starts, FIRST_STEPS)[:LONG_SEARCHES]
-        return self.fitted(structure, hypothesis, descend(starts, most_steps)[0])
+        bounded = Bounded(low, high, reach, step)
+        found, rss = descend(columns, self.y, np.array(starts), bounded, most_steps, RELATIVE_DECREASE)
+        return [found[i] for i in np.argsort(rss, kind="stable")]
 
     def bounds(self, structure: Structure, hypothesis: Hypothesis) -> tuple[Reals, Reals]:
         powers = np.array([1.0, 2.0, 1.0][: structure.lags] if structure.lags > 1 else [1.0])
@@ -184,7 +186,7 @@ class Fit:
         if load_at is not None:
             hypothesis = Hypothesis(loads=1)
             thetas = [np.append(theta, load_at) for theta in thetas]
-        rss = left_over(self.regressors(structure, hypothesis, thetas), self.y)
+        rss = left_over(self.regressors(structure, hypothesis, np.array(thetas)), self.y)
         return self.differing([thetas[i] for i in np.argsort(rss)], structure, keep)
 
     def differing(self, ranked: Sequence[Reals], structure: Structure, keep: int) -> list[Reals]:
@@ -230,43 +232,6 @@ class Fit:
         if structure.feed_through:
             num += unit * coefficients[structure.zeros + 1] * den
         return TransferFunction(tuple(num), tuple(den), max(float(theta[structure.lags]), 0.0) * Ts)
-
-
-class _Projection:
-    """Residual and slopes of one structure; remembers the last factors, which both need."""
-
-    def __init__(self, fit: Fit, structure: Structure, hypothesis: Hypothesis) -> None:
-        self._fit, self._structure, self._hypothesis = fit, structure, hypothesis
-        self._known: dict[bytes, tuple[Reals, Reals, Reals]] = {}
-
-    def residual(self, theta: Reals) -> Reals:
-        columns = self._fit.regressors(self._structure, self._hypothesis, [theta])[0]
-        lengths = np.sqrt(np.einsum("ij,ij->j", columns, columns))
-        lengths[lengths == 0.0] = 1.0
-        q, r = np.linalg.qr(columns / lengths)
-        along = q.T @ self._fit.y
-        found = self._fit.y - q @ along
-        if len(self._known) > 2:
-            self._known.clear()
-        self._known[theta.tobytes()] = (columns, q, _back(r, along) / lengths)
-        return found
-
-    def slopes(self, theta: Reals, residual: Reals, high: Reals, step: Reals) -> Reals:
-        key = theta.tobytes()
-        if key not in self._known:
-            self.residual(theta)
-        columns, q, c = self._known[key]
-        signed = np.where(theta + step <= high, step, -step)
-        moved = self._fit.regressors(self._structure, self._hypothesis, list(theta + np.diag(signed)))
-        change = ((moved @ c - columns @ c) / signed[:, None]).T
-        return np.asarray(q @ (q.T @ change) - change)
-
-
-def _back(r: Reals, along: Reals) -> Reals:
-    """R c = along, a direction that the columns do not have left out."""
-    if np.min(np.abs(np.diag(r))) > REDUNDANT:
-        return np.asarray(np.linalg.solve(r, along))
-    return np.asarray(np.linalg.lstsq(r, along, rcond=REDUNDANT)[0])
 
 
 def left_over(columns: Reals, y: Reals) -> Reals:

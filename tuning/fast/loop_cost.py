@@ -45,13 +45,14 @@ class LoopCost:
         num = np.concatenate((np.zeros(order + 1 - len(model.num)), model.num)) / model.den[0]
         direct, num = float(num[0]), num - num[0] * den
         in_steps = den * h ** np.arange(order + 1.0)
-        pulse = pulses(in_steps[None, 1:], [max(model.L / h - 0.5, 0.0)], order)[0]
+        pulse = pulses(in_steps[None, 1:], [max(model.L / h - 0.5, 0.0)], order)
+        recursion = pulse.recursion[0]
         # the i-th state is s^i/den with s counted in steps
         weights = num[:0:-1] * h ** (order - np.arange(order))
-        B = pulse.forward @ weights
+        B = pulse.forward[0] @ weights
         if direct:
-            B = np.append(B, 0.0)[: order + 2] + direct * np.concatenate(([0.0], pulse.recursion))
-        self._A, self._B = pulse.recursion, np.concatenate((np.zeros(pulse.delay), B))
+            B = np.append(B, 0.0)[: order + 2] + direct * np.concatenate(([0.0], recursion))
+        self._A, self._B = recursion, np.concatenate((np.zeros(int(pulse.delay[0])), B))
 
     def __call__(self, Kp: float, Ti: float, Td: float, N: float) -> Cost:
         """Of a stable loop. N: the derivative's filter is Td/N."""
