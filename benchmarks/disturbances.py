@@ -44,7 +44,8 @@ class Disturbance:
 class Disturbed:
     """A plant with a disturbance, in deviations from `nominal` (MV, PV).
 
-    noise: its standard deviation; a white one is the plant's own.  loads: (sample, size) of each, MV units.
+    noise: its standard deviation; a white one is the plant's own.  loads: (sample, size) of each, MV units, from the
+    relay's start (from the very beginning where the loop is not at rest).
     span: of PV.  period: samples.  amplitude: MV units.
     """
 
@@ -74,6 +75,7 @@ class Disturbed:
         # where in its slack the valve stands
         self._slack = self._dead_band * self._random.uniform(-1.0, 1.0)
         self._n, self._position = 0, 0.0
+        self._relay_at = 0 if how.unrest else -1
         self._gain, self._line = 1.0, deque([0.0])
         self._later = round(how.later * period)
         self._pv = self._measured(plant.pv)
@@ -92,11 +94,16 @@ class Disturbed:
 
     def step(self, mv: float) -> float:
         for at, size in self._loads:
-            if at == self._n:
+            if self._relay_at >= 0 and at == self._n - self._relay_at:
                 self._plant.disturbance += size
         self._n += 1
         self._pv = self._measured(self._plant.step(self._mv_nominal + self._moved(mv)))
         return self._pv
+
+    def relay(self) -> None:
+        """The relay starts."""
+        if self._relay_at < 0:
+            self._relay_at = self._n
 
     def change(self) -> None:
         """The new gains take over."""

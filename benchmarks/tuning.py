@@ -46,8 +46,8 @@ from tuning.margins import margins, ultimate_point
 from tuning.models import TransferFunction, sign
 from tuning.plan import Command, Mode, Plan, Sample
 from tuning.reasons import Ended
-from tuning.stages.common import Facts, Trace
-from tuning.stages.preflight import preflight
+from tuning.stages.common import Facts
+from tuning.stages.preflight import at_rest
 
 SAMPLES_PER_PERIOD = 80
 T95_PERIODS = 3.0
@@ -158,9 +158,12 @@ class Troubled(RehearsedLoop):
 
     def step(self, commands: Sequence[Command]) -> Sample:
         sample = super().step(commands)
-        if self._relaying and sample.mode != Mode.EXPERIMENT:
+        relaying = sample.mode == Mode.EXPERIMENT
+        if self._relaying and not relaying:
             self._process.change()
-        self._relaying = sample.mode == Mode.EXPERIMENT
+        elif relaying and not self._relaying:
+            self._process.relay()
+        self._relaying = relaying
         return super().step(()) if self._random.random() < self._lost else sample
 
 
@@ -213,18 +216,15 @@ def loop_of(
 
 
 def loads(plant: Plant, amplitude: float, seed: int, case: Case) -> list[tuple[int, float]]:
-    """Of each step of the load: its sample, its size."""
+    """Of each step of the load: the sample, from the start of the relay (of the first listening), and its size."""
     random = np.random.default_rng([seed, len(plant.name), int(1e6 * plant.Pu)])
     found = []
     for i in range(case.how.loads):
         size = float(random.choice((-1.0, 1.0)) * random.uniform(0.1, 0.3 if i else 0.5))
-        listened = case.known * T95_PERIODS * plant.samples / 2.0
-        if case.how.unrest:
-            at = listened * random.uniform(0.0, 1.0)
-        elif i:
-            at = listened + random.uniform(3.0, 5.5) * plant.samples
+        if case.how.unrest and not i:
+            at = case.known * T95_PERIODS * plant.samples / 2.0 * random.uniform(0.0, 1.0)
         else:
-            at = listened + random.uniform(0.0, 3.5) * plant.samples
+            at = plant.samples * random.uniform(*(3.0, 5.5) if i else (0.0, 3.5))
         found.append((round(at), amplitude * size))
     return found
 
@@ -233,8 +233,7 @@ def relay_span(plant: Plant) -> float:
     """Of PV under four switches of a relay of amplitude 1, without noise."""
 
     def plan(facts: Facts) -> Plan[float]:
-        listened = Trace()
-        point = yield from preflight(facts, LEAST_SAMPLES, listened)
+        point, listened = yield from at_rest(facts, LEAST_SAMPLES)
         experiment = Experiment(facts, point, listened, 1.0)
         yield from experiment.relay(4)
         return experiment.evidence().span

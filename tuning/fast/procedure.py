@@ -20,8 +20,8 @@ from tuning.fast.verdict import Judged, judge
 from tuning.models import sign
 from tuning.plan import Note, Plan, StageDone, StageStarted
 from tuning.reasons import Reason, Refused
-from tuning.stages.common import Facts, Trace
-from tuning.stages.preflight import preflight
+from tuning.stages.common import Facts
+from tuning.stages.preflight import at_rest
 
 __all__ = ["FAST", "FAST_STAGES", "FastOptions", "FastProposal", "fast"]
 
@@ -71,8 +71,7 @@ def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
         return (StageStarted(stage, expected[stage], sum(expected[s] for s in after)),)
 
     yield started("preflight")
-    listened = Trace()
-    point = yield from preflight(facts, LEAST_SAMPLES, listened)
+    point, listened = yield from at_rest(facts, LEAST_SAMPLES)
     experiment = Experiment(facts, point, listened, options.amplitude)
     yield from experiment.tell(StageDone("preflight", point))
 

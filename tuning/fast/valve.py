@@ -16,6 +16,8 @@ from tuning.fast.fit import Fit, Fitted, Hypothesis
 from tuning.models import Reals
 
 SIZES = (0.03, 0.06, 0.11, 0.19, 0.31)  # of MV's largest move
+LEAST_STICK = 0.04
+"""Of MV's largest move: less is not told from a plant that is none of the structures, and does not move Ms."""
 ENDS = (0.55, 0.7, 0.85)
 FIRST_STEPS, STEPS = 4, 10
 REFINED = (1.25, 1.1, 1.04)
@@ -79,6 +81,8 @@ def suspect(fit: Fit, best: Fitted) -> Suspicion | None:
     for factor in REFINED:
         near = [(under(fault, each, found.theta, FIRST_STEPS), fault, each) for each in (size / factor, size * factor)]
         found, fault, size = min([(found, fault, size), *near], key=_bic)
+    if fault is stick and size < LEAST_STICK:
+        return None
     found = under(fault, size, found.theta, STEPS)
     # that freedom alone may explain as much: MV at rest is known only as well as the noise lets it be
     sound = fit.search(structure, slack, [start], FIRST_STEPS + STEPS)

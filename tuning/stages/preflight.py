@@ -1,4 +1,8 @@
-"""Preflight: is the loop fit to be tested? Listens only; refuses with the numbers."""
+"""Preflight: is the loop fit to be tested? Listens only; refuses with the numbers.
+
+Noise alone moves a slow loop about, and what has just disturbed one dies away: a loop that is not at rest is looked at
+again.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +10,41 @@ import math
 
 import numpy as np
 
-from tuning.plan import Mode, Plan
+from tuning.plan import Mode, Note, Plan
 from tuning.reasons import Reason, Refused
 from tuning.stages.common import Facts, OperatingPoint, Trace, record
 
+LOOKS = 4
 MOST_NOISE = 0.10
 """Noise (standard deviation) as a share of the set-point step, above which no overshoot can be read."""
 LEAST_ROOM = 0.05
 """Room for MV on both sides, as a share of its permitted range."""
 
 
-def preflight(facts: Facts, least_samples: int = 60, into: Trace | None = None) -> Plan[OperatingPoint]:
-    """Listens for half T95 (at least so many samples) in automatic.
+def preflight(facts: Facts) -> Plan[OperatingPoint]:
+    """Where the loop rests, see `at_rest`."""
+    point, _ = yield from at_rest(facts)
+    return point
+
+
+def at_rest(facts: Facts, least_samples: int = 60) -> Plan[tuple[OperatingPoint, Trace]]:
+    """Looks at the loop until it is at rest, LOOKS times at most; the last look's samples come with the point.
 
     Raises Refused: WRONG_MODE, NOT_AT_REST, NOISE_TOO_HIGH, SATURATED.
     """
-    trace = yield from record(max(facts.T95_s / 2, least_samples * facts.sample_time_s), into=into)
+    for _ in range(LOOKS - 1):
+        try:
+            return (yield from look(facts, least_samples))
+        except Refused as refused:
+            if refused.reason is not Reason.NOT_AT_REST:
+                raise
+            yield (Note(f"{refused.detail}; it is given time"),)
+    return (yield from look(facts, least_samples))
+
+
+def look(facts: Facts, least_samples: int = 60) -> Plan[tuple[OperatingPoint, Trace]]:
+    """Listens once, for half T95 (at least so many samples) in automatic. Raises Refused as `at_rest`."""
+    trace = yield from record(max(facts.T95_s / 2, least_samples * facts.sample_time_s))
     sample = yield ()
     trace.add(sample)
     if sample.mode != Mode.AUTOMATIC:
@@ -52,4 +75,4 @@ def preflight(facts: Facts, least_samples: int = 60, into: Trace | None = None) 
             f"within {trace.t[-1] - trace.t[0]:.3g} s PV drifted by {drift:+.3g}, is {away:+.3g} off the set-point and "
             f"varies by {spread:.3g} (noise {noise:.3g}); the step would be {step:.3g}",
         )
-    return OperatingPoint(sample.sp, float(pv.mean()), float(mv.mean()), noise, room)
+    return OperatingPoint(sample.sp, float(pv.mean()), float(mv.mean()), noise, room), trace

@@ -8,7 +8,7 @@ from typing import TypeVar
 from tuning.plan import Plan, StageDone, StageStarted
 from tuning.reasons import Refused
 from tuning.stages.common import Facts
-from tuning.stages.preflight import preflight
+from tuning.stages.preflight import look
 
 T = TypeVar("T")
 
@@ -29,7 +29,7 @@ def after_settling(facts: Facts, plan: Plan[T]) -> Plan[T]:
         yield (StageStarted(SETTLE, facts.T95_s, ahead),)
         for _ in range(LOOKS):
             with suppress(Refused):
-                yield from preflight(facts)
+                yield from look(facts)
                 break
         items = (StageDone(SETTLE, None), *items)
         while True:
