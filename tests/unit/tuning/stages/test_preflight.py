@@ -1,0 +1,59 @@
+"""A loop that is not at rest is looked at again, and is judged by the last look alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from tuning.gains import Gains
+from tuning.plan import Mode, Note, Sample
+from tuning.reasons import Reason, Refused
+from tuning.stages.common import Facts, OperatingPoint, Trace
+from tuning.stages.preflight import LOOKS, at_rest
+
+TS, T95, SP = 0.1, 20.0, 50.0
+FACTS = Facts(TS, T95, 0.0, 100.0, 1.0, Gains(1.0, 10.0))
+LOOK_S = T95 / 2
+
+
+def listen(pv: Callable[[float], float]) -> tuple[OperatingPoint, Trace, list[Note], float]:
+    """With the plant time at the end, s."""
+    plan, notes, n = at_rest(FACTS), list[Note](), 0
+    answer = next(plan)
+    while True:
+        notes += [item for item in answer if isinstance(item, Note)]
+        t = n * TS
+        n += 1
+        try:
+            answer = plan.send(Sample(t, SP, pv(t), 40.0, Mode.AUTOMATIC))
+        except StopIteration as end:
+            return *end.value, notes, t
+        except Refused as refused:
+            raise Refused(refused.reason, f"{t:.1f}") from refused
+
+
+def test_what_has_disturbed_it_dies_away() -> None:
+    point, trace, notes, end = listen(lambda t: SP + (0.5 if t < 0.9 * LOOK_S else 0.0))
+    assert point.pv == SP and set(trace.pv) == {SP}
+    assert end == pytest.approx(2.0 * LOOK_S, abs=0.5)
+    assert len(notes) == 1 and notes[0].text.endswith("it is given time")
+
+
+def test_one_at_rest_is_looked_at_once() -> None:
+    _, trace, notes, end = listen(lambda t: SP)
+    assert not notes and end == pytest.approx(LOOK_S, abs=0.2) and len(trace) == pytest.approx(LOOK_S / TS, abs=3)
+
+
+def test_patience_ends() -> None:
+    with pytest.raises(Refused) as refused:
+        listen(lambda t: SP + 0.1 * t)
+    assert refused.value.reason is Reason.NOT_AT_REST
+    assert float(refused.value.detail) == pytest.approx(LOOKS * LOOK_S, abs=2.0)
+
+
+def test_what_time_does_not_mend_is_refused_at_once() -> None:
+    with pytest.raises(Refused) as refused:
+        listen(lambda t: SP + (1.0 if round(t / TS) % 2 else -1.0))
+    assert refused.value.reason is Reason.NOISE_TOO_HIGH
+    assert float(refused.value.detail) == pytest.approx(LOOK_S, abs=0.2)
