@@ -27,6 +27,9 @@ load is said to have moved twice."""
 WITH_A_STEP = (0.15, 0.8)
 """Periods before and after a step of the set-point, within which a load is said to have come with it."""
 
+LATE, ALIKE = 0.5, 0.3
+"""Periods: a load so shortly before the step need not have shown in the relay; two that are so near are the same."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
@@ -87,7 +90,7 @@ def judge(evidence: Evidence, wish: Wish, earlier: Judged | None = None) -> Judg
         if cause is None and (suspicion := suspect(fit, found)) is not None:
             cause, detail = "unexplained", f"{suspicion.fault} explains the record better, or the plant is not linear"
         if cause is None:
-            cause, detail = _excused(fit, found)
+            cause, detail = _excused(fit, found, earlier)
     return Judged(
         cause=cause,
         detail=detail,
@@ -105,22 +108,35 @@ def judge(evidence: Evidence, wish: Wish, earlier: Judged | None = None) -> Judg
     )
 
 
-def _excused(fit: Fit, found: Fitted) -> tuple[str | None, str]:
+def _excused(fit: Fit, found: Fitted, earlier: Judged) -> tuple[str | None, str]:
     """Loads that came with the new gains explain away what was to be tested: a plant that has changed looks the same.
 
-    One may be true, if the step back is explained without another.
+    One may be true, if the step back is explained without another. So does one in mid-relay that the relay's own record
+    had not shown.
     """
     steps, period = fit.evidence.steps, fit.period
     if not steps:
         return None, ""
     before, after = (period * each for each in WITH_A_STEP)
-    loads = [float(at) for at in found.theta[found.structure.searched :] if at > steps[0] - before]
+    times = _loads(found)
+    told = _loads(earlier.chosen.best)
+    if any(at < steps[0] - LATE * period and all(abs(at - each) > ALIKE * period for each in told) for at in times):
+        if len(steps) == 1:
+            return "ambiguous", "the whole record tells of a load in mid-relay that the relay's own record did not show"
+        if len(times) > 1:
+            return "surprise", "the whole record tells of other loads in mid-relay than the relay's own record"
+    loads = [at for at in times if at > steps[0] - before]
     with_a_step = any(step - before < at < step + after for at in loads for step in steps)
     if len(steps) == 1 and (with_a_step or len(loads) > 1):
         return "ambiguous", "a load seems to have come with the new gains; a plant that has changed would look the same"
     if len(loads) > 1:
         return "surprise", "PV answered each step of the new gains as if a load had come with it"
     return None, ""
+
+
+def _loads(found: Fitted) -> list[float]:
+    """Samples at which the load stepped."""
+    return [float(at) for at in found.theta[found.structure.searched :]]
 
 
 def _surprise(
