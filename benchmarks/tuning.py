@@ -52,6 +52,7 @@ from tuning.stages.preflight import at_rest
 SAMPLES_PER_PERIOD = 80
 T95_PERIODS = 3.0
 ASKED = 1.6
+PI = Wish(ASKED)
 WRONG = 0.1
 REACTOR = "reactor"
 
@@ -83,7 +84,7 @@ class Case:
     """noise: of the span.  derivative: PID.  lost: share of the samples that do not arrive.
 
     samples: in Pu.  known: T95 as it is said over 3 Pu.  adapted: so many times the amplitude is where MV ends, and the
-    procedure finds the amplitude itself.  limits: of MV, amplitudes.
+    procedure finds the amplitude itself.  limits: of MV, amplitudes.  Mt, noise_gain: bounds on them, this in Ku.
     """
 
     name: str
@@ -97,6 +98,12 @@ class Case:
     lost: float = 0.0
     amplitude: float = 1.0
     nonlinear: bool = False
+    Mt: float | None = None
+    noise_gain: float | None = None
+
+    def wish(self, plant: Plant) -> Wish:
+        bound = None if self.noise_gain is None else self.noise_gain * plant.Ku
+        return Wish(ASKED, self.derivative, self.Mt, bound)
 
 
 PLAIN = Case("", 0.0)
@@ -142,6 +149,9 @@ FURTHER = {
         Case("gain doubles with the new gains", 0.01, Disturbance(gain=2.0)),
         Case("gain falls to 0.4 with them", 0.01, Disturbance(gain=0.4)),
         Case("dead time 0.25 Pu longer with them", 0.01, Disturbance(later=0.25)),
+        Case("Mt at most 1.05", 0.01, Mt=1.05),
+        Case("noise gain at most 0.25 Ku", 0.01, noise_gain=0.25),
+        Case("PID, noise gain at most 2 Ku", 0.01, derivative=True, noise_gain=2.0),
         Case("nonlinear reactor, 5 %", 0.01, amplitude=5.0, nonlinear=True),
         Case("nonlinear reactor, 15 %", 0.01, amplitude=15.0, nonlinear=True),
     )
@@ -248,7 +258,8 @@ def relay_span(plant: Plant) -> float:
 class Ran:
     """How one run ended. passed: in Pu.  Ms, ratio (J over the best): on the true plant, None where it is unstable.
 
-    reason: why nothing was proposed, None if something was.  seconds: of processor.
+    reason: why nothing was proposed, None if something was.  seconds: of processor.  over: how far the bound that binds
+    is missed, of Ms, Mt or (relative) the noise gain.
     """
 
     case: str
@@ -260,16 +271,18 @@ class Ran:
     detail: str = ""
     Ms: float | None = None
     ratio: float | None = None
+    over: float | None = None
 
     @property
     def error(self) -> float:
-        return math.inf if self.Ms is None else abs(self.Ms - ASKED)
+        over = self.over if self.over is not None or self.Ms is None else self.Ms - ASKED
+        return math.inf if over is None else abs(over)
 
 
 @cache
-def optimum(plant: Plant, derivative: bool) -> tuple[Design, float, tuple[float, float]]:
+def optimum(plant: Plant, wish: Wish) -> tuple[Design, float, tuple[float, float]]:
     """The design on the true plant, its J, and the least integrals that J is counted in."""
-    design = Design(plant.model(), Wish(ASKED, derivative), plant.Pu)
+    design = Design(plant.model(), wish, plant.Pu)
     best = design.best()
     assert design.least is not None
     return design, best.J, (design.least.setpoint, design.least.load)
@@ -285,7 +298,8 @@ def fast_run(plant: Plant, case: Case, seed: int) -> tuple[RunResult[FastProposa
     # a step that the preflight can tell from the noise
     deviation = span * max(0.5, 12.0 * case.noise)
     loop, facts = loop_of(plant, case.amplitude, deviation, case.noise * span, seed, case)
-    options = FastOptions(Ms=ASKED, derivative=case.derivative, amplitude=None if case.adapted else case.amplitude)
+    wish = case.wish(plant)
+    options = FastOptions(wish.Ms, wish.derivative, wish.Mt, wish.noise_gain, None if case.adapted else case.amplitude)
     result = run(fast(facts, options), loop, watch=Watch(max_time_s=100.0 * plant.Pu))
     passed = sum(value for stage, value in result.plant_time_s.items() if stage != "preflight")
     return result, passed / plant.Pu
@@ -302,18 +316,25 @@ def measure(case: Case, plant: Plant, seed: int) -> Ran:
         return replace(ran, reason=result.ended.reason.value, detail=result.ended.detail)
     # a plant that has changed is judged as it is now
     now = replace(plant, num=tuple(case.how.gain * c for c in plant.num), L=plant.L + case.how.later * plant.Pu)
-    return judged(ran, now, result.value.gains, case.derivative)
+    return judged(ran, now, result.value.gains, case.wish(plant))
 
 
-def judged(ran: Ran, plant: Plant, gains: Gains, derivative: bool = False) -> Ran:
+def judged(ran: Ran, plant: Plant, gains: Gains, wish: Wish = PI) -> Ran:
     """With what the gains are worth on the true plant."""
     true = margins(plant.model(), gains)
-    return replace(ran, Ms=true.Ms, ratio=cost_over_best(plant, gains, derivative)) if true.stable else ran
+    if not true.stable:
+        return ran
+    over = true.Ms - wish.Ms
+    if wish.Mt is not None:
+        over = max(over, true.Mt - wish.Mt)
+    if wish.noise_gain is not None:
+        over = max(over, gains.Kp * (1.0 + wish.N if gains.Td else 1.0) / wish.noise_gain - 1.0)
+    return replace(ran, Ms=true.Ms, over=over, ratio=cost_over_best(plant, gains, wish))
 
 
-def cost_over_best(plant: Plant, gains: Gains, derivative: bool = False) -> float:
+def cost_over_best(plant: Plant, gains: Gains, wish: Wish = PI) -> float:
     """J of gains that are stable on the true plant, over that of the best PI (or PID) for it."""
-    design, best, least = optimum(plant, derivative)
+    design, best, least = optimum(plant, wish)
     cost = design.cost(gains.Kp, gains.Ti, gains.Td, design.wish.N)
     return (0.5 * cost.setpoint / least[0] + 0.5 * cost.load / least[1]) / best
 

@@ -110,7 +110,7 @@ class Design:
         size = float(np.max(np.abs(self.G_tail * controller(self.tail, Ti, Td, wish.N))))
         cap = min(cap, (TRUSTED if Td > 0.0 else 1.0) * (1.0 - 1.0 / wish.Ms) / size)
         found = []
-        for end in sorted({min(end, cap) for end in largest_gains(g, wish.Ms, wish.Mt)}):
+        for end in largest_gains(g, wish.Ms, wish.Mt, cap):
             if encircles_not(end * g):
                 cost = self.cost(end, Ti, Td, wish.N)
                 found.append((Gains(float(end), float(Ti), float(Td), float(Td) / wish.N), cost))

@@ -21,8 +21,10 @@ LEAST_LOW = 10.0
 """Of a loop with two integrators at the lowest frequency."""
 
 
-def largest_gains(g: Complexes, Ms: float, Mt: float | None = None) -> list[float]:
+def largest_gains(g: Complexes, Ms: float, Mt: float | None = None, most: float = math.inf) -> list[float]:
     """Kp > 0 at the upper end of each permitted piece, ascending. g: the loop for Kp = 1 on a grid, shape (points,).
+
+    most: a bound on Kp itself. It may lie where smaller gains are forbidden too, and then leaves those below alone.
 
     The last piece, which has no end, is left out: the grid ends before its gains do.
     """
@@ -36,8 +38,8 @@ def largest_gains(g: Complexes, Ms: float, Mt: float | None = None) -> list[floa
     found: list[float] = []
     covered = 0.0
     for a, b in zip(low[order], high[order], strict=True):
-        if a > covered:
-            found.append(float(a))
+        if a > covered and most > covered:
+            found.append(min(float(a), most))
         covered = max(covered, float(b))
     return found
 

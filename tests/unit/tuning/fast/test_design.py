@@ -116,6 +116,18 @@ def test_a_derivative_pays_on_lags_and_is_left_out_where_it_does_not() -> None:
     assert Design(delay, Wish(1.6, derivative=True), period(delay)).best().gains.Td == 0.0
 
 
+@pytest.mark.parametrize("name", BENCHES)
+@pytest.mark.parametrize("part", [0.1, 0.3, 0.6, 0.9])
+def test_a_gain_held_below_the_largest_keeps_Ms(name: str, part: float) -> None:
+    """With a short integral time a smaller gain may be the less robust one."""
+    bench = BENCHES[name]
+    model = TransferFunction(tuple(sign(bench.model) * c for c in bench.num), bench.den, bench.L)
+    most = part * Design(model, Wish(1.6), period(model)).best().gains.Kp
+    held = Design(model, Wish(1.6, noise_gain=most), period(model)).best().gains
+    assert held.Kp <= most * (1.0 + 1e-9)
+    assert margins(model, held).Ms <= 1.602
+
+
 def test_a_bound_on_the_noise_gain_holds() -> None:
     model = THREE_LAGS.model
     free = Design(model, Wish(1.6, derivative=True), period(model)).best().gains
