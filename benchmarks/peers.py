@@ -95,8 +95,7 @@ def by_step(rule: str, plant: Plant, case: Case, seed: int) -> Tuned:
 
 def by_relay(facts: Facts) -> Plan[Gains]:
     """Ziegler and Nichols' PI of the Ku and Pu that a symmetric relay shows."""
-    yield (StageStarted("preflight", 0.0, 0.0),)
-    point = yield from preflight(facts)
+    point = yield from preflight(facts, 0.0)
     yield (StageStarted("relay", 0.0, 0.0),)
     found = yield from relay_test(facts, point)
     return METHODS["zn-ultimate"].tune_measured(found.Ku_a, found.Pu_a_s).gains

@@ -243,7 +243,7 @@ def relay_span(plant: Plant) -> float:
     """Of PV under four switches of a relay of amplitude 1, without noise."""
 
     def plan(facts: Facts) -> Plan[float]:
-        point, listened = yield from at_rest(facts, LEAST_SAMPLES)
+        point, listened = yield from at_rest(facts, 0.0, LEAST_SAMPLES)
         experiment = Experiment(facts, point, listened, 1.0)
         yield from experiment.relay(4)
         return experiment.evidence().span

@@ -185,7 +185,8 @@ def five_stage(facts: Facts, options: Options, finished: Finished = Finished()) 
         return result
 
     notes: list[str] = []
-    point = yield from stage("preflight", None, lambda: preflight(facts))
+    point = yield from preflight(facts, sum(expected[s] for s in todo[1:]))
+    yield (StageDone("preflight", point),)
 
     baseline: StepResult | None = None
     if options.baseline:

@@ -62,4 +62,4 @@ def test_a_second_attempt_gives_the_loop_time_to_come_to_rest(swinging: tuple[Lo
 def test_a_first_attempt_is_refused_there(swinging: tuple[Loop, Facts]) -> None:
     ran, stages = _attempt(*swinging, [], "fast")
     assert ran.ended is not None and ran.ended.reason is Reason.NOT_AT_REST
-    assert stages == ["preflight"]
+    assert stages == ["preflight", *(3 * [SETTLE, "preflight"])]

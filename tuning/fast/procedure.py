@@ -70,8 +70,8 @@ def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
         after = todo[todo.index(stage) + 1 :]
         return (StageStarted(stage, expected[stage], sum(expected[s] for s in after)),)
 
-    yield started("preflight")
-    point, listened = yield from at_rest(facts, LEAST_SAMPLES)
+    after_s = sum(expected[stage] for stage in todo[1:])
+    point, listened = yield from at_rest(facts, after_s, LEAST_SAMPLES)
     experiment = Experiment(facts, point, listened, options.amplitude)
     yield from experiment.tell(StageDone("preflight", point))
 

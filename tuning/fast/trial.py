@@ -41,8 +41,7 @@ def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal
         after = todo[todo.index(stage) + 1 :]
         return (StageStarted(stage, expected[stage], sum(expected[s] for s in after)),)
 
-    yield started("preflight")
-    point = yield from preflight(facts)
+    point = yield from preflight(facts, sum(expected[stage] for stage in todo[1:]))
     yield (StageDone("preflight", point), *started("design"))
     if (sign(model) > 0.0) != facts.reverse:
         raise Refused(

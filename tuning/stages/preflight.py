@@ -1,7 +1,7 @@
 """Preflight: is the loop fit to be tested? Listens only; refuses with the numbers.
 
-Noise alone moves a slow loop about, and what has just disturbed one dies away: a loop that is not at rest is looked at
-again.
+Noise alone moves a slow loop about, and what has just disturbed one dies away: a loop that is not at rest is given time
+and looked at again.
 """
 
 from __future__ import annotations
@@ -10,10 +10,11 @@ import math
 
 import numpy as np
 
-from tuning.plan import Mode, Note, Plan
+from tuning.plan import Mode, Note, Plan, StageStarted
 from tuning.reasons import Reason, Refused
 from tuning.stages.common import Facts, OperatingPoint, Trace, record
 
+PREFLIGHT, SETTLE = "preflight", "settle"
 LOOKS = 4
 MOST_NOISE = 0.10
 """Noise (standard deviation) as a share of the set-point step, above which no overshoot can be read."""
@@ -21,24 +22,29 @@ LEAST_ROOM = 0.05
 """Room for MV on both sides, as a share of its permitted range."""
 
 
-def preflight(facts: Facts) -> Plan[OperatingPoint]:
+def preflight(facts: Facts, after_s: float) -> Plan[OperatingPoint]:
     """Where the loop rests, see `at_rest`."""
-    point, _ = yield from at_rest(facts)
+    point, _ = yield from at_rest(facts, after_s)
     return point
 
 
-def at_rest(facts: Facts, least_samples: int = 60) -> Plan[tuple[OperatingPoint, Trace]]:
+def at_rest(facts: Facts, after_s: float, least_samples: int = 60) -> Plan[tuple[OperatingPoint, Trace]]:
     """Looks at the loop until it is at rest, LOOKS times at most; the last look's samples come with the point.
 
+    after_s: expected of the stages that follow. Each look is a stage of its own, with one of settling before it.
     Raises Refused: WRONG_MODE, NOT_AT_REST, NOISE_TOO_HIGH, SATURATED.
     """
+    once_s = facts.T95_s / 2
+    begin = (StageStarted(PREFLIGHT, once_s, after_s),)
     for _ in range(LOOKS - 1):
+        yield begin
         try:
             return (yield from look(facts, least_samples))
         except Refused as refused:
             if refused.reason is not Reason.NOT_AT_REST:
                 raise
-            yield (Note(f"{refused.detail}; it is given time"),)
+            yield from record(once_s, (Note(refused.detail), StageStarted(SETTLE, once_s, once_s + after_s)))
+    yield begin
     return (yield from look(facts, least_samples))
 
 

@@ -8,11 +8,10 @@ from typing import TypeVar
 from tuning.plan import Plan, StageDone, StageStarted
 from tuning.reasons import Refused
 from tuning.stages.common import Facts
-from tuning.stages.preflight import look
+from tuning.stages.preflight import SETTLE, look
 
 T = TypeVar("T")
 
-SETTLE = "settle"
 LOOKS = 20
 """Of half a T95 each. The present gains may well swing, or creep, for much longer than the plant alone: that is why the
 loop is tuned."""

@@ -77,6 +77,20 @@ def test_the_last_attempt_counts(job: tuple[dict[str, Any], dict[str, list[Any]]
     assert again.switches == once.switches and np.array_equal(again.pv, once.pv)
 
 
+def test_the_last_look_at_the_loop_counts(job: tuple[dict[str, Any], dict[str, list[Any]]]) -> None:
+    """A loop that was not at rest at first: what was seen then is no part of the record."""
+    columns = job[1]
+    first = [i for i, name in enumerate(columns["stage"]) if name == "preflight"]
+    looked = {name: [values[i] for i in first] for name, values in columns.items()}
+    looked["pv"] = [pv + 5.0 for pv in looked["pv"]]
+    both = {name: 2 * looked[name] + values for name, values in columns.items()}
+    both["stage"][len(first) : 2 * len(first)] = len(first) * ["settle"]
+    both["t_s"] = [0.1 * i for i in range(len(both["t_s"]))]
+    again, once = kept(both), kept(columns)
+    assert again is not None and once is not None
+    assert again.listened == once.listened and np.array_equal(again.pv, once.pv)
+
+
 def test_no_relay_no_record(job: tuple[dict[str, Any], dict[str, list[Any]]]) -> None:
     columns = job[1]
     quiet = [i for i, mode in enumerate(columns["mode"]) if mode != Mode.EXPERIMENT]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from tuning.gains import Gains
-from tuning.plan import Mode, Note, Sample
+from tuning.plan import Mode, Sample, StageStarted
 from tuning.reasons import Reason, Refused
 from tuning.stages.common import Facts, OperatingPoint, Trace
 from tuning.stages.preflight import LOOKS, at_rest
@@ -17,43 +17,45 @@ FACTS = Facts(TS, T95, 0.0, 100.0, 1.0, Gains(1.0, 10.0))
 LOOK_S = T95 / 2
 
 
-def listen(pv: Callable[[float], float]) -> tuple[OperatingPoint, Trace, list[Note], float]:
-    """With the plant time at the end, s."""
-    plan, notes, n = at_rest(FACTS), list[Note](), 0
+def listen(pv: Callable[[float], float]) -> tuple[OperatingPoint, Trace, list[str], float]:
+    """With the stages and notes on the way, and the plant time at the end, s."""
+    plan, told, n = at_rest(FACTS, 1.0), list[str](), 0
     answer = next(plan)
     while True:
-        notes += [item for item in answer if isinstance(item, Note)]
+        told += [item.stage if isinstance(item, StageStarted) else type(item).__name__ for item in answer]
         t = n * TS
         n += 1
         try:
             answer = plan.send(Sample(t, SP, pv(t), 40.0, Mode.AUTOMATIC))
         except StopIteration as end:
-            return *end.value, notes, t
+            return *end.value, told, t
         except Refused as refused:
             raise Refused(refused.reason, f"{t:.1f}") from refused
 
 
 def test_what_has_disturbed_it_dies_away() -> None:
-    point, trace, notes, end = listen(lambda t: SP + (0.5 if t < 0.9 * LOOK_S else 0.0))
+    point, trace, told, end = listen(lambda t: SP + (0.5 if t < 0.9 * LOOK_S else 0.0))
     assert point.pv == SP and set(trace.pv) == {SP}
-    assert end == pytest.approx(2.0 * LOOK_S, abs=0.5)
-    assert len(notes) == 1 and notes[0].text.endswith("it is given time")
+    assert told == ["preflight", "Note", "settle", "preflight"]
+    assert end == pytest.approx(3.0 * LOOK_S, abs=1.0)
 
 
 def test_one_at_rest_is_looked_at_once() -> None:
-    _, trace, notes, end = listen(lambda t: SP)
-    assert not notes and end == pytest.approx(LOOK_S, abs=0.2) and len(trace) == pytest.approx(LOOK_S / TS, abs=3)
+    _, trace, told, end = listen(lambda t: SP)
+    assert told == ["preflight"]
+    assert end == pytest.approx(LOOK_S, abs=0.5)
+    assert len(trace) == pytest.approx(LOOK_S / TS, abs=3)
 
 
 def test_patience_ends() -> None:
     with pytest.raises(Refused) as refused:
         listen(lambda t: SP + 0.1 * t)
     assert refused.value.reason is Reason.NOT_AT_REST
-    assert float(refused.value.detail) == pytest.approx(LOOKS * LOOK_S, abs=2.0)
+    assert float(refused.value.detail) == pytest.approx((2 * LOOKS - 1) * LOOK_S, abs=2.0)
 
 
 def test_what_time_does_not_mend_is_refused_at_once() -> None:
     with pytest.raises(Refused) as refused:
         listen(lambda t: SP + (1.0 if round(t / TS) % 2 else -1.0))
     assert refused.value.reason is Reason.NOISE_TOO_HIGH
-    assert float(refused.value.detail) == pytest.approx(LOOK_S, abs=0.2)
+    assert float(refused.value.detail) == pytest.approx(LOOK_S, abs=0.4)
