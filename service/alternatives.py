@@ -17,7 +17,7 @@ from tuning.fast.design import Wish
 from tuning.fast.procedure import FAST, FastOptions
 from tuning.fast.results import delayed
 from tuning.fast.trial import designed_on
-from tuning.fast.verdict import judge
+from tuning.fast.verdict import judge_again
 from tuning.gains import Gains
 from tuning.methods import METHODS, Method
 from tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
@@ -66,7 +66,7 @@ def redesigned(
     evidence = record.evidence() if record and row.request.get("method") == FAST else None
     try:
         if evidence is not None:
-            judged = judge(evidence, Wish(ms, derivative))
+            judged = judge_again(evidence, Wish(ms, derivative))
             model, gains = judged.model, judged.best.gains
             doubt = {"uncertainty": judged.uncertainty, "ambiguity": judged.ambiguity}
             if judged.cause is not None:

@@ -49,6 +49,7 @@ class Kept:
             listened=self.listened,
             relayed=self.relayed,
             switches=self.switches,
+            steps=tuple(int(i) for i in self.relayed + np.flatnonzero(np.diff(self.sp[self.relayed - 1 :]))),
         )
 
 

@@ -108,6 +108,17 @@ def judge(evidence: Evidence, wish: Wish, earlier: Judged | None = None) -> Judg
     )
 
 
+def judge_again(evidence: Evidence, wish: Wish) -> Judged:
+    """The verdict on a whole record as the procedure comes to it, which judges the relay's part first.
+
+    Raises Refused, NOT_ROBUST.
+    """
+    if not evidence.steps:
+        return judge(evidence, wish)
+    until = slice(evidence.relayed)
+    return judge(evidence, wish, judge(replace(evidence, u=evidence.u[until], y=evidence.y[until], steps=()), wish))
+
+
 def _excused(fit: Fit, found: Fitted, earlier: Judged) -> tuple[str | None, str]:
     """Loads that came with the new gains explain away what was to be tested: a plant that has changed looks the same.
 
