@@ -21,14 +21,11 @@ from functools import cache, partial
 
 import numpy as np
 
+from benchmarks.cases import ASKED, CASES, PLAIN, Case
+from benchmarks.plants import Plant
 from benchmarks.tuning import (
-    ASKED,
-    CASES,
-    PLAIN,
     T95_PERIODS,
     WRONG,
-    Case,
-    Plant,
     Ran,
     judged,
     kept,
@@ -50,7 +47,7 @@ from tuning.plan import Plan, StageStarted
 from tuning.reasons import Ended
 from tuning.recorded_step import fit_step
 from tuning.stages.common import Facts
-from tuning.stages.preflight import preflight
+from tuning.stages.preflight import PREFLIGHT, SETTLE, preflight
 from tuning.stages.relay import relay_test
 
 SAMPLES = 1500
@@ -110,7 +107,7 @@ def rehearsed(plan: Callable[[Facts], Plan[Gains]], limits: float, plant: Plant,
     case = replace(case, known=known, limits=limits)
     loop, facts = loop_of(plant, 1.0, 0.5 * span_of(plant), case.noise * span_of(plant), seed, case)
     result = run(plan(facts), loop, watch=Watch(max_time_s=500.0 * facts.T95_s))
-    passed = sum(value for stage, value in result.plant_time_s.items() if stage != "preflight")
+    passed = sum(value for stage, value in result.plant_time_s.items() if stage not in (PREFLIGHT, SETTLE))
     answer = result.value or result.ended
     assert answer is not None
     return answer, passed

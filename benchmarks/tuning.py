@@ -22,140 +22,37 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.signal import ss2tf
 
-from benchmarks.disturbances import Disturbance, Disturbed
+from benchmarks.cases import ASKED, CASES, FURTHER, PI, PLAIN, Case
+from benchmarks.disturbances import Disturbed
+from benchmarks.plants import REACTOR, SAMPLES_PER_PERIOD, Plant, plants
 from controller.channel import Channel, Settings
 from controller.pid import Parameters
 from plantsim import reactor
 from plantsim.plant import LinearPlant
 from plantsim.plant import Plant as Process
 from plantsim.reactor import Reactor
+from service.fast_record import kept as recorded
 from service.rehearsal import RehearsedLoop
 from service.runner import RunResult, Watch, run
 from tuning.fast.design import Design, Wish
+from tuning.fast.evidence import Evidence
 from tuning.fast.experiment import Experiment
 from tuning.fast.procedure import LEAST_SAMPLES, FastOptions, FastProposal, fast
+from tuning.fast.verdict import judge_again
 from tuning.gains import Gains
-from tuning.margins import margins, ultimate_point
-from tuning.models import TransferFunction, sign
-from tuning.plan import Command, Mode, Plan, Sample
+from tuning.margins import margins
+from tuning.models import sign
+from tuning.plan import Command, Event, Mode, Plan, Sample, StageStarted
 from tuning.reasons import Ended
 from tuning.stages.common import Facts
-from tuning.stages.preflight import at_rest
+from tuning.stages.preflight import PREFLIGHT, SETTLE, at_rest
 
-SAMPLES_PER_PERIOD = 80
 T95_PERIODS = 3.0
-ASKED = 1.6
-PI = Wish(ASKED)
 WRONG = 0.1
-REACTOR = "reactor"
-
-
-@dataclass(frozen=True, slots=True)
-class Plant:
-    name: str
-    num: tuple[float, ...]
-    den: tuple[float, ...]
-    L: float
-    Ku: float
-    Pu: float
-    samples: int = SAMPLES_PER_PERIOD
-
-    @property
-    def Ts(self) -> float:
-        return self.Pu / self.samples
-
-    def model(self) -> TransferFunction:
-        """With the sampled controller's half sample."""
-        return TransferFunction(self.num, self.den, self.L + 0.5 * self.Ts)
-
-
-UNDISTURBED = Disturbance()
-
-
-@dataclass(frozen=True, slots=True)
-class Case:
-    """noise: of the span.  derivative: PID.  lost: share of the samples that do not arrive.
-
-    samples: in Pu.  known: T95 as it is said over 3 Pu.  adapted: so many times the amplitude is where MV ends, and the
-    procedure finds the amplitude itself.  limits: of MV, amplitudes.  Mt, noise_gain: bounds on them, this in Ku.
-    """
-
-    name: str
-    noise: float
-    how: Disturbance = UNDISTURBED
-    derivative: bool = False
-    samples: int = SAMPLES_PER_PERIOD
-    known: float = 1.0
-    limits: float = 2.0
-    adapted: bool = False
-    lost: float = 0.0
-    amplitude: float = 1.0
-    nonlinear: bool = False
-    Mt: float | None = None
-    noise_gain: float | None = None
-
-    def wish(self, plant: Plant) -> Wish:
-        bound = None if self.noise_gain is None else self.noise_gain * plant.Ku
-        return Wish(ASKED, self.derivative, self.Mt, bound)
-
-
-PLAIN = Case("", 0.0)
-ONE, TWO = Disturbance(loads=1), Disturbance(loads=2)
-CASES = {
-    case.name: case
-    for case in (
-        Case("PI 0.5 %", 0.005),
-        Case("PI 1 %", 0.01),
-        Case("PI 2 %", 0.02),
-        Case("PI 0.5 % + load", 0.005, ONE),
-        Case("PI 1 % + load", 0.01, ONE),
-        Case("PI 2 % + load", 0.02, ONE),
-        Case("PID 1 %", 0.01, derivative=True),
-    )
-}
-FURTHER = {
-    case.name: case
-    for case in (
-        Case("noise 5 %", 0.05),
-        Case("noise of pole 0.5", 0.01, Disturbance(pole=0.5)),
-        Case("noise of pole 0.8", 0.01, Disturbance(pole=0.8)),
-        Case("spikes, 1 in 100", 0.01, Disturbance(spikes=0.01)),
-        Case("PV in steps of span/100", 0.005, Disturbance(quantum=0.01)),
-        Case("PV in steps of span/50", 0.005, Disturbance(quantum=0.02)),
-        Case("PV in steps of span/50, no noise", 0.0, Disturbance(quantum=0.02)),
-        Case("drift 2 % in Pu", 0.01, Disturbance(drift=0.02)),
-        Case("two loads", 0.01, TWO),
-        Case("not at rest", 0.01, Disturbance(loads=1, unrest=True)),
-        Case("valve sticks by 0.1", 0.01, Disturbance(stiction=0.1)),
-        Case("valve sticks by 0.3", 0.01, Disturbance(stiction=0.3)),
-        Case("dead band 0.05", 0.01, Disturbance(dead_band=0.05)),
-        Case("dead band 0.2", 0.01, Disturbance(dead_band=0.2)),
-        Case("actuator ends at 0.7", 0.01, Disturbance(ends=0.7)),
-        Case("MV ends at 1.05", 0.01, limits=1.05),
-        Case("amplitude found, much room", 0.01, limits=20.0, adapted=True),
-        Case("amplitude found, little room", 0.01, limits=0.8, adapted=True),
-        Case("T95 a tenth", 0.01, known=0.1),
-        Case("T95 ten times", 0.01, known=10.0),
-        Case("Ts = Pu/30", 0.01, samples=30),
-        Case("Ts = Pu/100", 0.01, samples=100),
-        Case("2 % of samples lost", 0.01, lost=0.02),
-        Case("gain doubles with the new gains", 0.01, Disturbance(gain=2.0)),
-        Case("gain falls to 0.4 with them", 0.01, Disturbance(gain=0.4)),
-        Case("dead time 0.25 Pu longer with them", 0.01, Disturbance(later=0.25)),
-        Case("Mt at most 1.05", 0.01, Mt=1.05),
-        Case("noise gain at most 0.25 Ku", 0.01, noise_gain=0.25),
-        Case("PID, noise gain at most 2 Ku", 0.01, derivative=True, noise_gain=2.0),
-        Case("nonlinear reactor, 5 %", 0.01, amplitude=5.0, nonlinear=True),
-        Case("nonlinear reactor, 15 %", 0.01, amplitude=15.0, nonlinear=True),
-    )
-}
 
 
 class Troubled(RehearsedLoop):
@@ -165,6 +62,7 @@ class Troubled(RehearsedLoop):
         super().__init__(process, channel, sample_time_s)
         self._process, self._lost, self._random = process, lost, np.random.default_rng([seed, 2])
         self._relaying = False
+        self.taken: list[Sample] = []
 
     def step(self, commands: Sequence[Command]) -> Sample:
         sample = super().step(commands)
@@ -174,41 +72,27 @@ class Troubled(RehearsedLoop):
         elif relaying and not self._relaying:
             self._process.relay()
         self._relaying = relaying
-        return super().step(()) if self._random.random() < self._lost else sample
+        if self._random.random() < self._lost:
+            sample = super().step(())
+        self.taken.append(sample)
+        return sample
 
+    def hear(self, event: Event) -> None:
+        """The last look at the loop is where its record begins."""
+        if isinstance(event, StageStarted) and event.stage == PREFLIGHT:
+            self.taken.clear()
 
-def plants() -> list[Plant]:
-    batch = json.loads((Path(__file__).parent.parent / "tests/data/plants-batch.json").read_text())["processes"]
-    found = [Plant(p["id"], tuple(p["num"]), tuple(p["den"]), p["delay"], p["Ku"], p["Tu"]) for p in batch]
-    for m in json.loads((files("plantsim") / "models-50.json").read_text())["models"]:
-        found.append(_of(f"model-{m['id']}", TransferFunction(tuple(m["num"]), tuple(m["den"]), m["delay"])))
-    found.append(_of(REACTOR, linear_reactor()))
-    return found
-
-
-def _of(name: str, model: TransferFunction) -> Plant:
-    Ku, Pu = ultimate_point(model)
-    return Plant(name, model.num, model.den, model.L, Ku, Pu)
-
-
-def linear_reactor() -> TransferFunction:
-    """The reactor around its steady state, by central differences; its actuator and sensor with it."""
-    at = np.array([*reactor.STEADY_STATE, reactor.MV_NOMINAL])
-
-    def slope(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        a, b, c, h, T, opening = map(float, x)
-        return np.array(reactor.derivative((a, b, c, h, T), opening, reactor.INLET))
-
-    moves = np.diag(1e-5 * at)
-    jacobian = np.array([(slope(at + m) - slope(at - m)) / (2.0 * m.sum()) for m in moves]).T
-    num, den = ss2tf(jacobian[:, :5], jacobian[:, 5:], np.eye(5)[2:3], np.zeros((1, 1)))
-    lagged = np.convolve(den, (reactor.ACTUATOR_LAG_S, 1.0))
-    return TransferFunction(tuple(num[0][1:]), tuple(lagged), reactor.SENSOR_DELAY_S)
+    def record(self, tail: int) -> Evidence | None:
+        """Of what was taken, without the last so many samples."""
+        columns = zip(*self.taken[: len(self.taken) - tail], strict=True)
+        named = dict(zip(("t_s", "sp", "pv", "mv", "mode"), columns, strict=True))
+        record = recorded({"stage": len(named["t_s"]) * [PREFLIGHT], **named})
+        return record.evidence() if record else None
 
 
 def loop_of(
     plant: Plant, amplitude: float, deviation: float, noise: float, seed: int, case: Case = PLAIN
-) -> tuple[RehearsedLoop, Facts]:
+) -> tuple[Troubled, Facts]:
     """A loop at rest under sluggish gains, in deviation variables. deviation: the largest permitted set-point step."""
     process: Process = LinearPlant(plant.num, plant.den, plant.L, plant.Ts, noise_std=noise, seed=seed)
     nominal = (0.0, 0.0)
@@ -294,29 +178,43 @@ def span_of(plant: Plant) -> float:
 
 
 def fast_run(plant: Plant, case: Case, seed: int) -> tuple[RunResult[FastProposal], float]:
+    """What the procedure came to, and its time from the start of the relay, Pu."""
+    result, passed, _ = _run(plant, case, seed)
+    return result, passed
+
+
+def _run(plant: Plant, case: Case, seed: int) -> tuple[RunResult[FastProposal], float, Troubled]:
     span = case.amplitude * span_of(replace(plant, samples=SAMPLES_PER_PERIOD))
     # a step that the preflight can tell from the noise
     deviation = span * max(0.5, 12.0 * case.noise)
     loop, facts = loop_of(plant, case.amplitude, deviation, case.noise * span, seed, case)
     wish = case.wish(plant)
     options = FastOptions(wish.Ms, wish.derivative, wish.Mt, wish.noise_gain, None if case.adapted else case.amplitude)
-    result = run(fast(facts, options), loop, watch=Watch(max_time_s=100.0 * plant.Pu))
-    passed = sum(value for stage, value in result.plant_time_s.items() if stage != "preflight")
-    return result, passed / plant.Pu
+    result = run(fast(facts, options), loop, watch=Watch(max_time_s=100.0 * plant.Pu), on_event=loop.hear)
+    passed = sum(value for stage, value in result.plant_time_s.items() if stage not in (PREFLIGHT, SETTLE))
+    return result, passed / plant.Pu, loop
 
 
 def measure(case: Case, plant: Plant, seed: int) -> Ran:
     plant = replace(plant, samples=case.samples)
     start = time.process_time()
-    result, passed = fast_run(plant, case, seed)
+    result, passed, loop = _run(plant, case, seed)
     seconds = time.process_time() - start
     ran = Ran(case.name, plant.name, seed, passed, seconds)
     if result.value is None:
         assert isinstance(result.ended, Ended)
         return replace(ran, reason=result.ended.reason.value, detail=result.ended.detail)
+    gains = result.value.gains
+    if case.tail:
+        evidence = loop.record(round(case.tail * case.samples))
+        assert evidence is not None
+        again = judge_again(evidence, case.wish(plant))
+        if again.cause is not None:
+            return replace(ran, reason=again.cause, detail=again.detail)
+        gains = again.best.gains
     # a plant that has changed is judged as it is now
     now = replace(plant, num=tuple(case.how.gain * c for c in plant.num), L=plant.L + case.how.later * plant.Pu)
-    return judged(ran, now, result.value.gains, case.wish(plant))
+    return judged(ran, now, gains, case.wish(plant))
 
 
 def judged(ran: Ran, plant: Plant, gains: Gains, wish: Wish = PI) -> Ran:

@@ -6,7 +6,9 @@ from typing import Any
 
 import pytest
 
-from benchmarks.tuning import ASKED, FURTHER, fast_run, plants
+from benchmarks.cases import ASKED, FURTHER
+from benchmarks.plants import plants
+from benchmarks.tuning import fast_run
 from service.rehearsal import rehearse
 from tuning.gains import Gains
 from tuning.margins import margins, ultimate_point

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.tuning import FURTHER, measure, plants
+from benchmarks.cases import FURTHER
+from benchmarks.plants import plants
+from benchmarks.tuning import measure
 
 PLANTS = {plant.name: plant for plant in plants()}
 

@@ -7,7 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from benchmarks.tuning import ASKED, Plant, cost_over_best, loop_of, plants, span_of
+from benchmarks.cases import ASKED
+from benchmarks.plants import Plant, plants
+from benchmarks.tuning import cost_over_best, loop_of, span_of
 from service.bus_loop import BusLoop
 from service.runner import Watch, run
 from tests.vcan.test_bus_loop import CONTROLLER, PLANT, Start, start, url  # noqa: F401
