@@ -9,6 +9,7 @@ import numpy as np
 
 from tuning.models import Reals
 from tuning.reasons import Reason, Refused
+from tuning.record_fit import averaged
 
 LEAST_LISTENED = 60
 """Averages in which the time at rest must still be told, for noise and offset."""
@@ -99,11 +100,3 @@ def noise_of(rest: Reals) -> float:
     t = np.linspace(-1.0, 1.0, len(rest))
     slow = rest - np.polyval(np.polyfit(t, rest, 2), t)
     return max(fast, float(np.std(slow, ddof=3)))
-
-
-def averaged(columns: Reals, block: int) -> Reals:
-    """Means of `block` rows each; rows left over at the end are dropped."""
-    if block == 1:
-        return columns
-    rows = len(columns) // block
-    return np.asarray(columns[: rows * block].reshape(rows, block, *columns.shape[1:]).mean(axis=1))

@@ -1,4 +1,4 @@
-"""The structures fitted to a whole fast record, with steps of the load at free times and a drift if need be.
+"""Structures fitted to a whole record, with steps of the load at free times and a drift if need be.
 
 Variable projection with Kaufman's derivative (BIT 15, 1975): the slope of the projected residual without the term that
 vanishes with the residual, so that all slopes cost one solution of the linear part.
@@ -10,10 +10,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from tuning.fast.evidence import Evidence, averaged
 from tuning.models import Reals, TransferFunction
 from tuning.sampled import pulses
 from tuning.structures import Structure
@@ -34,6 +34,35 @@ RELATIVE_DECREASE = 1e-6
 LOG_STEP = 1e-4
 LOG_REACH = 1.5
 REDUNDANT = 1e-10
+
+
+class Signals(Protocol):
+    """A record as the fit wants it.
+
+    Ts: s.  u, y: MV and PV, shape (N,), as deviations from rest; MV is 0 before the record.  swing: of MV, span: of PV,
+    which measure them.  period: samples, the time scale: about that of an oscillation at the limit of stability.
+    block: samples averaged into one.  direction: +1 where PV finally rises with MV, -1, or 0 where nobody knows.
+    """
+
+    @property
+    def Ts(self) -> float: ...
+    @property
+    def u(self) -> Reals: ...
+    @property
+    def y(self) -> Reals: ...
+    @property
+    def swing(self) -> float: ...
+    @property
+    def span(self) -> float: ...
+    @property
+    def period(self) -> float: ...
+    @property
+    def block(self) -> int: ...
+    @property
+    def direction(self) -> float: ...
+
+
+S = TypeVar("S", bound=Signals)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,10 +99,10 @@ class Fitted:
         return len(self.theta) + int(self.columns.shape[1])
 
 
-class Fit:
+class Fit(Generic[S]):
     """Fits one record. Time in samples, MV in swings, PV in spans."""
 
-    def __init__(self, evidence: Evidence) -> None:
+    def __init__(self, evidence: S) -> None:
         self.evidence = evidence
         self.block = evidence.block
         self.u = evidence.u / evidence.swing
@@ -145,7 +174,7 @@ class Fit:
         return self.fitted(structure, hypothesis, descend(starts, most_steps)[0])
 
     def bounds(self, structure: Structure, hypothesis: Hypothesis) -> tuple[Reals, Reals]:
-        powers = np.array([1.0, 2.0, 1.0][: structure.lags] if structure.lags > 1 else [1.0])
+        powers = np.array([1.0, 2.0, 1.0][: structure.lags])
         low = np.concatenate((LOG_LOW + powers * self._rate, np.zeros(1 + hypothesis.loads)))
         high = np.concatenate((LOG_HIGH + powers * self._rate, [LONGEST_DEAD_TIME * self.period]))
         return low, np.append(high, np.full(hypothesis.loads, len(self.u) - 2.0 * self.block))
@@ -155,6 +184,8 @@ class Fit:
     def denominators(self, structure: Structure) -> list[Reals]:
         """Logs of the rates to begin with."""
         unit = self.period
+        if structure.lags == 0:
+            return [np.empty(0)]
         if structure.lags == 1:
             return [np.log([1.0 / (T * unit)]) for T in LAGS]
         if structure.lags == 3:
@@ -232,10 +263,10 @@ class Fit:
         return TransferFunction(tuple(num), tuple(den), max(float(theta[structure.lags]), 0.0) * Ts)
 
 
-class _Projection:
+class _Projection(Generic[S]):
     """Residual and slopes of one structure; remembers the last factors, which both need."""
 
-    def __init__(self, fit: Fit, structure: Structure, hypothesis: Hypothesis) -> None:
+    def __init__(self, fit: Fit[S], structure: Structure, hypothesis: Hypothesis) -> None:
         self._fit, self._structure, self._hypothesis = fit, structure, hypothesis
         self._known: dict[bytes, tuple[Reals, Reals, Reals]] = {}
 
@@ -278,3 +309,11 @@ def left_over(columns: Reals, y: Reals) -> Reals:
     along = turned @ y
     weights = np.linalg.solve(gram, along[:, :, None])[:, :, 0]
     return np.asarray(y @ y - np.einsum("bi,bi->b", weights, along))
+
+
+def averaged(columns: Reals, block: int) -> Reals:
+    """Means of `block` rows each; rows left over at the end are dropped."""
+    if block == 1:
+        return columns
+    rows = len(columns) // block
+    return np.asarray(columns[: rows * block].reshape(rows, block, *columns.shape[1:]).mean(axis=1))
