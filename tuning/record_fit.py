@@ -23,7 +23,6 @@ FLOOR = 2e-4
 """Of the residual in spans of PV: data without noise would ask for ever more parameters."""
 LOG_LOW, LOG_HIGH = -8.5, 9.5
 """Of a rate in 1/period (a product of two: its square)."""
-LONGEST_DEAD_TIME = 0.75  # periods
 DEAD_TIMES = (0.01, 0.06, 0.14, 0.23, 0.32, 0.41, 0.49)
 LAGS = (0.02, 0.08, 0.25, 0.8, 4.0, 40.0)
 COMPLEX = ((3.0, 0.5), (6.0, 0.5), (10.0, 0.3))
@@ -41,7 +40,7 @@ class Signals(Protocol):
 
     Ts: s.  u, y: MV and PV, shape (N,), as deviations from rest; MV is 0 before the record.  swing: of MV, span: of PV,
     which measure them.  period: samples, the time scale: about that of an oscillation at the limit of stability.
-    block: samples averaged into one.  direction: +1 where PV finally rises with MV, -1, or 0 where nobody knows.
+    most_dead_time: samples.  block: samples averaged into one.
     """
 
     @property
@@ -57,9 +56,9 @@ class Signals(Protocol):
     @property
     def period(self) -> float: ...
     @property
-    def block(self) -> int: ...
+    def most_dead_time(self) -> float: ...
     @property
-    def direction(self) -> float: ...
+    def block(self) -> int: ...
 
 
 S = TypeVar("S", bound=Signals)
@@ -67,13 +66,18 @@ S = TypeVar("S", bound=Signals)
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """What moved PV beside MV. loads: steps of the load at times to be found.  drift: PV drifts at a steady rate."""
+    """What moved PV beside MV. loads: steps of the load at times to be found.  drift: PV drifts at a steady rate.
+
+    moving: the plant was not at rest, or under a load, when the record began.
+    """
 
     loads: int = 0
     drift: bool = False
+    moving: bool = False
 
 
 QUIET = Hypothesis()
+MOVING = Hypothesis(moving=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,6 +103,11 @@ class Fitted:
         return len(self.theta) + int(self.columns.shape[1])
 
 
+def count(fit: Fitted) -> int:
+    """Parameters, as BIC takes them: a load's time was chosen among many and counts twice."""
+    return fit.parameters + fit.hypothesis.loads
+
+
 class Fit(Generic[S]):
     """Fits one record. Time in samples, MV in swings, PV in spans."""
 
@@ -121,10 +130,13 @@ class Fit(Generic[S]):
         monics = np.array([structure.monic(theta[:searched]) for theta in thetas])
         # one call for MV and every load: what it costs is mostly the call
         times = np.array(thetas)[:, structure.lags :].T
+        if hypothesis.moving:
+            # a step of every state at the start stands for any state there, and for a load
+            times = np.append(times, np.zeros((1, len(thetas))), axis=0)
         answers = pulses(np.tile(monics, (len(times), 1)), times.ravel(), structure.order)
         driven, loads = answers[: len(thetas)], answers[len(thetas) :]
         always = self._always[:, : 1 + hypothesis.drift]
-        width = structure.inputs + always.shape[1] + structure.order * hypothesis.loads
+        width = structure.inputs + always.shape[1] + structure.order * (hypothesis.loads + hypothesis.moving)
         out = np.empty((len(thetas), self.samples, width))
         for k, each in enumerate(driven):
             out[k, :, :count] = averaged(each.first(count).drive(self.u), self.block)
@@ -176,7 +188,7 @@ class Fit(Generic[S]):
     def bounds(self, structure: Structure, hypothesis: Hypothesis) -> tuple[Reals, Reals]:
         powers = np.array([1.0, 2.0, 1.0][: structure.lags])
         low = np.concatenate((LOG_LOW + powers * self._rate, np.zeros(1 + hypothesis.loads)))
-        high = np.concatenate((LOG_HIGH + powers * self._rate, [LONGEST_DEAD_TIME * self.period]))
+        high = np.concatenate((LOG_HIGH + powers * self._rate, [self.evidence.most_dead_time]))
         return low, np.append(high, np.full(hypothesis.loads, len(self.u) - 2.0 * self.block))
 
     # where to begin
@@ -234,13 +246,13 @@ class Fit(Generic[S]):
 
     # what it means
 
-    def goes_right(self, fit: Fitted) -> bool:
-        """The static gain has the sign that the controller's action says."""
+    def static_gain(self, fit: Fitted) -> float:
+        """In spans per swing; its sign and per sample where the plant integrates."""
         structure, c = fit.structure, fit.linear.coefficients
-        gain = float(c[0] / structure.monic(fit.theta[: structure.searched])[-1])
+        gain = float(c[0] / structure.slowest(fit.theta))
         if structure.feed_through:
             gain += float(c[structure.zeros + 1])
-        return gain * self.evidence.direction > 0.0
+        return gain
 
     def model(self, fit: Fitted) -> TransferFunction:
         """In s and the units of the record."""

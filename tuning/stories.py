@@ -50,18 +50,18 @@ def stories(
     unexplained: Callable[[Fitted], bool],
     known: Sequence[Fitted] = (),
     structures: Sequence[Structure] = STRUCTURES,
-) -> list[Fitted]:
-    """All structures with one step of the load; with a drift, or a second step, where that leaves something over.
+) -> list[list[Fitted]]:
+    """All structures with one step of the load; and, where that leaves something over, with a drift and with two steps.
 
     quiet: the same without a story.  unexplained: whether a fit leaves something over.  known: fits of an earlier part
     of the same record, from which is started as well.
     """
-    found = fits(fit, Hypothesis(loads=1), (*known, *_with_load(fit, quiet, known)), structures)
-    if unexplained(min(found, key=by_bic)):
-        drift = Hypothesis(drift=True)
-        twice = fits(fit, Hypothesis(loads=2), (*known, *_with_load(fit, found, known)), structures)
-        found = better(better(found, fits(fit, drift, [*known, *under(drift, quiet)], structures)), twice)
-    return found
+    once = fits(fit, Hypothesis(loads=1), (*known, *_with_load(fit, quiet, known)), structures)
+    if not unexplained(min(once, key=by_bic)):
+        return [once]
+    drift = Hypothesis(drift=True)
+    twice = fits(fit, Hypothesis(loads=2), (*known, *_with_load(fit, once, known)), structures)
+    return [once, fits(fit, drift, [*known, *under(drift, quiet)], structures), twice]
 
 
 def better(simple: list[Fitted], story: list[Fitted]) -> list[Fitted]:
@@ -170,6 +170,11 @@ def _timed(fit: Fit[S], structure: Structure, loads: int, thetas: Sequence[Reals
     starts = fit.differing([theta for _, theta in guesses], structure, 6)
     rough = sorted((fit.search(structure, hypothesis, [start], FIRST_STEPS) for start in starts), key=by_bic)
     return [fit.search(structure, hypothesis, [each.theta]) for each in rough[:2]]
+
+
+def timed_again(fit: Fit[S], found: Fitted) -> list[Fitted]:
+    """The last step of the load looked for once more over the whole record, with the plant now better known."""
+    return _timed(fit, found.structure, found.hypothesis.loads - 1, [found.theta[:-1]])
 
 
 def _by_time(fit: Fit[S], structure: Structure, theta: Reals, shifts: NDArray[np.int64]) -> Reals:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 
 import numpy as np
 
@@ -37,7 +37,7 @@ def choose(fit: Fit[Evidence], known: Sequence[Fitted] = ()) -> Chosen:
     found = quiet
     first = min(quiet, key=by_bic)
     if _unexplained(fit, first):
-        found = better(found, stories(fit, quiet, partial(_unexplained, fit), known))
+        found = better(found, reduce(better, stories(fit, quiet, partial(_unexplained, fit), known)))
     elif _slow(fit, first):
         # MV at rest is known as well as the noise lets it be; what it is off by is a drift to a slow plant
         drift = Hypothesis(drift=True)
@@ -45,10 +45,15 @@ def choose(fit: Fit[Evidence], known: Sequence[Fitted] = ()) -> Chosen:
         found = drifting if min(map(by_bic, drifting)) < first.bic else found
     ranked = sorted(found, key=by_bic)
     # the record hardly shows the static gain of a slow plant; that it has the wrong sign is then no finding
-    ranked = [each for each in ranked if fit.goes_right(each)] or ranked
+    ranked = [each for each in ranked if _goes_right(fit, each)] or ranked
     rivals = tuple(each for each in ranked[1:] if each.bic < ranked[0].bic + RIVAL)
     same = tuple(each for each in ranked if each.hypothesis == ranked[0].hypothesis)
     return Chosen(ranked[0], rivals, same)
+
+
+def _goes_right(fit: Fit[Evidence], found: Fitted) -> bool:
+    """The static gain has the sign that the controller's action says."""
+    return fit.static_gain(found) * fit.evidence.direction > 0.0
 
 
 def _slow(fit: Fit[Evidence], found: Fitted) -> bool:

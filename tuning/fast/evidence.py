@@ -14,6 +14,7 @@ from tuning.record_fit import averaged
 LEAST_LISTENED = 60
 """Averages in which the time at rest must still be told, for noise and offset."""
 AVERAGES_PER_PERIOD = 80
+LONGEST_DEAD_TIME = 0.75  # periods
 LEAST_SWITCHES = 4
 
 
@@ -62,6 +63,11 @@ class Evidence:
     def swing(self) -> float:
         """The largest move of MV, MV units."""
         return float(np.max(np.abs(self.u)))
+
+    @property
+    def most_dead_time(self) -> float:
+        """Samples."""
+        return LONGEST_DEAD_TIME * self.period
 
     @property
     def block(self) -> int:
