@@ -15,8 +15,8 @@ from tuning.reasons import Refused
 def identified(found: Identified, record: Record) -> dict[str, Any]:
     """Errors, noise_std and rms in the units of what they are of; fits in percent.
 
-    parameters: of the model by name; covariance: of the same, row by row in their order. loads: t_s, when each entered if
-    at the plant's input; seen_s, when PV began to answer; size in MV units.
+    parameters: of the model by name; covariance: of the same, row by row in their order. loads: t_s, when each entered
+    if at the plant's input; seen_s, when PV began to answer; size in MV units.
     """
     answer: dict[str, Any] = plain(
         {

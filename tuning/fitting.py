@@ -32,7 +32,7 @@ LONGEST_LAG = 30.0  # in records
 SHORTEST_LAG = 0.1  # in samples
 # of a wider search: periods that a record has at most, averages in it, and averages in a period at least
 MOST_PERIODS = 50.0
-MOST_AVERAGES = 1500
+MOST_AVERAGES = 1000
 AVERAGES_PER_PERIOD = 80.0
 LEAST_AVERAGES_PER_PERIOD = 30.0
 LEAST_PERIOD = 8.0  # samples

@@ -141,7 +141,7 @@ def _chosen(problem: Problem, lags_only: bool) -> tuple[Fitted, list[Fitted]]:
     lags = best = min(tried, key=by_bic)
     if problem.explains(best, WHITE_ABOVE if lags_only else SURELY_WHITE):
         return best, tried
-    search = Search(problem, tried[STRUCTURES.index(SECOND)])
+    search = Search(problem, list(tried))
     quiet = [each for each in search.quiet() if not each.structure.plain]
     tried += quiet
     richer = min((lags, *quiet), key=by_bic)
@@ -155,7 +155,9 @@ def _chosen(problem: Problem, lags_only: bool) -> tuple[Fitted, list[Fitted]]:
         return best, tried
     if best is lags and richer is not lags and problem.gain(richer, best) > EARNED:
         best = richer
-    for told in search.told() if problem.matters(best) else ():
+    # where more than lags explain the record, only lags and one load can be simpler
+    explained = best is richer and problem.explains(best, SURELY_WHITE)
+    for told in search.told(simple=explained) if problem.matters(best) else ():
         tried += told
         story = min((best, *told), key=by_bic)
         # one that is told of fewer parameters needs no more than to be likelier, if anything beside lags is needed

@@ -7,6 +7,7 @@ give comes from the second-order model of the same record: its ultimate period.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -16,9 +17,9 @@ from tuning.models import TransferFunction
 from tuning.reasons import Ended
 from tuning.record_fit import QUIET, Fitted
 from tuning.residual import whiteness
+from tuning.stories import PLAIN, by_bic, fits, stories, timed_again
 from tuning.stories import STRUCTURES as SEVEN
-from tuning.stories import by_bic, fits, stories, timed_again
-from tuning.structures import INTEGRATOR, INTEGRATOR_WITH_ZERO, LAGGED_INTEGRATOR, THIRD
+from tuning.structures import INTEGRATOR, INTEGRATOR_WITH_ZERO, LAGGED_INTEGRATOR, SECOND, SECOND_WITH_ZERO, THIRD
 
 STRUCTURES = (*SEVEN, THIRD, INTEGRATOR, LAGGED_INTEGRATOR, INTEGRATOR_WITH_ZERO)
 SLOWEST = 1.0
@@ -33,21 +34,27 @@ NEAR = range(-2, 3)
 
 
 class Search:
-    """second: the second-order fit of the record."""
+    """lags: the fits of the record by lags, the second order among them."""
 
-    def __init__(self, problem: Problem, second: Fitted) -> None:
+    def __init__(self, problem: Problem, lags: Sequence[Fitted]) -> None:
         self.problem = problem
-        self._fit = problem.wide(_period(problem, second))
+        self._lags = lags
+        self._fit = problem.wide(_period(problem, next(each for each in lags if each.structure is SECOND)))
         self._quiet: list[Fitted] = []
 
     def quiet(self) -> list[Fitted]:
         """All structures from rest that the record can show, on every sample."""
-        self._quiet = fits(self._fit, QUIET, structures=STRUCTURES)
+        known = [self.problem.fit(SECOND_WITH_ZERO, QUIET), *self._lags]
+        self._quiet = fits(self._fit, QUIET, known, STRUCTURES)
         return self._sound(self._quiet)
 
-    def told(self) -> list[list[Fitted]]:
-        """The same with what else moved PV, the simplest story first; `quiet` comes before."""
-        told = stories(self._fit, self._quiet, self._unexplained, structures=STRUCTURES)
+    def told(self, simple: bool) -> list[list[Fitted]]:
+        """The same with what else moved PV, the simplest story first; `quiet` comes before.
+
+        simple: one load and lags only.
+        """
+        unexplained = (lambda fit: False) if simple else self._unexplained
+        told = stories(self._fit, self._quiet, unexplained, structures=PLAIN if simple else STRUCTURES)
         for found in told:
             if (best := min(found, key=by_bic)).hypothesis.loads:
                 found += timed_again(self._fit, best)
