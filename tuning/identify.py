@@ -132,7 +132,10 @@ def identify(
     problem = Problem(record)
     best, tried = _chosen(problem, lags_only)
     problem.require_visible(best)
-    return _result(problem, best, sorted(tried, key=by_bic), float(np.asarray(t, dtype=float)[0]))
+    # of each structure and story the best alone
+    ranked = {(fit.structure, fit.hypothesis): fit for fit in sorted([*tried, best], key=by_bic, reverse=True)}
+    ranked[best.structure, best.hypothesis] = best
+    return _result(problem, best, sorted(ranked.values(), key=by_bic), float(np.asarray(t, dtype=float)[0]))
 
 
 def _chosen(problem: Problem, lags_only: bool) -> tuple[Fitted, list[Fitted]]:
