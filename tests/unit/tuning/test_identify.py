@@ -31,7 +31,7 @@ from tests.unit.tuning.recordings import (
     step,
 )
 from tuning.identify import Identified, identify
-from tuning.models import FOPDT, SOPDT, Integrating
+from tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
 from tuning.reasons import Reason, Refused
 
 CASES = {
@@ -158,6 +158,18 @@ def test_with_lags_only_an_inverse_response_is_said_to_be_outside(how: str, nois
     assert not found.explained and found.whiteness < 1e-3
     assert any("not white" in note for note in found.notes)
     assert any("inverse response" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("how", RECORDS)
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_an_inverse_response_is_found(how: str, noise: float) -> None:
+    found = identify(*recorded(INVERSE_RESPONSE, how, noise=noise))
+    assert isinstance(found.model, TransferFunction) and found.explained and not found.loads
+    if len(found.parameters) == 5:
+        for (name, value), true in zip(found.parameters.items(), (-2.0, 1.0, 20.0, 9.0, 1.0), strict=True):
+            assert value == pytest.approx(true, abs=4.0 * found.standard_errors[name] + 1e-4), name
+    else:
+        assert any("nearly as well" in note and "sopdt with zero" in note for note in found.notes)
 
 
 def test_with_lags_only_more_of_them_than_two_leave_a_residual_that_is_not_white() -> None:
