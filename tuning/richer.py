@@ -29,6 +29,8 @@ A_MOVE = 0.2
 FEW_MOVES = 2
 NEAR_A_MOVE = 0.02
 """Of the record: the neighbourhood of a move."""
+LIKELIEST = 4
+"""Of the fits to averages, so many are searched further on every sample."""
 NEAR = range(-2, 3)
 """Samples, around the dead time found, in which the jump of a plant that passes MV at once is looked for."""
 
@@ -64,9 +66,18 @@ class Search:
         return self.problem.matters(fit) and whiteness(fit.linear.residual, len(fit.theta)) < WHITE_ABOVE
 
     def _sound(self, found: list[Fitted]) -> list[Fitted]:
+        """Those that the record can show, the lowest BIC first."""
         best = min(found, key=by_bic)
         dead_time = float(best.theta[best.structure.lags])
-        return [each for each in (self._on_every_sample(fit, dead_time) for fit in found) if _shown(self.problem, each)]
+        ranked = sorted((self._on_every_sample(fit, dead_time) for fit in found), key=by_bic)
+        shown = [each for each in ranked if _shown(self.problem, each)]
+        if self._fit.block > 1:
+            # times are sharper on every sample than on averages, and that must not decide between structures
+            shown[:LIKELIEST] = [self._further(each) for each in shown[:LIKELIEST]]
+        return shown
+
+    def _further(self, fit: Fitted) -> Fitted:
+        return min(fit, self.problem.refined(fit.structure, fit.hypothesis, [fit.theta]), key=by_bic)
 
     def _on_every_sample(self, fit: Fitted, dead_time: float) -> Fitted:
         """Where MV passes at once whole samples of dead time are tried one by one: no slope leads across a jump.
@@ -81,7 +92,7 @@ class Search:
         tried = sorted((self.problem.fitted(fit.structure, fit.hypothesis, theta) for theta in thetas), key=by_bic)
         if len(tried) == 1:
             return tried[0]
-        return min(tried[0], self.problem.refined(fit.structure, fit.hypothesis, [tried[0].theta]), key=by_bic)
+        return self._further(tried[0])
 
 
 def _shown(problem: Problem, fit: Fitted) -> bool:
