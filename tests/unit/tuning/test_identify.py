@@ -172,6 +172,19 @@ def test_an_inverse_response_is_found(how: str, noise: float) -> None:
         assert any("nearly as well" in note and "sopdt with zero" in note for note in found.notes)
 
 
+@pytest.mark.parametrize("how", ["set-point", "relay"])
+@pytest.mark.parametrize("loop", [FIRST_ORDER, TWO_LAGS, INVERSE_RESPONSE, INTEGRATES_WITH_LAG])
+def test_a_load_in_closed_loop_is_found(loop: Loop, how: str) -> None:
+    found = identify(*recorded(loop, how, noise=0.01, load=0.3, load_at=350))
+    assert found.explained
+    (load,) = found.loads
+    assert load.t_s == pytest.approx(35.0, rel=0.1) and load.size == pytest.approx(0.3, rel=0.1)
+    # the gain at the frequencies that a loop decides by
+    w = np.geomspace(0.2, 0.5, 9)
+    true = TransferFunction(loop.num, loop.den, loop.L)
+    assert found.model.frequency_response(w) == pytest.approx(true.frequency_response(w), rel=0.1)
+
+
 def test_with_lags_only_more_of_them_than_two_leave_a_residual_that_is_not_white() -> None:
     found = identify(*recorded(FIVE_LAGS, "step", noise=0.002), lags_only=True)
     assert isinstance(found.model, SOPDT) and not found.explained
