@@ -24,15 +24,15 @@ from scipy.optimize import least_squares, minimize
 from controller.channel import Channel, Settings
 from controller.pid import Parameters
 from plantsim.plant import LinearPlant
-from tuning.fast.choice import STRUCTURES
 from tuning.fast.design import Wish
 from tuning.fast.evidence import Evidence
-from tuning.fast.fit import Fit
 from tuning.fast.verdict import judge
 from tuning.gains import Gains
 from tuning.margins import margins
 from tuning.models import TransferFunction
 from tuning.plan import Mode
+from tuning.record_fit import Fit
+from tuning.stories import STRUCTURES
 from tuning.structures import Structure
 
 NUM, DEN, L, TS = (1.0,), (2.0, 7.0, 7.0, 2.0), 0.53, 0.085

@@ -13,11 +13,10 @@ from matplotlib.figure import Figure
 from service.fast_record import Kept
 from tuning.assess import assess
 from tuning.fast.choice import choose
-from tuning.fast.evidence import averaged
-from tuning.fast.fit import Fit
 from tuning.gains import Gains
 from tuning.models import TransferFunction
 from tuning.reasons import Ended
+from tuning.record_fit import Fit, averaged
 from tuning.response import step_response
 
 GREY, RED, BLUE, GREEN = "0.55", "tab:red", "tab:blue", "tab:green"

@@ -13,7 +13,11 @@ from tuning.reasons import Refused
 
 
 def identified(found: Identified, record: Record) -> dict[str, Any]:
-    """Errors, noise_std and rms in the units of what they are of; fits in percent."""
+    """Errors, noise_std and rms in the units of what they are of; fits in percent.
+
+    parameters: of the model by name; covariance: of the same, row by row in their order. loads: t_s, when each entered
+    if at the plant's input; seen_s, when PV began to answer; size in MV units.
+    """
     answer: dict[str, Any] = plain(
         {
             "outcome": "identified",
@@ -21,7 +25,11 @@ def identified(found: Identified, record: Record) -> dict[str, Any]:
             "detail": None,
             "advice": None,
             "model": dump_model(found.model),
+            "parameters": found.parameters,
             "standard_errors": found.standard_errors,
+            "covariance": found.covariance.tolist(),
+            "loads": [asdict(each) for each in found.loads],
+            "drift": found.drift,
             "fit_pct": found.fit_pct,
             "r2_pct": found.r2_pct,
             "noise_std": found.noise_std,

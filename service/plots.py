@@ -59,6 +59,8 @@ def record_and_model(path: Path, record: Record, found: Identified) -> None:
     axes[0].plot(record.t, found.fitted, color="tab:blue", linewidth=1.3, label=f"model, fit {found.fit_pct:.1f} %")
     if record.sp is not None:
         axes[0].step(record.t, record.sp, where="post", color="black", linestyle=":", linewidth=1.0, label="set-point")
+    for load in found.loads:
+        axes[0].axvline(load.seen_s, color="tab:orange", linewidth=1.2, label=f"load {load.size:+.3g} MV units found")
     axes[0].set_ylabel("PV, PV units")
     axes[0].legend(loc="best")
     axes[1].plot(record.t, record.y - found.fitted, color="tab:red", linewidth=0.8)

@@ -14,6 +14,7 @@ from service.model_forms import describe
 
 console = Console(highlight=False)
 
+MOST_CANDIDATES = 8
 _COLUMNS = (
     ("", "Kp", "gains"),
     ("", "Ti", "gains"),
@@ -96,23 +97,34 @@ def identified(answer: dict[str, Any]) -> None:
     console.print(f"Model {escape(describe(answer['model']))}")
     table = Table("", "value", "standard error", box=box.SIMPLE_HEAD, pad_edge=False)
     for name, error in answer["standard_errors"].items():
-        table.add_row(name, number(answer["model"].get(name)), number(error))
+        table.add_row(escape(name), number(answer["parameters"][name]), number(error))
     console.print(table)
     white = "explains it" if answer["explained"] else "leaves a part unexplained"
     console.print(
         f"Fit {answer['fit_pct']:.2f} % (R2 {answer['r2_pct']:.3f} %) of {answer['samples']} samples; "
         f"the model {white}; noise {number(answer['noise_std'])} PV units"
     )
-    table = Table("structure", "BIC", "rms", "parameters", "from rest", "", box=box.SIMPLE_HEAD, pad_edge=False)
-    for each in answer["candidates"]:
-        table.add_row(
-            each["structure"], f"{each['bic']:.1f}", number(each["rms"]), str(each["parameters"]),
-            "yes" if each["at_rest"] else "no", "chosen" if each["chosen"] else "",
-        )  # fmt: skip
+    table = Table(
+        "structure", "BIC", "rms", "parameters", "from rest", "beside MV", "", box=box.SIMPLE_HEAD, pad_edge=False
+    )
+    for i, each in enumerate(answer["candidates"]):
+        if i < MOST_CANDIDATES or each["chosen"]:
+            table.add_row(
+                each["structure"], f"{each['bic']:.1f}", number(each["rms"]), str(each["parameters"]),
+                "yes" if each["at_rest"] else "no", _beside(each), "chosen" if each["chosen"] else "",
+            )  # fmt: skip
     console.print(table)
+    if len(answer["candidates"]) > MOST_CANDIDATES:
+        console.print(f"{len(answer['candidates'])} were tried; --json has them all.")
     console.print("For `loopwright tune --model`: " + json.dumps(answer["model"]), markup=False, soft_wrap=True)
     for note in answer["notes"]:
         console.print(f"note: {note}", markup=False)
+
+
+def _beside(candidate: dict[str, Any]) -> str:
+    """What is said to have moved PV beside MV."""
+    loads = ("", "a load", "two loads")[candidate["loads"]]
+    return "a drift" if candidate["drift"] else loads
 
 
 def _cell(name: str, value: float | None) -> str:

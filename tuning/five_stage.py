@@ -20,7 +20,7 @@ from tuning.estimate import fopdt_from_overshoot
 from tuning.gains import Gains
 from tuning.identify import identify
 from tuning.methods import METHODS
-from tuning.models import FOPDT, SOPDT, Integrating
+from tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
 from tuning.plan import Plan, StageDone, StageStarted, worked
 from tuning.reasons import Reason, Refused
 from tuning.stages.common import Facts, OperatingPoint, Trace, to_rest
@@ -318,7 +318,7 @@ def _identified(
     Unless it was asked for, one that does not explain the step gives way to the estimate.
     """
     try:
-        found = yield from worked(lambda: identify(step.t, step.mv, step.pv, u_before=point.mv))
+        found = yield from worked(lambda: identify(step.t, step.mv, step.pv, point.mv, lags_only=True))
     except Refused as refused:
         if asked:
             raise
@@ -329,6 +329,7 @@ def _identified(
         return estimate
     notes += found.notes
     plant = found.model
+    assert not isinstance(plant, TransferFunction)  # lags_only
     if isinstance(plant, Integrating):
         raise Refused(Reason.NOT_SELF_REGULATING, f"the set-point step fits an integrating plant best: {plant}")
     if (plant.K > 0) != facts.reverse:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from tuning.models import FOPDT, SOPDT, Integrating, Reals
-from tuning.sampled import states
 
 Plant = FOPDT | SOPDT | Integrating
 
@@ -55,21 +54,18 @@ class Structure:
             return np.concatenate((searched, np.zeros((*searched.shape[:-1], 1))), axis=-1)
         return np.asarray(searched)
 
-    def regressors(self, theta: Reals, u: Reals, load_from: int | None) -> Reals:
-        """Columns of everything linear, shape (len(u), columns): the input's, the offset's, then a load step's.
+    def slowest(self, theta: Reals) -> float:
+        """The denominator's last coefficient other than 0."""
+        return float(np.append(1.0, self.monic(theta[: self.searched]))[self.lags])
 
-        load_from: sample at which a step of unknown size and place enters the plant, its dead time included; 0 stands
-        for a plant that was not at rest at the start; None for no load.
-        """
-        monic = self.monic(theta)
-        parts = [states(monic, float(theta[-1]), u, self.zeros + 1), np.ones((len(u), 1))]
-        if load_from is not None:
-            parts.append(states(monic, 0.0, (np.arange(len(u)) >= load_from).astype(float), self.order))
-        return np.concatenate(parts, axis=1)
+    @property
+    def plain(self) -> bool:
+        """Lags and a dead time, nothing more: what `plant` has a form for."""
+        return not (self.zeros or self.feed_through) and self.order <= 2
 
     def plant(self, theta: Reals, b0: float, Ts: float) -> Plant:
         """The model of these parameters, time in s again; b0 in PV units per MV unit (and sample^order)."""
-        L = max(float(theta[-1]), 0.0) * Ts
+        L = max(float(theta[self.lags]), 0.0) * Ts
         if self.integrating:
             if not self.lags:
                 return Integrating(b0 / Ts, L)
@@ -86,8 +82,10 @@ FIRST = Structure("fopdt", 1)
 SECOND = Structure("sopdt", 2)
 INTEGRATOR = Structure("integrating", 0, integrating=True)
 LAGGED_INTEGRATOR = Structure("integrating with lag", 1, integrating=True)
+INTEGRATOR_WITH_ZERO = Structure("integrating with lag and zero", 1, integrating=True, zeros=1)
 SECOND_WITH_ZERO = Structure("sopdt with zero", 2, zeros=1)
 FIRST_FED = Structure("fopdt with feed-through", 1, feed_through=True)
 SECOND_FED = Structure("sopdt with zero and feed-through", 2, zeros=1, feed_through=True)
+THIRD = Structure("third order", 3)
 THIRD_WITH_ZERO = Structure("third order with zero", 3, zeros=1)
 THIRD_WITH_ZEROS = Structure("third order with two zeros", 3, zeros=2)

@@ -1,7 +1,9 @@
-"""Separable least squares: linear coefficients solved for, the few others searched by Levenberg and Marquardt.
+"""Separable least squares: linear coefficients solved for, the few others searched from many starts side by side.
 
-Variable projection (Golub and Pereyra, 1973): the residual is taken after the best linear fit, so its derivative by the
-searched parameters already contains how the linear ones follow.
+Variable projection (Golub and Pereyra, 1973), steps of Levenberg and Marquardt, Kaufman's slopes (BIT 15, 1975): the
+slope of the projected residual without the term that vanishes with the residual, so that all slopes cost one solution
+of the linear part. The starts do not know of each other; they share the calls, which cost more than the arithmetic in
+them.
 """
 
 from __future__ import annotations
@@ -10,11 +12,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tuning.models import Reals
 
-MOST_STEPS = 60
-RELATIVE_DECREASE = 1e-7
+Rows = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+TRIES = 12
+FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-12
+WORTH_TRYING = 0.1
+"""Of the decrease at which a search ends: a step that promises less is not tried."""
+UNFELT = 1e-9
+"""Of the largest slope: a parameter whose slope is less does nothing, but for rounding."""
+REDUNDANT = 1e-10
 # directions weaker than this, in columns of unit length, are not seen in the data
 LEAST_SINGULAR = 1e-9
 
@@ -37,60 +47,136 @@ def solve(columns: Reals, y: Reals) -> Linear:
     return Linear(found, residual, float(residual @ residual))
 
 
-def search(
-    residual: Callable[[Reals], Reals],
-    start: Reals,
-    low: Reals,
-    high: Reals,
-    reach: Reals,
-    step: Reals,
-    slopes_of: Callable[[Reals, Reals, Reals, Reals], Reals] | None = None,
-    most_steps: int = MOST_STEPS,
-    relative_decrease: float = RELATIVE_DECREASE,
-) -> tuple[Reals, float]:
-    """A local minimum of the sum of squares within the bounds: (where, the sum there).
+@dataclass(frozen=True, slots=True, eq=False)
+class Bounded:
+    """Of each parameter: its bounds, its longest step, and the step of its forward difference."""
 
-    reach: the longest step of each parameter.  step: for its forward difference.  slopes_of: the residual's derivative
-    at (theta, residual there, high, step), by default by differences of the residual itself.
+    low: Reals
+    high: Reals
+    reach: Reals
+    step: Reals
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Projected:
+    """y after the best linear fit at each point.
+
+    columns, basis (orthonormal): shape (points, N, columns).  linear: (points, columns).  rest: (points, N).
     """
-    at = np.clip(start, low, high)
-    r = residual(at)
-    cost, damping = float(r @ r), 1e-3
+
+    columns: Reals
+    basis: Reals
+    linear: Reals
+    rest: Reals
+
+    @staticmethod
+    def of(columns: Reals, y: Reals) -> _Projected:
+        lengths = np.sqrt(np.einsum("bij,bij->bj", columns, columns))
+        lengths[lengths == 0.0] = 1.0
+        basis, r = np.linalg.qr(columns / lengths[:, None, :])
+        along = y @ basis
+        rest = y - (basis @ along[:, :, None])[:, :, 0]
+        return _Projected(columns, basis, _back(r, along) / lengths, rest)
+
+    @property
+    def rss(self) -> Reals:
+        return np.asarray(np.einsum("bi,bi->b", self.rest, self.rest))
+
+    def replaced(self, where: Rows, by: _Projected, which: Rows | Flags) -> None:
+        for mine, other in (
+            (self.columns, by.columns),
+            (self.basis, by.basis),
+            (self.linear, by.linear),
+            (self.rest, by.rest),
+        ):
+            mine[where] = other[which]
+
+
+def descend(
+    columns_of: Callable[[Reals], Reals],
+    y: Reals,
+    starts: Reals,
+    bounded: Bounded,
+    most_steps: int,
+    relative_decrease: float,
+) -> tuple[Reals, Reals]:
+    """The local minimum of the sum of squares that each start leads to: (where, the sums there).
+
+    columns_of: the regressors, shape (points, N, columns), at points of shape (points, parameters).  y: shape (N,).
+    starts: shape (starts, parameters).
+    """
+    low, high, reach = bounded.low, bounded.high, bounded.reach
+    at = np.clip(starts, low, high)
+    here = _Projected.of(columns_of(at), y)
+    cost = here.rss
+    damping = np.full(len(at), FIRST_DAMPING)
+    one = np.eye(at.shape[1])
+    going = np.arange(len(at))
     for _ in range(most_steps):
-        slopes = slopes_of(at, r, high, step) if slopes_of else jacobian(residual, at, r, high, step)
-        normal, gradient = slopes.T @ slopes, slopes.T @ r
-        scale = np.diag(normal).copy()
-        scale[scale <= 0.0] = 1.0
+        slopes = _slopes(columns_of, at, here, going, bounded)
+        turned = np.swapaxes(slopes, 1, 2)
+        gradient = (turned @ here.rest[going, :, None])[:, :, 0]
         # a parameter pressed against its bound stays there
-        free = ~(((at <= low) & (gradient > 0.0)) | ((at >= high) & (gradient < 0.0)))
-        if not free.any():
-            break
-        before = cost
-        for _ in range(12):
-            move = np.zeros_like(at)
-            lhs = normal[np.ix_(free, free)] + damping * np.diag(scale[free])
-            move[free] = np.linalg.lstsq(lhs, -gradient[free], rcond=None)[0]
-            new = np.clip(at + np.clip(move, -reach, reach), low, high)
-            r_new = residual(new)
-            if float(r_new @ r_new) < cost:
-                at, r, cost = new, r_new, float(r_new @ r_new)
-                damping = max(0.2 * damping, 1e-12)
+        now = at[going]
+        free = ~(((now <= low) & (gradient > 0.0)) | ((now >= high) & (gradient < 0.0)))
+        normal = turned @ slopes
+        scale = np.sqrt(np.einsum("bii->bi", normal))
+        free &= scale > UNFELT * scale.max(axis=1, keepdims=True)
+        gradient = np.where(free, gradient, 0.0)
+        normal = np.where(free[:, :, None] & free[:, None, :], normal, 0.0)
+        scale[~free] = 1.0
+        gradient /= scale
+        normal /= scale[:, :, None] * scale[:, None, :]
+
+        before = cost[going]
+        trying = np.arange(len(going))
+        for _ in range(TRIES):
+            mine = going[trying]
+            A, b = normal[trying], gradient[trying]
+            move = -np.linalg.solve(A + damping[mine, None, None] * one, b[:, :, None])[:, :, 0]
+            promised = -2.0 * np.einsum("bi,bi->b", b, move) - np.einsum("bi,bij,bj->b", move, A, move)
+            worth = promised > WORTH_TRYING * relative_decrease * cost[mine]
+            trying, mine, move = trying[worth], mine[worth], move[worth]
+            if not len(trying):
                 break
-            damping *= 4.0
-        if before - cost <= relative_decrease * before:
+            new = np.clip(at[mine] + np.clip(move / scale[trying], -reach, reach), low, high)
+            there = _Projected.of(columns_of(new), y)
+            better = there.rss < cost[mine]
+            won = mine[better]
+            at[won], cost[won] = new[better], there.rss[better]
+            here.replaced(won, there, better)
+            damping[won] = np.maximum(0.2 * damping[won], LEAST_DAMPING)
+            damping[mine[~better]] *= 4.0
+            trying = trying[~better]
+        going = going[before - cost[going] > relative_decrease * before]
+        if not len(going):
             break
     return at, cost
 
 
-def jacobian(residual: Callable[[Reals], Reals], at: Reals, r: Reals, high: Reals, step: Reals) -> Reals:
-    """Forward differences of the residual, backward at the upper bound; shape (N, parameters)."""
-    columns = []
-    for i, h in enumerate(step):
-        moved = at.copy()
-        signed = h if at[i] + h <= high[i] else -h
-        moved[i] += signed
-        columns.append((residual(moved) - r) / signed)
-    return np.stack(columns, axis=1)
+def _slopes(columns_of: Callable[[Reals], Reals], at: Reals, here: _Projected, which: Rows, bounded: Bounded) -> Reals:
+    """Of the residuals at these points by each parameter, shape (points, N, parameters)."""
+    points, count = at[which], at.shape[1]
+    signed = np.where(points + bounded.step <= bounded.high, bounded.step, -bounded.step)
+    moved = points[:, None, :] + signed[:, :, None] * np.eye(count)
+    columns = columns_of(moved.reshape(-1, count))
+    linear, basis = here.linear[which], here.basis[which]
+    fitted = (here.columns[which] @ linear[:, :, None])[:, :, 0]
+    answers = np.matmul(columns.reshape(len(points), count, *columns.shape[1:]), linear[:, None, :, None])[..., 0]
+    change = np.swapaxes((answers - fitted[:, None, :]) / signed[:, :, None], 1, 2)
+    return np.asarray(basis @ (np.swapaxes(basis, 1, 2) @ change) - change)
+
+
+def _back(r: Reals, along: Reals) -> Reals:
+    """R c = along, without a direction that the columns have left out."""
+    seen = np.abs(np.einsum("bii->bi", r)).min(axis=1) > REDUNDANT
+    if seen.all():
+        return np.asarray(np.linalg.solve(r, along[:, :, None])[:, :, 0])
+    found = np.empty_like(along)
+    found[seen] = np.linalg.solve(r[seen], along[seen, :, None])[:, :, 0]
+    for i in np.flatnonzero(~seen):
+        found[i] = np.linalg.lstsq(r[i], along[i], rcond=REDUNDANT)[0]
+    return found
 
 
 def covariance(columns: Reals, variance: float) -> Reals:

@@ -9,10 +9,12 @@ import numpy as np
 
 from tuning.models import Reals
 from tuning.reasons import Reason, Refused
+from tuning.record_fit import averaged
 
 LEAST_LISTENED = 60
 """Averages in which the time at rest must still be told, for noise and offset."""
 AVERAGES_PER_PERIOD = 80
+LONGEST_DEAD_TIME = 0.75  # periods
 LEAST_SWITCHES = 4
 
 
@@ -63,6 +65,11 @@ class Evidence:
         return float(np.max(np.abs(self.u)))
 
     @property
+    def most_dead_time(self) -> float:
+        """Samples."""
+        return LONGEST_DEAD_TIME * self.period
+
+    @property
     def block(self) -> int:
         """Samples averaged into one for the fit: sampling faster than this tells nothing more."""
         return max(1, min(int(self.period / AVERAGES_PER_PERIOD), self.listened // LEAST_LISTENED))
@@ -99,12 +106,3 @@ def noise_of(rest: Reals) -> float:
     t = np.linspace(-1.0, 1.0, len(rest))
     slow = rest - np.polyval(np.polyfit(t, rest, 2), t)
     return max(fast, float(np.std(slow, ddof=3)))
-
-
-def averaged(columns: Reals, block: int, axis: int = 0) -> Reals:
-    """Means of `block` rows each, which lie along the axis; rows left over at the end are dropped."""
-    if block == 1:
-        return columns
-    before, rows, after = columns.shape[:axis], columns.shape[axis] // block, columns.shape[axis + 1 :]
-    kept = columns[(slice(None),) * axis + (slice(rows * block),)]
-    return np.asarray(kept.reshape(*before, rows, block, *after).mean(axis=axis + 1))

@@ -9,13 +9,15 @@ import numpy as np
 
 from tuning.assess import assess
 from tuning.design import Predicted, Ultimate
-from tuning.fast.fit import LOG_STEP, Fit, Fitted
+from tuning.fast.evidence import Evidence
 from tuning.fast.spread import fit_covariance
 from tuning.fast.verdict import Judged
+from tuning.fit_spread import slopes_of
 from tuning.gains import Gains
 from tuning.margins import margins, ultimate_point
 from tuning.models import Model, Reals, TransferFunction
 from tuning.reasons import Ended, Reason, Refused
+from tuning.record_fit import Fit, Fitted
 from tuning.stages.common import Facts
 from tuning.stages.step_test import StepResult
 
@@ -151,7 +153,7 @@ def found_of(judged: Judged) -> Found:
     )
 
 
-def model_of(fit: Fit, found: Fitted) -> FoundModel:
+def model_of(fit: Fit[Evidence], found: Fitted) -> FoundModel:
     """With the standard errors that the parameters' covariance gives the coefficients (delta method)."""
     structure = found.structure
     searched, inputs = structure.searched, structure.inputs
@@ -164,11 +166,7 @@ def model_of(fit: Fit, found: Fitted) -> FoundModel:
         # a coefficient that happens to vanish is not left out
         return np.concatenate((np.zeros(width - len(moved.num)), moved.num[-width:], moved.den))
 
-    slopes = np.zeros((width + len(model.den), len(at)))
-    for i in range(len(at)):
-        move = np.zeros(len(at))
-        move[i] = LOG_STEP * (abs(at[i]) + 1e-12 if i >= searched else 1.0)
-        slopes[:, i] = (coefficients(at + move) - coefficients(at - move)) / (2.0 * move[i])
+    slopes = slopes_of(coefficients, at, searched)
     whole = fit_covariance(fit, found)
     kept = np.concatenate((np.arange(searched), len(found.theta) + np.arange(inputs)))
     covariance = whole[np.ix_(kept, kept)]

@@ -8,9 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from tuning.fast.design import controller
-from tuning.fast.fit import LOG_STEP, Fit, Fitted
+from tuning.fast.evidence import Evidence
+from tuning.fit_spread import sensitivities
 from tuning.gains import Gains
 from tuning.models import Complexes, Reals, TransferFunction, sign
+from tuning.record_fit import LOG_STEP, Fit, Fitted
 
 NEAR_THE_PEAK = 0.7
 """Of |S|: where it is less, an error of the model costs nothing."""
@@ -27,22 +29,10 @@ def colour(residual: Reals) -> float:
     return max(1.0, float(np.mean(residual**2)) / fast) if fast > 0.0 else 1.0
 
 
-def fit_covariance(fit: Fit, found: Fitted) -> Reals:
+def fit_covariance(fit: Fit[Evidence], found: Fitted) -> Reals:
     """Of theta and the linear coefficients, in this order."""
-    structure, hypothesis, c = found.structure, found.hypothesis, found.linear.coefficients
-    low, high = fit.bounds(structure, hypothesis)
-    # a corner has no derivative: half a sample for a time, a whole one where MV passes at once
-    time = (1.0 if structure.feed_through else 0.5) * fit.block
-    step = np.append(np.full(structure.lags, LOG_STEP), np.full(len(found.theta) - structure.lags, time))
-    above = [np.minimum(found.theta + move, high) for move in np.diag(step)]
-    below = [np.maximum(found.theta - move, low) for move in np.diag(step)]
-    outputs = fit.regressors(structure, hypothesis, np.array(above + below)) @ c
-    count = len(found.theta)
-    apart = np.array([above[i][i] - below[i][i] for i in range(count)])
-    slopes = ((outputs[:count] - outputs[count:]) / apart[:, None]).T
-    rest = found.linear.residual
-    variance = found.linear.rss / max(fit.samples - found.parameters, 1) * colour(rest)
-    return seen_covariance(np.column_stack((slopes, found.columns)), variance)
+    variance = found.linear.rss / max(fit.samples - found.parameters, 1) * colour(found.linear.residual)
+    return seen_covariance(sensitivities(fit, found), variance)
 
 
 def seen_covariance(columns: Reals, variance: float) -> Reals:
@@ -53,7 +43,7 @@ def seen_covariance(columns: Reals, variance: float) -> Reals:
     return np.asarray(variance * (inverse @ inverse.T) / np.outer(lengths, lengths))
 
 
-def uncertainty_of_Ms(fit: Fit, found: Fitted, gains: Gains, w: Reals, N: float, delay: float) -> float:
+def uncertainty_of_Ms(fit: Fit[Evidence], found: Fitted, gains: Gains, w: Reals, N: float, delay: float) -> float:
     """Ms that would be met at two standard deviations, less the nominal one. delay: s, of the sampling."""
     structure, theta, c = found.structure, found.theta, found.linear.coefficients
     inputs = structure.inputs
@@ -86,7 +76,7 @@ def uncertainty_of_Ms(fit: Fit, found: Fitted, gains: Gains, w: Reals, N: float,
 
 
 def difference_of_rivals(
-    fit: Fit, best: Fitted, rivals: Sequence[Fitted], gains: Gains, w: Reals, delay: float
+    fit: Fit[Evidence], best: Fitted, rivals: Sequence[Fitted], gains: Gains, w: Reals, delay: float
 ) -> float:
     """The largest |Ms - nominal Ms| that the same controller has on another model the record supports."""
     nominal = peak(fit.model(best), gains, w, delay)

@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tuning.fast.choice import EARNED
-from tuning.fast.fit import Fit, Fitted, Hypothesis
+from tuning.fast.evidence import Evidence
 from tuning.models import Reals
+from tuning.record_fit import Fit, Fitted, Hypothesis
+from tuning.stories import EARNED
 
 SIZES = (0.03, 0.06, 0.11, 0.19, 0.31)  # of MV's largest move
 LEAST_STICK = 0.04
@@ -63,7 +64,7 @@ FAULTS = {
 }
 
 
-def suspect(fit: Fit, best: Fitted) -> Suspicion | None:
+def suspect(fit: Fit[Evidence], best: Fitted) -> Suspicion | None:
     """The fault that explains the record clearly better than the best model without one."""
     structure, evidence = best.structure, fit.evidence
     # at rest nobody knows where in its slack the valve stands: that is a load from the relay's start on

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from tuning.fast.choice import Chosen, choose
 from tuning.fast.design import Best, Design, Wish
 from tuning.fast.evidence import Evidence
-from tuning.fast.fit import Fit, Fitted
 from tuning.fast.spread import colour, difference_of_rivals, peak, uncertainty_of_Ms
 from tuning.fast.valve import suspect
 from tuning.gains import Gains
 from tuning.models import TransferFunction
+from tuning.record_fit import Fit, Fitted
 
 MOST_RESIDUAL, UNIMPORTANT = 1.35, 0.004
 """Of the residual: in noises at rest; in spans of PV, below which it does not matter."""
@@ -49,7 +49,7 @@ class Judged:
     ambiguity: float
     residual: float
     chosen: Chosen
-    fit: Fit
+    fit: Fit[Evidence]
     design_delay: float
     period: float
 
@@ -119,7 +119,7 @@ def judge_again(evidence: Evidence, wish: Wish) -> Judged:
     return judge(evidence, wish, judge(replace(evidence, u=evidence.u[until], y=evidence.y[until], steps=()), wish))
 
 
-def _excused(fit: Fit, found: Fitted, earlier: Judged) -> tuple[str | None, str]:
+def _excused(fit: Fit[Evidence], found: Fitted, earlier: Judged) -> tuple[str | None, str]:
     """Loads that came with the new gains explain away what was to be tested: a plant that has changed looks the same.
 
     One may be true, if the step back is explained without another. So does one in mid-relay that the relay's own record

@@ -234,6 +234,29 @@ def test_identify_finds_the_plant(record: Path, tmp_path: Path) -> None:
     assert answer("tune", "--model", json.dumps(found["model"]), "--method", "simc")["methods"][0]["outcome"] == "tuned"
 
 
+def test_identify_finds_an_inverse_response_and_a_load(tmp_path: Path) -> None:
+    plant = LinearPlant([-2.0, 1.0], [20.0, 9.0, 1.0], 1.0, 0.1, noise_std=0.02, seed=3, mv_low=-50.0, mv_high=50.0)
+    lines, pv = ["t,u,y"], plant.pv
+    for k in range(600):
+        move = 2.0 * (k >= 50)
+        plant.disturbance = 0.6 * (k >= 360)
+        lines.append(f"{0.1 * k:.3f},{50.0 + move},{20.0 + pv:.6f}")
+        pv = plant.step(move)
+    file, picture = tmp_path / "load.csv", tmp_path / "fit.svg"
+    file.write_text("\n".join(lines) + "\n")
+    found = answer("identify", str(file), "--plot", str(picture))
+    assert set(found["model"]) == {"num", "den", "dead_time_s"}
+    assert list(found["parameters"]) == list(found["standard_errors"])
+    for row, error in zip(enumerate(found["covariance"]), found["standard_errors"].values(), strict=True):
+        assert math.sqrt(row[1][row[0]]) == pytest.approx(error)
+    (load,) = found["loads"]
+    assert load["t_s"] == pytest.approx(36.0, rel=0.1) and load["size"] == pytest.approx(0.6, rel=0.1)
+    assert "MV units found" in picture.read_text()
+    told = run("identify", str(file)).stdout
+    assert "den[0]" in told and "a load" in told and "step of the load" in told
+    assert answer("tune", "--model", json.dumps(found["model"]), "--method", "simc")["methods"][0]["outcome"] == "tuned"
+
+
 def test_identify_on_a_terminal(record: Path) -> None:
     result = run("identify", str(record))
     assert result.exit_code == 0

@@ -10,8 +10,8 @@ import pytest
 from service.fast_record import kept
 from service.rehearsal import rehearse
 from tuning.fast.choice import choose
-from tuning.fast.fit import Fit
 from tuning.plan import Event, Mode, Sample, StageStarted
+from tuning.record_fit import Fit
 
 SPEC = {"num": [-1.5], "den": [8.0, 1.0], "dead_time_s": 2.0, "sample_time_s": 0.1, "noise_std": 0.002, "t95_s": 26.0}
 

@@ -63,9 +63,16 @@ def open_loop(
 
 
 def closed_loop(
-    loop: Loop, relay: bool = False, samples: int = 600, Ts: float = 0.1, noise: float = 0.0, seed: int = 1
+    loop: Loop,
+    relay: bool = False,
+    samples: int = 600,
+    Ts: float = 0.1,
+    noise: float = 0.0,
+    seed: int = 1,
+    load: float = 0.0,
+    load_at: int = 0,
 ) -> tuple[Reals, Reals, Reals]:
-    """(t, u, y) of a set-point step of 1, or of a relay, after a time at rest."""
+    """(t, u, y) of a set-point step of 1, or of a relay, after a time at rest. load: MV units, from that sample on."""
     plant = loop.plant(Ts, noise, seed)
     integrates = loop.den[-1] == 0.0
     reverse = loop.num[-1] * loop.den[-2 if integrates else -1] > 0.0
@@ -77,6 +84,8 @@ def closed_loop(
             channel.start_relay(1.0, 0.02, MV, 0.0, samples, 0.0, 100.0)
         elif k == FIRST_MOVE:
             channel.setpoint = PV + 1.0
+        if load and k == load_at:
+            plant.disturbance = load
         u.append(channel.step(pv))
         y.append(pv)
         pv = plant.step(u[-1])

@@ -8,6 +8,7 @@ import pytest
 from tests.unit.tuning.recordings import NEGATIVE, moves, open_loop
 from tuning.fitting import Problem
 from tuning.models import FOPDT
+from tuning.record_fit import MOVING, QUIET, Hypothesis
 from tuning.recorded import recorded
 from tuning.structures import FIRST
 
@@ -22,22 +23,28 @@ def with_load(noise: float) -> Problem:
     return Problem(recorded(t, u, open_loop(NEGATIVE, loaded, noise=noise)[2]))
 
 
-def test_a_load_step_at_the_right_sample_explains_the_record() -> None:
+def test_a_load_step_at_its_own_sample_explains_the_record() -> None:
     problem = with_load(0.0)
     arrives = LOAD_AT + 20  # dead time 2 s, sampled at 0.1 s
-    found, without = problem.fit(FIRST, arrives), problem.fit(FIRST, None)
+    without = problem.fit(FIRST, QUIET)
+    found = problem.refined(FIRST, Hypothesis(loads=1), [np.append(without.theta, arrives + 3.0)])
     model = problem.model(found)
     assert isinstance(model, FOPDT)
     assert pytest.approx((-1.5, 8.0, 2.0), rel=1e-6) == (model.K, model.T, model.L)
     assert found.rms < 1e-9 < 1e-2 < without.rms
-    assert found.explains and not without.explains
-    # the size of the load, by the plant's own static gain
-    monic = FIRST.monic(found.theta)[0]
-    size = found.linear.coefficients[2] / monic * problem.pv_unit
-    assert size == pytest.approx(-1.5 * 0.4, rel=1e-6)
+    assert problem.explains(found) and not problem.explains(without)
+    ((seen, entered, size), _) = problem.loads(found)[0]
+    assert (seen, entered, size) == pytest.approx((0.1 * arrives, 0.1 * LOAD_AT, 0.4), rel=1e-6)
 
 
 def test_a_load_step_at_another_sample_explains_less() -> None:
     problem = with_load(0.005)
-    bic = [problem.fit(FIRST, at).bic for at in (310, 320, 330)]
+    theta = problem.refined(FIRST, Hypothesis(loads=1), [np.append(problem.fit(FIRST, QUIET).theta, 320.0)]).theta
+    bic = [problem.fitted(FIRST, Hypothesis(loads=1), np.append(theta[:-1], at)).bic for at in (310.0, 320.0, 330.0)]
     assert bic[1] < min(bic[0], bic[2]) - 15.0
+
+
+def test_more_parameters_gain_less_where_the_residual_is_not_white() -> None:
+    problem = with_load(0.005)
+    without, moving = problem.fit(FIRST, QUIET), problem.fit(FIRST, MOVING)
+    assert problem.gain(moving, without) < without.bic - moving.bic

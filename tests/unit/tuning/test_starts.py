@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from tests.unit.tuning.recordings import COMPLEX_POLES, FIRST_ORDER, INVERSE_RESPONSE, Loop, moves, open_loop
+from tuning.fitting import Problem
+from tuning.record_fit import MOVING, QUIET
+from tuning.recorded import recorded
 from tuning.starts import starts
 from tuning.structures import FIRST, SECOND, SECOND_WITH_ZERO, Structure
-from tuning.varpro import solve
 
 
 @pytest.mark.parametrize("nuisance", [False, True])
@@ -17,10 +19,11 @@ from tuning.varpro import solve
 )
 def test_the_dead_time_is_the_best_of_all_tried_one_by_one(structure: Structure, loop: Loop, nuisance: bool) -> None:
     change = moves(300)
-    y = open_loop(loop, change, noise=0.05)[2]
+    t, u, y = open_loop(loop, change, noise=0.05)
+    fit = Problem(recorded(t, u, y)).whole
     best = starts(structure, change, y, 60, nuisance, 1)[0]
-    load = 0 if nuisance else None
-    plain = [solve(structure.regressors(np.append(best[:-1], float(m)), change, load), y).rss for m in range(61)]
+    story = MOVING if nuisance else QUIET
+    plain = [fit.fitted(structure, story, np.append(best[:-1], float(m))).linear.rss for m in range(61)]
     assert best[-1] == int(np.argmin(plain))
 
 

@@ -9,9 +9,9 @@ import pytest
 
 from tests.unit.tuning.fast.records import BENCHES, FIRST, FIVE_LAGS, THREE_LAGS, Bench, record
 from tuning.fast.choice import choose
-from tuning.fast.fit import QUIET, Fit, Hypothesis
 from tuning.margins import ultimate_point
 from tuning.models import TransferFunction
+from tuning.record_fit import QUIET, Fit, Hypothesis
 from tuning.structures import FIRST_FED, SECOND_FED
 
 

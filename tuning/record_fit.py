@@ -1,4 +1,4 @@
-"""The structures fitted to a whole fast record, with steps of the load at free times and a drift if need be."""
+"""Structures fitted to a whole record, with steps of the load at free times and a drift if need be."""
 
 from __future__ import annotations
 
@@ -6,21 +6,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from tuning.fast.evidence import Evidence, averaged
 from tuning.models import Reals, TransferFunction
-from tuning.projection import Bounded, descend
 from tuning.sampled import pulses
 from tuning.structures import Structure
-from tuning.varpro import Linear, solve
+from tuning.varpro import Bounded, Linear, descend, solve
 
 FLOOR = 2e-4
 """Of the residual in spans of PV: data without noise would ask for ever more parameters."""
 LOG_LOW, LOG_HIGH = -8.5, 9.5
 """Of a rate in 1/period (a product of two: its square)."""
-LONGEST_DEAD_TIME = 0.75  # periods
 DEAD_TIMES = (0.01, 0.06, 0.14, 0.23, 0.32, 0.41, 0.49)
 LAGS = (0.02, 0.08, 0.25, 0.8, 4.0, 40.0)
 COMPLEX = ((3.0, 0.5), (6.0, 0.5), (10.0, 0.3))
@@ -33,15 +31,49 @@ LOG_REACH = 1.5
 REDUNDANT = 1e-10
 
 
+class Signals(Protocol):
+    """A record as the fit wants it.
+
+    Ts: s.  u, y: MV and PV, shape (N,), as deviations from rest; MV is 0 before the record.  swing: of MV, span: of PV,
+    which measure them.  period: samples, the time scale: about that of an oscillation at the limit of stability.
+    most_dead_time: samples.  block: samples averaged into one.
+    """
+
+    @property
+    def Ts(self) -> float: ...
+    @property
+    def u(self) -> Reals: ...
+    @property
+    def y(self) -> Reals: ...
+    @property
+    def swing(self) -> float: ...
+    @property
+    def span(self) -> float: ...
+    @property
+    def period(self) -> float: ...
+    @property
+    def most_dead_time(self) -> float: ...
+    @property
+    def block(self) -> int: ...
+
+
+S = TypeVar("S", bound=Signals)
+
+
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """What moved PV beside MV. loads: steps of the load at times to be found.  drift: PV drifts at a steady rate."""
+    """What moved PV beside MV. loads: steps of the load at times to be found.  drift: PV drifts at a steady rate.
+
+    moving: the plant was not at rest, or under a load, when the record began.
+    """
 
     loads: int = 0
     drift: bool = False
+    moving: bool = False
 
 
 QUIET = Hypothesis()
+MOVING = Hypothesis(moving=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,10 +99,15 @@ class Fitted:
         return len(self.theta) + int(self.columns.shape[1])
 
 
-class Fit:
+def count(fit: Fitted) -> int:
+    """Parameters, as BIC takes them: a load's time was chosen among many and counts twice."""
+    return fit.parameters + fit.hypothesis.loads
+
+
+class Fit(Generic[S]):
     """Fits one record. Time in samples, MV in swings, PV in spans."""
 
-    def __init__(self, evidence: Evidence) -> None:
+    def __init__(self, evidence: S) -> None:
         self.evidence = evidence
         self.block = evidence.block
         self.u = evidence.u / evidence.swing
@@ -88,11 +125,14 @@ class Fit:
         many, inputs = len(thetas), structure.zeros + 1
         # one call for MV and every load: what it costs is mostly the call
         times = thetas[:, structure.lags :].T
-        answers = pulses(np.tile(structure.monic(thetas), (len(times), 1)), times.ravel(), structure.order)
+        if hypothesis.moving:
+            # a step of every state at the start stands for any state there, and for a load
+            times = np.append(times, np.zeros((1, many)), axis=0)
+        steps = len(times) - 1
+        answers = pulses(np.tile(structure.monic(thetas), (1 + steps, 1)), times.ravel(), structure.order)
         driven, loads = answers.of(slice(many)), answers.of(slice(many, None))
         always = self._always[:, : 1 + hypothesis.drift]
-        width = structure.inputs + always.shape[1] + structure.order * hypothesis.loads
-        out = np.empty((many, self.samples, width))
+        out = np.empty((many, self.samples, structure.inputs + always.shape[1] + structure.order * steps))
         out[:, :, :inputs] = averaged(driven.drive(self.u, inputs), self.block, 1)
         if structure.feed_through:
             delayed = np.zeros((many, len(self.u)))
@@ -102,8 +142,8 @@ class Fit:
         at = structure.inputs
         out[:, :, at : at + always.shape[1]] = always
         at += always.shape[1]
-        moved = averaged(loads.drive(self._step), self.block, 1) if hypothesis.loads else out[:0]
-        for k in range(hypothesis.loads):
+        moved = averaged(loads.drive(self._step), self.block, 1) if steps else out[:0]
+        for k in range(steps):
             out[:, :, at : at + structure.order] = moved[k * many : (k + 1) * many]
             at += structure.order
         return out
@@ -147,9 +187,9 @@ class Fit:
         return [found[i] for i in np.argsort(rss, kind="stable")]
 
     def bounds(self, structure: Structure, hypothesis: Hypothesis) -> tuple[Reals, Reals]:
-        powers = np.array([1.0, 2.0, 1.0][: structure.lags] if structure.lags > 1 else [1.0])
+        powers = np.array([1.0, 2.0, 1.0][: structure.lags])
         low = np.concatenate((LOG_LOW + powers * self._rate, np.zeros(1 + hypothesis.loads)))
-        high = np.concatenate((LOG_HIGH + powers * self._rate, [LONGEST_DEAD_TIME * self.period]))
+        high = np.concatenate((LOG_HIGH + powers * self._rate, [self.evidence.most_dead_time]))
         return low, np.append(high, np.full(hypothesis.loads, len(self.u) - 2.0 * self.block))
 
     # where to begin
@@ -157,6 +197,8 @@ class Fit:
     def denominators(self, structure: Structure) -> list[Reals]:
         """Logs of the rates to begin with."""
         unit = self.period
+        if structure.lags == 0:
+            return [np.empty(0)]
         if structure.lags == 1:
             return [np.log([1.0 / (T * unit)]) for T in LAGS]
         if structure.lags == 3:
@@ -205,13 +247,13 @@ class Fit:
 
     # what it means
 
-    def goes_right(self, fit: Fitted) -> bool:
-        """The static gain has the sign that the controller's action says."""
+    def static_gain(self, fit: Fitted) -> float:
+        """In spans per swing; its sign and per sample where the plant integrates."""
         structure, c = fit.structure, fit.linear.coefficients
-        gain = float(c[0] / structure.monic(fit.theta[: structure.searched])[-1])
+        gain = float(c[0] / structure.slowest(fit.theta))
         if structure.feed_through:
             gain += float(c[structure.zeros + 1])
-        return gain * self.evidence.direction > 0.0
+        return gain
 
     def model(self, fit: Fitted) -> TransferFunction:
         """In s and the units of the record."""
@@ -243,3 +285,12 @@ def left_over(columns: Reals, y: Reals) -> Reals:
     along = turned @ y
     weights = np.linalg.solve(gram, along[:, :, None])[:, :, 0]
     return np.asarray(y @ y - np.einsum("bi,bi->b", weights, along))
+
+
+def averaged(columns: Reals, block: int, axis: int = 0) -> Reals:
+    """Means of `block` rows each, which lie along the axis; rows left over at the end are dropped."""
+    if block == 1:
+        return columns
+    before, rows, after = columns.shape[:axis], columns.shape[axis] // block, columns.shape[axis + 1 :]
+    kept = columns[(slice(None),) * axis + (slice(rows * block),)]
+    return np.asarray(kept.reshape(*before, rows, block, *after).mean(axis=axis + 1))
