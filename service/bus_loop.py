@@ -169,8 +169,7 @@ class BusLoop:
     def accept(self, gains: Gains) -> LoopState:
         with self._translated() as tuner:
             held = tuner.beating
-            tuner.beating = True
-            tuner.heartbeat()
+            tuner.hold()
             self._make_accepted(tuner, gains)
             tuner.beating = held
             state = self._state(tuner)
@@ -211,8 +210,7 @@ class BusLoop:
                 raise Refused(Reason.WRONG_MODE, "another tuner holds the lease of this loop")
             time.sleep(0.05)
         tuner.write("heartbeat_consumer", TUNER_NODE << 16 | HEARTBEAT_WATCH_MS, sub=1, node=self._node)
-        tuner.beating = True
-        tuner.heartbeat()
+        tuner.hold()
         if tuner.number("controller_on_trial"):
             tuner.write("controller_parameter_command", ParameterCommand.GO_BACK)
 
