@@ -39,7 +39,7 @@ HEARTBEAT_S = 0.1
 _WAIT_S = 0.05  # one wait on the bus: short enough to beat in time; always the same, which RawBus makes cheap
 _TAKE_IN_S = 0.1
 _ABORT = 0x80
-_LEASE = "controller_lease"
+_URGENT = ("controller_lease", "controller_lease_renewal")
 
 ABORT_TEXT = {
     Abort.TOGGLE: "toggle bit not alternated",
@@ -253,7 +253,7 @@ class Tuner:
         """
         with _turns_guard:
             turns = _turns.setdefault((self._url, node), Turns())
-        with turns.take(urgent=name == _LEASE):
+        with turns.take(urgent=name in _URGENT):
             self._bus.set_filters(self._heard | {sdo_response_id(node)})
             try:
                 yield

@@ -305,10 +305,13 @@ class BusLoop:
             self._renew(tuner)
 
     def _renew(self, tuner: Tuner) -> None:
-        """Looks before it pays: paying for a session that has ended would open another one."""
-        if not tuner.number("controller_lease"):
-            raise self._gone_back(tuner)
-        tuner.write("controller_lease", self._lease)
+        """Pays for the session that is open; a lease written after its end would open another one."""
+        try:
+            tuner.write("controller_lease_renewal", self._lease)
+        except TunerError as error:
+            if error.code == Abort.DEVICE_STATE:
+                raise self._gone_back(tuner) from error
+            raise
         self._until_renewal, self._paid_at = self._lease // 3, time.monotonic()
 
     def _look(self, tuner: Tuner) -> None:
