@@ -144,13 +144,13 @@ class Tuner:
         self.beating = True
         self._beat(time.monotonic())
 
-    def heartbeat(self) -> None:
-        """Sends our heartbeat when it is due and no other loop on this bus has sent it."""
-        if not self.beating:
-            return
+    def heartbeat(self) -> float:
+        """Sends our heartbeat when it is due and no other loop on this bus has sent it. The time on the clock, which it
+        takes a system call to read in some virtual machines."""
         now = time.monotonic()
-        if now - _beats.get(self._url, -HEARTBEAT_S) >= HEARTBEAT_S:
+        if self.beating and now - _beats.get(self._url, -HEARTBEAT_S) >= HEARTBEAT_S:
             self._beat(now)
+        return now
 
     def _beat(self, now: float) -> None:
         self._bus.send(heartbeat_id(TUNER_NODE), HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL))
@@ -158,13 +158,13 @@ class Tuner:
 
     def sample(self, timeout_s: float) -> BusSample | None:
         """The next sample in order; None when none came within `timeout_s` of wall time."""
-        give_up = time.monotonic() + timeout_s
-        self.heartbeat()  # also while there are samples at hand: who catches up is alive
+        now = self.heartbeat()  # also while there are samples at hand: who catches up is alive
+        give_up = now + timeout_s
         while not self._samples:
-            self.heartbeat()
-            wait = _WAIT_S if time.monotonic() < give_up else 0.0  # then only what is here already
-            if not self._receive(wait) and time.monotonic() >= give_up:
+            wait = _WAIT_S if now < give_up else 0.0  # then only what is here already
+            if not self._receive(wait) and not wait:
                 return None
+            now = self.heartbeat()
         return self._samples.popleft()
 
     def drain(self) -> None:
@@ -176,8 +176,8 @@ class Tuner:
         """What has arrived, in its order. Where more arrives than we can take, that is no reason to stay here for
         ever or to fall silent: the rest is taken later."""
         give_up = time.monotonic() + _TAKE_IN_S
-        while self._receive(0.0) and time.monotonic() < give_up:
-            self.heartbeat()
+        while self._receive(0.0) and self.heartbeat() < give_up:
+            pass
 
     def _receive(self, timeout_s: float) -> bool:
         frame = self._bus.recv(timeout_s)
@@ -306,9 +306,8 @@ class Tuner:
                 can_id, data = self._answers.popleft()
                 if can_id == wanted and len(data) == 8:
                     return data
-            self.heartbeat()
-            wait = _WAIT_S if time.monotonic() < give_up else 0.0  # then only what is here already
-            if not self._receive(wait) and time.monotonic() >= give_up:
+            wait = _WAIT_S if self.heartbeat() < give_up else 0.0  # then only what is here already
+            if not self._receive(wait) and not wait:
                 return None
 
 
