@@ -263,7 +263,7 @@ class BusLoop:
             case SetMode(mode):
                 tuner.write("controller_mode_command", mode)
             case SetGains(gains):
-                self._try(tuner, gains)
+                self._try(tuner, gains, self._keep)
                 self._tried = gains
             case SetOutput(value):
                 tuner.write("controller_manual_output", value)
@@ -291,9 +291,11 @@ class BusLoop:
         tuner.write("controller_experiment", Experiment.RELAY)
         tuner.write("controller_mode_command", Mode.EXPERIMENT)
 
-    def _try(self, tuner: Tuner, gains: Gains) -> None:
+    def _try(self, tuner: Tuner, gains: Gains, pay: Callable[[Tuner], None] = lambda tuner: None) -> None:
+        """pay: what keeps the session open while one write waits for the other, if there is a session."""
         values = (gains.Kp, gains.Ti, gains.Td, gains.Tf, gains.b, gains.c)
         for name, value in zip(_PARAMETERS, values, strict=True):
+            pay(tuner)
             tuner.write(f"controller_staged_{name}", value)
         tuner.write("controller_parameter_command", ParameterCommand.TRY)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
@@ -20,7 +20,8 @@ from protocol.profile import CONTROLLER_NODE, PLANT_NODE, sdo_request_id
 from service import bus_loop as bus_loop_module
 from service.bus_loop import LEASE_WALL_S, BusLoop
 from tests.unit.protocol.memory_bus import MemoryBus, Wire
-from tuning.plan import Mode, SetMode, SetRelay, SetSetpoint
+from tuning.gains import Gains
+from tuning.plan import Command, Mode, SetGains, SetMode, SetRelay, SetSetpoint
 from tuning.reasons import Failed, Reason
 
 NAMES = {entry.index: name for name, entry in BY_NAME.items() if entry.device is not Device.PLANT}
@@ -109,19 +110,23 @@ def test_the_lease_is_paid_before_commands_are_sent(in_blocks: Site) -> None:
     assert in_blocks.names() == [RENEWAL, "controller_setpoint"]
 
 
-def test_the_lease_is_paid_between_commands_that_take_long(in_real_time: Site) -> None:
+@pytest.mark.parametrize("commands", [(RELAY, SetMode(Mode.EXPERIMENT)), (SetGains(Gains(150.0, 9.0)),)], ids=str)
+def test_the_lease_is_paid_between_writes_that_take_long(in_real_time: Site, commands: Sequence[Command]) -> None:
     """As many loops that ask one node make them."""
     loop = in_real_time.loop
     loop.begin()
     paid = in_real_time.wire.clock.now
-    in_real_time.slow_s = 0.4
-    loop.step((RELAY, SetMode(Mode.EXPERIMENT)))
+    in_real_time.slow_s = 0.45
+    loop.step(commands)
     in_real_time.slow_s = 0.0
     written = in_real_time.written
-    times = [paid, *(at for name, at in written if name == RENEWAL)]
-    assert written[-1][0] == "controller_mode_command" and written[-1][1] - paid > LEASE_WALL_S
-    assert len(times) > 2 and max(b - a for a, b in pairwise(times)) < LEASE_WALL_S
-    assert Mode.EXPERIMENT in {loop.step(()).mode for _ in range(100)}
+    times = [paid, *(at for name, at in written if name == RENEWAL), written[-1][1]]
+    assert written[-1][0] != RENEWAL and written[-1][1] - paid > LEASE_WALL_S
+    assert len(times) > 2 and max(b - a for a, b in pairwise(times)) < 0.8 * LEASE_WALL_S
+    last = [loop.step(()) for _ in range(100)][-1]
+    assert (last.mode, in_real_time.controller.channels[0].on_trial) == (
+        (Mode.EXPERIMENT, False) if RELAY in commands else (Mode.AUTOMATIC, True)
+    )
 
 
 def test_what_a_relay_has_already_is_not_written_again(in_blocks: Site) -> None:
