@@ -29,7 +29,7 @@ _NUMBERS = {
     "mv": (50.0, "first output, percent"),
     "mv_low": (0.0, "percent"),
     "mv_high": (100.0, "percent"),
-    "pv_low": (0.0, "PV span"),
+    "pv_low": (0.0, "PV span; a PV farther outside than it is wide is no measurement, MV holds"),
     "pv_high": (100.0, "PV span"),
     "safe_output": (0.0, "percent, in mode off"),
     "rate_limit": (0.0, "percent per s, 0 = none"),

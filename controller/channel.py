@@ -21,7 +21,10 @@ __all__ = ["Cause", "Channel", "ExperimentState", "Mode", "Parameters", "Setting
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Limits in MV units (rate: per s, 0 = none) and the PV span; reverse: MV falls as PV rises."""
+    """Limits in MV units (rate: per s, 0 = none) and the PV span; reverse: MV falls as PV rises.
+
+    A PV that is farther outside its span than the span is wide is no measurement.
+    """
 
     mv_low: float = 0.0
     mv_high: float = 100.0
@@ -39,6 +42,10 @@ class Settings:
             raise ValueError("the low end of the PV span must not exceed the high one")
         if self.rate_limit_per_s < 0:
             raise ValueError("the rate limit must not be negative")
+
+    def measured(self, pv: float) -> bool:
+        width = self.pv_high - self.pv_low
+        return self.pv_low - width <= pv <= self.pv_high + width
 
 
 @dataclass(slots=True)
@@ -65,8 +72,8 @@ class _Latched:
 class Channel:
     """Call `step` once per sample with the PV; it answers with the MV that holds until the next one.
 
-    A PV that is not finite holds the MV of AUTOMATIC and of the relay, and counts in `bad_samples`; nothing of it is
-    remembered. MANUAL and OFF need no PV.
+    A PV that is not finite, or far outside its span, holds the MV of AUTOMATIC and of the relay, and counts in
+    `bad_samples`; nothing of it is remembered. MANUAL and OFF need no PV.
     """
 
     def __init__(
@@ -146,7 +153,7 @@ class Channel:
     def step(self, pv: float) -> float:
         if self._relay is not None:
             self._watch_relay(self._relay, pv)
-        if pv - pv == 0.0:
+        if self._settings.measured(pv):
             if self._pv is None:
                 self._pid.rebase(self._setpoint, pv, self._mv)
             self._pv = pv

@@ -223,6 +223,7 @@ class ControllerDevice:
         read["controller_accept_count"] = lambda sub: channels[sub - 1].accept_count
         read["controller_lease"] = lambda sub: channels[sub - 1].lease
         write["controller_lease"] = self._write_lease
+        write["controller_lease_renewal"] = self._renew_lease
         read["controller_cause"] = lambda sub: channels[sub - 1].cause
         read["controller_experiment_state"] = lambda sub: channels[sub - 1].experiment_state
         read["controller_proportional_band"] = self._proportional_band
@@ -307,6 +308,12 @@ class ControllerDevice:
         self.channels[sub - 1].renew_lease(int(value))
         if value:
             self.runtime.clear_error(Emcy.LEASE_USED_UP)
+
+    def _renew_lease(self, sub: int, value: Value) -> None:
+        """Unlike a lease written, it never opens a session: one that has ended stays ended."""
+        if not self.channels[sub - 1].lease:
+            raise SdoAbort(Abort.DEVICE_STATE)
+        self.channels[sub - 1].renew_lease(int(value))
 
     def _proportional_band(self, sub: int) -> float:
         """Percent of span."""

@@ -211,6 +211,8 @@ _CONTROLLER = (
     Object("controller_accept_count", 0x2122, U32, "ro", "Accept counter", CONTROLLER, CHANNELS),
     Object("controller_lease", 0x2130, U32, "rw", "Lease, samples left (0 none)", CONTROLLER, CHANNELS),
     Object("controller_cause", 0x2131, U8, "ro", "Cause of the last going back", CONTROLLER, CHANNELS),
+    Object("controller_lease_renewal", 0x2132, U32, "wo", "Lease renewal, samples (refused without a lease)",
+           CONTROLLER, CHANNELS, low=1),
     Object("controller_experiment", 0x2140, U8, "rw", "Experiment (0 none, 1 relay)", CONTROLLER, CHANNELS,
            low=0, high=1),
     Object("controller_relay_amplitude", 0x2141, REAL32, "rw", "Relay amplitude", CONTROLLER, CHANNELS, default=5.0,

@@ -10,7 +10,8 @@ import struct
 import threading
 import time
 from collections import Counter, deque
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -38,7 +39,7 @@ HEARTBEAT_S = 0.1
 _WAIT_S = 0.05  # one wait on the bus: short enough to beat in time; always the same, which RawBus makes cheap
 _TAKE_IN_S = 0.1
 _ABORT = 0x80
-_LEASE = "controller_lease"
+_URGENT = ("controller_lease", "controller_lease_renewal")
 
 ABORT_TEXT = {
     Abort.TOGGLE: "toggle bit not alternated",
@@ -88,15 +89,12 @@ class BusSample(NamedTuple):
 _turns: dict[tuple[str, int], Turns] = {}
 _turns_guard = threading.Lock()
 
+_beats: dict[str, float] = {}
+"""By bus: when a loop of this process has last sent our heartbeat. One beat speaks for all of them: it says that the
+process lives. That a loop's own thread works, only its lease says."""
+
 sdo_retries: Counter[str] = Counter()
 """By bus: SDO requests that this process sent again because no answer came."""
-
-
-def _turn(url: str, node: int, name: str) -> AbstractContextManager[None]:
-    """What keeps a loop in our hands goes before what others want of its node."""
-    with _turns_guard:
-        turns = _turns.setdefault((url, node), Turns())
-    return turns.take(urgent=name == _LEASE)
 
 
 class Tuner:
@@ -114,7 +112,6 @@ class Tuner:
     ) -> None:
         """plant_node None: a plant that offers no SDO; its PV frames are still expected from node 10h."""
         ids = channel_ids(channel, plant_node or PLANT_NODE, controller_node)
-        nodes = [controller_node] if plant_node is None else [controller_node, plant_node]
         self._url = url
         self._controller = controller_node
         self._plant = plant_node
@@ -124,13 +121,11 @@ class Tuner:
         self._pv_id, self._mv_id, self._status_id = ids.pv, ids.mv, ids.status
         self._emcy_id, self._alive_id = emcy_id(controller_node), heartbeat_id(controller_node)
         self._bus: Bus = open_bus(url)
-        self._bus.set_filters(
-            {self._pv_id, self._mv_id, self._status_id, self._emcy_id, self._alive_id, *map(sdo_response_id, nodes)}
-        )
+        self._heard = frozenset({self._pv_id, self._mv_id, self._status_id, self._emcy_id, self._alive_id})
+        self._bus.set_filters(self._heard)
         self._answers: deque[Frame] = deque()
         self._samples: deque[BusSample] = deque()
         self._pv = (0.0, -1)
-        self._beat_at = 0.0
         self.beating = False
         """Only who holds the loop beats: a mere reader must not keep alive the trial of a tuner that died."""
         self.mode, self.on_trial, self.sp = 0, False, 0.0
@@ -144,24 +139,32 @@ class Tuner:
 
     # -- heartbeat and frames
 
-    def heartbeat(self) -> None:
-        """Sends our heartbeat when it is due."""
-        if not self.beating:
-            return
+    def hold(self) -> None:
+        """We beat from now on, and at once: a watch on us begins with the first beat that it hears."""
+        self.beating = True
+        self._beat(time.monotonic())
+
+    def heartbeat(self) -> float:
+        """Sends our heartbeat when it is due and no other loop on this bus has sent it. The time on the clock, which it
+        takes a system call to read in some virtual machines."""
         now = time.monotonic()
-        if now - self._beat_at >= HEARTBEAT_S:
-            self._bus.send(heartbeat_id(TUNER_NODE), HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL))
-            self._beat_at = now
+        if self.beating and now - _beats.get(self._url, -HEARTBEAT_S) >= HEARTBEAT_S:
+            self._beat(now)
+        return now
+
+    def _beat(self, now: float) -> None:
+        self._bus.send(heartbeat_id(TUNER_NODE), HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL))
+        _beats[self._url] = now
 
     def sample(self, timeout_s: float) -> BusSample | None:
         """The next sample in order; None when none came within `timeout_s` of wall time."""
-        give_up = time.monotonic() + timeout_s
-        self.heartbeat()  # also while there are samples at hand: who catches up is alive
+        now = self.heartbeat()  # also while there are samples at hand: who catches up is alive
+        give_up = now + timeout_s
         while not self._samples:
-            self.heartbeat()
-            wait = _WAIT_S if time.monotonic() < give_up else 0.0  # then only what is here already
-            if not self._receive(wait) and time.monotonic() >= give_up:
+            wait = _WAIT_S if now < give_up else 0.0  # then only what is here already
+            if not self._receive(wait) and not wait:
                 return None
+            now = self.heartbeat()
         return self._samples.popleft()
 
     def drain(self) -> None:
@@ -173,8 +176,8 @@ class Tuner:
         """What has arrived, in its order. Where more arrives than we can take, that is no reason to stay here for
         ever or to fall silent: the rest is taken later."""
         give_up = time.monotonic() + _TAKE_IN_S
-        while self._receive(0.0) and time.monotonic() < give_up:
-            self.heartbeat()
+        while self._receive(0.0) and self.heartbeat() < give_up:
+            pass
 
     def _receive(self, timeout_s: float) -> bool:
         frame = self._bus.recv(timeout_s)
@@ -209,7 +212,7 @@ class Tuner:
     def read(self, name: str, sub: int | None = None, node: int | None = None) -> Value:
         """The value of an object by name, of our channel unless `sub` says otherwise."""
         entry, node, sub = self._address(name, sub, node)
-        with _turn(self._url, node, name):
+        with self._turn(node, name):
             data = self._request(entry, node, sub, 0x40, b"\0\0\0\0")
             if data[0] & 0x02:
                 length = 4 - (data[0] >> 2 & 3) if data[0] & 0x01 else entry.type.size
@@ -229,7 +232,7 @@ class Tuner:
         """Writes a number; every object the profile lets us write fits one frame."""
         entry, node, sub = self._address(name, sub, node)
         raw = entry.type.encode(value if entry.type is Type.REAL32 else int(value))
-        with _turn(self._url, node, name):
+        with self._turn(node, name):
             self._request(entry, node, sub, 0x23 | (4 - len(raw)) << 2, raw.ljust(4, b"\0"))
 
     def _address(self, name: str, sub: int | None, node: int | None) -> tuple[Object, int, int]:
@@ -241,6 +244,21 @@ class Tuner:
         if sub is None:
             sub = self._channel if entry.shape is Shape.CHANNELS else 0
         return entry, node, sub
+
+    @contextmanager
+    def _turn(self, node: int, name: str) -> Iterator[None]:
+        """Our turn with the node, and its answers heard. What keeps a loop in our hands goes before what others want.
+
+        Outside of it the answers, which are to others then, are not received: of fifty loops each would wake for all.
+        """
+        with _turns_guard:
+            turns = _turns.setdefault((self._url, node), Turns())
+        with turns.take(urgent=name in _URGENT):
+            self._bus.set_filters(self._heard | {sdo_response_id(node)})
+            try:
+                yield
+            finally:
+                self._bus.set_filters(self._heard)
 
     def _request(self, entry: Object, node: int, sub: int, command: int, payload: bytes) -> bytes:
         """The answer's 8 bytes. An answer names its object, so a late one to another request is passed over."""
@@ -288,9 +306,8 @@ class Tuner:
                 can_id, data = self._answers.popleft()
                 if can_id == wanted and len(data) == 8:
                     return data
-            self.heartbeat()
-            wait = _WAIT_S if time.monotonic() < give_up else 0.0  # then only what is here already
-            if not self._receive(wait) and time.monotonic() >= give_up:
+            wait = _WAIT_S if self.heartbeat() < give_up else 0.0  # then only what is here already
+            if not self._receive(wait) and not wait:
                 return None
 
 

@@ -169,8 +169,7 @@ class BusLoop:
     def accept(self, gains: Gains) -> LoopState:
         with self._translated() as tuner:
             held = tuner.beating
-            tuner.beating = True
-            tuner.heartbeat()
+            tuner.hold()
             self._make_accepted(tuner, gains)
             tuner.beating = held
             state = self._state(tuner)
@@ -211,8 +210,7 @@ class BusLoop:
                 raise Refused(Reason.WRONG_MODE, "another tuner holds the lease of this loop")
             time.sleep(0.05)
         tuner.write("heartbeat_consumer", TUNER_NODE << 16 | HEARTBEAT_WATCH_MS, sub=1, node=self._node)
-        tuner.beating = True
-        tuner.heartbeat()
+        tuner.hold()
         if tuner.number("controller_on_trial"):
             tuner.write("controller_parameter_command", ParameterCommand.GO_BACK)
 
@@ -265,7 +263,7 @@ class BusLoop:
             case SetMode(mode):
                 tuner.write("controller_mode_command", mode)
             case SetGains(gains):
-                self._try(tuner, gains)
+                self._try(tuner, gains, self._keep)
                 self._tried = gains
             case SetOutput(value):
                 tuner.write("controller_manual_output", value)
@@ -293,9 +291,11 @@ class BusLoop:
         tuner.write("controller_experiment", Experiment.RELAY)
         tuner.write("controller_mode_command", Mode.EXPERIMENT)
 
-    def _try(self, tuner: Tuner, gains: Gains) -> None:
+    def _try(self, tuner: Tuner, gains: Gains, pay: Callable[[Tuner], None] = lambda tuner: None) -> None:
+        """pay: what keeps the session open while one write waits for the other, if there is a session."""
         values = (gains.Kp, gains.Ti, gains.Td, gains.Tf, gains.b, gains.c)
         for name, value in zip(_PARAMETERS, values, strict=True):
+            pay(tuner)
             tuner.write(f"controller_staged_{name}", value)
         tuner.write("controller_parameter_command", ParameterCommand.TRY)
 
@@ -307,10 +307,13 @@ class BusLoop:
             self._renew(tuner)
 
     def _renew(self, tuner: Tuner) -> None:
-        """Looks before it pays: paying for a session that has ended would open another one."""
-        if not tuner.number("controller_lease"):
-            raise self._gone_back(tuner)
-        tuner.write("controller_lease", self._lease)
+        """Pays for the session that is open; a lease written after its end would open another one."""
+        try:
+            tuner.write("controller_lease_renewal", self._lease)
+        except TunerError as error:
+            if error.code == Abort.DEVICE_STATE:
+                raise self._gone_back(tuner) from error
+            raise
         self._until_renewal, self._paid_at = self._lease // 3, time.monotonic()
 
     def _look(self, tuner: Tuner) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import socket
-import sys
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,9 +28,6 @@ from service.store.store import LOCAL, Store
 from service.work import Tune, rehearse, tune
 
 _GRACE_S = 10
-_SWITCH_S = 0.0005
-"""How long a thread that computes keeps the interpreter from one that has an answer of the bus: Python's 5 ms, twice
-for each SDO and once more for every other thread that computes, are seconds where many loops are under test."""
 
 
 class _Server(uvicorn.Server):
@@ -105,7 +101,6 @@ def serve(setup: Setup, open_loop: LoopFactory = open_bus_loop, tune: Tune = tun
     SQLAlchemyError (the database cannot be reached).
     """
     logs.configure(setup.log_format)
-    sys.setswitchinterval(_SWITCH_S)
     # python-can's socketcand client warns of every frame that TCP splits, which is what TCP does.
     logging.getLogger("can").setLevel(logging.ERROR)
     site = load_site(setup.loops_file)

@@ -128,7 +128,7 @@ def test_turning_the_action_round_does_not_move_the_output() -> None:
     assert c.step(49.2) == pytest.approx(mv)
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e30, 200.5, -100.5])
 @pytest.mark.parametrize("law", list(LAWS))
 def test_a_bad_measurement_holds_the_output_and_leaves_no_trace(law: str, bad: float) -> None:
     c, twin = channel(LAWS[law]), channel(LAWS[law])
@@ -137,6 +137,13 @@ def test_a_bad_measurement_holds_the_output_and_leaves_no_trace(law: str, bad: f
     assert [c.step(bad) for _ in range(5)] == [mv] * 5
     assert c.bad_samples == 5
     assert [c.step(49.0 + n) for n in range(9)] == [twin.step(49.0 + n) for n in range(9)]
+
+
+@pytest.mark.parametrize("pv", [200.0, -100.0])
+def test_a_measurement_out_of_its_span_is_one_up_to_the_width_of_the_span(pv: float) -> None:
+    c = channel(PI)
+    assert c.step(49.0) != c.step(pv)
+    assert c.bad_samples == 0
 
 
 def test_the_operator_can_move_the_output_by_hand_without_a_sensor() -> None:

@@ -26,8 +26,11 @@ class Wire:
 
     def open(self) -> MemoryBus:
         bus = MemoryBus(self)
-        self._buses.append(bus)
+        self.join(bus)
         return bus
+
+    def join(self, bus: MemoryBus) -> None:
+        self._buses.append(bus)
 
     def carry(self, sender: MemoryBus, frame: Frame) -> None:
         self.frames.append(frame)

@@ -237,6 +237,19 @@ class TestSessions:
         try_gains(rig)
         assert rig.emergencies(CONTROLLER)[-1] == Emcy.ERROR_GONE
 
+    def test_a_renewal_pays_for_a_session_and_never_opens_one(self, rig: Rig) -> None:
+        rig.run(1)
+        assert rig.write("controller_lease_renewal", 100) is Abort.DEVICE_STATE
+        try_gains(rig, lease=5)
+        rig.run(3)
+        assert rig.write("controller_lease_renewal", 100) is None
+        assert rig.write("controller_lease_renewal", 0) is Abort.TOO_LOW
+        assert rig.read("controller_lease") == 100
+        rig.run(100)
+        assert rig.read("controller_cause") == Cause.LEASE
+        assert rig.write("controller_lease_renewal", 100) is Abort.DEVICE_STATE
+        assert (rig.read("controller_lease"), rig.read("controller_on_trial")) == (0, 0)
+
     def test_a_heartbeat_lost(self, rig: Rig) -> None:
         rig.run(1)
         try_gains(rig)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 import pytest
 
@@ -26,7 +26,7 @@ from protocol.profile import (
     sdo_response_id,
 )
 from protocol.sdo import SdoServer
-from protocol.tuner import Kind, Tuner, TunerError
+from protocol.tuner import HEARTBEAT_S, Kind, Tuner, TunerError
 
 NODE, PLANT = 0x20, 0x10
 IDS = channel_ids(1)
@@ -40,6 +40,7 @@ class ListBus:
         self.incoming: deque[tuple[int, bytes]] = deque()
         self.before: list[tuple[int, bytes]] = []
         self.mute = 0
+        self.on_request: Callable[[], object] = lambda: None
         self.servers = {}
         for device, node in ((Device.CONTROLLER, NODE), (Device.PLANT, PLANT)):
             dictionary = Dictionary(device, 1)
@@ -49,6 +50,7 @@ class ListBus:
         self.sent.append((can_id, data))
         if can_id not in self.servers:
             return
+        self.on_request()
         if self.mute:
             self.mute -= 1
             return
@@ -73,6 +75,7 @@ class ListBus:
 def bus(monkeypatch: pytest.MonkeyPatch) -> ListBus:
     bus = ListBus()
     monkeypatch.setattr(tuner_module, "open_bus", lambda url: bus)
+    monkeypatch.setattr(tuner_module, "_beats", {})
     return bus
 
 
@@ -192,6 +195,39 @@ def test_only_who_holds_the_loop_beats(tuner: Tuner, bus: ListBus) -> None:
     tuner.sample(0.0)
     tuner.sample(0.0)
     assert [can_id for can_id, _ in bus.sent] == [heartbeat_id(TUNER_NODE)]
+
+
+def test_the_loops_of_a_process_send_one_heartbeat(tuner: Tuner, bus: ListBus) -> None:
+    """The watch of the controller is on the process; the lease is of the loop."""
+    other = Tuner("list", NODE, PLANT, channel=2)
+    tuner.hold()
+    other.hold()
+    assert len(bus.sent) == 2, "a watch that was just armed begins with the first beat"
+    began = time.monotonic()
+    while time.monotonic() - began < 0.35:
+        for each in (tuner, other):
+            each.sample(0.0)
+        time.sleep(0.001)
+    assert 4 <= len(bus.sent) <= 6
+    tuner.beating = False
+    bus.sent.clear()
+    time.sleep(HEARTBEAT_S)
+    tuner.sample(0.0)
+    assert not bus.sent
+    other.sample(0.0)
+    assert len(bus.sent) == 1, "the other goes on"
+
+
+def test_answers_are_heard_by_who_has_asked_only(tuner: Tuner, bus: ListBus) -> None:
+    assert not {sdo_response_id(NODE), sdo_response_id(PLANT)} & set(bus.ids)
+    heard: list[set[int]] = []
+    bus.on_request = lambda: heard.append(set(bus.ids))
+    tuner.number("controller_mode")
+    assert sdo_response_id(NODE) in heard[0] and set(IDS) - {IDS.command} <= heard[0]
+    bus.mute = 100
+    with pytest.raises(TunerError):
+        tuner.number("controller_mode")
+    assert sdo_response_id(NODE) not in bus.ids and set(IDS) - {IDS.command} <= set(bus.ids)
 
 
 def test_the_bus_is_asked_for_our_frames_only(tuner: Tuner, bus: ListBus) -> None:
