@@ -2,24 +2,35 @@
 
 from __future__ import annotations
 
+import logging
+import multiprocessing
+import os
+import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
+from functools import partial
+from multiprocessing.connection import wait
+from typing import Any
 
 from service.loop import Loop, LoopState
 from tuning.gains import Gains
-from tuning.plan import Command, Sample
+from tuning.plan import Command, Sample, Work
 from tuning.reasons import Reason
 
 HELD_S = 0.3
 """Wall time for which a step may be held up: a part of the heartbeat time."""
+MOST_WORKERS = 4
+NICE = 5
 
 _SWITCH_S = 0.0005
 """How long a computation keeps the interpreter from a thread that has an answer of the bus: Python's 5 ms, twice for
 each SDO, are seconds where many loops are under test. Only meanwhile, for threads that wait look as often, and of fifty
 that takes more than it brings."""
 
+_log = logging.getLogger(__name__)
 _turn = threading.Lock()
 
 
@@ -36,23 +47,75 @@ def _alone() -> Iterator[None]:
             sys.setswitchinterval(usual)
 
 
+class Workers:
+    """Processes that compute for the loops of this one, which needs its interpreter for the bus.
+
+    To be made before the process has threads: they are forked, and so have loaded what they need. What has killed one
+    ends them all; from then on computations are done here.
+    """
+
+    def __init__(self, count: int | None = None) -> None:
+        import tuning.fast.procedure
+        import tuning.five_stage  # noqa: F401
+
+        count = count or max(1, min(MOST_WORKERS, (os.cpu_count() or 1) - 1))
+        self._pool = ProcessPoolExecutor(count, multiprocessing.get_context("fork"), _begin)
+        self._pool.submit(os.getpid).result()
+
+    def submit(self, compute: Callable[[], Any]) -> Future[Any]:
+        """Raises BrokenExecutor."""
+        return self._pool.submit(compute)
+
+    def close(self) -> None:
+        """At once: what is being computed nobody wants any more."""
+        processes = list((self._pool._processes or {}).values())
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            process.kill()
+
+
+def _begin() -> None:
+    """In the worker: it ends with the service, whatever ends that, and by nothing else."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    os.nice(NICE)
+
+    def outlive() -> None:
+        parent = multiprocessing.parent_process()
+        assert parent is not None
+        wait([parent.sentinel])
+        os._exit(0)
+
+    threading.Thread(target=outlive, daemon=True).start()
+
+
 class Computing:
     """A loop, and what is being computed for it: steps of the loop go through here, all else to the loop itself.
 
     A real plant goes on while we compute. One that waits for us, in memory or run in blocks, is held from sample to
     sample: at full speed a second of arithmetic would be minutes of its time under the relay.
+    workers: who computes; None: a thread of this process.
     """
 
-    def __init__(self, loop: Loop) -> None:
-        self._loop = loop
+    def __init__(self, loop: Loop, workers: Workers | None = None) -> None:
+        self._loop, self._workers = loop, workers
         self._idle = threading.Event()
         self._idle.set()
         self._over = False
+        self._future: Future[Any] | None = None
 
-    def start(self, work: Callable[[], None]) -> None:
+    def start(self, work: Work[Any]) -> None:
         """For `start_work` of the runner."""
         self._idle.clear()
-        threading.Thread(target=self._do, args=(work,), daemon=True, name="computation").start()
+        if self._workers is None:
+            self._beside(work)
+            return
+        try:
+            self._future = self._workers.submit(work.compute)
+        except BrokenExecutor:
+            self._beside(work)
+        else:
+            self._future.add_done_callback(partial(self._came, work))
 
     def step(self, commands: Sequence[Command]) -> Sample:
         if not self._idle.is_set() and self._loop.waits:
@@ -71,6 +134,8 @@ class Computing:
 
     def restore(self, state: LoopState) -> LoopState:
         self._over = True  # what still waits for its turn nobody wants any more
+        if self._future is not None:
+            self._future.cancel()
         return self._loop.restore(state)
 
     def accept(self, gains: Gains) -> LoopState:
@@ -79,10 +144,27 @@ class Computing:
     def close(self) -> None:
         self._loop.close()
 
-    def _do(self, work: Callable[[], None]) -> None:
+    def _came(self, work: Work[Any], future: Future[Any]) -> None:
+        """From the workers; called in a thread of theirs."""
+        if future.cancelled():
+            self._idle.set()
+        elif isinstance(error := future.exception(), BrokenExecutor):
+            _log.warning("a worker has died; computations are done in the service from now on")
+            self._beside(work)
+        else:
+            if error is not None:
+                work.fail(error)
+            else:
+                work.finish(future.result())
+            self._idle.set()
+
+    def _beside(self, work: Work[Any]) -> None:
+        threading.Thread(target=self._do, args=(work,), daemon=True, name="computation").start()
+
+    def _do(self, work: Work[Any]) -> None:
         try:
             with _alone():
                 if not self._over:
-                    work()
+                    work.run()
         finally:
             self._idle.set()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from service.loop import Loop, LoopState
 from tuning.plan import (
@@ -141,7 +141,7 @@ def run(
     on_event: Callable[[Event], None] = lambda event: None,
     on_samples: Callable[[list[Sample]], None] = lambda samples: None,
     stop: Callable[[], Reason | None] = lambda: None,
-    start_work: Callable[[Callable[[], None]], None] = lambda work: work(),
+    start_work: Callable[[Work[Any]], None] = Work.run,
 ) -> RunResult[T]:
     """Runs the plan to its end and restores the loop. Raises nothing that a loop or plan can cause; see `ended`.
 
@@ -179,7 +179,7 @@ def run(
                     if isinstance(item, SetMode | SetGains | SetSetpoint | SetOutput | SetRelay):
                         commands.append(item)
                     elif isinstance(item, Work):
-                        start_work(item.run)
+                        start_work(item)
                     else:
                         if isinstance(item, StageStarted):
                             clock(item.stage)

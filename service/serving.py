@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import os
 import socket
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
@@ -14,6 +15,7 @@ import uvicorn
 
 from service import logs
 from service.api.app import create_app
+from service.computing import Workers
 from service.config import LoopConfig, load_site
 from service.engine.durable import POLL_S, DurableEngine
 from service.jobs import Jobs, LoopFactory
@@ -25,7 +27,8 @@ from service.security.keyring import Keyring
 from service.security.limits import RequestLimits
 from service.store.database import BadDatabase
 from service.store.store import LOCAL, Store
-from service.work import Tune, rehearse, tune
+from service.work import Tune, rehearse
+from service.work import tune as live
 
 _GRACE_S = 10
 
@@ -94,8 +97,8 @@ class Setup:
     keep: Keep = field(default_factory=Keep)
 
 
-def serve(setup: Setup, open_loop: LoopFactory = open_bus_loop, tune: Tune = tune) -> None:
-    """Serves until SIGTERM or SIGINT; every loop is restored before it returns.
+def serve(setup: Setup, open_loop: LoopFactory = open_bus_loop, tune: Tune | None = None) -> None:
+    """Serves until SIGTERM or SIGINT; every loop is restored before it returns. tune: by default with workers.
 
     Raises ConfigError, FolderInUse, ForeignLoop, BadDatabase, NotSafe, OSError (the address cannot be had),
     SQLAlchemyError (the database cannot be reached).
@@ -109,8 +112,11 @@ def serve(setup: Setup, open_loop: LoopFactory = open_bus_loop, tune: Tune = tun
     local = is_loopback(setup.bind)
     if setup.auth is False and not local:
         raise NotSafe(f"without keys only this machine is served: leave out --no-auth, or --bind {setup.bind}")
-    # Bound before anything is started, so that a busy port is an error and not half a service.
-    with listen(setup.bind, setup.port) as listener:
+    with ExitStack() as stack:
+        if tune is None:  # forked before there is anything that a child should not have
+            tune = partial(live, workers=stack.enter_context(closing(Workers())))
+        # Bound before anything is started, so that a busy port is an error and not half a service.
+        listener = stack.enter_context(listen(setup.bind, setup.port))
         store = Store(setup.data, setup.database, setup.host or LOCAL)
         try:
             keyring = Keyring(store.engine) if setup.auth or not local else None

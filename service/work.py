@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from service.config import LoopConfig
 from service.loop import Loop, LoopState
@@ -17,6 +17,9 @@ from tuning.plan import Event, Plan, Sample
 from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 from tuning.stages.common import Facts
 from tuning.stages.settle import after_settling
+
+if TYPE_CHECKING:
+    from service.computing import Workers
 
 TIME_BUDGET_T95 = {FAST: 100.0}
 OTHER_BUDGET_T95 = 500.0
@@ -63,8 +66,15 @@ class Rehearse(Protocol):
     def __call__(self, config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome: ...
 
 
-def tune(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks) -> Outcome:
-    """The procedure asked for on the live loop."""
+def tune(
+    config: LoopConfig,
+    request: RetuneRequest,
+    loop: Loop,
+    state: LoopState,
+    hooks: Hooks,
+    workers: Workers | None = None,
+) -> Outcome:
+    """The procedure asked for on the live loop. workers: who computes, by default a thread."""
     from service.computing import Computing
     from service.runner import Watch, run
 
@@ -85,7 +95,7 @@ def tune(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopStat
         max_time_s=request.max_time_s or time_budget_s(request.method, facts),
         max_frozen_s=FROZEN_T95 * config.t95_s,
     )
-    computing = Computing(loop)
+    computing = Computing(loop, workers)
     ran = run(
         plan(request, facts, hooks.earlier),
         computing,

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal, TypeVar
 
 from tuning.design import Designed, Predicted, Ultimate, design
@@ -318,7 +319,7 @@ def _identified(
     Unless it was asked for, one that does not explain the step gives way to the estimate.
     """
     try:
-        found = yield from worked(lambda: identify(step.t, step.mv, step.pv, point.mv, lags_only=True))
+        found = yield from worked(partial(identify, step.t, step.mv, step.pv, point.mv, lags_only=True))
     except Refused as refused:
         if asked:
             raise
@@ -339,10 +340,8 @@ def _identified(
 
 
 def _designed(options: Options, model: Model, ultimate: Ultimate | None) -> Plan[Designed]:
-    def compute() -> Designed:
-        return design(rule, model.plant(), ultimate, options.method_options)
-
     rule = rule_of(options.method)
+    compute = partial(design, rule, model.plant(), ultimate, options.method_options)
     if METHODS[rule].slow:
         return (yield from worked(compute))
     return compute()

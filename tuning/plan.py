@@ -107,10 +107,13 @@ class Note:
 
 
 class Work(Generic[T]):
-    """A computation too long to do between two samples: the runner does it beside them, and goes on pumping."""
+    """A computation too long to do between two samples: the runner does it beside them, and goes on pumping.
+
+    compute: to be done in this process or another; what can be pickled.
+    """
 
     def __init__(self, compute: Callable[[], T]) -> None:
-        self._compute = compute
+        self.compute = compute
         self._value: T | None = None
         self._error: BaseException | None = None
         self.done = False
@@ -118,9 +121,20 @@ class Work(Generic[T]):
     def run(self) -> None:
         """Called once, by whoever pumps the plan, in a thread of its own or not."""
         try:
-            self._value = self._compute()
+            value = self.compute()
         except BaseException as error:
-            self._error = error
+            self.fail(error)
+        else:
+            self.finish(value)
+
+    def finish(self, value: T) -> None:
+        """It came to this."""
+        self._value = value
+        self.done = True
+
+    def fail(self, error: BaseException) -> None:
+        """It raised this."""
+        self._error = error
         self.done = True
 
     def result(self) -> T:

@@ -120,6 +120,9 @@ class Ended(Exception):
         self.reason = reason
         self.detail = detail
 
+    def __reduce__(self) -> tuple[type[Ended], tuple[Reason, str]]:
+        return type(self), (self.reason, self.detail)
+
     @property
     def advice(self) -> str:
         return ADVICE[self.reason]

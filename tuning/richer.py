@@ -41,7 +41,7 @@ class Search:
     def __init__(self, problem: Problem, lags: Sequence[Fitted]) -> None:
         self.problem = problem
         self._lags = lags
-        self._fit = problem.wide(_period(problem, next(each for each in lags if each.structure is SECOND)))
+        self._fit = problem.wide(_period(problem, next(each for each in lags if each.structure == SECOND)))
         self._quiet: list[Fitted] = []
 
     def quiet(self) -> list[Fitted]:

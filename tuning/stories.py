@@ -95,7 +95,7 @@ def fits(
     found: list[Fitted] = []
     for structure in structures:
         same = [k.theta for k in known if _poles(k.structure) == _poles(structure) and k.hypothesis == hypothesis]
-        exact = [k.theta for k in known if k.structure is structure and k.hypothesis == hypothesis]
+        exact = [k.theta for k in known if k.structure == structure and k.hypothesis == hypothesis]
         starts = [*exact, *same[:STARTS], *begun.get(_poles(structure), [])]
         if structure.lags == 3:
             simpler = [each for each in found if each.structure in (SECOND, SECOND_WITH_ZERO)]
@@ -106,7 +106,7 @@ def fits(
                 begun[_poles(structure)] = fit.grid(THIRD_WITH_ZEROS, THIRD_STARTS, dead_times=around)
                 starts += begun[_poles(structure)]
             starts += [_third(fit, each, rate) for each in simpler for rate in THIRD_RATES]
-            starts += [each.theta for each in found if each.structure is THIRD_WITH_ZERO]
+            starts += [each.theta for each in found if each.structure == THIRD_WITH_ZERO]
         elif structure not in PLAIN:
             starts += [each.theta for each in found if _poles(each.structure) == _poles(structure)]
         found.append(fit.search(structure, hypothesis, _distinct(starts)))
@@ -145,14 +145,14 @@ def _with_load(fit: Fit[S], simpler: Sequence[Fitted], known: Sequence[Fitted]) 
     Of the second order, and of the structure that has explained most so far.
     """
     loads = simpler[0].hypothesis.loads
-    second = min((each for each in simpler if each.structure is SECOND), key=by_bic)
+    second = min((each for each in simpler if each.structure == SECOND), key=by_bic)
     thetas = [second.theta]
     if not loads:
         thetas += [np.append(logs, L * fit.period) for logs in fit.denominators(SECOND) for L in LOAD_DEAD_TIMES]
     found = _timed(fit, SECOND, loads, thetas)
     likely = [min(simpler, key=by_bic), *(each for each in known if each.hypothesis.loads == loads)][:2]
     for each in likely:
-        if each.structure is not SECOND:
+        if each.structure != SECOND:
             found += _timed(fit, each.structure, loads, [each.theta])
     return found
 

@@ -51,7 +51,7 @@ def test_the_bus_gives_what_the_rehearsal_gives(start: Start, url: str, number: 
         fast(facts, FastOptions(Ms=ASKED, amplitude=AMPLITUDE * PERCENT)),
         loop,
         watch=Watch(0.0, 100.0, 0.0, 100.0),
-        start_work=lambda work: threading.Thread(target=work, daemon=True).start(),
+        start_work=lambda work: threading.Thread(target=work.run, daemon=True).start(),
     )
     loop.close()
     assert found.value is not None, found.ended

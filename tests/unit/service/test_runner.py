@@ -29,6 +29,7 @@ from tuning.plan import (
     SetSetpoint,
     StageDone,
     StageStarted,
+    Work,
     worked,
 )
 from tuning.reasons import Failed, Reason, Refused
@@ -151,8 +152,8 @@ class TestWorkBesideTheSamples:
     """A live loop is pumped and guarded while something long is computed."""
 
     @staticmethod
-    def beside(work: Callable[[], None]) -> None:
-        threading.Thread(target=work, daemon=True).start()
+    def beside(work: Work[Any]) -> None:
+        threading.Thread(target=work.run, daemon=True).start()
 
     def test_samples_go_on_until_it_is_done(self) -> None:
         enough = threading.Event()
