@@ -19,7 +19,7 @@ from tuning.stories import EARNED
 SIZES = (0.03, 0.06, 0.11, 0.19, 0.31)  # of MV's largest move
 LEAST_STICK = 0.04
 """Of MV's largest move: less is not told from a plant that is none of the structures, and does not move Ms."""
-ENDS = (0.55, 0.7, 0.85)
+ENDS, WIDEST_END = (0.55, 0.7, 0.85), 0.96
 FIRST_STEPS, STEPS = 4, 10
 REFINED = (1.25, 1.1, 1.04)
 """Factors by which the size of the likeliest fault is moved."""
@@ -80,13 +80,15 @@ def suspect(fit: Fit[Evidence], best: Fitted) -> Suspicion | None:
     ]
     found, fault, size = min(tried, key=_bic)
     for factor in REFINED:
-        near = [(under(fault, each, found.theta, FIRST_STEPS), fault, each) for each in (size / factor, size * factor)]
+        sizes = [each for each in (size / factor, size * factor) if fault is not end or each <= WIDEST_END]
+        near = [(under(fault, each, found.theta, FIRST_STEPS), fault, each) for each in sizes]
         found, fault, size = min([(found, fault, size), *near], key=_bic)
     if fault is stick and size < LEAST_STICK:
         return None
     found = under(fault, size, found.theta, STEPS)
-    # that freedom alone may explain as much: MV at rest is known only as well as the noise lets it be
-    sound = fit.search(structure, slack, [start], FIRST_STEPS + STEPS)
+    # that freedom alone may explain as much: MV at rest is known only as well as the noise lets it be. Or the way that
+    # the search has gone: the best fit may be a local minimum
+    sound = fit.search(structure, slack, [start, found.theta], FIRST_STEPS + STEPS)
     gain = min(best.bic, sound.bic) - found.bic
     return Suspicion(FAULTS[fault][1].format(size * evidence.swing), gain) if gain > EARNED else None
 

@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tuning.fast.valve import end, play, stick
+from tests.unit.tuning.fast.records import BENCHES, record
+from tuning.fast.choice import choose
+from tuning.fast.valve import end, play, stick, suspect
+from tuning.record_fit import Fit
 
 U = np.array([0.0, 1.0, 0.9, 0.7, 0.4, 0.5, -0.5, -0.45, 0.0])
 
@@ -25,3 +28,14 @@ def test_an_end_is_an_end() -> None:
 def test_a_fault_of_no_size_changes_nothing() -> None:
     assert play(U, 0.0) == pytest.approx(U)
     assert stick(U, 0.0) == pytest.approx(U)
+
+
+def test_a_fit_that_missed_the_minimum_is_no_faulty_valve() -> None:
+    """A search for faults finds better parameters on its way: they would explain the record without one."""
+    fit = Fit(record(BENCHES["three lags"], 1e-5))
+    best = choose(fit).best
+    off = best.theta.copy()
+    off[0] += 3.0
+    missed = fit.fitted(best.structure, best.hypothesis, off)
+    assert missed.bic > best.bic + 100.0
+    assert suspect(fit, missed) is None
