@@ -30,9 +30,21 @@ SETTLE_S = 5.0
 
 
 def memory_MB(pid: int) -> float:
-    """What a process has for itself, and its share of what it has with others."""
+    """What a process and its children have for themselves, and their share of what they have with others."""
+    family = [pid, *(int(each.name) for each in Path("/proc").glob("[0-9]*") if _parent(each) == pid)]
+    return sum(_own_MB(each) for each in family)
+
+
+def _own_MB(pid: int) -> float:
     rollup = Path(f"/proc/{pid}/smaps_rollup").read_text()
     return next(int(line.split()[1]) for line in rollup.splitlines() if line.startswith("Pss:")) * 1024 / 1e6
+
+
+def _parent(process: Path) -> int | None:
+    try:
+        return int((process / "stat").read_text().rpartition(")")[2].split()[1])
+    except (FileNotFoundError, ProcessLookupError):
+        return None
 
 
 def processor_s(pid: int) -> float:
