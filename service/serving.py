@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import socket
+from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -31,6 +32,7 @@ from service.work import Tune, rehearse
 from service.work import tune as live
 
 _GRACE_S = 10
+_log = logging.getLogger(__name__)
 
 
 class _Server(uvicorn.Server):
@@ -114,7 +116,7 @@ def serve(setup: Setup, open_loop: LoopFactory = open_bus_loop, tune: Tune | Non
         raise NotSafe(f"without keys only this machine is served: leave out --no-auth, or --bind {setup.bind}")
     with ExitStack() as stack:
         if tune is None:  # forked before there is anything that a child should not have
-            tune = partial(live, workers=stack.enter_context(closing(Workers())))
+            tune = partial(live, workers=_workers(stack))
         # Bound before anything is started, so that a busy port is an error and not half a service.
         listener = stack.enter_context(listen(setup.bind, setup.port))
         store = Store(setup.data, setup.database, setup.host or LOCAL)
@@ -149,6 +151,15 @@ def serve(setup: Setup, open_loop: LoopFactory = open_bus_loop, tune: Tune | Non
                 jobs.stop()
         finally:
             store.close()
+
+
+def _workers(stack: ExitStack) -> Workers | None:
+    """None where this machine has no room for them."""
+    try:
+        return stack.enter_context(closing(Workers()))
+    except (OSError, BrokenExecutor) as error:
+        _log.warning("no processes for long computations, the service does them itself: %s", error)
+        return None
 
 
 def listen(bind: str, port: int) -> socket.socket:

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 import yaml
 from typer.testing import CliRunner
 
+from service import serving
 from service.cli import app
 from tests.unit.service.fakes import loop_entry
 
@@ -25,3 +27,15 @@ def test_a_database_that_cannot_be_used_is_said_in_words(tmp_path: Path, options
     ended = CliRunner().invoke(app, ["serve", *place, *options])
     assert ended.exit_code == 2 and words in ended.output
     assert "secret" not in ended.output and "Traceback" not in ended.output
+
+
+def test_without_room_for_processes_the_service_computes_itself(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full() -> None:
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(serving, "Workers", full)
+    with ExitStack() as stack:
+        assert serving._workers(stack) is None
+    assert "the service does them itself" in caplog.text
