@@ -13,6 +13,7 @@ import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from typing import Any
 
 import pytest
 
@@ -93,11 +94,20 @@ def test_noise_too_high(here: Plantsite, early: Stage) -> None:
 
 
 def test_not_at_rest(here: Plantsite, early: Stage) -> None:
-    here.write("plant_pace", 2.0)
+    """One load would die away, and the loop would be looked at again: this one comes again and again."""
     url = here.retune(**early.options)
     here.until(url, lambda job: job["state"] == "running" and job["stage"] == "preflight")
-    here.write("plant_disturbance", 10.0)
-    assert ended(here, url) == ("refused", "not_at_rest")
+    load, again_at = -10.0, 0.0
+
+    def over(job: dict[str, Any]) -> bool:
+        nonlocal load, again_at
+        if time.monotonic() > again_at:
+            load, again_at = -load, time.monotonic() + 0.3
+            here.write("plant_disturbance", load)
+        return job["state"] != "running"
+
+    job = here.until(url, over)
+    assert (job["state"], job["reason"]) == ("refused", "not_at_rest")
     assert here.is_home()
 
 
