@@ -55,6 +55,7 @@ class Workers:
     """
 
     def __init__(self, count: int | None = None) -> None:
+        # before the fork, so that the first computation does not wait for it
         import tuning.fast.procedure
         import tuning.five_stage  # noqa: F401
 

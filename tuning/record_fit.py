@@ -13,7 +13,7 @@ import numpy as np
 from tuning.models import Reals, TransferFunction
 from tuning.sampled import pulses
 from tuning.structures import Structure
-from tuning.varpro import Bounded, Linear, descend, solve
+from tuning.varpro import REDUNDANT, Bounded, Linear, descend, solve
 
 FLOOR = 2e-4
 """Of the residual in spans of PV: data without noise would ask for ever more parameters."""
@@ -28,7 +28,6 @@ FIRST_STEPS, LONG_SEARCHES = 5, 2
 RELATIVE_DECREASE = 1e-6
 LOG_STEP = 1e-4
 LOG_REACH = 1.5
-REDUNDANT = 1e-10
 
 
 class Signals(Protocol):

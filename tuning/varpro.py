@@ -25,6 +25,7 @@ WORTH_TRYING = 0.1
 UNFELT = 1e-9
 """Of the largest slope: a parameter whose slope is less does nothing, but for rounding."""
 REDUNDANT = 1e-10
+"""Of a direction, in columns of unit length, that the others have left nothing of."""
 # directions weaker than this, in columns of unit length, are not seen in the data
 LEAST_SINGULAR = 1e-9
 
