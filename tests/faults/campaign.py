@@ -37,7 +37,7 @@ def ending(stand: Stand, name: str, stage: str, database: str = "sqlite") -> End
     fault, where = FAULTS[name], STAGES[stage]
     began = time.monotonic()
     url = _brought_into(stand, where)
-    first, struck_at, struck = stand.hub.first_of_session, stand.hub.sample_number, time.monotonic()
+    first, struck_at, struck = stand.hub.first_of_session, stand.hub.answered, time.monotonic()
     with stand.eye.watching(HOME) as safe, fault.inject(stand, url) as other:
         job = _over(stand, url)
         home = other or HOME
@@ -89,7 +89,7 @@ def _over(stand: Stand, url: str) -> dict[str, Any]:
 
 
 def _samples(stand: Stand, url: str, struck_s: int) -> tuple[int, int, int]:
-    """Of the attempt that was struck at that sample: how many of those before are stored, how many after the last of
+    """Of the attempt that was struck after that sample: how many until then are stored, how many after the last of
     them are not, and how many never came over the bus, between two that did."""
     numbers = stand.left
     if numbers is None:

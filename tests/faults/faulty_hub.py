@@ -11,12 +11,20 @@ from collections.abc import Callable, Sequence
 
 from protocol.hub import Hub, _Member
 from protocol.objects import lookup
-from protocol.profile import CONTROLLER_NODE, PLANT_NODE, PV_FRAME, channel_ids, sdo_request_id, sdo_response_id
+from protocol.profile import (
+    CONTROLLER_NODE,
+    MV_FRAME,
+    PLANT_NODE,
+    PV_FRAME,
+    channel_ids,
+    sdo_request_id,
+    sdo_response_id,
+)
 
 Fault = Callable[[int], Sequence[float]]
 """Of a frame's COB-ID: the delays in s after which copies are passed on; none: the frame is lost."""
 
-_PV = channel_ids(1).pv
+_PV, _MV = channel_ids(1)[:2]
 _ANSWERS = {sdo_response_id(PLANT_NODE), sdo_response_id(CONTROLLER_NODE)}
 _LEASE = lookup("controller_lease").index.to_bytes(2, "little") + b"\x01"
 
@@ -31,6 +39,8 @@ class FaultyHub(Hub):
         self.fault: Fault = well
         self.sample_number = 0
         """Of the latest PV, whoever sent it."""
+        self.answered = 0
+        """Of the latest MV, with which a sample has passed whole."""
         self.first_of_session = 0
         """The number of the first sample after the lease was last taken."""
         self._taken = self._held = False
@@ -76,6 +86,8 @@ class FaultyHub(Hub):
             self.sample_number = PV_FRAME.unpack(bytes.fromhex(data.decode()))[1]
             if self._taken:
                 self._taken, self.first_of_session = False, self.sample_number
+        elif can_id == _MV and len(data) == 2 * MV_FRAME.size:
+            self.answered = MV_FRAME.unpack(bytes.fromhex(data.decode()))[1]
         elif can_id == sdo_request_id(CONTROLLER_NODE) and not self._held:
             request = bytes.fromhex(data.decode())
             if request[:1] == b"\x23" and request[1:4] == _LEASE and any(request[4:]):
