@@ -106,7 +106,8 @@ def plain_fit(evidence: Evidence) -> TransferFunction:
             def residual(p: Reals, structure: Structure = structure) -> Reals:
                 count = structure.searched
                 y = plain_response(structure, p[:count], p[count:-1], fit.u)
-                return np.nan_to_num(y + p[-1] - fit.y, nan=1e3, posinf=1e3, neginf=-1e3)
+                left: Reals = np.nan_to_num(y + p[-1] - fit.y, nan=1e3, posinf=1e3, neginf=-1e3)
+                return left
 
             one = least_squares(residual, start, x_scale=np.maximum(np.abs(start), 0.01), max_nfev=20)
             if best is None or one.cost < best.cost:

@@ -65,7 +65,7 @@ def settled_s(plant: Plant, within: float) -> float:
     """When the answer to a step of MV stays so near to its end, s."""
     if integrators(plant.model()):
         return INTEGRATING_PERIODS * plant.Pu
-    slowest = max(1.0 / abs(pole.real) for pole in np.roots(plant.den))
+    slowest = max(1.0 / abs(float(pole.real)) for pole in np.roots(plant.den))
     dt = max(slowest, plant.L) / 400.0
     model = LinearPlant(plant.num, plant.den, plant.L, dt)
     y = np.array([model.step(1.0) for _ in range(round((12.0 * slowest + plant.L) / dt))])
@@ -84,7 +84,7 @@ def by_step(rule: str, plant: Plant, case: Case, seed: int) -> Tuned:
         u[at % len(u) :] += size
     y = [rest[-1], *(model.step(float(value)) for value in u)]
     try:
-        found = fit_step(Ts * np.arange(len(y)), np.array(y), 1.0, float(np.mean(rest)))
+        found = fit_step(Ts * np.arange(len(y), dtype=float), np.array(y), 1.0, float(np.mean(rest)))
         return METHODS[rule].tune(found).gains, lasts
     except Ended as ended:
         return ended, lasts

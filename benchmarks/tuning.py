@@ -33,7 +33,7 @@ from controller.channel import Channel, Settings
 from controller.pid import Parameters
 from plantsim import reactor
 from plantsim.plant import LinearPlant
-from plantsim.plant import Plant as Process
+from plantsim.plant import Plant as Simulated
 from plantsim.reactor import Reactor
 from service.fast_record import kept as recorded
 from service.rehearsal import RehearsedLoop
@@ -94,7 +94,7 @@ def loop_of(
     plant: Plant, amplitude: float, deviation: float, noise: float, seed: int, case: Case = PLAIN
 ) -> tuple[Troubled, Facts]:
     """A loop at rest under sluggish gains, in deviation variables. deviation: the largest permitted set-point step."""
-    process: Process = LinearPlant(plant.num, plant.den, plant.L, plant.Ts, noise_std=noise, seed=seed)
+    process: Simulated = LinearPlant(plant.num, plant.den, plant.L, plant.Ts, noise_std=noise, seed=seed)
     nominal = (0.0, 0.0)
     if case.nonlinear:
         process, nominal = Reactor(plant.Ts, noise, seed), (reactor.MV_NOMINAL, reactor.STEADY_STATE[2])

@@ -16,12 +16,7 @@ import numpy as np
 from plantsim.models import sampled
 
 
-class Plant(Protocol):
-    disturbance: float
-    """Load at the plant's input, behind the actuator's limits; MV units."""
-    noise_std: float
-    """Standard deviation of the white measurement noise; PV units."""
-
+class Process(Protocol):
     @property
     def pv(self) -> float:
         """The present measured value, PV units, noise included."""
@@ -30,6 +25,15 @@ class Plant(Protocol):
     def step(self, mv: float) -> float:
         """Holds `mv` for one sampling period; the PV at its end."""
         ...
+
+
+class Plant(Process, Protocol):
+    """What can be disturbed."""
+
+    disturbance: float
+    """Load at the plant's input, behind the actuator's limits; MV units."""
+    noise_std: float
+    """Standard deviation of the white measurement noise; PV units."""
 
 
 class LinearPlant:

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from controller.channel import Cause, Channel, Settings
 from controller.pid import Parameters
-from plantsim.plant import LinearPlant, Plant
+from plantsim.plant import LinearPlant, Process
 from service.loop import LoopState
 from service.plain import plain
 from service.runner import RunResult, Watch, run
@@ -47,7 +47,7 @@ class RehearsedLoop:
 
     waits = True
 
-    def __init__(self, plant: Plant, channel: Channel, sample_time_s: float) -> None:
+    def __init__(self, plant: Process, channel: Channel, sample_time_s: float) -> None:
         self._plant = plant
         self._channel = channel
         self._dt = sample_time_s
