@@ -25,10 +25,12 @@ SURPRISE, SURPRISE_OF_A_STORY = 0.5, 0.2
 """Of Ms from what was asked, of the tested controller on the new model and the new one on the earlier model; where the
 load is said to have moved twice."""
 WITH_A_STEP = (0.15, 0.8)
-"""Periods before and after a step of the set-point, within which a load is said to have come with it."""
-
+"""Periods before and after the step of the set-point, within which a load is said to have come with it."""
 LATE, ALIKE = 0.5, 0.3
-"""Periods: a load so shortly before the step need not have shown in the relay; two that are so near are the same."""
+"""Periods: a load so shortly before the step need not have shown in the relay, and if it has not, it may as well be a
+plant that has changed; two that are so near are the same."""
+REDRAWN = 1.5
+"""Times by which the tested gains may change where a load is said to have come with them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,7 +92,7 @@ def judge(evidence: Evidence, wish: Wish, earlier: Judged | None = None) -> Judg
         if cause is None and (suspicion := suspect(fit, found)) is not None:
             cause, detail = "unexplained", f"{suspicion.fault} explains the record better, or the plant is not linear"
         if cause is None:
-            cause, detail = _excused(fit, found, earlier)
+            cause, detail = _excused(fit, found, earlier, best.gains)
     return Judged(
         cause=cause,
         detail=detail,
@@ -119,29 +121,35 @@ def judge_again(evidence: Evidence, wish: Wish) -> Judged:
     return judge(evidence, wish, judge(replace(evidence, u=evidence.u[until], y=evidence.y[until], steps=()), wish))
 
 
-def _excused(fit: Fit[Evidence], found: Fitted, earlier: Judged) -> tuple[str | None, str]:
+def _excused(fit: Fit[Evidence], found: Fitted, earlier: Judged, gains: Gains) -> tuple[str | None, str]:
     """Loads that came with the new gains explain away what was to be tested: a plant that has changed looks the same.
 
-    One may be true, if the step back is explained without another. So does one in mid-relay that the relay's own record
-    had not shown.
+    One may be true, if the step back is explained without another, by about the gains that were tested: relay and steps
+    show different frequencies, and one model can be drawn through both plants. So does one in mid-relay that the
+    relay's own record had not shown.
     """
     steps, period = fit.evidence.steps, fit.period
     if not steps:
         return None, ""
-    before, after = (period * each for each in WITH_A_STEP)
-    times = _loads(found)
-    told = _loads(earlier.chosen.best)
-    if any(at < steps[0] - LATE * period and all(abs(at - each) > ALIKE * period for each in told) for at in times):
+    times, told = _loads(found), _loads(earlier.chosen.best)
+    untold = [at for at in times if all(abs(at - each) > ALIKE * period for each in told)]
+    if any(at < steps[0] - LATE * period for at in untold):
         if len(steps) == 1:
             return "ambiguous", "the whole record tells of a load in mid-relay that the relay's own record did not show"
         if len(times) > 1:
             return "surprise", "the whole record tells of other loads in mid-relay than the relay's own record"
-    loads = [at for at in times if at > steps[0] - before]
-    with_a_step = any(step - before < at < step + after for at in loads for step in steps)
-    if len(steps) == 1 and (with_a_step or len(loads) > 1):
+    before, after = WITH_A_STEP
+    loads = [at for at in times if at > steps[0] - (LATE if at in untold else before) * period]
+    with_the_step = any(at < steps[0] + after * period for at in loads)
+    if len(steps) == 1 and (with_the_step or len(loads) > 1):
         return "ambiguous", "a load seems to have come with the new gains; a plant that has changed would look the same"
     if len(loads) > 1:
         return "surprise", "PV answered each step of the new gains as if a load had come with it"
+    tested = earlier.best.gains
+    Kp, Ti = gains.Kp / tested.Kp, gains.Ti / tested.Ti
+    if with_the_step and max(Kp, 1.0 / Kp, Ti, 1.0 / Ti) > REDRAWN:
+        text = f"a load seems to have come with the new gains, and would ask for {Kp:.2f} times their Kp, {Ti:.2f} Ti"
+        return "surprise", f"{text}; a plant that has changed would look the same"
     return None, ""
 
 
