@@ -16,6 +16,8 @@ PLANTS = {plant.name: plant for plant in plants()}
     [
         ("P7_T=1_L1=0.02", "gain falls to 0.4 with them", 1),
         ("P7_T=1_L1=0.02", "dead time 0.25 Pu longer with them", 1),
+        ("P2_T=20", "gain falls to 0.4 with them", 2),
+        ("P2_T=200", "gain falls to 0.4 with them", 1),
         ("reactor", "nonlinear reactor, 15 %", 2),
     ],
 )
