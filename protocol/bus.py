@@ -149,13 +149,25 @@ def _enlarge(sock: socket.socket) -> None:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
 
 
+_GREETED_S = 5.0
+"""Within which a server of socketcand answers."""
+
+
 class _Socketcand(SocketCanDaemonBus):
     """Takes the server's greetings one by one. The library expects "< ok >" alone in one read; on a busy machine the
     first frames are behind it by then, and the bus would be told to be gone."""
 
     def _expect_msg(self, msg: str) -> None:
         server: socket.socket = vars(self)["_SocketCanDaemonBus__socket"]
-        found = server.recv(len(msg), socket.MSG_WAITALL)
+        found, usual = b"", server.gettimeout()
+        server.settimeout(_GREETED_S)  # the kernel accepts for a server that has stopped
+        try:
+            while len(found) < len(msg) and (part := server.recv(len(msg) - len(found))):
+                found += part
+        except OSError:
+            server.close()
+            raise
+        server.settimeout(usual)
         if found != msg.encode():
             raise can.CanError(f"expected {msg!r}, got {found!r}")
 

@@ -62,6 +62,10 @@ class Workers:
         count = count or max(1, min(MOST_WORKERS, (os.cpu_count() or 1) - 1))
         self._pool = ProcessPoolExecutor(count, multiprocessing.get_context("fork"), _begin)
         self._pool.submit(os.getpid).result()
+        # When one has died the pool ends the others by SIGTERM, which they do not heed, and (from Python 3.12 on) waits
+        # for them with a lock that `submit` needs.
+        for process in self._pool._processes.values():
+            process.terminate = process.kill  # type: ignore[method-assign]
 
     def submit(self, compute: Callable[[], Any]) -> Future[Any]:
         """Raises BrokenExecutor."""
@@ -103,7 +107,6 @@ class Computing:
         self._idle = threading.Event()
         self._idle.set()
         self._over = False
-        self._future: Future[Any] | None = None
 
     def start(self, work: Work[Any]) -> None:
         """For `start_work` of the runner."""
@@ -112,11 +115,11 @@ class Computing:
             self._beside(work)
             return
         try:
-            self._future = self._workers.submit(work.compute)
+            future = self._workers.submit(work.compute)
         except BrokenExecutor:
             self._beside(work)
         else:
-            self._future.add_done_callback(partial(self._came, work))
+            future.add_done_callback(partial(self._came, work))
 
     def step(self, commands: Sequence[Command]) -> Sample:
         if not self._idle.is_set() and self._loop.waits:
@@ -134,9 +137,9 @@ class Computing:
         return self._loop.begin(stop)
 
     def restore(self, state: LoopState) -> LoopState:
-        self._over = True  # what still waits for its turn nobody wants any more
-        if self._future is not None:
-            self._future.cancel()
+        # What still waits for its turn nobody wants any more. In a worker it is computed in vain: a pool that breaks
+        # with a cancelled future in its queue gives no word of what is behind it.
+        self._over = True
         return self._loop.restore(state)
 
     def accept(self, gains: Gains) -> LoopState:
@@ -147,7 +150,7 @@ class Computing:
 
     def _came(self, work: Work[Any], future: Future[Any]) -> None:
         """From the workers; called in a thread of theirs."""
-        if future.cancelled():
+        if future.cancelled():  # the service ends
             self._idle.set()
         elif isinstance(error := future.exception(), BrokenExecutor):
             _log.warning("a worker has died; computations are done in the service from now on")

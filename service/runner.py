@@ -103,30 +103,37 @@ class Guard:
         elif t - self._last > (watch.max_gap_samples + 1.5) * self._dt:
             raise Failed(Reason.SAMPLES_LOST, f"{(t - self._last) / self._dt - 1:.0f} samples missing before {t:.3f} s")
         self._last = t
+        foreign = self._foreign(sp, mode)  # noted first, whatever the run ends by: their hand has the last word
         if not watch.pv_low <= pv <= watch.pv_high:
             raise Failed(Reason.PV_LIMIT, f"PV {pv:.5g} left {watch.pv_low:.5g} .. {watch.pv_high:.5g} at {t:.3f} s")
         if self._acting and not watch.mv_low - self._slack <= mv <= watch.mv_high + self._slack:
             raise Failed(Reason.MV_LIMIT, f"MV {mv:.5g} left {watch.mv_low:.5g} .. {watch.mv_high:.5g} at {t:.3f} s")
         if t - self._start > watch.max_time_s:
             raise Failed(Reason.TIME_BUDGET, f"{t - self._start:.0f} s of plant time are over the budget")
-        if self._grace:
-            self._grace -= 1
-            if mode == self._mode and same(sp, self._sp):
-                self._grace = 0
-        else:
-            if not same(sp, self._sp):
-                self.foreign_setpoint = sp
-                raise Aborted(Reason.SETPOINT_CHANGED, f"at {t:.3f} s the set-point is {sp:.6g}, not {self._sp:.6g}")
-            if mode != self._mode:
-                if mode in (Mode.OFF, Mode.MANUAL, Mode.AUTOMATIC):
-                    self.foreign_mode = Mode(mode)
-                raise Aborted(Reason.MODE_CHANGED, f"at {t:.3f} s the mode is {_mode(mode)}, not {_mode(self._mode)}")
+        if foreign is not None:
+            raise Aborted(foreign[0], f"at {t:.3f} s {foreign[1]}")
         if pv != self._pv:
             self._frozen_at, self._pv, self._mv = t, pv, mv
         elif abs(mv - self._mv) < self._notable:
             self._frozen_at = t
         elif t - self._frozen_at > watch.max_frozen_s:
             raise Failed(Reason.PV_FROZEN, f"PV is exactly {pv:.6g} for {t - self._frozen_at:.3g} s while MV moved")
+
+    def _foreign(self, sp: float, mode: int) -> tuple[Reason, str] | None:
+        """What another's hand has moved; both where it was both."""
+        set_point_ours, mode_ours = same(sp, self._sp), mode == self._mode
+        if self._grace:
+            self._grace = 0 if set_point_ours and mode_ours else self._grace - 1
+            return None
+        if not set_point_ours:
+            self.foreign_setpoint = sp
+        if not mode_ours and mode in (Mode.OFF, Mode.MANUAL, Mode.AUTOMATIC):
+            self.foreign_mode = Mode(mode)
+        if not set_point_ours:
+            return Reason.SETPOINT_CHANGED, f"the set-point is {sp:.6g}, not {self._sp:.6g}"
+        if not mode_ours:
+            return Reason.MODE_CHANGED, f"the mode is {_mode(mode)}, not {_mode(self._mode)}"
+        return None
 
 
 def _mode(number: int) -> str:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import can
 import pytest
 
-from protocol.bus import open_bus
+from protocol.bus import BusError, open_bus
 from protocol.hub import Hub
 
 
@@ -130,3 +130,12 @@ def test_frames_right_behind_the_greeting_are_frames() -> None:
         assert bus.recv(5) == (0x190, b"\x01\x02")
         bus.close()
         thread.join(5)
+
+
+def test_a_server_that_says_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("protocol.bus._GREETED_S", 0.2)
+    with (
+        socket.create_server(("127.0.0.1", 0)) as listener,  # the kernel accepts for it
+        pytest.raises(BusError, match="cannot be opened: timed out"),
+    ):
+        open_bus(f"socketcand:127.0.0.1:{listener.getsockname()[1]}")

@@ -95,6 +95,19 @@ class TestWorkers:
         for _ in range(2):
             assert done(Work(partial(kill, os.getpid())), workers) == os.getpid()
 
+    def test_so_is_what_waited_behind_that_of_a_test_that_has_ended(self, workers: Workers) -> None:
+        loops = [Computing(FakeLoop(FakeController()), workers) for _ in range(8)]
+        works: list[Work[Any]] = [Work(partial(time.sleep, 0.2)) for _ in loops[1:]]
+        loops[0].start(Work(partial(time.sleep, 60.0)))
+        for loop, work in zip(loops[1:], works, strict=True):
+            loop.start(work)
+        ended = loops[0], loops[-2]
+        for loop in ended:
+            loop.restore(loop.read())
+        os.kill(next(iter(workers._pool._processes)), signal.SIGKILL)
+        for loop, work in zip(loops[1:], works, strict=True):
+            assert loop._idle.wait(20) and (work.done or loop in ended)
+
     def test_signals_to_the_whole_group_leave_them_alone(self, workers: Workers) -> None:
         worker = done(Work(os.getpid), workers)
         for number in (signal.SIGINT, signal.SIGTERM):

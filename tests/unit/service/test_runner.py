@@ -133,6 +133,18 @@ def test_the_mode_that_somebody_else_chose_stays(mode: Mode, plan: Callable[[], 
     assert loop.step(()).mv == state.mv
 
 
+@pytest.mark.parametrize("also", [{"sp": 0.7}, {"pv": 20.0}, {"mv": 5.0}])
+def test_it_stays_too_where_something_else_ends_the_run_in_the_same_sample(also: dict[str, float]) -> None:
+    def pressed(sample: Sample) -> Sample:
+        loop.channel.command_mode(int(Mode.MANUAL))
+        return sample._replace(mode=int(Mode.MANUAL), **also)
+
+    loop = Meddled(100, pressed)
+    result = run(trial(), loop, watch=Watch(pv_low=-10.0, pv_high=10.0, mv_low=-1.0, mv_high=1.0))
+    assert result.ended is not None and result.restored is not None
+    assert (loop.read().mode, loop.read().sp) == (Mode.MANUAL, also.get("sp", 0.0))
+
+
 def test_mv_beyond_what_the_job_permits_ends_the_run() -> None:
     result = run(trial(), loop := Meddled(), watch=Watch(mv_low=-0.05, mv_high=0.08))
     assert result.ended is not None
