@@ -29,6 +29,8 @@ def _rule(model: Model, Ms: float = 1.6, derivative: bool = False) -> Setting:
     return Setting(designed_on(model, FastOptions(Ms=Ms, derivative=derivative), 0.0)[0].gains, {"Ms": Ms})
 
 
+DISPROVED = (Reason.WRONG_SIGN, Reason.SURPRISE, Reason.DIVERGES, Reason.UNEXPLAINED, Reason.DISTURBED)
+"""How a job ends whose own record speaks against the model that an earlier stage had found."""
 FAST_DESIGN = Method(
     name=FAST,
     title="The design of fast",
@@ -43,9 +45,10 @@ FAST_DESIGN = Method(
 def alternatives(row: JobRow, events: Sequence[EventRow], method: str | None = None) -> dict[str, Any]:
     """The JSON object of GET /jobs/{id}/alternatives: by the method named, else by all that are not slow.
 
-    Raises Conflict for a job that has no model (yet), BadTuning for an unknown method.
+    Raises Conflict for a job that has no model (yet) or has disproved it, BadTuning for an unknown method.
     """
     model = job_model(row, events)
+    _not_disproved(row, DISPROVED)
     names = [method] if method else [name for name, each in METHODS.items() if not each.slow]
     found = tune_each(model, names)
     told = answer(model, found)
@@ -60,10 +63,12 @@ def redesigned(
     """The same object with the gains of fast for another Ms: no new experiment.
 
     record: the job's, if it is kept; else, and for a job of another method, the model that it found is designed on.
+    Raises Conflict as `alternatives` does; a record is judged anew.
     """
     model = job_model(row, events)
     doubt: dict[str, float | None] = {"uncertainty": None, "ambiguity": None}
     evidence = record.evidence() if record and row.request.get("method") == FAST else None
+    _not_disproved(row, DISPROVED[:1] if evidence else DISPROVED)
     try:
         if evidence is not None:
             judged = judge_again(evidence, Wish(ms, derivative))
@@ -106,6 +111,12 @@ def job_model(row: JobRow, events: Sequence[EventRow]) -> FOPDT | SOPDT | Transf
             dead_time = data.get("dead_time_s", data.get("L_s", 0.0))
             return TransferFunction(tuple(data["num"]), tuple(data["den"]), dead_time)
     raise Conflict(f"job {row.id} ended as {row.state} before it had a model")
+
+
+def _not_disproved(row: JobRow, reasons: Sequence[Reason]) -> None:
+    if row.reason in reasons:
+        text = f"job {row.id} ended as {row.reason}, which speaks against its model ({row.detail})"
+        raise Conflict(f"{text}: retune instead")
 
 
 def _retune(found: Tuned, model: FOPDT | SOPDT | TransferFunction) -> dict[str, Any] | None:

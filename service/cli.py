@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -63,7 +64,7 @@ def serve(
     loops: Annotated[Path, typer.Option(help="The loops, YAML.")] = Path("loops.yaml"),
     data: Annotated[Path, typer.Option(help="Folder for jobs and samples.")] = Path("data"),
     bind: Annotated[str, typer.Option(help="Address to listen on; others than loopback need keys.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="Port to listen on; 0: any free one.")] = 8080,
+    port: Annotated[int, typer.Option(help="Port to listen on; 0: any free one.", min=0, max=65535)] = 8080,
     database: Annotated[
         str | None,
         typer.Option(envvar="LOOPWRIGHT_DATABASE", help="postgresql://..., shared by several hosts; default: a file."),
@@ -134,6 +135,10 @@ def serve(
     except SQLAlchemyError as error:
         die(f"the database cannot be used: {getattr(error, 'orig', None) or error}", 2)
     except OSError as error:
+        if data.exists() and not data.is_dir():
+            die(f"{data} is a file: --data takes a folder", 2)
+        if error.errno == errno.EADDRINUSE:
+            die(f"cannot listen on {bind}:{port}, another program does: choose another with --port", 2)
         die(f"cannot listen on {bind}:{port} or write to {data}: {error.strerror or error}", 2)
 
 

@@ -6,7 +6,7 @@ Everything wrong with a file is reported in one go: who edits it should not have
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -94,10 +94,22 @@ class Site:
     buses: dict[str, BusConfig]
 
 
+class _OnceEach(yaml.SafeLoader):
+    """A key given twice is one too many: of two limits the last would win without a word."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen: set[str] = set()
+        for name in (name for name, _ in node.value if isinstance(name, yaml.ScalarNode)):
+            if name.value in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"{name.value!r} is given twice", name.start_mark)
+            seen.add(name.value)
+        return super().construct_mapping(node, deep)
+
+
 def load_site(path: Path) -> Site:
     """The site of a file. Raises ConfigError with everything that is wrong with it."""
     try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+        document = yaml.load(path.read_text(encoding="utf-8"), _OnceEach)
     except OSError as error:
         raise ConfigError(str(path), [error.strerror or str(error)]) from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:

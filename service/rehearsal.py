@@ -40,6 +40,8 @@ from tuning.plan import (
 from tuning.reasons import Ended, Failed, Reason, Refused
 
 LEASE_SAMPLES = 1_000_000
+MOST_SAMPLES = 200_000
+"""In T95: of more, a rehearsal takes minutes."""
 
 
 class RehearsedLoop:
@@ -133,6 +135,15 @@ def _gains(p: Parameters) -> Gains:
     return Gains(p.Kp, p.Ti, p.Td, p.Tf, p.b, p.c)
 
 
+class PresentGains(BaseModel):
+    """Of the loop before the test."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    Kp: float = Field(gt=0)
+    Ti: float = Field(0.0, ge=0, description="s; 0: no integral part")
+
+
 class PlantFile(BaseModel):
     """A plant for `loopwright rehearse`, in deviation variables; what is left out is chosen and echoed."""
 
@@ -148,7 +159,7 @@ class PlantFile(BaseModel):
     seed: int = Field(1, ge=0)
     mv_limits: tuple[float, float] = (-0.5, 0.5)
     sp_deviation: float | None = Field(None, gt=0)
-    gains: dict[str, float] | None = Field(None, description="present PI of the loop: Kp, Ti (s)")
+    gains: PresentGains | None = Field(None, description="present PI of the loop: Kp, Ti (s)")
 
     @model_validator(mode="after")
     def _proper(self) -> PlantFile:
@@ -158,6 +169,8 @@ class PlantFile(BaseModel):
             raise ValueError(f"num has order {len(self.num) - 1}, more than den's {len(self.den) - 1}: not proper")
         if not any(self.num):
             raise ValueError("num is zero: the plant does not answer MV")
+        if self.num[-1] == 0 and self.den[-1] != 0:
+            raise ValueError("num must end with a coefficient other than 0: PV would come back from every move of MV")
         if not self.mv_limits[0] < 0 < self.mv_limits[1]:
             raise ValueError(f"mv_limits must be [low < 0, high > 0] around the operating point, not {self.mv_limits}")
         return self
@@ -183,7 +196,12 @@ def _complete(file: PlantFile) -> PlantFile:
     ts = file.sample_time_s or _nice(max(_period(file, t95) / 300, t95 / 5000))
     room = min(-file.mv_limits[0], file.mv_limits[1])
     step = file.sp_deviation or 0.2 * room * (abs(gain) if math.isfinite(gain) else 1.0)
-    gains = file.gains or {"Kp": 0.3 / abs(gain) if math.isfinite(gain) else 0.1, "Ti": t95 / 3}
+    if t95 / ts > MOST_SAMPLES:
+        raise Refused(
+            Reason.BAD_INPUT,
+            f"sample_time_s {ts:g} is {t95 / ts:.3g} times in T95 ({t95:.4g} s); at most {MOST_SAMPLES:,} are allowed",
+        )
+    gains = file.gains or PresentGains(Kp=0.3 / abs(gain) if math.isfinite(gain) else 0.1, Ti=t95 / 3)
     return file.model_copy(update={"sample_time_s": ts, "t95_s": t95, "sp_deviation": step, "gains": gains})
 
 
@@ -267,7 +285,7 @@ def _loop(file: PlantFile) -> tuple[RehearsedLoop, Facts]:
     positive = (file.num[-1] or file.num[0]) / (file.den[-1] or file.den[0]) > 0
     span = 1e9
     settings = Settings(mv_low=low, mv_high=high, safe_output=0.0, pv_low=-span, pv_high=span, reverse=positive)
-    present = Gains(Kp=gains["Kp"], Ti=gains.get("Ti", 0.0))
+    present = Gains(Kp=gains.Kp, Ti=gains.Ti)
     channel = Channel(ts, settings, _parameters(present), 0.0, int(Mode.AUTOMATIC), 0.0)
     facts = Facts(ts, t95, low, high, step, present, positive)
     return RehearsedLoop(plant, channel, ts), facts

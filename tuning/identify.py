@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tuning.feedback import follows_from_pv
 from tuning.fitting import WHITE_ABOVE, Problem
 from tuning.models import Integrating, Model, Reals, TransferFunction
 from tuning.record_fit import MOVING, QUIET, Fitted, count
@@ -44,6 +45,10 @@ POORLY_KNOWN = 0.25
 NEXT_TO_NOTHING = 0.02
 # a load that PV answers within so many samples of the first is a start not at rest
 AT_THE_START = 2.0
+FEEDBACK = (
+    "MV follows from PV alone, as under a controller whose set-point rests: the model may be the controller turned "
+    "around. Step the set-point, or move MV by hand."
+)
 COARSE = 0.02
 # noise, as a part of the response's span, beyond which the errors are not small enough to be linear
 NOISY = 0.2
@@ -135,7 +140,10 @@ def identify(
     # of each structure and story the best alone
     ranked = {(fit.structure, fit.hypothesis): fit for fit in sorted([*tried, best], key=by_bic, reverse=True)}
     ranked[best.structure, best.hypothesis] = best
-    return _result(problem, best, sorted(ranked.values(), key=by_bic), float(np.asarray(t, dtype=float)[0]))
+    found = _result(problem, best, sorted(ranked.values(), key=by_bic), float(np.asarray(t, dtype=float)[0]))
+    if not lags_only and follows_from_pv(record.u, record.y):
+        found = replace(found, explained=False, notes=(FEEDBACK, *found.notes))
+    return found
 
 
 def _chosen(problem: Problem, lags_only: bool) -> tuple[Fitted, list[Fitted]]:
@@ -292,7 +300,7 @@ def _words(problem: Problem, fit: Fitted) -> str:
         parts.append("an inverse response" if np.any(np.roots(model.num).real > 0.0) else "a zero")
     if fit.structure.feed_through:
         parts.append("a part that passes at once")
-    return f"{order}-order model with {' and '.join(parts)}"
+    return f"{order}-order model" + (f" with {' and '.join(parts)}" if parts else "")
 
 
 def _story(problem: Problem, found: Identified) -> list[str]:

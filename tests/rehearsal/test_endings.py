@@ -36,6 +36,10 @@ ONLY_FIVE = (FIVE,)
         (LAG | {"num": [1, 2, 3]}, BOTH, "refused", "bad_input"),
         (LAG | {"dead_time_s": -1}, BOTH, "refused", "bad_input"),
         (LAG | {"colour": 3}, BOTH, "refused", "bad_input"),
+        (LAG | {"num": [1, 0], "den": [30, 13, 1]}, BOTH, "refused", "bad_input"),
+        (LAG | {"gains": {"Kp": 0.0, "Ti": 1.0}}, BOTH, "refused", "bad_input"),
+        (LAG | {"gains": {"Ti": 1.0}}, BOTH, "refused", "bad_input"),
+        (LAG | {"sample_time_s": 1e-6}, BOTH, "refused", "bad_input"),
         ({}, BOTH, "refused", "bad_input"),
     ],
 )

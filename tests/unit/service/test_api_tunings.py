@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from service.alternatives import DISPROVED
 from service.model_forms import parse_model
 from service.request import PlantModel, RetuneRequest
 from service.tunings import tunings
@@ -155,6 +156,19 @@ def test_a_refused_job_whose_stages_found_a_model(service: Service, client: Test
     service.store.append(job["id"], "stage_done", {"stage": "optimise", "result": None}, 1.0)
     found = client.get(f"{job['url']}/alternatives?method=simc").json()
     assert job["state"] == "refused" and found["model"] == {"K": 2.0, "T": 3.0, "L": 1.0}
+
+
+@pytest.mark.parametrize("reason", DISPROVED)
+@pytest.mark.parametrize("query", ["", "?method=simc", "?ms=1.4"])
+def test_no_gains_on_a_model_that_the_job_has_disproved(
+    service: Service, client: TestClient, reason: Reason, query: str
+) -> None:
+    service.tune.ends = Refused(reason, "the plant is another")
+    job = finished(service, client)
+    result = {"num": [1.0], "den": [3.0, 1.0], "L_s": 1.0, "cause": None}
+    service.store.append(job["id"], "stage_done", {"stage": "design", "result": result}, 1.0)
+    problem = assert_problem(client.get(f"{job['url']}/alternatives{query}"), 409)
+    assert reason in problem["detail"] and "the plant is another" in problem["detail"]
 
 
 def test_a_refused_job_whose_model_was_typed_in(service: Service, client: TestClient) -> None:

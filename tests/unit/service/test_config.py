@@ -60,6 +60,14 @@ def test_not_a_list_of_loops(tmp_path: Path, text: str) -> None:
         load_site(file)
 
 
+def test_a_key_given_twice_is_refused_with_its_line(tmp_path: Path) -> None:
+    file = tmp_path / "loops.yaml"
+    entry = yaml.safe_dump({"loops": [loop_entry()]})
+    file.write_text(entry + "  pv_limits: {low: 0, high: 90}\n")
+    with pytest.raises(ConfigError, match=r"'pv_limits' is given twice\n.*line \d+"):
+        load_site(file)
+
+
 def test_no_such_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="No such file"):
         load_site(tmp_path / "none.yaml")

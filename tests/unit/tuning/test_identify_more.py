@@ -10,6 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter
 
+from controller.channel import Channel, Mode, Parameters, Settings
+from plantsim.plant import LinearPlant
 from tests.unit.tuning import recordings
 from tuning.identify import Identified, identify
 from tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
@@ -201,3 +203,23 @@ def test_ten_thousand_samples_take_seconds_and_averages_do_not_decide() -> None:
     assert isinstance(found.model, FOPDT)
     (load,) = found.loads
     assert load.t_s == pytest.approx(600.0, abs=1.0) and load.size == pytest.approx(LOAD, rel=0.01)
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_loop_in_plain_operation_is_no_test_of_its_plant(moved: bool) -> None:
+    """PI on a first-order plant under a coloured load; then the set-point steps, which tells them apart."""
+    random = np.random.default_rng(1)
+    load = lfilter([0.3], [1.0, -0.95], random.normal(size=1500))
+    settings = Settings(mv_low=-1e3, mv_high=1e3, reverse=True)
+    channel = Channel(TS, settings, Parameters(2.0, 3.0), 0.0, int(Mode.AUTOMATIC), 0.0)
+    plant = LinearPlant([2.0], [10.0, 1.0], 0.5, TS)
+    u, y = [], []
+    for k in range(1500):
+        channel.setpoint = 10.0 if moved and k > 300 else 0.0
+        plant.disturbance = float(load[k])
+        y.append(plant.pv)
+        u.append(channel.step(y[-1]))
+        plant.step(u[-1])
+    found = identify(TS * np.arange(1500), u, y)
+    assert any("follows from PV alone" in note for note in found.notes) is not moved
+    assert moved or not found.explained
