@@ -256,11 +256,15 @@ class Jobs:
 
     # decide
     def accept(self, job_id: str, by: str) -> JobRow:
-        """Makes the proposed gains the accepted ones of the controller, and reads them back."""
+        """Makes the proposed gains the accepted ones of the controller, and reads them back.
+
+        After an error it is asked again, which finishes what was begun, or rolled back.
+        """
         return self._decide(job_id, JobState.ACCEPTED, by)
 
     def rollback(self, job_id: str, by: str) -> JobRow:
-        """Declines a proposal (the loop has its old gains already), or takes an accepted change back."""
+        """Declines a proposal (the loop has its old gains already), or takes back a change that is accepted or was
+        begun to be."""
         return self._decide(job_id, JobState.ROLLED_BACK, by)
 
     def _decide(self, job_id: str, wanted: JobState, by: str) -> JobRow:
@@ -275,17 +279,18 @@ class Jobs:
             active = self.store.active(row.loop)
             if active is not None:
                 raise Busy(row.loop, active.id)
-            if now is JobState.PROPOSED and wanted is JobState.ROLLED_BACK:
-                return self.store.move(job_id, wanted, by=by)
+            if wanted is JobState.ROLLED_BACK and (declined := self.store.decline(job_id, by)) is not None:
+                return declined
             config, host = self.owner(row.loop)
             if host != self.store.host:
                 raise Conflict(f"loop {row.loop} is on the bus of host {host}: only the service there can write to it")
             old, new = gains_of(row.old_gains), gains_of((row.result or {}).get("gains"))
             before, after = (old, new) if wanted is JobState.ACCEPTED else (new, old)
+            begun = self.store.decision_begun(job_id)
             try:
                 loop = self._open_loop(config)
                 try:
-                    state = exchange(loop, before, after)
+                    state = exchange(loop, before, after, begun, lambda: self.store.begin_decision(job_id, wanted, by))
                 finally:
                     loop.close()
             except Ended as ended:
