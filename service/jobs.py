@@ -307,13 +307,17 @@ class Jobs:
         except NoSuchJob:
             return
         with self._lock:
-            if self.stopping or job_id in self._running or JobState(row.state) not in ACTIVE:
+            if self.stopping or job_id in self._running:
                 return
             running = Running(job_id, row.loop, self.journal, max(row.plant_time_s, before_s))
-            if row.stop_reason is not None:
-                running.stop_reason = Reason(row.stop_reason)
             self._running[job_id] = running
         try:
+            # Read anew: until it was among those that run, an abort ended it as one that waits for its turn.
+            row = self._lasting(lambda: self.store.get(job_id))
+            if JobState(row.state) not in ACTIVE:
+                return
+            if row.stop_reason is not None:
+                running.stop_reason = running.stop_reason or Reason(row.stop_reason)
             with about(job=job_id, loop=row.loop):
                 self._to_the_end(running, row)
         finally:

@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session, sessionmaker
 
 from service.plain import plain
 from service.security import audit
-from service.states import ACTIVE, JobState, check
+from service.states import ACTIVE, IllegalMove, JobState, check
 from service.store import chunks, retunes
 from service.store.clock import now
 from service.store.database import WAIT_S, migrate, open_database
@@ -226,9 +226,12 @@ class Store:
             append(session, job_id, _BEGUN, {"decision": DECISIONS[wanted], "by": by}, row.plant_time_s)
 
     def resumed(self, job_id: str, told: dict[str, Any], **columns: Any) -> None:
-        """Notes that an active job has begun another attempt."""
+        """Notes that an active job has begun another attempt. Raises IllegalMove when it is over."""
         with self.writing() as session:
             row = _find(session, job_id, lock=True)
+            state = JobState(row.state)
+            if state not in ACTIVE:
+                raise IllegalMove(state, JobState.RUNNING)
             set_columns(row, columns)
             append(session, job_id, "resumed", told, row.plant_time_s)
 
