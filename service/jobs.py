@@ -12,6 +12,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any, TypeVar
 
@@ -85,6 +86,8 @@ class Jobs:
         # By loop: who is about to begin a job on it, or to decide one.
         self._hands: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
         self._lost: set[str] = set()
+        # By id: jobs whose asker was told that they could not be queued, and whose end could not be written either.
+        self._unqueued: dict[str, JobRow] = {}
         self._ended = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name="watcher", daemon=True)
 
@@ -109,8 +112,10 @@ class Jobs:
 
         at_once: without waiting for a second look, which keeps a job that is just being started from being lost.
         """
+        self._end_unqueued()
         with self._lock:
-            idle = [row for row in self.store.unfinished() if row.id not in self._running]
+            apart = self._running.keys() | self._unqueued.keys()
+            idle = [row for row in self.store.unfinished() if row.id not in apart]
         lost = {row.id for row in idle} - self.engine.known([row.id for row in idle])
         for row in idle:
             if row.id in lost and (at_once or row.id in self._lost):
@@ -186,10 +191,28 @@ class Jobs:
             self.engine.enqueue(row.id, self._rehearsals(host) if row.dry_run else self._queue(config, host))
         except Exception:
             # Whoever asked is told that it failed: it must not begin later.
-            detail = "it could not be queued"
-            self.store.move(row.id, JobState.FAILED, reason=Reason.INTERNAL.value, detail=detail)
+            self._unqueued[row.id] = row
+            self._end_unqueued()
             raise
         return row
+
+    def _end_unqueued(self) -> None:
+        """Ends the jobs that could not be queued, as far as the database takes it."""
+        for job_id, row in list(self._unqueued.items()):
+            try:
+                if row.host == self.store.host:
+                    self._heed(job_id, Reason.INTERNAL, JobState.FAILED, "it could not be queued")
+                else:  # its own host may have found and begun it: only that one can tell
+                    with suppress(IllegalMove):
+                        self.store.wish_to_stop(job_id, Reason.INTERNAL.value, "service")
+            except SQLAlchemyError as error:
+                log.error(
+                    "job %s of loop %s could not be queued, and its end not be written: it does not begin, and holds "
+                    "the loop until the database takes its end, which is tried every %.0f s: %s",
+                    job_id, row.loop, _RECONCILE_S, error,
+                )  # fmt: skip
+            else:
+                self._unqueued.pop(job_id, None)
 
     def abort(self, job_id: str, by: str) -> JobRow:
         """Asks an active job to stop; it ends as aborted once the loop is restored. Raises IllegalMove."""
@@ -198,8 +221,15 @@ class Jobs:
             self._heed(job_id, Reason.OPERATOR)
         return self.store.get(job_id)
 
-    def _heed(self, job_id: str, reason: Reason) -> None:
-        """A job that runs hears of it at its next sample; one that waits for its turn has nothing to restore."""
+    def _heed(
+        self,
+        job_id: str,
+        reason: Reason,
+        state: JobState = JobState.ABORTED,
+        detail: str = "stopped while it waited for its turn",
+    ) -> None:
+        """A job that runs hears of it at its next sample; one that waits for its turn has nothing to restore, and
+        ends in that state."""
         with self._lock:
             running = self._running.get(job_id)
             if running is not None:
@@ -207,8 +237,7 @@ class Jobs:
                 return
             row = self.store.get(job_id)
             if JobState(row.state) in ACTIVE:
-                detail = "stopped while it waited for its turn"
-                self.store.move(job_id, JobState.ABORTED, reason=reason.value, detail=detail)
+                self.store.move(job_id, state, reason=reason.value, detail=detail)
 
     def request_stop(self) -> None:
         """Tells every job to end; returns at once."""
@@ -307,7 +336,7 @@ class Jobs:
         except NoSuchJob:
             return
         with self._lock:
-            if self.stopping or job_id in self._running:
+            if self.stopping or job_id in self._running or job_id in self._unqueued:
                 return
             running = Running(job_id, row.loop, self.journal, max(row.plant_time_s, before_s))
             self._running[job_id] = running

@@ -204,6 +204,63 @@ def test_what_could_not_be_queued_is_over_and_does_not_begin_later(started: list
     assert (row.state, row.reason) == ("failed", "internal") and service.store.active(TAG) is None
 
 
+def test_what_could_neither_be_queued_nor_ended_does_not_begin_later(
+    started: list[Service], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A full disk: the end is written when there is room again; until then nobody begins it."""
+    service = again(started, tmp_path)
+    jobs = service.jobs
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OperationalError("INSERT", {}, Exception("database or disk is full"))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(jobs.engine, "enqueue", full)
+        patch.setattr(service.store, "move", full)
+        with pytest.raises(OperationalError):
+            jobs.start(TAG, RetuneRequest())
+        (row,) = service.store.unfinished()
+        patch.setattr(jobs.engine, "enqueue", ThreadEngine.enqueue.__get__(jobs.engine))
+        for _ in range(3):
+            jobs.reconcile()
+        jobs.work(row.id)  # an engine that had taken it after all
+        assert service.store.get(row.id).state == "queued" and not service.tune.inside.is_set()
+    jobs.reconcile()
+    row = service.store.get(row.id)
+    assert (row.state, row.reason, row.detail) == ("failed", "internal", "it could not be queued")
+    again_asked = jobs.start(TAG, RetuneRequest())
+    service.wait(again_asked.id)
+    assert service.store.get(again_asked.id).state == "proposed"
+
+
+def test_what_could_not_be_queued_but_has_begun_is_stopped(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    service.tune.hold.clear()
+    enqueue = service.jobs.engine.enqueue
+
+    def taken_all_the_same(job_id: str, queue: str) -> None:
+        enqueue(job_id, queue)
+        service.tune.inside.wait(5)
+        raise OperationalError("INSERT", {}, Exception("no answer"))
+
+    monkeypatch.setattr(service.jobs.engine, "enqueue", taken_all_the_same)
+    with pytest.raises(OperationalError):
+        service.jobs.start(TAG, RetuneRequest())
+    (row,) = service.store.recent()
+    service.wait(row.id)
+    row = service.store.get(row.id)
+    assert (row.state, row.reason, service.controller.state) == ("aborted", "internal", HOME)
+
+
+def test_what_could_not_be_queued_elsewhere_is_stopped_there(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its own host may have begun it by now: a job under test must not be called over."""
+    monkeypatch.setattr(service.jobs, "owner", lambda tag: (service.loops[TAG], "gateway B"))
+    monkeypatch.setattr(service.jobs.engine, "enqueue", Broken().enqueue)
+    with pytest.raises(OperationalError):
+        service.jobs.start(TAG, RetuneRequest())
+    (row,) = service.store.recent()
+    assert (row.state, row.stop_reason, row.host) == ("queued", "internal", "gateway B")
+
+
 def test_a_service_that_does_not_come_to_its_start_leaves_the_jobs(tmp_path: Path) -> None:
     job_id = left(tmp_path)
     store = Store(tmp_path)
