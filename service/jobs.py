@@ -47,6 +47,10 @@ _WATCH_S = 0.2
 _RECONCILE_S = 15.0
 _AT_BOOT = 16
 _STOP_PATIENCE_S = 20.0
+_ENDS_S = 75.0
+"""Wall time in which a job that is told to stop has ended: its loop restored (tried for 4 s, and every answer of the
+last try may be late, 25 s in all), its reports and its end written or given up (twice _STOP_PATIENCE_S and a wait of
+the database). Shorter than TimeoutStopSec of the unit, which would end the service without a word."""
 
 
 class Jobs:
@@ -246,13 +250,23 @@ class Jobs:
             running.stop_reason = running.stop_reason or Reason.SERVICE_STOPPED
 
     def stop(self) -> None:
-        """Ends every job, waits until each has restored its loop, and gives the engine up."""
+        """Ends every job, waits until each has restored its loop, and gives the engine up.
+
+        A job whose thread hangs does not hold up the others' ends for ever.
+        """
         if self._ended.is_set():
             return
         with self._lock:
             self.request_stop()
+        give_up = time.monotonic() + _ENDS_S
         for running in list(self._running.values()):
-            running.over.wait()
+            if not running.over.wait(max(0.0, give_up - time.monotonic())):
+                log.error(
+                    "job %s of loop %s has not ended in %.0f s: whether its loop is restored is unknown, and its end "
+                    "is not written; look at the controller, which goes back by itself when it hears no more of the "
+                    "service; the next start looks at the loop again",
+                    running.job_id, running.tag, _ENDS_S,
+                )  # fmt: skip
         self._ended.set()
         if self._watcher.ident is not None:  # a service that did not come to its start leaves the jobs as they are
             self._watcher.join()
