@@ -12,6 +12,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any, TypeVar
 
@@ -46,6 +47,10 @@ _WATCH_S = 0.2
 _RECONCILE_S = 15.0
 _AT_BOOT = 16
 _STOP_PATIENCE_S = 20.0
+_ENDS_S = 75.0
+"""Wall time in which a job that is told to stop has ended: its loop restored (tried for 4 s, and every answer of the
+last try may be late, 25 s in all), its reports and its end written or given up (twice _STOP_PATIENCE_S and a wait of
+the database). Shorter than TimeoutStopSec of the unit, which would end the service without a word."""
 
 
 class Jobs:
@@ -85,6 +90,8 @@ class Jobs:
         # By loop: who is about to begin a job on it, or to decide one.
         self._hands: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
         self._lost: set[str] = set()
+        # By id: jobs whose asker was told that they could not be queued, and whose end could not be written either.
+        self._unqueued: dict[str, JobRow] = {}
         self._ended = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name="watcher", daemon=True)
 
@@ -109,8 +116,10 @@ class Jobs:
 
         at_once: without waiting for a second look, which keeps a job that is just being started from being lost.
         """
+        self._end_unqueued()
         with self._lock:
-            idle = [row for row in self.store.unfinished() if row.id not in self._running]
+            apart = self._running.keys() | self._unqueued.keys()
+            idle = [row for row in self.store.unfinished() if row.id not in apart]
         lost = {row.id for row in idle} - self.engine.known([row.id for row in idle])
         for row in idle:
             if row.id in lost and (at_once or row.id in self._lost):
@@ -186,10 +195,28 @@ class Jobs:
             self.engine.enqueue(row.id, self._rehearsals(host) if row.dry_run else self._queue(config, host))
         except Exception:
             # Whoever asked is told that it failed: it must not begin later.
-            detail = "it could not be queued"
-            self.store.move(row.id, JobState.FAILED, reason=Reason.INTERNAL.value, detail=detail)
+            self._unqueued[row.id] = row
+            self._end_unqueued()
             raise
         return row
+
+    def _end_unqueued(self) -> None:
+        """Ends the jobs that could not be queued, as far as the database takes it."""
+        for job_id, row in list(self._unqueued.items()):
+            try:
+                if row.host == self.store.host:
+                    self._heed(job_id, Reason.INTERNAL, JobState.FAILED, "it could not be queued")
+                else:  # its own host may have found and begun it: only that one can tell
+                    with suppress(IllegalMove):
+                        self.store.wish_to_stop(job_id, Reason.INTERNAL.value, "service")
+            except SQLAlchemyError as error:
+                log.error(
+                    "job %s of loop %s could not be queued, and its end not be written: it does not begin, and holds "
+                    "the loop until the database takes its end, which is tried every %.0f s: %s",
+                    job_id, row.loop, _RECONCILE_S, error,
+                )  # fmt: skip
+            else:
+                self._unqueued.pop(job_id, None)
 
     def abort(self, job_id: str, by: str) -> JobRow:
         """Asks an active job to stop; it ends as aborted once the loop is restored. Raises IllegalMove."""
@@ -198,8 +225,15 @@ class Jobs:
             self._heed(job_id, Reason.OPERATOR)
         return self.store.get(job_id)
 
-    def _heed(self, job_id: str, reason: Reason) -> None:
-        """A job that runs hears of it at its next sample; one that waits for its turn has nothing to restore."""
+    def _heed(
+        self,
+        job_id: str,
+        reason: Reason,
+        state: JobState = JobState.ABORTED,
+        detail: str = "stopped while it waited for its turn",
+    ) -> None:
+        """A job that runs hears of it at its next sample; one that waits for its turn has nothing to restore, and
+        ends in that state."""
         with self._lock:
             running = self._running.get(job_id)
             if running is not None:
@@ -207,8 +241,7 @@ class Jobs:
                 return
             row = self.store.get(job_id)
             if JobState(row.state) in ACTIVE:
-                detail = "stopped while it waited for its turn"
-                self.store.move(job_id, JobState.ABORTED, reason=reason.value, detail=detail)
+                self.store.move(job_id, state, reason=reason.value, detail=detail)
 
     def request_stop(self) -> None:
         """Tells every job to end; returns at once."""
@@ -217,13 +250,23 @@ class Jobs:
             running.stop_reason = running.stop_reason or Reason.SERVICE_STOPPED
 
     def stop(self) -> None:
-        """Ends every job, waits until each has restored its loop, and gives the engine up."""
+        """Ends every job, waits until each has restored its loop, and gives the engine up.
+
+        A job whose thread hangs does not hold up the others' ends for ever.
+        """
         if self._ended.is_set():
             return
         with self._lock:
             self.request_stop()
+        give_up = time.monotonic() + _ENDS_S
         for running in list(self._running.values()):
-            running.over.wait()
+            if not running.over.wait(max(0.0, give_up - time.monotonic())):
+                log.error(
+                    "job %s of loop %s has not ended in %.0f s: whether its loop is restored is unknown, and its end "
+                    "is not written; look at the controller, which goes back by itself when it hears no more of the "
+                    "service; the next start looks at the loop again",
+                    running.job_id, running.tag, _ENDS_S,
+                )  # fmt: skip
         self._ended.set()
         if self._watcher.ident is not None:  # a service that did not come to its start leaves the jobs as they are
             self._watcher.join()
@@ -256,11 +299,15 @@ class Jobs:
 
     # decide
     def accept(self, job_id: str, by: str) -> JobRow:
-        """Makes the proposed gains the accepted ones of the controller, and reads them back."""
+        """Makes the proposed gains the accepted ones of the controller, and reads them back.
+
+        After an error it is asked again, which finishes what was begun, or rolled back.
+        """
         return self._decide(job_id, JobState.ACCEPTED, by)
 
     def rollback(self, job_id: str, by: str) -> JobRow:
-        """Declines a proposal (the loop has its old gains already), or takes an accepted change back."""
+        """Declines a proposal (the loop has its old gains already), or takes back a change that is accepted or was
+        begun to be."""
         return self._decide(job_id, JobState.ROLLED_BACK, by)
 
     def _decide(self, job_id: str, wanted: JobState, by: str) -> JobRow:
@@ -275,17 +322,18 @@ class Jobs:
             active = self.store.active(row.loop)
             if active is not None:
                 raise Busy(row.loop, active.id)
-            if now is JobState.PROPOSED and wanted is JobState.ROLLED_BACK:
-                return self.store.move(job_id, wanted, by=by)
+            if wanted is JobState.ROLLED_BACK and (declined := self.store.decline(job_id, by)) is not None:
+                return declined
             config, host = self.owner(row.loop)
             if host != self.store.host:
                 raise Conflict(f"loop {row.loop} is on the bus of host {host}: only the service there can write to it")
             old, new = gains_of(row.old_gains), gains_of((row.result or {}).get("gains"))
             before, after = (old, new) if wanted is JobState.ACCEPTED else (new, old)
+            begun = self.store.decision_begun(job_id)
             try:
                 loop = self._open_loop(config)
                 try:
-                    state = exchange(loop, before, after)
+                    state = exchange(loop, before, after, begun, lambda: self.store.begin_decision(job_id, wanted, by))
                 finally:
                     loop.close()
             except Ended as ended:
@@ -302,13 +350,17 @@ class Jobs:
         except NoSuchJob:
             return
         with self._lock:
-            if self.stopping or job_id in self._running or JobState(row.state) not in ACTIVE:
+            if self.stopping or job_id in self._running or job_id in self._unqueued:
                 return
             running = Running(job_id, row.loop, self.journal, max(row.plant_time_s, before_s))
-            if row.stop_reason is not None:
-                running.stop_reason = Reason(row.stop_reason)
             self._running[job_id] = running
         try:
+            # Read anew: until it was among those that run, an abort ended it as one that waits for its turn.
+            row = self._lasting(lambda: self.store.get(job_id))
+            if JobState(row.state) not in ACTIVE:
+                return
+            if row.stop_reason is not None:
+                running.stop_reason = running.stop_reason or Reason(row.stop_reason)
             with about(job=job_id, loop=row.loop):
                 self._to_the_end(running, row)
         finally:

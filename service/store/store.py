@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session, sessionmaker
 
 from service.plain import plain
 from service.security import audit
-from service.states import ACTIVE, JobState, check
+from service.states import ACTIVE, IllegalMove, JobState, check
 from service.store import chunks, retunes
 from service.store.clock import now
 from service.store.database import WAIT_S, migrate, open_database
@@ -33,6 +33,9 @@ WithJob = Callable[[Session, JobRow], None]
 LOCAL = "local"
 DECISIONS = {JobState.ACCEPTED: "accept", JobState.ROLLED_BACK: "rollback"}
 """What the audit log calls the moves that somebody decides."""
+_BEGUN = "decision_begun"
+"""The event that a decision writes before it writes to the controller: only without it is a proposal known to have
+left the old gains in effect."""
 _ACTIVE = [state.value for state in ACTIVE]
 
 
@@ -200,26 +203,35 @@ class Store:
     def move(self, job_id: str, wanted: JobState, by: str = "service", **columns: Any) -> JobRow:
         """Moves the job as the table allows and sets the columns, in one transaction with its event."""
         with self.writing() as session:
-            row = _find(session, job_id, lock=True)
-            previous = JobState(row.state)
-            check(previous, wanted)
-            row.state = wanted.value
-            set_columns(row, columns)
-            if wanted is JobState.RUNNING:
-                row.started_at = now()
-            elif previous in ACTIVE:
-                row.ended_at = now()
-            told = {"state": wanted.value, "from": previous.value, "by": by}
-            told |= {key: columns[key] for key in ("reason", "detail") if columns.get(key)}
-            append(session, job_id, "state", told, row.plant_time_s)
-            if wanted in DECISIONS:
-                _audit_decision(session, row, previous, wanted, by)
-            return row
+            return _move(session, _find(session, job_id, lock=True), wanted, by, columns)
 
-    def resumed(self, job_id: str, told: dict[str, Any], **columns: Any) -> None:
-        """Notes that an active job has begun another attempt."""
+    def decline(self, job_id: str, by: str) -> JobRow | None:
+        """Rolls back a proposal of which nothing was written to the controller; None when it is no such one."""
         with self.writing() as session:
             row = _find(session, job_id, lock=True)
+            if row.state != JobState.PROPOSED or _last_begun(session, job_id) is not None:
+                return None
+            return _move(session, row, JobState.ROLLED_BACK, by, {})
+
+    def decision_begun(self, job_id: str) -> bool:
+        """Whether any decision on the job may have written to the controller."""
+        with self._session() as session:
+            return _last_begun(session, job_id) is not None
+
+    def begin_decision(self, job_id: str, wanted: JobState, by: str) -> None:
+        """Notes that the controller is about to be written to. Raises IllegalMove when another was faster."""
+        with self.writing() as session:
+            row = _find(session, job_id, lock=True)
+            check(JobState(row.state), wanted)
+            append(session, job_id, _BEGUN, {"decision": DECISIONS[wanted], "by": by}, row.plant_time_s)
+
+    def resumed(self, job_id: str, told: dict[str, Any], **columns: Any) -> None:
+        """Notes that an active job has begun another attempt. Raises IllegalMove when it is over."""
+        with self.writing() as session:
+            row = _find(session, job_id, lock=True)
+            state = JobState(row.state)
+            if state not in ACTIVE:
+                raise IllegalMove(state, JobState.RUNNING)
             set_columns(row, columns)
             append(session, job_id, "resumed", told, row.plant_time_s)
 
@@ -385,9 +397,35 @@ def set_columns(row: JobRow, columns: dict[str, Any]) -> None:
         setattr(row, name, plain(value))
 
 
+def _move(session: Session, row: JobRow, wanted: JobState, by: str, columns: dict[str, Any]) -> JobRow:
+    previous = JobState(row.state)
+    check(previous, wanted)
+    row.state = wanted.value
+    set_columns(row, columns)
+    if wanted is JobState.RUNNING:
+        row.started_at = now()
+    elif previous in ACTIVE:
+        row.ended_at = now()
+    told = {"state": wanted.value, "from": previous.value, "by": by}
+    told |= {key: columns[key] for key in ("reason", "detail") if columns.get(key)}
+    append(session, row.id, "state", told, row.plant_time_s)
+    if wanted in DECISIONS:
+        _audit_decision(session, row, previous, wanted, by)
+    return row
+
+
+def _last_begun(session: Session, job_id: str) -> str | None:
+    """What the last decision that was about to write to the controller wanted, as in DECISIONS."""
+    mine = (EventRow.job_id == job_id, EventRow.kind == _BEGUN)
+    event = session.scalars(select(EventRow).where(*mine).order_by(EventRow.seq.desc()).limit(1)).one_or_none()
+    return None if event is None else str(event.data["decision"])
+
+
 def _audit_decision(session: Session, row: JobRow, previous: JobState, wanted: JobState, by: str) -> None:
     old, new = row.old_gains, (row.result or {}).get("gains")
-    had, has = (new, old) if previous is JobState.ACCEPTED else (old, new if wanted is JobState.ACCEPTED else old)
+    has = new if wanted is JobState.ACCEPTED else old
+    # A rollback that had to write found the new gains, of an acceptance that had ended in an error too.
+    had = new if wanted is JobState.ROLLED_BACK and _last_begun(session, row.id) == DECISIONS[wanted] else old
     audit.record(
         session,
         DECISIONS[wanted],

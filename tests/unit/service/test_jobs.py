@@ -1,11 +1,16 @@
 from __future__ import annotations
 
+import threading
+import time
 from pathlib import Path
 
 import pytest
 
+from service import jobs as jobs_module
 from service.api.results import ModelView, TransferModelView
 from service.api.views import job_view
+from service.bus_loop import RESTORE_PATIENCE_S
+from service.loop import LoopState
 from service.progress import Progress
 from service.request import RetuneRequest
 from service.states import JobState
@@ -24,6 +29,37 @@ def test_stopping_ends_the_jobs_and_waits_for_their_loops(service: Service) -> N
     row = service.store.get(row.id)
     assert (row.state, row.reason) == ("aborted", Reason.SERVICE_STOPPED.value)
     assert service.controller.state.gains == OLD and service.controller.open == 0
+
+
+def test_a_job_that_does_not_end_holds_the_stop_up_for_a_while_only(
+    service: Service, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(jobs_module, "_ENDS_S", 0.2)
+    inside, free = threading.Event(), threading.Event()
+
+    def hangs(loop: FakeLoop, state: LoopState) -> LoopState:
+        inside.set()
+        free.wait(20)
+        return state
+
+    monkeypatch.setattr(FakeLoop, "restore", hangs)
+    row = service.jobs.start(TAG, RetuneRequest())
+    try:
+        assert inside.wait(5)
+        running = service.jobs.running(row.id)
+        began = time.monotonic()
+        service.jobs.stop()
+        assert time.monotonic() - began < 10
+    finally:
+        free.set()
+    (error,) = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
+    assert row.id in error and TAG in error and "unknown" in error and "look at the controller" in error
+    assert service.store.get(row.id).state == "running"  # the next start looks at its loop
+    assert running is not None and running.over.wait(5)
+
+
+def test_the_stop_waits_longer_than_any_restore() -> None:
+    assert jobs_module._ENDS_S > RESTORE_PATIENCE_S + 3 * jobs_module._STOP_PATIENCE_S
 
 
 def test_what_a_dead_service_left_is_marked_at_the_next_start(tmp_path: Path) -> None:

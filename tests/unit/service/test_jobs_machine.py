@@ -278,7 +278,8 @@ class JobsMachine(RuleBasedStateMachine):
 
     def decide(self, job: Job, what: str, wish: Callable[[str, str], object], legal: tuple[str, ...]) -> bool:
         """Whether the model lets it pass to the controller; else the service refuses in the same way."""
-        before = {"accept": job.old, "rollback": job.act.new}[what]
+        # To roll back what has been rolled back by hand is no conflict.
+        legal_gains = {"accept": (job.old,), "rollback": (job.old, job.act.new)}[what]
         declined = what == "rollback" and job.state == "proposed"
         refusal: type[Exception] | None = None
         if job.state not in legal:
@@ -287,7 +288,7 @@ class JobsMachine(RuleBasedStateMachine):
             refusal, word = Conflict, "conflict"
         elif self.having(job.loop):
             refusal, word = Busy, "busy"
-        elif not declined and self.gains[job.loop] != before:
+        elif not declined and self.gains[job.loop] not in legal_gains:
             refusal, word = Conflict, "conflict"
         if refusal is None:
             wish(job.id, "me")

@@ -17,7 +17,7 @@ from service.loop import LoopState
 from service.recovery import MOST_ATTEMPTS
 from service.request import RetuneRequest
 from service.state_json import state_json
-from service.states import JobState
+from service.states import IllegalMove, JobState
 from service.store.store import Store
 from service.store.tables import JobRow
 from tests.unit.service.fakes import (
@@ -204,6 +204,63 @@ def test_what_could_not_be_queued_is_over_and_does_not_begin_later(started: list
     assert (row.state, row.reason) == ("failed", "internal") and service.store.active(TAG) is None
 
 
+def test_what_could_neither_be_queued_nor_ended_does_not_begin_later(
+    started: list[Service], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A full disk: the end is written when there is room again; until then nobody begins it."""
+    service = again(started, tmp_path)
+    jobs = service.jobs
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OperationalError("INSERT", {}, Exception("database or disk is full"))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(jobs.engine, "enqueue", full)
+        patch.setattr(service.store, "move", full)
+        with pytest.raises(OperationalError):
+            jobs.start(TAG, RetuneRequest())
+        (row,) = service.store.unfinished()
+        patch.setattr(jobs.engine, "enqueue", ThreadEngine.enqueue.__get__(jobs.engine))
+        for _ in range(3):
+            jobs.reconcile()
+        jobs.work(row.id)  # an engine that had taken it after all
+        assert service.store.get(row.id).state == "queued" and not service.tune.inside.is_set()
+    jobs.reconcile()
+    row = service.store.get(row.id)
+    assert (row.state, row.reason, row.detail) == ("failed", "internal", "it could not be queued")
+    again_asked = jobs.start(TAG, RetuneRequest())
+    service.wait(again_asked.id)
+    assert service.store.get(again_asked.id).state == "proposed"
+
+
+def test_what_could_not_be_queued_but_has_begun_is_stopped(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    service.tune.hold.clear()
+    enqueue = service.jobs.engine.enqueue
+
+    def taken_all_the_same(job_id: str, queue: str) -> None:
+        enqueue(job_id, queue)
+        service.tune.inside.wait(5)
+        raise OperationalError("INSERT", {}, Exception("no answer"))
+
+    monkeypatch.setattr(service.jobs.engine, "enqueue", taken_all_the_same)
+    with pytest.raises(OperationalError):
+        service.jobs.start(TAG, RetuneRequest())
+    (row,) = service.store.recent()
+    service.wait(row.id)
+    row = service.store.get(row.id)
+    assert (row.state, row.reason, service.controller.state) == ("aborted", "internal", HOME)
+
+
+def test_what_could_not_be_queued_elsewhere_is_stopped_there(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its own host may have begun it by now: a job under test must not be called over."""
+    monkeypatch.setattr(service.jobs, "owner", lambda tag: (service.loops[TAG], "gateway B"))
+    monkeypatch.setattr(service.jobs.engine, "enqueue", Broken().enqueue)
+    with pytest.raises(OperationalError):
+        service.jobs.start(TAG, RetuneRequest())
+    (row,) = service.store.recent()
+    assert (row.state, row.stop_reason, row.host) == ("queued", "internal", "gateway B")
+
+
 def test_a_service_that_does_not_come_to_its_start_leaves_the_jobs(tmp_path: Path) -> None:
     job_id = left(tmp_path)
     store = Store(tmp_path)
@@ -228,6 +285,55 @@ def test_a_job_that_waits_for_its_turn_ends_at_once_when_aborted(started: list[S
     row = service.jobs.abort(row.id, "me")
     assert (row.state, row.reason) == ("aborted", "operator")
     assert [event.kind for event in service.store.events(row.id)] == ["state", "abort_requested", "state"]
+
+
+def test_an_abort_just_as_the_job_gets_its_turn_is_kept(
+    started: list[Service], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Answered as aborted, for it was waiting: then its test must not begin."""
+    job_id = left(tmp_path)
+    last_sample_s = Store.last_sample_s
+
+    def aborted_meanwhile(store: Store, job: str) -> float:
+        found = last_sample_s(store, job)
+        answers.append(service.jobs.abort(job_id, "me").state)
+        return found
+
+    answers: list[str] = []
+    service = again(started, tmp_path, engine=Forgetful())  # has the job, and does not begin it
+    monkeypatch.setattr(Store, "last_sample_s", aborted_meanwhile)
+    service.jobs.work(job_id)
+    assert answers == ["aborted"] and service.jobs.running(job_id) is None
+    assert not service.tune.inside.is_set() and not texts(service, job_id, "resumed")
+    assert service.store.get(job_id).state == "aborted"
+
+
+def test_a_wish_to_stop_written_just_as_the_job_gets_its_turn_is_heard(
+    started: list[Service], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = left(tmp_path)
+    last_sample_s = Store.last_sample_s
+
+    def wished_meanwhile(store: Store, job: str) -> float:
+        found = last_sample_s(store, job)
+        store.wish_to_stop(job_id, Reason.OPERATOR.value, "gateway B")
+        return found
+
+    service = again(started, tmp_path, engine=Forgetful())
+    monkeypatch.setattr(service.jobs, "_heed", lambda *_: None)  # the watcher comes later
+    monkeypatch.setattr(Store, "last_sample_s", wished_meanwhile)
+    service.jobs.work(job_id)
+    row = service.store.get(job_id)
+    assert (row.state, row.reason) == ("aborted", "operator") and not service.tune.inside.is_set()
+    monkeypatch.undo()
+
+
+def test_a_job_that_is_over_is_not_resumed(store: Store) -> None:
+    row = store.create(TAG, {}, "me", False)
+    store.move(row.id, JobState.ABORTED)
+    with pytest.raises(IllegalMove):
+        store.resumed(row.id, {"attempt": 2}, attempt=2)
+    assert store.get(row.id).attempt == 0
 
 
 def test_a_job_that_waits_when_the_service_stops_ends_as_such(started: list[Service], tmp_path: Path) -> None:

@@ -1,0 +1,180 @@
+"""Decisions that end in an error half way: what was written to the controller is neither forgotten nor denied."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from sqlalchemy.exc import OperationalError
+
+from service.errors import Conflict
+from service.loop import LoopState
+from service.request import RetuneRequest
+from service.security import audit
+from service.states import IllegalMove, JobState
+from tests.unit.service.fakes import NEW, OLD, TAG, FakeLoop, Service
+from tuning.gains import Gains
+from tuning.reasons import Failed, Reason
+
+Patch = pytest.MonkeyPatch
+BY_HAND = Gains(0.9, 4.0)
+
+
+def full(*_: Any, **__: Any) -> None:
+    raise OperationalError("UPDATE", {}, Exception("database or disk is full"))
+
+
+def proposed(service: Service) -> str:
+    row = service.jobs.start(TAG, RetuneRequest())
+    service.wait(row.id)
+    assert service.store.get(row.id).state == "proposed"
+    return row.id
+
+
+def begun(service: Service, job_id: str) -> list[str]:
+    return [event.data["decision"] for event in service.store.events(job_id) if event.kind == "decision_begun"]
+
+
+def lost_in_the_read_back(service: Service, patch: Patch) -> type[Exception]:
+    accept = FakeLoop.accept
+
+    def lost(loop: FakeLoop, gains: Gains) -> LoopState:
+        accept(loop, gains)
+        raise Failed(Reason.NODE_LOST, "node 20h does not answer (controller_on_trial)")
+
+    patch.setattr(FakeLoop, "accept", lost)
+    return Failed
+
+
+def lost_on_trial(service: Service, patch: Patch) -> type[Exception]:
+    def lost(loop: FakeLoop, gains: Gains) -> LoopState:
+        service.controller.state = replace(service.controller.state, gains=gains, on_trial=True)
+        raise Failed(Reason.NODE_LOST, "node 20h does not answer (controller_parameter_command)")
+
+    patch.setattr(FakeLoop, "accept", lost)
+    return Failed
+
+
+def disk_full_at_the_end(service: Service, patch: Patch) -> type[Exception]:
+    patch.setattr(service.store, "move", full)
+    return OperationalError
+
+
+@pytest.fixture(params=[lost_in_the_read_back, lost_on_trial, disk_full_at_the_end])
+def half_accepted(service: Service, request: pytest.FixtureRequest) -> str:
+    """A proposal whose gains the controller has although its acceptance ended in an error."""
+    half_way: Callable[[Service, Patch], type[Exception]] = request.param
+    job_id = proposed(service)
+    with pytest.MonkeyPatch.context() as patch:
+        error = half_way(service, patch)
+        with pytest.raises(error):
+            service.jobs.accept(job_id, "me")
+    assert (service.store.get(job_id).state, service.controller.state.gains) == ("proposed", NEW)
+
+    # A controller on trial takes what it is given; the fake one would stay so.
+    accept = FakeLoop.accept
+
+    def off_trial(loop: FakeLoop, gains: Gains) -> LoopState:
+        service.controller.state = replace(service.controller.state, on_trial=False)
+        return accept(loop, gains)
+
+    patch = pytest.MonkeyPatch()
+    patch.setattr(FakeLoop, "accept", off_trial)
+    request.addfinalizer(patch.undo)
+    return job_id
+
+
+def holds(service: Service, gains: Gains) -> bool:
+    state = service.controller.state
+    return state.gains == gains and not state.on_trial
+
+
+def test_a_second_click_finishes_the_first(service: Service, half_accepted: str) -> None:
+    row = service.jobs.accept(half_accepted, "me")
+    assert row.state == "accepted" and holds(service, NEW)
+    assert row.restored is not None and row.restored["gains"]["Kp"] == NEW.Kp
+
+
+def test_what_was_half_accepted_is_taken_back_on_the_controller(service: Service, half_accepted: str) -> None:
+    row = service.jobs.rollback(half_accepted, "me")
+    assert row.state == "rolled_back" and holds(service, OLD)
+    last = audit.trail(service.store.engine, 1)[0]
+    assert last.before is not None and last.after is not None
+    assert (last.what, last.before["gains"]["Kp"], last.after["gains"]["Kp"]) == ("rollback", NEW.Kp, OLD.Kp)
+
+
+def test_a_loop_that_is_not_reached_is_not_said_to_have_its_old_gains(service: Service, half_accepted: str) -> None:
+    service.controller.absent = Reason.NODE_LOST
+    with pytest.raises(Failed):
+        service.jobs.rollback(half_accepted, "me")
+    assert service.store.get(half_accepted).state == "proposed"
+
+
+def test_gains_put_in_by_hand_after_a_half_acceptance_stay(service: Service, half_accepted: str) -> None:
+    service.controller.state = replace(service.controller.state, gains=BY_HAND, on_trial=False)
+    for wish in (service.jobs.accept, service.jobs.rollback):
+        with pytest.raises(Conflict, match="somebody changed the gains"):
+            wish(half_accepted, "me")
+    assert holds(service, BY_HAND)
+
+
+def test_an_acceptance_that_wrote_nothing_is_rolled_back_without_writing(service: Service, monkeypatch: Patch) -> None:
+    job_id = proposed(service)
+
+    def lost(loop: FakeLoop, gains: Gains) -> LoopState:
+        raise Failed(Reason.NODE_LOST, "node 20h does not answer (controller_staged_kp)")
+
+    monkeypatch.setattr(FakeLoop, "accept", lost)
+    with pytest.raises(Failed):
+        service.jobs.accept(job_id, "me")
+    assert service.jobs.rollback(job_id, "me").state == "rolled_back" and holds(service, OLD)
+    assert begun(service, job_id) == ["accept"]
+
+
+def test_a_half_rollback_is_finished_by_the_next(service: Service) -> None:
+    job_id = proposed(service)
+    service.jobs.accept(job_id, "me")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(service.store, "move", full)
+        with pytest.raises(OperationalError):
+            service.jobs.rollback(job_id, "me")
+    assert holds(service, OLD) and service.store.get(job_id).state == "accepted"
+    assert service.jobs.rollback(job_id, "me").state == "rolled_back"
+    assert begun(service, job_id) == ["accept", "rollback"]
+
+
+def test_a_decision_that_cannot_be_written_down_does_not_touch_the_loop(service: Service, monkeypatch: Patch) -> None:
+    job_id = proposed(service)
+    with monkeypatch.context() as patch:
+        patch.setattr(service.store, "begin_decision", full)
+        with pytest.raises(OperationalError):
+            service.jobs.accept(job_id, "me")
+    assert holds(service, OLD) and service.controller.open == 0
+    service.controller.absent = Reason.NODE_LOST
+    assert service.jobs.rollback(job_id, "me").state == "rolled_back"  # nothing was begun: no need of the bus
+
+
+def test_a_conflict_begins_nothing(service: Service) -> None:
+    job_id = proposed(service)
+    service.controller.state = replace(service.controller.state, gains=BY_HAND)
+    with pytest.raises(Conflict):
+        service.jobs.accept(job_id, "me")
+    assert begun(service, job_id) == []
+    assert service.jobs.rollback(job_id, "me").state == "rolled_back" and holds(service, BY_HAND)
+
+
+def test_what_another_host_has_declined_meanwhile_is_not_written(service: Service, monkeypatch: Patch) -> None:
+    job_id = proposed(service)
+    read = FakeLoop.read
+
+    def slow(loop: FakeLoop) -> LoopState:
+        if service.store.get(job_id).state == "proposed":
+            service.store.decline(job_id, "gateway B")
+        return read(loop)
+
+    monkeypatch.setattr(FakeLoop, "read", slow)
+    with pytest.raises(IllegalMove):
+        service.jobs.accept(job_id, "me")
+    assert service.store.get(job_id).state == JobState.ROLLED_BACK and holds(service, OLD)
