@@ -37,6 +37,8 @@ SILENCE_S = 1.0
 RESTORE_PATIENCE_S = 4.0
 COMMAND_WALL_S = 2.0
 """How long a handful of commands may take on a slow bus."""
+FASTEST_PER_S = 20_000
+"""More samples a second than a simulated plant at pace 0 makes when nobody runs it in blocks."""
 RELAY_LONGEST = 1_000_000  # samples; plans end their relays, and so does the lease
 MAX_GAP = 5
 
@@ -104,8 +106,7 @@ class BusLoop:
                 self._watch_us(tuner)
                 self._take_time(tuner)
                 state = replace(self._state(tuner), command_lag_samples=self._command_lag())
-                if state.mode is Mode.EXPERIMENT:
-                    raise Refused(Reason.WRONG_MODE, "an experiment is running in the controller")
+                self._no_experiment(state.mode)
                 self._plan_lease()
                 tuner.write("controller_lease", self._lease)
                 self._paid_at = time.monotonic()
@@ -167,15 +168,26 @@ class BusLoop:
             self._release()
 
     def accept(self, gains: Gains) -> LoopState:
-        with self._translated() as tuner:
-            held = tuner.beating
-            tuner.hold()
-            self._make_accepted(tuner, gains)
-            tuner.beating = held
-            state = self._state(tuner)
-            if state.on_trial or not _same_gains(state.gains, gains):
-                raise Failed(Reason.RESTORE_UNCONFIRMED, f"accepted {gains}, read back {state.gains}")
-            return state
+        """In a short session of its own, so that gains whose acceptance fails, or whose tuner dies, do not stay."""
+        try:
+            with self._translated() as tuner:
+                self._watch_us(tuner)
+                self._no_experiment(Mode(int(tuner.number("controller_mode"))))
+                lease = self._short_lease(tuner)
+                self._stage(tuner, gains)
+            try:
+                with self._translated() as tuner:
+                    tuner.write("controller_lease", lease)
+                    tuner.write("controller_parameter_command", ParameterCommand.TRY)
+                    tuner.write("controller_parameter_command", ParameterCommand.ACCEPT)
+                state = self._let_go()
+                if state.on_trial or not _same_gains(state.gains, gains):
+                    raise Failed(Reason.RESTORE_UNCONFIRMED, f"accepted {gains}, read back {state.gains}")
+                return state
+            except Ended as ended:
+                return self._after_all(gains, ended)
+        finally:
+            self._release()
 
     def close(self) -> None:
         self._release()
@@ -252,6 +264,19 @@ class BusLoop:
             return
         self._lease = max(SHORTEST_LEASE, math.ceil(LEASE_WALL_S * self._pace / self._sample_time_s))
 
+    def _short_lease(self, tuner: Tuner) -> int:
+        """Samples of LEASE_WALL_S, whoever runs the plant. It may run freely at pace 0; where it stands still, the
+        watch on our heartbeat alone ends a session."""
+        pace = tuner.number("plant_pace") if self._plant is not None else 1.0
+        per_s = pace / (tuner.number("sample_time", node=self._node) / 1e6) if pace else FASTEST_PER_S
+        return max(SHORTEST_LEASE, math.ceil(LEASE_WALL_S * per_s))
+
+    @staticmethod
+    def _no_experiment(mode: Mode) -> None:
+        if mode is Mode.EXPERIMENT:
+            text = "an experiment is running in the controller: wait for its end, or set the mode to automatic"
+            raise Refused(Reason.WRONG_MODE, text)
+
     # -- on the way
 
     def _carry_out(self, tuner: Tuner, command: Command) -> None:
@@ -293,11 +318,14 @@ class BusLoop:
 
     def _try(self, tuner: Tuner, gains: Gains, pay: Callable[[Tuner], None] = lambda tuner: None) -> None:
         """pay: what keeps the session open while one write waits for the other, if there is a session."""
+        self._stage(tuner, gains, pay)
+        tuner.write("controller_parameter_command", ParameterCommand.TRY)
+
+    def _stage(self, tuner: Tuner, gains: Gains, pay: Callable[[Tuner], None] = lambda tuner: None) -> None:
         values = (gains.Kp, gains.Ti, gains.Td, gains.Tf, gains.b, gains.c)
         for name, value in zip(_PARAMETERS, values, strict=True):
             pay(tuner)
             tuner.write(f"controller_staged_{name}", value)
-        tuner.write("controller_parameter_command", ParameterCommand.TRY)
 
     def _keep(self, tuner: Tuner) -> None:
         """Pays for more when a third is used up: by samples, or by wall time that went by in waiting for answers of a
@@ -404,6 +432,30 @@ class BusLoop:
     def _make_accepted(self, tuner: Tuner, gains: Gains) -> None:
         self._try(tuner, gains)
         tuner.write("controller_parameter_command", ParameterCommand.ACCEPT)
+
+    def _let_go(self) -> LoopState:
+        """The state without a session. A lease of 0 ends what is on trial and leaves mode, set-point and output as they
+        are; going back would undo a hand that has been on them meanwhile."""
+        with self._translated() as tuner:
+            tuner.write("controller_lease", 0)
+            return self._state(tuner)
+
+    def _after_all(self, gains: Gains, why: Ended) -> LoopState:
+        """An acceptance that has failed: nothing may stay on trial. Where only an answer was lost, the gains are
+        accepted: what is read back counts."""
+        give_up = time.monotonic() + RESTORE_PATIENCE_S
+        state: LoopState | None = None
+        while state is None or state.on_trial:
+            if time.monotonic() > give_up:
+                text = "the end of the trial is not confirmed, the controller ends it by itself within seconds"
+                raise type(why)(why.reason, f"{why.detail}; {text}: read the loop before going on") from why
+            try:
+                state = self._let_go()
+            except Ended:
+                time.sleep(0.05)
+        if not _same_gains(state.gains, gains):
+            raise why
+        return state
 
     def _release(self) -> None:
         """Our heartbeat ends; a plant that we ran in blocks runs on by itself, and others may take it."""
