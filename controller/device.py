@@ -284,7 +284,7 @@ class ControllerDevice:
             )
         except ValueError:
             raise SdoAbort(Abort.INVALID_VALUE) from None
-        self.runtime.clear_error(Emcy.PV_LIMIT)
+        self.runtime.clear_error(Emcy.PV_LIMIT, bytes((sub,)))
 
     def _write_parameter_command(self, sub: int, value: Value) -> None:
         channel = self.channels[sub - 1]
@@ -307,7 +307,7 @@ class ControllerDevice:
     def _write_lease(self, sub: int, value: Value) -> None:
         self.channels[sub - 1].renew_lease(int(value))
         if value:
-            self.runtime.clear_error(Emcy.LEASE_USED_UP)
+            self.runtime.clear_error(Emcy.LEASE_USED_UP, bytes((sub,)))
 
     def _renew_lease(self, sub: int, value: Value) -> None:
         """Unlike a lease written, it never opens a session: one that has ended stays ended."""

@@ -19,12 +19,15 @@ from protocol.bus import BusError, Frame
 from protocol.objects import BY_NAME, Device, lookup
 from protocol.profile import (
     CONTROLLER_NODE,
+    EMCY_FRAME,
     FOREVER,
     HEARTBEAT_FRAME,
     PLANT_NODE,
     TUNER_NODE,
     Cause,
+    Emcy,
     NmtState,
+    emcy_id,
     heartbeat_id,
     sdo_request_id,
 )
@@ -64,16 +67,17 @@ class OurBus(MemoryBus):
 
 
 class Site:
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, pace: float) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, pace: float, channels: int = 1) -> None:
         self.wire = Wire()
         self.slow_s = 0.0
         self.lost: Exception | None = None
         """What our bus raises, while it does."""
         self.written: list[tuple[str, float]] = []
         entry, clock = find("fopdt"), self.wire.clock
-        self.plant = PlantDevice(self.wire.open(), [PlantChannel(entry.build)], pace=pace, run=0, clock=clock)
-        channel = ControllerChannel(Parameters(200.0, 12.0), 50.0)
-        self.controller = ControllerDevice(self.wire.open(), [channel], clock=clock)
+        plants = [PlantChannel(entry.build)] * channels
+        self.plant = PlantDevice(self.wire.open(), plants, pace=pace, run=0, clock=clock)
+        laws = [ControllerChannel(Parameters(200.0, 12.0), 50.0)] * channels
+        self.controller = ControllerDevice(self.wire.open(), laws, clock=clock)
         self.controller.start()
         self.plant.start()
         monkeypatch.setattr(tuner_module, "open_bus", self.open)
@@ -305,3 +309,24 @@ def test_an_acceptance_does_not_end_an_experiment(in_real_time: Site) -> None:
 def test_gains_are_accepted_while_the_plant_stands_still(in_blocks: Site) -> None:
     assert in_blocks.loop.accept(NEW).gains == NEW
     assert in_blocks.controller.channels[0].lease == 0
+
+
+def test_a_pv_limit_has_its_name_while_another_channel_stands_at_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    site = Site(monkeypatch, pace=1.0, channels=2)
+    loop = BusLoop("wire", CONTROLLER_NODE, PLANT_NODE, 2)
+    one, two = site.controller.channels
+    loop.begin()
+    loop.step((RELAY, SetMode(Mode.EXPERIMENT)))
+    for pv_low in (0.0, 60.0):
+        one.start_relay(5.0, 0.0, 50.0, 0.0, 1000, pv_low, 100.0)
+        for _ in range(20):
+            loop.step(())
+    assert Emcy.PV_LIMIT in [EMCY_FRAME.unpack(data)[0] for data in site.wire.sent(emcy_id(CONTROLLER_NODE))]
+    assert two.mode == Mode.EXPERIMENT
+    two.start_relay(5.0, 0.0, 50.0, 0.0, 1000, 60.0, 100.0)
+    with pytest.raises(Failed) as caught:
+        for _ in range(20):
+            if loop.step(()).mode != Mode.EXPERIMENT:
+                pytest.fail("it would be taken for somebody's hand")
+    assert caught.value.reason is Reason.PV_LIMIT
+    loop.close()
