@@ -485,6 +485,10 @@ class BusLoop:
         except BusError as error:
             self._forget()
             raise Failed(Reason.BUS_LOST, str(error)) from error
+        except OSError as error:  # an interface that disappears between two calls
+            self._forget()
+            text = f"bus {self._url!r} is lost ({error.strerror or error}): see that its interface is there and up"
+            raise Failed(Reason.BUS_LOST, text) from error
         except TunerError as error:
             if error.kind is Kind.TIMEOUT:
                 raise Failed(Reason.NODE_LOST, str(error)) from error

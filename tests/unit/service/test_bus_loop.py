@@ -330,3 +330,14 @@ def test_a_pv_limit_has_its_name_while_another_channel_stands_at_one(monkeypatch
                 pytest.fail("it would be taken for somebody's hand")
     assert caught.value.reason is Reason.PV_LIMIT
     loop.close()
+
+
+def test_an_interface_that_disappears_is_a_lost_bus(in_real_time: Site) -> None:
+    """The kernel says so at whatever call comes next; not each is one that the bus layer has a word for."""
+    state = in_real_time.loop.begin()
+    in_real_time.lost = OSError(19, "No such device")
+    with pytest.raises(Failed, match=r"No such device.*interface") as caught:
+        in_real_time.loop.step(())
+    assert caught.value.reason is Reason.BUS_LOST
+    in_real_time.lost = None
+    assert in_real_time.loop.restore(state).mode is state.mode
