@@ -497,15 +497,15 @@ class BusLoop:
             raise Refused(Reason.BAD_INPUT, f"the controller refused: {error}") from error
 
     def _state(self, tuner: Tuner) -> LoopState:
-        """In or out of a trial: the gains in effect."""
-        on_trial = bool(tuner.number("controller_on_trial"))
+        """The gains are the accepted ones, in or out of a trial: those that it ends with. Whoever reads here has none
+        on trial itself; what somebody else tries, or has forgotten, must not be written down as what to restore."""
         return LoopState(
             mode=Mode(int(tuner.number("controller_mode"))),
             sp=tuner.number("controller_setpoint"),
             pv=tuner.number("controller_received_pv"),
             mv=tuner.number("controller_mv"),
-            gains=_gains(tuner, "staged" if on_trial else "accepted"),
-            on_trial=on_trial,
+            gains=_gains(tuner, "accepted"),
+            on_trial=bool(tuner.number("controller_on_trial")),
             mv_low=tuner.number("controller_mv_low"),
             mv_high=tuner.number("controller_mv_high"),
             sample_time_s=tuner.number("sample_time", node=self._node) / 1e6,

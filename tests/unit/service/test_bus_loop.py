@@ -188,6 +188,7 @@ def time_passes(site: Site, seconds: float, beating: bool = False) -> None:
         if beating and tick % 5 == 0:
             beat.send(heartbeat_id(TUNER_NODE), HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL))
         site.pump()
+        site.controller.runtime.poll(1e-9)  # an idle device looks at the clock
 
 
 def let_run(site: Site, samples: int = FOREVER) -> None:
@@ -341,3 +342,26 @@ def test_an_interface_that_disappears_is_a_lost_bus(in_real_time: Site) -> None:
     assert caught.value.reason is Reason.BUS_LOST
     in_real_time.lost = None
     assert in_real_time.loop.restore(state).mode is state.mode
+
+
+@pytest.mark.parametrize("lease", [0, 50], ids=["forgotten", "of a tuner that has died"])
+def test_gains_that_somebody_tries_are_not_the_ones_to_come_back_to(in_real_time: Site, lease: int) -> None:
+    """What a job writes down as found, before it begins, and what it then finds are the same."""
+    let_run(in_real_time)
+    loop, channel = in_real_time.loop, in_real_time.controller.channels[0]
+    channel.renew_lease(lease)
+    channel.stage(Parameters(999.0, 3.0))
+    channel.try_staged()
+    found = loop.read()
+    assert found.on_trial and found.gains == Gains(200.0, 12.0)
+    time_passes(in_real_time, 0.1 * lease + 1.0)
+    assert loop.begin().gains == found.gains
+    assert not loop.restore(found).on_trial
+
+
+def test_an_acceptance_ends_a_forgotten_trial(in_real_time: Site) -> None:
+    channel = in_real_time.controller.channels[0]
+    channel.stage(Parameters(999.0, 3.0))
+    channel.try_staged()
+    assert in_real_time.loop.read().gains == Gains(200.0, 12.0), "what the decision compares with"
+    assert in_real_time.loop.accept(NEW).gains == NEW and not channel.on_trial
