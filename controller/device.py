@@ -171,17 +171,21 @@ class ControllerDevice:
     # Going back
 
     def _go_back_from_trials(self, cause: Cause) -> int:
-        """Every channel on which a tuner has something open; the mask of the first 32 of them."""
+        """Every channel on which a tuner has something open; the mask of them."""
         mask = 0
         for at, channel in enumerate(self.channels):
             if channel.lease or channel.on_trial or channel.mode is Mode.EXPERIMENT:
                 channel.go_back(cause)
                 mask |= 1 << at
-        return mask & 0xFFFFFFFF
+        return mask
 
-    def _on_heartbeat_lost(self, node: int) -> bytes:
-        mask = self._go_back_from_trials(Cause.HEARTBEAT) if node == TUNER_NODE else 0
-        return mask.to_bytes(4, "little")
+    def _on_heartbeat_lost(self, node: int) -> bytes | None:
+        """A tuner that has let every loop go may fall silent. It leaves the watch armed, for it cannot know whether
+        another tuner holds a loop here; we know. The emergency names the first 32 channels."""
+        if node != TUNER_NODE:
+            return bytes(4)
+        mask = self._go_back_from_trials(Cause.HEARTBEAT)
+        return (mask & 0xFFFFFFFF).to_bytes(4, "little") if mask else None
 
     def _on_leave_operational(self) -> None:
         self._go_back_from_trials(Cause.NMT)

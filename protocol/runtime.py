@@ -63,8 +63,8 @@ class Runtime:
         """Called with the wall time about every 20 ms, and at least every 64 frames."""
         self.on_leave_operational: Callable[[], None] = lambda: None
         self.on_reset: Callable[[], None] = lambda: None
-        self.on_heartbeat_lost: Callable[[int], bytes] = lambda node: b""
-        """Node lost; returns what EMCY 8130h carries behind the node."""
+        self.on_heartbeat_lost: Callable[[int], bytes | None] = lambda node: b""
+        """Node lost; returns what EMCY 8130h carries behind the node, None when nothing hung on it: no emergency."""
         self.due: float | None = None
         """Wall time at which `on_due` is to be called next."""
         self.on_due: Callable[[], None] = lambda: None
@@ -210,9 +210,10 @@ class Runtime:
         for watch in self._watches.values():
             if watch.heard is not None and now - watch.heard > watch.limit_s:
                 watch.heard = None
-                watch.lost = True
                 detail = self.on_heartbeat_lost(watch.node)
-                self.raise_error(Emcy.HEARTBEAT_LOST, bytes((watch.node,)) + detail)
+                if detail is not None:
+                    watch.lost = True
+                    self.raise_error(Emcy.HEARTBEAT_LOST, bytes((watch.node,)) + detail)
 
     def _on_heartbeat(self, watch: _Watch, data: bytes) -> None:
         watch.heard = self.clock()

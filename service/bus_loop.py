@@ -458,7 +458,11 @@ class BusLoop:
         return state
 
     def _release(self) -> None:
-        """Our heartbeat ends; a plant that we ran in blocks runs on by itself, and others may take it."""
+        """Our heartbeat ends; a plant that we ran in blocks runs on by itself, and others may take it.
+
+        The watch on it stays armed: it is the node's, not the channel's, and another process may hold a loop there.
+        A controller that does not tell an idle tuner from a lost one says 8130h once we are silent; it harms nothing.
+        """
         if self._tuner is not None:
             self._tuner.beating = False
         if self._held is None:

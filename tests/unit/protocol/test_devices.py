@@ -283,11 +283,23 @@ class TestSessions:
         assert rig.write("heartbeat_consumer", 0x55 << 16 | 500, sub=2) is None
         rig.wait(0.1, alive=[0x55, TUNER_NODE])
         for _ in range(2):
+            rig.write("controller_lease", 1000)
             rig.wait(1.2)
             rig.wait(0.1, alive=[TUNER_NODE])
         sources = [data[3] for data in rig.wire.sent(emcy_id(CONTROLLER)) if data[:2] == b"\x30\x81"]
         assert sources == [0x55, TUNER_NODE, TUNER_NODE]
         assert rig.read("error_register") == 0x11
+
+    def test_a_tuner_with_nothing_open_may_fall_silent(self) -> None:
+        rig = Rig(channels=33)
+        rig.wait(0.1, alive=[TUNER_NODE])
+        rig.wait(1.5)
+        assert Emcy.HEARTBEAT_LOST not in rig.emergencies(CONTROLLER)
+        rig.write("controller_lease", 1000, sub=33)
+        rig.wait(0.1, alive=[TUNER_NODE])
+        rig.wait(1.5)
+        assert rig.read("controller_lease", sub=33) == 0, "the watch has stayed armed"
+        assert Emcy.HEARTBEAT_LOST in rig.emergencies(CONTROLLER)
 
     def test_no_trial_without_a_first_heartbeat_is_lost(self, rig: Rig) -> None:
         rig.run(1)

@@ -365,3 +365,17 @@ def test_an_acceptance_ends_a_forgotten_trial(in_real_time: Site) -> None:
     channel.try_staged()
     assert in_real_time.loop.read().gains == Gains(200.0, 12.0), "what the decision compares with"
     assert in_real_time.loop.accept(NEW).gains == NEW and not channel.on_trial
+
+
+@pytest.mark.parametrize("way", ["job", "acceptance"])
+def test_a_loop_let_go_is_no_emergency(in_real_time: Site, way: str) -> None:
+    loop = in_real_time.loop
+    if way == "job":
+        state = loop.begin()
+        loop.step(())
+        loop.restore(state)
+    else:
+        loop.accept(NEW)
+    let_run(in_real_time)
+    time_passes(in_real_time, 3.0)
+    assert in_real_time.wire.sent(emcy_id(CONTROLLER_NODE)) == []
