@@ -171,17 +171,21 @@ class ControllerDevice:
     # Going back
 
     def _go_back_from_trials(self, cause: Cause) -> int:
-        """Every channel on which a tuner has something open; the mask of the first 32 of them."""
+        """Every channel on which a tuner has something open; the mask of them."""
         mask = 0
         for at, channel in enumerate(self.channels):
             if channel.lease or channel.on_trial or channel.mode is Mode.EXPERIMENT:
                 channel.go_back(cause)
                 mask |= 1 << at
-        return mask & 0xFFFFFFFF
+        return mask
 
-    def _on_heartbeat_lost(self, node: int) -> bytes:
-        mask = self._go_back_from_trials(Cause.HEARTBEAT) if node == TUNER_NODE else 0
-        return mask.to_bytes(4, "little")
+    def _on_heartbeat_lost(self, node: int) -> bytes | None:
+        """A tuner that has let every loop go may fall silent. It leaves the watch armed, for it cannot know whether
+        another tuner holds a loop here; we know. The emergency names the first 32 channels."""
+        if node != TUNER_NODE:
+            return bytes(4)
+        mask = self._go_back_from_trials(Cause.HEARTBEAT)
+        return (mask & 0xFFFFFFFF).to_bytes(4, "little") if mask else None
 
     def _on_leave_operational(self) -> None:
         self._go_back_from_trials(Cause.NMT)
@@ -284,7 +288,7 @@ class ControllerDevice:
             )
         except ValueError:
             raise SdoAbort(Abort.INVALID_VALUE) from None
-        self.runtime.clear_error(Emcy.PV_LIMIT)
+        self.runtime.clear_error(Emcy.PV_LIMIT, bytes((sub,)))
 
     def _write_parameter_command(self, sub: int, value: Value) -> None:
         channel = self.channels[sub - 1]
@@ -307,7 +311,7 @@ class ControllerDevice:
     def _write_lease(self, sub: int, value: Value) -> None:
         self.channels[sub - 1].renew_lease(int(value))
         if value:
-            self.runtime.clear_error(Emcy.LEASE_USED_UP)
+            self.runtime.clear_error(Emcy.LEASE_USED_UP, bytes((sub,)))
 
     def _renew_lease(self, sub: int, value: Value) -> None:
         """Unlike a lease written, it never opens a session: one that has ended stays ended."""

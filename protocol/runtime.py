@@ -63,8 +63,8 @@ class Runtime:
         """Called with the wall time about every 20 ms, and at least every 64 frames."""
         self.on_leave_operational: Callable[[], None] = lambda: None
         self.on_reset: Callable[[], None] = lambda: None
-        self.on_heartbeat_lost: Callable[[int], bytes] = lambda node: b""
-        """Node lost; returns what EMCY 8130h carries behind the node."""
+        self.on_heartbeat_lost: Callable[[int], bytes | None] = lambda node: b""
+        """Node lost; returns what EMCY 8130h carries behind the node, None when nothing hung on it: no emergency."""
         self.due: float | None = None
         """Wall time at which `on_due` is to be called next."""
         self.on_due: Callable[[], None] = lambda: None
@@ -74,7 +74,8 @@ class Runtime:
         self._always: dict[int, Handler] = {}
         self._active: dict[int, Handler] = {}
         self._watches: dict[int, _Watch] = {}
-        self._errors: list[Emcy] = []
+        self._errors: list[tuple[Emcy, bytes]] = []
+        """Each with its source, the first byte of its detail: a channel, or a node that was lost."""
         self._history: list[int] = []
         self._next_heartbeat = 0.0
         self._countdown = self._between_ticks = 1
@@ -209,9 +210,10 @@ class Runtime:
         for watch in self._watches.values():
             if watch.heard is not None and now - watch.heard > watch.limit_s:
                 watch.heard = None
-                watch.lost = True
                 detail = self.on_heartbeat_lost(watch.node)
-                self.raise_error(Emcy.HEARTBEAT_LOST, bytes((watch.node,)) + detail)
+                if detail is not None:
+                    watch.lost = True
+                    self.raise_error(Emcy.HEARTBEAT_LOST, bytes((watch.node,)) + detail)
 
     def _on_heartbeat(self, watch: _Watch, data: bytes) -> None:
         watch.heard = self.clock()
@@ -220,8 +222,10 @@ class Runtime:
             self._heartbeats_back()
 
     def _heartbeats_back(self) -> None:
-        if not any(watch.lost for watch in self._watches.values()):
-            self.clear_error(Emcy.HEARTBEAT_LOST)
+        lost = {bytes((watch.node,)) for watch in self._watches.values() if watch.lost}
+        for code, source in list(self._errors):
+            if code is Emcy.HEARTBEAT_LOST and source not in lost:
+                self.clear_error(code, source)
 
     def _write_consumer(self, sub: int, value: Value) -> None:
         self._watch(sub, int(value))
@@ -244,17 +248,23 @@ class Runtime:
     # Emergencies
 
     def raise_error(self, code: Emcy, detail: bytes = b"") -> None:
-        """Says it once per occurrence; an error that stays is not repeated until `clear_error`."""
-        if code in self._errors:
+        """Says it once per occurrence; an error that stays is not repeated until `clear_error`.
+
+        The first byte of `detail` is the source. That of another source is said too: whoever holds channel 2 must not
+        miss what happens to it because channel 1 has the same error.
+        """
+        error = code, detail[:1]
+        if error in self._errors:
             return
-        self._errors.append(code)
+        self._errors.append(error)
         self._history = [int(code), *self._history][:4]
         self._send_emcy(code, EMCY_REGISTER[code], detail)
 
-    def clear_error(self, code: Emcy) -> None:
-        """With the last one gone, EMCY 0000h says so."""
-        if code in self._errors:
-            self._errors.remove(code)
+    def clear_error(self, code: Emcy, source: bytes | None = None) -> None:
+        """Of one source, or of all. EMCY 0000h says it, with the register of what is left."""
+        left = [error for error in self._errors if error[0] != code or source not in (None, error[1])]
+        if len(left) < len(self._errors):
+            self._errors = left
             self._send_emcy(Emcy.ERROR_GONE, self._error_register(), b"")
 
     def _send_emcy(self, code: Emcy, register: int, detail: bytes) -> None:
@@ -263,6 +273,6 @@ class Runtime:
 
     def _error_register(self) -> int:
         register = 0
-        for code in self._errors:
+        for code, _ in self._errors:
             register |= EMCY_REGISTER[code]
         return register

@@ -37,6 +37,8 @@ SILENCE_S = 1.0
 RESTORE_PATIENCE_S = 4.0
 COMMAND_WALL_S = 2.0
 """How long a handful of commands may take on a slow bus."""
+FASTEST_PER_S = 20_000
+"""More samples a second than a simulated plant at pace 0 makes when nobody runs it in blocks."""
 RELAY_LONGEST = 1_000_000  # samples; plans end their relays, and so does the lease
 MAX_GAP = 5
 
@@ -104,8 +106,7 @@ class BusLoop:
                 self._watch_us(tuner)
                 self._take_time(tuner)
                 state = replace(self._state(tuner), command_lag_samples=self._command_lag())
-                if state.mode is Mode.EXPERIMENT:
-                    raise Refused(Reason.WRONG_MODE, "an experiment is running in the controller")
+                self._no_experiment(state.mode)
                 self._plan_lease()
                 tuner.write("controller_lease", self._lease)
                 self._paid_at = time.monotonic()
@@ -167,15 +168,26 @@ class BusLoop:
             self._release()
 
     def accept(self, gains: Gains) -> LoopState:
-        with self._translated() as tuner:
-            held = tuner.beating
-            tuner.hold()
-            self._make_accepted(tuner, gains)
-            tuner.beating = held
-            state = self._state(tuner)
-            if state.on_trial or not _same_gains(state.gains, gains):
-                raise Failed(Reason.RESTORE_UNCONFIRMED, f"accepted {gains}, read back {state.gains}")
-            return state
+        """In a short session of its own, so that gains whose acceptance fails, or whose tuner dies, do not stay."""
+        try:
+            with self._translated() as tuner:
+                self._watch_us(tuner)
+                self._no_experiment(Mode(int(tuner.number("controller_mode"))))
+                lease = self._short_lease(tuner)
+                self._stage(tuner, gains)
+            try:
+                with self._translated() as tuner:
+                    tuner.write("controller_lease", lease)
+                    tuner.write("controller_parameter_command", ParameterCommand.TRY)
+                    tuner.write("controller_parameter_command", ParameterCommand.ACCEPT)
+                state = self._let_go()
+                if state.on_trial or not _same_gains(state.gains, gains):
+                    raise Failed(Reason.RESTORE_UNCONFIRMED, f"accepted {gains}, read back {state.gains}")
+                return state
+            except Ended as ended:
+                return self._after_all(gains, ended)
+        finally:
+            self._release()
 
     def close(self) -> None:
         self._release()
@@ -252,6 +264,19 @@ class BusLoop:
             return
         self._lease = max(SHORTEST_LEASE, math.ceil(LEASE_WALL_S * self._pace / self._sample_time_s))
 
+    def _short_lease(self, tuner: Tuner) -> int:
+        """Samples of LEASE_WALL_S, whoever runs the plant. It may run freely at pace 0; where it stands still, the
+        watch on our heartbeat alone ends a session."""
+        pace = tuner.number("plant_pace") if self._plant is not None else 1.0
+        per_s = pace / (tuner.number("sample_time", node=self._node) / 1e6) if pace else FASTEST_PER_S
+        return max(SHORTEST_LEASE, math.ceil(LEASE_WALL_S * per_s))
+
+    @staticmethod
+    def _no_experiment(mode: Mode) -> None:
+        if mode is Mode.EXPERIMENT:
+            text = "an experiment is running in the controller: wait for its end, or set the mode to automatic"
+            raise Refused(Reason.WRONG_MODE, text)
+
     # -- on the way
 
     def _carry_out(self, tuner: Tuner, command: Command) -> None:
@@ -293,11 +318,14 @@ class BusLoop:
 
     def _try(self, tuner: Tuner, gains: Gains, pay: Callable[[Tuner], None] = lambda tuner: None) -> None:
         """pay: what keeps the session open while one write waits for the other, if there is a session."""
+        self._stage(tuner, gains, pay)
+        tuner.write("controller_parameter_command", ParameterCommand.TRY)
+
+    def _stage(self, tuner: Tuner, gains: Gains, pay: Callable[[Tuner], None] = lambda tuner: None) -> None:
         values = (gains.Kp, gains.Ti, gains.Td, gains.Tf, gains.b, gains.c)
         for name, value in zip(_PARAMETERS, values, strict=True):
             pay(tuner)
             tuner.write(f"controller_staged_{name}", value)
-        tuner.write("controller_parameter_command", ParameterCommand.TRY)
 
     def _keep(self, tuner: Tuner) -> None:
         """Pays for more when a third is used up: by samples, or by wall time that went by in waiting for answers of a
@@ -405,8 +433,36 @@ class BusLoop:
         self._try(tuner, gains)
         tuner.write("controller_parameter_command", ParameterCommand.ACCEPT)
 
+    def _let_go(self) -> LoopState:
+        """The state without a session. A lease of 0 ends what is on trial and leaves mode, set-point and output as they
+        are; going back would undo a hand that has been on them meanwhile."""
+        with self._translated() as tuner:
+            tuner.write("controller_lease", 0)
+            return self._state(tuner)
+
+    def _after_all(self, gains: Gains, why: Ended) -> LoopState:
+        """An acceptance that has failed: nothing may stay on trial. Where only an answer was lost, the gains are
+        accepted: what is read back counts."""
+        give_up = time.monotonic() + RESTORE_PATIENCE_S
+        state: LoopState | None = None
+        while state is None or state.on_trial:
+            if time.monotonic() > give_up:
+                text = "the end of the trial is not confirmed, the controller ends it by itself within seconds"
+                raise type(why)(why.reason, f"{why.detail}; {text}: read the loop before going on") from why
+            try:
+                state = self._let_go()
+            except Ended:
+                time.sleep(0.05)
+        if not _same_gains(state.gains, gains):
+            raise why
+        return state
+
     def _release(self) -> None:
-        """Our heartbeat ends; a plant that we ran in blocks runs on by itself, and others may take it."""
+        """Our heartbeat ends; a plant that we ran in blocks runs on by itself, and others may take it.
+
+        The watch on it stays armed: it is the node's, not the channel's, and another process may hold a loop there.
+        A controller that does not tell an idle tuner from a lost one says 8130h once we are silent; it harms nothing.
+        """
         if self._tuner is not None:
             self._tuner.beating = False
         if self._held is None:
@@ -433,6 +489,10 @@ class BusLoop:
         except BusError as error:
             self._forget()
             raise Failed(Reason.BUS_LOST, str(error)) from error
+        except OSError as error:  # an interface that disappears between two calls
+            self._forget()
+            text = f"bus {self._url!r} is lost ({error.strerror or error}): see that its interface is there and up"
+            raise Failed(Reason.BUS_LOST, text) from error
         except TunerError as error:
             if error.kind is Kind.TIMEOUT:
                 raise Failed(Reason.NODE_LOST, str(error)) from error
@@ -441,15 +501,15 @@ class BusLoop:
             raise Refused(Reason.BAD_INPUT, f"the controller refused: {error}") from error
 
     def _state(self, tuner: Tuner) -> LoopState:
-        """In or out of a trial: the gains in effect."""
-        on_trial = bool(tuner.number("controller_on_trial"))
+        """The gains are the accepted ones, in or out of a trial: those that it ends with. Whoever reads here has none
+        on trial itself; what somebody else tries, or has forgotten, must not be written down as what to restore."""
         return LoopState(
             mode=Mode(int(tuner.number("controller_mode"))),
             sp=tuner.number("controller_setpoint"),
             pv=tuner.number("controller_received_pv"),
             mv=tuner.number("controller_mv"),
-            gains=_gains(tuner, "staged" if on_trial else "accepted"),
-            on_trial=on_trial,
+            gains=_gains(tuner, "accepted"),
+            on_trial=bool(tuner.number("controller_on_trial")),
             mv_low=tuner.number("controller_mv_low"),
             mv_high=tuner.number("controller_mv_high"),
             sample_time_s=tuner.number("sample_time", node=self._node) / 1e6,

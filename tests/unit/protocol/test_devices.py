@@ -237,6 +237,20 @@ class TestSessions:
         try_gains(rig)
         assert rig.emergencies(CONTROLLER)[-1] == Emcy.ERROR_GONE
 
+    def test_each_channel_says_and_clears_its_own_error(self) -> None:
+        rig = Rig(channels=2)
+        rig.run(1)
+        for sub in (1, 2):
+            rig.write("controller_lease", 3, sub)
+            rig.run(3)
+        sources = [data[3] for data in rig.wire.sent(emcy_id(CONTROLLER)) if data[:2] == b"\x01\xff"]
+        assert sources == [1, 2]
+        registers = []
+        for sub in (1, 2):
+            rig.write("controller_lease", 1000, sub)
+            registers.append(rig.read("error_register"))
+        assert registers == [0x81, 0]
+
     def test_a_renewal_pays_for_a_session_and_never_opens_one(self, rig: Rig) -> None:
         rig.run(1)
         assert rig.write("controller_lease_renewal", 100) is Abort.DEVICE_STATE
@@ -263,6 +277,29 @@ class TestSessions:
         assert lost == [bytes((0x30, 0x81, 0x11, TUNER_NODE, 1, 0, 0, 0))]
         rig.wait(0.1, alive=[TUNER_NODE])
         assert Emcy.ERROR_GONE in rig.emergencies(CONTROLLER)
+
+    def test_a_heartbeat_is_lost_again_while_another_is_away(self, rig: Rig) -> None:
+        """Each loss ends what is open then: none may go unsaid because some other node is still missing."""
+        assert rig.write("heartbeat_consumer", 0x55 << 16 | 500, sub=2) is None
+        rig.wait(0.1, alive=[0x55, TUNER_NODE])
+        for _ in range(2):
+            rig.write("controller_lease", 1000)
+            rig.wait(1.2)
+            rig.wait(0.1, alive=[TUNER_NODE])
+        sources = [data[3] for data in rig.wire.sent(emcy_id(CONTROLLER)) if data[:2] == b"\x30\x81"]
+        assert sources == [0x55, TUNER_NODE, TUNER_NODE]
+        assert rig.read("error_register") == 0x11
+
+    def test_a_tuner_with_nothing_open_may_fall_silent(self) -> None:
+        rig = Rig(channels=33)
+        rig.wait(0.1, alive=[TUNER_NODE])
+        rig.wait(1.5)
+        assert Emcy.HEARTBEAT_LOST not in rig.emergencies(CONTROLLER)
+        rig.write("controller_lease", 1000, sub=33)
+        rig.wait(0.1, alive=[TUNER_NODE])
+        rig.wait(1.5)
+        assert rig.read("controller_lease", sub=33) == 0, "the watch has stayed armed"
+        assert Emcy.HEARTBEAT_LOST in rig.emergencies(CONTROLLER)
 
     def test_no_trial_without_a_first_heartbeat_is_lost(self, rig: Rig) -> None:
         rig.run(1)
