@@ -15,6 +15,7 @@ from tuning.reasons import Reason
 class LoopState:
     """What a loop is and must come back to. MV and PV in the loop's units, limits as the controller holds them.
 
+    gains: of a live loop the accepted ones, those that a trial ends with.
     command_lag_samples: how many samples a command may take to show before another's hand is suspected.
     """
 

@@ -69,7 +69,7 @@ class LiveView(BaseModel):
     pv: float | None = Field(description="Process value, PV units", examples=[49.8])
     mv: float | None = Field(description="Controller output, percent", examples=[41.2])
     mode: str = Field(description="off, manual, automatic or experiment", examples=["automatic"])
-    gains: GainsView = Field(description="Gains in effect")
+    gains: GainsView = Field(description="Gains in effect; while another tuner has others on trial, the accepted ones")
     on_trial: bool = Field(description="True while gains are on trial under the tuner's lease")
     mv_low: float = Field(description="The controller's own lower output limit, percent", examples=[0.0])
     mv_high: float = Field(description="The controller's own upper output limit, percent", examples=[100.0])
