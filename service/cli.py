@@ -136,7 +136,7 @@ def serve(
         die(f"the database cannot be used: {getattr(error, 'orig', None) or error}", 2)
     except OSError as error:
         if data.exists() and not data.is_dir():
-            die(f"{data} is a file: --data takes a folder", 2)
+            die(f"cannot write to {data}: it is a file, --data takes a folder", 2)
         if error.errno == errno.EADDRINUSE:
             die(f"cannot listen on {bind}:{port}, another program does: choose another with --port", 2)
         die(f"cannot listen on {bind}:{port} or write to {data}: {error.strerror or error}", 2)
