@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from service.api.app import create_app
+from service.security.principal import SERVICE, current
 from service.store.store import Store
 from tests.unit.service.fakes import Service
 from tests.unit.service.postgres import Server, binaries
@@ -16,6 +17,14 @@ with warnings.catch_warnings():
     # starlette warns that its test client will want another HTTP package one day.
     warnings.simplefilter("ignore")
     from fastapi.testclient import TestClient
+
+
+@pytest.fixture(autouse=True)
+def as_the_service() -> Iterator[None]:
+    """A command that ran in this process leaves word of who gave it."""
+    token = current.set(SERVICE)
+    yield
+    current.reset(token)
 
 
 @pytest.fixture
