@@ -62,6 +62,7 @@ def test_a_back_up_of_a_service_that_writes_is_of_one_moment(data: Path, tmp_pat
     store = Store(data)
     stop = threading.Event()
     written = 0
+    once_more = threading.Event()
 
     def write() -> None:
         nonlocal written
@@ -70,11 +71,14 @@ def test_a_back_up_of_a_service_that_writes_is_of_one_moment(data: Path, tmp_pat
             store.add_samples(row.id, "relay", [Sample(0.1 * n, 1.0, 2.0, 3.0, 2) for n in range(500)])
             store.move(row.id, JobState.FAILED, reason="internal")
             written += 1
+            once_more.set()
 
     writer = threading.Thread(target=write)
     writer.start()
     try:
         for n in range(5):
+            once_more.clear()
+            assert once_more.wait(60)  # it writes between any two
             seen = written
             back_up(data, tmp_path / f"b{n}")
             with closing(sqlite3.connect(tmp_path / f"b{n}")) as copy:
@@ -87,7 +91,6 @@ def test_a_back_up_of_a_service_that_writes_is_of_one_moment(data: Path, tmp_pat
         stop.set()
         writer.join()
         store.close()
-    assert written > 5
 
 
 def test_restore_keeps_what_was_there(data: Path, tmp_path: Path) -> None:
