@@ -68,7 +68,7 @@ def redesigned(
     model = job_model(row, events)
     doubt: dict[str, float | None] = {"uncertainty": None, "ambiguity": None}
     evidence = record.evidence() if record and row.request.get("method") == FAST else None
-    _not_disproved(row, DISPROVED[:1] if evidence else DISPROVED)
+    _not_disproved(row, (Reason.WRONG_SIGN,) if evidence else DISPROVED)
     try:
         if evidence is not None:
             judged = judge_again(evidence, Wish(ms, derivative))

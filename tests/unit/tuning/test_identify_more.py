@@ -13,6 +13,7 @@ from scipy.signal import cont2discrete, lfilter
 from controller.channel import Channel, Mode, Parameters, Settings
 from plantsim.plant import LinearPlant
 from tests.unit.tuning import recordings
+from tuning.feedback import follows_from_pv
 from tuning.identify import Identified, identify
 from tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
 
@@ -223,3 +224,9 @@ def test_a_loop_in_plain_operation_is_no_test_of_its_plant(moved: bool) -> None:
     found = identify(TS * np.arange(1500), u, y)
     assert any("follows from PV alone" in note for note in found.notes) is not moved
     assert moved or not found.explained
+
+
+def test_a_short_record_whose_only_moves_come_first_is_no_feedback() -> None:
+    """Few samples have many values of MV for their number."""
+    u = np.array([0.0, 1.0, *18 * [2.0]])
+    assert not follows_from_pv(u, np.cumsum(u))
