@@ -287,21 +287,26 @@ def test_a_job_that_waits_for_its_turn_ends_at_once_when_aborted(started: list[S
     assert [event.kind for event in service.store.events(row.id)] == ["state", "abort_requested", "state"]
 
 
+def as_it_gets_its_turn(monkeypatch: pytest.MonkeyPatch, happens: Callable[[], object]) -> None:
+    """Between the job's row being read and its being among those that run."""
+    last_sample_s = Store.last_sample_s
+
+    def meanwhile(store: Store, job: str) -> float:
+        found = last_sample_s(store, job)
+        happens()
+        return found
+
+    monkeypatch.setattr(Store, "last_sample_s", meanwhile)
+
+
 def test_an_abort_just_as_the_job_gets_its_turn_is_kept(
     started: list[Service], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Answered as aborted, for it was waiting: then its test must not begin."""
     job_id = left(tmp_path)
-    last_sample_s = Store.last_sample_s
-
-    def aborted_meanwhile(store: Store, job: str) -> float:
-        found = last_sample_s(store, job)
-        answers.append(service.jobs.abort(job_id, "me").state)
-        return found
-
     answers: list[str] = []
     service = again(started, tmp_path, engine=Forgetful())  # has the job, and does not begin it
-    monkeypatch.setattr(Store, "last_sample_s", aborted_meanwhile)
+    as_it_gets_its_turn(monkeypatch, lambda: answers.append(service.jobs.abort(job_id, "me").state))
     service.jobs.work(job_id)
     assert answers == ["aborted"] and service.jobs.running(job_id) is None
     assert not service.tune.inside.is_set() and not texts(service, job_id, "resumed")
@@ -312,16 +317,9 @@ def test_a_wish_to_stop_written_just_as_the_job_gets_its_turn_is_heard(
     started: list[Service], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job_id = left(tmp_path)
-    last_sample_s = Store.last_sample_s
-
-    def wished_meanwhile(store: Store, job: str) -> float:
-        found = last_sample_s(store, job)
-        store.wish_to_stop(job_id, Reason.OPERATOR.value, "gateway B")
-        return found
-
     service = again(started, tmp_path, engine=Forgetful())
     monkeypatch.setattr(service.jobs, "_heed", lambda *_: None)  # the watcher comes later
-    monkeypatch.setattr(Store, "last_sample_s", wished_meanwhile)
+    as_it_gets_its_turn(monkeypatch, lambda: service.store.wish_to_stop(job_id, Reason.OPERATOR.value, "gateway B"))
     service.jobs.work(job_id)
     row = service.store.get(job_id)
     assert (row.state, row.reason) == ("aborted", "operator") and not service.tune.inside.is_set()
