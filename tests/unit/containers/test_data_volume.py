@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import sqlite3
 import subprocess
 import sys
@@ -21,8 +22,9 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def serve(folder: Path) -> subprocess.CompletedProcess[str]:
-    command = ["-m", "service", "serve", "--loops", f"{folder}/loops.yaml", "--data", f"{folder}/data", "--port", "0"]
+def serve(folder: Path, port: int = 0) -> subprocess.CompletedProcess[str]:
+    command = ["-m", "service", "serve", "--loops", f"{folder}/loops.yaml", "--data", f"{folder}/data"]
+    command += ["--port", str(port)]
     return subprocess.run([sys.executable, *command], capture_output=True, text=True, timeout=60, check=False)
 
 
@@ -47,4 +49,16 @@ def test_no_folder_can_be_made_there(folder: Path) -> None:
     (folder / "data").write_text("a file where the folder should be")
     done = serve(folder)
     assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1 and "write to" in done.stderr
+    assert len(done.stderr.splitlines()) == 1 and "it is a file" in done.stderr
+
+
+def test_a_port_that_is_taken_is_named(folder: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        done = serve(folder, other.getsockname()[1])
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1 and "choose another with --port" in done.stderr
+
+
+def test_a_port_that_is_none_is_refused(folder: Path) -> None:
+    done = serve(folder, 65536)
+    assert done.returncode == 2 and "--port" in done.stderr and "Traceback" not in done.stderr
