@@ -15,12 +15,12 @@ VALUES = 0.1
 
 
 def follows_from_pv(u: Reals, y: Reals) -> bool:
-    """u, y: MV and PV, shape (N,), neither constant. Of a PI or PID at a set-point that rests nothing is left; of a
+    """u, y: MV and PV, shape (N,), PV not constant. Of a PI or PID at a set-point that rests nothing is left; of a
     step, a relay or a set-point that acts on MV at once, nearly all."""
     moves = np.diff(u)
-    moves /= np.max(np.abs(moves))
     if len(np.unique(u)) < VALUES * len(u) or not np.any(moves[2:]):
         return False
+    moves /= np.max(np.abs(moves))
     centred = (y - y.mean()) / np.ptp(y)
     own = np.column_stack((np.ones(len(moves) - 2), moves[1:-1], moves[:-2]))
     of_pv = np.column_stack((own, centred[3:], centred[2:-1], centred[1:-2]))
