@@ -1,7 +1,7 @@
 # make demo    a loop is retuned before your eyes      make test    every test and every check
 # make setup   the Python environment in .venv         make check   types, style, import directions, packages
 # make bench   every benchmark, in one table           make validate    the five papers, recomputed
-# make faults  every fault in every stage, live: 30 min
+# make faults  every fault in every stage, live: 30 min    make simulate    thousands of simulated disasters
 # make compose-test    the containers, with a real engine      make bench-tuning    how well "fast" tunes 121 plants
 
 PYTHON ?= python3
@@ -11,7 +11,7 @@ DEBIAN := user-mode-linux tshark can-utils iproute2 postgresql systemd
 ENGINE := docker.io docker-compose
 BESIDE := debootstrap user-mode-linux iproute2 e2fsprogs
 
-.PHONY: setup demo test compose-test check bench bench-tuning validate faults system clean
+.PHONY: setup demo test compose-test check bench bench-tuning validate faults simulate system clean
 
 setup: $(VENV)/.installed
 
@@ -57,6 +57,12 @@ validate: setup
 faults: setup
 	@sh tools/system-packages postgresql
 	$(BIN)/python -m tests.faults $(FAULTS)
+
+# Simulated disasters, a few a second on each core; fails on a bad one. SEEDS=20000 WRITE=1 writes docs/simulation.md.
+SEEDS ?= 2000
+simulate: setup
+	$(if $(WRITE),,$(BIN)/python -m tests.simulation --every-call)
+	$(BIN)/python -m tests.simulation --seeds $(SEEDS) $(if $(WRITE),--write)
 
 # Long; BENCH="--plants 20 --seeds 1" limits it.
 bench-tuning: setup

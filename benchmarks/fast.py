@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.optimize import least_squares, minimize
 
-from controller.channel import Channel, Settings
+from controller.channel import Channel, RelaySettings, Settings
 from controller.pid import Parameters
 from plantsim.plant import LinearPlant
 from tuning.fast.design import Wish
@@ -57,7 +57,7 @@ def _recorded(noise: float, seed: int) -> Evidence:
     u, y, switches = [], [], []
     for k in range(SAMPLES):
         if k == LISTENED:
-            channel.start_relay(1.0, 2.2 * noise, 0.0, 0.0, SAMPLES, -1e9, 1e9, 0.5, 3 if noise else 1)
+            channel.start_relay(RelaySettings(1.0, 2.2 * noise, 0.0, SAMPLES, -1e9, 1e9, 0.5, 3 if noise else 1))
         y.append(plant.pv)
         u.append(channel.step(plant.pv))
         if k > LISTENED and u[-1] != u[-2]:

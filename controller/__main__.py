@@ -5,14 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from controller.channel import Settings
 from controller.device import ControllerChannel, ControllerDevice
-from controller.memory import KeptError, keep, remembered
+from controller.memory import FileKeeper, KeptError, remembered
 from controller.pid import Parameters
 from protocol.process import ConfigError, node_id, read_channels, run_device
 from protocol.profile import CONTROLLER_NODE, PLANT_NODE, Mode
@@ -42,9 +40,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         rows = read_channels(options.config, common) if options.config else [{}] * options.channels
         channels = [_channel({**common, **row}) for row in rows]
-        kept = remembered(options.keep, len(channels)) if options.keep else None
+        kept = remembered(options.keep, [one.kept for one in channels]) if options.keep else None
         if kept:
-            channels = [replace(one, parameters=own) for one, own in zip(channels, kept, strict=True)]
+            channels = [one.with_kept(own) for one, own in zip(channels, kept, strict=True)]
     except (ConfigError, KeptError, KeyError, TypeError, ValueError) as error:
         print(f"controller: {error.args[0]}", file=sys.stderr)
         return 2
@@ -57,10 +55,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             options.ts,
             options.node,
             options.plant_node,
-            keep=partial(keep, options.keep) if options.keep else lambda accepted: None,
+            keeper=FileKeeper(options.keep) if options.keep else None,
         ),
         f"node {options.node:#04x} on {options.bus}: {len(channels)} channel(s), Ts {options.ts:g} s"
-        + (f", accepted gains from {options.keep}" if kept else ""),
+        + (f", as kept in {options.keep}" if kept else ""),
     )
 
 
@@ -90,7 +88,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--bus", required=True, metavar="URL", help="socketcan:vcan0, socketcand:HOST:PORT, ...")
     parser.add_argument("--channels", type=int, default=1, metavar="N", help="that many, all alike")
     parser.add_argument("--config", metavar="FILE", help="YAML list of channels, with the names of these options (_)")
-    parser.add_argument("--keep", type=Path, metavar="FILE", help="keeps accepted gains over a restart")
+    parser.add_argument("--keep", type=Path, metavar="FILE", help="keeps gains, mode, set-point over a restart")
     parser.add_argument("--ts", type=float, default=0.1, metavar="S", help="sample time, process seconds")
     for name, (default, text) in _NUMBERS.items():
         option = f"--{name.replace('_', '-')}"

@@ -1,22 +1,19 @@
-"""One loop inside the controller: modes, limits, the relay, sets on trial, and the way back.
+"""The control of one loop: modes, limits, the relay, gains on trial, and the way home.
 
-Changing the law or the mode never moves the output (OFF and MANUAL go to the output they stand for). What a tuner
-tries lives in a session: the first lease opens it and notes mode, set-point and manual output; when the lease runs out,
-or on `go_back`, the accepted parameters and all three come back.
+Changing the law or the mode never moves the output (OFF and MANUAL go to the output they stand for). Who may command
+what, and when a test ends, is the session's business (`controller.session`).
 """
 
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import dataclass
 
 from controller.pid import Parameters, Pid
-from protocol.profile import Cause, ExperimentState, Mode
+from controller.relay import Relay, RelaySettings
+from protocol.profile import Mode, RelayState
 
-MOST_AVERAGED = 100
-
-__all__ = ["Cause", "Channel", "ExperimentState", "Mode", "Parameters", "Settings"]
+__all__ = ["Channel", "Home", "Mode", "Parameters", "RelaySettings", "RelayState", "Settings"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,25 +45,14 @@ class Settings:
         return self.pv_low - width <= pv <= self.pv_high + width
 
 
-@dataclass(slots=True)
-class _Relay:
-    amplitude: float
-    hysteresis: float
-    working_output: float
-    parallel_gain: float
-    samples_left: int
-    pv_low: float
-    pv_high: float
-    high: bool
-    amplitude_low: float
-    errors: deque[float]
-
-
 @dataclass(frozen=True, slots=True)
-class _Latched:
+class Home:
+    """What a channel comes back to at the end of a test; PV and MV units."""
+
     mode: Mode
     setpoint: float
     manual_output: float
+    mv: float
 
 
 class Channel:
@@ -92,23 +78,23 @@ class Channel:
         self.staged = parameters
         self.in_effect = parameters
         self.on_trial = False
-        self.cause = Cause.NONE
         self.accept_count = 0
         self.bad_samples = 0
-        self.experiment_state = ExperimentState.IDLE
+        self.good_samples = 0
+        self.measuring = False
+        """The last PV was valid."""
+        self.relay_state = RelayState.IDLE
         self._sample_time_s = sample_time_s
         self._settings = settings
         self._mode = Mode(mode)
-        self._mode_after_relay = self._mode
         self._setpoint = setpoint
         self._manual_output = manual_output
-        self._relay: _Relay | None = None
-        self._session: _Latched | None = None
-        self._lease = 0
+        self._relay: Relay | None = None
         self._pv: float | None = None
         self._pid = Pid(sample_time_s, parameters, settings.reverse)
-        start = settings.safe_output if self._mode is Mode.OFF else manual_output
-        self._mv = min(max(start, settings.mv_low), settings.mv_high)
+        self._mv = self._limited(settings.safe_output if self._mode is Mode.OFF else manual_output)
+        self._takes_over = self._mv
+        """The output from which the next law, or MANUAL, goes on."""
 
     @property
     def mode(self) -> Mode:
@@ -119,9 +105,8 @@ class Channel:
         return self._mv
 
     @property
-    def lease(self) -> int:
-        """Samples left; 0: no session."""
-        return self._lease
+    def relay(self) -> Relay | None:
+        return self._relay
 
     @property
     def setpoint(self) -> float:
@@ -151,21 +136,18 @@ class Channel:
         self._use(self.in_effect)
 
     def step(self, pv: float) -> float:
-        if self._relay is not None:
-            self._watch_relay(self._relay, pv)
-        if self._settings.measured(pv):
+        """MV for this sample."""
+        self.measuring = self._settings.measured(pv)
+        if self.measuring:
+            self.good_samples += 1
             if self._pv is None:
-                self._pid.rebase(self._setpoint, pv, self._mv)
+                self._pid.rebase(self._setpoint, pv, self._takes_over)
             self._pv = pv
-            self._mv = self._answer(pv)
+            self._mv = self._takes_over = self._answer(pv)
         else:
             self.bad_samples += 1
             if self._mode is Mode.MANUAL or self._mode is Mode.OFF:
-                self._mv = self._answer(pv)
-        if self._lease:
-            self._lease -= 1
-            if not self._lease:
-                self.go_back(Cause.LEASE)
+                self._mv = self._takes_over = self._answer(pv)
         return self._mv
 
     def command_mode(self, mode: Mode | int) -> None:
@@ -175,133 +157,81 @@ class Channel:
             return
         if mode is Mode.EXPERIMENT:
             raise ValueError("an experiment is started with its parameters, not by a mode")
-        if self._mode is Mode.EXPERIMENT:
-            self.experiment_state = ExperimentState.DONE
-        self._enter(mode)
+        self._end_relay(RelayState.DONE)
+        self._mode = mode
+        self._use(self.in_effect)
         if mode is Mode.MANUAL:
-            self._manual_output = self._mv
+            self._manual_output = self._takes_over
 
     def stage(self, parameters: Parameters) -> None:
         self.staged = parameters
 
-    def try_staged(self) -> None:
-        """The staged set goes on trial, all of it in one sample."""
+    def try_gains(self, parameters: Parameters) -> None:
+        """These go on trial, all of them in one sample."""
         self.on_trial = True
-        if self.staged != self.in_effect:
-            self._use(self.staged)
+        if parameters != self.in_effect:
+            self._use(parameters)
 
-    def accept(self) -> None:
-        """The set in effect becomes the one to come back to."""
-        self.accepted = self.in_effect
+    def accept(self, parameters: Parameters) -> None:
+        """These are in effect, and are the set to come back to."""
+        if parameters != self.in_effect:
+            self._use(parameters)
+        self.accepted = parameters
         self.on_trial = False
         self.accept_count += 1
 
-    def start_relay(
-        self,
-        amplitude: float,
-        hysteresis: float,
-        working_output: float,
-        parallel_gain: float,
-        max_samples: int,
-        pv_low: float,
-        pv_high: float,
-        amplitude_low: float = 0.0,
-        average: int = 1,
-    ) -> None:
-        """MV = working_output +- amplitude + parallel_gain*e, within the limits. MV units; hysteresis in PV units.
-
-        amplitude_low: of the lower side, 0 for the same.  average: the mean error of so many samples switches the
-        relay, up at e >= hysteresis and down at e <= -hysteresis (below 0 without hysteresis). It begins high unless
-        that would switch it, a running one on the side it is on, and ends by itself when PV leaves pv_low..pv_high or
-        after max_samples.
-        """
-        _finite(amplitude, hysteresis, working_output, parallel_gain, pv_low, pv_high, amplitude_low)
-        if amplitude <= 0 or hysteresis < 0 or max_samples <= 0 or pv_low >= pv_high:
-            raise ValueError("a relay needs amplitude > 0, hysteresis >= 0, max_samples > 0 and pv_low < pv_high")
-        if amplitude_low < 0 or not 1 <= average <= MOST_AVERAGED:
-            raise ValueError(f"a relay's low amplitude must be >= 0, its average 1 .. {MOST_AVERAGED} samples")
-        error = 0.0 if self._pv is None else self._error(self._pv)
-        high, errors = error > -hysteresis or error >= 0, deque([error], average)
-        if self._relay is not None:
-            high, errors = self._relay.high, deque(self._relay.errors, average)
-        if self._mode is not Mode.EXPERIMENT:
-            self._mode_after_relay = self._mode
-        self._relay = _Relay(
-            amplitude,
-            hysteresis,
-            working_output,
-            parallel_gain,
-            max_samples,
-            pv_low,
-            pv_high,
-            high,
-            amplitude_low or amplitude,
-            errors,
-        )
-        self._mode = Mode.EXPERIMENT
-        self.experiment_state = ExperimentState.RUNNING
-
-    def renew_lease(self, samples: int) -> None:
-        """samples > 0: that many are paid for, and a session opens if none is open.
-
-        0 closes the session: trial and experiment end with it, mode, set-point and manual output stay as they are.
-        """
-        if samples < 0:
-            raise ValueError("a lease must not be negative")
-        if samples and self._session is None:
-            mode = self._mode_after_relay if self._mode is Mode.EXPERIMENT else self._mode
-            self._session = _Latched(mode, self._setpoint, self._manual_output)
-        if not samples:
-            self._session = None
-            if self._mode is Mode.EXPERIMENT:
-                self.experiment_state = ExperimentState.DONE
-                self._enter(self._mode_after_relay)
-            if self.on_trial:
-                self.on_trial = False
-                self._use(self.accepted)
-        self._lease = samples
-
-    def go_back(self, cause: Cause) -> None:
-        """Ends trial, experiment and session: the accepted set, and what the session had noted."""
-        self.cause = Cause(cause)
+    def go_back(self) -> None:
+        """Ends the trial: the accepted set, from the present output on."""
         self.on_trial = False
-        mode = self._mode_after_relay if self._mode is Mode.EXPERIMENT else self._mode
-        if self._mode is Mode.EXPERIMENT:
-            self.experiment_state = ExperimentState.ENDED_BY_LIMIT if cause == Cause.PV_LIMIT else ExperimentState.DONE
-        if self._session is not None:
-            mode = self._session.mode
-            self._setpoint = self._session.setpoint
-            self._manual_output = self._session.manual_output
-        self._session = None
-        self._lease = 0
-        self.in_effect = self.accepted
-        self._enter(mode)
+        self._use(self.accepted)
 
-    def _enter(self, mode: Mode) -> None:
-        self._relay = None
-        self._mode = mode
-        self._use(self.in_effect)
+    def start_relay(self, settings: RelaySettings) -> None:
+        """Mode EXPERIMENT until something ends it; a running relay takes new settings on the side it is on."""
+        error = 0.0 if self._pv is None else self._error(self._pv)
+        self._relay = Relay(settings, error, self._relay)
+        self._mode = Mode.EXPERIMENT
+        self.relay_state = RelayState.RUNNING
+
+    @property
+    def home(self) -> Home:
+        """The channel as it is, to come back to; where a relay has just ended, MV is its working output already."""
+        return Home(self._mode, self._setpoint, self._manual_output, self._takes_over)
+
+    def go_home(self, home: Home, relay_state: RelayState = RelayState.DONE) -> None:
+        """Ends trial and relay: accepted gains, and mode, set-point and manual output of `home`.
+
+        The law goes on from the present output, from the working output where a relay ran.
+        """
+        self._end_relay(relay_state)
+        self.on_trial = False
+        self._mode, self._setpoint, self._manual_output = home.mode, home.setpoint, home.manual_output
+        self._use(self.accepted)
+
+    def without_pv(self, mv: float) -> None:
+        """The output at once where no PV comes: manual or safe output, in automatic `mv`, from which the law goes on
+        when PV is back. The rate limit does not hold here: there is no next sample to go on with."""
+        outputs = {Mode.MANUAL: self._manual_output, Mode.OFF: self._settings.safe_output}
+        self._mv = self._takes_over = self._limited(outputs.get(self._mode, mv))
+        self._pv = None
+
+    def _end_relay(self, state: RelayState) -> None:
+        if self._relay is not None:
+            self._takes_over = self._limited(self._relay.settings.working_output)
+            self._relay = None
+            self.relay_state = state
 
     def _use(self, parameters: Parameters) -> None:
         """This law from the present output on."""
         self.in_effect = parameters
         self._pid = Pid(self._sample_time_s, parameters, self._settings.reverse)
         if self._pv is not None:
-            self._pid.rebase(self._setpoint, self._pv, self._mv)
+            self._pid.rebase(self._setpoint, self._pv, self._takes_over)
 
     def _error(self, pv: float) -> float:
         return self._setpoint - pv if self._settings.reverse else pv - self._setpoint
 
-    def _watch_relay(self, relay: _Relay, pv: float) -> None:
-        """Ends the relay when its time is up or PV is out of bounds; a PV that is no number is not out of bounds."""
-        if relay.samples_left == 0:
-            self.go_back(Cause.PV_LIMIT)
-            self.experiment_state = ExperimentState.DONE
-        elif pv < relay.pv_low or pv > relay.pv_high:
-            self.go_back(Cause.PV_LIMIT)
-            self.experiment_state = ExperimentState.ENDED_BY_LIMIT
-        else:
-            relay.samples_left -= 1
+    def _limited(self, output: float) -> float:
+        return min(max(output, self._settings.mv_low), self._settings.mv_high)
 
     def _answer(self, pv: float) -> float:
         """The output this mode wants for this PV, within limits and rate."""
@@ -314,23 +244,12 @@ class Channel:
         if self._mode is Mode.AUTOMATIC:
             return self._pid.step(self._setpoint, pv, low, high)
         if self._relay is not None:
-            wanted = self._swing(self._relay, self._error(pv))
+            wanted = self._relay.output(self._error(pv))
         elif self._mode is Mode.MANUAL:
             wanted = self._manual_output
         else:
             wanted = settings.safe_output
         return low if wanted < low else high if wanted > high else wanted
-
-    @staticmethod
-    def _swing(relay: _Relay, error: float) -> float:
-        relay.errors.append(error)
-        mean = sum(relay.errors) / len(relay.errors)
-        if mean >= relay.hysteresis:
-            relay.high = True
-        elif mean <= -relay.hysteresis:
-            relay.high = False
-        swing = relay.amplitude if relay.high else -relay.amplitude_low
-        return relay.working_output + swing + relay.parallel_gain * error
 
 
 def _finite(*values: float) -> None:

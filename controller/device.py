@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
+import secrets
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from ctypes import c_float
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
-from controller.channel import Channel, Settings
+from controller.channel import Channel, Home, Settings
 from controller.pid import Parameters
+from controller.session import Session
 from protocol.bus import Bus
 from protocol.dictionary import Dictionary, Writer
 from protocol.objects import Device, Value
@@ -21,24 +26,29 @@ from protocol.profile import (
     PLANT_NODE,
     PV_FRAME,
     STATUS_FRAME,
-    TUNER_NODE,
+    UNASKED,
     Abort,
     Cause,
     Emcy,
-    Experiment,
-    ExperimentState,
+    Hand,
     Mode,
     NmtState,
+    Order,
     ParameterCommand,
     channel_ids,
 )
 from protocol.runtime import Runtime
 from protocol.sdo import SdoAbort
+from protocol.session import GAINS, STAGED, object_of
 
 _SHORTEST_PV_TIMEOUT_S = 1.0
 _PV_TIMEOUT_SAMPLES = 3
 
-_GAINS = {"kp": "Kp", "ti": "Ti", "td": "Td", "tf": "Tf", "b": "b", "c": "c"}
+_DRIVEN_S = 2.0
+_DRIVEN_SAMPLES = 10
+"""A set-point that an RPDO has moved within this time is driven by somebody: an outer loop, a ramp."""
+
+_GAINS = dict(zip(GAINS, ("Kp", "Ti", "Td", "Tf", "b", "c"), strict=True))
 _SETTINGS = {
     "controller_mv_low": "mv_low",
     "controller_mv_high": "mv_high",
@@ -47,6 +57,17 @@ _SETTINGS = {
     "controller_pv_low": "pv_low",
     "controller_pv_high": "pv_high",
 }
+_ENDED_BY = {Cause.LEASE: Emcy.LEASE_USED_UP, Cause.PV_LIMIT: Emcy.PV_LIMIT, Cause.HEARTBEAT: Emcy.TUNER_LOST}
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """What outlives a restart of one channel: the accepted gains, and home or the last choice of the rest."""
+
+    accepted: Parameters
+    mode: Mode
+    setpoint: float
+    manual_output: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,14 +80,63 @@ class ControllerChannel:
     mode: Mode = Mode.AUTOMATIC
     manual_output: float = 50.0
 
+    @property
+    def kept(self) -> Kept:
+        return Kept(self.parameters, self.mode, self.setpoint, self.manual_output)
 
-_Status = tuple[Mode, bool, float]
+    def with_kept(self, kept: Kept) -> ControllerChannel:
+        return replace(
+            self, parameters=kept.accepted, mode=kept.mode, setpoint=kept.setpoint, manual_output=kept.manual_output
+        )
+
+    def make(self, sample_time_s: float) -> Channel:
+        return Channel(sample_time_s, self.settings, self.parameters, self.setpoint, self.mode, self.manual_output)
+
+
+class Keeper(Protocol):
+    """Where the channels are kept over a restart."""
+
+    def now(self, channels: Sequence[Kept]) -> None:
+        """Returns when they are on the disk. Raises OSError; what is to hold then has to be given again, by `soon`."""
+        ...
+
+    def soon(self, channels: Sequence[Kept]) -> None:
+        """Returns at once, and has them written within seconds."""
+        ...
+
+
+class KeepNothing:
+    def now(self, channels: Sequence[Kept]) -> None:
+        pass
+
+    def soon(self, channels: Sequence[Kept]) -> None:
+        pass
+
+
+_Status = tuple[Mode, bool, float, bool, Cause]
+
+
+@dataclass(slots=True)
+class _PdoSetpoint:
+    """What the set-point's RPDO has brought. changed_at: of the controller's clock, s."""
+
+    value: float | None = None
+    changed_at: float = -math.inf
+
+
+def _home_gain(attribute: str, session: Session) -> float:
+    return float(getattr(session.home_gains, attribute))
+
+
+def _random_number() -> int:
+    return secrets.randbelow(0xFFFFFFFF) + 1
 
 
 class ControllerDevice:
-    """pv_timeout_s: wall time without a PV after which EMCY 8250h is sent; default 3 samples, at least 1 s.
+    """pv_timeout_s: wall time without a valid PV after which EMCY 8250h is sent; default 3 samples, at least 1 s.
 
-    keep: called with the accepted sets whenever one changes; what raises OSError there is not accepted.
+    keeper: where accepted gains, mode, set-point and manual output outlive a restart; gains it cannot keep are not
+    accepted.  draw: numbers of sessions.
     """
 
     def __init__(
@@ -78,142 +148,238 @@ class ControllerDevice:
         plant_node: int = PLANT_NODE,
         pv_timeout_s: float | None = None,
         clock: Callable[[], float] = time.monotonic,
-        keep: Callable[[Sequence[Parameters]], None] = lambda accepted: None,
+        keeper: Keeper | None = None,
+        draw: Callable[[], int] = _random_number,
     ) -> None:
-        self._keep = keep
+        self._started_with = list(channels)
+        self._started_sample_time_s = sample_time_s
+        self._asked_pv_timeout_s = pv_timeout_s
+        self._keeper: Keeper = keeper or KeepNothing()
+        self._keeps = keeper is not None
+        self._draw = draw
         count = len(channels)
         self._sample_time_s = sample_time_s
-        self._pv_timeout_s = pv_timeout_s or max(_SHORTEST_PV_TIMEOUT_S, _PV_TIMEOUT_SAMPLES * sample_time_s)
-        self.channels = [
-            Channel(sample_time_s, each.settings, each.parameters, each.setpoint, each.mode, each.manual_output)
-            for each in channels
-        ]
         self.dictionary = dictionary = Dictionary(Device.CONTROLLER, count, plant_node, node)
         self.runtime = runtime = Runtime(bus, node, dictionary, clock)
         self._send = bus.send
         ids = [channel_ids(k, plant_node, node) for k in range(1, count + 1)]
         self._mv_ids = [each.mv for each in ids]
         self._status_ids = [each.status for each in ids]
-        self._numbers = [0] * count
-        self._pvs = [0.0] * count
-        self._told: list[_Status | None] = [None] * count
-        self._pv_seen: list[tuple[int, float] | None] = [None] * count
         runtime.handlers = {
             **{each.pv: partial(self._on_pv, at) for at, each in enumerate(ids)},
             **{each.command: partial(self._on_command, at) for at, each in enumerate(ids)},
         }
+        runtime.lengths = {each.pv: PV_FRAME.size for each in ids} | {each.command: COMMAND_FRAME.size for each in ids}
         runtime.on_tick = self._on_tick
         runtime.on_leave_operational = self._on_leave_operational
-        runtime.on_heartbeat_lost = self._on_heartbeat_lost
+        runtime.on_heartbeat = self._on_heartbeat
         runtime.on_reset = self._on_reset
-        dictionary.set("sample_time", round(sample_time_s * 1e6))
-        for at, each in enumerate(channels):
-            dictionary.set("controller_relay_pv_low", each.settings.pv_low, at + 1)
-            dictionary.set("controller_relay_pv_high", each.settings.pv_high, at + 1)
         self._connect(dictionary)
+        self._power_on()
+        self._kept = self._to_keep()
+
+    @property
+    def channels(self) -> list[Channel]:
+        return [session.channel for session in self.sessions]
 
     def start(self) -> None:
         self.runtime.start()
 
+    def _power_on(self) -> None:
+        """Every channel, and what is staged, as the program was started."""
+        count = len(self._started_with)
+        self._numbers = [0] * count
+        self._pvs = [0.0] * count
+        self._told: list[_Status | None] = [None] * count
+        self._driven = [_PdoSetpoint() for _ in range(count)]
+        sample_time_s = self._started_sample_time_s
+        self._set_up([each.make(sample_time_s) for each in self._started_with], sample_time_s)
+        self.dictionary.restore(0x2000, 0xFFFF)
+        self.dictionary.set("sample_time", round(sample_time_s * 1e6))
+        for at, each in enumerate(self._started_with):
+            self.dictionary.set("controller_relay_pv_low", each.settings.pv_low, at + 1)
+            self.dictionary.set("controller_relay_pv_high", each.settings.pv_high, at + 1)
+
+    def _set_up(self, channels: Sequence[Channel], sample_time_s: float) -> None:
+        self._sample_time_s = sample_time_s
+        usual_s = max(_SHORTEST_PV_TIMEOUT_S, _PV_TIMEOUT_SAMPLES * sample_time_s)
+        self.sessions = [Session(each, self._draw, self._asked_pv_timeout_s or usual_s) for each in channels]
+
     # The sample
 
     def _on_pv(self, at: int, data: bytes) -> None:
-        if len(data) != PV_FRAME.size:
-            return
         pv, number = PV_FRAME.unpack(data)
         if number == self._numbers[at] and number:  # a frame that came twice is one sample
             return
         self._numbers[at] = number
         self._pvs[at] = pv
-        channel = self.channels[at]
-        lease = channel.lease
-        mv = channel.step(pv)
-        if (channel.mode, channel.on_trial, channel.setpoint) != self._told[at]:
-            self._report(at)
-        if lease == 1 and channel.cause is Cause.LEASE:
-            self.runtime.raise_error(Emcy.LEASE_USED_UP, bytes((at + 1,)))
+        session = self.sessions[at]
+        was_open = session.number
+        mv = session.step(pv)
+        self._report_if_new(at)
+        if was_open and not session.number:
+            self._say_end(at)
         self._send(self._mv_ids[at], MV_FRAME.pack(mv, number))
 
     def _on_command(self, at: int, data: bytes) -> None:
-        if len(data) != COMMAND_FRAME.size:
-            return
+        """The set-point by RPDO. A value that is repeated says nothing new: within a session it is passed over, and
+        after it it is nobody's hand while it is the set-point."""
         setpoint = COMMAND_FRAME.unpack(data)[0]
-        if setpoint - setpoint == 0.0:  # finite
-            self.channels[at].setpoint = setpoint
+        if not math.isfinite(setpoint):
+            return
+        session, driven = self.sessions[at], self._driven[at]
+        before = driven.value
+        if before is None:  # as an RPDO would carry it
+            before = c_float(session.home.setpoint if session.is_open else session.channel.setpoint).value
+        driven.value = setpoint
+        if setpoint != before:
+            driven.changed_at = self.runtime.clock()
+        elif session.is_open or setpoint == c_float(session.channel.setpoint).value:
+            return
+        with self._another_hand(at + 1, Hand.SETPOINT) as channel:
+            channel.setpoint = setpoint
 
-    def _report(self, at: int) -> None:
-        """The status PDO, and the emergency of an experiment that a limit has ended."""
-        channel = self.channels[at]
-        before = self._told[at]
-        self._told[at] = (channel.mode, channel.on_trial, channel.setpoint)
-        self._send(self._status_ids[at], STATUS_FRAME.pack(channel.mode, channel.on_trial, channel.setpoint))
-        ended = before is not None and before[0] is Mode.EXPERIMENT and channel.mode is not Mode.EXPERIMENT
-        if ended and channel.experiment_state is ExperimentState.ENDED_BY_LIMIT:
-            self.runtime.raise_error(Emcy.PV_LIMIT, bytes((at + 1,)))
+    def _report_if_new(self, at: int) -> None:
+        session = self.sessions[at]
+        channel = session.channel
+        status = channel.mode, channel.on_trial, channel.setpoint, session.is_open, session.cause
+        if status != self._told[at]:
+            self._told[at] = status
+            self._send(self._status_ids[at], STATUS_FRAME.pack(*status))
 
     def _on_tick(self, now: float) -> None:
         if self.runtime.state is not NmtState.OPERATIONAL:
             return
         silent = []
-        for at, channel in enumerate(self.channels):
-            if (channel.mode, channel.on_trial, channel.setpoint) != self._told[at]:
-                self._report(at)
-            seen, number = self._pv_seen[at], self._numbers[at]
-            if seen is None or seen[0] != number:
-                self._pv_seen[at] = (number, now)
-            elif now - seen[1] > self._pv_timeout_s:
+        for at, session in enumerate(self.sessions):
+            was_open = session.number
+            session.tick(now)
+            if was_open and not session.number:
+                self._say_end(at)
+            self._send_unasked(at)
+            self._report_if_new(at)
+            if session.silent:
                 silent.append(at + 1)
         if silent:
             self.runtime.raise_error(Emcy.NO_PV, bytes(silent[:1]))
         else:
             self.runtime.clear_error(Emcy.NO_PV)
+        self._keep_soon()
 
-    # Going back
+    # Sessions
 
-    def _go_back_from_trials(self, cause: Cause) -> int:
-        """Every channel on which a tuner has something open; the mask of them."""
-        mask = 0
-        for at, channel in enumerate(self.channels):
-            if channel.lease or channel.on_trial or channel.mode is Mode.EXPERIMENT:
-                channel.go_back(cause)
-                mask |= 1 << at
-        return mask
+    def _order(self, order: Order, sub: int, value: Value) -> None:
+        session, now = self.sessions[sub - 1], self.runtime.clock()
+        if order is Order.OPEN and not session.is_open:
+            if self.runtime.state is not NmtState.OPERATIONAL:  # no time would end it there
+                raise SdoAbort(Abort.DEVICE_STATE)
+            if self._is_driven(sub - 1, now):
+                raise SdoAbort(Abort.LOCAL_CONTROL)
+        was_open = session.number
+        values = [self.dictionary.get(name, sub) for name in STAGED[order]]
+        session.give(order, int(value), values, now, partial(self._store, sub))
+        if session.number and not was_open:
+            self.runtime.listen(each.holder for each in self.sessions)
+            for code in _ENDED_BY.values():
+                self.runtime.clear_error(code, bytes((sub,)))
+        self._report_if_new(sub - 1)
+        self._send_unasked(sub - 1)
 
-    def _on_heartbeat_lost(self, node: int) -> bytes | None:
-        """A tuner that has let every loop go may fall silent. It leaves the watch armed, for it cannot know whether
-        another tuner holds a loop here; we know. The emergency names the first 32 channels."""
-        if node != TUNER_NODE:
-            return bytes(4)
-        mask = self._go_back_from_trials(Cause.HEARTBEAT)
-        return (mask & 0xFFFFFFFF).to_bytes(4, "little") if mask else None
+    def _is_driven(self, at: int, now: float) -> bool:
+        return now - self._driven[at].changed_at < max(_DRIVEN_S, _DRIVEN_SAMPLES * self._sample_time_s)
+
+    def _renew(self, sub: int, value: Value) -> None:
+        self.sessions[sub - 1].renew(int(value), self.runtime.clock())
+
+    @contextmanager
+    def _another_hand(self, sub: int, what: Hand) -> Iterator[Channel]:
+        """The channel, for what somebody commands by the ordinary objects: a test on it is over."""
+        session = self.sessions[sub - 1]
+        session.another_hand(what)
+        try:
+            yield session.channel
+        finally:
+            session.settle()
+            self._send_unasked(sub - 1)
+
+    def _say_end(self, at: int) -> None:
+        code = _ENDED_BY.get(self.sessions[at].cause)
+        if code is not None:
+            self.runtime.raise_error(code, bytes((at + 1,)))
+
+    def _send_unasked(self, at: int) -> None:
+        """No PV asks for this output: the plant takes it as it comes."""
+        session = self.sessions[at]
+        if session.unasked:
+            session.unasked = False
+            self._send(self._mv_ids[at], MV_FRAME.pack(session.channel.mv, UNASKED))
+
+    def _on_heartbeat(self, node: int) -> None:
+        now = self.runtime.clock()
+        for session in self.sessions:
+            session.heard(node, now)
 
     def _on_leave_operational(self) -> None:
-        self._go_back_from_trials(Cause.NMT)
+        for at, session in enumerate(self.sessions):
+            session.end(Cause.NMT, operational=False)
+            self._report_if_new(at)
+            self._send_unasked(at)
 
     def _on_reset(self) -> None:
-        for at, channel in enumerate(self.channels):
-            channel.stage(channel.accepted)
-            self._told[at] = None
-            self._pv_seen[at] = None
+        """As at power-on: what is kept comes back, and else what the program was started with."""
+        if self._keeps:
+            pairs = zip(self._started_with, self._to_keep(), strict=True)
+            self._started_with = [each.with_kept(kept) for each, kept in pairs]
+        self._power_on()
+
+    # What outlives a restart
+
+    def _to_keep(self) -> list[Kept]:
+        return [self._kept_of(session, session.channel.accepted) for session in self.sessions]
+
+    @staticmethod
+    def _kept_of(session: Session, accepted: Parameters) -> Kept:
+        home: Home = session.kept
+        return Kept(accepted, home.mode, home.setpoint, home.manual_output)
+
+    def _keep_soon(self) -> None:
+        if not self._keeps:
+            return
+        kept = self._to_keep()
+        if kept != self._kept:
+            self._kept = kept
+            self._keeper.soon(kept)
+
+    def _store(self, sub: int, parameters: Parameters) -> None:
+        """Before they are accepted: what is confirmed is on the disk."""
+        kept = self._to_keep()
+        kept[sub - 1] = self._kept_of(self.sessions[sub - 1], parameters)
+        try:
+            self._keeper.now(kept)
+        except OSError as error:
+            print(f"controller: channel {sub} not accepted, it could not be kept: {error}", file=sys.stderr)
+            self._kept = self._to_keep()
+            self._keeper.soon(self._kept)
+            raise SdoAbort(Abort.NOT_STORED) from error
+        self._kept = kept
 
     # The object dictionary
 
     def _connect(self, dictionary: Dictionary) -> None:
         read, write = dictionary.on_read, dictionary.on_write
-        channels = self.channels
         read["sample_number"] = lambda sub: max(self._numbers)
         read["controller_received_pv"] = lambda sub: self._pvs[sub - 1]
-        write["controller_received_pv"] = self._only_by_pdo
-        read["controller_mode_command"] = read["controller_mode"] = lambda sub: channels[sub - 1].mode
+        for name in ("mode_command", "mode"):
+            self._reads(f"controller_{name}", lambda session: session.channel.mode)
         write["controller_mode_command"] = self._write_mode
-        read["controller_on"] = lambda sub: channels[sub - 1].mode >= Mode.AUTOMATIC
+        self._reads("controller_on", lambda session: session.channel.mode >= Mode.AUTOMATIC)
         write["controller_on"] = lambda sub, value: self._write_mode(sub, Mode.AUTOMATIC if value else Mode.OFF)
-        read["controller_manual_output"] = lambda sub: channels[sub - 1].manual_output
+        self._reads("controller_manual_output", lambda session: session.channel.manual_output)
         write["controller_manual_output"] = self._write_manual_output
-        read["controller_setpoint"] = lambda sub: channels[sub - 1].setpoint
+        self._reads("controller_setpoint", lambda session: session.channel.setpoint)
         write["controller_setpoint"] = self._write_setpoint
-        read["controller_mv"] = lambda sub: channels[sub - 1].mv
-        read["controller_action"] = lambda sub: not channels[sub - 1].settings.reverse
+        self._reads("controller_mv", lambda session: session.channel.mv)
+        self._reads("controller_action", lambda session: not session.channel.settings.reverse)
         write["controller_action"] = lambda sub, value: self._write_settings("reverse", sub, not value)
         for name, attribute in _SETTINGS.items():
             read[name] = partial(self._read_settings, attribute)
@@ -221,34 +387,48 @@ class ControllerDevice:
         for name, attribute in _GAINS.items():
             read[f"controller_staged_{name}"] = partial(self._read_gain, "staged", attribute)
             read[f"controller_accepted_{name}"] = partial(self._read_gain, "accepted", attribute)
+            self._reads(f"controller_home_{name}", partial(_home_gain, attribute))
             write[f"controller_staged_{name}"] = self._writer_of_gain(attribute)
         write["controller_parameter_command"] = self._write_parameter_command
-        read["controller_on_trial"] = lambda sub: channels[sub - 1].on_trial
-        read["controller_accept_count"] = lambda sub: channels[sub - 1].accept_count
-        read["controller_lease"] = lambda sub: channels[sub - 1].lease
-        write["controller_lease"] = self._write_lease
-        write["controller_lease_renewal"] = self._renew_lease
-        read["controller_cause"] = lambda sub: channels[sub - 1].cause
-        read["controller_experiment_state"] = lambda sub: channels[sub - 1].experiment_state
+        self._reads("controller_on_trial", lambda session: session.channel.on_trial)
+        self._reads("controller_accept_count", lambda session: session.channel.accept_count)
+        self._reads("controller_pv_valid", lambda session: session.pv_is_valid)
+        self._reads("controller_session_next", lambda session: session.next)
+        self._reads("controller_session", lambda session: session.number)
+        self._reads("controller_session_last", lambda session: session.last)
+        self._reads("controller_session_count", lambda session: session.count)
+        self._reads("controller_session_holder", lambda session: session.holder)
+        self._reads("controller_session_is_open", lambda session: session.is_open)
+        self._reads("controller_cause", lambda session: session.cause)
+        self._reads("controller_hand", lambda session: session.hand)
+        self._reads("controller_home_mode", lambda session: session.home.mode)
+        self._reads("controller_home_setpoint", lambda session: session.home.setpoint)
+        self._reads("controller_home_manual_output", lambda session: session.home.manual_output)
+        self._reads("controller_home_mv", lambda session: session.home.mv)
+        write["controller_session_renewal"] = self._renew
+        for order in Order:
+            write[object_of(order)] = partial(self._order, order)
+        self._reads("controller_relay_state", lambda session: session.channel.relay_state)
         read["controller_proportional_band"] = self._proportional_band
         read["controller_ti"] = partial(self._read_gain, "in_effect", "Ti")
         read["controller_td"] = partial(self._read_gain, "in_effect", "Td")
         read["controller_cycle_time"] = lambda sub: self._sample_time_s
         write["sample_time"] = self._write_sample_time
 
-    def _only_by_pdo(self, sub: int, value: Value) -> None:
-        raise SdoAbort(Abort.DEVICE_STATE)
+    def _reads(self, name: str, value: Callable[[Session], Value]) -> None:
+        self.dictionary.on_read[name] = lambda sub: value(self.sessions[sub - 1])
 
     def _read_settings(self, attribute: str, sub: int) -> float:
         return float(getattr(self.channels[sub - 1].settings, attribute))
 
     def _write_settings(self, attribute: str, sub: int, value: Value) -> None:
-        channel = self.channels[sub - 1]
         changed: dict[str, Any] = {attribute: value}
         try:
-            channel.settings = replace(channel.settings, **changed)
+            settings = replace(self.channels[sub - 1].settings, **changed)
         except ValueError:
             raise SdoAbort(Abort.MAXIMUM_BELOW_MINIMUM) from None
+        with self._another_hand(sub, Hand.LIMITS) as channel:
+            channel.settings = settings
 
     def _read_gain(self, parameter_set: str, attribute: str, sub: int) -> float:
         return float(getattr(getattr(self.channels[sub - 1], parameter_set), attribute))
@@ -261,63 +441,27 @@ class ControllerDevice:
         return write
 
     def _write_setpoint(self, sub: int, value: Value) -> None:
-        self.channels[sub - 1].setpoint = float(value)
+        with self._another_hand(sub, Hand.SETPOINT) as channel:
+            channel.setpoint = float(value)
 
     def _write_manual_output(self, sub: int, value: Value) -> None:
-        self.channels[sub - 1].manual_output = float(value)
+        with self._another_hand(sub, Hand.OUTPUT) as channel:
+            channel.manual_output = float(value)
 
     def _write_mode(self, sub: int, value: Value) -> None:
-        if value == Mode.EXPERIMENT:
-            self._start_experiment(sub)
-        else:
-            self.channels[sub - 1].command_mode(int(value))
-
-    def _start_experiment(self, sub: int) -> None:
-        if self.dictionary.get("controller_experiment", sub) != Experiment.RELAY:
-            raise SdoAbort(Abort.DEVICE_STATE)
-        amplitude, hysteresis, working_output, parallel_gain, pv_low, pv_high = (
-            float(self.dictionary.get(f"controller_relay_{name}", sub))
-            for name in ("amplitude", "hysteresis", "working_output", "parallel_gain", "pv_low", "pv_high")
-        )
-        most = int(self.dictionary.get("controller_relay_max_samples", sub))
-        low = float(self.dictionary.get("controller_relay_amplitude_low", sub))
-        average = int(self.dictionary.get("controller_relay_average", sub))
-        try:
-            self.channels[sub - 1].start_relay(
-                amplitude, hysteresis, working_output, parallel_gain, most, pv_low, pv_high, low, average
-            )
-        except ValueError:
-            raise SdoAbort(Abort.INVALID_VALUE) from None
-        self.runtime.clear_error(Emcy.PV_LIMIT, bytes((sub,)))
+        with self._another_hand(sub, Hand.MODE) as channel:
+            channel.command_mode(int(value))
 
     def _write_parameter_command(self, sub: int, value: Value) -> None:
-        channel = self.channels[sub - 1]
-        if value == ParameterCommand.GO_BACK:
-            channel.go_back(Cause.COMMAND)
-        elif channel.mode is Mode.EXPERIMENT:
-            raise SdoAbort(Abort.DEVICE_STATE)
-        elif value == ParameterCommand.TRY:
-            channel.try_staged()
-        else:
-            sets = [each.accepted for each in self.channels]
-            sets[sub - 1] = channel.in_effect
-            try:
-                self._keep(sets)
-            except OSError as error:
-                print(f"controller: channel {sub} not accepted, it could not be kept: {error}", file=sys.stderr)
-                raise SdoAbort(Abort.NOT_STORED) from error
-            channel.accept()
-
-    def _write_lease(self, sub: int, value: Value) -> None:
-        self.channels[sub - 1].renew_lease(int(value))
-        if value:
-            self.runtime.clear_error(Emcy.LEASE_USED_UP, bytes((sub,)))
-
-    def _renew_lease(self, sub: int, value: Value) -> None:
-        """Unlike a lease written, it never opens a session: one that has ended stays ended."""
-        if not self.channels[sub - 1].lease:
-            raise SdoAbort(Abort.DEVICE_STATE)
-        self.channels[sub - 1].renew_lease(int(value))
+        """Gains by hand, without a session."""
+        with self._another_hand(sub, Hand.GAINS) as channel:
+            if value == ParameterCommand.GO_BACK:
+                channel.go_back()
+            elif value == ParameterCommand.TRY:
+                channel.try_gains(channel.staged)
+            else:
+                self._store(sub, channel.in_effect)
+                channel.accept(channel.in_effect)
 
     def _proportional_band(self, sub: int) -> float:
         """Percent of span."""
@@ -330,7 +474,8 @@ class ControllerDevice:
         """A new cycle time starts every channel anew on its accepted set, at its present output."""
         if self.runtime.state is not NmtState.PRE_OPERATIONAL:
             raise SdoAbort(Abort.DEVICE_STATE)
-        self._sample_time_s = int(value) / 1e6
-        for at, old in enumerate(self.channels):
-            mode = Mode.AUTOMATIC if old.mode is Mode.EXPERIMENT else old.mode
-            self.channels[at] = Channel(self._sample_time_s, old.settings, old.accepted, old.setpoint, mode, old.mv)
+        sample_time_s = int(value) / 1e6
+        channels = [
+            Channel(sample_time_s, old.settings, old.accepted, old.setpoint, old.mode, old.mv) for old in self.channels
+        ]
+        self._set_up(channels, sample_time_s)

@@ -1,49 +1,128 @@
-"""What the controller keeps over a restart: the accepted set of each channel, in one JSON file.
+"""What the controller keeps over a restart, in one JSON file: accepted gains, mode, set-point, manual output.
 
-The file is replaced whole and is on the disk before an acceptance is confirmed: a set is never half written, and none
-is called accepted that a power cut would lose.
+The file is replaced whole, and file and folder are synced before an acceptance is confirmed: a set is never half
+written, and none is called accepted that a power cut would lose.
 """
 
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Sequence
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
+from controller.device import Kept
 from controller.pid import Parameters
+from protocol.durable import put_in_place
+from protocol.profile import Mode
 
-FORM = "loopwright controller 1"
+FORM = "loopwright controller 2"
+FORM_1 = "loopwright controller 1"
+"""Accepted gains only."""
+AGAIN_S = 5.0
 
 
 class KeptError(Exception):
     """The file is there but cannot be used; the text says what to do."""
 
 
-def remembered(path: Path, channels: int) -> list[Parameters] | None:
-    """The accepted sets, None when nothing has been kept yet. Raises KeptError rather than guess at gains."""
-    advice = "correct it, or remove it to start with the gains of the options"
+def remembered(path: Path, start: Sequence[Kept]) -> list[Kept] | None:
+    """What was kept, None when nothing has been yet. Raises KeptError rather than guess.
+
+    start: what the channels start with; from there comes what a file of an earlier form does not hold.
+    """
+    advice = "correct it, or remove it to start with the values of the options"
     try:
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        if kept["form"] != FORM:
-            raise ValueError(f"its form is {kept['form']!r}, not {FORM!r}")
-        sets = [Parameters(**{name: float(value) for name, value in row.items()}) for row in kept["accepted"]]
+        text = json.loads(path.read_text(encoding="utf-8"))
+        if text["form"] == FORM_1:
+            rows = [{"accepted": row} for row in text["accepted"]]
+        elif text["form"] == FORM:
+            rows = text["channels"]
+        else:
+            raise ValueError(f"its form is {text['form']!r}, not {FORM!r}")
+        if len(rows) != len(start):
+            raise KeptError(f"{path}: it keeps {len(rows)} channel(s), there are {len(start)}; {advice}")
+        return [_kept(row, each) for row, each in zip(rows, start, strict=True)]
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise KeptError(f"{path}: {error or type(error).__name__}; {advice}") from error
-    if len(sets) != channels:
-        raise KeptError(f"{path}: it keeps {len(sets)} channel(s), there are {channels}; {advice}")
-    return sets
 
 
-def keep(path: Path, accepted: Sequence[Parameters]) -> None:
-    """Raises OSError; the file is then the one of before."""
-    text = json.dumps({"form": FORM, "accepted": [asdict(each) for each in accepted]}, indent=2)
+def _kept(row: dict[str, Any], start: Kept) -> Kept:
+    accepted = Parameters(**{name: float(value) for name, value in row["accepted"].items()})
+    mode = Mode[row["mode"].upper()] if "mode" in row else start.mode
+    setpoint, output = float(row.get("setpoint", start.setpoint)), float(row.get("manual_output", start.manual_output))
+    if mode is Mode.EXPERIMENT or setpoint - setpoint != 0.0 or output - output != 0.0:
+        raise ValueError(f"no start with mode {mode.name.lower()}, set-point {setpoint}, manual output {output}")
+    return Kept(accepted, mode, setpoint, output)
+
+
+def write(path: Path, channels: Sequence[Kept]) -> None:
+    """Returns when it is on the disk. Raises OSError; the file is then the one of before, or this one where the disk
+    refused the very last step: who wrote it writes again what is to hold."""
+    rows = [
+        {
+            "accepted": asdict(each.accepted),
+            "mode": each.mode.name.lower(),
+            "setpoint": each.setpoint,
+            "manual_output": each.manual_output,
+        }
+        for each in channels
+    ]
     new = path.with_name(path.name + ".new")
     with new.open("w", encoding="utf-8") as file:
-        file.write(text + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-    new.replace(path)
+        file.write(json.dumps({"form": FORM, "channels": rows}, indent=2) + "\n")
+    put_in_place(new, path)
+
+
+class FileKeeper:
+    """Writes at once where somebody waits for it, and in a thread of its own where nobody does: no sample waits for a
+    disk. What cannot be written then is tried again, every `again_s` and with the next change."""
+
+    def __init__(
+        self, path: Path, write: Callable[[Path, Sequence[Kept]], None] = write, again_s: float = AGAIN_S
+    ) -> None:
+        self._path = path
+        self._write = write
+        self._again_s = again_s
+        self._disk = threading.Lock()
+        self._changed = threading.Condition()
+        self._wanted: Sequence[Kept] | None = None
+        """What was asked for last: nothing older is written after it."""
+        self._waiting: Sequence[Kept] | None = None
+        threading.Thread(target=self._run, name="keeper", daemon=True).start()
+
+    def now(self, channels: Sequence[Kept]) -> None:
+        with self._changed:
+            self._wanted, self._waiting = channels, None
+        with self._disk:
+            self._write(self._path, channels)
+
+    def soon(self, channels: Sequence[Kept]) -> None:
+        with self._changed:
+            self._wanted = self._waiting = channels
+            self._changed.notify()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting is not None)
+            with self._disk:
+                with self._changed:
+                    channels, self._waiting = self._waiting, None
+                if channels is None:
+                    continue
+                try:
+                    self._write(self._path, channels)
+                    continue
+                except OSError as error:
+                    print(f"controller: mode and set-point could not be kept: {error}", file=sys.stderr)
+            time.sleep(self._again_s)
+            with self._changed:
+                if self._wanted is channels:
+                    self._waiting = channels

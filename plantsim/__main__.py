@@ -30,7 +30,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         "plantsim",
         options.bus,
         lambda bus: PlantDevice(
-            bus, channels, options.ts, options.speed, seed=options.seed, node=options.node,
+            bus,
+            channels,
+            options.ts,
+            options.speed,
+            seed=options.seed,
+            node=options.node,
             controller_node=options.controller_node,
         ),
         f"node {options.node:#04x} on {options.bus}: {len(channels)} channel(s), Ts {options.ts:g} s",

@@ -20,6 +20,7 @@ from protocol.profile import (
     SYNC_COUNTER_OVERFLOW,
     SYNC_FRAME,
     SYNC_ID,
+    UNASKED,
     Abort,
     Emcy,
     NmtState,
@@ -64,16 +65,17 @@ class PlantDevice:
         self.runtime = runtime = Runtime(bus, node, dictionary, clock)
         self._send = bus.send
         self._pace = pace
-        self._remaining = run
+        self._remaining = self._run = run
         self._missing_in_all = 0
         self._next_at: float | None = None
         ids = [channel_ids(k, node, controller_node) for k in range(1, count + 1)]
         self._pv_ids = [each.pv for each in ids]
         runtime.handlers = {each.mv: partial(self._on_mv, at) for at, each in enumerate(ids)}
+        runtime.lengths = {each.mv: MV_FRAME.size for each in ids}
         runtime.on_tick = self._on_tick
         runtime.on_due = self._on_due
         runtime.on_leave_operational = lambda: self._unanswered.clear()
-        runtime.on_reset = self._initialise
+        runtime.on_reset = self._on_reset
         dictionary.set("sample_time", round(sample_time_s * 1e6))
         dictionary.set("plant_pace", pace)
         dictionary.set("plant_seed", seed)
@@ -85,6 +87,15 @@ class PlantDevice:
 
     def start(self) -> None:
         self.runtime.start()
+        self._schedule()
+
+    def _on_reset(self) -> None:
+        """All as the program was started, what was written since is gone."""
+        self.dictionary.restore(0x2000, 0xFFFF)
+        self._pace = float(self.dictionary.get("plant_pace"))
+        self._remaining = self._run
+        self._missing_in_all = 0
+        self._initialise()
         self._schedule()
 
     def _initialise(self) -> None:
@@ -110,7 +121,7 @@ class PlantDevice:
         """Latch the outputs, integrate one step, SYNC, PV with its number."""
         if self._remaining != FOREVER:
             self._remaining -= 1
-        self._number = number = self._number + 1 & 0xFFFFFFFF
+        self._number = number = self._number % 0xFFFFFFFF + 1  # 0 is UNASKED
         self._sync_counter = self._sync_counter % SYNC_COUNTER_OVERFLOW + 1
         self._unanswered.update(range(self._count))
         values = [plant.step(mv) for plant, mv in zip(self._plants, self._mv, strict=True)]
@@ -119,12 +130,12 @@ class PlantDevice:
             self._send(can_id, PV_FRAME.pack(pv, number))
 
     def _on_mv(self, at: int, data: bytes) -> None:
-        if len(data) != MV_FRAME.size:
-            return
         mv, number = MV_FRAME.unpack(data)
-        if number != self._number or mv - mv != 0.0:
+        if (number != self._number and number != UNASKED) or mv - mv != 0.0:
             return  # an answer to another sample, or no number: this sample stays unanswered
         self._mv[at] = 0.0 if mv < 0.0 else 100.0 if mv > 100.0 else mv
+        if number == UNASKED:
+            return
         self._unanswered.discard(at)
         if not self._unanswered:
             self._answered_number = number
@@ -207,11 +218,7 @@ class PlantDevice:
             "plant_seed": self._only_held,
             "plant_initialise": self._write_initialise,
             "plant_mv": self._write_mv,
-            "plant_output_sample_number": self._only_by_pdo,
         })
-
-    def _only_by_pdo(self, sub: int, value: Value) -> None:
-        raise SdoAbort(Abort.DEVICE_STATE)
 
     def _only_held(self, sub: int, value: Value) -> None:
         if self._remaining:

@@ -14,6 +14,8 @@ from typing import Any, Protocol
 import can
 from can.interfaces.socketcand import SocketCanDaemonBus
 
+from protocol.bus_state import ERROR_FRAME, TOLD, BusState, state_after, what_to_do, what_to_do_elsewhere
+
 Frame = tuple[int, bytes]
 
 _CAN_FRAME = struct.Struct("=IB3x8s")
@@ -23,15 +25,22 @@ _RECEIVE_BUFFER = 4 << 20  # the default holds about 275 frames, then frames van
 _SHORTEST_ARMED_S = 0.02  # SO_RCVTIMEO counts in kernel ticks (up to 10 ms): shorter waits go through poll
 _SEND_PATIENCE_S = 1.0
 SO_RCVBUFFORCE = 33
+_CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h
 _PASSED_OVER_S = 0.05  # how long frames that nobody wants may keep us beyond a time-out
 
 
 class BusError(Exception):
-    """The bus is not there, or not up. The text says what to do."""
+    """The bus is not there, not up, or bus-off. The text says what to do."""
 
 
 class Bus(Protocol):
     """One opening of a bus: standard identifiers, own frames are not returned. Not for use by two threads."""
+
+    @property
+    def state(self) -> BusState:
+        """What the CAN controller has said of itself since the opening. While it is bus-off, `send` raises BusError,
+        and so does `recv` once there is nothing left to receive."""
+        ...
 
     def send(self, can_id: int, data: bytes) -> None: ...
 
@@ -62,25 +71,15 @@ class RawBus:
     """Linux SocketCAN without a library in between."""
 
     def __init__(self, interface: str) -> None:
-        if not hasattr(socket, "AF_CAN"):
-            raise BusError("this system has no SocketCAN; use the loopback hub (socketcand:HOST:PORT)")
-        try:
-            self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
-        except OSError as error:
-            raise BusError(f"this kernel has no SocketCAN ({error.strerror})") from error
-        try:
-            _enlarge(self._socket)
-            self._socket.bind((interface,))
-        except OSError as error:
-            self._socket.close()
-            raise BusError(f"CAN interface {interface!r} cannot be opened: {error.strerror}") from error
+        self._socket = _opened(interface)
+        self.state = BusState.ACTIVE
         self._interface = interface
         self._armed: float | None = None
         self._poll = select.poll()
         self._poll.register(self._socket, select.POLLIN)
         # Bound once: looked up twice per frame otherwise.
         self._recv = self._socket.recv
-        self._send = self._socket.send
+        self._send: Callable[[bytes], int] = self._socket.send
 
     def send(self, can_id: int, data: bytes) -> None:
         frame = _CAN_FRAME.pack(can_id, len(data), data)
@@ -110,16 +109,34 @@ class RawBus:
                 raw = self._recv(16)
             else:
                 if timeout > 0.0 and not self._poll.poll(timeout * 1000.0):
-                    return None
+                    return self._nothing()
                 raw = self._recv(16, socket.MSG_DONTWAIT)
         except BlockingIOError:
-            return None
+            return self._nothing()
         except OSError as error:
+            if error.errno == errno.ENETDOWN:
+                self._become(BusState.ACTIVE)  # as it is when it comes up again, which no frame tells
             raise BusError(f"cannot receive on {self._interface!r}: {error.strerror}") from error
         can_id, length, data = _CAN_FRAME.unpack(raw)
         if can_id & _NOT_DATA:
-            return None
+            if can_id & ERROR_FRAME:
+                self._become(state_after(self.state, can_id, data[:length]))
+            return self._nothing()
         return can_id & _ID_MASK, data[:length] if length < 8 else data
+
+    def _nothing(self) -> Frame | None:
+        if self.state is BusState.BUS_OFF:
+            raise BusError(what_to_do(self._interface))
+        return None
+
+    def _become(self, state: BusState) -> None:
+        """The kernel takes frames for an interface that is bus-off, and drops them without a word. To say so costs
+        nothing where the bus works: what sends is changed, and does not look."""
+        self.state = state
+        self._send = self._refuse if state is BusState.BUS_OFF else self._socket.send
+
+    def _refuse(self, frame: bytes) -> int:
+        raise BusError(what_to_do(self._interface))
 
     def _arm(self, timeout: float | None) -> None:
         """The kernel keeps the time-out, so that a receive with the same one as last time is one system call."""
@@ -139,6 +156,24 @@ class RawBus:
 
     def close(self) -> None:
         self._socket.close()
+
+
+def _opened(interface: str) -> socket.socket:
+    """A raw socket that hears all data frames, and the error frames that tell of the controller's state."""
+    if not hasattr(socket, "AF_CAN"):
+        raise BusError("this system has no SocketCAN; use the loopback hub (socketcand:HOST:PORT)")
+    try:
+        sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+    except OSError as error:
+        raise BusError(f"this kernel has no SocketCAN ({error.strerror})") from error
+    try:
+        _enlarge(sock)
+        sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, TOLD)
+        sock.bind((interface,))
+    except OSError as error:
+        sock.close()
+        raise BusError(f"CAN interface {interface!r} cannot be opened: {error.strerror}") from error
+    return sock
 
 
 def _enlarge(sock: socket.socket) -> None:
@@ -172,6 +207,8 @@ class _Socketcand(SocketCanDaemonBus):
             raise can.CanError(f"expected {msg!r}, got {found!r}")
 
 
+_LIBRARY_STATES = {can.BusState.PASSIVE: BusState.PASSIVE, can.BusState.ERROR: BusState.BUS_OFF}
+
 _OPENED_BY: dict[str, Callable[..., can.BusABC]] = {"socketcand": _Socketcand}
 
 
@@ -191,6 +228,7 @@ class LibraryBus:
         try:
             self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
         except (OSError, can.CanError) as error:
+            self._raise_if_off()
             raise BusError(f"cannot send on {self._url!r}: {error}") from error
 
     def recv(self, timeout: float | None) -> Frame | None:
@@ -201,6 +239,8 @@ class LibraryBus:
                 message = self._bus.recv(left)
             except (OSError, can.CanError) as error:
                 raise BusError(f"cannot receive on {self._url!r}: {error}") from error
+            if message is None or message.is_error_frame:
+                self._raise_if_off()
             if message is None and timeout is not None:
                 return None
             if message is not None and self._wants(message):
@@ -211,6 +251,15 @@ class LibraryBus:
                 if over > _PASSED_OVER_S:
                     return None
                 left = max(0.0, -over)
+
+    @property
+    def state(self) -> BusState:
+        """As far as python-can offers it for the adapter; it does not tell WARNING."""
+        return _LIBRARY_STATES.get(self._bus.state, BusState.ACTIVE)
+
+    def _raise_if_off(self) -> None:
+        if self.state is BusState.BUS_OFF:
+            raise BusError(what_to_do_elsewhere(self._url))
 
     def _wants(self, message: can.Message) -> bool:
         if message.is_error_frame or message.is_remote_frame or message.is_extended_id:

@@ -36,6 +36,7 @@ class Dictionary:
             for sub in range(0 if entry.shape is Shape.VAR else 1, entry.count(channels) + 1)
         }
         self.set("emcy_cob_id", 0x80 + node)
+        self._start: dict[tuple[str, int], Value] = {}
 
     def get(self, name: str, sub: int = 0) -> Value:
         return self._values[name, sub]
@@ -44,10 +45,23 @@ class Dictionary:
         """From inside the device: no checks, no `on_write`."""
         self._values[name, sub] = value
 
+    def remember(self) -> None:
+        """The values there are now are those to `restore`."""
+        self._start = dict(self._values)
+
+    def restore(self, first: int, last: int) -> list[tuple[str, int]]:
+        """Sets the objects from index `first` to `last` back to what was remembered; name and sub-index of those that
+        were different. As `set`, it asks nobody."""
+        names = {entry.name for index, entry in self._by_index.items() if first <= index <= last}
+        changed = [key for key, value in self._start.items() if key[0] in names and self._values[key] != value]
+        for key in changed:
+            self._values[key] = self._start[key]
+        return changed
+
     def read(self, index: int, sub: int) -> bytes:
         """As an SDO upload sees it."""
         entry = self._entry(index, sub)
-        if entry.shape is not Shape.VAR and sub == 0:
+        if entry.shape is not Shape.VAR and sub == 0 and not entry.counted:
             return Type.U8.encode(entry.count(self.channels))
         if not entry.readable:
             raise SdoAbort(Abort.WRITE_ONLY)
@@ -58,11 +72,13 @@ class Dictionary:
         except OverflowError:  # a double beyond the range of a REAL32
             return entry.type_of(sub).encode(math.copysign(math.inf, float(value)))
 
+    def room(self, index: int, sub: int) -> int:
+        """Bytes that an SDO download must have, 0 for any number; refuses where nothing may be written."""
+        return self._writable(index, sub).type_of(sub).size
+
     def write(self, index: int, sub: int, data: bytes) -> None:
         """As an SDO download does it: access, length, finite, limits, then what the device itself says."""
-        entry = self._entry(index, sub)
-        if not entry.writable or (entry.shape is not Shape.VAR and sub == 0):
-            raise SdoAbort(Abort.READ_ONLY)
+        entry = self._writable(index, sub)
         try:
             value = entry.type_of(sub).decode(data)
         except struct.error:
@@ -72,6 +88,17 @@ class Dictionary:
         if writer:
             writer(sub, value)
         self._values[entry.name, sub] = value
+
+    def _writable(self, index: int, sub: int) -> Object:
+        entry = self._entry(index, sub)
+        if entry.shape is not Shape.VAR and sub == 0:
+            if not entry.counted:
+                raise SdoAbort(Abort.READ_ONLY)
+        elif not entry.writable:
+            raise SdoAbort(Abort.READ_ONLY)
+        elif entry.by_pdo:
+            raise SdoAbort(Abort.DEVICE_STATE)
+        return entry
 
     def _entry(self, index: int, sub: int) -> Object:
         entry = self._by_index.get(index)

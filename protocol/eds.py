@@ -11,9 +11,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
-from protocol.objects import Device, Object, Shape, Type, Value, default_of, objects_of
+from protocol.objects import Device, Object, Shape, Type, default_of, lookup, objects_of
 from protocol.pdos import pdo_objects
-from protocol.profile import CONTROLLER_NODE, PLANT_NODE
+from protocol.profile import CONTROLLER_NODE, PLANT_NODE, REVISION
 
 FILES = {Device.PLANT: "loopwright_plant.eds", Device.CONTROLLER: "loopwright_controller.eds"}
 FOLDER = Path(__file__).parent / "eds_files"
@@ -21,6 +21,8 @@ FOLDER = Path(__file__).parent / "eds_files"
 _NODE = {Device.PLANT: PLANT_NODE, Device.CONTROLLER: CONTROLLER_NODE}
 _VAR, _ARRAY, _RECORD = 0x7, 0x8, 0x9
 _MANDATORY = (0x1000, 0x1001, 0x1018)
+_MODIFIED = "11-22-2026"
+"""Month first. Set by hand with the revision: a date of generation would make every file differ."""
 _BIT_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
 
 
@@ -42,24 +44,28 @@ def eds(device: Device, channels: int = 1) -> str:
 def _head(device: Device, table: Sequence[Object]) -> Iterator[str]:
     receive = sum(1 for entry in table if 0x1400 <= entry.index < 0x1600)
     transmit = sum(1 for entry in table if 0x1800 <= entry.index < 0x1A00)
+    vendor, product, revision = (default_of(lookup("identity"), sub, device) for sub in (1, 2, 3))
     yield from (
         "[FileInfo]",
         f"FileName={FILES[device]}",
-        "FileVersion=1",
-        "FileRevision=0",
+        f"FileVersion={REVISION >> 16}",
+        f"FileRevision={REVISION & 0xFFFF}",
         "EDSVersion=4.0",
         f"Description=Loopwright {device.value}",
         "CreationTime=12:00AM",
         "CreationDate=01-01-2026",
         "CreatedBy=protocol.eds",
+        "ModificationTime=12:00AM",
+        f"ModificationDate={_MODIFIED}",
+        "ModifiedBy=protocol.eds",
         "",
         "[DeviceInfo]",
         "VendorName=Loopwright (vendor-ID 0 is for tests)",
-        "VendorNumber=0x0",
+        f"VendorNumber=0x{vendor:X}",
         f"ProductName=Loopwright {device.value}",
-        "ProductNumber=0x0",
-        "RevisionNumber=0x0",
-        "OrderCode=",
+        f"ProductNumber=0x{product:X}",
+        f"RevisionNumber=0x{revision:X}",
+        f"OrderCode=loopwright-{device.value}",
         *(f"BaudRate_{rate}=1" for rate in _BIT_RATES),
         "SimpleBootUpMaster=0",
         "SimpleBootUpSlave=1",
@@ -89,7 +95,7 @@ def _object(entry: Object, device: Device, channels: int) -> Iterator[str]:
     yield f"SubNumber=0x{count + 1:X}"
     yield from (
         "", f"[{section}sub0]", "ParameterName=Highest sub-index supported", f"ObjectType=0x{_VAR:X}",
-        f"DataType=0x{Type.U8.number:04X}", "AccessType=const", f"DefaultValue={count}", "PDOMapping=0",
+        f"DataType=0x{Type.U8.number:04X}", *_count_of(entry, count), "PDOMapping=0",
     )
     for sub in range(1, count + 1):
         name = entry.names[sub - 1] if entry.names else f"{entry.text} {sub}"
@@ -97,18 +103,24 @@ def _object(entry: Object, device: Device, channels: int) -> Iterator[str]:
 
 
 def _variable(entry: Object, section: str, name: str, sub: int, device: Device) -> Iterator[str]:
+    """What is only written has no default, nor has an entry that is there at times. A REAL32 has neither default nor
+    limits: readers of EDS files disagree on whether such a number is a decimal or the bits of one, and some refuse
+    writes for it. The device enforces its limits all the same."""
     data_type = entry.type_of(sub)
+    limits = ("LowLimit", entry.low), ("HighLimit", entry.high)
     yield from ("", f"[{section}]", f"ParameterName={name}", f"ObjectType=0x{_VAR:X}")
     yield f"DataType=0x{data_type.number:04X}"
     yield f"AccessType={_access(entry)}"
-    yield f"DefaultValue={_default(entry, sub, device)}"
+    if entry.readable and not entry.counted and data_type is not Type.REAL32:
+        yield f"DefaultValue={_default(entry, sub, device)}"
     yield f"PDOMapping={int(bool(entry.pdo))}"
-    if entry.low is not None:
-        yield f"LowLimit={_number(entry.low)}"
-    if entry.high is not None:
-        yield f"HighLimit={_number(entry.high)}"
-    if entry.unit:
-        yield f"Unit={entry.unit}"
+    if data_type is not Type.REAL32:
+        yield from (f"{key}={limit:.0f}" for key, limit in limits if limit is not None)
+
+
+def _count_of(entry: Object, count: int) -> tuple[str, str]:
+    """Access and default of sub-index 0."""
+    return ("AccessType=rw", "DefaultValue=0") if entry.counted else ("AccessType=const", f"DefaultValue={count}")
 
 
 def _access(entry: Object) -> str:
@@ -127,13 +139,6 @@ def _default(entry: Object, sub: int, device: Device) -> str:
         return f"$NODEID+0x{base:X}"
     if isinstance(value, int) and entry.type_of(sub) is Type.U32 and value > 0xFFFF:
         return f"0x{value:X}"
-    return _number(value)
-
-
-def _number(value: Value) -> str:
-    """Whole numbers without a point: some readers of EDS files take nothing else as a limit."""
-    if isinstance(value, float):
-        return str(int(value)) if value.is_integer() else f"{value:.9g}"
     return str(value)
 
 

@@ -7,10 +7,11 @@ CiA 301, 6000h-9FFFh carry the index and meaning publicly known of CiA 404.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
-from protocol.profile import SYNC_COUNTER_OVERFLOW, SYNC_ID, TUNER_NODE
+from protocol.profile import REVISION, SYNC_COUNTER_OVERFLOW, SYNC_ID, Order
 
 Value = int | float | str
 
@@ -82,6 +83,7 @@ class Object:
     low: float | None = None
     high: float | None = None
     unit: str = ""
+    """For who reads this table: EDS files have no place for it."""
     held: bool = False
     """Written only while the plant does not run (2011h = 0)."""
     names: tuple[str, ...] = ()
@@ -89,12 +91,18 @@ class Object:
     types: tuple[Type, ...] = ()
     """Types of the entries where they differ."""
     defaults: tuple[Value, ...] = ()
+    by_pdo: bool = False
+    """Written by PDOs alone: an SDO write is refused as not possible in the present state."""
+    counted: bool = False
+    """Sub-index 0 says how many entries there are at present, and may be written."""
     relative: tuple[int, ...] = ()
     """Sub-indices whose default moves with the node-ID (COB-IDs); the EDS says so."""
     is_record: bool = False
 
     def type_of(self, sub: int) -> Type:
-        return self.types[sub - 1] if self.types and sub > 0 else self.type
+        if sub == 0 and self.shape is not Shape.VAR:
+            return Type.U8
+        return self.types[sub - 1] if self.types else self.type
 
     def default_of(self, sub: int) -> Value:
         return self.defaults[sub - 1] if self.defaults and sub > 0 else self.default
@@ -125,7 +133,7 @@ _COMMUNICATION = (
     Object("device_type", 0x1000, U32, "ro", "Device type", BOTH),
     Object("error_register", 0x1001, U8, "ro", "Error register", BOTH, pdo="T"),
     Object("error_field", 0x1003, U32, "ro", "Pre-defined error field", BOTH, ENTRIES,
-           names=("Error 1", "Error 2", "Error 3", "Error 4")),
+           names=("Error 1", "Error 2", "Error 3", "Error 4"), counted=True),
     Object("sync_cob_id", 0x1005, U32, "ro", "COB-ID SYNC", BOTH, default=0x80),
     Object("sample_time", 0x1006, U32, "rw", "Communication cycle period", BOTH, default=100_000,
            low=100, high=3_600_000_000, unit="us"),
@@ -134,17 +142,25 @@ _COMMUNICATION = (
     Object("software_version", 0x100A, STRING, "const", "Manufacturer software version", BOTH, default="0.1.0"),
     Object("emcy_cob_id", 0x1014, U32, "ro", "COB-ID EMCY", BOTH, default=0x80, relative=(0,)),
     Object("heartbeat_consumer", 0x1016, U32, "rw", "Consumer heartbeat time", BOTH, ENTRIES,
-           names=("Tuner", "Peer device")),
+           names=("First node watched", "Second node watched")),
     Object("heartbeat_producer", 0x1017, U16, "rw", "Producer heartbeat time", BOTH, default=500,
            unit="ms"),
-    Object("identity", 0x1018, U32, "ro", "Identity object", BOTH, ENTRIES, names=_IDENTITY, is_record=True),
+    Object("identity", 0x1018, U32, "ro", "Identity object", BOTH, ENTRIES, names=_IDENTITY,
+           defaults=(0, 0, REVISION, 0), is_record=True),
     Object("sync_counter_overflow", 0x1019, U8, "ro", "Synchronous counter overflow value", BOTH,
            default=SYNC_COUNTER_OVERFLOW),
-    Object("sample_number", 0x2000, U32, "ro", "Sample number", BOTH, pdo="TR"),
+    # 1: no change of the NMT state. Control goes on when a node that is watched falls silent.
+    Object("error_behaviour", 0x1029, U8, "const", "Error behaviour", BOTH, ENTRIES, names=("Communication error",),
+           default=1),
+    # 0: operational by itself. Control does not wait for a master.
+    Object("nmt_startup", 0x1F80, U32, "ro", "NMT startup", BOTH),
+    Object("sample_number", 0x2000, U32, "rw", "Sample number", BOTH, pdo="TR", by_pdo=True),
+    Object("node_state", 0x2002, U8, "ro", "NMT state, as the heartbeat carries it", BOTH, default=5),
 )
 
 _PLANT = (
-    Object("plant_output_sample_number", 0x2001, U32, "rw", "Sample number of the output received", PLANT, pdo="R"),
+    Object("plant_output_sample_number", 0x2001, U32, "rw", "Sample number of the output received", PLANT, pdo="R",
+           by_pdo=True),
     Object("plant_pace", 0x2010, REAL32, "rw", "Pace (0 as fast as possible, 1 real time)", PLANT, default=1.0,
            low=0, high=1_000_000),
     Object("plant_samples_to_run", 0x2011, U32, "rw", "Samples to run (0 hold, FFFFFFFFh without end)", PLANT),
@@ -184,17 +200,61 @@ def _gains(first_index: int, access: str, prefix: str, text: str) -> tuple[Objec
     )
 
 
+_ORDERS = {
+    Order.OPEN: "open the session",
+    Order.CLOSE: "close the session",
+    Order.SETPOINT: "set-point",
+    Order.MODE: "mode",
+    Order.OUTPUT: "manual output",
+    Order.RELAY: "start the relay, or change it",
+    Order.TRY: "gains on trial",
+    Order.ACCEPT: "accept these gains",
+}
+
+
+def _session() -> tuple[Object, ...]:
+    """What is known of the session of a channel, and what the next one is opened with."""
+    rows: tuple[tuple[str, Type, str, str, dict[str, Any]], ...] = (
+        ("session_next", U32, "ro", "Number to open the next session with", {}),
+        ("session", U32, "ro", "Number of the open session (0 none)", {}),
+        ("session_last", U32, "ro", "Number of the session that ended last (0 none)", {}),
+        ("cause", U8, "ro", "Why it ended", {"pdo": "T"}),
+        ("hand", U8, "ro", "Moved by another hand since the opening (1 SP, 2 mode, 4 output, 8 gains, 16 limits)", {}),
+        ("session_count", U32, "ro", "Orders put in force in the session", {}),
+        ("session_renewal", U32, "wo", "Renewal of the lease (number of the session)", {}),
+        ("session_holder", U8, "ro", "Node-ID of the tuner that holds the session (0 none)", {}),
+        ("session_is_open", U8, "ro", "Session (0 none, 1 open)", {"pdo": "T"}),
+        ("session_tuner", U8, "rw", "Node-ID of the tuner, staged", {"default": 125, "low": 1, "high": 127}),
+        ("session_lease_samples", U32, "rw", "Lease, staged", {"default": 100, "low": 1}),
+        ("session_lease_ms", U32, "rw", "Lease by the controller's clock, staged",
+         {"default": 3000, "low": 1, "unit": "ms"}),
+        ("session_pv_silence_ms", U32, "rw", "Time without a valid PV that ends the session, staged",
+         {"default": 1000, "low": 1, "unit": "ms"}),
+        ("session_watch_ms", U32, "rw", "Time without the tuner's heartbeat that ends the session, staged",
+         {"default": 1000, "low": 1, "unit": "ms"}),
+        ("home_mode", U8, "ro", "Mode at the opening", {}),
+        ("home_setpoint", REAL32, "ro", "Set-point at the opening", {}),
+        ("home_manual_output", REAL32, "ro", "Manual output at the opening", {"unit": "%"}),
+        ("home_mv", REAL32, "ro", "MV at the opening", {"unit": "%"}),
+    )
+    return tuple(
+        Object(f"controller_{name}", 0x2130 + at, kind, access, text, CONTROLLER, CHANNELS, **more)
+        for at, (name, kind, access, text, more) in enumerate(rows)
+    )
+
+
 _CONTROLLER = (
-    Object("controller_mode_command", 0x2100, U8, "rw", "Mode command (0 off, 1 manual, 2 automatic, 3 experiment)",
-           CONTROLLER, CHANNELS, default=2, low=0, high=3),
-    Object("controller_mode", 0x2101, U8, "ro", "Mode in effect", CONTROLLER, CHANNELS, pdo="T"),
+    Object("controller_mode_command", 0x2100, U8, "rw", "Mode command (0 off, 1 manual, 2 automatic)", CONTROLLER,
+           CHANNELS, default=2, low=0, high=2),
+    Object("controller_mode", 0x2101, U8, "ro", "Mode in effect", CONTROLLER, CHANNELS, pdo="T", default=2),
     Object("controller_manual_output", 0x2102, REAL32, "rw", "Manual output", CONTROLLER, CHANNELS, pdo="R",
            low=0, high=100, unit="%"),
     Object("controller_mv_low", 0x2103, REAL32, "rw", "Output low limit", CONTROLLER, CHANNELS, low=0, high=100,
            unit="%"),
     Object("controller_mv_high", 0x2104, REAL32, "rw", "Output high limit", CONTROLLER, CHANNELS, default=100.0,
            low=0, high=100, unit="%"),
-    Object("controller_received_pv", 0x2105, REAL32, "rw", "Received process value X", CONTROLLER, CHANNELS, pdo="R"),
+    Object("controller_received_pv", 0x2105, REAL32, "rw", "Received process value X", CONTROLLER, CHANNELS, pdo="R",
+           by_pdo=True),
     Object("controller_safe_output", 0x2106, REAL32, "rw", "Safe output", CONTROLLER, CHANNELS, low=0, high=100,
            unit="%"),
     Object("controller_rate_limit", 0x2107, REAL32, "rw", "Output rate limit (0 none)", CONTROLLER, CHANNELS, low=0,
@@ -209,35 +269,45 @@ _CONTROLLER = (
     Object("controller_on_trial", 0x2121, U8, "ro", "Set in effect (0 accepted, 1 on trial)", CONTROLLER, CHANNELS,
            pdo="T"),
     Object("controller_accept_count", 0x2122, U32, "ro", "Accept counter", CONTROLLER, CHANNELS),
-    Object("controller_lease", 0x2130, U32, "rw", "Lease, samples left (0 none)", CONTROLLER, CHANNELS),
-    Object("controller_cause", 0x2131, U8, "ro", "Cause of the last going back", CONTROLLER, CHANNELS),
-    Object("controller_lease_renewal", 0x2132, U32, "wo", "Lease renewal, samples (refused without a lease)",
-           CONTROLLER, CHANNELS, low=1),
-    Object("controller_experiment", 0x2140, U8, "rw", "Experiment (0 none, 1 relay)", CONTROLLER, CHANNELS,
-           low=0, high=1),
-    Object("controller_relay_amplitude", 0x2141, REAL32, "rw", "Relay amplitude", CONTROLLER, CHANNELS, default=5.0,
-           low=0, high=100, unit="%"),
-    Object("controller_relay_hysteresis", 0x2142, REAL32, "rw", "Relay hysteresis", CONTROLLER, CHANNELS, low=0),
-    Object("controller_relay_working_output", 0x2143, REAL32, "rw", "Working output", CONTROLLER, CHANNELS,
-           default=50.0, low=0, high=100, unit="%"),
-    Object("controller_relay_max_samples", 0x2144, U32, "rw", "Most samples an experiment may take", CONTROLLER,
+    Object("controller_pv_valid", 0x2123, U8, "ro", "PV is valid (0 no number, out of its span, or silent)", CONTROLLER,
+           CHANNELS),
+    *_session(),
+    *_gains(0x2142, "ro", "home", "Accepted at the opening:"),
+    Object("controller_relay_amplitude", 0x2151, REAL32, "rw", "Relay amplitude, staged", CONTROLLER, CHANNELS,
+           default=5.0, low=0, high=100, unit="%"),
+    Object("controller_relay_hysteresis", 0x2152, REAL32, "rw", "Relay hysteresis, staged", CONTROLLER, CHANNELS,
+           low=0),
+    Object("controller_relay_working_output", 0x2153, REAL32, "rw", "Relay working output, staged", CONTROLLER,
+           CHANNELS, default=50.0, low=0, high=100, unit="%"),
+    Object("controller_relay_max_samples", 0x2154, U32, "rw", "Most samples the relay may take, staged", CONTROLLER,
            CHANNELS, default=6000, low=1),
-    Object("controller_relay_pv_low", 0x2145, REAL32, "rw", "PV low limit of an experiment", CONTROLLER, CHANNELS),
-    Object("controller_relay_pv_high", 0x2146, REAL32, "rw", "PV high limit of an experiment", CONTROLLER, CHANNELS,
-           default=100.0),
-    Object("controller_experiment_state", 0x2147, U8, "ro", "Experiment state (0 idle, 1 running, 2 done, 3 limit)",
-           CONTROLLER, CHANNELS, pdo="T"),
-    Object("controller_relay_parallel_gain", 0x2148, REAL32, "rw", "Relay parallel gain", CONTROLLER, CHANNELS, low=0),
-    Object("controller_relay_amplitude_low", 0x2149, REAL32, "rw", "Relay amplitude of the low side (0 the same)",
+    Object("controller_relay_pv_low", 0x2155, REAL32, "rw", "PV low limit of the relay, staged", CONTROLLER, CHANNELS),
+    Object("controller_relay_pv_high", 0x2156, REAL32, "rw", "PV high limit of the relay, staged", CONTROLLER,
+           CHANNELS, default=100.0),
+    Object("controller_relay_amplitude_low", 0x2157, REAL32, "rw", "Relay amplitude of the low side, staged (0 same)",
            CONTROLLER, CHANNELS, low=0, high=100, unit="%"),
-    Object("controller_relay_average", 0x214A, U8, "rw", "Samples whose mean switches the relay", CONTROLLER, CHANNELS,
-           default=1, low=1, high=100),
+    Object("controller_relay_average", 0x2158, U8, "rw", "Samples whose mean switches the relay, staged", CONTROLLER,
+           CHANNELS, default=1, low=1, high=100),
+    Object("controller_relay_state", 0x2159, U8, "ro", "Relay state (0 idle, 1 running, 2 done, 3 limit)",
+           CONTROLLER, CHANNELS, pdo="T"),
+    *_gains(0x2160, "rw", "session", "Session"),
+    Object("controller_session_setpoint", 0x2166, REAL32, "rw", "Set-point, staged", CONTROLLER, CHANNELS),
+    Object("controller_session_mode", 0x2167, U8, "rw", "Mode, staged (0 off, 1 manual, 2 automatic)", CONTROLLER,
+           CHANNELS, default=2, low=0, high=2),
+    Object("controller_session_output", 0x2168, REAL32, "rw", "Manual output, staged", CONTROLLER, CHANNELS, low=0,
+           high=100, unit="%"),
+    *(
+        Object(f"controller_order_{order.name.lower()}", 0x2170 + order, U32, "wo", f"Check of the order: {text}",
+               CONTROLLER, CHANNELS)
+        for order, text in _ORDERS.items()
+    ),
     Object("controller_setpoint", 0x6402, REAL32, "rw", "CO set point W", CONTROLLER, CHANNELS, pdo="TR"),
     Object("controller_pv_unit", 0x6406, U32, "ro", "CO physical unit XW", CONTROLLER, CHANNELS,
            default=DEGREE_CELSIUS),
     Object("controller_mv", 0x6410, REAL32, "ro", "CO effective controller output Y", CONTROLLER, CHANNELS, pdo="T",
            unit="%"),
-    Object("controller_on", 0x6422, BOOLEAN, "rw", "CO controller on/off", CONTROLLER, CHANNELS),
+    Object("controller_on", 0x6422, BOOLEAN, "rw", "CO controller on/off", CONTROLLER, CHANNELS,
+           default=1),
     Object("controller_proportional_band", 0x6450, REAL32, "ro", "CO proportional band Xp1", CONTROLLER, CHANNELS,
            unit="%"),
     Object("controller_ti", 0x6452, REAL32, "ro", "CO integral action time Tn1", CONTROLLER, CHANNELS, unit="s"),
@@ -247,8 +317,6 @@ _CONTROLLER = (
            default=SECOND),
 )
 
-TUNER_HEARTBEAT_MS = 1000
-"""Default of the controller's 1016h:1: after this long without the tuner, what it tried is taken back."""
 _SYNC_PRODUCER = 0x40000000
 
 _OWN_DEFAULTS: dict[tuple[Device, str, int], Value] = {
@@ -257,7 +325,6 @@ _OWN_DEFAULTS: dict[tuple[Device, str, int], Value] = {
     (PLANT, "device_name", 0): "Loopwright plant",
     (CONTROLLER, "device_name", 0): "Loopwright controller",
     (PLANT, "sync_cob_id", 0): _SYNC_PRODUCER | SYNC_ID,
-    (CONTROLLER, "heartbeat_consumer", 1): TUNER_NODE << 16 | TUNER_HEARTBEAT_MS,
 }
 
 OBJECTS: tuple[Object, ...] = _COMMUNICATION + _PLANT + _CONTROLLER
@@ -270,6 +337,12 @@ def lookup(name: str) -> Object:
     return BY_NAME[name]
 
 
+_OWN_OBJECTS: dict[tuple[Device, str], Object] = {
+    (PLANT, "sample_number"): replace(BY_NAME["sample_number"], access="ro", pdo="T", by_pdo=False),
+}
+"""Where both devices have an object and not in the same way: the plant gives the number, the controller is told."""
+
+
 def default_of(entry: Object, sub: int, device: Device) -> Value:
     """Where both devices have an object, its default may be the device's own."""
     return _OWN_DEFAULTS.get((device, entry.name, sub), entry.default_of(sub))
@@ -277,5 +350,5 @@ def default_of(entry: Object, sub: int, device: Device) -> Value:
 
 def objects_of(device: Device) -> tuple[Object, ...]:
     """What the plant or the controller has, by index."""
-    own = (entry for entry in OBJECTS if entry.device in (device, BOTH))
+    own = (_OWN_OBJECTS.get((device, entry.name), entry) for entry in OBJECTS if entry.device in (device, BOTH))
     return tuple(sorted(own, key=lambda entry: entry.index))

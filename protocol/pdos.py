@@ -10,6 +10,8 @@ from protocol.profile import CONTROLLER_NODE, PLANT_NODE, channel_ids
 _ON_SYNC = 1
 _ON_ARRIVAL_OR_CHANGE = 255
 _RPDO, _TPDO = 0x1400, 0x1800
+_NO_REMOTE_REQUEST = 1 << 30
+"""In the COB-ID of a transmitted PDO: who asks for it by a remote frame is not answered."""
 
 
 def pdo_objects(
@@ -34,22 +36,42 @@ def pdo_objects(
             yield from _pdo(_RPDO + slot, ids.pv, event, channel, ("controller_received_pv", "sample_number"), False)
             yield from _pdo(_RPDO + slot + 1, ids.command, event, channel, ("controller_setpoint",), own)
             yield from _pdo(_TPDO + slot + 1, ids.mv, event, channel, ("controller_mv", "sample_number"), own)
-            status = ("controller_mode", "controller_on_trial", "controller_setpoint")
+            status = (
+                "controller_mode", "controller_on_trial", "controller_setpoint", "controller_session_is_open",
+                "controller_cause",
+            )  # fmt: skip
             yield from _pdo(_TPDO + slot + 2, ids.status, event, channel, status, own)
 
 
 def _pdo(index: int, cob_id: int, kind: int, channel: int, mapped: tuple[str, ...], own: bool) -> Iterator[Object]:
     label = f"{'RPDO' if index < _TPDO else 'TPDO'}{(index & 0x1FF) + 1}"
     owner = lookup(mapped[0]).device
+    cob_id |= _NO_REMOTE_REQUEST if index >= _TPDO else 0
     yield Object(
-        f"{label.lower()}_communication", index, Type.U32, "ro", f"{label} communication parameter", owner,
-        Shape.ENTRIES, names=("COB-ID", "Transmission type"), types=(Type.U32, Type.U8), defaults=(cob_id, kind),
-        relative=(1,) if own else (), is_record=True,
+        f"{label.lower()}_communication",
+        index,
+        Type.U32,
+        "ro",
+        f"{label} communication parameter",
+        owner,
+        Shape.ENTRIES,
+        names=("COB-ID", "Transmission type"),
+        types=(Type.U32, Type.U8),
+        defaults=(cob_id, kind),
+        relative=(1,) if own else (),
+        is_record=True,
     )
     yield Object(
-        f"{label.lower()}_mapping", index + 0x200, Type.U32, "ro", f"{label} mapping parameter", owner, Shape.ENTRIES,
+        f"{label.lower()}_mapping",
+        index + 0x200,
+        Type.U32,
+        "ro",
+        f"{label} mapping parameter",
+        owner,
+        Shape.ENTRIES,
         names=tuple(f"Mapped object {number}" for number in range(1, len(mapped) + 1)),
-        defaults=tuple(_mapping(lookup(name), channel) for name in mapped), is_record=True,
+        defaults=tuple(_mapping(lookup(name), channel) for name in mapped),
+        is_record=True,
     )
 
 

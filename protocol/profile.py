@@ -6,7 +6,7 @@ Plant time is `sample number * sample time`; a PV and the MV that answers it car
 
 from __future__ import annotations
 
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 from functools import cache
 from struct import Struct
 from typing import NamedTuple
@@ -14,8 +14,11 @@ from typing import NamedTuple
 PLANT_NODE = 0x10
 CONTROLLER_NODE = 0x20
 TUNER_NODE = 0x7D
+"""Node-ID of a gateway that is given no other."""
 LISTENER_NODE = 0x7E
 MAX_CHANNELS = 199
+REVISION = 0x00020000
+"""1018h:3 of both devices. The upper half counts what they do differently on the bus, the lower half the rest."""
 
 NMT_ID = 0x000
 SYNC_ID = 0x080
@@ -26,9 +29,10 @@ FOREVER = 0xFFFFFFFF
 PV_FRAME = Struct("<fI")
 """PV REAL32, sample number U32."""
 MV_FRAME = Struct("<fI")
-"""MV REAL32 (percent), number U32 of the sample it answers."""
-STATUS_FRAME = Struct("<BBf")
-"""Mode U8, set in effect U8 (0 accepted, 1 on trial), set point REAL32."""
+"""MV REAL32 (percent), number U32 of the sample it answers; UNASKED: it answers none, and takes effect at once."""
+UNASKED = 0
+STATUS_FRAME = Struct("<BBfBB")
+"""Mode U8, set in effect U8 (0 accepted, 1 on trial), set-point REAL32, session U8 (0 none, 1 open), cause U8."""
 COMMAND_FRAME = Struct("<f")
 """Set point REAL32."""
 SYNC_FRAME = Struct("<B")
@@ -47,14 +51,41 @@ class Mode(IntEnum):
 
 
 class Cause(IntEnum):
-    """Why the controller last went back to its accepted set (2131h)."""
+    """Why a session ended (2133h)."""
 
     NONE = 0
     HEARTBEAT = 1
     LEASE = 2
     PV_LIMIT = 3
-    COMMAND = 4
+    CLOSED = 4
     NMT = 5
+    NO_PV = 6
+    RELAY_SAMPLES = 7
+    HAND = 8
+
+
+class Hand(IntFlag):
+    """What another hand has moved since the opening (2134h)."""
+
+    NONE = 0
+    SETPOINT = 1
+    MODE = 2
+    OUTPUT = 4
+    GAINS = 8
+    LIMITS = 16
+
+
+class Order(IntEnum):
+    """What a tuner commands within its session: one object each, 2170h + the number."""
+
+    OPEN = 0
+    CLOSE = 1
+    SETPOINT = 2
+    MODE = 3
+    OUTPUT = 4
+    RELAY = 5
+    TRY = 6
+    ACCEPT = 7
 
 
 class ParameterCommand(IntEnum):
@@ -65,15 +96,8 @@ class ParameterCommand(IntEnum):
     GO_BACK = 3
 
 
-class Experiment(IntEnum):
-    """2140h; only the relay is built."""
-
-    NONE = 0
-    RELAY = 1
-
-
-class ExperimentState(IntEnum):
-    """2147h."""
+class RelayState(IntEnum):
+    """2159h."""
 
     IDLE = 0
     RUNNING = 1
@@ -109,19 +133,23 @@ class NmtState(IntEnum):
 class Emcy(IntEnum):
     ERROR_GONE = 0x0000
     HEARTBEAT_LOST = 0x8130
+    PDO_LENGTH = 0x8210
     NO_PV = 0x8250
     LEASE_USED_UP = 0xFF01
     PV_LIMIT = 0xFF02
     NO_ANSWER = 0xFF03
+    TUNER_LOST = 0xFF04
 
 
 EMCY_REGISTER = {
     Emcy.ERROR_GONE: 0x00,
     Emcy.HEARTBEAT_LOST: 0x11,
+    Emcy.PDO_LENGTH: 0x11,
     Emcy.NO_PV: 0x11,
     Emcy.LEASE_USED_UP: 0x81,
     Emcy.PV_LIMIT: 0x81,
     Emcy.NO_ANSWER: 0x81,
+    Emcy.TUNER_LOST: 0x91,
 }
 """Error register (1001h): bit 0 generic, bit 4 communication, bit 7 manufacturer."""
 
@@ -131,10 +159,13 @@ class Abort(IntEnum):
 
     TOGGLE = 0x05030000
     COMMAND = 0x05040001
+    BLOCK_SIZE = 0x05040002
+    SEQUENCE_NUMBER = 0x05040003
     OUT_OF_MEMORY = 0x05040005
     WRITE_ONLY = 0x06010001
     READ_ONLY = 0x06010002
     NO_OBJECT = 0x06020000
+    INCOMPATIBLE = 0x06040043
     LENGTH = 0x06070010
     NO_SUBINDEX = 0x06090011
     INVALID_VALUE = 0x06090030
@@ -143,7 +174,18 @@ class Abort(IntEnum):
     MAXIMUM_BELOW_MINIMUM = 0x06090036
     GENERAL = 0x08000000
     NOT_STORED = 0x08000020
+    LOCAL_CONTROL = 0x08000021
     DEVICE_STATE = 0x08000022
+    NO_DATA = 0x08000024
+
+
+def samples_between(earlier: int, later: int) -> int:
+    """How many samples `later` comes after `earlier`: numbers go from FFFFFFFFh on to 1, for 0 is UNASKED.
+
+    A number that lies far behind (a plant that has started anew) gives a negative count.
+    """
+    passed = (later - earlier) % 0xFFFFFFFF
+    return passed if passed < 0x80000000 else passed - 0xFFFFFFFF
 
 
 def emcy_id(node: int) -> int:

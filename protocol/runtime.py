@@ -7,21 +7,21 @@ a sample but one dictionary look-up per frame.
 from __future__ import annotations
 
 import contextlib
+import struct
+import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from functools import partial
 
 from protocol.bus import Bus, BusError
 from protocol.dictionary import Dictionary
+from protocol.emergencies import Emergencies
+from protocol.heartbeats import Consumer, Producer
 from protocol.objects import Value
 from protocol.profile import (
-    EMCY_FRAME,
-    EMCY_REGISTER,
     HEARTBEAT_FRAME,
     NMT_FRAME,
     NMT_ID,
-    Abort,
     Emcy,
     NmtCommand,
     NmtState,
@@ -30,22 +30,16 @@ from protocol.profile import (
     sdo_request_id,
     sdo_response_id,
 )
-from protocol.sdo import SdoAbort, SdoServer
+from protocol.sdo import SdoServer
 
 Handler = Callable[[bytes], None]
 
 _IDLE_S = 0.02
 _MOST_FRAMES_BETWEEN_TICKS = 64  # reading the clock is a system call in some virtual machines
 _PAUSE_AFTER_BUS_ERROR_S = 0.05
-
-
-@dataclass(slots=True)
-class _Watch:
-    node: int
-    limit_s: float
-    heard: float | None = None
-    """Wall time of the last heartbeat; None before the first one (watching starts with it) and after the loss."""
-    lost: bool = False
+_TOLD_AGAIN_AFTER_S = 5.0  # without an error: then it is another one
+_COMMUNICATION = (0x1000, 0x1FFF)
+_LENGTH_DETAIL = struct.Struct("<HBB")  # of EMCY 8210h: COB-ID, bytes that came, bytes mapped
 
 
 class Runtime:
@@ -59,39 +53,54 @@ class Runtime:
         self.clock = clock
         self.state = NmtState.BOOT_UP
         self.handlers: dict[int, Handler] = {}
+        self.lengths: dict[int, int] = {}
+        """Bytes mapped to a received PDO, by COB-ID. Its handler gets just as many: a longer frame is cut, a shorter
+        one is not processed, which EMCY 8210h says. Without an entry here every frame is handed over as it came."""
         self.on_tick: Callable[[float], None] = lambda now: None
         """Called with the wall time about every 20 ms, and at least every 64 frames."""
         self.on_leave_operational: Callable[[], None] = lambda: None
         self.on_reset: Callable[[], None] = lambda: None
+        """Reset node: 1000h-1FFFh are back at their start values already, everything else is the device's to do."""
         self.on_heartbeat_lost: Callable[[int], bytes | None] = lambda node: b""
         """Node lost; returns what EMCY 8130h carries behind the node, None when nothing hung on it: no emergency."""
+        self.on_heartbeat: Callable[[int], None] = lambda node: None
+        """A heartbeat of a node that is listened to."""
         self.due: float | None = None
         """Wall time at which `on_due` is to be called next."""
         self.on_due: Callable[[], None] = lambda: None
         self._bus = bus
         self.send = bus.send
-        self._sdo = SdoServer(dictionary.read, dictionary.write)
+        self._sdo = SdoServer(dictionary.read, dictionary.write, dictionary.room)
+        self._emergencies = Emergencies(dictionary, self._send_emcy)
+        self.raise_error = self._emergencies.raise_error
+        self.clear_error = self._emergencies.clear_error
         self._always: dict[int, Handler] = {}
-        self._active: dict[int, Handler] = {}
-        self._watches: dict[int, _Watch] = {}
-        self._errors: list[tuple[Emcy, bytes]] = []
-        """Each with its source, the first byte of its detail: a channel, or a node that was lost."""
-        self._history: list[int] = []
-        self._next_heartbeat = 0.0
+        self._active: dict[int, tuple[Handler, int | None]] = {}
+        """Handler and length of each frame that is for us in the present state."""
+        self._too_short: set[int] = set()
+        """COB-IDs whose last frame was too short."""
+        self._watches = Consumer(clock)
+        self._listened: frozenset[int] = frozenset()
+        self._own_beat = Producer()
         self._countdown = self._between_ticks = 1
         self._last_tick = clock()
         self._stopping = False
+        self._told, self._told_at = "", 0.0
         dictionary.on_write["heartbeat_consumer"] = self._write_consumer
         dictionary.on_write["heartbeat_producer"] = self._write_producer
-        dictionary.on_read["error_register"] = lambda sub: self._error_register()
-        dictionary.on_read["error_field"] = lambda sub: (self._history + [0] * 4)[sub - 1]
+        dictionary.on_read["node_state"] = lambda sub: self.state
 
     # Life
 
     def start(self) -> None:
+        """What the dictionary holds now is what a reset goes back to."""
+        self.dictionary.remember()
+        self._boot()
+
+    def _boot(self) -> None:
         """Boot-up, pre-operational, and on to operational by itself: control must not wait for a tuner."""
         for sub in (1, 2):
-            self._watch(sub, int(self.dictionary.get("heartbeat_consumer", sub)))
+            self._watches.watch(sub, int(self.dictionary.get("heartbeat_consumer", sub)))
         self._collect_handlers()
         self._bus.send(heartbeat_id(self.node), HEARTBEAT_FRAME.pack(NmtState.BOOT_UP))
         self._enter(NmtState.PRE_OPERATIONAL)
@@ -106,10 +115,18 @@ class Runtime:
         while not self._stopping:
             try:
                 self.poll()
-            except BusError:
+            except BusError as error:
+                self._tell(error)
                 time.sleep(_PAUSE_AFTER_BUS_ERROR_S)
                 with contextlib.suppress(BusError):
                     self._tick()
+
+    def _tell(self, error: BusError) -> None:
+        """Once, while it stays the same."""
+        now = self.clock()
+        if str(error) != self._told or now - self._told_at > _TOLD_AGAIN_AFTER_S:
+            print(f"node {self.node:02X}h: {error}", file=sys.stderr, flush=True)
+        self._told, self._told_at = str(error), now
 
     def poll(self, idle_s: float = _IDLE_S) -> bool:
         """One frame, or whatever time has made due. False when no frame came within `idle_s`."""
@@ -127,9 +144,13 @@ class Runtime:
             if wait:
                 self._tick()
             return False
-        handler = self._active.get(frame[0])
-        if handler is not None:
-            handler(frame[1])
+        active = self._active.get(frame[0])
+        if active is not None:
+            handler, length = active
+            if length is None or len(frame[1]) == length:
+                handler(frame[1])
+            else:
+                self._on_other_length(frame[0], handler, length, frame[1])
         self._countdown -= 1
         if self._countdown <= 0:
             self._tick()
@@ -150,25 +171,27 @@ class Runtime:
     def _enter(self, state: NmtState) -> None:
         if state is self.state:
             return
-        left_operational = self.state is NmtState.OPERATIONAL
+        if self.state is NmtState.OPERATIONAL:
+            self.on_leave_operational()  # first: it may have a last PDO to send
         self.state = state
         self._gate()
-        if left_operational:
-            self.on_leave_operational()
-        self._next_heartbeat = 0.0
+        self._own_beat.restart()
 
     def _gate(self) -> None:
         """PDOs in operational only; SDO not in stopped."""
-        self._active = dict(self._always)
+        self._active = {can_id: (handler, None) for can_id, handler in self._always.items()}
         if self.state is NmtState.OPERATIONAL:
-            self._active.update(self.handlers)
+            for can_id, handler in self.handlers.items():
+                self._active[can_id] = handler, self.lengths.get(can_id)
+            for can_id in self._too_short:
+                self._active[can_id] = partial(self._after_too_short, can_id), None
         if self.state is NmtState.STOPPED:
             del self._active[sdo_request_id(self.node)]
 
     def _collect_handlers(self) -> None:
         self._always = {NMT_ID: self._on_nmt, sdo_request_id(self.node): self._on_sdo}
-        for watch in self._watches.values():
-            self._always[heartbeat_id(watch.node)] = partial(self._on_heartbeat, watch)
+        for node in self._listened | {watch.node for watch in self._watches}:
+            self._always[heartbeat_id(node)] = partial(self._on_heartbeat, node)
         self._gate()
         self._bus.set_filters({*self._always, *self.handlers})
 
@@ -185,94 +208,97 @@ class Runtime:
         elif command == NmtCommand.PRE_OPERATIONAL:
             self._enter(NmtState.PRE_OPERATIONAL)
         elif command in (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION):
-            self._enter(NmtState.BOOT_UP)
-            if command == NmtCommand.RESET_NODE:
-                self.on_reset()
-            self._errors.clear()
-            self.start()
+            self._reset(command == NmtCommand.RESET_NODE)
+
+    def _reset(self, node: bool) -> None:
+        """Resets the communication, or the whole node: both have 1000h-1FFFh as at power-on.
+
+        What hangs on an object is told as by an SDO, in the state in which it may be written.
+        """
+        self._enter(NmtState.PRE_OPERATIONAL)
+        self._sdo.end()
+        self._emergencies.forget()
+        self._too_short.clear()
+        self._watches.clear()
+        for name, sub in self.dictionary.restore(*_COMMUNICATION):
+            if name in self.dictionary.on_write:
+                self.dictionary.on_write[name](sub, self.dictionary.get(name, sub))
+        if node:
+            self.on_reset()
+        self.state = NmtState.BOOT_UP
+        self._boot()
+
+    # PDOs that are not as long as mapped
+
+    def _on_other_length(self, can_id: int, handler: Handler, length: int, data: bytes) -> None:
+        if len(data) > length:
+            handler(data[:length])
+            return
+        detail = _LENGTH_DETAIL.pack(can_id, len(data), length)
+        self.raise_error(Emcy.PDO_LENGTH, detail, source=detail[:2])
+        self._too_short.add(can_id)
+        self._gate()
+
+    def _after_too_short(self, can_id: int, data: bytes) -> None:
+        """Stands in for the handler until a frame is long enough, so that no other frame pays for the question."""
+        length = self.lengths[can_id]
+        if len(data) >= length:
+            self._too_short.discard(can_id)
+            self._gate()
+            self.clear_error(Emcy.PDO_LENGTH, _LENGTH_DETAIL.pack(can_id, 0, 0)[:2])
+            self.handlers[can_id](data[:length])
 
     # SDO
 
     def _on_sdo(self, data: bytes) -> None:
         answer = self._sdo.answer(data)
         if answer is not None:
-            self._bus.send(sdo_response_id(self.node), answer)
+            for at in range(0, len(answer), 8):
+                self._bus.send(sdo_response_id(self.node), answer[at : at + 8])
 
     # Heartbeats
 
     def _produce_heartbeat(self, now: float) -> None:
         period_ms = int(self.dictionary.get("heartbeat_producer"))
-        if period_ms and now >= self._next_heartbeat:
-            self._next_heartbeat = now + period_ms / 1000.0
+        if self._own_beat.is_due(now, period_ms / 1000.0):
             self._bus.send(heartbeat_id(self.node), HEARTBEAT_FRAME.pack(self.state))
 
     def _consume_heartbeats(self, now: float) -> None:
-        for watch in self._watches.values():
-            if watch.heard is not None and now - watch.heard > watch.limit_s:
-                watch.heard = None
-                detail = self.on_heartbeat_lost(watch.node)
-                if detail is not None:
-                    watch.lost = True
-                    self.raise_error(Emcy.HEARTBEAT_LOST, bytes((watch.node,)) + detail)
+        for watch in self._watches.overdue(now):
+            detail = self.on_heartbeat_lost(watch.node)
+            if detail is not None:
+                watch.lost = True
+                self.raise_error(Emcy.HEARTBEAT_LOST, bytes((watch.node,)) + detail)
 
-    def _on_heartbeat(self, watch: _Watch, data: bytes) -> None:
-        watch.heard = self.clock()
-        if watch.lost:
-            watch.lost = False
-            self._heartbeats_back()
+    def listen(self, nodes: Iterable[int]) -> None:
+        """The nodes whose heartbeats `on_heartbeat` is told of, besides those of 1016h; 0 stands for none."""
+        listened = frozenset(nodes) - {0}
+        if listened != self._listened:
+            self._listened = listened
+            self._collect_handlers()
+
+    def _on_heartbeat(self, node: int, data: bytes) -> None:
+        self.on_heartbeat(node)
+        for watch in self._watches:
+            if watch.node == node and self._watches.heard(watch):
+                self._heartbeats_back()
 
     def _heartbeats_back(self) -> None:
-        lost = {bytes((watch.node,)) for watch in self._watches.values() if watch.lost}
-        for code, source in list(self._errors):
-            if code is Emcy.HEARTBEAT_LOST and source not in lost:
-                self.clear_error(code, source)
+        lost = {bytes((watch.node,)) for watch in self._watches if watch.lost}
+        for source in self._emergencies.sources(Emcy.HEARTBEAT_LOST):
+            if source not in lost:
+                self.clear_error(Emcy.HEARTBEAT_LOST, source)
 
     def _write_consumer(self, sub: int, value: Value) -> None:
-        self._watch(sub, int(value))
+        self._watches.watch(sub, int(value))
         self._collect_handlers()
         self._heartbeats_back()
 
-    def _watch(self, sub: int, value: int) -> None:
-        """Node-ID in bits 16-22, milliseconds below; a new value waits for a first heartbeat again."""
-        node, limit_ms = value >> 16 & 0xFF, value & 0xFFFF
-        if value >> 24 or node > 127:
-            raise SdoAbort(Abort.INVALID_VALUE)
-        if node and limit_ms:
-            self._watches[sub] = _Watch(node, limit_ms / 1000.0)
-        else:
-            self._watches.pop(sub, None)
-
     def _write_producer(self, sub: int, value: Value) -> None:
-        self._next_heartbeat = 0.0
+        self._own_beat.restart()
 
     # Emergencies
 
-    def raise_error(self, code: Emcy, detail: bytes = b"") -> None:
-        """Says it once per occurrence; an error that stays is not repeated until `clear_error`.
-
-        The first byte of `detail` is the source. That of another source is said too: whoever holds channel 2 must not
-        miss what happens to it because channel 1 has the same error.
-        """
-        error = code, detail[:1]
-        if error in self._errors:
-            return
-        self._errors.append(error)
-        self._history = [int(code), *self._history][:4]
-        self._send_emcy(code, EMCY_REGISTER[code], detail)
-
-    def clear_error(self, code: Emcy, source: bytes | None = None) -> None:
-        """Of one source, or of all. EMCY 0000h says it, with the register of what is left."""
-        left = [error for error in self._errors if error[0] != code or source not in (None, error[1])]
-        if len(left) < len(self._errors):
-            self._errors = left
-            self._send_emcy(Emcy.ERROR_GONE, self._error_register(), b"")
-
-    def _send_emcy(self, code: Emcy, register: int, detail: bytes) -> None:
+    def _send_emcy(self, frame: bytes) -> None:
         if self.state is not NmtState.STOPPED:
-            self._bus.send(emcy_id(self.node), EMCY_FRAME.pack(code, register, detail[:5]))
-
-    def _error_register(self) -> int:
-        register = 0
-        for code, _ in self._errors:
-            register |= EMCY_REGISTER[code]
-        return register
+            self._bus.send(emcy_id(self.node), frame)

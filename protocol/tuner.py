@@ -7,15 +7,13 @@ falls silent. What arrives while an SDO waits is taken in order and handed out l
 from __future__ import annotations
 
 import struct
-import threading
-import time
 from collections import Counter, deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from typing import NamedTuple
 
-from protocol.bus import Bus, Frame, open_bus
+from protocol.bus import Bus, Frame
 from protocol.objects import Device, Object, Shape, Type, Value, lookup
 from protocol.profile import (
     EMCY_FRAME,
@@ -24,8 +22,9 @@ from protocol.profile import (
     PLANT_NODE,
     PV_FRAME,
     STATUS_FRAME,
-    TUNER_NODE,
+    UNASKED,
     Abort,
+    Cause,
     NmtState,
     channel_ids,
     emcy_id,
@@ -33,21 +32,23 @@ from protocol.profile import (
     sdo_request_id,
     sdo_response_id,
 )
-from protocol.turns import Turns
+from protocol.station import Station
 
-HEARTBEAT_S = 0.1
 _WAIT_S = 0.05  # one wait on the bus: short enough to beat in time; always the same, which RawBus makes cheap
 _TAKE_IN_S = 0.1
 _ABORT = 0x80
-_URGENT = ("controller_lease", "controller_lease_renewal")
+_URGENT = ("controller_session_renewal", "controller_order_close")
 
 ABORT_TEXT = {
     Abort.TOGGLE: "toggle bit not alternated",
     Abort.COMMAND: "command not known",
+    Abort.BLOCK_SIZE: "wrong block size",
+    Abort.SEQUENCE_NUMBER: "wrong sequence number",
     Abort.OUT_OF_MEMORY: "out of memory",
     Abort.WRITE_ONLY: "write only",
     Abort.READ_ONLY: "read only",
     Abort.NO_OBJECT: "no such object",
+    Abort.INCOMPATIBLE: "does not fit what is there already",
     Abort.LENGTH: "wrong length",
     Abort.NO_SUBINDEX: "no such sub-index",
     Abort.INVALID_VALUE: "invalid value",
@@ -56,7 +57,9 @@ ABORT_TEXT = {
     Abort.MAXIMUM_BELOW_MINIMUM: "maximum below minimum",
     Abort.GENERAL: "general error",
     Abort.NOT_STORED: "the device could not store it",
+    Abort.LOCAL_CONTROL: "something else controls it",
     Abort.DEVICE_STATE: "not in the present state of the device",
+    Abort.NO_DATA: "no data",
 }
 
 
@@ -85,14 +88,6 @@ class BusSample(NamedTuple):
     sp: float
 
 
-# The SDO server answers one request at a time, whoever asks: loops of one process on one node take turns.
-_turns: dict[tuple[str, int], Turns] = {}
-_turns_guard = threading.Lock()
-
-_beats: dict[str, float] = {}
-"""By bus: when a loop of this process has last sent our heartbeat. One beat speaks for all of them: it says that the
-process lives. That a loop's own thread works, only its lease says."""
-
 sdo_retries: Counter[str] = Counter()
 """By bus: SDO requests that this process sent again because no answer came."""
 
@@ -107,10 +102,15 @@ class Tuner:
         plant_node: int | None,
         channel: int = 1,
         *,
+        station: Station | None = None,
         sdo_timeout_s: float = 0.25,
         sdo_tries: int = 3,
     ) -> None:
-        """plant_node None: a plant that offers no SDO; its PV frames are still expected from node 10h."""
+        """plant_node None: a plant that offers no SDO; its PV frames are still expected from node 10h.
+
+        station: what this process shares; by default one of its own, for who only reads.
+        """
+        self.station = station or Station()
         ids = channel_ids(channel, plant_node or PLANT_NODE, controller_node)
         self._url = url
         self._controller = controller_node
@@ -119,9 +119,10 @@ class Tuner:
         self._sdo_timeout_s = sdo_timeout_s
         self._sdo_tries = sdo_tries
         self._pv_id, self._mv_id, self._status_id = ids.pv, ids.mv, ids.status
-        self._emcy_id, self._alive_id = emcy_id(controller_node), heartbeat_id(controller_node)
-        self._bus: Bus = open_bus(url)
-        self._heard = frozenset({self._pv_id, self._mv_id, self._status_id, self._emcy_id, self._alive_id})
+        self._emcy_id = emcy_id(controller_node)
+        self._alive = {heartbeat_id(node): node for node in (controller_node, plant_node) if node is not None}
+        self._bus: Bus = self.station.open_bus(url)
+        self._heard = frozenset({self._pv_id, self._mv_id, self._status_id, self._emcy_id, *self._alive})
         self._bus.set_filters(self._heard)
         self._answers: deque[Frame] = deque()
         self._samples: deque[BusSample] = deque()
@@ -129,6 +130,9 @@ class Tuner:
         self.beating = False
         """Only who holds the loop beats: a mere reader must not keep alive the trial of a tuner that died."""
         self.mode, self.on_trial, self.sp = 0, False, 0.0
+        self.session_is_open, self.cause = False, Cause.NONE
+        self.node_states: dict[int, int] = {}
+        """NMT states of controller and plant by node-ID, as their heartbeats have said last."""
         self.emergencies: list[int] = []
         """EMCY codes of the controller other than "error gone", until the owner clears them."""
         self.restarted = False
@@ -140,21 +144,15 @@ class Tuner:
     # -- heartbeat and frames
 
     def hold(self) -> None:
-        """We beat from now on, and at once: a watch on us begins with the first beat that it hears."""
+        """We beat from now on, and at once. Raises NodeTaken."""
+        self.station.join(self._url)
         self.beating = True
-        self._beat(time.monotonic())
+        self.station.beat(self._url, self._bus, self.station.monotonic())
 
     def heartbeat(self) -> float:
         """Sends our heartbeat when it is due and no other loop on this bus has sent it. The time on the clock, which it
         takes a system call to read in some virtual machines."""
-        now = time.monotonic()
-        if self.beating and now - _beats.get(self._url, -HEARTBEAT_S) >= HEARTBEAT_S:
-            self._beat(now)
-        return now
-
-    def _beat(self, now: float) -> None:
-        self._bus.send(heartbeat_id(TUNER_NODE), HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL))
-        _beats[self._url] = now
+        return self.station.beat_if_due(self._url, self._bus) if self.beating else self.station.monotonic()
 
     def sample(self, timeout_s: float) -> BusSample | None:
         """The next sample in order; None when none came within `timeout_s` of wall time."""
@@ -175,7 +173,7 @@ class Tuner:
     def _take_in(self) -> None:
         """What has arrived, in its order. Where more arrives than we can take, that is no reason to stay here for
         ever or to fall silent: the rest is taken later."""
-        give_up = time.monotonic() + _TAKE_IN_S
+        give_up = self.station.monotonic() + _TAKE_IN_S
         while self._receive(0.0) and self.heartbeat() < give_up:
             pass
 
@@ -188,19 +186,22 @@ class Tuner:
             if can_id == self._mv_id:
                 mv, n = MV_FRAME.unpack(data)
                 pv, answered = self._pv
-                if n == answered:
+                if n == answered and n != UNASKED:
                     self._samples.append(BusSample(n, pv, mv, self.mode, self.on_trial, self.sp))
             elif can_id == self._pv_id:
                 self._pv = PV_FRAME.unpack(data)
             elif can_id == self._status_id:
-                self.mode, on_trial, self.sp = STATUS_FRAME.unpack(data)
-                self.on_trial = bool(on_trial)
+                self.mode, on_trial, self.sp, is_open, cause = STATUS_FRAME.unpack(data)
+                self.on_trial, self.session_is_open = bool(on_trial), bool(is_open)
+                self.cause = Cause(cause) if cause in Cause._value2member_map_ else Cause.NONE
             elif can_id == self._emcy_id:
                 code = EMCY_FRAME.unpack(data)[0]
                 if code:
                     self.emergencies.append(code)
-            elif can_id == self._alive_id:
-                self.restarted |= data[:1] == bytes([NmtState.BOOT_UP])
+            elif can_id in self._alive:
+                (state,) = HEARTBEAT_FRAME.unpack(data)
+                self.node_states[self._alive[can_id]] = state
+                self.restarted |= state == NmtState.BOOT_UP and self._alive[can_id] == self._controller
             else:
                 self._answers.append(frame)
         except struct.error:
@@ -251,9 +252,7 @@ class Tuner:
 
         Outside of it the answers, which are to others then, are not received: of fifty loops each would wake for all.
         """
-        with _turns_guard:
-            turns = _turns.setdefault((self._url, node), Turns())
-        with turns.take(urgent=name in _URGENT):
+        with self.station.turns(self._url, node).take(urgent=name in _URGENT):
             self._bus.set_filters(self._heard | {sdo_response_id(node)})
             try:
                 yield
@@ -269,10 +268,9 @@ class Tuner:
         self._answers.clear()
         for attempt in range(self._sdo_tries):
             if attempt:
-                with _turns_guard:
-                    sdo_retries[self._url] += 1
+                sdo_retries[self._url] += 1
             self._bus.send(sdo_request_id(node), request)
-            give_up = time.monotonic() + self._sdo_timeout_s
+            give_up = self.station.monotonic() + self._sdo_timeout_s
             while (answer := self._answer(node, give_up)) is not None:
                 if answer[1:4] != address:
                     continue
@@ -287,7 +285,7 @@ class Tuner:
         value, toggle = b"", 0
         while True:
             self._bus.send(sdo_request_id(node), bytes([0x60 | toggle, 0, 0, 0, 0, 0, 0, 0]))
-            answer = self._answer(node, time.monotonic() + self._sdo_timeout_s)
+            answer = self._answer(node, self.station.monotonic() + self._sdo_timeout_s)
             if answer is None:
                 raise TunerError(Kind.TIMEOUT, f"node {node:02X}h stopped in the middle of {entry.name}")
             if answer[0] == _ABORT:

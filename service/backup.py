@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import sqlite3
 import tempfile
@@ -13,6 +12,7 @@ from pathlib import Path
 from alembic.config import Config
 from alembic.script import ScriptDirectory
 
+from protocol.durable import put_in_place, sync
 from service.store.database import FILE
 from service.store.lock import FolderLock
 from service.store.store import Store
@@ -23,7 +23,8 @@ class BackupProblem(Exception):
 
 
 def back_up(data: Path, target: Path, replace: bool = False) -> int:
-    """Copies the database of a data folder, as of one moment, to `target`. Returns its size in bytes.
+    """Copies the database of a data folder, as of one moment, to `target`. Returns its size in bytes once it is on the
+    disk.
 
     Raises BackupProblem, OSError.
     """
@@ -43,8 +44,7 @@ def back_up(data: Path, target: Path, replace: bool = False) -> int:
             raise BackupProblem(f"{source}: {error}") from error
         _check(copy)
         copy.chmod(0o600)
-        _to_disk(copy)
-        os.replace(copy, target)
+        put_in_place(copy, target)
     return target.stat().st_size
 
 
@@ -68,15 +68,16 @@ def restore(source: Path, data: Path, replace: bool = False) -> tuple[int, Path 
         store = Store(made)  # brings it to the present revision
         interrupted = store.restored(source.name)
         store.close()
-        _to_disk(made / FILE)
+        sync(made / FILE)
         aside = None
         if there:
             aside = data / f"replaced-{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}"
             aside.mkdir(mode=0o700)
             for path in there:
                 path.rename(aside / path.name)
+            sync(aside)
         (made / FILE).chmod(0o600)
-        (made / FILE).rename(data / FILE)
+        put_in_place(made / FILE, data / FILE)
         return interrupted, aside
 
 
@@ -95,8 +96,3 @@ def _check(path: Path) -> None:
     known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
     if revision is None or revision[0] not in known:
         raise BackupProblem(f"{path} was made by another version: its revision {revision and revision[0]} is not known")
-
-
-def _to_disk(path: Path) -> None:
-    with path.open("rb+") as file:
-        os.fsync(file.fileno())

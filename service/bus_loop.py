@@ -1,7 +1,8 @@
 """The live loop: a controller and its plant on a CAN bus, as a plan sees it.
 
-Every wait in here also sends our heartbeat, and the lease is renewed from `step` alone: a service that hangs or dies
-loses the loop, and the controller goes back to its accepted set by itself.
+The session belongs to the controller (`controller.session`, decision 8): here it is opened, renewed, closed, and what
+it left is read back. Every wait in here also sends our heartbeat and renews the lease: a service that hangs or dies
+loses the loop, and the controller brings it home by itself.
 
 A simulated plant that runs as fast as the answers come (pace 0) is run in blocks of samples: no sample is lost however
 slow we are, and commands act between two blocks, so that equal seeds give equal runs.
@@ -11,49 +12,56 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import astuple
 
 from protocol.bus import BusError
-from protocol.objects import Device, default_of, lookup
-from protocol.profile import FOREVER, TUNER_NODE, Abort, Cause, Emcy, Experiment, ParameterCommand
+from protocol.profile import (
+    FOREVER,
+    Abort,
+    NmtState,
+    Order,
+    samples_between,
+)
+from protocol.station import NodeTaken, Station
 from protocol.tuner import BusSample, Kind, Tuner, TunerError
-from service.loop import LoopState
+from protocol.tuner_session import Lease, TunerSession
+from service.bus_endings import cause_of, read_back, why_over, words_of
+from service.bus_reading import BusReading, not_operational
+from service.loop import LoopState, Restored, same_gains
 from service.metrics import SAMPLES_LOST
 from tuning.gains import Gains
 from tuning.plan import Command, Mode, Sample, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
 from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 
 HEARTBEAT_WATCH_MS = 1000
-"""Wall time without our heartbeat after which the controller goes back by itself."""
+"""Time of the controller's clock without our heartbeat after which it ends the session."""
 LEASE_WALL_S = 3.0
-LEFTOVER_S = LEASE_WALL_S + 1.0
+LEASE_IN_BLOCKS_S = 30.0
+PV_SILENCE_IN_BLOCKS_S = 60.0
+"""A plant that we hold sends no PV, and a block may wait for a computation."""
+OTHERS_S = LEASE_WALL_S + 1.0
 """How long a session of another tuner may take to end before we begin."""
+HALT_S, HALT_AGAIN_S = 5.0, 0.5
+"""How long a plant that is run in blocks may take to halt, and when it is told once more."""
 SHORTEST_LEASE = 20
 SILENCE_S = 1.0
 """Wall time without a sample (at least three sampling periods) after which the nodes are asked whether they live."""
 RESTORE_PATIENCE_S = 4.0
-COMMAND_WALL_S = 2.0
-"""How long a handful of commands may take on a slow bus."""
-FASTEST_PER_S = 20_000
-"""More samples a second than a simulated plant at pace 0 makes when nobody runs it in blocks."""
 RELAY_LONGEST = 1_000_000  # samples; plans end their relays, and so does the lease
 MAX_GAP = 5
+_SLICE_S = 0.05  # of a wait: after each, lease and stop are looked at
+_AGAIN_S = 0.05
+_HALTED_S = 0.03  # without a sample: the plant has halted
 
-_PARAMETERS = ("kp", "ti", "td", "tf", "b", "c")
-_WENT_BACK = (Emcy.HEARTBEAT_LOST, Emcy.LEASE_USED_UP, Emcy.PV_LIMIT)
 _NOT_OURS = (Abort.NO_OBJECT, Abort.NO_SUBINDEX, Abort.LENGTH, Abort.READ_ONLY, Abort.WRITE_ONLY)
-
-# A plant that we run in blocks belongs to one job at a time, whatever its number of channels.
-_plants: dict[tuple[str, int], threading.Lock] = {}
-_plants_guard = threading.Lock()
 
 
 class BusLoop:
     """One channel of a controller node. plant_node: the plant I/O, if it offers one to ask (a simulated one does).
 
+    station: this process on the bus.  pv_limits: at which the relay ends in the controller; None: the PV span.
     block: samples per block of a plant at pace 0.  max_gap: samples in a row that may be missing.
     """
 
@@ -64,6 +72,8 @@ class BusLoop:
         plant_node: int | None,
         channel: int = 1,
         *,
+        station: Station | None = None,
+        pv_limits: tuple[float, float] | None = None,
         block: int = 10,
         max_gap: int = MAX_GAP,
     ) -> None:
@@ -71,56 +81,65 @@ class BusLoop:
         self._node = controller_node
         self._plant = plant_node
         self._channel = channel
+        self._station = station or Station()
+        self._pv_limits = pv_limits
         self._block = block
         self._max_gap = max_gap
         self._tuner: Tuner | None = None
+        self._session: TunerSession | None = None
         self._held: threading.Lock | None = None
+        self._halted = False
+        self._stop: Callable[[], Reason | None] = lambda: None
         self._in_blocks = False
         self._pace = 1.0
         self._left = 0  # samples of the present block still to come
         self._commands: list[Command] = []
         self._sample_time_s = 0.0
         self._silence_s = SILENCE_S
-        self._lease = SHORTEST_LEASE
+        self._lease = Lease(SHORTEST_LEASE, 1, 1, 1)
         self._until_renewal = 0
-        self._paid_at = 0.0
-        self._until_look = 0
-        self._relay_written: dict[str, float] = {}
-        self._mode_found: Mode | None = None
-        self._tried: Gains | None = None
+        self._renewed_at = 0.0
+        self._number = 0
+        """The number of the session that we have opened last; 0: there is none."""
         self._first_n: int | None = None
         self._last_n = 0
+        self._passed = 0
 
     # -- what a Loop does
 
-    def read(self) -> LoopState:
+    def read(self, beside_tests: bool = False) -> LoopState:
         with self._translated() as tuner:
-            return self._state(tuner)
+            reading = self._reading(tuner)
+            if not beside_tests:
+                return reading.state()
+            while True:
+                session = tuner.number("controller_session")
+                state = reading.beside_the_test() if session else reading.state()
+                if tuner.number("controller_session") == session:
+                    return state
 
-    def begin(self, stop: Callable[[], Reason | None] = lambda: None) -> LoopState:
+    def begin(
+        self,
+        stop: Callable[[], Reason | None] = lambda: None,
+        remember: Callable[[int], None] = lambda session: None,
+    ) -> LoopState:
+        self._stop = stop
+        self._number = 0
         try:
             with self._translated() as tuner:
-                self._identify(tuner)
-                self._compare_times(tuner)
-                self._take_plant(tuner, stop)
-                self._watch_us(tuner)
-                self._take_time(tuner)
-                state = replace(self._state(tuner), command_lag_samples=self._command_lag())
-                self._no_experiment(state.mode)
-                self._plan_lease()
-                tuner.write("controller_lease", self._lease)
-                self._paid_at = time.monotonic()
+                self._reading(tuner).identify()
+                self._reading(tuner).compare_times()
+                self._take_plant(tuner)
+                home = self._open(tuner, remember)
+                self._take_time(tuner)  # nobody else's test is on it any more
                 tuner.drain()
-                tuner.mode, tuner.on_trial, tuner.sp = state.mode, state.on_trial, state.sp
-                tuner.emergencies.clear()
-                tuner.restarted = False
-                self._until_renewal = self._until_look = self._lease // 3
-                self._relay_written.clear()
-                self._mode_found = state.mode
-                self._first_n, self._left, self._tried = None, 0, None
+                self._first_n, self._left, self._passed = None, 0, 0
                 self._commands.clear()
-                return state
+                return home
         except BaseException:
+            if self._number:  # the answer to the opening may have been lost
+                with suppress(Ended), self._translated() as tuner:
+                    self._close(tuner, self._number)
             self._release()
             raise
 
@@ -132,62 +151,58 @@ class BusLoop:
         with self._translated() as tuner:
             self._commands += commands
             if self._left <= 0:
-                self._keep(tuner)
-                if self._commands:
-                    self._until_look = self._command_lag() // 2
+                self._renew_if_due(tuner)
                 for command in self._commands:
                     self._carry_out(tuner, command)
                 self._commands.clear()
-                if self._until_look <= 0:
-                    self._look(tuner)
                 if self._in_blocks:
                     tuner.write("plant_samples_to_run", self._block)
                     self._left = self._block
-            found = tuner.sample(self._silence_s)
-            while found is not None and self._first_n is not None and found.n == self._last_n:
-                found = tuner.sample(self._silence_s)  # a frame that came twice
-            if tuner.emergencies or tuner.restarted:
-                self._hear(tuner)
-            if found is None:
-                raise self._silent(tuner)
-            if found.on_trial and self._tried is None:
-                raise Aborted(Reason.GAINS_CHANGED, "gains are on trial that this test has not given")
-            return self._count(found)
+            return self._count(self._next_sample(tuner))
 
-    def restore(self, state: LoopState) -> LoopState:
-        give_up = time.monotonic() + RESTORE_PATIENCE_S
+    def restore(self, home: LoopState, session: int | None = None) -> Restored:
+        number = session if session is not None else self._number
+        give_up = self._station.monotonic() + RESTORE_PATIENCE_S
         try:
             while True:
                 try:
-                    return self._bring_back(state)
+                    with self._translated() as tuner:
+                        how = self._close(tuner, number) if number else "no session was opened"
+                        return read_back(self._reading(tuner), home, number, how)
                 except Ended as ended:
-                    if time.monotonic() > give_up:
+                    if self._station.monotonic() > give_up:
+                        if ended.reason is Reason.NODE_NOT_OPERATIONAL:
+                            raise
                         raise Failed(Reason.RESTORE_UNCONFIRMED, ended.detail) from ended
-                    time.sleep(0.05)
+                    self._station.sleep(_AGAIN_S)
         finally:
             self._release()
 
-    def accept(self, gains: Gains) -> LoopState:
-        """In a short session of its own, so that gains whose acceptance fails, or whose tuner dies, do not stay."""
+    def accept(self, gains: Gains, instead_of: Gains) -> LoopState:
+        """In a short session of its own, so that an acceptance that is cut off leaves one set or the other."""
+        why: Ended | None = None
+        self._number = 0
         try:
-            with self._translated() as tuner:
-                self._watch_us(tuner)
-                self._no_experiment(Mode(int(tuner.number("controller_mode"))))
-                lease = self._short_lease(tuner)
-                self._stage(tuner, gains)
             try:
                 with self._translated() as tuner:
-                    tuner.write("controller_lease", lease)
-                    tuner.write("controller_parameter_command", ParameterCommand.TRY)
-                    tuner.write("controller_parameter_command", ParameterCommand.ACCEPT)
-                state = self._let_go()
-                if state.on_trial or not _same_gains(state.gains, gains):
-                    raise Failed(Reason.RESTORE_UNCONFIRMED, f"accepted {gains}, read back {state.gains}")
-                return state
+                    self._reading(tuner).identify()
+                    self._pace = tuner.number("plant_pace") if self._plant is not None else 1.0
+                    self._sample_time_s = tuner.number("sample_time", node=self._node) / 1e6
+                    held = self._open(tuner).gains
+                    if not same_gains(held, instead_of) and not same_gains(held, gains):
+                        text = f"the controller holds {held}, not {instead_of}: somebody has changed the gains"
+                        raise Refused(Reason.GAINS_CHANGED, text)
+                    self._order(tuner, Order.ACCEPT, *astuple(gains))
             except Ended as ended:
-                return self._after_all(gains, ended)
+                why = ended
+                if not self._number:
+                    raise
+            state = self._let_go(why)
         finally:
             self._release()
+        if state.on_trial or not same_gains(state.gains, gains):
+            raise why or Failed(Reason.RESTORE_UNCONFIRMED, f"accepted {gains}, read back {state.gains}")
+        return state
 
     def close(self) -> None:
         self._release()
@@ -195,201 +210,197 @@ class BusLoop:
 
     # -- the way in
 
-    def _identify(self, tuner: Tuner) -> None:
-        for node, device in ((self._node, Device.CONTROLLER), (self._plant, Device.PLANT)):
-            if node is None:
-                continue
-            found = int(tuner.number("device_type", node=node))
-            expected = int(default_of(lookup("device_type"), 0, device))
-            if found != expected:
-                text = f"node {node:02X}h is of type {found:08X}h, not a {device.value} ({expected:08X}h)"
-                raise Refused(Reason.DEVICE_MISMATCH, text)
-
-    def _compare_times(self, tuner: Tuner) -> None:
-        """A controller that reckons with another sample time than the plant's has other gains than it shows."""
-        if self._plant is None:
-            return
-        ours, theirs = (tuner.number("sample_time", node=node) / 1e6 for node in (self._node, self._plant))
-        if ours != theirs:
-            text = f"controller node {self._node:02X}h has a sample time of {ours:g} s"
-            raise Refused(Reason.DEVICE_MISMATCH, f"{text}, plant node {self._plant:02X}h one of {theirs:g} s")
-
-    def _watch_us(self, tuner: Tuner) -> None:
-        """Arms the watch on our heartbeat. A session that a dead tuner left ends first, for want of its heartbeat."""
-        give_up = time.monotonic() + LEFTOVER_S
-        while tuner.number("controller_lease"):
-            if time.monotonic() > give_up:
-                raise Refused(Reason.WRONG_MODE, "another tuner holds the lease of this loop")
-            time.sleep(0.05)
-        tuner.write("heartbeat_consumer", TUNER_NODE << 16 | HEARTBEAT_WATCH_MS, sub=1, node=self._node)
-        tuner.hold()
-        if tuner.number("controller_on_trial"):
-            tuner.write("controller_parameter_command", ParameterCommand.GO_BACK)
-
-    def _take_plant(self, tuner: Tuner, stop: Callable[[], Reason | None]) -> None:
+    def _take_plant(self, tuner: Tuner) -> None:
         """Waits for its turn on a plant that is run in blocks; before anything of ours is armed in the controller."""
+        self._sample_time_s = tuner.number("sample_time", node=self._node) / 1e6
         self._pace = tuner.number("plant_pace") if self._plant is not None else 1.0
         self._in_blocks = self._pace == 0.0
         if not self._in_blocks or self._plant is None:
             return
-        with _plants_guard:
-            lock = _plants.setdefault((self._url, self._plant), threading.Lock())
+        lock = self._station.plant(self._url, self._plant)
         while not lock.acquire(timeout=0.1):
-            if (reason := stop()) is not None:
-                raise Aborted(reason, f"while another test was using plant node {self._plant:02X}h")
+            self._heed_stop(f"while another test was using plant node {self._plant:02X}h")
         self._held = lock
 
     def _take_time(self, tuner: Tuner) -> None:
         """Who drives the samples: the plant by its clock, or we in blocks."""
-        self._sample_time_s = tuner.number("sample_time", node=self._node) / 1e6
-        per_sample_s = self._sample_time_s / (self._pace or math.inf)
-        self._silence_s = max(SILENCE_S, 3.0 * per_sample_s)
+        self._silence_s = max(SILENCE_S, 3.0 * self._sample_time_s / (self._pace or math.inf))
         if self._in_blocks:
-            tuner.write("plant_samples_to_run", 0)
-            while tuner.sample(0.03) is not None:
-                pass
+            self._halted = True
+            self._halt(tuner)
         elif self._plant is not None and not tuner.number("plant_samples_to_run"):
             tuner.write("plant_samples_to_run", FOREVER)
 
-    def _command_lag(self) -> int:
-        """A block, or the samples that come while several commands wait for slow answers."""
-        if self._in_blocks:
-            return 5 * self._block
-        return max(50, math.ceil(COMMAND_WALL_S * self._pace / self._sample_time_s))
+    def _halt(self, tuner: Tuner) -> None:
+        """Tells the plant more than once: one that is reset meanwhile runs again as it was started."""
+        give_up = self._station.monotonic() + HALT_S
+        again_at = 0.0
+        while True:
+            now = self._station.monotonic()
+            if now >= again_at:
+                tuner.write("plant_samples_to_run", 0)
+                again_at = now + HALT_AGAIN_S
+            if tuner.sample(_HALTED_S) is None:
+                return
+            self._heed_stop("while the plant was brought to a halt")
+            self._renew_if_due(tuner)
+            if now > give_up:
+                text = f"plant node {self._plant:02X}h runs on although it has been told to halt (2011h)"
+                raise Failed(Reason.SAMPLES_LOST, text)
 
-    def _plan_lease(self) -> None:
-        """Samples we pay for at a time: some seconds of wall time, or some blocks."""
-        if self._in_blocks:
-            self._lease = 60 * self._block
-            return
-        self._lease = max(SHORTEST_LEASE, math.ceil(LEASE_WALL_S * self._pace / self._sample_time_s))
+    def _open(self, tuner: Tuner, remember: Callable[[int], None] = lambda session: None) -> LoopState:
+        """Opens our session and returns home."""
 
-    def _short_lease(self, tuner: Tuner) -> int:
-        """Samples of LEASE_WALL_S, whoever runs the plant. It may run freely at pace 0; where it stands still, the
-        watch on our heartbeat alone ends a session."""
-        pace = tuner.number("plant_pace") if self._plant is not None else 1.0
-        per_s = pace / (tuner.number("sample_time", node=self._node) / 1e6) if pace else FASTEST_PER_S
-        return max(SHORTEST_LEASE, math.ceil(LEASE_WALL_S * per_s))
+        def note(number: int) -> None:
+            remember(number)
+            self._number = number
 
-    @staticmethod
-    def _no_experiment(mode: Mode) -> None:
-        if mode is Mode.EXPERIMENT:
-            text = "an experiment is running in the controller: wait for its end, or set the mode to automatic"
-            raise Refused(Reason.WRONG_MODE, text)
+        self._wait_for_others(tuner)
+        tuner.hold()  # not before: a process before us may have had our node-ID, and its session would hear our beats
+        self._session = TunerSession(tuner)
+        self._lease = self._terms()
+        try:
+            self._session.open(self._lease, note)
+        except TunerError as error:
+            if error.kind is Kind.ABORT:  # there is no session: nothing to close, nothing to look after
+                note(0)
+            if error.code == Abort.LOCAL_CONTROL:
+                text = "an RPDO has just moved the set-point: an outer loop, a ramp or a recipe drives it"
+                raise Refused(Reason.SETPOINT_IS_DRIVEN, text) from error
+            if error.code == Abort.DEVICE_STATE:
+                raise self._in_use(tuner) from error
+            raise
+        self._renewed_at = self._station.monotonic()
+        self._until_renewal = self._lease.samples // 3
+        tuner.emergencies.clear()
+        tuner.restarted, tuner.session_is_open = False, True
+        home = self._reading(tuner).home()
+        if tuner.session_is_open:  # else a hand was on the loop meanwhile, and the status has said so
+            tuner.mode, tuner.on_trial, tuner.sp = home.mode, False, home.sp
+        return home
+
+    def _wait_for_others(self, tuner: Tuner) -> None:
+        """The session of a tuner that has died ends within its lease; that of one that lives is not ours to end."""
+        give_up = self._station.monotonic() + OTHERS_S
+        while tuner.number("controller_session"):
+            if self._station.monotonic() > give_up:
+                raise self._in_use(tuner)
+            self._heed_stop("while another tuner held the loop")
+            self._station.sleep(_AGAIN_S)
+
+    def _in_use(self, tuner: Tuner) -> Refused:
+        self._reading(tuner).check_controller_operational()
+        holder = int(tuner.number("controller_session_holder"))
+        if holder:
+            return Refused(Reason.LOOP_IN_USE, f"the tuner with node-ID {holder:02X}h holds a session on this loop")
+        if tuner.number("controller_on_trial"):
+            text = "somebody tries other gains by hand: accept them or take them back (2120h), then repeat"
+            return Refused(Reason.GAINS_CHANGED, text)
+        return Refused(Reason.LOOP_IN_USE, "another tuner had this loop in the moment of the opening")
+
+    def _terms(self) -> Lease:
+        """What we pay for at a time. At pace 0 samples say nothing of time."""
+        if not self._pace:
+            samples, lease_s, silence_s = FOREVER, LEASE_IN_BLOCKS_S, PV_SILENCE_IN_BLOCKS_S
+        else:
+            samples, lease_s = math.ceil(LEASE_WALL_S * self._pace / self._sample_time_s), LEASE_WALL_S
+            silence_s = max(SILENCE_S, 3.0 * self._sample_time_s / self._pace)
+        ms = (math.ceil(1000.0 * lease_s), math.ceil(1000.0 * silence_s))
+        return Lease(min(max(samples, SHORTEST_LEASE), FOREVER), *ms, HEARTBEAT_WATCH_MS)
 
     # -- on the way
 
     def _carry_out(self, tuner: Tuner, command: Command) -> None:
+        """What an order has brought about is known from its answer: a status frame may be lost."""
         match command:
             case SetSetpoint(value):
-                tuner.write("controller_setpoint", value)
+                self._order(tuner, Order.SETPOINT, value)
+                tuner.sp = tuner.number("controller_setpoint")
             case SetMode(Mode.EXPERIMENT):
-                pass  # SetRelay has started it; commanded again it would start anew
+                pass  # SetRelay has started it
             case SetMode(mode):
-                tuner.write("controller_mode_command", mode)
+                self._order(tuner, Order.MODE, mode)
+                tuner.mode = mode
             case SetGains(gains):
-                self._try(tuner, gains, self._keep)
-                self._tried = gains
+                self._order(tuner, Order.TRY, *astuple(gains))
+                tuner.on_trial = True
             case SetOutput(value):
-                tuner.write("controller_manual_output", value)
+                self._order(tuner, Order.OUTPUT, value)
             case SetRelay():
-                self._start_relay(tuner, command)
+                low, high = self._pv_limits or tuple(tuner.number(f"controller_pv_{end}") for end in ("low", "high"))
+                self._order(
+                    tuner, Order.RELAY, command.amplitude, command.hysteresis, command.working_output, RELAY_LONGEST,
+                    low, high, command.amplitude_low or 0.0, command.average,
+                )  # fmt: skip
+                tuner.mode = Mode.EXPERIMENT
 
-    def _start_relay(self, tuner: Tuner, relay: SetRelay) -> None:
-        """Writes what is not as it was written before: a relay that only gets another amplitude soon has it."""
-        wanted = {
-            "amplitude": relay.amplitude,
-            "hysteresis": relay.hysteresis,
-            "working_output": relay.working_output,
-            "parallel_gain": 0.0,  # the controller has one, no procedure wants it
-            "amplitude_low": relay.amplitude_low or 0.0,
-            "average": relay.average,
-            "max_samples": RELAY_LONGEST,
-        }
-        if not self._relay_written:
-            wanted |= {name: tuner.number(f"controller_{name}") for name in ("pv_low", "pv_high")}
-        for name, value in wanted.items():
-            if self._relay_written.get(name) != value:
-                self._keep(tuner)
-                tuner.write(f"controller_relay_{name}", value)
-                self._relay_written[name] = value
-        tuner.write("controller_experiment", Experiment.RELAY)
-        tuner.write("controller_mode_command", Mode.EXPERIMENT)
-
-    def _try(self, tuner: Tuner, gains: Gains, pay: Callable[[Tuner], None] = lambda tuner: None) -> None:
-        """pay: what keeps the session open while one write waits for the other, if there is a session."""
-        self._stage(tuner, gains, pay)
-        tuner.write("controller_parameter_command", ParameterCommand.TRY)
-
-    def _stage(self, tuner: Tuner, gains: Gains, pay: Callable[[Tuner], None] = lambda tuner: None) -> None:
-        values = (gains.Kp, gains.Ti, gains.Td, gains.Tf, gains.b, gains.c)
-        for name, value in zip(_PARAMETERS, values, strict=True):
-            pay(tuner)
-            tuner.write(f"controller_staged_{name}", value)
-
-    def _keep(self, tuner: Tuner) -> None:
-        """Pays for more when a third is used up: by samples, or by wall time that went by in waiting for answers of a
-        node that many loops ask."""
-        waited = not self._in_blocks and time.monotonic() - self._paid_at > LEASE_WALL_S / 3
-        if self._until_renewal <= 0 or waited:
-            self._renew(tuner)
-
-    def _renew(self, tuner: Tuner) -> None:
-        """Pays for the session that is open; a lease written after its end would open another one."""
+    def _order(self, tuner: Tuner, order: Order, *values: float) -> None:
+        assert self._session is not None
         try:
-            tuner.write("controller_lease_renewal", self._lease)
+            self._session.give(order, values, lambda: self._renew_if_due(tuner))
+        except TunerError as error:
+            if error.code in (Abort.DEVICE_STATE, Abort.INVALID_VALUE) and not self._session.is_open:
+                raise self._over(tuner) from error
+            raise
+
+    def _renew_if_due(self, tuner: Tuner) -> None:
+        """Pays for more when a third is used up, by samples or by wall time."""
+        waited_s = self._station.monotonic() - self._renewed_at
+        if self._until_renewal > 0 and waited_s * 3000.0 < self._lease.ms:
+            return
+        assert self._session is not None
+        try:
+            self._session.renew()
         except TunerError as error:
             if error.code == Abort.DEVICE_STATE:
-                raise self._gone_back(tuner) from error
+                raise self._over(tuner) from error
             raise
-        self._until_renewal, self._paid_at = self._lease // 3, time.monotonic()
+        self._until_renewal, self._renewed_at = self._lease.samples // 3, self._station.monotonic()
 
-    def _look(self, tuner: Tuner) -> None:
-        """Asks for what the status frames tell (one of them may have been lost), and for what none tells: whether the
-        gains on trial are still ours."""
-        tuner.sp = tuner.number("controller_setpoint")
-        tuner.mode = int(tuner.number("controller_mode"))
-        if self._tried is not None:
-            Kp, Ti = (tuner.number(f"controller_staged_{name}") for name in ("kp", "ti"))
-            if not (_same(Kp, self._tried.Kp) and _same(Ti, self._tried.Ti)):
-                text = f"somebody else has put Kp {Kp:.6g}, Ti {Ti:.6g} s in the place of the gains on trial"
-                raise Aborted(Reason.GAINS_CHANGED, text)
-        self._until_look = self._lease * 2 // 3
+    def _heed_stop(self, when: str) -> None:
+        reason = self._stop()
+        if reason is not None:
+            raise Aborted(reason, when)
 
-    def _hear(self, tuner: Tuner) -> None:
-        """An emergency may concern another channel: our own lease tells."""
-        codes, tuner.emergencies = tuner.emergencies, []
-        if tuner.restarted:
-            tuner.restarted = False
-            raise self._restarted()
-        if any(code in _WENT_BACK for code in codes) and not tuner.number("controller_lease"):
-            raise self._gone_back(tuner)
+    def _next_sample(self, tuner: Tuner) -> BusSample:
+        give_up: float | None = None
+        while True:
+            found = tuner.sample(_SLICE_S)
+            if tuner.restarted or not tuner.session_is_open:
+                self._see_whether_it_is_over(tuner)
+            if found is not None and (self._first_n is None or found.n != self._last_n):  # a frame may come twice
+                return found
+            now = self._station.monotonic()
+            give_up = give_up or now + self._silence_s
+            if now > give_up:
+                raise self._silent(tuner)
+            self._renew_if_due(tuner)
+            self._heed_stop("while waiting for a sample")
 
-    def _restarted(self) -> Failed:
-        return Failed(Reason.NODE_LOST, f"controller node {self._node:02X}h restarted")
+    def _see_whether_it_is_over(self, tuner: Tuner) -> None:
+        """A status frame from before the opening may come late; the controller knows."""
+        tuner.restarted, tuner.session_is_open = False, True
+        if int(tuner.number("controller_session")) != self._number:
+            raise self._over(tuner)
 
-    def _gone_back(self, tuner: Tuner) -> Failed:
-        cause = Cause(int(tuner.number("controller_cause")))
-        if cause is Cause.PV_LIMIT:
-            return Failed(Reason.PV_LIMIT, "PV left its span during the experiment; the controller ended it")
-        if cause is Cause.NONE:  # it has never held a lease of ours
-            return self._restarted()
-        name = cause.name.lower().replace("_", " ")
-        return Failed(Reason.DEVICE_WENT_BACK, f"the controller ended the trial by itself (cause: {name})")
+    def _over(self, tuner: Tuner) -> Ended:
+        """Why our session has ended without us."""
+        return why_over(self._reading(tuner), self._number, self._lease.pv_silence_ms / 1000.0)
 
-    def _silent(self, tuner: Tuner) -> Failed:
+    def _silent(self, tuner: Tuner) -> Ended:
         """No samples: who is it? A node that is gone raises by its time-out."""
-        tuner.number("controller_mode")
-        if self._plant is not None:
-            tuner.number("plant_samples_to_run")
-        if not tuner.number("controller_lease"):
-            return self._gone_back(tuner)
+        reading = self._reading(tuner)
+        reading.check_controller_operational()
+        reading.check_plant_operational()
+        if int(tuner.number("controller_session")) != self._number:
+            return self._over(tuner)
         return Failed(Reason.SAMPLES_LOST, f"no sample for {self._silence_s:g} s although the nodes answer")
 
     def _count(self, found: BusSample) -> Sample:
-        if self._first_n is None:
-            self._first_n, self._last_n = found.n, found.n - 1
-        passed = found.n - self._last_n
+        first = self._first_n is None
+        if first:
+            self._first_n = found.n
+        passed = 1 if first else samples_between(self._last_n, found.n)
         self._last_n = found.n
         if passed < 1:
             raise Failed(Reason.SAMPLES_LOST, f"the plant started anew: sample {found.n} after {found.n - passed}")
@@ -399,78 +410,51 @@ class BusLoop:
             raise Failed(Reason.SAMPLES_LOST, f"{passed - 1} samples missing before sample {found.n}")
         self._left -= passed if self._in_blocks else 0
         self._until_renewal -= passed
-        self._until_look -= passed
-        return Sample((found.n - self._first_n) * self._sample_time_s, found.sp, found.pv, found.mv, found.mode)
+        self._passed += passed
+        return Sample((self._passed - 1) * self._sample_time_s, found.sp, found.pv, found.mv, found.mode)
 
     # -- the way out
 
-    def _bring_back(self, state: LoopState) -> LoopState:
-        with self._translated() as tuner:
-            if state.mode is not self._mode_found and tuner.number("controller_mode") == state.mode:
-                tuner.write("controller_lease", 0)  # ends the trial; their mode and output stay
-            tuner.write("controller_parameter_command", ParameterCommand.GO_BACK)
-            if not _same_gains(_gains(tuner, "accepted"), state.gains):
-                self._make_accepted(tuner, state.gains)
-            tuner.write("controller_setpoint", state.sp)
-            tuner.write("controller_mode_command", state.mode)
-            tuner.write("controller_lease", 0)
-            found = self._state(tuner)
-        differences = [
-            f"{name} is {is_}, was {was}"
-            for name, is_, was, same in (
-                ("mode", found.mode.name, state.mode.name, found.mode is state.mode),
-                ("set-point", found.sp, state.sp, _same(found.sp, state.sp)),
-                ("gains", found.gains, state.gains, _same_gains(found.gains, state.gains)),
-                ("trial", found.on_trial, False, not found.on_trial),
-            )
-            if not same
-        ]
-        if differences:
-            raise Failed(Reason.RESTORE_UNCONFIRMED, "; ".join(differences))
-        return found
+    def _close(self, tuner: Tuner, number: int) -> str:
+        """How the session has ended, in words."""
+        if int(tuner.number("controller_session")) == number:
+            session = TunerSession(tuner)
+            session.take_up(number)
+            with suppress(TunerError):  # a hand may be faster; what is read next counts
+                session.close()
+            if int(tuner.number("controller_session")) == number:
+                raise Failed(Reason.RESTORE_UNCONFIRMED, f"session {number:08X}h could not be closed")
+            return "the session was closed"
+        if int(tuner.number("controller_session_last")) == number:
+            return f"the controller had ended the session ({words_of(cause_of(tuner))})"
+        return "the controller knows nothing of the session: it has been restarted, or others have been on it since"
 
-    def _make_accepted(self, tuner: Tuner, gains: Gains) -> None:
-        self._try(tuner, gains)
-        tuner.write("controller_parameter_command", ParameterCommand.ACCEPT)
-
-    def _let_go(self) -> LoopState:
-        """The state without a session. A lease of 0 ends what is on trial and leaves mode, set-point and output as they
-        are; going back would undo a hand that has been on them meanwhile."""
-        with self._translated() as tuner:
-            tuner.write("controller_lease", 0)
-            return self._state(tuner)
-
-    def _after_all(self, gains: Gains, why: Ended) -> LoopState:
-        """An acceptance that has failed: nothing may stay on trial. Where only an answer was lost, the gains are
-        accepted: what is read back counts."""
-        give_up = time.monotonic() + RESTORE_PATIENCE_S
-        state: LoopState | None = None
-        while state is None or state.on_trial:
-            if time.monotonic() > give_up:
-                text = "the end of the trial is not confirmed, the controller ends it by itself within seconds"
-                raise type(why)(why.reason, f"{why.detail}; {text}: read the loop before going on") from why
+    def _let_go(self, why: Ended | None) -> LoopState:
+        """Closes the session of an acceptance and reads what is accepted now."""
+        give_up = self._station.monotonic() + RESTORE_PATIENCE_S
+        while True:
             try:
-                state = self._let_go()
-            except Ended:
-                time.sleep(0.05)
-        if not _same_gains(state.gains, gains):
-            raise why
-        return state
+                with self._translated() as tuner:
+                    self._close(tuner, self._number)
+                    return self._reading(tuner).state()
+            except Ended as ended:
+                if self._station.monotonic() > give_up:
+                    why = why or ended
+                    text = "the end of the session is not confirmed, the controller ends it by itself within seconds"
+                    raise type(why)(why.reason, f"{why.detail}; {text}: read the loop before going on") from ended
+                self._station.sleep(_AGAIN_S)
 
     def _release(self) -> None:
-        """Our heartbeat ends; a plant that we ran in blocks runs on by itself, and others may take it.
-
-        The watch on it stays armed: it is the node's, not the channel's, and another process may hold a loop there.
-        A controller that does not tell an idle tuner from a lost one says 8130h once we are silent; it harms nothing.
-        """
+        """Our heartbeat ends; a plant that we ran in blocks runs on by itself, and others may take it."""
         if self._tuner is not None:
             self._tuner.beating = False
-        if self._held is None:
-            return
-        with suppress(Ended), self._translated() as tuner:
-            tuner.write("plant_samples_to_run", FOREVER)
-        self._held.release()
-        self._held = None
+        if self._halted:
+            with suppress(Ended), self._translated() as tuner:
+                tuner.write("plant_samples_to_run", FOREVER)
+            self._halted = False
+        if self._held is not None:
+            self._held.release()
+            self._held = None
 
     def _forget(self) -> None:
         if self._tuner is not None:
@@ -484,8 +468,10 @@ class BusLoop:
         """The tuner, opened when needed; what goes wrong on the bus becomes a reason of the closed list."""
         try:
             if self._tuner is None:
-                self._tuner = Tuner(self._url, self._node, self._plant, self._channel)
+                self._tuner = Tuner(self._url, self._node, self._plant, self._channel, station=self._station)
             yield self._tuner
+        except NodeTaken as error:
+            raise Refused(Reason.LOOP_IN_USE, str(error)) from error
         except BusError as error:
             self._forget()
             raise Failed(Reason.BUS_LOST, str(error)) from error
@@ -495,37 +481,18 @@ class BusLoop:
             raise Failed(Reason.BUS_LOST, text) from error
         except TunerError as error:
             if error.kind is Kind.TIMEOUT:
-                raise Failed(Reason.NODE_LOST, str(error)) from error
+                raise self._no_answer(error) from error
             if error.code in _NOT_OURS:
                 raise Refused(Reason.DEVICE_MISMATCH, str(error)) from error
             raise Refused(Reason.BAD_INPUT, f"the controller refused: {error}") from error
 
-    def _state(self, tuner: Tuner) -> LoopState:
-        """The gains are the accepted ones, in or out of a trial: those that it ends with. Whoever reads here has none
-        on trial itself; what somebody else tries, or has forgotten, must not be written down as what to restore."""
-        return LoopState(
-            mode=Mode(int(tuner.number("controller_mode"))),
-            sp=tuner.number("controller_setpoint"),
-            pv=tuner.number("controller_received_pv"),
-            mv=tuner.number("controller_mv"),
-            gains=_gains(tuner, "accepted"),
-            on_trial=bool(tuner.number("controller_on_trial")),
-            mv_low=tuner.number("controller_mv_low"),
-            mv_high=tuner.number("controller_mv_high"),
-            sample_time_s=tuner.number("sample_time", node=self._node) / 1e6,
-            reverse_acting=tuner.number("controller_action") == 0,
-        )
+    def _no_answer(self, error: TunerError) -> Failed:
+        """A node that is stopped beats, and answers no SDO."""
+        states = self._tuner.node_states if self._tuner is not None else {}
+        for node in (self._node, self._plant):
+            if node is not None and states.get(node) == NmtState.STOPPED:
+                return not_operational(node, NmtState.STOPPED)
+        return Failed(Reason.NODE_LOST, str(error))
 
-
-def _gains(tuner: Tuner, which: str) -> Gains:
-    return Gains(*(tuner.number(f"controller_{which}_{name}") for name in _PARAMETERS))
-
-
-def _same(a: float, b: float) -> bool:
-    """Equal as far as REAL32 can tell."""
-    return math.isclose(a, b, rel_tol=1e-6, abs_tol=1e-12)
-
-
-def _same_gains(a: Gains, b: Gains) -> bool:
-    pairs = ((a.Kp, b.Kp), (a.Ti, b.Ti), (a.Td, b.Td), (a.Tf, b.Tf), (a.b, b.b), (a.c, b.c))
-    return all(_same(one, other) for one, other in pairs)
+    def _reading(self, tuner: Tuner) -> BusReading:
+        return BusReading(tuner, self._node, self._plant, self._channel)

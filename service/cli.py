@@ -72,6 +72,9 @@ def serve(
     host: Annotated[
         str | None, typer.Option(envvar="LOOPWRIGHT_HOST", help="Name of this host among those of a shared database.")
     ] = None,
+    node: Annotated[
+        str, typer.Option(envvar="LOOPWRIGHT_NODE", help="Our CANopen node id, another one at each gateway of a bus.")
+    ] = "0x7D",
     resume: Annotated[bool, typer.Option(help="Go on with jobs that a crash has cut off.")] = True,
     auth: Annotated[
         bool | None, typer.Option("--auth/--no-auth", help="Ask for keys. Default: unless only this machine is served.")
@@ -103,8 +106,11 @@ def serve(
     ] = "text",
 ) -> None:
     """The service: REST over jobs that retune live loops."""
+    from argparse import ArgumentTypeError
+
     from sqlalchemy.exc import SQLAlchemyError
 
+    from protocol.process import node_id
     from service.config import ConfigError
     from service.retention import Keep
     from service.security.limits import RequestLimits
@@ -123,9 +129,13 @@ def serve(
         streams_at_once=streams,
         computations_at_once=computations,
     )
+    try:
+        own_node = node_id(node)
+    except (ValueError, ArgumentTypeError):
+        die(f"--node must be a CANopen node id, 1 to 127 (0x01 to 0x7F), not {node!r}", 2)
     setup = Setup(
         loops, data, bind, port, database, host, resume,
-        auth=auth, limits=limits, log_format="json" if log_format == "json" else "text",
+        node=own_node, auth=auth, limits=limits, log_format="json" if log_format == "json" else "text",
         keep=Keep(keep_jobs, keep_days),
     )  # fmt: skip
     try:
@@ -201,6 +211,20 @@ def retune(
         show.job_report(job)
     if wait and job["state"] != "proposed":
         raise typer.Exit(3)
+
+
+@app.command()
+def dismiss(
+    loop: Annotated[str, typer.Argument(help="Tag of the loop.")], url: Url = DEFAULT_URL, as_json: AsJson = False
+) -> None:
+    """Answer for a loop that was not confirmed home after a job: it is looked after no more."""
+    found = Client(url).post(f"/loops/{loop}/dismiss", {"by": "cli"})
+    if as_json:
+        print_json(found)
+    elif found["jobs"]:
+        print(f"{loop} is looked after no more ({', '.join(found['jobs'])})")
+    else:
+        print(f"{loop} was not looked after")
 
 
 @app.command("jobs")

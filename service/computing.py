@@ -15,7 +15,7 @@ from functools import partial
 from multiprocessing.connection import wait
 from typing import Any
 
-from service.loop import Loop, LoopState
+from service.loop import Loop, LoopState, Restored
 from tuning.gains import Gains
 from tuning.plan import Command, Sample, Work
 from tuning.reasons import Reason
@@ -130,20 +130,24 @@ class Computing:
     def waits(self) -> bool:
         return self._loop.waits
 
-    def read(self) -> LoopState:
-        return self._loop.read()
+    def read(self, beside_tests: bool = False) -> LoopState:
+        return self._loop.read(beside_tests)
 
-    def begin(self, stop: Callable[[], Reason | None] = lambda: None) -> LoopState:
-        return self._loop.begin(stop)
+    def begin(
+        self,
+        stop: Callable[[], Reason | None] = lambda: None,
+        remember: Callable[[int], None] = lambda session: None,
+    ) -> LoopState:
+        return self._loop.begin(stop, remember)
 
-    def restore(self, state: LoopState) -> LoopState:
+    def restore(self, home: LoopState, session: int | None = None) -> Restored:
         # What still waits for its turn nobody wants any more. In a worker it is computed in vain: a pool that breaks
         # with a cancelled future in its queue gives no word of what is behind it.
         self._over = True
-        return self._loop.restore(state)
+        return self._loop.restore(home, session)
 
-    def accept(self, gains: Gains) -> LoopState:
-        return self._loop.accept(gains)
+    def accept(self, gains: Gains, instead_of: Gains) -> LoopState:
+        return self._loop.accept(gains, instead_of)
 
     def close(self) -> None:
         self._loop.close()

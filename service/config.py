@@ -93,6 +93,17 @@ class Site:
     loops: dict[str, LoopConfig]
     buses: dict[str, BusConfig]
 
+    def check_own_node(self, node: int, source: str) -> None:
+        """Raises ConfigError where a device of the site has the node id that the service is to have."""
+        ours = [
+            f"{loop.tag}: {name}_node is {node:#04x}, which is the service's own node id: start it with another --node"
+            for loop in self.loops.values()
+            for name, its in (("controller", loop.controller_node), ("plant", loop.plant_node))
+            if its == node
+        ]
+        if ours:
+            raise ConfigError(source, ours)
+
 
 class _OnceEach(yaml.SafeLoader):
     """A key given twice is one too many: of two limits the last would win without a word."""

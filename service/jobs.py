@@ -8,30 +8,31 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import asdict
 from typing import Any, TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from service.aftercare import Aftercare
 from service.config import BusConfig, LoopConfig
 from service.engine import WORKFLOW_VERSION, Engine
 from service.errors import Conflict, Stopping, UnknownLoop
-from service.exchange import exchange
+from service.exchange import ForeignGains, exchange
 from service.journal import Journal, temporary
 from service.logs import about
-from service.loop import Loop, LoopState
+from service.loop import Loop, LoopState, differences, same_gains
+from service.machine import Machine
 from service.observed import ObservedLoop
 from service.recovery import Recovery
 from service.request import BadLimits, RetuneRequest, within
 from service.running import Running
-from service.safe import PATIENCE_S, make_safe
+from service.safe import make_safe
 from service.state_json import gains_of, loop_state, state_json
 from service.states import ACTIVE, IllegalMove, JobState, state_after
+from service.store import looked_after
 from service.store.store import Busy, FolderInUse, NoSuchJob, Store, WithJob
 from service.store.tables import JobRow
 from service.work import Hooks, Outcome, Rehearse, Tune
@@ -57,7 +58,7 @@ class Jobs:
     """Starts, stops and decides jobs of this host's loops; shows, starts and aborts those of the others.
 
     buses: what is configured for them.  resume: whether jobs that a dead service left go on at the next start.
-    patience_s: how long a loop that such a job had gets to come back by itself, s of wall time.
+    machine: clock and threads.
     """
 
     def __init__(
@@ -71,29 +72,32 @@ class Jobs:
         engine: Engine,
         buses: Mapping[str, BusConfig] | None = None,
         resume: bool = True,
-        patience_s: float = PATIENCE_S,
+        machine: Machine | None = None,
     ) -> None:
         self.loops = loops
         self.store = store
         self.engine = engine
-        self.journal = Journal(store)
+        self._machine = machine or Machine()
+        self.journal = Journal(store, beside=self._machine.writes_beside)
         self.stopping = False
         self._open_loop = open_loop
         self._tune = tune
         self._rehearse = rehearse
         self._buses = buses or {}
         self.resumes = resume
-        self._patience_s = patience_s
         self._running: dict[str, Running] = {}
         # Guards the registry of running jobs and `stopping`.
         self._lock = threading.Lock()
         # By loop: who is about to begin a job on it, or to decide one.
-        self._hands: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
+        self._hands: defaultdict[str, AbstractContextManager[Any]] = defaultdict(self._machine.lock)
+        self.aftercare = Aftercare(
+            loops, store, lambda config: self._open_loop(config), self._hands, machine=self._machine
+        )
         self._lost: set[str] = set()
         # By id: jobs whose asker was told that they could not be queued, and whose end could not be written either.
         self._unqueued: dict[str, JobRow] = {}
         self._ended = threading.Event()
-        self._watcher = threading.Thread(target=self._watch, name="watcher", daemon=True)
+        self._watcher = self._machine.thread(self._watch, "watcher")
 
     # at the start of the service
     def boot(self) -> None:
@@ -102,14 +106,16 @@ class Jobs:
         Raises ForeignLoop.
         """
         self.store.own_loops({tag: config.model_dump(mode="json") for tag, config in self.loops.items()})
-        with ThreadPoolExecutor(_AT_BOOT, "boot") as pool:
-            recovery = Recovery(self.loops, self.store, self._open_loop, self.resumes, self._patience_s)
-            for _ in pool.map(recovery.recover, self.store.unfinished()):
-                pass
+        recovery = Recovery(self.loops, self.store, self._open_loop, self.resumes, lambda: self.stopping)
+        self._machine.side_by_side(recovery.recover, self.store.unfinished(), _AT_BOOT)
+        if self.stopping:  # told to end meanwhile: what is left of the jobs is left to the next start
+            return
         queues = {self._queue(config): self.at_once(config.bus) for config in self.loops.values()}
         self.engine.launch(self.work, queues | {self._rehearsals(self.store.host): REHEARSALS_AT_ONCE})
         self.reconcile(at_once=True)
-        self._watcher.start()
+        if not self.stopping:
+            self._watcher.start()
+            self.aftercare.start()
 
     def reconcile(self, at_once: bool = False) -> None:
         """Hands the engine what it has lost (an enqueue that failed, a file that was deleted or is older than ours).
@@ -246,6 +252,7 @@ class Jobs:
     def request_stop(self) -> None:
         """Tells every job to end; returns at once."""
         self.stopping = True
+        self.aftercare.request_stop()
         for running in list(self._running.values()):
             running.stop_reason = running.stop_reason or Reason.SERVICE_STOPPED
 
@@ -258,15 +265,16 @@ class Jobs:
             return
         with self._lock:
             self.request_stop()
-        give_up = time.monotonic() + _ENDS_S
+        give_up = self._machine.monotonic() + _ENDS_S
         for running in list(self._running.values()):
-            if not running.over.wait(max(0.0, give_up - time.monotonic())):
+            if not running.over.wait(max(0.0, give_up - self._machine.monotonic())):
                 log.error(
                     "job %s of loop %s has not ended in %.0f s: whether its loop is restored is unknown, and its end "
                     "is not written; look at the controller, which goes back by itself when it hears no more of the "
                     "service; the next start looks at the loop again",
                     running.job_id, running.tag, _ENDS_S,
                 )  # fmt: skip
+        self.aftercare.close()
         self._ended.set()
         if self._watcher.ident is not None:  # a service that did not come to its start leaves the jobs as they are
             self._watcher.join()
@@ -280,15 +288,15 @@ class Jobs:
 
     def _watch(self) -> None:
         """Hears of jobs to stop, from whatever host; holds the lock on our name; finds what the engine has lost."""
-        reconciled = time.monotonic()
+        reconciled = self._machine.monotonic()
         while not self._ended.wait(_WATCH_S):
             try:
                 for job_id, reason in self.store.wishes_to_stop().items():
                     self._heed(job_id, Reason(reason))
-                if time.monotonic() - reconciled > _RECONCILE_S:
+                if self._machine.monotonic() - reconciled > _RECONCILE_S:
                     self.store.check_lock()
                     self.reconcile()
-                    reconciled = time.monotonic()
+                    reconciled = self._machine.monotonic()
             except FolderInUse as error:
                 log.critical("%s; every job is stopped", error)
                 self.request_stop()
@@ -296,6 +304,18 @@ class Jobs:
                 log.warning("the database does not answer: %s", error)
             except Exception:  # whatever it is, aborts from other hosts must go on being heard
                 log.exception("watching the jobs")
+
+    # loops looked after
+    def dismiss(self, tag: str, by: str) -> list[str]:
+        """A person answers for a loop that is looked after: it is not looked at any more. The jobs it was for; none
+        when it was not looked after. Raises UnknownLoop, Busy."""
+        if not looked_after.rows(self.store, tag):
+            self.owner(tag)
+            return []
+        active = self.store.active(tag)
+        if active is not None:
+            raise Busy(tag, active.id)
+        return looked_after.dismissed(self.store, tag, by)
 
     # decide
     def accept(self, job_id: str, by: str) -> JobRow:
@@ -307,7 +327,8 @@ class Jobs:
 
     def rollback(self, job_id: str, by: str) -> JobRow:
         """Declines a proposal (the loop has its old gains already), or takes back a change that is accepted or was
-        begun to be."""
+        begun to be. Gains that somebody else has put in since stay: a proposal is declined, an accepted change is not
+        taken back (Conflict)."""
         return self._decide(job_id, JobState.ROLLED_BACK, by)
 
     def _decide(self, job_id: str, wanted: JobState, by: str) -> JobRow:
@@ -336,8 +357,16 @@ class Jobs:
                     state = exchange(loop, before, after, begun, lambda: self.store.begin_decision(job_id, wanted, by))
                 finally:
                     loop.close()
+            except ForeignGains as foreign:
+                # An acceptance that broke off, and then other gains by hand: there is nothing left to take back.
+                if not (begun and now is JobState.PROPOSED and wanted is JobState.ROLLED_BACK):
+                    raise
+                detail = f"declined; the controller holds {foreign.found.gains}: somebody else's, left as they are"
+                return self.store.move(job_id, wanted, by=by, restored=state_json(foreign.found), detail=detail)
             except Ended as ended:
                 self.store.decision_failed(job_id, wanted, by, f"{ended.reason.value}: {ended.detail}")
+                if ended.reason is Reason.GAINS_CHANGED:
+                    raise Conflict(ended.detail) from ended
                 raise
             return self.store.move(job_id, wanted, by=by, restored=state_json(state))
 
@@ -352,7 +381,8 @@ class Jobs:
         with self._lock:
             if self.stopping or job_id in self._running or job_id in self._unqueued:
                 return
-            running = Running(job_id, row.loop, self.journal, max(row.plant_time_s, before_s))
+            before_s = max(row.plant_time_s, before_s)
+            running = Running(job_id, row.loop, self.journal, before_s, self._machine.monotonic)
             self._running[job_id] = running
         try:
             # Read anew: until it was among those that run, an abort ended it as one that waits for its turn.
@@ -397,19 +427,40 @@ class Jobs:
             with self._hands[row.loop]:
                 state = self._begun(loop, row)
             earlier = self.store.events(row.id) if row.found is not None else ()
-            hooks = Hooks(running.on_event, running.on_samples, lambda: running.stop_reason, earlier)
+            hooks = Hooks(
+                running.on_event, running.on_samples, lambda: running.stop_reason, earlier,
+                lambda session: self._lasting(lambda: self.store.note_session(row.id, session)),
+                lambda home: self._note_home(row.id, state, home),
+            )  # fmt: skip
             return self._tune(config, request, loop, state, hooks)
         finally:
             loop.close()
 
+    def _note_home(self, job_id: str, read: LoopState, home: LoopState) -> None:
+        """What the controller noted as it opened the session counts, where a hand was faster than our reading.
+
+        Through the journal: the session is open, and waits for no database.
+        """
+        columns: dict[str, Any] = {}
+        if differences(home, read):
+            columns = {"found": state_json(home), "old_gains": asdict(home.gains)}
+        self.journal.put(looked_after.opened(job_id, columns))
+        if not same_gains(home.gains, read.gains):  # the plan reckons with those that were read
+            raise Aborted(Reason.GAINS_CHANGED, "other gains were accepted as the test was about to begin")
+
     def _begun(self, loop: Loop, row: JobRow) -> LoopState:
         """The state of the loop as an attempt begins, written down before anything is touched."""
-        if row.found is None:
-            state = loop.read()
-            columns: dict[str, Any] = {"old_gains": asdict(state.gains), "found": state_json(state), "attempt": 1}
-            self._lasting(lambda: self.store.move(row.id, JobState.RUNNING, **columns))
+        if row.found is None or row.session is None:
+            # No attempt has touched it. What an earlier one had read may have been another tuner's test.
+            state = loop.read(beside_tests=True)
+            columns: dict[str, Any] = {"old_gains": asdict(state.gains), "found": state_json(state)}
+            if row.found is None:
+                self._lasting(lambda: self.store.move(row.id, JobState.RUNNING, attempt=1, **columns))
+            else:
+                self._lasting(lambda: self.store.note(row.id, **columns))
+                self._resumed(row, "the loop had not been touched")
             return state
-        safe = make_safe(loop, loop_state(row.found), self._patience_s)
+        safe = make_safe(loop, loop_state(row.found), row.session)
         if safe.state is None:
             raise Failed(safe.reason or Reason.NODE_LOST, safe.text)
         if safe.reason is not None:
@@ -452,6 +503,8 @@ class Jobs:
         }
         if outcome.restored is not None:
             columns["restored"] = state_json(outcome.restored)
+        elif self._lasting(lambda: self.store.get(running.job_id)).session is not None:
+            columns["look_after"] = True
         state = JobState.PROPOSED
         if outcome.ended is not None:
             state = state_after(outcome.ended)
@@ -469,11 +522,11 @@ class Jobs:
 
     def _lasting(self, wish: Callable[[], T]) -> T:
         """The answer of the database, asked until it gives one; while the service stops, for a while only."""
-        since = time.monotonic()
+        since = self._machine.monotonic()
         while True:
             try:
                 return wish()
             except SQLAlchemyError as error:
-                if not temporary(error) or (self.stopping and time.monotonic() - since > _STOP_PATIENCE_S):
+                if not temporary(error) or (self.stopping and self._machine.monotonic() - since > _STOP_PATIENCE_S):
                     raise
-                time.sleep(0.5)
+                self._machine.sleep(0.5)

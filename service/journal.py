@@ -22,20 +22,27 @@ _RETRY_S = (0.1, 2.0)
 
 
 class Journal:
-    """One per service, for all of its jobs: what many jobs report at the same time is one transaction."""
+    """One per service, for all of its jobs: what many jobs report at the same time is one transaction.
 
-    def __init__(self, store: Store) -> None:
+    beside: written by a thread of its own; else by who reports, which is for a simulation.
+    """
+
+    def __init__(self, store: Store, beside: bool = True) -> None:
         self._store = store
         self._waiting: deque[Write] = deque()
         self._put = self._written = 0
         self._since: float | None = None
         self._closing = False
         self._changed = threading.Condition()
-        self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
-        self._thread.start()
+        self._thread = threading.Thread(target=self._run, name="journal", daemon=True) if beside else None
+        if self._thread is not None:
+            self._thread.start()
 
     def put(self, write: Write) -> None:
         """Returns at once."""
+        if self._thread is None:
+            self._write([write])
+            return
         with self._changed:
             self._waiting.append(write)
             self._put += 1
@@ -59,7 +66,8 @@ class Journal:
         with self._changed:
             self._closing = True
             self._changed.notify_all()
-        self._thread.join(timeout_s)
+        if self._thread is not None:
+            self._thread.join(timeout_s)
 
     def _run(self) -> None:
         pause, longest = _RETRY_S

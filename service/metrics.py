@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session
 from protocol.tuner import sdo_retries
 from service.config import LoopConfig
 from service.states import ACTIVE, JobState
+from service.store import looked_after
 from service.store.store import Store
 from service.store.tables import JobRow
 
@@ -57,12 +58,13 @@ class _OfTheStore(Collector):
         yield retries
         up = GaugeMetricFamily("loopwright_database_up", "1: the database answers")
         try:
-            jobs = self._jobs()
+            jobs, not_home = self._jobs(), self._not_home()
         except SQLAlchemyError:
             up.add_metric([], 0)
         else:
             up.add_metric([], 1)
             yield jobs
+            yield not_home
         yield up
 
     def _jobs(self) -> Metric:
@@ -75,6 +77,13 @@ class _OfTheStore(Collector):
         for key in sorted(found.keys() | {(state.value, "") for state in ACTIVE | {JobState.PROPOSED}}):
             jobs.add_metric(list(key), found.get(key, 0))
         return jobs
+
+    def _not_home(self) -> Metric:
+        with Session(self._store.engine) as session:
+            count = looked_after.count(session, self._store.host)
+        found = GaugeMetricFamily("loopwright_loops_looked_after", "Loops not confirmed home after a job")
+        found.add_metric([], count)
+        return found
 
 
 def registry(loops: Mapping[str, LoopConfig], store: Store) -> CollectorRegistry:

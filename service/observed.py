@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from service.loop import Loop, LoopState
+from service.loop import Loop, LoopState, Restored
 from tuning.gains import Gains
 from tuning.plan import Command, Mode, Sample, SetGains
 from tuning.reasons import Reason
@@ -41,12 +41,16 @@ class ObservedLoop:
     def waits(self) -> bool:
         return self._loop.waits
 
-    def read(self) -> LoopState:
-        self._state = self._loop.read()
+    def read(self, beside_tests: bool = False) -> LoopState:
+        self._state = self._loop.read(beside_tests)
         return self._state
 
-    def begin(self, stop: Callable[[], Reason | None] = lambda: None) -> LoopState:
-        self._state = self._loop.begin(stop)
+    def begin(
+        self,
+        stop: Callable[[], Reason | None] = lambda: None,
+        remember: Callable[[int], None] = lambda session: None,
+    ) -> LoopState:
+        self._state = self._loop.begin(stop, remember)
         return self._state
 
     def step(self, commands: Sequence[Command]) -> Sample:
@@ -56,13 +60,13 @@ class ObservedLoop:
                 self._trial = command.gains
         return sample
 
-    def restore(self, state: LoopState) -> LoopState:
-        home = self._loop.restore(state)
-        self._trial, self._sample, self._state = None, None, home
-        return home
+    def restore(self, home: LoopState, session: int | None = None) -> Restored:
+        restored = self._loop.restore(home, session)
+        self._trial, self._sample, self._state = None, None, restored.state
+        return restored
 
-    def accept(self, gains: Gains) -> LoopState:
-        return self._loop.accept(gains)
+    def accept(self, gains: Gains, instead_of: Gains) -> LoopState:
+        return self._loop.accept(gains, instead_of)
 
     def close(self) -> None:
         self._loop.close()

@@ -11,8 +11,8 @@ from service.config import LoopConfig
 from service.engine import WORKFLOW_VERSION
 from service.loop import Loop
 from service.request import RetuneRequest, within
-from service.safe import Safe, make_safe
-from service.state_json import loop_state, state_json
+from service.safe import Safe, look
+from service.state_json import state_json
 from service.states import JobState
 from service.store.store import Store
 from service.store.tables import JobRow
@@ -25,23 +25,29 @@ MOST_ATTEMPTS = 10
 
 @dataclass(frozen=True)
 class Recovery:
-    """resumes: whether such jobs go on.  patience_s: wall time a loop gets to come back by itself, s."""
+    """resumes: whether such jobs go on.  stopping: whether this service is to end before it has begun: what it has not
+    looked at yet is left to the next start."""
 
     loops: Mapping[str, LoopConfig]
     store: Store
     open_loop: Callable[[LoopConfig], Loop]
     resumes: bool
-    patience_s: float
+    stopping: Callable[[], bool] = lambda: False
 
     def recover(self, row: JobRow) -> None:
         """Makes the loop of the job safe, and ends the job if it is not to go on."""
+        if self.stopping():
+            return
         safe: Safe | None = None
-        if row.found is not None:
-            safe = self._safe(row)
+        # A job of the code before has no session, and may have touched its loop all the same.
+        if row.found is not None and (row.session is not None or row.version != WORKFLOW_VERSION):
+            safe = look(row, self.loops, self.open_loop)
             self.store.append(row.id, "loop_found", {"text": safe.text}, row.plant_time_s)
         restored: dict[str, Any] = {}
         if safe is not None and safe.state is not None:
             restored = {"restored": state_json(safe.state)}
+        elif safe is not None:
+            restored = {"look_after": True}
         if row.stop_reason is not None:
             detail = "asked to stop before the service ended; " + _loop_words(safe)
             self.store.move(row.id, JobState.ABORTED, reason=row.stop_reason, detail=detail, **restored)
@@ -51,20 +57,6 @@ class Recovery:
             reason, text = why
             detail = f"cut off by the end of the service, and not resumed: {text}; {_loop_words(safe)}"
             self.store.move(row.id, JobState.INTERRUPTED, reason=reason.value, detail=detail, **restored)
-
-    def _safe(self, row: JobRow) -> Safe:
-        config = self.loops.get(row.loop)
-        if config is None:
-            return Safe(None, "the loop is no longer configured here", Reason.SERVICE_STOPPED)
-        try:
-            loop = self.open_loop(config)
-            try:
-                return make_safe(loop, loop_state(row.found or {}), self.patience_s)
-            finally:
-                loop.close()
-        except Exception as error:  # one loop must not keep the service of the others from starting
-            log.exception("loop %s", row.loop)
-            return Safe(None, f"not reached: {error}; the controller goes back by itself", Reason.BUS_LOST)
 
     def _why_not(self, row: JobRow, safe: Safe | None) -> tuple[Reason, str] | None:
         """Why a job is not to be resumed, if so."""

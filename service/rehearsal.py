@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from controller.channel import Cause, Channel, Settings
+from controller.channel import Channel, RelaySettings, Settings
 from controller.pid import Parameters
 from plantsim.plant import LinearPlant, Process
-from service.loop import LoopState
+from service.loop import LoopState, Restored
 from service.plain import plain
 from service.runner import RunResult, Watch, run
 from tuning.fast.procedure import FAST, FAST_STAGES, FastOptions, FastProposal, fast
@@ -39,7 +39,6 @@ from tuning.plan import (
 )
 from tuning.reasons import Ended, Failed, Reason, Refused
 
-LEASE_SAMPLES = 1_000_000
 MOST_SAMPLES = 200_000
 """In T95: of more, a rehearsal takes minutes."""
 
@@ -54,36 +53,37 @@ class RehearsedLoop:
         self._channel = channel
         self._dt = sample_time_s
         self._n = 0
-        self._mode_found: Mode | None = None
+        self._home = channel.home
         self._pv = plant.pv
 
-    def read(self) -> LoopState:
+    def read(self, beside_tests: bool = False) -> LoopState:
         channel = self._channel
         return LoopState(
             mode=Mode(channel.mode),
             sp=channel.setpoint,
             pv=self._pv,
             mv=channel.mv,
-            gains=_gains(channel.in_effect),
+            gains=_gains(channel.accepted),
             on_trial=channel.on_trial,
             mv_low=channel.settings.mv_low,
             mv_high=channel.settings.mv_high,
             sample_time_s=self._dt,
             reverse_acting=channel.settings.reverse,
+            manual_output=channel.manual_output,
         )
 
-    def begin(self, stop: Callable[[], Reason | None] = lambda: None) -> LoopState:
-        state = self.read()
-        self._mode_found = state.mode
-        self._channel.renew_lease(LEASE_SAMPLES)
-        return state
+    def begin(
+        self,
+        stop: Callable[[], Reason | None] = lambda: None,
+        remember: Callable[[int], None] = lambda session: None,
+    ) -> LoopState:
+        self._home = self._channel.home
+        return self.read()
 
     def step(self, commands: Sequence[Command]) -> Sample:
         channel = self._channel
         for command in commands:
             self._carry_out(command)
-        if channel.lease < LEASE_SAMPLES // 2:
-            channel.renew_lease(LEASE_SAMPLES)
         mv = channel.step(self._pv)
         sample = Sample(self._n * self._dt, channel.setpoint, self._pv, mv, channel.mode)
         self._pv = self._plant.step(mv)
@@ -99,28 +99,21 @@ class RehearsedLoop:
                 if int(mode) != int(channel.mode):
                     channel.command_mode(int(mode))
             case SetGains(gains):
-                channel.stage(_parameters(gains))
-                channel.try_staged()
+                channel.try_gains(_parameters(gains))
             case SetOutput(value):
                 channel.manual_output = value
             case SetRelay(amplitude, hysteresis, working, amplitude_low, average):
                 low, high = channel.settings.pv_low, channel.settings.pv_high
                 channel.start_relay(
-                    amplitude, hysteresis, working, 0.0, 10**9, low, high, amplitude_low or 0.0, average
+                    RelaySettings(amplitude, hysteresis, working, 10**9, low, high, amplitude_low or 0.0, average)
                 )
 
-    def restore(self, state: LoopState) -> LoopState:
-        if int(self._channel.mode) == state.mode != self._mode_found:
-            self._channel.renew_lease(0)
-        self._channel.go_back(Cause.COMMAND)
-        self._channel.setpoint = state.sp
-        self._channel.command_mode(int(state.mode))
-        return self.read()
+    def restore(self, home: LoopState, session: int | None = None) -> Restored:
+        self._channel.go_home(self._home)
+        return Restored(self.read(), "the test is over")
 
-    def accept(self, gains: Gains) -> LoopState:
-        self._channel.stage(_parameters(gains))
-        self._channel.try_staged()
-        self._channel.accept()
+    def accept(self, gains: Gains, instead_of: Gains) -> LoopState:
+        self._channel.accept(_parameters(gains))
         return self.read()
 
     def close(self) -> None:

@@ -1,21 +1,20 @@
 """Pumps a plan through a loop, guards every sample, and always restores the loop: the safety contract's second clause.
 
 Whatever ends the run - the plan's result, a refusal, a limit, a lost node, an operator, a defect - the way out is one:
-restore mode, set-point and gains of the state found at the beginning, and read them back.
+the session is closed, the controller brings the loop home, and what it came to is read back.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from service.loop import Loop, LoopState
 from tuning.plan import (
     Command,
     Event,
-    Mode,
     Note,
     Plan,
     Sample,
@@ -29,7 +28,6 @@ from tuning.plan import (
     Work,
 )
 from tuning.reasons import Aborted, Ended, Failed, Reason
-from tuning.stages.common import same
 
 T = TypeVar("T")
 CHUNK = 200
@@ -65,36 +63,26 @@ class RunResult(Generic[T]):
 
 
 class Guard:
-    """Checks each sample against the watch and against what the plan itself has commanded."""
+    """Checks each sample against the watch. Another's hand on the loop is the controller's to see."""
 
     def __init__(self, watch: Watch, state: LoopState) -> None:
         self._watch = watch
         self._dt = state.sample_time_s
-        self._sp = state.sp
-        self._mode = int(state.mode)
         self._start: float | None = None
         self._last = 0.0
-        self._lag = self._grace = state.command_lag_samples
         self._acting = False
         self._slack = 0.01 * min(watch.mv_high - watch.mv_low, 1e300)
         self._pv = math.nan
         self._mv = math.nan
         self._frozen_at = 0.0
         self._notable = 1e-3 * abs(state.mv_high - state.mv_low)
-        self.foreign_setpoint: float | None = None
-        self.foreign_mode: Mode | None = None
 
-    def commanded(self, commands: Sequence[Command]) -> None:
+    def commanded(self) -> None:
+        """The plan acts on the loop from now on."""
         self._acting = True
-        for command in commands:
-            if isinstance(command, SetSetpoint):
-                self._sp = command.value
-            elif isinstance(command, SetMode):
-                self._mode = int(command.mode)
-        self._grace = self._lag
 
     def check(self, sample: Sample) -> None:
-        t, sp, pv, mv, mode = sample
+        t, _, pv, mv, _ = sample
         watch = self._watch
         if not (math.isfinite(pv) and math.isfinite(mv)):
             raise Failed(Reason.BAD_SAMPLE, f"at {t:.3f} s PV is {pv}, MV is {mv}")
@@ -103,41 +91,18 @@ class Guard:
         elif t - self._last > (watch.max_gap_samples + 1.5) * self._dt:
             raise Failed(Reason.SAMPLES_LOST, f"{(t - self._last) / self._dt - 1:.0f} samples missing before {t:.3f} s")
         self._last = t
-        foreign = self._foreign(sp, mode)  # noted first, whatever the run ends by: their hand has the last word
         if not watch.pv_low <= pv <= watch.pv_high:
             raise Failed(Reason.PV_LIMIT, f"PV {pv:.5g} left {watch.pv_low:.5g} .. {watch.pv_high:.5g} at {t:.3f} s")
         if self._acting and not watch.mv_low - self._slack <= mv <= watch.mv_high + self._slack:
             raise Failed(Reason.MV_LIMIT, f"MV {mv:.5g} left {watch.mv_low:.5g} .. {watch.mv_high:.5g} at {t:.3f} s")
         if t - self._start > watch.max_time_s:
             raise Failed(Reason.TIME_BUDGET, f"{t - self._start:.0f} s of plant time are over the budget")
-        if foreign is not None:
-            raise Aborted(foreign[0], f"at {t:.3f} s {foreign[1]}")
         if pv != self._pv:
             self._frozen_at, self._pv, self._mv = t, pv, mv
         elif abs(mv - self._mv) < self._notable:
             self._frozen_at = t
         elif t - self._frozen_at > watch.max_frozen_s:
             raise Failed(Reason.PV_FROZEN, f"PV is exactly {pv:.6g} for {t - self._frozen_at:.3g} s while MV moved")
-
-    def _foreign(self, sp: float, mode: int) -> tuple[Reason, str] | None:
-        """What another's hand has moved; both where it was both."""
-        set_point_ours, mode_ours = same(sp, self._sp), mode == self._mode
-        if self._grace:
-            self._grace = 0 if set_point_ours and mode_ours else self._grace - 1
-            return None
-        if not set_point_ours:
-            self.foreign_setpoint = sp
-        if not mode_ours and mode in (Mode.OFF, Mode.MANUAL, Mode.AUTOMATIC):
-            self.foreign_mode = Mode(mode)
-        if not set_point_ours:
-            return Reason.SETPOINT_CHANGED, f"the set-point is {sp:.6g}, not {self._sp:.6g}"
-        if not mode_ours:
-            return Reason.MODE_CHANGED, f"the mode is {_mode(mode)}, not {_mode(self._mode)}"
-        return None
-
-
-def _mode(number: int) -> str:
-    return Mode(number).name.lower() if number in Mode._value2member_map_ else str(number)
 
 
 def run(
@@ -149,11 +114,15 @@ def run(
     on_samples: Callable[[list[Sample]], None] = lambda samples: None,
     stop: Callable[[], Reason | None] = lambda: None,
     start_work: Callable[[Work[Any]], None] = Work.run,
+    remember: Callable[[int], None] = lambda session: None,
+    on_home: Callable[[LoopState], None] = lambda home: None,
 ) -> RunResult[T]:
     """Runs the plan to its end and restores the loop. Raises nothing that a loop or plan can cause; see `ended`.
 
-    stop is asked once a sample; what it returns ends the run as Aborted.  start_work starts a plan's long computation:
-    in a thread for a live loop, which must be pumped meanwhile; at once, as here, where nobody waits.
+    stop is asked once a sample and in every wait; what it returns ends the run as Aborted.
+    start_work starts a plan's long computation: in a thread for a live loop, which must be pumped meanwhile; at
+    once, as here, where nobody waits.
+    remember: told the number of the session before it is opened.  on_home: told what the loop must come back to.
     """
     result: RunResult[T] = RunResult()
     samples: list[Sample] = []
@@ -174,7 +143,10 @@ def run(
         stage, since = next_stage, now
 
     try:
-        state = loop.begin(stop)
+        state = loop.begin(stop, remember)
+        on_home(state)
+        if state.when_silent:
+            on_event(Note(f"if the controller falls silent, the plant's I/O {state.when_silent}"))
         guard = Guard(watch, state)
         chunk = min(CHUNK, max(1, round(CHUNK_S / state.sample_time_s)))
         answer = next(plan)
@@ -194,7 +166,7 @@ def run(
                             hand_on()  # a stage that is done never runs again: its samples go before the word
                         on_event(item)
                 if commands:
-                    guard.commanded(commands)
+                    guard.commanded()
             elif commands:
                 commands = []
             sample = loop.step(commands)
@@ -220,17 +192,15 @@ def run(
         plan.close()
     clock("")
     if state is not None:
-        home = state
-        if guard is not None:  # another's hand on the loop has the last word
-            if guard.foreign_setpoint is not None:
-                home = replace(home, sp=guard.foreign_setpoint)
-            if guard.foreign_mode is not None:
-                home = replace(home, mode=guard.foreign_mode)
         try:
-            result.restored = loop.restore(home)
+            restored = loop.restore(state)
         except Ended as ended:
             on_event(Note(f"restore: {ended}"))
             if result.ended is None or result.ended.reason not in (Reason.NODE_LOST, Reason.BUS_LOST):
                 result.value, result.ended = None, ended
+        else:
+            result.restored = restored.state
+            if restored.changed:
+                on_event(Note(f"not as before the test, and left so: {'; '.join(restored.changed.values())}"))
     hand_on()
     return result

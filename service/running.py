@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 from service.journal import Journal
@@ -26,7 +27,14 @@ class Running:
     before_s: plant time that earlier attempts took, s: the samples of this one are counted on from there.
     """
 
-    def __init__(self, job_id: str, tag: str, journal: Journal, before_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        job_id: str,
+        tag: str,
+        journal: Journal,
+        before_s: float = 0.0,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.job_id = job_id
         self.tag = tag
         self.progress = Progress(before_s)
@@ -40,7 +48,8 @@ class Running:
         self._stage = "preflight"
         self._boundaries: list[tuple[float, str]] = []
         self._last_t = -math.inf
-        self._flushed = time.monotonic()
+        self._monotonic = monotonic
+        self._flushed = monotonic()
 
     def on_event(self, event: Event) -> None:
         self.keep_time()
@@ -68,7 +77,7 @@ class Running:
                 self.flush()
                 self._stage = self._boundaries.pop(0)[1]
             self._buffer.append(sample._replace(t=sample.t + self.before_s) if self.before_s else sample)
-        if len(self._buffer) >= _BLOCK_SAMPLES or time.monotonic() - self._flushed > _BLOCK_WALL_S:
+        if len(self._buffer) >= _BLOCK_SAMPLES or self._monotonic() - self._flushed > _BLOCK_WALL_S:
             self.flush()
 
     def flush(self) -> None:
@@ -76,7 +85,7 @@ class Running:
         if self._buffer:
             self._journal.put(block_of(self.job_id, self._stage, self._buffer))
             self._buffer = []
-        self._flushed = time.monotonic()
+        self._flushed = self._monotonic()
 
     def keep_time(self) -> None:
         """Brings the progress up to the latest sample."""

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import socket
+import threading
+from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from types import FrameType
+from typing import Any, Self
 
 import uvicorn
 
+from protocol.profile import TUNER_NODE
+from protocol.station import Station
 from service import logs
 from service.api.app import create_app
 from service.computing import Workers
@@ -43,6 +49,12 @@ class _Server(uvicorn.Server):
         super().__init__(config)
         self._jobs = jobs
 
+    async def serve(self, sockets: list[socket.socket] | None = None) -> None:
+        with self.capture_signals():
+            # One that came before they are captured here has told the jobs only.
+            self.should_exit = self.should_exit or self._jobs.stopping
+            await self._serve(sockets)
+
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         tell_systemd("STOPPING=1")
         self._jobs.request_stop()
@@ -64,11 +76,49 @@ def tell_systemd(state: str) -> None:
             notify.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
 
 
-def open_bus_loop(config: LoopConfig) -> Loop:
+def open_bus_loop(station: Station, config: LoopConfig) -> Loop:
     """The live loop of a configuration."""
     from service.bus_loop import BusLoop
 
-    return BusLoop(config.bus, config.controller_node, config.plant_node, channel=config.channel)
+    return BusLoop(
+        config.bus,
+        config.controller_node,
+        config.plant_node,
+        channel=config.channel,
+        station=station,
+        pv_limits=(config.pv_limits.low, config.pv_limits.high),
+    )
+
+
+class Signals:
+    """SIGTERM and SIGINT from the start of the service to its end: whoever is told of them first is told at once.
+
+    While requests are served the server hears them itself, and says them again when it is through.
+    """
+
+    def __init__(self) -> None:
+        self._asked = False
+        self._end: Callable[[], None] = lambda: None
+
+    def __enter__(self) -> Self:
+        self._before: dict[int, Any] = {}
+        if threading.current_thread() is threading.main_thread():
+            self._before = {each: signal.signal(each, self._hear) for each in (signal.SIGTERM, signal.SIGINT)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for each, handler in self._before.items():
+            signal.signal(each, handler)
+
+    def tell(self, end: Callable[[], None]) -> None:
+        """Calls `end` when a signal comes, or has come."""
+        self._end = end
+        if self._asked:
+            end()
+
+    def _hear(self, _signal: int, _frame: FrameType | None) -> None:
+        self._asked = True
+        self._end()
 
 
 class NotSafe(Exception):
@@ -82,6 +132,7 @@ class Setup:
     bind: the address to listen on.  host: this host's name among those that share the database.
     resume: jobs that a dead service left go on.  poll_s: how often the engine looks for jobs, s of wall time.
     keep: whose samples are kept.
+    node: our node-ID on every bus, another one than any other gateway's.
     auth: whether keys are asked for; None: unless the address is this machine's own.
     """
 
@@ -93,13 +144,14 @@ class Setup:
     host: str | None = None
     resume: bool = True
     poll_s: float = POLL_S
+    node: int = TUNER_NODE
     auth: bool | None = None
     limits: RequestLimits = field(default_factory=RequestLimits)
     log_format: LogFormat = "text"
     keep: Keep = field(default_factory=Keep)
 
 
-def serve(setup: Setup, open_loop: LoopFactory = open_bus_loop, tune: Tune | None = None) -> None:
+def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None = None) -> None:
     """Serves until SIGTERM or SIGINT; every loop is restored before it returns. tune: by default with workers.
 
     Raises ConfigError, FolderInUse, ForeignLoop, BadDatabase, NotSafe, OSError (the address cannot be had),
@@ -109,6 +161,7 @@ def serve(setup: Setup, open_loop: LoopFactory = open_bus_loop, tune: Tune | Non
     # python-can's socketcand client warns of every frame that TCP splits, which is what TCP does.
     logging.getLogger("can").setLevel(logging.ERROR)
     site = load_site(setup.loops_file)
+    site.check_own_node(setup.node, str(setup.loops_file))
     if setup.database is not None and setup.host is None:
         raise BadDatabase("a shared database needs --host NAME: what this host is called among the others, for ever")
     local = is_loopback(setup.bind)
@@ -117,6 +170,7 @@ def serve(setup: Setup, open_loop: LoopFactory = open_bus_loop, tune: Tune | Non
     with ExitStack() as stack:
         if tune is None:  # forked before there is anything that a child should not have
             tune = partial(live, workers=_workers(stack))
+        signals = stack.enter_context(Signals())
         # Bound before anything is started, so that a busy port is an error and not half a service.
         listener = stack.enter_context(listen(setup.bind, setup.port))
         store = Store(setup.data, setup.database, setup.host or LOCAL)
@@ -131,7 +185,14 @@ def serve(setup: Setup, open_loop: LoopFactory = open_bus_loop, tune: Tune | Non
             policy = Policy(keyring, setup.limits, local_only=True)
             engine = DurableEngine(setup.data, store.engine if store.shared else None, store.host, setup.poll_s)
             jobs = Jobs(
-                site.loops, store, open_loop, tune, rehearse, engine=engine, buses=site.buses, resume=setup.resume
+                site.loops,
+                store,
+                open_loop or partial(open_bus_loop, Station(setup.node)),
+                tune,
+                rehearse,
+                engine=engine,
+                buses=site.buses,
+                resume=setup.resume,
             )
             config = uvicorn.Config(
                 create_app(jobs, policy),
@@ -142,10 +203,12 @@ def serve(setup: Setup, open_loop: LoopFactory = open_bus_loop, tune: Tune | Non
                 timeout_graceful_shutdown=_GRACE_S,
             )
             retention = Retention(store, engine, setup.keep)
+            signals.tell(jobs.request_stop)
             try:
                 jobs.boot()
-                retention.start()
-                _Server(config, jobs).run(sockets=[listener])
+                if not jobs.stopping:
+                    retention.start()
+                    _Server(config, jobs).run(sockets=[listener])
             finally:
                 retention.close()
                 jobs.stop()

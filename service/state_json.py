@@ -26,4 +26,5 @@ def state_json(state: LoopState) -> dict[str, Any]:
 def loop_state(data: dict[str, Any]) -> LoopState:
     """A loop's state from its JSON. PV and MV that were not numbers are of no account."""
     numbers = {name: 0.0 if data[name] is None else data[name] for name in ("pv", "mv")}
-    return LoopState(**data | numbers | {"mode": Mode[data["mode"].upper()], "gains": gains_of(data["gains"])})
+    known = {name: value for name, value in data.items() if name in LoopState.__dataclass_fields__}
+    return LoopState(**known | numbers | {"mode": Mode[data["mode"].upper()], "gains": gains_of(data["gains"])})

@@ -33,6 +33,7 @@ _STOPPED = (Reason.OPERATOR, Reason.SERVICE_STOPPED)
 class Hooks:
     """How work reports, and how it learns that it should stop.
 
+    remember: told the number of a session before it is opened.  on_home: told what the loop must come back to.
     earlier: what the earlier attempts of a job that is resumed have stored; a stage done there is not run again.
     """
 
@@ -40,6 +41,8 @@ class Hooks:
     on_samples: Callable[[list[Sample]], None]
     stop: Callable[[], Reason | None]
     earlier: Sequence[EventRow] = ()
+    remember: Callable[[int], None] = lambda session: None
+    on_home: Callable[[LoopState], None] = lambda home: None
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,8 @@ def tune(
         on_samples=hooks.on_samples,
         stop=hooks.stop,
         start_work=computing.start,
+        remember=hooks.remember,
+        on_home=hooks.on_home,
     )
     return Outcome(plain_object(ran.value), ran.ended, ran.restored, dict(ran.plant_time_s))
 

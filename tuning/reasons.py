@@ -20,6 +20,8 @@ class Reason(StrEnum):
     NOISE_TOO_HIGH = "noise_too_high"
     SATURATED = "saturated"
     WRONG_MODE = "wrong_mode"
+    LOOP_IN_USE = "loop_in_use"
+    SETPOINT_IS_DRIVEN = "setpoint_is_driven"
     WRONG_SIGN = "wrong_sign"
     NO_RESPONSE = "no_response"
     CANNOT_OSCILLATE = "cannot_oscillate"
@@ -49,6 +51,7 @@ class Reason(StrEnum):
     PV_FROZEN = "pv_frozen"
     NODE_LOST = "node_lost"
     BUS_LOST = "bus_lost"
+    NODE_NOT_OPERATIONAL = "node_not_operational"
     DEVICE_WENT_BACK = "device_went_back"
     RESTORE_UNCONFIRMED = "restore_unconfirmed"
     INTERNAL = "internal"
@@ -56,6 +59,8 @@ class Reason(StrEnum):
     SETPOINT_CHANGED = "setpoint_changed"
     MODE_CHANGED = "mode_changed"
     GAINS_CHANGED = "gains_changed"
+    OUTPUT_CHANGED = "output_changed"
+    LIMITS_CHANGED = "limits_changed"
     OPERATOR = "operator"
     SERVICE_STOPPED = "service_stopped"
 
@@ -65,6 +70,9 @@ ADVICE: dict[Reason, str] = {
     Reason.NOISE_TOO_HIGH: "Filter the measurement or permit a larger set-point deviation.",
     Reason.SATURATED: "MV is at a limit: move the operating point or widen the limits, then retune.",
     Reason.WRONG_MODE: "Put the loop in automatic with working gains before retuning.",
+    Reason.LOOP_IN_USE: "Another tuner holds a session on this loop: wait for its end, then retune.",
+    Reason.SETPOINT_IS_DRIVEN: "Another controller or a ramp moves the set-point: open the outer loop or wait for the "
+    "ramp's end, then retune.",
     Reason.WRONG_SIGN: "Check the controller's action (direct/reverse) against the sign of the plant's gain.",
     Reason.NO_RESPONSE: "PV did not answer MV: check the valve, the sensor and that the right loop is selected.",
     Reason.CANNOT_OSCILLATE: "The plant has next to no dead time, or the sampling is too slow to see it "
@@ -102,11 +110,16 @@ ADVICE: dict[Reason, str] = {
     Reason.SETPOINT_CHANGED: "Somebody else moved the set-point during the test; agree on the time and repeat.",
     Reason.MODE_CHANGED: "Somebody else changed the mode during the test; agree on the time and repeat.",
     Reason.GAINS_CHANGED: "Somebody else tried other gains during the test; agree on the time and repeat.",
-    Reason.NODE_LOST: "The device fell silent: check power and cable; it goes back to its accepted gains.",
-    Reason.BUS_LOST: "The CAN bus is gone: check the interface; the device goes back to its accepted gains.",
-    Reason.DEVICE_WENT_BACK: "The controller ended the trial by itself (lease, heartbeat): check this machine's load.",
+    Reason.NODE_LOST: "The device fell silent: check power and cable; it goes home by itself.",
+    Reason.BUS_LOST: "The CAN bus is gone: check the interface; the device goes home by itself.",
+    Reason.NODE_NOT_OPERATIONAL: "The node does not control: start it (NMT) and look at the loop; Loopwright looks at "
+    "it again by itself, and sends no NMT command.",
+    Reason.DEVICE_WENT_BACK: "The controller ended the test by itself (lease, heartbeat): check this machine's load.",
     Reason.RESTORE_UNCONFIRMED: "The loop could not be read back after the test: look at the controller NOW.",
     Reason.INTERNAL: "This is a defect of Loopwright; please report it with the job's events.",
+    Reason.OUTPUT_CHANGED: "Somebody else moved the manual output during the test; agree on the time and repeat.",
+    Reason.LIMITS_CHANGED: "Somebody else changed a limit, the span or the action during the test; agree on the time "
+    "and repeat.",
     Reason.OPERATOR: "Stopped on request.",
     Reason.SERVICE_STOPPED: "The service was stopped during the test; start the retune again.",
 }

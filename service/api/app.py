@@ -18,8 +18,10 @@ from service.api.samples import sample_columns
 from service.api.stream import event_stream
 from service.api.views import (
     Decision,
+    DismissedView,
     JobView,
     LoopDetail,
+    NotHomeView,
     SamplesView,
     job_view,
     live_view,
@@ -32,6 +34,7 @@ from service.security.gate import Gate, Policy
 from service.states import ACTIVE, JobState
 from service.store.tables import JobRow
 from tuning.plan import Sample
+from tuning.reasons import Ended
 
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 JobId = Annotated[str, Path(description="Id of the job", examples=["4f0c2a9be113"])]
@@ -76,9 +79,29 @@ def create_app(
     )
     def loop(tag: Tag) -> LoopDetail:
         config, host = jobs.owner(tag)
-        state = jobs.live(tag)
+        not_home = next(iter(jobs.aftercare.not_home(tag)), None)
+        try:
+            state = jobs.live(tag)
+        except Ended:
+            if not_home is None:
+                raise
+            state = None
         shown = loop_view(config, host, jobs.store.busy().get(tag), jobs.store.last_states(tag).get(tag))
-        return LoopDetail(**shown, live=live_view(state) if state else None)
+        return LoopDetail(
+            **shown,
+            live=live_view(state) if state else None,
+            not_confirmed_home=NotHomeView.of(not_home) if not_home else None,
+        )
+
+    @app.post(
+        "/loops/{tag}/dismiss",
+        tags=["loops"],
+        summary="Answer for a loop that is looked after: it is not looked at any more",
+        responses=problems.responses(404, 409, 422),
+    )
+    def dismiss(tag: Tag, decision: Annotated[Decision | None, Body()] = None) -> DismissedView:
+        found = jobs.dismiss(tag, (decision or Decision()).by)
+        return DismissedView(loop=tag, jobs=[f"/jobs/{job_id}" for job_id in found])
 
     @app.post(
         "/loops/{tag}/retune",

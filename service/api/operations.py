@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Annotated, Any
 from urllib.parse import urlencode
 
@@ -12,10 +13,11 @@ from fastapi import APIRouter, FastAPI, Query, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import BaseModel, Field
 
-from protocol.bus import BusError, open_bus
 from service import metrics
+from service.aftercare import NotHome
 from service.api import problems
 from service.api.page import POLICY, page
+from service.bus_watch import BusWatch
 from service.jobs import Jobs
 from service.security import audit
 from service.security.tables import AuditRow
@@ -43,7 +45,9 @@ class Ready(BaseModel):
     """Whether the service can take work."""
 
     ready: bool = Field(description="All of its parts are")
-    parts: dict[str, PartView] = Field(description="database, engine and each bus by its address")
+    parts: dict[str, PartView] = Field(
+        description="database, engine, each bus by its address, and each loop that is looked after"
+    )
 
 
 class AuditView(BaseModel):
@@ -61,7 +65,7 @@ class AuditView(BaseModel):
     said_by: str | None = Field(description="Who the request itself says it is from", examples=["night shift"])
     what: str = Field(
         description="retune, abort, accept, rollback, accept_failed, rollback_failed, retune_many, retune_many_abort, "
-        "samples_delete, restore, key_create, key_revoke",
+        "dismiss, samples_delete, restore, key_create, key_revoke",
         examples=["accept"],
     )
     subject: str = Field(description="Id of the job, key, or retune of many loops", examples=["4f0c2a9be113"])
@@ -76,18 +80,22 @@ class AuditPage(BaseModel):
 
 
 class Readiness:
-    """Asks every part, each within CHECK_S."""
+    """Asks every part, each within CHECK_S. more: parts that come and go, asked for each time."""
 
-    def __init__(self, checks: Mapping[str, Check]) -> None:
+    def __init__(self, checks: Mapping[str, Check], more: Callable[[], Mapping[str, Check]] = dict) -> None:
         self._checks = checks
+        self._more = more
         self._asking = asyncio.Lock()
         self._last: tuple[float, Ready] | None = None
 
     async def ask(self) -> Ready:
         async with self._asking:
             if self._last is None or time.monotonic() - self._last[0] > FRESH_S:
-                views = await asyncio.gather(*(self._one(check) for check in self._checks.values()))
-                parts = dict(zip(self._checks, views, strict=True))
+                checks = dict(self._checks)
+                with suppress(Exception):  # the database that should name them is a part of its own
+                    checks |= await asyncio.wait_for(asyncio.to_thread(self._more), CHECK_S)
+                views = await asyncio.gather(*(self._one(check) for check in checks.values()))
+                parts = dict(zip(checks, views, strict=True))
                 self._last = time.monotonic(), Ready(ready=all(part.ready for part in views), parts=parts)
             return self._last[1]
 
@@ -116,25 +124,26 @@ def checks(jobs: Jobs) -> dict[str, Check]:
         if not jobs.engine.alive():
             raise RuntimeError("the engine does not run")
 
-    def bus(url: str) -> Check:
-        return lambda: bus_opens(url)
-
     urls = sorted({loop.bus for loop in jobs.loops.values()})
-    return {"database": database, "engine": engine, **{f"bus {url}": bus(url) for url in urls}}
+    return {"database": database, "engine": engine, **{f"bus {url}": BusWatch(url).check for url in urls}}
 
 
-def bus_opens(url: str) -> None:
-    """Raises BusError unless the bus can be opened; sends nothing on it."""
-    try:
-        open_bus(url).close()
-    except OSError as error:
-        raise BusError(f"{url}: {error.strerror or error}") from error
+def loops_looked_after(jobs: Jobs) -> dict[str, Check]:
+    """A part for each of this host's loops that is not confirmed home: never ready, and says why."""
+
+    def part(found: NotHome) -> Check:
+        def check() -> None:
+            raise RuntimeError(found.words)
+
+        return check
+
+    return {f"loop {found.loop}": part(found) for found in jobs.aftercare.not_home()}
 
 
 def install(app: FastAPI, jobs: Jobs, parts: Mapping[str, Check]) -> None:
     """Adds the routes."""
     router = APIRouter(tags=["operations"])
-    readiness = Readiness(parts)
+    readiness = Readiness(parts, lambda: loops_looked_after(jobs))
     counted = metrics.registry(jobs.loops, jobs.store)
 
     @router.get("/healthz", summary="Is the process alive")
@@ -143,7 +152,7 @@ def install(app: FastAPI, jobs: Jobs, parts: Mapping[str, Check]) -> None:
 
     @router.get(
         "/readyz",
-        summary="Can it take work: database, engine, each bus",
+        summary="Can it take work: database, engine, each bus; and is each loop home",
         response_model=Ready,
         responses={503: {"model": Ready, "description": "At least one part is not ready"}},
     )

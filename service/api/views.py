@@ -7,6 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
+from service.aftercare import NotHome
 from service.api.results import (
     EvidenceView,
     ModelView,
@@ -75,10 +76,46 @@ class LiveView(BaseModel):
     mv_high: float = Field(description="The controller's own upper output limit, percent", examples=[100.0])
     sample_time_s: float = Field(description="Sampling period, s", examples=[0.1])
     reverse_acting: bool = Field(description="True: MV falls as PV rises")
+    node_state: str = Field(
+        description="operational, or which node of the loop is in which state and controls nothing",
+        examples=["operational", "node 20h is pre-operational"],
+    )
+    when_silent: str = Field(
+        description="What the plant's I/O does with MV when the controller falls silent; empty: not known",
+        examples=["it holds MV where it is"],
+    )
+
+
+class NotHomeView(BaseModel):
+    """A loop that a job has left and that was not read back as home since: it is looked at until it is, or until
+    `POST /loops/TAG/dismiss`."""
+
+    job: str = Field(description="URL of the job", examples=["/jobs/4f0c2a9be113"])
+    reason: str | None = Field(description="From the closed list", examples=["node_not_operational"])
+    detail: str = Field(description="What was found when it was looked at last")
+    advice: str = Field(description="The same, and what to do about it")
+
+    @classmethod
+    def of(cls, found: NotHome) -> NotHomeView:
+        reason = None if found.reason is None else found.reason.value
+        return cls(job=f"/jobs/{found.job_id}", reason=reason, detail=found.detail, advice=found.words)
 
 
 class LoopDetail(LoopView):
-    live: LiveView | None = Field(description="null: the bus is another host's, whose service can tell")
+    live: LiveView | None = Field(
+        description="null: the bus is another host's, whose service can tell; or the loop is not reached, and looked "
+        "after"
+    )
+    not_confirmed_home: NotHomeView | None = Field(description="null: it is not looked after")
+
+
+class DismissedView(BaseModel):
+    """What a loop was looked after for."""
+
+    loop: str = Field(examples=["TIC-101"])
+    jobs: list[str] = Field(
+        description="URLs of the jobs it was looked after for; empty: it was not", examples=[["/jobs/4f0c2a9be113"]]
+    )
 
 
 class StageView(BaseModel):
@@ -165,6 +202,8 @@ def live_view(state: LoopState) -> LiveView:
         mv_high=state.mv_high,
         sample_time_s=state.sample_time_s,
         reverse_acting=state.reverse_acting,
+        node_state=state.node_state,
+        when_silent=state.when_silent,
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from typing import Protocol
 
-WORKFLOW_VERSION = "1"
+WORKFLOW_VERSION = "2"
 """Raised when a job begun by the code before can no longer be finished by this one; such jobs end as interrupted."""
 
 

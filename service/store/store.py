@@ -13,8 +13,10 @@ from sqlalchemy import delete, func, select, text, update
 from sqlalchemy.exc import IntegrityError, TimeoutError
 from sqlalchemy.orm import Session, sessionmaker
 
+from service.loop import same_gains
 from service.plain import plain
 from service.security import audit
+from service.state_json import gains_of
 from service.states import ACTIVE, IllegalMove, JobState, check
 from service.store import chunks, retunes
 from service.store.clock import now
@@ -131,8 +133,8 @@ class Store:
     def own_loops(self, loops: dict[str, dict[str, Any]]) -> None:
         """These are the loops of this host from now on, by tag.
 
-        A loop of a host that is not running is taken over with its active job: its bus has moved. Raises ForeignLoop
-        when the other host is running.
+        A loop of a host that is not running is taken over with its active job, and looked after here if it was there:
+        its bus has moved. Raises ForeignLoop when the other host is running.
         """
         with self.writing() as session:
             foreign = session.scalars(select(LoopRow).where(LoopRow.tag.in_(loops), LoopRow.host != self.host)).all()
@@ -143,7 +145,9 @@ class Store:
                 raise ForeignLoop(f"loops of other hosts: {others}; take them out of one of the two configurations")
             moved = [row.tag for row in foreign]
             session.execute(
-                update(JobRow).where(JobRow.loop.in_(moved), JobRow.state.in_(_ACTIVE)).values(host=self.host)
+                update(JobRow)
+                .where(JobRow.loop.in_(moved), JobRow.state.in_(_ACTIVE) | JobRow.look_after.is_(True))
+                .values(host=self.host)
             )
             session.execute(delete(LoopRow).where((LoopRow.host == self.host) | LoopRow.tag.in_(moved)))
             session.add_all(LoopRow(tag=tag, host=self.host, config=config) for tag, config in loops.items())
@@ -234,6 +238,15 @@ class Store:
                 raise IllegalMove(state, JobState.RUNNING)
             set_columns(row, columns)
             append(session, job_id, "resumed", told, row.plant_time_s)
+
+    def note(self, job_id: str, **columns: Any) -> None:
+        """Sets columns of an active job."""
+        with self.writing() as session:
+            set_columns(_find(session, job_id, lock=True), columns)
+
+    def note_session(self, job_id: str, number: int) -> None:
+        """The session that is about to be opened for the job; 0: it was refused, and there is none."""
+        self.note(job_id, session=number or None)
 
     def get(self, job_id: str) -> JobRow:
         with self._session() as session:
@@ -410,7 +423,7 @@ def _move(session: Session, row: JobRow, wanted: JobState, by: str, columns: dic
     told |= {key: columns[key] for key in ("reason", "detail") if columns.get(key)}
     append(session, row.id, "state", told, row.plant_time_s)
     if wanted in DECISIONS:
-        _audit_decision(session, row, previous, wanted, by)
+        _audit_decision(session, row, previous, wanted, by, (columns.get("restored") or {}).get("gains"))
     return row
 
 
@@ -421,11 +434,16 @@ def _last_begun(session: Session, job_id: str) -> str | None:
     return None if event is None else str(event.data["decision"])
 
 
-def _audit_decision(session: Session, row: JobRow, previous: JobState, wanted: JobState, by: str) -> None:
+def _audit_decision(
+    session: Session, row: JobRow, previous: JobState, wanted: JobState, by: str, held: dict[str, Any] | None
+) -> None:
+    """held: the gains read back after the decision, where it went to the controller."""
     old, new = row.old_gains, (row.result or {}).get("gains")
     has = new if wanted is JobState.ACCEPTED else old
     # A rollback that had to write found the new gains, of an acceptance that had ended in an error too.
     had = new if wanted is JobState.ROLLED_BACK and _last_begun(session, row.id) == DECISIONS[wanted] else old
+    if held and not any(same_gains(gains_of(held), gains_of(one)) for one in (old, new) if one):
+        had = has = held  # somebody else's: found, and left
     audit.record(
         session,
         DECISIONS[wanted],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import JSON, ForeignKey, Index, LargeBinary, text
+from sqlalchemy import JSON, BigInteger, ForeignKey, Index, LargeBinary, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 
@@ -52,6 +52,10 @@ class JobRow(Base):
     attempt: Mapped[int] = mapped_column(server_default="0", default=0)
     # The loop as the first attempt found it, before anything was touched: what every attempt has to bring back.
     found: Mapped[dict[str, Any] | None]
+    # The number of the session that was opened last, written down before it was: a later process can close it.
+    session: Mapped[int | None] = mapped_column(BigInteger)
+    # The loop was not read back as home: it is looked at until it is, or a person says otherwise.
+    look_after: Mapped[bool] = mapped_column(server_default=text("false"), default=False)
     # Why the job is to stop, once somebody wants it to: any host may write it, the job's own host acts.
     stop_reason: Mapped[str | None]
 

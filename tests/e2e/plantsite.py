@@ -187,7 +187,7 @@ class Plantsite:
         url = self.retune(**stage.options | options)
         self.until(url, lambda job: job["stage"] == stage.stage and job["attempts"] == 1)
         deadline = time.monotonic() + 10
-        while not (self.read("controller_lease") if stage.untouched else not self.is_home()):
+        while not (self.read("controller_session") if stage.untouched else not self.is_home()):
             assert time.monotonic() < deadline, self.job(url)
             time.sleep(0.02)
         job = self.job(url)

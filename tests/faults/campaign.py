@@ -22,7 +22,7 @@ from tests.faults.ending import Ending, unsafe
 from tests.faults.stand import HOME, LOOP, PACE, Missing, Stand
 
 HOME_WITHIN_S = 6.0
-"""After the end of a job that could not restore its loop: heartbeat and lease run out."""
+"""After the end of a job that could not restore its loop: heartbeat or lease runs out, the law brings MV to rest."""
 OVER_WITHIN_S = 300.0
 """A job that is still active then is one for ever."""
 STALL_S = 0.4
@@ -50,8 +50,8 @@ def ending(stand: Stand, name: str, stage: str, database: str = "sqlite") -> End
     return Ending(
         database, name, stage, job["state"], job["reason"], job["detail"], job["attempts"],
         None if went_on or math.isnan(safe_s) else round(safe_s, 1),
-        kept, lost, missing, unsafe(last, home), home.words, list(stand.defects), round(time.monotonic() - began, 1),
-        round(stand.stalls.longest_s, 2),
+        kept, lost, missing, unsafe(last, home, at_rest=True), home.words, list(stand.defects),
+        round(time.monotonic() - began, 1), round(stand.stalls.longest_s, 2),
     )  # fmt: skip
 
 

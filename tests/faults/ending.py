@@ -9,39 +9,57 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from protocol.profile import Mode
+from protocol.profile import Mode, NmtState
 from protocol.tuner import Tuner, TunerError
 from tests.faults.faulty_hub import FaultyHub
+
+NEAR = 1.0
+"""Percent: how far MV may be from where it rests, and the plant's from the controller's, between two of its samples."""
 
 
 @dataclass(frozen=True)
 class Home:
-    """What the loop must be in the end: as it was found, but for what another's hand has chosen meanwhile."""
+    """What the loop must be in the end: as it was found, but for what another's hand has chosen meanwhile.
+
+    mv: at which the loop rests in automatic, percent; None where that is not known beforehand.
+    """
 
     mode: Mode
     sp: float
     Kp: float
     Ti: float
     words: str = "as found"
+    mv: float | None = None
 
 
 @dataclass(frozen=True)
 class Glance:
-    """A loop as its controller tells by SDO. at: monotonic wall time, s.  Kp, Ti: the accepted ones."""
+    """A loop as its nodes tell by SDO. at: monotonic wall time, s.  Kp, Ti: the accepted ones.
+
+    mv: as the controller has it, and as the plant does.  states: NMT states of both nodes.  session: the number of an
+    open one.
+    """
 
     at: float
     mode: int
     sp: float
     on_trial: bool
-    lease: int
+    session: int
     Kp: float
     Ti: float
+    mv: float
+    plant_mv: float
+    manual_output: float
+    safe_output: float
+    states: tuple[int, int]
 
 
-def unsafe(glance: Glance | None, home: Home) -> str:
+def unsafe(glance: Glance | None, home: Home, at_rest: bool = False) -> str:
     """In what an end is unsafe, in words; empty when it is safe.
 
-    Safe is: the mode found, the set-point found, the accepted gains in effect (not on trial), and no session open.
+    Safe is: the mode found, the set-point found, the accepted gains in effect (not on trial), no session open, both
+    nodes operational, and the output that the mode stands for at the plant. at_rest: in automatic MV must be where the
+    loop rests, too; it takes the law some time to bring it there.
     """
     if glance is None:
         return "the controller cannot be read"
@@ -53,10 +71,17 @@ def unsafe(glance: Glance | None, home: Home) -> str:
             ("Kp", glance.Kp, home.Kp, math.isclose(glance.Kp, home.Kp, rel_tol=1e-6)),
             ("Ti", glance.Ti, home.Ti, math.isclose(glance.Ti, home.Ti, rel_tol=1e-6)),
             ("on trial", glance.on_trial, False, not glance.on_trial),
-            ("lease", glance.lease, 0, not glance.lease),
+            ("session", glance.session, 0, not glance.session),
+            ("NMT states", glance.states, "operational", set(glance.states) == {NmtState.OPERATIONAL}),
         )
         if not same
     ]
+    if not wrong:
+        wanted = {Mode.OFF: glance.safe_output, Mode.MANUAL: glance.manual_output}.get(home.mode)
+        if wanted is None and at_rest:
+            wanted = home.mv if home.mv is not None else glance.mv
+        if wanted is not None and not math.isclose(glance.plant_mv, wanted, abs_tol=NEAR):
+            wrong.append(f"MV is {glance.plant_mv}, not {wanted}")
     return "; ".join(wrong)
 
 
@@ -80,9 +105,14 @@ class Eye:
                     int(number("controller_mode")),
                     number("controller_setpoint"),
                     bool(number("controller_on_trial")),
-                    int(number("controller_lease")),
+                    int(number("controller_session")),
                     number("controller_accepted_kp"),
                     number("controller_accepted_ti"),
+                    number("controller_mv"),
+                    number("plant_mv"),
+                    number("controller_manual_output"),
+                    number("controller_safe_output"),
+                    (int(number("node_state", node=0x20)), int(number("node_state", node=0x10))),
                 )
             except TunerError:
                 return None
@@ -108,11 +138,11 @@ class Eye:
             thread.join()
 
     def settled(self, home: Home, within_s: float) -> Glance | None:
-        """The loop as soon as it is safe, or as it is after that time."""
+        """The loop as soon as it is safe and at rest, or as it is after that time."""
         give_up = time.monotonic() + within_s
         while True:
             seen = self.glance()
-            if not unsafe(seen, home) or time.monotonic() > give_up:
+            if not unsafe(seen, home, at_rest=True) or time.monotonic() > give_up:
                 return seen
             time.sleep(0.1)
 

@@ -16,17 +16,27 @@ from protocol.profile import (
     MV_FRAME,
     PLANT_NODE,
     PV_FRAME,
+    Order,
     channel_ids,
     sdo_request_id,
     sdo_response_id,
 )
+from protocol.session import object_of
 
 Fault = Callable[[int], Sequence[float]]
 """Of a frame's COB-ID: the delays in s after which copies are passed on; none: the frame is lost."""
 
+
+
+def _address_of(order: Order) -> bytes:
+    return lookup(object_of(order)).index.to_bytes(2, "little") + b"\x01"
+
+
 _PV, _MV = channel_ids(1)[:2]
 _ANSWERS = {sdo_response_id(PLANT_NODE), sdo_response_id(CONTROLLER_NODE)}
-_LEASE = lookup("controller_lease").index.to_bytes(2, "little") + b"\x01"
+_OPENING = _address_of(Order.OPEN)
+_COMMANDS = {_address_of(order) for order in Order if order not in (Order.OPEN, Order.CLOSE)}
+_NO_NUMBER = b"0000C07F"
 
 
 def well(can_id: int) -> Sequence[float]:
@@ -42,7 +52,11 @@ class FaultyHub(Hub):
         self.answered = 0
         """Of the latest MV, with which a sample has passed whole."""
         self.first_of_session = 0
-        """The number of the first sample after the lease was last taken."""
+        """The number of the first sample after the session was opened."""
+        self.commanded = 0
+        """The number of the sample in which a tuner has last given an order within its session."""
+        self.pv_broken = False
+        """The transmitter of channel 1 gives no number."""
         self._taken = self._held = False
         self._onlooker: _Member | None = None
         self._late: list[tuple[float, _Member, bytes]] = []
@@ -52,7 +66,7 @@ class FaultyHub(Hub):
         return f"{self.url}/onlooker"
 
     def new_job(self) -> None:
-        """The next lease that is taken begins a session."""
+        """The next session that is opened is its."""
         self._held = False
 
     def _answer(self, member: _Member, words: list[bytes]) -> None:
@@ -63,7 +77,10 @@ class FaultyHub(Hub):
     def _pass_on(self, sender: _Member, frame: bytes) -> None:
         words = frame.split()
         can_id = int(words[2], 16)
-        self._witness(can_id, words[4] if len(words) > 5 else b"")
+        data = words[4] if len(words) > 5 else b""
+        self._witness(can_id, data)
+        if self.pv_broken and can_id == _PV and len(data) == 2 * PV_FRAME.size:
+            frame = frame.replace(data, _NO_NUMBER + data[8:])
         onlooker = self._onlooker
         if sender is onlooker:
             super()._pass_on(sender, frame)
@@ -88,9 +105,13 @@ class FaultyHub(Hub):
                 self._taken, self.first_of_session = False, self.sample_number
         elif can_id == _MV and len(data) == 2 * MV_FRAME.size:
             self.answered = MV_FRAME.unpack(bytes.fromhex(data.decode()))[1]
-        elif can_id == sdo_request_id(CONTROLLER_NODE) and not self._held:
+        elif can_id == sdo_request_id(CONTROLLER_NODE):
             request = bytes.fromhex(data.decode())
-            if request[:1] == b"\x23" and request[1:4] == _LEASE and any(request[4:]):
+            if request[:1] != b"\x23":
+                return
+            if request[1:4] in _COMMANDS:
+                self.commanded = self.sample_number
+            elif request[1:4] == _OPENING and not self._held:
                 self._taken = self._held = True
 
     def _flush(self, member: _Member) -> None:

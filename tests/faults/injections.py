@@ -22,26 +22,29 @@ from sqlalchemy import create_engine, text
 from protocol.bus import open_bus
 from protocol.profile import (
     CONTROLLER_NODE,
+    HEARTBEAT_FRAME,
     NMT_FRAME,
     NMT_ID,
     PLANT_NODE,
     PV_FRAME,
-    Abort,
     Mode,
     NmtCommand,
+    NmtState,
     ParameterCommand,
     channel_ids,
     heartbeat_id,
     sdo_request_id,
     sdo_response_id,
 )
-from protocol.tuner import TunerError
+from protocol.station import Station
 from service.backup import back_up, restore
+from service.bus_loop import BusLoop
 from service.processes import NotReady
 from tests.e2e.plantsite import TAG
-from tests.faults.ending import Home
+from tests.faults.ending import Home, unsafe
 from tests.faults.faulty_hub import Fault, well
-from tests.faults.stand import HOME, Stand
+from tests.faults.stand import HOME, LOOP, Stand
+from tuning.reasons import Ended, Reason
 
 Harm = Iterator[Home | None]
 Injection = Callable[[Stand, str], AbstractContextManager[Home | None]]
@@ -50,6 +53,17 @@ LOCKED_S = 8.0
 """Longer than a request waits for the database."""
 AWAY_S = 15.0
 CLIENTS = 20
+OTHER_TUNER = 0x7C
+RECOVERING_S = 1.5
+"""After its start a service is about to look for jobs that were left, or does."""
+SOON_HOME_S = 3.0
+SLOW_PACE = 0.5
+NEXT_COMMAND_S = 2.0
+"""A stage that commands nothing for so long will not do it soon: then the operator does not wait either."""
+WAY_OUT_S = 0.3
+OUT_OF_OPERATION_S = 2.0
+LEFT_NEAR = 3.0
+"""Percent: a loop is opened where noise and the last test have left MV."""
 _ANSWERS = (sdo_response_id(PLANT_NODE), sdo_response_id(CONTROLLER_NODE))
 
 
@@ -81,6 +95,66 @@ def controller_killed(stand: Stand, url: str) -> Harm:
     stand.site.controller.kill()
     stand.site.start_controller()
     stand.site.controller.wait_ready()
+    yield None
+
+
+@contextmanager
+def service_killed_twice(stand: Stand, url: str) -> Harm:
+    """The second time while it looks for what the first one has left."""
+    stand.site.service.kill()
+    again = stand.site.launch_service()
+    time.sleep(RECOVERING_S)
+    again.kill()
+    stand.serve_again(url)
+    yield None
+
+
+@contextmanager
+def second_gateway(stand: Stand, url: str) -> Harm:
+    """Ours is killed at a slow sample time, while another one beats on the same bus."""
+    pace = stand.site.read("plant_pace")
+    stand.site.write("plant_pace", LOOP.ts)  # a sample a second
+    over = threading.Event()
+
+    def beat() -> None:
+        bus = open_bus(stand.hub.url)
+        while not over.wait(0.1):
+            bus.send(heartbeat_id(OTHER_TUNER), HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL))
+        bus.close()
+
+    other = threading.Thread(target=beat)
+    other.start()
+    try:
+        stand.site.service.kill()
+        since = time.monotonic()
+        while unsafe(stand.eye.glance(), HOME):
+            if time.monotonic() - since > SOON_HOME_S:
+                stand.defects.append(f"not home {SOON_HOME_S:g} s after the kill")
+                break
+            time.sleep(0.05)
+        stand.site.write("plant_pace", pace)
+        stand.serve_again(url)
+        yield None
+    finally:
+        over.set()
+        other.join()
+
+
+@contextmanager
+def two_tuners(stand: Stand, url: str) -> Harm:
+    """Another gateway wants the loop that is under test."""
+    pace = stand.site.read("plant_pace")
+    stand.site.write("plant_pace", SLOW_PACE)  # the job must not be over while the other one waits
+    loop = BusLoop(stand.hub.url, CONTROLLER_NODE, PLANT_NODE, station=Station(OTHER_TUNER))
+    try:
+        loop.begin()
+        stand.defects.append("a second tuner was given the loop")
+    except Ended as ended:
+        if ended.reason is not Reason.LOOP_IN_USE:
+            stand.defects.append(f"the second tuner was told {ended}")
+    finally:
+        loop.close()
+        stand.site.write("plant_pace", pace)
     yield None
 
 
@@ -177,12 +251,11 @@ def wrong_pv(stand: Stand, url: str) -> Harm:
 
 @contextmanager
 def foreign_gains(stand: Stand, url: str) -> Harm:
+    """Tried by hand, and taken back when the job is over."""
     stand.site.write("controller_staged_kp", 999.0)
-    try:
-        stand.site.write("controller_parameter_command", ParameterCommand.TRY)
-    except TunerError as refused:  # as it is while the relay runs
-        if refused.code != Abort.DEVICE_STATE:
-            raise
+    stand.site.write("controller_parameter_command", ParameterCommand.TRY)
+    stand.site.finished(url)
+    stand.site.write("controller_parameter_command", ParameterCommand.GO_BACK)
     yield None
 
 
@@ -192,10 +265,60 @@ def foreign_mode(stand: Stand, url: str) -> Harm:
     yield replace(HOME, mode=Mode.MANUAL, words="in their mode")
 
 
+def operators_off(samples: int) -> Injection:
+    """So many samples after a command of the test."""
+
+    def inject(stand: Stand, url: str) -> Harm:
+        hub, give_up = stand.hub, time.monotonic() + NEXT_COMMAND_S
+        before = hub.commanded
+        while hub.commanded == before and time.monotonic() < give_up:
+            time.sleep(0.001)
+        while hub.sample_number < hub.commanded + samples and time.monotonic() < give_up:
+            time.sleep(0.001)
+        stand.site.write("controller_mode_command", Mode.OFF)
+        yield replace(HOME, mode=Mode.OFF, words="off")
+
+    return contextmanager(inject)
+
+
+@contextmanager
+def off_on_the_way_out(stand: Stand, url: str) -> Harm:
+    stand.site.http.post(f"{url}/abort")
+    time.sleep(random.uniform(0.0, WAY_OUT_S))
+    stand.site.write("controller_mode_command", Mode.OFF)
+    yield replace(HOME, mode=Mode.OFF, words="off")
+
+
+@contextmanager
+def pre_operational(stand: Stand, url: str) -> Harm:
+    """By a third node, which starts the controller again in the end."""
+    _send(stand, [(NMT_ID, NMT_FRAME.pack(NmtCommand.PRE_OPERATIONAL, CONTROLLER_NODE))])
+    time.sleep(OUT_OF_OPERATION_S)
+    _look_at_mv(stand)
+    _send(stand, [(NMT_ID, NMT_FRAME.pack(NmtCommand.START, CONTROLLER_NODE))])
+    yield None
+
+
+@contextmanager
+def pv_gone(stand: Stand, url: str) -> Harm:
+    """No number, until the job is over."""
+    stand.hub.pv_broken = True
+    yield None
+    _look_at_mv(stand)
+    stand.hub.pv_broken = False
+
+
+def _look_at_mv(stand: Stand) -> None:
+    """Nothing controls: MV must be that of home."""
+    seen = stand.eye.glance()
+    if seen is None or abs(seen.plant_mv - (HOME.mv or 0.0)) > LEFT_NEAR:
+        stand.defects.append(f"while nothing controls, MV is {seen and seen.plant_mv}, home's was about {HOME.mv}")
+
+
 @contextmanager
 def foreign_setpoint(stand: Stand, url: str) -> Harm:
     stand.site.write("controller_setpoint", 50.03)
-    yield replace(HOME, sp=50.03, words="on their set-point")
+    yield replace(HOME, sp=50.03, words="on their set-point", mv=None)
 
 
 @contextmanager

@@ -23,9 +23,10 @@ stage, then one fault is let loose on it. The end of the loop is read from the c
 **{runs} runs, {unsafe} unsafe endings, {active} jobs that stayed active, {defects} answers that no page describes.**
 {dates}. `make faults` fails unless the last three numbers are 0.
 
-An ending is unsafe unless mode and set-point are those found, the accepted gains are in effect, nothing is on trial and
-no session is open; what another node has chosen for itself during the job has the last word. Unsafe ends and their
-jobs would stand here by name:{bad}
+An ending is unsafe unless mode and set-point are those found, the accepted gains are in effect, nothing is on trial,
+no session is open, both nodes are operational, and MV at the plant is what the mode stands for, in automatic where the
+loop rests; what another node has chosen for itself during the job has the last word. Unsafe ends and their jobs would
+stand here by name:{bad}
 
 ## How to read it
 

@@ -6,20 +6,20 @@ gains of its options would be seen.
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import subprocess
 import threading
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import httpx
 from sqlalchemy import create_engine, select
 from sqlalchemy.orm import Session
 
-from controller.memory import FORM
+from controller.device import Kept
+from controller.memory import write
 from controller.pid import Parameters
 from protocol.profile import Mode
 from service.store.chunks import unpack
@@ -32,7 +32,7 @@ from tests.unit.service.postgres import Server, binaries
 LOOP = replace(MODEL_14, ts=0.05)
 PACE = 10.0
 """Three stands at a time are then what two processors can just do."""
-HOME = Home(Mode.AUTOMATIC, LOOP.sp, LOOP.kp, LOOP.ti)
+HOME = Home(Mode.AUTOMATIC, LOOP.sp, LOOP.kp, LOOP.ti, mv=50.0)
 SMALL_DISK_MIB = 8
 
 
@@ -82,8 +82,7 @@ class Stand:
         stack.callback(self.eye.close)
         self.stalls = Stalls()
         stack.callback(self.stalls.close)
-        accepted = [asdict(Parameters(LOOP.kp, LOOP.ti, 0.0, 0.0, 1.0, 0.0))]
-        (folder / "kept.json").write_text(json.dumps({"form": FORM, "accepted": accepted}))
+        write(folder / "kept.json", [Kept(Parameters(LOOP.kp, LOOP.ti), Mode.AUTOMATIC, LOOP.sp, 50.0)])
         others = replace(LOOP, kp=LOOP.kp / 2, ti=2 * LOOP.ti)
         self.site = Plantsite(
             stack, folder, others, bus=self.hub.url, launcher=launcher, served_with=served_with, speed=str(PACE),
@@ -92,7 +91,7 @@ class Stand:
         self.site.case = LOOP
 
     def at_rest(self, pace: float) -> None:
-        self.hub.fault = well
+        self.hub.fault, self.hub.pv_broken = well, False
         self.site.at_rest(pace)
         self.hub.new_job()
         self.defects.clear()

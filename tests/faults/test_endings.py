@@ -6,9 +6,12 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
+from typing import Any
 
 import pytest
 
+from protocol.profile import Mode
 from tests.faults import campaign, report
 from tests.faults.cases import FAULTS
 from tests.faults.ending import Glance, unsafe
@@ -35,6 +38,15 @@ EXPECTED: dict[tuple[str, str], tuple[str, ...]] = {
     ("foreign-gains", "verify"): ("aborted gains_changed",),
     ("deaf-listener", "verify"): (PROPOSED,),
     ("clients", "ultimate"): ("aborted operator",),
+    ("killed-twice", "relay"): (PROPOSED, "aborted operator"),
+    ("off-1", "relay"): ("aborted mode_changed",),
+    ("off-10", "verify"): ("aborted mode_changed",),
+    ("off-40", "verify"): ("aborted mode_changed",),
+    ("off-way-out", "fast-relay"): ("aborted operator", "aborted mode_changed"),
+    ("pre-operational", "fast-relay"): ("failed node_not_operational",),
+    ("pv-gone", "fast-relay"): ("failed bad_sample",),
+    ("two-tuners", "fast-relay"): (PROPOSED,),
+    ("second-gateway", "verify"): (PROPOSED,),
     ("disk-full", "zn_pi"): (PROPOSED,),
     ("clock-back", "zn_pi"): (PROPOSED,),
 }
@@ -68,7 +80,7 @@ def test_the_loop_ends_safe_and_the_job_says_why(fault: str, stage: str, stands:
     assert not one.bad, one
     assert f"{one.state} {one.reason}" in EXPECTED[fault, stage], one
     assert one.kept > 0
-    assert (one.attempts > 1) == (fault == "service-killed")
+    assert (one.attempts > 1) == (fault in ("service-killed", "killed-twice", "second-gateway"))
     if one.state == "proposed" and one.attempts == 1:
         assert one.lost == 0, one
 
@@ -83,15 +95,31 @@ def test_frames_that_make_no_sense_are_passed_over(stands: dict[Needs, Stand]) -
         assert stand.site.read("sample_number") > before
 
 
+WELL: dict[str, Any] = {
+    "at": 0.0, "mode": 2, "sp": HOME.sp, "on_trial": False, "session": 0, "Kp": HOME.Kp, "Ti": HOME.Ti, "mv": 50.2,
+    "plant_mv": 50.0, "manual_output": 30.0, "safe_output": 0.0, "states": (5, 5),
+}  # fmt: skip
+
+
 @pytest.mark.parametrize(
     "change",
-    [{"mode": 3}, {"mode": 1}, {"sp": 50.1}, {"on_trial": True}, {"lease": 5}, {"Kp": 40.0}, {"Ti": 2.4}],
-)
-def test_what_is_unsafe(change: dict[str, float]) -> None:
-    well = {"at": 0.0, "mode": 2, "sp": HOME.sp, "on_trial": False, "lease": 0, "Kp": HOME.Kp, "Ti": HOME.Ti}
-    assert unsafe(Glance(**well), HOME) == ""  # type: ignore[arg-type]
-    assert unsafe(Glance(**well | change), HOME)  # type: ignore[arg-type]
+    [
+        {"mode": 3}, {"mode": 1}, {"sp": 50.1}, {"on_trial": True}, {"session": 5}, {"Kp": 40.0}, {"Ti": 2.4},
+        {"plant_mv": 60.0}, {"states": (127, 5)}, {"states": (5, 4)},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_what_is_unsafe(change: dict[str, Any]) -> None:
+    assert unsafe(Glance(**WELL), HOME, at_rest=True) == ""
+    assert unsafe(Glance(**WELL | change), HOME, at_rest=True)
     assert unsafe(None, HOME)
+
+
+@pytest.mark.parametrize(("mode", "mv"), [(Mode.OFF, 0.0), (Mode.MANUAL, 30.0)], ids=str)
+def test_in_off_and_manual_mv_is_what_they_stand_for(mode: Mode, mv: float) -> None:
+    home = replace(HOME, mode=mode)
+    assert unsafe(Glance(**WELL | {"mode": mode, "plant_mv": mv}), home) == ""
+    assert "MV is 50.0" in unsafe(Glance(**WELL | {"mode": mode}), home)
 
 
 def test_the_page_is_that_of_the_results() -> None:

@@ -179,7 +179,7 @@ def test_a_plant_with_its_own_clock_is_listened_to(start: Start, url: str) -> No
 
 
 def test_gains_are_accepted_and_stay(loop: BusLoop) -> None:
-    state = loop.accept(TRIED)
+    state = loop.accept(TRIED, GAINS)
     assert (state.gains, state.on_trial) == (TRIED, False)
     run(wait(20), loop, watch=WATCH)
     assert loop.read().gains == TRIED
@@ -211,7 +211,11 @@ def test_a_tuner_that_dies_or_hangs_loses_the_loop(start: Start, url: str, speed
     with tuner:
         assert tuner.stdout is not None
         assert tuner.stdout.readline() == "in trial 1 50.5\n"
-        assert observer.read().on_trial
+        try:
+            assert observer.read().on_trial
+        except BaseException:
+            tuner.kill()  # else it is waited for without end
+            raise
         tuner.send_signal(end)
         give_up = time.monotonic() + 4.0
         while not as_configured(observer.read()) and time.monotonic() < give_up:
@@ -247,7 +251,7 @@ def test_a_node_that_is_gone_is_noticed(loop: BusLoop, devices: dict[str, subpro
             loop.restore(state)
         assert caught.value.reason is Reason.RESTORE_UNCONFIRMED
     else:
-        assert as_configured(loop.restore(state))
+        assert as_configured(loop.restore(state).state)
 
 
 @on_vcan
@@ -260,7 +264,7 @@ def test_a_bus_that_goes_down_is_noticed_and_the_loop_restored_when_it_is_back(l
         assert reason is Reason.BUS_LOST
     finally:
         link("up")
-    assert as_configured(loop.restore(state))
+    assert as_configured(loop.restore(state).state)
 
 
 @on_vcan
@@ -306,4 +310,4 @@ def test_what_the_controller_refuses_is_said(loop: BusLoop) -> None:
     with pytest.raises(Refused, match="above the limit") as caught:
         loop.step(commands)
     assert caught.value.reason is Reason.BAD_INPUT
-    assert as_configured(loop.restore(state))
+    assert as_configured(loop.restore(state).state)

@@ -28,11 +28,12 @@ from protocol.profile import (
     Emcy,
     NmtCommand,
     NmtState,
-    ParameterCommand,
+    Order,
     channel_ids,
     emcy_id,
     heartbeat_id,
 )
+from protocol.session import STAGED, check_of, object_of
 
 INTERFACE = "vcan0"
 URL = f"socketcan:{INTERFACE}"
@@ -127,10 +128,19 @@ def hear_emergency(listener: Bus, node: int, code: Emcy) -> bytes:
     raise AssertionError(f"no EMCY {code.name}")
 
 
+def order(network: canopen.Network, which: Order, *values: float) -> None:
+    """Stages the values and writes the check over them."""
+    for name, value in zip(STAGED[which], values, strict=True):
+        sdo(network, name).raw = value
+    opening = which is Order.OPEN
+    number = sdo(network, "controller_session_next" if opening else "controller_session").raw
+    count = 0 if opening else sdo(network, "controller_session_count").raw
+    sdo(network, object_of(which)).raw = check_of(number, count, which, values)
+
+
 def open_trial(network: canopen.Network, lease: int) -> None:
-    sdo(network, "controller_lease").raw = lease
-    sdo(network, "controller_staged_kp").raw = 300.0
-    sdo(network, "controller_parameter_command").raw = ParameterCommand.TRY
+    order(network, Order.OPEN, TUNER_NODE, lease, 60_000, 10_000, 1000)
+    order(network, Order.TRY, 300.0, 12.0, 0.0, 0.0, 1.0, 0.0)
 
 
 @pytest.mark.usefixtures("loop")
@@ -172,11 +182,12 @@ class TestLoop:
 
     def test_a_tuner_that_falls_silent_loses_the_loop(self, network: canopen.Network, listener: Bus) -> None:
         listener.set_filters({emcy_id(CONTROLLER)})
+        network[CONTROLLER].sdo[0x1016][1].raw = TUNER_NODE << 16 | 1000
         for _ in range(3):
             listener.send(heartbeat_id(TUNER_NODE), HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL))
         open_trial(network, 0x7FFFFFFF)
         assert sdo(network, "controller_on_trial").raw == 1
-        assert hear_emergency(listener, CONTROLLER, Emcy.HEARTBEAT_LOST)[0] == TUNER_NODE
+        assert hear_emergency(listener, CONTROLLER, Emcy.TUNER_LOST)[0] == 1, "the channel"
         assert sdo(network, "controller_on_trial").raw == 0
         assert sdo(network, "controller_cause").raw == Cause.HEARTBEAT
         assert sdo(network, "controller_accepted_kp").raw == 200.0
@@ -184,7 +195,7 @@ class TestLoop:
     def test_a_lease_not_renewed_ends_the_trial(self, network: canopen.Network, listener: Bus) -> None:
         listener.set_filters({emcy_id(CONTROLLER)})
         open_trial(network, 3000)
-        sdo(network, "controller_setpoint").raw = 50.1
+        order(network, Order.SETPOINT, 50.125)
         hear_emergency(listener, CONTROLLER, Emcy.LEASE_USED_UP)
         assert sdo(network, "controller_on_trial").raw == 0
         assert sdo(network, "controller_cause").raw == Cause.LEASE

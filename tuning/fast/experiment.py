@@ -88,7 +88,7 @@ class Experiment:
     def relay(self, switches: int) -> Plan[bool]:
         """Goes on until the relay has switched so often; False where the time is over first.
 
-        Raises Refused: NO_RESPONSE, WRONG_SIGN, CANNOT_OSCILLATE before the second switch, STALLED before the fourth.
+        Raises Refused: NO_RESPONSE, WRONG_SIGN, CANNOT_OSCILLATE up to the second switch, STALLED before the fourth.
         """
         if not self.relayed:
             self.listened = self.relayed = len(self.trace)
@@ -208,9 +208,16 @@ class Experiment:
         return ()
 
     def _adapted(self) -> tuple[Command, ...]:
-        """After the first wave: more amplitude above the noise, or less where PV went too far."""
+        """After the first wave: more amplitude above the noise, or less where PV went too far. Raises Refused,
+        NO_RESPONSE: MV has switched, and PV stands still."""
         seen = float(np.ptp(self.trace.pv[self.listened :]))
         factor = 1.0
+        if seen == 0.0:
+            raise Refused(
+                Reason.NO_RESPONSE,
+                f"the relay of {self.amplitude:.4g} has switched twice, and PV is exactly {self.trace.pv[-1]:.6g} "
+                f"all the time (noise {self.noise:.3g} before)",
+            )
         if seen < LEAST_SPAN * self.noise:
             factor = min(GOOD_SPAN * self.noise / seen, self._most / self.amplitude)
         elif seen > WIDEST_SPAN * self.facts.sp_deviation:

@@ -1,4 +1,4 @@
-"""Modes, changes without bumps, trials, the session and the relay."""
+"""Modes, limits, changes without bumps, gains on trial, and the way home."""
 
 from __future__ import annotations
 
@@ -6,13 +6,11 @@ import itertools
 import math
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.channel import Cause, Channel, ExperimentState, Mode, Parameters, Settings
-from plantsim.plant import LinearPlant
+from controller.channel import Channel, Home, Mode, Parameters, RelaySettings, RelayState, Settings
 
 Ts = 0.1
 P, P2 = Parameters(3.0), Parameters(0.5)
@@ -34,9 +32,7 @@ def moving(c: Channel) -> float:
     return c.step(49.2)
 
 
-def relay(c: Channel, amplitude: float = 10.0, hysteresis: float = 0.0, working: float = 50.0, parallel: float = 0.0,
-          samples: int = 1000, low: float = 0.0, high: float = 100.0) -> None:  # fmt: skip
-    c.start_relay(amplitude, hysteresis, working, parallel, samples, low, high)
+RELAY = RelaySettings(10.0, 0.0, 50.0, 1000, 0.0, 100.0)
 
 
 @ACTIONS
@@ -44,11 +40,10 @@ def relay(c: Channel, amplitude: float = 10.0, hysteresis: float = 0.0, working:
 def test_new_gains_do_not_move_the_output(before: str, after: str, reverse: bool) -> None:
     c = channel(LAWS[before], reverse=reverse)
     mv = moving(c)
-    c.stage(LAWS[after])
-    c.try_staged()
+    c.try_gains(LAWS[after])
     assert c.on_trial and c.in_effect == LAWS[after] and c.accepted == LAWS[before]
     assert c.step(49.2) == pytest.approx(mv, abs=1e-9)
-    c.go_back(Cause.COMMAND)
+    c.go_back()
     mv = c.mv
     assert not c.on_trial and c.in_effect == LAWS[before]
     assert c.step(49.2) == pytest.approx(mv, abs=1e-9)
@@ -73,8 +68,7 @@ def test_gains_change_without_a_bump_while_saturated_and_leave_the_limit_at_once
         c = channel(PI)
         for _ in range(500):
             c.step(0.0)
-        c.stage(after)
-        c.try_staged()
+        c.try_gains(after)
         c.step(0.0)
         assert c.mv == 100.0
         assert c.step(60.0) < 100.0
@@ -160,187 +154,88 @@ def test_the_operator_can_move_the_output_by_hand_without_a_sensor() -> None:
 def test_accepting_makes_the_trial_the_set_to_come_back_to() -> None:
     c = channel(PI)
     c.stage(PI2)
-    assert c.in_effect == PI and not c.on_trial
-    c.try_staged()
-    c.accept()
+    assert (c.staged, c.in_effect, c.on_trial) == (PI2, PI, False)
+    c.try_gains(PI2)
+    c.accept(PI2)
     assert (c.accepted, c.on_trial, c.accept_count) == (PI2, False, 1)
-    c.go_back(Cause.COMMAND)
-    assert (c.in_effect, c.cause) == (PI2, Cause.COMMAND)
+    c.go_back()
+    assert c.in_effect == PI2
 
 
-def trial(c: Channel) -> None:
-    """What a tuner does in its session: another law, set-point, output and mode."""
-    c.stage(PI2)
-    c.try_staged()
-    c.setpoint = 53.0
-    c.step(49.2)
-    c.command_mode(Mode.MANUAL)
-    c.manual_output = 70.0
-    c.step(49.2)
-
-
-def test_a_lease_used_up_brings_everything_back() -> None:
+@pytest.mark.parametrize("tried", [PI2, PID], ids=["the accepted ones", "others"])
+def test_what_is_accepted_is_in_effect_whatever_was_tried_before(tried: Parameters) -> None:
     c = channel(PI)
-    moving(c)
-    c.renew_lease(5)
-    trial(c)
-    assert (c.lease, c.cause) == (3, Cause.NONE)
-    c.renew_lease(2)
-    c.step(49.2)
-    assert c.mode is Mode.MANUAL
-    mv = c.step(49.2)
-    assert (c.mode, c.setpoint, c.in_effect, c.on_trial) == (Mode.AUTOMATIC, 50.0, PI, False)
-    assert (c.lease, c.cause, c.manual_output) == (0, Cause.LEASE, 45.0)
+    mv = moving(c)
+    c.try_gains(tried)
+    c.accept(PI2)
+    assert (c.accepted, c.in_effect, c.on_trial) == (PI2, PI2, False)
     assert c.step(49.2) == pytest.approx(mv)
 
 
-def test_the_session_notes_the_loop_when_it_opens_not_when_it_is_renewed() -> None:
-    c = channel(PI, Mode.MANUAL)
-    c.renew_lease(100)
-    c.command_mode(Mode.AUTOMATIC)
-    c.renew_lease(100)
-    c.go_back(Cause.HEARTBEAT)
-    assert (c.mode, c.manual_output, c.step(49.0), c.cause) == (Mode.MANUAL, 45.0, 45.0, Cause.HEARTBEAT)
+HOMES = {
+    "off": Home(Mode.OFF, 50.0, 45.0, 5.0),
+    "manual": Home(Mode.MANUAL, 50.0, 45.0, 45.0),
+    "automatic": Home(Mode.AUTOMATIC, 50.0, 45.0, 48.0),
+}
 
 
-def test_closing_the_session_ends_the_trial_and_leaves_the_rest() -> None:
+@pytest.mark.parametrize("home", HOMES.values(), ids=list(HOMES))
+def test_home_is_mode_set_point_manual_output_and_the_accepted_gains(home: Home) -> None:
     c = channel(PI)
-    c.renew_lease(100)
-    trial(c)
-    mv = c.step(49.2)
-    c.renew_lease(0)
-    for _ in range(200):
-        assert c.step(49.2) == mv
-    assert (c.mode, c.setpoint, c.in_effect, c.lease, c.cause) == (Mode.MANUAL, 53.0, PI, 0, Cause.NONE)
-    assert not c.on_trial
-
-
-def test_closing_the_session_ends_an_experiment_without_a_bump() -> None:
-    c = channel(PI)
-    c.renew_lease(100)
-    relay(c)
-    mv = c.step(50.0)
-    c.renew_lease(0)
-    assert (c.mode, c.experiment_state) == (Mode.AUTOMATIC, ExperimentState.DONE)
-    assert c.step(50.0) == pytest.approx(mv)
-
-
-def test_the_next_session_notes_the_loop_as_it_is_then() -> None:
-    c = channel(PI)
-    c.renew_lease(100)
-    c.setpoint = 52.0
-    c.renew_lease(0)
-    c.renew_lease(100)
-    c.setpoint = 53.0
-    c.go_back(Cause.COMMAND)
-    assert c.setpoint == 52.0
-
-
-def test_a_lease_runs_out_on_bad_measurements_too() -> None:
-    c = channel(PI)
-    moving(c)
-    c.renew_lease(3)
-    c.stage(PI2)
-    c.try_staged()
-    for _ in range(3):
-        c.step(math.nan)
-    assert (c.in_effect, c.cause) == (PI, Cause.LEASE)
+    c.try_gains(PI2)
+    c.setpoint, c.manual_output = 53.0, 70.0
+    c.go_home(home)
+    assert (c.mode, c.setpoint, c.manual_output) == (home.mode, home.setpoint, home.manual_output)
+    assert (c.in_effect, c.on_trial) == (PI, False)
 
 
 @ACTIONS
-def test_relay_switches_on_the_sign_of_the_error(reverse: bool) -> None:
+def test_the_way_home_in_automatic_has_no_bump(reverse: bool) -> None:
     c = channel(PI, reverse=reverse)
-    relay(c)
-    assert c.mode is Mode.EXPERIMENT and c.experiment_state is ExperimentState.RUNNING
-    below, above = (60.0, 40.0) if reverse else (40.0, 60.0)
-    assert [c.step(pv) for pv in (49.9, 50.1, 49.9)] == [below, above, below]
-    assert c.step(50.0) == 60.0
-
-
-def test_relay_keeps_its_side_within_the_hysteresis() -> None:
-    c = channel(PI)
-    relay(c, hysteresis=1.0)
-    assert [c.step(pv) for pv in (49.5, 50.5, 51.0, 50.5, 49.5, 49.0, 50.9)] == [60, 60, 40, 40, 40, 60, 60]
-
-
-def test_relay_adds_its_parallel_path_and_keeps_the_limits() -> None:
-    c = channel(PI, mv_high=61.0)
-    relay(c, parallel=0.5)
-    assert c.step(49.0) == pytest.approx(60.5)
-    assert c.step(40.0) == 61.0
-
-
-def test_relay_ends_at_a_pv_limit_without_a_bump() -> None:
-    c = channel(PI)
-    moving(c)
-    relay(c, low=45.0, high=55.0)
-    c.step(54.9)
-    mv = c.step(54.9)
-    assert c.step(55.1) == pytest.approx(mv, abs=0.5)
-    assert (c.mode, c.cause, c.experiment_state) == (Mode.AUTOMATIC, Cause.PV_LIMIT, ExperimentState.ENDED_BY_LIMIT)
-
-
-def test_relay_ends_after_its_samples_into_the_sessions_mode() -> None:
-    c = channel(PI)
-    moving(c)
-    c.renew_lease(1000)
-    c.command_mode(Mode.MANUAL)
-    c.setpoint = 51.0
-    relay(c, samples=10)
-    modes = [c.step(49.2) and c.mode for _ in range(12)]
-    assert modes == [Mode.EXPERIMENT] * 10 + [Mode.AUTOMATIC] * 2
-    assert (c.setpoint, c.lease, c.experiment_state) == (50.0, 0, ExperimentState.DONE)
-
-
-def test_relay_outside_a_session_comes_back_to_the_mode_before_it() -> None:
-    for mode in (Mode.MANUAL, Mode.AUTOMATIC):
-        c = channel(PI, mode)
-        relay(c, samples=2)
-        relay(c, samples=2)
-        for _ in range(3):
-            c.step(49.0)
-        assert c.mode is mode
-
-
-def test_a_session_opened_during_a_relay_comes_back_to_the_mode_before_it() -> None:
-    c = channel(PI)
-    relay(c)
-    c.renew_lease(3)
-    for _ in range(3):
-        c.step(49.0)
-    assert (c.mode, c.cause) == (Mode.AUTOMATIC, Cause.LEASE)
-
-
-def test_relay_ends_into_automatic_by_command_without_a_bump() -> None:
-    c = channel(PI)
-    moving(c)
-    relay(c)
-    mv = c.step(49.2)
-    c.command_mode(Mode.AUTOMATIC)
+    c.try_gains(PI2)
+    c.setpoint = 53.0
+    mv = moving(c)
+    c.go_home(HOMES["automatic"])
     assert c.step(49.2) == pytest.approx(mv)
-    assert c.experiment_state is ExperimentState.DONE
 
 
-def test_relay_swings_a_plant_at_its_ultimate_period() -> None:
-    plant = LinearPlant([1], [1, 5, 10, 10, 5, 1], 0.0, 0.02, mv_nominal=50, pv_nominal=50)
-    c = Channel(0.02, Settings(), PI, 50.0, Mode.AUTOMATIC, 50.0)
-    c.step(plant.pv)
-    relay(c, samples=10**6)
-    y = np.array([plant.step(c.step(plant.pv)) for _ in range(6000)]) - 50
-    ups = np.nonzero((y[:-1] < 0) & (y[1:] >= 0))[0]
-    assert np.diff(ups)[-5:].mean() * 0.02 == pytest.approx(8.648, rel=0.02)
-    assert 4 * 10 / (math.pi * np.ptp(y[-1000:]) / 2) == pytest.approx(2.885, rel=0.03)
+def test_home_in_manual_is_reached_no_faster_than_the_rate_limit_allows() -> None:
+    c = channel(PI, rate_limit_per_s=10.0)
+    mv = moving(c)
+    c.go_home(Home(Mode.MANUAL, 50.0, 20.0, 20.0))
+    assert [c.step(49.2) for _ in range(3)] == pytest.approx([mv - 1.0, mv - 2.0, mv - 3.0])
+
+
+@pytest.mark.parametrize(("mode", "mv"), [(Mode.OFF, 5.0), (Mode.MANUAL, 60.0), (Mode.AUTOMATIC, 48.0)], ids=str)
+def test_without_pv_the_output_is_at_once_what_the_mode_stands_for(mode: Mode, mv: float) -> None:
+    c = channel(PI, safe_output=5.0, rate_limit_per_s=1.0)
+    moving(c)
+    c.command_mode(mode)
+    c.manual_output = 60.0
+    c.without_pv(48.0)
+    assert c.mv == mv
+    assert c.step(51.0) == pytest.approx(mv, abs=0.11), "and the law goes on from there"
+
+
+def test_without_pv_the_output_keeps_its_limits() -> None:
+    c = channel(PI, mv_low=20.0, mv_high=40.0)
+    c.without_pv(99.0)
+    assert c.mv == 40.0
+
+
+def test_only_an_experiment_in_its_relay_is_one() -> None:
+    with pytest.raises(ValueError, match="cannot start with an experiment"):
+        channel(mode=Mode.EXPERIMENT)
+    c = channel(PI)
+    c.start_relay(RELAY)
+    assert (c.mode, c.relay_state) == (Mode.EXPERIMENT, RelayState.RUNNING)
+    c.command_mode(Mode.AUTOMATIC)
+    assert (c.relay, c.relay_state) == (None, RelayState.DONE)
 
 
 REFUSED: list[Callable[[Channel], object]] = [
     lambda c: c.command_mode(7),
     lambda c: c.command_mode(Mode.EXPERIMENT),
-    lambda c: c.renew_lease(-1),
-    lambda c: relay(c, amplitude=0),
-    lambda c: relay(c, hysteresis=-1),
-    lambda c: relay(c, samples=0),
-    lambda c: relay(c, low=60, high=40),
-    lambda c: relay(c, working=math.nan),
     lambda c: setattr(c, "setpoint", math.nan),
     lambda c: setattr(c, "manual_output", math.inf),
     lambda c: setattr(c, "settings", Settings(mv_low=2, mv_high=1)),
@@ -355,7 +250,7 @@ def test_what_has_no_meaning_is_refused_and_changes_nothing(command: Callable[[C
     mv = moving(c)
     with pytest.raises(ValueError):
         command(c)
-    assert (c.mode, c.setpoint, c.settings, c.lease) == (Mode.AUTOMATIC, 50.0, Settings(), 0)
+    assert (c.mode, c.setpoint, c.settings) == (Mode.AUTOMATIC, 50.0, Settings())
     assert c.step(49.2) != mv  # it still integrates
 
 
@@ -368,67 +263,26 @@ COMMANDS: list[Callable[[Channel], object]] = [
     lambda c: c.command_mode(Mode.AUTOMATIC),
     lambda c: setattr(c, "manual_output", 120.0),
     lambda c: setattr(c, "setpoint", 57.0),
-    lambda c: c.stage(PI2),
     lambda c: c.stage(P),
-    lambda c: c.try_staged(),
-    lambda c: c.accept(),
-    lambda c: relay(c, amplitude=70.0, parallel=3.0, samples=3),
-    lambda c: c.renew_lease(4),
-    lambda c: c.renew_lease(0),
-    lambda c: c.go_back(Cause.NMT),
+    lambda c: c.try_gains(PI2),
+    lambda c: c.accept(PID),
+    lambda c: c.accept(c.in_effect),
+    lambda c: c.go_back(),
+    lambda c: c.start_relay(RelaySettings(70.0, 0.0, 60.0, 3, 0.0, 100.0)),
+    lambda c: c.go_home(HOMES["manual"]),
+    lambda c: c.without_pv(99.0),
 ]
 
 
 @settings(deadline=None, max_examples=300)
-@given(st.lists(st.sampled_from(range(len(COMMANDS))), max_size=40))
-def test_any_order_of_commands_keeps_the_promises(order: list[int]) -> None:
+@given(st.lists(st.sampled_from(range(len(COMMANDS))), max_size=40), st.sampled_from(list(HOMES)))
+def test_any_order_of_commands_keeps_the_promises(order: list[int], home: str) -> None:
     c = channel(PI, mv_low=10.0, mv_high=90.0)
     for index in order:
         COMMANDS[index](c)
         assert 10.0 <= c.mv <= 90.0
         assert c.on_trial or c.in_effect == c.accepted
-        assert (c.mode is Mode.EXPERIMENT) == (c.experiment_state is ExperimentState.RUNNING)
-    c.renew_lease(2)
-    latched = c.setpoint
-    c.stage(PID)
-    c.try_staged()
-    c.setpoint = 1.0
-    for _ in range(2):
-        c.step(50.0)
-    assert (c.in_effect, c.on_trial, c.lease) == (c.accepted, False, 0)
-    assert c.setpoint in (latched, 50.0, 57.0)
-    assert c.mode is not Mode.EXPERIMENT
-
-
-def test_a_biased_relay_has_two_amplitudes_and_begins_high_within_its_hysteresis() -> None:
-    c = channel()
-    c.step(50.4)
-    c.start_relay(10.0, 0.5, 50.0, 0.0, 1000, 0.0, 100.0, amplitude_low=5.0)
-    outputs = [c.step(pv) for pv in (50.4, 50.6, 50.0, 49.6, 49.4, 50.0)]
-    assert outputs == [60.0, 45.0, 45.0, 45.0, 60.0, 60.0]
-
-
-def test_a_relay_that_averages_is_not_switched_by_one_sample() -> None:
-    c = channel()
-    c.step(50.0)
-    c.start_relay(10.0, 0.5, 50.0, 0.0, 1000, 0.0, 100.0, average=3)
-    # means of the last three: 0, 0.4, 0.4, 0.6
-    assert [c.step(pv) for pv in (50.0, 51.2, 50.0, 50.6)] == [60.0, 60.0, 60.0, 40.0]
-
-
-def test_a_running_relay_takes_new_amplitudes_on_the_side_it_is_on() -> None:
-    c = channel()
-    c.step(50.0)
-    c.start_relay(10.0, 0.5, 50.0, 0.0, 1000, 0.0, 100.0)
-    assert [c.step(pv) for pv in (51.0, 50.0)] == [40.0, 40.0]
-    c.start_relay(20.0, 0.5, 50.0, 0.0, 1000, 0.0, 100.0, amplitude_low=15.0)
-    assert [c.step(pv) for pv in (50.0, 49.0)] == [35.0, 70.0]
-
-
-@pytest.mark.parametrize(("amplitude_low", "average"), [(-1.0, 1), (math.nan, 1), (5.0, 0), (5.0, 101)])
-def test_a_biased_relay_refuses_what_it_cannot_do(amplitude_low: float, average: int) -> None:
-    c = channel()
-    c.step(50.0)
-    with pytest.raises(ValueError):
-        c.start_relay(10.0, 0.5, 50.0, 0.0, 1000, 0.0, 100.0, amplitude_low, average)
-    assert c.mode is Mode.AUTOMATIC
+        assert (c.mode is Mode.EXPERIMENT) == (c.relay is not None) == (c.relay_state is RelayState.RUNNING)
+    c.go_home(HOMES[home])
+    assert (c.in_effect, c.on_trial, c.relay) == (c.accepted, False, None)
+    assert (c.mode, c.setpoint, c.manual_output) == (HOMES[home].mode, 50.0, 45.0)

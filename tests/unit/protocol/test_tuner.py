@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection
 
 import pytest
 
-from protocol import tuner as tuner_module
+from protocol.bus import Bus
 from protocol.dictionary import Dictionary
 from protocol.objects import Device
 from protocol.profile import (
@@ -17,8 +17,11 @@ from protocol.profile import (
     PV_FRAME,
     STATUS_FRAME,
     TUNER_NODE,
+    UNASKED,
     Abort,
+    Cause,
     Emcy,
+    NmtState,
     channel_ids,
     emcy_id,
     heartbeat_id,
@@ -26,7 +29,8 @@ from protocol.profile import (
     sdo_response_id,
 )
 from protocol.sdo import SdoServer
-from protocol.tuner import HEARTBEAT_S, Kind, Tuner, TunerError
+from protocol.station import HEARTBEAT_S, Station
+from protocol.tuner import Kind, Tuner, TunerError
 
 NODE, PLANT = 0x20, 0x10
 IDS = channel_ids(1)
@@ -44,7 +48,8 @@ class ListBus:
         self.servers = {}
         for device, node in ((Device.CONTROLLER, NODE), (Device.PLANT, PLANT)):
             dictionary = Dictionary(device, 1)
-            self.servers[sdo_request_id(node)] = (sdo_response_id(node), SdoServer(dictionary.read, dictionary.write))
+            server = SdoServer(dictionary.read, dictionary.write, dictionary.room)
+            self.servers[sdo_request_id(node)] = (sdo_response_id(node), server)
 
     def send(self, can_id: int, data: bytes) -> None:
         self.sent.append((can_id, data))
@@ -72,16 +77,18 @@ class ListBus:
 
 
 @pytest.fixture
-def bus(monkeypatch: pytest.MonkeyPatch) -> ListBus:
-    bus = ListBus()
-    monkeypatch.setattr(tuner_module, "open_bus", lambda url: bus)
-    monkeypatch.setattr(tuner_module, "_beats", {})
-    return bus
+def bus() -> ListBus:
+    return ListBus()
+
+
+def tuner_on(bus: Bus, channel: int = 1, station: Station | None = None) -> Tuner:
+    station = station or Station(listen_s=0.0, open_bus=lambda url: bus)
+    return Tuner("list", NODE, PLANT, channel, station=station, sdo_timeout_s=0.01, sdo_tries=2)
 
 
 @pytest.fixture
 def tuner(bus: ListBus) -> Tuner:
-    return Tuner("list", NODE, PLANT, sdo_timeout_s=0.01, sdo_tries=2)
+    return tuner_on(bus)
 
 
 def sample(n: int, pv: float = 1.0, mv: float = 2.0) -> list[tuple[int, bytes]]:
@@ -154,7 +161,7 @@ def test_samples_that_arrive_while_an_sdo_waits_are_kept(tuner: Tuner, bus: List
 
 
 def test_status_counts_from_the_sample_in_which_it_changed(tuner: Tuner, bus: ListBus) -> None:
-    status = (IDS.status, STATUS_FRAME.pack(3, 1, 7.5))
+    status = (IDS.status, STATUS_FRAME.pack(3, 1, 7.5, 1, Cause.NONE))
     pv, mv = sample(2)
     bus.incoming.extend([*sample(1), pv, status, mv])
     first, second = tuner.sample(0.01), tuner.sample(0.01)
@@ -162,6 +169,7 @@ def test_status_counts_from_the_sample_in_which_it_changed(tuner: Tuner, bus: Li
     assert second is not None
     assert (first.mode, first.on_trial) == (0, False)
     assert (second.mode, second.on_trial, second.sp) == (3, True, 7.5)
+    assert tuner.session_is_open
 
 
 def test_draining_forgets_the_past(tuner: Tuner, bus: ListBus) -> None:
@@ -199,7 +207,7 @@ def test_only_who_holds_the_loop_beats(tuner: Tuner, bus: ListBus) -> None:
 
 def test_the_loops_of_a_process_send_one_heartbeat(tuner: Tuner, bus: ListBus) -> None:
     """The watch of the controller is on the process; the lease is of the loop."""
-    other = Tuner("list", NODE, PLANT, channel=2)
+    other = tuner_on(bus, 2, tuner.station)
     tuner.hold()
     other.hold()
     assert len(bus.sent) == 2, "a watch that was just armed begins with the first beat"
@@ -250,15 +258,14 @@ class Flood(ListBus):
         return IDS.mv, MV_FRAME.pack(40.0, self.n)
 
 
-def test_a_bus_that_brings_more_than_can_be_taken_silences_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bus_that_brings_more_than_can_be_taken_silences_nobody() -> None:
     """The watch on our heartbeat is 1 s of wall time: it must go out, and the request too."""
     bus = Flood()
-    monkeypatch.setattr(tuner_module, "open_bus", lambda url: bus)
-    tuner = Tuner("flood", NODE, PLANT)
+    tuner = tuner_on(bus)
     tuner.beating = True
     began = time.monotonic()
     tuner.drain()
-    assert tuner.number("controller_mode") == 0
+    assert tuner.number("controller_mode") == 2
     assert time.monotonic() - began < 0.5
     assert (heartbeat_id(TUNER_NODE), b"\x05") in bus.sent
 
@@ -271,3 +278,25 @@ def test_who_takes_samples_that_wait_beats_meanwhile(bus: ListBus, tuner: Tuner)
     bus.sent.clear()
     assert tuner.sample(0.0) is not None
     assert bus.sent == [(heartbeat_id(TUNER_NODE), b"\x05")]
+
+
+def test_an_mv_that_answers_no_sample_is_none(tuner: Tuner, bus: ListBus) -> None:
+    bus.incoming.extend([(IDS.pv, PV_FRAME.pack(50.0, UNASKED)), (IDS.mv, MV_FRAME.pack(71.0, UNASKED)), *sample(7)])
+    found = tuner.sample(0.01)
+    assert found is not None and found.n == 7
+
+
+def test_the_end_of_a_session_is_heard(tuner: Tuner, bus: ListBus) -> None:
+    for is_open, cause in ((1, 0), (0, Cause.HAND), (0, 99)):
+        bus.incoming.append((IDS.status, STATUS_FRAME.pack(2, 0, 50.0, is_open, cause)))
+        tuner.drain()
+        assert tuner.session_is_open == bool(is_open)
+        assert tuner.cause == (cause if cause != 99 else Cause.NONE), "one of a later revision is none of ours"
+
+
+def test_the_states_of_both_nodes_are_noted(tuner: Tuner, bus: ListBus) -> None:
+    bus.incoming += [
+        (heartbeat_id(NODE), bytes((NmtState.PRE_OPERATIONAL,))), (heartbeat_id(PLANT), bytes((NmtState.OPERATIONAL,)))
+    ]  # fmt: skip
+    tuner.drain()
+    assert tuner.node_states == {NODE: NmtState.PRE_OPERATIONAL, PLANT: NmtState.OPERATIONAL}

@@ -11,7 +11,7 @@ from typing import Any
 
 from service.config import LoopConfig, parse_site
 from service.jobs import Jobs
-from service.loop import Loop, LoopState
+from service.loop import OPERATIONAL, Loop, LoopState, Restored, differences, same_gains
 from service.request import RetuneRequest
 from service.states import ACTIVE, JobState
 from service.store.store import Store
@@ -19,7 +19,7 @@ from service.work import Hooks, Outcome, Rehearse
 from tuning.design import Predicted
 from tuning.gains import Gains
 from tuning.plan import Command, Mode, Note, Sample, SetGains, SetSetpoint, StageDone, StageStarted
-from tuning.reasons import Aborted, Ended, Failed, Reason
+from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 from tuning.stages.step_test import StepResult
 
 OLD, NEW = Gains(0.5, 2.0), Gains(0.75, 3.0)
@@ -35,12 +35,39 @@ def loop_entry(**changes: Any) -> dict[str, Any]:
 
 
 class FakeController:
-    """What survives of a loop between two openings of it."""
+    """What survives of a loop between two openings of it. hands: what another's hand has moved since the opening."""
 
     def __init__(self) -> None:
         self.state = LoopState(Mode.AUTOMATIC, 50.0, 50.0, 40.0, OLD, False, 0.0, 100.0, 0.1, True)
         self.absent: Reason | None = None
         self.open = 0
+        self.home = self.state
+        self.session = 0
+        self.session_last = 0
+        self.hands: set[str] = set()
+
+    def answer(self) -> LoopState:
+        if self.absent:
+            raise Failed(self.absent, "node 32 does not answer")
+        return self.state
+
+    def begin_session(self, number: int) -> None:
+        self.home, self.session, self.session_last, self.hands = self.state, number, number, set()
+
+    def end_session(self) -> None:
+        """As the controller does by itself, whatever ended it."""
+        if self.session:
+            moved = {name: getattr(self.state, name) for name in ("mode", "sp") if _WORD[name] in self.hands}
+            self.state, self.session = replace(self.home, **moved), 0
+
+    def by_hand(self, **moved: Any) -> None:
+        """An operator moves it: that ends a session at once."""
+        self.state = replace(self.state, **moved)
+        self.hands |= {_WORD[name] for name in moved}
+        self.end_session()
+
+
+_WORD = {"mode": "mode", "sp": "set-point", "gains": "gains", "manual_output": "output", "on_trial": "trial"}
 
 
 class FakeLoop:
@@ -48,17 +75,29 @@ class FakeLoop:
         self._controller = controller
         controller.open += 1
         self._n = 0
+        self._number = 0
 
-    def read(self) -> LoopState:
-        if self._controller.absent:
-            raise Failed(self._controller.absent, "node 32 does not answer")
-        return self._controller.state
+    waits = False
 
-    def begin(self, stop: Callable[[], Reason | None] = lambda: None) -> LoopState:
-        return self.read()
+    def read(self, beside_tests: bool = False) -> LoopState:
+        return self._controller.answer()
+
+    def begin(
+        self,
+        stop: Callable[[], Reason | None] = lambda: None,
+        remember: Callable[[int], None] = lambda session: None,
+    ) -> LoopState:
+        self._operational(self.read())
+        number = self._controller.session_last + 1
+        remember(number)
+        self._number = number
+        self._controller.begin_session(number)
+        return self._controller.home
 
     def step(self, commands: Sequence[Command]) -> Sample:
         self.read()
+        if not self._controller.session:
+            raise Failed(Reason.DEVICE_WENT_BACK, "the controller ended the test by itself")
         for command in commands:
             if isinstance(command, SetSetpoint):
                 self._controller.state = replace(self._controller.state, sp=command.value)
@@ -68,11 +107,31 @@ class FakeLoop:
         state = self._controller.state
         return Sample(0.1 * self._n, state.sp, state.pv, state.mv, int(state.mode))
 
-    def restore(self, state: LoopState) -> LoopState:
-        self._controller.state = state
-        return state
+    def restore(self, home: LoopState, session: int | None = None) -> Restored:
+        controller, number = self._controller, self._number if session is None else session
+        self._operational(self.read())
+        if number and controller.session == number:
+            controller.end_session()
+            how = "the session was closed"
+        elif number and controller.session_last == number:
+            how = "the controller had ended the session"
+        else:
+            found = differences(controller.state, home)
+            return Restored(controller.state, "no session was opened" if not number else "nothing is known", found)
+        found = differences(controller.state, controller.home)
+        if found.keys() - controller.hands:
+            raise Failed(Reason.RESTORE_UNCONFIRMED, "; ".join(found.values()))
+        return Restored(controller.state, how, found)
 
-    def accept(self, gains: Gains) -> LoopState:
+    @staticmethod
+    def _operational(state: LoopState) -> None:
+        if state.node_state != OPERATIONAL:
+            raise Failed(Reason.NODE_NOT_OPERATIONAL, f"{state.node_state}: nothing controls, MV stays where it is")
+
+    def accept(self, gains: Gains, instead_of: Gains) -> LoopState:
+        held = self.read().gains
+        if not same_gains(held, instead_of) and not same_gains(held, gains):
+            raise Refused(Reason.GAINS_CHANGED, f"the controller holds {held}: somebody has changed the gains")
         self._controller.state = replace(self._controller.state, gains=gains)
         return self._controller.state
 
@@ -108,8 +167,13 @@ class FakeTune:
         self, config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks
     ) -> Outcome:
         ended: Ended | None = None
+        restored: LoopState | None = None
         times: dict[str, float] = {}
         done = {event.data["stage"] for event in hooks.earlier if event.kind == "stage_done"}
+        try:
+            hooks.on_home(loop.begin(hooks.stop, hooks.remember))
+        except Ended as error:
+            return Outcome(None, error, None, {})
         try:
             for stage, remaining in (("preflight", 3.0), ("relay", 1.0)):
                 if stage in done:
@@ -129,8 +193,10 @@ class FakeTune:
                 raise self.ends
         except Ended as error:
             ended = error
-        finally:
-            restored = loop.restore(state)
+        try:
+            restored = loop.restore(state).state
+        except Ended as error:
+            ended = error
         return Outcome(None if ended else RESULT, ended, restored, times)
 
 
@@ -188,7 +254,7 @@ class Service:
         self, open_loop: Callable[[LoopConfig], Loop], rehearse: Rehearse = fake_rehearse, **options: Any
     ) -> Jobs:
         """Jobs on the same store, started."""
-        settings = {"engine": ThreadEngine(), "patience_s": 0.3} | options
+        settings = {"engine": ThreadEngine()} | options
         jobs = Jobs(self.loops, self.store, open_loop, self.tune, rehearse, **settings)
         jobs.boot()
         return jobs

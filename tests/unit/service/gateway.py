@@ -9,17 +9,21 @@ With --hours-back its clock is set back as soon as FOLDER/clock-is-back is there
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
+import os
+import signal
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import yaml
 
 from service.config import LoopConfig
-from service.loop import Loop, LoopState
+from service.loop import Loop, LoopState, Restored, differences
 from service.request import RetuneRequest
 from service.serving import Setup, serve
 from service.state_json import loop_state, state_json
@@ -45,21 +49,31 @@ def write_loop(folder: Path, tag: str, state: LoopState) -> None:
 
 
 class FileLoop:
-    """A controller that keeps what it is told, even when its tuner dies: the service has to bring it back."""
+    """A controller that keeps what it is told, even when its tuner dies: the service has to close its session."""
+
+    waits = False
 
     def __init__(self, folder: Path, tag: str) -> None:
         self._folder, self._tag = folder, tag
         self._n = 0
+        self._session = folder / f"{tag}.session"
         if not (folder / f"{tag}.json").exists():
             write_loop(folder, tag, HOME)
 
-    def read(self) -> LoopState:
+    def read(self, beside_tests: bool = False) -> LoopState:
         if (self._folder / f"{self._tag}.silent").exists():
             raise Failed(Reason.NODE_LOST, "node 32 does not answer")
         return read_loop(self._folder, self._tag)
 
-    def begin(self, stop: Callable[[], Reason | None] = lambda: None) -> LoopState:
-        return self.read()
+    def begin(
+        self,
+        stop: Callable[[], Reason | None] = lambda: None,
+        remember: Callable[[int], None] = lambda session: None,
+    ) -> LoopState:
+        home, number = self.read(), time.time_ns() % 2**32
+        remember(number)
+        self._session.write_text(json.dumps({"number": number, "home": state_json(home)}))
+        return home
 
     def step(self, commands: Sequence[Command]) -> Sample:
         for command in commands:
@@ -71,11 +85,16 @@ class FileLoop:
         self._n += 1
         return Sample(0.1 * self._n, 50.0, 50.0, 40.0, int(Mode.AUTOMATIC))
 
-    def restore(self, state: LoopState) -> LoopState:
-        write_loop(self._folder, self._tag, state)
-        return self.read()
+    def restore(self, home: LoopState, session: int | None = None) -> Restored:
+        state = self.read()
+        known = json.loads(self._session.read_text()) if self._session.exists() else {}
+        if session is None or known.get("number") == session:
+            write_loop(self._folder, self._tag, loop_state(known["home"]))
+            self._session.unlink()
+            return Restored(self.read(), "the session was closed")
+        return Restored(state, "the controller knows nothing of the session", differences(state, home))
 
-    def accept(self, gains: object) -> LoopState:
+    def accept(self, gains: object, instead_of: object) -> LoopState:
         raise NotImplementedError
 
     def close(self) -> None:
@@ -88,6 +107,7 @@ def tune_in(folder: Path) -> Callable[[LoopConfig, RetuneRequest, Loop, LoopStat
     def tune(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks) -> Outcome:
         done = {event.data["stage"] for event in hooks.earlier if event.kind == "stage_done"}
         ended: Ended | None = None
+        hooks.on_home(loop.begin(hooks.stop, hooks.remember))
         try:
             for stage in STAGES:
                 if stage in done:
@@ -104,7 +124,7 @@ def tune_in(folder: Path) -> Callable[[LoopConfig, RetuneRequest, Loop, LoopStat
                 hooks.on_event(StageDone(stage, Found(2.05, 3.32)))
         except Ended as error:
             ended = error
-        return Outcome(None if ended else RESULT, ended, loop.restore(state), {})
+        return Outcome(None if ended else RESULT, ended, loop.restore(state).state, {})
 
     return tune
 
@@ -116,6 +136,24 @@ def set_back(flag: Path, seconds: float) -> None:
     store.now = lambda: datetime.fromtimestamp(time.time(), UTC).isoformat(timespec="milliseconds")
 
 
+def sigterm(when: str, name: str) -> None:
+    """Somebody ends this process just `before` or `after` the function MODULE:CLASS.NAME is called the first time."""
+    module, _, path = name.partition(":")
+    owner, function = path.split(".")
+    holder = getattr(importlib.import_module(module), owner)
+    real = getattr(holder, function)
+
+    def cut(*arguments: Any, **more: Any) -> Any:
+        setattr(holder, function, real)
+        if when == "after":
+            found = real(*arguments, **more)
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.2)
+        return found if when == "after" else real(*arguments, **more)
+
+    setattr(holder, function, cut)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
@@ -124,7 +162,10 @@ def main() -> None:
     parser.add_argument("--database")
     parser.add_argument("--no-resume", action="store_true")
     parser.add_argument("--hours-back", type=float, default=0.0)
+    parser.add_argument("--sigterm")
     asked = parser.parse_args()
+    if asked.sigterm:
+        sigterm(*asked.sigterm.split())
     asked.folder.mkdir(parents=True, exist_ok=True)
     set_back(asked.folder / "clock-is-back", 3600 * asked.hours_back)
     loops = asked.folder / "loops.yaml"

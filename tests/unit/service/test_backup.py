@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import sqlite3
 import subprocess
 import sys
@@ -192,6 +193,32 @@ def test_a_back_up_of_the_first_revision_is_brought_to_the_present_one(data: Pat
     store = Store(data)
     assert store.get("j1").state == "interrupted" and Keyring(store.engine).list() == []
     store.close()
+
+
+def synced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The names of what is synced from now on."""
+    done: list[str] = []
+    fsync = os.fsync
+
+    def remember(opened: int) -> None:
+        done.append(Path(os.readlink(f"/proc/self/fd/{opened}")).name)
+        fsync(opened)
+
+    monkeypatch.setattr(os, "fsync", remember)
+    return done
+
+
+def test_what_is_reported_as_done_outlives_a_power_cut(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file, and the folder that names it."""
+    filled(data)
+    done = synced(monkeypatch)
+    back_up(data, tmp_path / "b")
+    assert done[-2:] == ["b", tmp_path.name]
+    done.clear()
+    _, aside = restore(tmp_path / "b", data, replace=True)
+    assert aside is not None and done[-3:] == [aside.name, "loopwright.sqlite", data.name]
 
 
 def test_no_room(data: Path, tmp_path: Path) -> None:

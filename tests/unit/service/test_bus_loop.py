@@ -1,381 +1,579 @@
-"""The live loop on devices and a bus in memory: what it writes to the controller, and when. Time is the wire's."""
+"""The live loop on devices and a bus in memory: what it asks of the controller, when, and what it makes of it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from types import SimpleNamespace
 
 import pytest
 
-from controller.channel import Channel
-from controller.device import ControllerChannel, ControllerDevice
+from controller.channel import Mode as ControllerMode
+from controller.device import Kept
 from controller.pid import Parameters
-from plantsim.catalogue import find
-from plantsim.device import PlantChannel, PlantDevice
-from protocol import tuner as tuner_module
-from protocol.bus import BusError, Frame
-from protocol.objects import BY_NAME, Device, lookup
+from protocol.objects import Value
 from protocol.profile import (
     CONTROLLER_NODE,
     EMCY_FRAME,
-    FOREVER,
     HEARTBEAT_FRAME,
+    MV_FRAME,
     PLANT_NODE,
+    PV_FRAME,
     TUNER_NODE,
     Cause,
     Emcy,
+    NmtCommand,
     NmtState,
+    OnMissingAnswer,
+    channel_ids,
     emcy_id,
     heartbeat_id,
-    sdo_request_id,
 )
-from service import bus_loop as bus_loop_module
 from service.bus_loop import LEASE_WALL_S, BusLoop
-from tests.unit.protocol.memory_bus import MemoryBus, Wire
+from tests.unit.service.bus_site import FOUND, NEW, RELAY, Gateway, Site
 from tuning.gains import Gains
-from tuning.plan import Command, Mode, SetGains, SetMode, SetRelay, SetSetpoint
-from tuning.reasons import Failed, Reason, Refused
+from tuning.plan import Command, Mode, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
+from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 
-NAMES = {entry.index: name for name, entry in BY_NAME.items() if entry.device is not Device.PLANT}
-RELAY = SetRelay(amplitude=5.0, hysteresis=0.0, working_output=50.0)
-RENEWAL = "controller_lease_renewal"
+RENEWAL = "controller_session_renewal"
 
 
-class OurBus(MemoryBus):
-    """What we wait for, the devices do meanwhile; an SDO takes them `slow_s`."""
-
-    def __init__(self, site: Site) -> None:
-        super().__init__(site.wire)
-        self.site = site
-
-    def send(self, can_id: int, data: bytes) -> None:
-        if self.site.lost is not None:
-            raise self.site.lost
-        if can_id == sdo_request_id(CONTROLLER_NODE):
-            self.site.wire.clock.now += self.site.slow_s
-            if data[0] & 0xE0 == 0x20:
-                self.site.written.append((NAMES[data[1] | data[2] << 8], self.site.wire.clock.now))
-        super().send(can_id, data)
-
-    def recv(self, timeout: float | None) -> Frame | None:
-        self.site.pump()
-        if self.site.lost is not None:
-            raise self.site.lost
-        return super().recv(timeout)
+@pytest.fixture
+def in_blocks() -> Site:
+    return Site(pace=0.0)
 
 
-class Site:
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, pace: float, channels: int = 1) -> None:
-        self.wire = Wire()
-        self.slow_s = 0.0
-        self.lost: Exception | None = None
-        """What our bus raises, while it does."""
-        self.written: list[tuple[str, float]] = []
-        entry, clock = find("fopdt"), self.wire.clock
-        plants = [PlantChannel(entry.build)] * channels
-        self.plant = PlantDevice(self.wire.open(), plants, pace=pace, run=0, clock=clock)
-        laws = [ControllerChannel(Parameters(200.0, 12.0), 50.0)] * channels
-        self.controller = ControllerDevice(self.wire.open(), laws, clock=clock)
-        self.controller.start()
-        self.plant.start()
-        monkeypatch.setattr(tuner_module, "open_bus", self.open)
-        monkeypatch.setattr(tuner_module, "_beats", {})
-        time = SimpleNamespace(monotonic=clock, sleep=self.sleep)
-        monkeypatch.setattr(tuner_module, "time", time)
-        monkeypatch.setattr(bus_loop_module, "time", time)
-        self.loop = BusLoop("wire", CONTROLLER_NODE, PLANT_NODE)
+@pytest.fixture
+def site() -> Site:
+    return Site()
 
-    def open(self, url: str) -> OurBus:
-        bus = OurBus(self)
-        self.wire.join(bus)
-        return bus
 
-    def sleep(self, seconds: float) -> None:
-        self.wire.clock.now += seconds
+class TestBeginning:
+    def test_opens_a_session_and_gives_home_as_the_controller_has_noted_it(self, site: Site) -> None:
+        site.hand("controller_setpoint", 50.25)
+        home, number = site.begun()
+        session = site.controller.sessions[0]
+        assert (session.number, session.holder) == (number, TUNER_NODE)
+        assert (home.mode, home.sp, home.gains) == (Mode.AUTOMATIC, 50.25, Gains(200.0, 12.0))
+        assert home.node_state == "operational"
+        assert home.mv == pytest.approx(session.home.mv, rel=1e-6)
 
-    def pump(self) -> None:
-        """A plant that runs freely never has nothing to do."""
+    def test_the_number_is_written_down_before_the_opening(self, site: Site) -> None:
+        site.let_run()
+        seen: list[tuple[int, bool]] = []
+        site.loop.begin(remember=lambda number: seen.append((number, site.controller.sessions[0].is_open)))
+        assert len(seen) == 1 and seen[0][0] and not seen[0][1]
+
+    def test_tells_what_the_plant_does_when_the_controller_falls_silent(self, site: Site) -> None:
+        for reaction, words in ((OnMissingAnswer.STOP_RUN, "stops its run"), (OnMissingAnswer.SAFE_OUTPUT, "of 50 %")):
+            site.plant.dictionary.set("plant_on_missing_answer", reaction)
+            assert words in site.loop.read().when_silent
+
+    @pytest.mark.parametrize("device", ["controller", "plant"])
+    def test_versions_that_differ_are_named_on_both_sides(self, site: Site, device: str) -> None:
+        getattr(site, device).dictionary.set("identity", 0x00010003, 3)
+        with pytest.raises(Refused, match=rf"{device} node .*revision 1\.3 .*this service 2\.0") as caught:
+            site.loop.begin()
+        assert caught.value.reason is Reason.DEVICE_MISMATCH
+        assert site.names() == []
+
+    def test_a_plant_with_another_sample_time_is_refused(self, site: Site) -> None:
+        site.plant.dictionary.set("sample_time", 50_000)
+        with pytest.raises(Refused, match=r"0\.1 s.*0\.05 s"):
+            site.loop.begin()
+
+    @pytest.mark.parametrize("node", [CONTROLLER_NODE, PLANT_NODE])
+    def test_a_node_that_is_not_operational_is_named(self, site: Site, node: int) -> None:
+        site.nmt(NmtCommand.PRE_OPERATIONAL, node)
+        with pytest.raises(Failed, match=f"{node:02X}h is pre-operational") as caught:
+            site.loop.begin()
+        assert caught.value.reason is Reason.NODE_NOT_OPERATIONAL
+        assert site.loop.read().node_state == f"node {node:02X}h is pre-operational"
+
+    def test_a_stopped_controller_answers_no_sdo_and_is_named_all_the_same(self, site: Site) -> None:
+        site.loop.read()
+        site.nmt(NmtCommand.STOP)
+        site.pass_time(1.0)
+        with pytest.raises(Failed) as caught:
+            site.loop.read()
+        assert caught.value.reason is Reason.NODE_NOT_OPERATIONAL
+
+    def test_a_trial_by_hand_is_nobody_elses_to_end(self, site: Site) -> None:
+        site.let_run()
+        site.hand("controller_staged_kp", 99.0)
+        site.hand("controller_parameter_command", 1)
+        with pytest.raises(Refused, match="tries other gains by hand") as caught:
+            site.loop.begin()
+        assert caught.value.reason is Reason.GAINS_CHANGED
+        assert site.channel.in_effect.Kp == 99.0
+
+    def test_a_set_point_that_an_rpdo_drives_is_not_tuned_against(self, site: Site) -> None:
+        site.let_run()
+        for value in (b"\x00\x00\x48\x42", b"\x00\x00\x4c\x42"):  # 50, 51
+            site.replay((channel_ids(1).command, value))
+        with pytest.raises(Refused) as caught:
+            site.loop.begin()
+        assert caught.value.reason is Reason.SETPOINT_IS_DRIVEN
+        assert not site.controller.sessions[0].is_open
+
+    def test_another_gateway_with_our_node_id_is_refused(self, site: Site) -> None:
+        site.let_run()
+        gateway = Gateway(site, listen_s=2.0)
+        gateway.before = lambda call: site.replay((heartbeat_id(TUNER_NODE), b"\x05"))
+        with pytest.raises(Refused, match="--node") as caught:
+            site.tuner(gateway).begin()
+        assert caught.value.reason is Reason.LOOP_IN_USE
+
+    def test_1016h_stays_the_installers(self, site: Site) -> None:
+        site.controller.dictionary.set("heartbeat_consumer", 0x00550064, 1)
+        home, _ = site.begun()
+        site.loop.step((SetSetpoint(50.1),))
+        site.loop.restore(home)
+        site.loop.accept(NEW, home.gains)
+        assert "heartbeat_consumer" not in site.names()
+        assert site.controller.dictionary.get("heartbeat_consumer", 1) == 0x00550064
+
+
+class TestLease:
+    def test_is_paid_before_commands_are_sent(self, in_blocks: Site) -> None:
+        loop = in_blocks.loop
+        loop.begin()
+        in_blocks.names()
         for _ in range(100):
-            if not self.plant.runtime.poll(0.0) | self.controller.runtime.poll(0.0):
-                break
-
-    def names(self) -> list[str]:
-        names, self.written = [name for name, _ in self.written], []
-        return names
-
-
-@pytest.fixture
-def in_blocks(monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
-    site = Site(monkeypatch, pace=0.0)
-    yield site
-    site.loop.close()
-
-
-@pytest.fixture
-def in_real_time(monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
-    site = Site(monkeypatch, pace=1.0)
-    yield site
-    site.loop.close()
-
-
-def test_the_lease_is_paid_before_commands_are_sent(in_blocks: Site) -> None:
-    loop = in_blocks.loop
-    loop.begin()
-    in_blocks.names()
-    for _ in range(loop._lease // 3):
-        loop.step(())
-    assert in_blocks.names() == [], "until a third is used up nothing is paid"
-    loop.step((SetSetpoint(50.1),))
-    assert in_blocks.names() == [RENEWAL, "controller_setpoint"]
-
-
-@pytest.mark.parametrize("commands", [(RELAY, SetMode(Mode.EXPERIMENT)), (SetGains(Gains(150.0, 9.0)),)], ids=str)
-def test_the_lease_is_paid_between_writes_that_take_long(in_real_time: Site, commands: Sequence[Command]) -> None:
-    """As many loops that ask one node make them."""
-    loop = in_real_time.loop
-    loop.begin()
-    paid = in_real_time.wire.clock.now
-    in_real_time.slow_s = 0.45
-    loop.step(commands)
-    in_real_time.slow_s = 0.0
-    written = in_real_time.written
-    times = [paid, *(at for name, at in written if name == RENEWAL), written[-1][1]]
-    assert written[-1][0] != RENEWAL and written[-1][1] - paid > LEASE_WALL_S
-    assert len(times) > 2 and max(b - a for a, b in pairwise(times)) < 0.8 * LEASE_WALL_S
-    last = [loop.step(()) for _ in range(100)][-1]
-    assert (last.mode, in_real_time.controller.channels[0].on_trial) == (
-        (Mode.EXPERIMENT, False) if RELAY in commands else (Mode.AUTOMATIC, True)
-    )
-
-
-def test_what_a_relay_has_already_is_not_written_again(in_blocks: Site) -> None:
-    loop = in_blocks.loop
-    loop.begin()
-    loop.step((RELAY, SetMode(Mode.EXPERIMENT)))
-    first = [name for name in in_blocks.names() if name.startswith("controller_relay_")]
-    assert len(first) == len(set(first)) >= 8
-    for _ in range(9):
-        loop.step(())
-    loop.step((replace(RELAY, amplitude=6.0),))
-    assert in_blocks.names() == [
-        "controller_relay_amplitude", "controller_experiment", "controller_mode_command",
-    ]  # fmt: skip
-
-
-def test_a_session_that_has_ended_is_not_paid_for(in_blocks: Site) -> None:
-    loop = in_blocks.loop
-    loop.begin()
-    for _ in range(loop._lease // 3):
-        loop.step(())
-    in_blocks.controller.channels[0].renew_lease(1)
-    in_blocks.controller.channels[0].step(50.0)
-    with pytest.raises(Failed) as caught:
-        loop.step(())
-    assert caught.value.reason is Reason.DEVICE_WENT_BACK
-    assert in_blocks.controller.channels[0].lease == 0
-
-
-FOUND, NEW = Parameters(200.0, 12.0), Gains(150.0, 9.0)
-
-
-def time_passes(site: Site, seconds: float, beating: bool = False) -> None:
-    """beating: another loop of this process goes on sending our heartbeat."""
-    beat = site.wire.open()
-    for tick in range(round(seconds / 0.02)):
-        site.wire.clock.now += 0.02
-        if beating and tick % 5 == 0:
-            beat.send(heartbeat_id(TUNER_NODE), HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL))
-        site.pump()
-        site.controller.runtime.poll(1e-9)  # an idle device looks at the clock
-
-
-def let_run(site: Site, samples: int = FOREVER) -> None:
-    site.plant.dictionary.write(lookup("plant_samples_to_run").index, 0, samples.to_bytes(4, "little"))
-    site.pump()
-
-
-def cannot_keep(sets: Sequence[Parameters]) -> None:
-    raise OSError(28, "No space left on device")
-
-
-def test_an_acceptance_leaves_nothing_behind(in_real_time: Site) -> None:
-    let_run(in_real_time)
-    channel = in_real_time.controller.channels[0]
-    channel.command_mode(Mode.MANUAL)
-    channel.manual_output = 43.0
-    assert in_real_time.loop.accept(NEW).gains == NEW
-    assert (channel.accepted.Kp, channel.on_trial, channel.lease) == (150.0, False, 0)
-    beats = len(in_real_time.wire.sent(heartbeat_id(TUNER_NODE)))
-    time_passes(in_real_time, 10.0)
-    assert (channel.accepted.Kp, channel.in_effect.Kp, channel.mode, channel.mv) == (150.0, 150.0, Mode.MANUAL, 43.0)
-    assert beats and len(in_real_time.wire.sent(heartbeat_id(TUNER_NODE))) == beats
-
-
-@pytest.mark.parametrize("again", [False, True], ids=["never before", "after a job"])
-def test_gains_that_the_controller_cannot_keep_do_not_stay(in_real_time: Site, again: bool) -> None:
-    loop, channel = in_real_time.loop, in_real_time.controller.channels[0]
-    if again:
-        loop.restore(loop.begin())
-        time_passes(in_real_time, 3.0)
-    in_real_time.controller._keep = cannot_keep
-    with pytest.raises(Refused, match="could not store it"):
-        loop.accept(NEW)
-    assert (channel.in_effect, channel.accepted, channel.on_trial, channel.lease) == (FOUND, FOUND, False, 0)
-    channel.setpoint = 50.5
-    time_passes(in_real_time, 10.0)
-    assert channel.setpoint == 50.5, "there is no session left that could bring another one back"
-
-
-def test_an_acceptance_tries_to_end_the_trial_until_the_bus_is_back(in_real_time: Site) -> None:
-    loop, channel, pump = in_real_time.loop, in_real_time.controller.channels[0], in_real_time.pump
-    lost_at: list[float] = []
-
-    def broken(sets: Sequence[Parameters]) -> None:
-        lost_at.append(in_real_time.wire.clock.now)
-        in_real_time.lost = BusError("it is down")
-        raise OSError(28, "No space left on device")
-
-    def until_it_is_back() -> None:
-        if lost_at and in_real_time.wire.clock.now > lost_at[0] + 0.8:
-            in_real_time.lost = None
-        pump()
-
-    in_real_time.controller._keep, in_real_time.pump = broken, until_it_is_back  # type: ignore[method-assign]
-    with pytest.raises(Failed) as caught:
-        loop.accept(NEW)
-    assert caught.value.reason is Reason.BUS_LOST
-    assert (channel.in_effect, channel.on_trial, channel.lease) == (FOUND, False, 0)
-
-
-def test_an_acceptance_whose_answer_was_lost_is_one(in_real_time: Site) -> None:
-    channel, accept = in_real_time.controller.channels[0], Channel.accept
-    times = 0
-
-    def answer_lost(sets: Sequence[Parameters]) -> None:
-        nonlocal times
-        times += 1
-        if times == 1:
-            accept(channel)
-            in_real_time.wire.clock.now += 0.01
-            raise OSError(5, "Input/output error")
-
-    in_real_time.controller._keep = answer_lost
-    assert in_real_time.loop.accept(NEW).gains == NEW
-    assert not channel.on_trial and channel.lease == 0
-
-
-@pytest.mark.parametrize("beating", [False, True], ids=["silent", "another loop beats"])
-def test_a_tuner_that_dies_while_it_accepts_leaves_no_gains(in_real_time: Site, beating: bool) -> None:
-    let_run(in_real_time)
-
-    class Dead(BaseException):
-        pass
-
-    def die(sets: Sequence[Parameters]) -> None:
-        raise Dead
-
-    channel = in_real_time.controller.channels[0]
-    in_real_time.controller._keep = die
-    with pytest.raises(Dead):
-        in_real_time.loop.accept(NEW)
-    assert channel.on_trial and channel.lease > 0
-    time_passes(in_real_time, LEASE_WALL_S + 1.0, beating)
-    assert (channel.in_effect, channel.on_trial, channel.lease) == (FOUND, False, 0)
-    assert channel.cause is (Cause.LEASE if beating else Cause.HEARTBEAT)
-
-
-def test_an_acceptance_keeps_its_hands_off_a_loop_that_another_has(in_real_time: Site) -> None:
-    channel = in_real_time.controller.channels[0]
-    channel.renew_lease(10**6)
-    channel.stage(Parameters(80.0, 5.0))
-    channel.try_staged()
-    with pytest.raises(Refused) as caught:
-        in_real_time.loop.accept(NEW)
-    assert caught.value.reason is Reason.WRONG_MODE
-    assert channel.on_trial and channel.in_effect.Kp == 80.0 and channel.lease > 0
-
-
-def test_an_acceptance_does_not_end_an_experiment(in_real_time: Site) -> None:
-    let_run(in_real_time)
-    channel = in_real_time.controller.channels[0]
-    time_passes(in_real_time, 0.5)
-    channel.start_relay(5.0, 0.0, 50.0, 0.0, 10**6, 0.0, 100.0)
-    with pytest.raises(Refused, match="experiment is running"):
-        in_real_time.loop.accept(NEW)
-    assert channel.mode == Mode.EXPERIMENT
-
-
-def test_gains_are_accepted_while_the_plant_stands_still(in_blocks: Site) -> None:
-    assert in_blocks.loop.accept(NEW).gains == NEW
-    assert in_blocks.controller.channels[0].lease == 0
-
-
-def test_a_pv_limit_has_its_name_while_another_channel_stands_at_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    site = Site(monkeypatch, pace=1.0, channels=2)
-    loop = BusLoop("wire", CONTROLLER_NODE, PLANT_NODE, 2)
-    one, two = site.controller.channels
-    loop.begin()
-    loop.step((RELAY, SetMode(Mode.EXPERIMENT)))
-    for pv_low in (0.0, 60.0):
-        one.start_relay(5.0, 0.0, 50.0, 0.0, 1000, pv_low, 100.0)
-        for _ in range(20):
             loop.step(())
-    assert Emcy.PV_LIMIT in [EMCY_FRAME.unpack(data)[0] for data in site.wire.sent(emcy_id(CONTROLLER_NODE))]
-    assert two.mode == Mode.EXPERIMENT
-    two.start_relay(5.0, 0.0, 50.0, 0.0, 1000, 60.0, 100.0)
-    with pytest.raises(Failed) as caught:
+        assert in_blocks.names() == [], "until a third is used up nothing is paid"
+        loop._renewed_at -= loop._lease.ms / 3000.0
+        loop.step((SetSetpoint(50.1),))
+        assert in_blocks.names() == [RENEWAL, "controller_session_setpoint", "controller_order_setpoint"]
+
+    @pytest.mark.parametrize("commands", [(RELAY, SetMode(Mode.EXPERIMENT)), (SetGains(NEW),)], ids=str)
+    def test_is_paid_between_writes_that_take_long(self, site: Site, commands: Sequence[Command]) -> None:
+        """As many loops that ask one node make them."""
+        site.begun()
+        paid = site.wire.clock.now
+        site.names()
+        site.slow_s = 0.45
+        site.loop.step(commands)
+        site.slow_s = 0.0
+        written = site.written
+        times = [paid, *(at for name, at in written if name == RENEWAL), written[-1][1]]
+        assert written[-1][1] - paid > LEASE_WALL_S
+        assert len(times) > 2 and max(b - a for a, b in pairwise(times)) < 0.8 * LEASE_WALL_S
+        assert site.controller.sessions[0].is_open
+
+    def test_of_a_session_that_has_ended_is_not_paid(self, in_blocks: Site) -> None:
+        in_blocks.loop.begin()
+        in_blocks.controller.sessions[0].end(Cause.LEASE)
+        with pytest.raises(Failed, match="cause: lease") as caught:
+            for _ in range(100):
+                in_blocks.loop.step(())
+        assert caught.value.reason is Reason.DEVICE_WENT_BACK
+
+    def test_is_paid_while_a_slow_sample_is_waited_for(self) -> None:
+        site = Site(Ts=60.0)
+        site.begun()
+        began = site.wire.clock.now
+        for _ in range(3):
+            site.loop.step(())
+        assert site.wire.clock.now - began > 100.0 and site.controller.sessions[0].is_open
+
+
+class TestWaiting:
+    def test_at_a_slow_sample_time_an_abort_is_heard_at_once(self) -> None:
+        site = Site(Ts=60.0)
+        site.let_run()
+        asked_at = 0.0
+
+        def stop() -> Reason | None:
+            return Reason.OPERATOR if asked_at and site.wire.clock.now > asked_at else None
+
+        site.loop.begin(stop)
+        site.loop.step(())
+        asked_at = site.wire.clock.now + 5.0
+        with pytest.raises(Aborted) as caught:
+            site.loop.step(())
+        assert caught.value.reason is Reason.OPERATOR
+        assert site.wire.clock.now - asked_at < 0.2
+
+    def test_a_plant_that_another_test_runs_in_blocks_is_waited_for_until_somebody_asks_to_stop(
+        self, in_blocks: Site
+    ) -> None:
+        held, asked = in_blocks.gateway.plant("wire", PLANT_NODE), 0
+
+        def stop() -> Reason | None:
+            nonlocal asked
+            asked += 1
+            return Reason.SERVICE_STOPPED if asked > 2 else None
+
+        with held, pytest.raises(Aborted, match="another test was using plant node 10h"):
+            in_blocks.loop.begin(stop)
+        assert not in_blocks.controller.sessions[0].is_open
+        assert in_blocks.loop.begin().mode is Mode.AUTOMATIC
+
+    def test_a_plant_that_does_not_come_to_a_halt_is_waited_for_until_somebody_asks_to_stop(
+        self, in_blocks: Site
+    ) -> None:
+        gateway, number = in_blocks.gateway, 0
+
+        def samples(call: int) -> None:
+            nonlocal number
+            in_blocks.wire.clock.now += 0.001
+            if in_blocks.wire._buses[-1]._queue:
+                return
+            number += 1
+            in_blocks.replay((channel_ids(1).pv, PV_FRAME.pack(50.0, number)))
+            in_blocks.replay((channel_ids(1).mv, MV_FRAME.pack(50.0, number)))
+
+        gateway.before = samples
+        with pytest.raises(Aborted, match="brought to a halt"):
+            in_blocks.loop.begin(lambda: Reason.OPERATOR if number > 100 else None)
+        assert not gateway.plant("wire", PLANT_NODE).locked(), "the plant was given back"
+
+    def test_a_plant_that_runs_again_while_it_is_halted_is_told_once_more(self, in_blocks: Site) -> None:
+        gateway, number, told = in_blocks.gateway, 0, 0
+        written = in_blocks.plant.dictionary.on_write["plant_samples_to_run"]
+
+        def tell(sub: int, value: Value) -> None:
+            nonlocal told
+            told += 1
+            written(sub, value)
+
+        def samples(call: int) -> None:
+            nonlocal number
+            in_blocks.wire.clock.now += 0.001
+            if told != 1 or in_blocks.wire._buses[-1]._queue:
+                return
+            number += 1
+            in_blocks.replay((channel_ids(1).pv, PV_FRAME.pack(50.0, number)))
+            in_blocks.replay((channel_ids(1).mv, MV_FRAME.pack(50.0, number)))
+
+        in_blocks.plant.dictionary.on_write["plant_samples_to_run"] = tell
+        gateway.before = samples
+        in_blocks.loop.begin()
+        assert told == 2 and number
+
+    def test_what_is_read_during_anothers_test_is_what_that_comes_back_to(self, site: Site) -> None:
+        site.begun()
+        site.loop.step((SetSetpoint(50.2), SetGains(NEW)))
+        _, second = site.another(0x7C)
+        found = second.read(beside_tests=True)
+        assert (found.sp, found.mode, found.on_trial) == (50.0, Mode.AUTOMATIC, False)
+        assert second.read().on_trial, "who looks on sees the test"
+
+    def test_another_tuners_session_is_waited_for_until_somebody_asks_to_stop(self, site: Site) -> None:
+        site.begun()
+        _, second = site.another(0x7C)
+        with pytest.raises(Aborted, match="another tuner held the loop"):
+            second.begin(lambda: Reason.OPERATOR)
+
+
+class TestSamples:
+    @pytest.mark.parametrize("pace", [0.0, 1.0], ids=["in blocks", "in real time"])
+    def test_go_on_over_the_wrap_of_their_number(self, pace: float) -> None:
+        site = Site(pace)
+        site.let_run()
+        site.plant._number = 0xFFFFFFF0
+        site.loop.begin()
+        samples = [site.loop.step(()) for _ in range(40)]
+        assert [round(sample.t, 6) for sample in samples] == [round(0.1 * n, 6) for n in range(40)]
+        assert site.plant._number < 100
+
+    def test_of_a_plant_that_has_started_anew_are_lost(self, site: Site) -> None:
+        site.begun()
         for _ in range(20):
-            if loop.step(()).mode != Mode.EXPERIMENT:
-                pytest.fail("it would be taken for somebody's hand")
-    assert caught.value.reason is Reason.PV_LIMIT
-    loop.close()
+            site.loop.step(())
+        site.plant._number = 2
+        with pytest.raises(Failed, match="started anew") as caught:
+            site.loop.step(())
+        assert caught.value.reason is Reason.SAMPLES_LOST
+
+    def test_a_plant_that_is_gone_is_named_though_the_controller_has_ended_the_test(self, site: Site) -> None:
+        site.begun()
+        site.plant.runtime.poll = lambda idle_s=0.0: False  # type: ignore[method-assign, assignment]
+        with pytest.raises(Failed, match="node 10h does not answer") as caught:
+            for _ in range(30):
+                site.loop.step(())
+        assert caught.value.reason is Reason.NODE_LOST
 
 
-def test_an_interface_that_disappears_is_a_lost_bus(in_real_time: Site) -> None:
-    """The kernel says so at whatever call comes next; not each is one that the bus layer has a word for."""
-    state = in_real_time.loop.begin()
-    in_real_time.lost = OSError(19, "No such device")
-    with pytest.raises(Failed, match=r"No such device.*interface") as caught:
-        in_real_time.loop.step(())
-    assert caught.value.reason is Reason.BUS_LOST
-    in_real_time.lost = None
-    assert in_real_time.loop.restore(state).mode is state.mode
+class TestCommands:
+    def test_what_a_relay_has_already_is_not_written_again(self, in_blocks: Site) -> None:
+        loop = in_blocks.loop
+        loop.begin()
+        loop.step((RELAY, SetMode(Mode.EXPERIMENT)))
+        first = [name for name in in_blocks.names() if name.startswith("controller_relay_")]
+        assert len(first) == len(set(first)) >= 8
+        for _ in range(9):
+            loop.step(())
+        loop.step((replace(RELAY, amplitude=6.0),))
+        assert in_blocks.names() == ["controller_relay_amplitude", "controller_order_relay"]
+
+    def test_each_does_what_it_says_in_the_sample_after_it(self, site: Site) -> None:
+        site.begun()
+        sample = site.loop.step((SetSetpoint(50.25), SetGains(NEW)))
+        assert (sample.sp, site.channel.in_effect.Kp, site.channel.on_trial) == (50.25, 150.0, True)
+        assert site.loop.step((SetMode(Mode.MANUAL), SetOutput(55.0))).mode == Mode.MANUAL
+        assert site.loop.step(()).mv == 55.0
+        assert site.loop.step((RELAY, SetMode(Mode.EXPERIMENT))).mode == Mode.EXPERIMENT
+        assert {site.loop.step(()).mv for _ in range(5)} <= {45.0, 55.0}
+
+    @pytest.mark.parametrize("limits", [None, (49.0, 51.5)], ids=["the span", "the job's"])
+    def test_the_relays_pv_limits_are_the_jobs(self, site: Site, limits: tuple[float, float] | None) -> None:
+        site.let_run()
+        loop = site.tuner(Gateway(site), limits)
+        loop.begin()
+        loop.step((RELAY, SetMode(Mode.EXPERIMENT)))
+        relay = site.channel.relay
+        assert relay is not None
+        assert (relay.settings.pv_low, relay.settings.pv_high) == (limits or (40.0, 60.0))
+
+    def test_a_pv_that_leaves_them_ends_the_test(self, site: Site) -> None:
+        site.let_run()
+        loop = site.tuner(Gateway(site), (49.999, 50.001))
+        home = loop.begin()
+        with pytest.raises(Failed) as caught:
+            for commands in ((RELAY, SetMode(Mode.EXPERIMENT)), *[()] * 200):
+                loop.step(commands)
+        assert caught.value.reason is Reason.PV_LIMIT
+        assert loop.restore(home).changed == {} and site.is_home()
+
+    @pytest.mark.parametrize("command", [SetOutput(150.0), SetGains(Gains(0.0)), SetRelay(0.0, 0.0, 50.0)], ids=str)
+    def test_what_the_controller_refuses_is_said(self, site: Site, command: Command) -> None:
+        home, _ = site.begun()
+        with pytest.raises(Refused, match="controller refused") as caught:
+            site.loop.step((command,))
+        assert caught.value.reason is Reason.BAD_INPUT
+        assert site.loop.restore(home).changed == {} and site.is_home()
 
 
-@pytest.mark.parametrize("lease", [0, 50], ids=["forgotten", "of a tuner that has died"])
-def test_gains_that_somebody_tries_are_not_the_ones_to_come_back_to(in_real_time: Site, lease: int) -> None:
-    """What a job writes down as found, before it begins, and what it then finds are the same."""
-    let_run(in_real_time)
-    loop, channel = in_real_time.loop, in_real_time.controller.channels[0]
-    channel.renew_lease(lease)
-    channel.stage(Parameters(999.0, 3.0))
-    channel.try_staged()
-    found = loop.read()
-    assert found.on_trial and found.gains == Gains(200.0, 12.0)
-    time_passes(in_real_time, 0.1 * lease + 1.0)
-    assert loop.begin().gains == found.gains
-    assert not loop.restore(found).on_trial
+class TestRestoring:
+    def test_closes_the_session_and_reads_the_loop_back(self, site: Site) -> None:
+        home, _ = site.begun()
+        site.loop.step((SetSetpoint(50.25), SetGains(NEW)))
+        restored = site.loop.restore(home)
+        assert (restored.how, restored.changed) == ("the session was closed", {})
+        assert (restored.state.mode, restored.state.sp, restored.state.gains) == (home.mode, home.sp, home.gains)
+        assert site.is_home() and site.controller.sessions[0].cause is Cause.CLOSED
+
+    def test_works_for_a_loop_whose_plant_has_no_node(self, site: Site) -> None:
+        site.let_run()
+        loop = BusLoop("wire", CONTROLLER_NODE, None, station=Gateway(site))
+        home = loop.begin()
+        loop.step((SetSetpoint(50.25),))
+        assert loop.restore(home).changed == {} and site.is_home()
+
+    def test_works_while_the_plant_is_silent(self, site: Site) -> None:
+        home, _ = site.begun()
+        site.loop.step((RELAY, SetMode(Mode.EXPERIMENT)))
+        site.plant.runtime.poll = lambda idle_s=0.0: False  # type: ignore[method-assign, assignment]
+        restored = site.loop.restore(home)
+        assert "node 10h is silent" in restored.state.node_state and site.is_home()
+
+    @pytest.mark.parametrize("name", Gains.__dataclass_fields__)
+    def test_all_six_gains_are_compared(self, site: Site, name: str) -> None:
+        home, _ = site.begun()
+        site.loop.restore(home)
+        site.channel.accept(replace(FOUND, **{name: getattr(FOUND, name) + 0.5}))
+        found = site.loop.restore(home, session=0)
+        assert set(found.changed) == {"gains"}
+
+    def test_what_differs_by_nobodys_hand_is_not_confirmed(self, site: Site) -> None:
+        home, _ = site.begun()
+        site.loop.step(())
+        site.gateway.before = lambda call: setattr(site.channel, "setpoint", 51.0)
+        with pytest.raises(Failed, match="set-point is 51, was 50") as caught:
+            site.loop.restore(home)
+        assert caught.value.reason is Reason.RESTORE_UNCONFIRMED
+
+    @pytest.mark.parametrize("kept", [True, False], ids=["kept", "forgotten"])
+    def test_a_controller_that_was_restarted_is_told(self, site: Site, kept: bool) -> None:
+        home, _ = site.begun()
+        site.loop.step((SetSetpoint(50.25),))
+        site.nmt(NmtCommand.RESET_NODE)
+        with pytest.raises(Ended):
+            for _ in range(50):
+                site.loop.step(())
+        restored = site.loop.restore(home)
+        assert "restarted" in restored.how and restored.changed == {}
+
+    def test_tries_again_until_the_bus_is_back(self, site: Site) -> None:
+        home, _ = site.begun()
+        site.loop.step((SetSetpoint(50.25),))
+        site.lost, back_at = OSError(19, "No such device"), site.wire.clock.now + 2.0
+        sleep = site.gateway.sleep
+
+        def until_it_is_back(seconds: float) -> None:
+            sleep(seconds)
+            if site.wire.clock.now > back_at:
+                site.lost = None
+
+        site.gateway.sleep = until_it_is_back
+        assert site.loop.restore(home).changed == {} and site.is_home()
+
+    def test_an_interface_that_disappears_is_a_lost_bus(self, site: Site) -> None:
+        """The kernel says so at whatever call comes next; not each is one that the bus layer has a word for."""
+        site.begun()
+        site.lost = OSError(19, "No such device")
+        with pytest.raises(Failed, match=r"No such device.*interface") as caught:
+            site.loop.step(())
+        assert caught.value.reason is Reason.BUS_LOST
+
+    @pytest.mark.parametrize("way", ["job", "acceptance"])
+    def test_a_loop_let_go_is_no_emergency(self, site: Site, way: str) -> None:
+        if way == "job":
+            home, _ = site.begun()
+            site.loop.step(())
+            site.loop.restore(home)
+        else:
+            site.let_run()
+            site.loop.accept(NEW, Gains(200.0, 12.0))
+        beats = len(site.wire.sent(heartbeat_id(TUNER_NODE)))
+        site.pass_time(3.0)
+        assert site.wire.sent(emcy_id(CONTROLLER_NODE)) == []
+        assert len(site.wire.sent(heartbeat_id(TUNER_NODE))) == beats
 
 
-def test_an_acceptance_ends_a_forgotten_trial(in_real_time: Site) -> None:
-    channel = in_real_time.controller.channels[0]
-    channel.stage(Parameters(999.0, 3.0))
-    channel.try_staged()
-    assert in_real_time.loop.read().gains == Gains(200.0, 12.0), "what the decision compares with"
-    assert in_real_time.loop.accept(NEW).gains == NEW and not channel.on_trial
+class TestTwoChannels:
+    def test_a_pv_limit_has_its_name_while_another_channel_stands_at_one(self) -> None:
+        site = Site(channels=2)
+        site.let_run()
+        one = site.tuner(Gateway(site, 0x7C), (49.999, 50.001))
+        two = site.tuner(Gateway(site), channel=2)
+        one.begin()
+        two.begin()
+        two.step((RELAY, SetMode(Mode.EXPERIMENT)))
+        with pytest.raises(Failed):
+            for commands in ((RELAY, SetMode(Mode.EXPERIMENT)), *[()] * 100):
+                one.step(commands)
+                two.step(())
+        assert Emcy.PV_LIMIT in [EMCY_FRAME.unpack(data)[0] for data in site.wire.sent(emcy_id(CONTROLLER_NODE))]
+        assert two.step(()).mode == Mode.EXPERIMENT
 
 
-@pytest.mark.parametrize("way", ["job", "acceptance"])
-def test_a_loop_let_go_is_no_emergency(in_real_time: Site, way: str) -> None:
-    loop = in_real_time.loop
-    if way == "job":
-        state = loop.begin()
-        loop.step(())
-        loop.restore(state)
-    else:
-        loop.accept(NEW)
-    let_run(in_real_time)
-    time_passes(in_real_time, 3.0)
-    assert in_real_time.wire.sent(emcy_id(CONTROLLER_NODE)) == []
+class Full:
+    """A keeper without room; `lose` does something besides."""
+
+    def __init__(self, error: BaseException) -> None:
+        self.error = error
+        self.on_now = lambda: None
+
+    def now(self, channels: Sequence[Kept]) -> None:
+        self.on_now()
+        raise self.error
+
+    def soon(self, channels: Sequence[Kept]) -> None: ...
+
+
+class TestAccepting:
+    OLD = Gains(200.0, 12.0)
+
+    def test_leaves_nothing_behind(self, site: Site) -> None:
+        site.let_run()
+        site.hand("controller_mode_command", ControllerMode.MANUAL)
+        site.hand("controller_manual_output", 43.0)
+        assert site.loop.accept(NEW, self.OLD).gains == NEW
+        beats = len(site.wire.sent(heartbeat_id(TUNER_NODE)))
+        site.pass_time(10.0)
+        assert site.channel.accepted.Kp == 150.0 and site.is_home(mode=ControllerMode.MANUAL)
+        assert site.mv == 43.0 and len(site.wire.sent(heartbeat_id(TUNER_NODE))) == beats
+
+    def test_twice_is_once(self, site: Site) -> None:
+        for _ in range(2):
+            assert site.loop.accept(NEW, self.OLD).gains == NEW
+
+    def test_does_not_move_the_output(self, site: Site) -> None:
+        site.let_run()
+        mv = site.mv
+        site.loop.accept(NEW, self.OLD)
+        site.pass_time(0.3)
+        assert site.mv == pytest.approx(mv, abs=0.1)
+
+    def test_refuses_where_somebody_has_changed_the_gains(self, site: Site) -> None:
+        site.let_run()
+        site.channel.accept(Parameters(99.0, 12.0))
+        with pytest.raises(Refused, match="somebody has changed the gains") as caught:
+            site.loop.accept(NEW, self.OLD)
+        assert caught.value.reason is Reason.GAINS_CHANGED
+        assert site.channel.accepted.Kp == 99.0 and site.is_home()
+
+    def test_what_the_controller_cannot_keep_does_not_stay(self, site: Site) -> None:
+        site.let_run()
+        site.controller._keeper = Full(OSError(28, "No space left on device"))
+        with pytest.raises(Refused, match="could not store it"):
+            site.loop.accept(NEW, self.OLD)
+        assert site.channel.accepted == FOUND and site.is_home()
+
+    def test_one_whose_answer_was_lost_is_one(self, site: Site) -> None:
+        site.let_run()
+        number = 0
+
+        def lose_answers(call: int) -> None:
+            nonlocal number
+            if "controller_order_accept" in [name for name, _ in site.written] and number < 3:
+                number += 1
+                for bus in site.wire._buses:
+                    if hasattr(bus, "gateway"):
+                        bus._queue.clear()
+
+        site.gateway.before = lose_answers
+        assert site.loop.accept(NEW, self.OLD).gains == NEW
+        assert site.is_home() and site.channel.accept_count == 1
+
+    def test_keeps_its_hands_off_a_loop_that_another_tunes(self, site: Site) -> None:
+        site.begun()
+        site.loop.step((SetGains(Gains(80.0, 5.0)),))
+        gateway, second = site.another(0x7C)
+
+        def first_lives(call: int) -> None:
+            site.replay((heartbeat_id(TUNER_NODE), HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL)))
+            site.controller.sessions[0].renew(site.controller.sessions[0].number, site.wire.clock.now)
+
+        gateway.before = first_lives
+        with pytest.raises(Refused, match="7Dh holds a session") as caught:
+            second.accept(NEW, self.OLD)
+        assert caught.value.reason is Reason.LOOP_IN_USE
+        assert site.channel.on_trial and site.channel.in_effect.Kp == 80.0
+
+    def test_is_made_while_the_plant_stands_still(self, in_blocks: Site) -> None:
+        assert in_blocks.loop.accept(NEW, self.OLD).gains == NEW and in_blocks.is_home()
+
+    def test_tries_to_end_its_session_until_the_bus_is_back(self, site: Site) -> None:
+        site.let_run()
+        full = Full(OSError(28, "No space left on device"))
+        full.on_now = lambda: setattr(site, "lost", OSError(19, "No such device"))
+        site.controller._keeper = full
+        sleep, tries = site.gateway.sleep, 0
+
+        def soon_back(seconds: float) -> None:
+            nonlocal tries
+            tries += 1
+            sleep(seconds)
+            if tries > 10:
+                site.lost = None
+
+        site.gateway.sleep = soon_back
+        with pytest.raises(Refused, match="could not store it"):
+            site.loop.accept(NEW, self.OLD)
+        assert tries > 10
+        assert site.channel.accepted == FOUND and site.is_home()
+
+
+class TestTelling:
+    """What is said of a loop after a test is what the controller holds."""
+
+    def test_a_trial_by_hand_is_told(self, site: Site) -> None:
+        home, _ = site.begun()
+        site.hand("controller_staged_kp", 99.0)
+        site.hand("controller_parameter_command", 1)
+        restored = site.loop.restore(home)
+        assert restored.state.on_trial and "trial" in restored.changed
+
+    def test_an_opening_that_is_refused_leaves_no_session_to_look_after(self, site: Site) -> None:
+        told: list[int] = []
+        site.let_run()
+        for value in (b"\x00\x00\x48\x42", b"\x00\x00\x4c\x42"):  # 50, 51
+            site.replay((channel_ids(1).command, value))
+        with pytest.raises(Refused) as caught:
+            site.loop.begin(remember=told.append)
+        assert caught.value.reason is Reason.SETPOINT_IS_DRIVEN
+        assert told[0] > 0 and told[-1] == 0

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from fastapi.testclient import TestClient
 from sqlalchemy.exc import OperationalError
 
 from service.errors import Conflict
@@ -40,18 +41,9 @@ def begun(service: Service, job_id: str) -> list[str]:
 def lost_in_the_read_back(service: Service, patch: Patch) -> type[Exception]:
     accept = FakeLoop.accept
 
-    def lost(loop: FakeLoop, gains: Gains) -> LoopState:
-        accept(loop, gains)
+    def lost(loop: FakeLoop, gains: Gains, instead_of: Gains) -> LoopState:
+        accept(loop, gains, instead_of)
         raise Failed(Reason.NODE_LOST, "node 20h does not answer (controller_on_trial)")
-
-    patch.setattr(FakeLoop, "accept", lost)
-    return Failed
-
-
-def lost_on_trial(service: Service, patch: Patch) -> type[Exception]:
-    def lost(loop: FakeLoop, gains: Gains) -> LoopState:
-        service.controller.state = replace(service.controller.state, gains=gains, on_trial=True)
-        raise Failed(Reason.NODE_LOST, "node 20h does not answer (controller_parameter_command)")
 
     patch.setattr(FakeLoop, "accept", lost)
     return Failed
@@ -62,7 +54,7 @@ def disk_full_at_the_end(service: Service, patch: Patch) -> type[Exception]:
     return OperationalError
 
 
-@pytest.fixture(params=[lost_in_the_read_back, lost_on_trial, disk_full_at_the_end])
+@pytest.fixture(params=[lost_in_the_read_back, disk_full_at_the_end])
 def half_accepted(service: Service, request: pytest.FixtureRequest) -> str:
     """A proposal whose gains the controller has although its acceptance ended in an error."""
     half_way: Callable[[Service, Patch], type[Exception]] = request.param
@@ -72,17 +64,6 @@ def half_accepted(service: Service, request: pytest.FixtureRequest) -> str:
         with pytest.raises(error):
             service.jobs.accept(job_id, "me")
     assert (service.store.get(job_id).state, service.controller.state.gains) == ("proposed", NEW)
-
-    # A controller on trial takes what it is given; the fake one would stay so.
-    accept = FakeLoop.accept
-
-    def off_trial(loop: FakeLoop, gains: Gains) -> LoopState:
-        service.controller.state = replace(service.controller.state, on_trial=False)
-        return accept(loop, gains)
-
-    patch = pytest.MonkeyPatch()
-    patch.setattr(FakeLoop, "accept", off_trial)
-    request.addfinalizer(patch.undo)
     return job_id
 
 
@@ -112,19 +93,58 @@ def test_a_loop_that_is_not_reached_is_not_said_to_have_its_old_gains(service: S
     assert service.store.get(half_accepted).state == "proposed"
 
 
-def test_gains_put_in_by_hand_after_a_half_acceptance_stay(service: Service, half_accepted: str) -> None:
-    service.controller.state = replace(service.controller.state, gains=BY_HAND, on_trial=False)
-    for wish in (service.jobs.accept, service.jobs.rollback):
-        with pytest.raises(Conflict, match="somebody changed the gains"):
-            wish(half_accepted, "me")
-    assert holds(service, BY_HAND)
+def test_gains_put_in_by_hand_after_a_half_acceptance_stay_and_the_job_can_be_declined(
+    service: Service, half_accepted: str
+) -> None:
+    service.controller.by_hand(gains=BY_HAND)
+    with pytest.raises(Conflict, match="somebody changed the gains"):
+        service.jobs.accept(half_accepted, "me")
+    assert service.store.get(half_accepted).state == "proposed"
+    row = service.jobs.rollback(half_accepted, "me")
+    assert row.state == "rolled_back" and holds(service, BY_HAND)
+    assert row.restored is not None and row.restored["gains"]["Kp"] == BY_HAND.Kp
+    assert row.detail is not None and "somebody else's, left as they are" in row.detail
+    last = audit.trail(service.store.engine, 1)[0]
+    assert last.before is not None and last.after is not None
+    assert (last.what, last.before["gains"]["Kp"], last.after["gains"]["Kp"]) == ("rollback", BY_HAND.Kp, BY_HAND.Kp)
+
+
+def test_gains_put_in_by_hand_after_an_acceptance_stay_and_it_is_not_taken_back(service: Service) -> None:
+    job_id = proposed(service)
+    service.jobs.accept(job_id, "me")
+    service.controller.by_hand(gains=BY_HAND)
+    with pytest.raises(Conflict, match="somebody changed the gains in between; retune instead"):
+        service.jobs.rollback(job_id, "me")
+    assert holds(service, BY_HAND) and service.store.get(job_id).state == "accepted"
+
+
+def test_gains_that_come_in_while_an_acceptance_is_written_are_a_conflict(
+    service: Service, client: TestClient, monkeypatch: Patch
+) -> None:
+    """Between our reading and the opening of the session: the loop itself refuses, and nothing is written."""
+    job_id = proposed(service)
+    accept = FakeLoop.accept
+
+    def late(loop: FakeLoop, gains: Gains, instead_of: Gains) -> LoopState:
+        service.controller.by_hand(gains=BY_HAND)
+        return accept(loop, gains, instead_of)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FakeLoop, "accept", late)
+        answer = client.post(f"/jobs/{job_id}/accept")
+    assert answer.status_code == 409 and "somebody has changed the gains" in answer.json()["detail"]
+    assert holds(service, BY_HAND) and service.store.get(job_id).state == "proposed"
+    assert audit.trail(service.store.engine, 1)[0].what == "accept_failed"
+    assert client.post(f"/jobs/{job_id}/accept").status_code == 409
+    answer = client.post(f"/jobs/{job_id}/rollback")
+    assert (answer.status_code, answer.json()["state"]) == (200, "rolled_back") and holds(service, BY_HAND)
 
 
 def test_an_acceptance_that_wrote_nothing_is_rolled_back_without_writing(service: Service, monkeypatch: Patch) -> None:
     job_id = proposed(service)
 
-    def lost(loop: FakeLoop, gains: Gains) -> LoopState:
-        raise Failed(Reason.NODE_LOST, "node 20h does not answer (controller_staged_kp)")
+    def lost(loop: FakeLoop, gains: Gains, instead_of: Gains) -> LoopState:
+        raise Failed(Reason.NODE_LOST, "node 20h does not answer (controller_order_kp)")
 
     monkeypatch.setattr(FakeLoop, "accept", lost)
     with pytest.raises(Failed):

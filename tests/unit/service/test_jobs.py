@@ -10,7 +10,7 @@ from service import jobs as jobs_module
 from service.api.results import ModelView, TransferModelView
 from service.api.views import job_view
 from service.bus_loop import RESTORE_PATIENCE_S
-from service.loop import LoopState
+from service.loop import LoopState, Restored
 from service.progress import Progress
 from service.request import RetuneRequest
 from service.states import JobState
@@ -37,10 +37,10 @@ def test_a_job_that_does_not_end_holds_the_stop_up_for_a_while_only(
     monkeypatch.setattr(jobs_module, "_ENDS_S", 0.2)
     inside, free = threading.Event(), threading.Event()
 
-    def hangs(loop: FakeLoop, state: LoopState) -> LoopState:
+    def hangs(loop: FakeLoop, home: LoopState, session: int | None = None) -> Restored:
         inside.set()
         free.wait(20)
-        return state
+        return Restored(home, "at last")
 
     monkeypatch.setattr(FakeLoop, "restore", hangs)
     row = service.jobs.start(TAG, RetuneRequest())

@@ -167,7 +167,7 @@ class JobsMachine(RuleBasedStateMachine):
         self.store, self.engine = Store(self.folder), HandEngine()
         self.service = Jobs(
             parse_site({"loops": ENTRIES}, "test").loops, self.store, self.open, self.tune, self.rehearse,
-            engine=self.engine, patience_s=0.3,
+            engine=self.engine,
         )  # fmt: skip
         self.service.boot()
 
@@ -176,9 +176,10 @@ class JobsMachine(RuleBasedStateMachine):
 
     def tune(self, config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks) -> Outcome:
         act = self.acts[request.requested_by]
+        hooks.on_home(loop.begin(hooks.stop, hooks.remember))
         loop.step((SetGains(act.new),))
         result, ended = act.play(hooks)
-        return Outcome(result, ended, loop.restore(state), {})
+        return Outcome(result, ended, loop.restore(state).state, {})
 
     def rehearse(self, config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:
         result, ended = self.acts[request.requested_by].play(hooks)
@@ -323,7 +324,7 @@ class JobsMachine(RuleBasedStateMachine):
         """An operator puts other gains into a controller that no job has."""
         if self.having(loop) is None:
             self.gains[loop] = Gains(kp, 5.0)
-            self.controllers[loop].state = replace(self.controllers[loop].state, gains=self.gains[loop])
+            self.controllers[loop].by_hand(gains=self.gains[loop])
             self.said("by hand", "done")
 
     @precondition(lambda self: any(job.begun for job in self.jobs))
@@ -332,6 +333,7 @@ class JobsMachine(RuleBasedStateMachine):
         """kill -9 and the next start; the controllers have ended their sessions meanwhile, or not yet."""
         self.service._ended.set()
         self.service._watcher.join()
+        self.service.aftercare.close()
         for job in self.jobs:
             if job.begun:
                 job.act.killed = True
@@ -339,9 +341,9 @@ class JobsMachine(RuleBasedStateMachine):
                 self.over(job)
         self.service.journal.close(5.0)
         self.store.close()
-        for tag, controller in self.controllers.items():
+        for controller in self.controllers.values():
             if goes_back:
-                controller.state = replace(controller.state, gains=self.gains[tag], on_trial=False)
+                controller.end_session()
         self.boot()
         for job in self.jobs:
             if not job.active:

@@ -18,7 +18,8 @@ from sqlalchemy.exc import OperationalError
 from protocol.tuner import Kind, Tuner, TunerError, sdo_retries
 from service.api import operations
 from service.api.app import create_app
-from service.api.operations import Readiness, bus_opens
+from service.api.operations import Readiness
+from service.bus_watch import BusWatch
 from service.logs import JsonLines, about
 from service.metrics import SAMPLES_LOST
 from service.serving import listen, tell_systemd
@@ -104,7 +105,7 @@ def test_the_parts_are_not_asked_more_often_than_they_need_to_be() -> None:
 @pytest.mark.parametrize("url", ["socketcan:nothere0", "socketcand:127.0.0.1:1", "nonsense"])
 def test_a_bus_that_is_not_there(url: str) -> None:
     with pytest.raises(Exception, match=r"nothere0|refused|kernel|not a bus|no SocketCAN"):
-        bus_opens(url)
+        BusWatch(url).check()
 
 
 # metrics

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy import inspect, text
 from sqlalchemy.exc import OperationalError
 
 from service.config import parse_site
@@ -32,10 +34,14 @@ from tests.unit.service.fakes import (
     fake_rehearse,
     loop_entry,
 )
+from tests.unit.service.test_store import migrate
+from tuning.gains import Gains
 from tuning.plan import Mode
 from tuning.reasons import Reason
 
 HOME = FakeController().state
+ON_TRIAL = replace(HOME, gains=NEW, on_trial=True, sp=52.0)
+SESSION = 41
 
 
 @pytest.fixture
@@ -51,7 +57,8 @@ def left(folder: Path, version: str = WORKFLOW_VERSION, done: tuple[str, ...] = 
     store = Store(folder)
     row = store.create(TAG, {}, "me", False, version=version)
     old = {"Kp": OLD.Kp, "Ti": OLD.Ti}
-    store.move(row.id, JobState.RUNNING, **{"old_gains": old, "found": state_json(HOME), "attempt": 1, **columns})
+    running: dict[str, Any] = {"old_gains": old, "found": state_json(HOME), "attempt": 1, "session": SESSION}
+    store.move(row.id, JobState.RUNNING, **running | columns)
     for stage in done:
         store.append(row.id, "stage_started", {"stage": stage, "expected_s": 1.0, "remaining_s": 1.0}, 5.0)
         store.append(row.id, "stage_done", {"stage": stage, "result": {}, "stage_time_s": 5.0}, 5.0)
@@ -59,14 +66,55 @@ def left(folder: Path, version: str = WORKFLOW_VERSION, done: tuple[str, ...] = 
     return row.id
 
 
+def in_the_session(controller: FakeController) -> None:
+    """Still in the test that the dead service has begun."""
+    controller.begin_session(SESSION)
+    controller.state = ON_TRIAL
+
+
+def ended_by_itself(controller: FakeController) -> None:
+    in_the_session(controller)
+    controller.end_session()
+
+
+def moved(**by_hand: Any) -> Callable[[FakeController], None]:
+    """Another's hand was on it after the service had died."""
+
+    def move(controller: FakeController) -> None:
+        in_the_session(controller)
+        controller.by_hand(**by_hand)
+
+    return move
+
+
+def restarted(state: LoopState) -> Callable[[FakeController], None]:
+    """It knows nothing of the session."""
+
+    def start(controller: FakeController) -> None:
+        controller.state = state
+
+    return start
+
+
+def away(reason: Reason) -> Callable[[FakeController], None]:
+    def leave(controller: FakeController) -> None:
+        in_the_session(controller)
+        controller.absent = reason
+
+    return leave
+
+
 def again(
-    started: list[Service], folder: Path, found: LoopState = HOME, absent: Reason | None = None, **options: Any
+    started: list[Service],
+    folder: Path,
+    becomes: Callable[[FakeController], None] = ended_by_itself,
+    **options: Any,
 ) -> Service:
-    """The next start, with the controller in that state."""
+    """The next start, with what has become of the controller."""
 
     class Later(Service):
         def more_jobs(self, open_loop: Callable[..., Any], *more: Any, **settings: Any) -> Jobs:
-            self.controller.state, self.controller.absent = found, absent
+            becomes(self.controller)
             return super().more_jobs(open_loop, *more, **settings)
 
     service = Later(folder, **options)
@@ -78,18 +126,19 @@ def texts(service: Service, job_id: str, kind: str) -> list[str]:
     return [event.data["text"] for event in service.store.events(job_id) if event.kind == kind]
 
 
-ON_TRIAL = replace(HOME, gains=NEW, on_trial=True, sp=52.0)
-
-
+@pytest.mark.parametrize(
+    ("becomes", "words"),
+    [(in_the_session, "the session was closed"), (ended_by_itself, "the controller had ended the session")],
+)
 def test_a_loop_on_trial_is_brought_back_and_its_job_goes_on_where_it_was(
-    started: list[Service], tmp_path: Path
+    started: list[Service], tmp_path: Path, becomes: Callable[[FakeController], None], words: str
 ) -> None:
     job_id = left(tmp_path, done=("preflight",), plant_time_s=7.0)
-    service = again(started, tmp_path, ON_TRIAL)
+    service = again(started, tmp_path, becomes)
     service.wait(job_id)
     row = service.store.get(job_id)
     assert (row.state, row.attempt) == ("proposed", 2), row.detail
-    assert "brought back" in texts(service, job_id, "loop_found")[0] and len(texts(service, job_id, "resumed")) == 1
+    assert words in texts(service, job_id, "loop_found")[0] and len(texts(service, job_id, "resumed")) == 1
     assert service.controller.state == HOME
     assert [stage for stage, _ in service.store.samples(job_id)] == ["relay"]
     assert service.store.samples(job_id)[0][1][0].t > 7.0
@@ -105,21 +154,39 @@ def test_a_job_that_had_not_begun_is_begun(started: list[Service], tmp_path: Pat
     assert service.store.get(row.id).state == "proposed" and not texts(service, row.id, "loop_found")
 
 
+def test_a_job_that_had_opened_no_session_begins_anew_on_the_loop_as_it_is(
+    started: list[Service], tmp_path: Path
+) -> None:
+    """What it had read may have been the test of another tuner."""
+    job_id = left(tmp_path, found=state_json(ON_TRIAL), session=None)
+    service = again(started, tmp_path, lambda controller: None)
+    service.wait(job_id)
+    row = service.store.get(job_id)
+    assert (row.state, row.attempt) == ("proposed", 2), row.detail
+    assert row.found == state_json(HOME) and not texts(service, job_id, "loop_found")
+
+
 @pytest.mark.parametrize(
-    ("found", "reason", "words"),
+    ("becomes", "found", "reason", "words"),
     [
-        (replace(HOME, sp=55.0), Reason.SETPOINT_CHANGED, "set-point is 55, was 50"),
-        (replace(HOME, mode=Mode.MANUAL), Reason.MODE_CHANGED, "mode is manual, was automatic"),
-        (replace(HOME, gains=NEW), Reason.SERVICE_STOPPED, "gains is"),
+        (moved(sp=55.0), replace(HOME, sp=55.0), Reason.SETPOINT_CHANGED, "set-point is 55, was 50"),
+        (moved(mode=Mode.MANUAL), replace(HOME, mode=Mode.MANUAL), Reason.MODE_CHANGED, "mode is manual"),
+        (restarted(replace(HOME, gains=NEW)), replace(HOME, gains=NEW), Reason.GAINS_CHANGED, "gains is"),
     ],
 )
 def test_what_somebody_changed_meanwhile_stays_and_the_job_does_not_go_on(
-    started: list[Service], tmp_path: Path, found: LoopState, reason: Reason, words: str
+    started: list[Service],
+    tmp_path: Path,
+    becomes: Callable[[FakeController], None],
+    found: LoopState,
+    reason: Reason,
+    words: str,
 ) -> None:
     job_id = left(tmp_path)
-    service = again(started, tmp_path, found)
+    service = again(started, tmp_path, becomes)
     row = service.store.get(job_id)
-    assert (row.state, row.reason) == ("interrupted", reason.value) and words in (row.detail or "")
+    assert (row.state, row.reason, row.look_after) == ("interrupted", reason.value, False)
+    assert words in (row.detail or "") and "not as before the job" in (row.detail or "")
     assert service.controller.state == found and row.restored == state_json(found)
 
 
@@ -136,26 +203,75 @@ def test_a_job_that_may_not_go_on_says_why_and_what_was_restored(
     started: list[Service], tmp_path: Path, columns: dict[str, Any], options: dict[str, Any], words: str
 ) -> None:
     job_id = left(tmp_path, **columns)
-    service = again(started, tmp_path, ON_TRIAL, **options)
+    service = again(started, tmp_path, in_the_session, **options)
     row = service.store.get(job_id)
     assert (row.state, row.reason) == ("interrupted", row.reason) and words in (row.detail or "")
-    assert "brought back" in (row.detail or "") and row.restored == state_json(HOME) == state_json(
-        service.controller.state
-    )
+    assert "the session was closed" in (row.detail or "") and service.controller.session == 0
+    assert row.restored == state_json(HOME) == state_json(service.controller.state)
     assert service.store.active(TAG) is None
 
 
 def test_a_loop_that_is_not_reached_is_said_so(started: list[Service], tmp_path: Path) -> None:
     job_id = left(tmp_path)
-    service = again(started, tmp_path, absent=Reason.NODE_LOST)
+    service = again(started, tmp_path, away(Reason.NODE_LOST))
     row = service.store.get(job_id)
-    assert (row.state, row.reason, row.restored) == ("interrupted", "node_lost", None)
+    assert (row.state, row.reason, row.restored, row.look_after) == ("interrupted", "node_lost", None, True)
     assert "not reached" in (row.detail or "")
+
+
+def older(folder: Path) -> str:
+    """A job in the middle of its test, in a database that the code before the sessions has left."""
+    store = Store(folder)
+    with store.engine.begin() as connection:
+        migrate(connection, "0004")
+        assert "session" not in {column["name"] for column in inspect(connection).get_columns("jobs")}
+        home = json.dumps({name: value for name, value in state_json(HOME).items() if name not in NEW_FIELDS})
+        connection.execute(
+            text(
+                "INSERT INTO jobs (id, loop, state, dry_run, request, requested_by, created_at, plant_time_s, host,"
+                " version, attempt, found) VALUES ('old', :tag, 'running', :no, '{}', 'me', '2026-01-01', 5.0, 'local',"
+                " '1', 1, :home)"
+            ),
+            {"tag": TAG, "no": False, "home": home},
+        )
+    store.close()
+    return "old"
+
+
+NEW_FIELDS = ("manual_output", "node_state", "when_silent")
+
+
+def test_a_job_of_the_code_before_ends_with_its_loop_read_back(started: list[Service], tmp_path: Path) -> None:
+    job_id = older(tmp_path)
+    service = again(started, tmp_path, restarted(HOME))
+    row = service.store.get(job_id)
+    assert (row.state, row.reason, row.look_after) == ("interrupted", "service_stopped", False)
+    assert "begun by another version of Loopwright" in (row.detail or "")
+    assert row.restored == state_json(HOME) and len(texts(service, job_id, "loop_found")) == 1
+    assert not service.tune.inside.is_set()
+
+
+def test_what_a_job_of_the_code_before_has_left_is_told_and_blamed_on_nobody(
+    started: list[Service], tmp_path: Path
+) -> None:
+    job_id = older(tmp_path)
+    service = again(started, tmp_path, restarted(replace(HOME, sp=52.0)))
+    row = service.store.get(job_id)
+    assert row.state == "interrupted" and row.restored is not None and row.restored["sp"] == 52.0
+    (found,) = texts(service, job_id, "loop_found")
+    assert "not as before the job, left so: set-point is 52, was 50" in found and "somebody" not in found
+
+
+def test_the_loop_of_a_job_of_the_code_before_is_looked_after_too(started: list[Service], tmp_path: Path) -> None:
+    job_id = older(tmp_path)
+    service = again(started, tmp_path, away(Reason.NODE_LOST))
+    row = service.store.get(job_id)
+    assert (row.state, row.session, row.look_after) == ("interrupted", None, True)
 
 
 def test_a_job_asked_to_stop_before_the_crash_is_stopped(started: list[Service], tmp_path: Path) -> None:
     job_id = left(tmp_path, stop_reason="operator")
-    service = again(started, tmp_path, ON_TRIAL)
+    service = again(started, tmp_path, in_the_session)
     row = service.store.get(job_id)
     assert (row.state, row.reason) == ("aborted", "operator") and service.controller.state == HOME
 
@@ -279,6 +395,20 @@ def test_a_service_that_does_not_come_to_its_start_leaves_the_jobs(tmp_path: Pat
     store.close()
 
 
+def test_a_service_told_to_end_before_it_has_begun_leaves_the_jobs(tmp_path: Path) -> None:
+    job_id = left(tmp_path)
+    store = Store(tmp_path)
+    loops = parse_site({"loops": [loop_entry()]}, "test").loops
+    controller, engine = FakeController(), ThreadEngine()
+    in_the_session(controller)
+    jobs = Jobs(loops, store, lambda config: FakeLoop(controller), FakeTune(), fake_rehearse, engine=engine)
+    jobs.request_stop()
+    jobs.boot()
+    jobs.stop()
+    assert store.get(job_id).state == "running" and not engine.alive() and controller.session == SESSION
+    store.close()
+
+
 def test_a_job_that_waits_for_its_turn_ends_at_once_when_aborted(started: list[Service], tmp_path: Path) -> None:
     service = again(started, tmp_path, engine=Forgetful())
     row = service.jobs.start(TAG, RetuneRequest())
@@ -357,12 +487,12 @@ def test_no_loop_is_read_while_a_decision_is_carried_out(service: Service) -> No
     seen: list[Any] = []
 
     class Slow(FakeLoop):
-        def accept(self, gains: Any) -> LoopState:
+        def accept(self, gains: Gains, instead_of: Gains) -> LoopState:
             second = service.store.create(TAG, {}, "B", False, version=WORKFLOW_VERSION)
             service.jobs.engine.enqueue(second.id, "local:virtual:test")
             seen.append(second.id)
             service.tune.inside.wait(0.2)
-            return super().accept(gains)
+            return super().accept(gains, instead_of)
 
     service.tune.inside.clear()
     service.jobs._open_loop = lambda config: Slow(service.controller)

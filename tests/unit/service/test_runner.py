@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -12,7 +13,7 @@ import pytest
 from controller.channel import Channel, Settings
 from controller.pid import Parameters
 from plantsim.plant import LinearPlant
-from service.loop import LoopState
+from service.loop import LoopState, Restored, differences
 from service.rehearsal import RehearsedLoop
 from service.runner import RunResult, Watch, run
 from tuning.gains import Gains
@@ -20,6 +21,7 @@ from tuning.plan import (
     Command,
     Event,
     Mode,
+    Note,
     Plan,
     Sample,
     SetGains,
@@ -32,7 +34,7 @@ from tuning.plan import (
     Work,
     worked,
 )
-from tuning.reasons import Failed, Reason, Refused
+from tuning.reasons import Aborted, Failed, Reason, Refused
 
 TS = 0.1
 OLD = Gains(Kp=0.15, Ti=5.0)
@@ -72,11 +74,10 @@ def relay() -> Plan[None]:
         yield ()
 
 
-def assert_home(loop: Meddled, result: RunResult[Any], sp: float = 0.0) -> None:
+def assert_home(loop: Meddled, result: RunResult[Any]) -> None:
     state = loop.read()
     assert result.restored == state
-    assert (state.mode, state.sp, state.gains, state.on_trial) == (Mode.AUTOMATIC, sp, OLD, False)
-    assert loop.channel.lease == 0
+    assert (state.mode, state.sp, state.gains, state.on_trial) == (Mode.AUTOMATIC, 0.0, OLD, False)
 
 
 def test_success_gives_the_value_and_the_stage_times() -> None:
@@ -107,42 +108,75 @@ def test_a_bad_sample_ends_the_run(
     assert_home(loop, result)
 
 
-def test_the_set_point_that_somebody_else_gave_stays() -> None:
-    loop = Meddled(100, lambda s: s._replace(sp=0.7))
-    result = run(trial(), loop, watch=Watch())
-    assert result.ended is not None
-    assert result.ended.reason is Reason.SETPOINT_CHANGED
-    assert_home(loop, result, sp=0.7)
+class Pressed(Meddled):
+    """The controller sees another's hand at that sample, ends the test by itself, and says so."""
+
+    def __init__(self, at: int, mode: Mode) -> None:
+        super().__init__()
+        self._pressed_at, self._mode = at, mode
+
+    def step(self, commands: Sequence[Command]) -> Sample:
+        sample = super().step(commands)
+        if self._count == self._pressed_at:
+            self.channel.go_home(self._home)
+            self.channel.command_mode(int(self._mode))
+            raise Aborted(Reason.MODE_CHANGED, "another hand on the loop: mode")
+        return sample
+
+    def restore(self, home: LoopState, session: int | None = None) -> Restored:
+        state = self.read()
+        return Restored(state, "the controller had ended the session", differences(state, home))
 
 
 @pytest.mark.parametrize("plan", [trial, relay])
 @pytest.mark.parametrize("mode", [Mode.OFF, Mode.MANUAL])
 def test_the_mode_that_somebody_else_chose_stays(mode: Mode, plan: Callable[[], Plan[Any]]) -> None:
-    def pressed(sample: Sample) -> Sample:
-        loop.channel.command_mode(int(mode))
-        return sample
-
-    loop = Meddled(100, pressed)
-    result = run(plan(), loop, watch=Watch())
+    notes: list[str] = []
+    loop = Pressed(100, mode)
+    result = run(plan(), loop, watch=Watch(), on_event=lambda e: notes.append(e.text) if isinstance(e, Note) else None)
     assert result.ended is not None
     assert result.ended.reason is Reason.MODE_CHANGED
     state = loop.read()
     assert result.restored == state
     assert (state.mode, state.sp, state.gains, state.on_trial) == (mode, 0.0, OLD, False)
-    assert loop.channel.lease == 0
-    assert loop.step(()).mv == state.mv
+    assert notes == [f"not as before the test, and left so: mode is {mode.name.lower()}, was automatic"]
 
 
-@pytest.mark.parametrize("also", [{"sp": 0.7}, {"pv": 20.0}, {"mv": 5.0}])
-def test_it_stays_too_where_something_else_ends_the_run_in_the_same_sample(also: dict[str, float]) -> None:
-    def pressed(sample: Sample) -> Sample:
-        loop.channel.command_mode(int(Mode.MANUAL))
-        return sample._replace(mode=int(Mode.MANUAL), **also)
+def test_what_is_opened_and_what_must_come_back_is_told() -> None:
+    told: list[Any] = []
 
-    loop = Meddled(100, pressed)
-    result = run(trial(), loop, watch=Watch(pv_low=-10.0, pv_high=10.0, mv_low=-1.0, mv_high=1.0))
-    assert result.ended is not None and result.restored is not None
-    assert (loop.read().mode, loop.read().sp) == (Mode.MANUAL, also.get("sp", 0.0))
+    class Numbered(Meddled):
+        def begin(
+            self,
+            stop: Callable[[], Reason | None] = lambda: None,
+            remember: Callable[[int], None] = lambda session: None,
+        ) -> LoopState:
+            remember(7)
+            return replace(super().begin(), when_silent="holds MV where it is")
+
+    loop = Numbered()
+    home = loop.read()
+    run(
+        trial(), loop, watch=Watch(), remember=told.append, on_home=told.append,
+        on_event=lambda e: told.append(e.text) if isinstance(e, Note) else None,
+    )  # fmt: skip
+    silent = "if the controller falls silent, the plant's I/O holds MV where it is"
+    assert told == [7, replace(home, when_silent="holds MV where it is"), silent]
+
+
+def test_a_stop_ends_the_wait_for_the_loop() -> None:
+    class Busy(Meddled):
+        def begin(
+            self,
+            stop: Callable[[], Reason | None] = lambda: None,
+            remember: Callable[[int], None] = lambda session: None,
+        ) -> LoopState:
+            assert stop() is Reason.OPERATOR
+            raise Aborted(Reason.OPERATOR, "while another tuner held the loop")
+
+    result = run(trial(), Busy(), watch=Watch(), stop=lambda: Reason.OPERATOR)
+    assert result.ended is not None and result.restored is None
+    assert (result.ended.reason, result.value) == (Reason.OPERATOR, None)
 
 
 def test_mv_beyond_what_the_job_permits_ends_the_run() -> None:
@@ -279,7 +313,7 @@ def test_a_defect_in_a_plan_is_told_as_one_and_the_loop_is_restored() -> None:
 
 def test_a_result_without_a_confirmed_restore_is_no_result() -> None:
     class Unrestorable(Meddled):
-        def restore(self, state: LoopState) -> LoopState:
+        def restore(self, home: LoopState, session: int | None = None) -> Restored:
             raise Failed(Reason.RESTORE_UNCONFIRMED, "mode reads manual")
 
     result = run(trial(), Unrestorable(), watch=Watch())

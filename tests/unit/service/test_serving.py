@@ -7,6 +7,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from protocol.profile import TUNER_NODE
 from service import serving
 from service.cli import app
 from tests.unit.service.fakes import loop_entry
@@ -39,3 +40,27 @@ def test_without_room_for_processes_the_service_computes_itself(
     with ExitStack() as stack:
         assert serving._workers(stack) is None
     assert "the service does them itself" in caplog.text
+
+
+@pytest.mark.parametrize("node", ["0", "128", "x", "-3"])
+def test_a_node_id_that_is_none_is_refused(tmp_path: Path, node: str) -> None:
+    ended = CliRunner().invoke(app, ["serve", "--data", str(tmp_path / "data")], env={"LOOPWRIGHT_NODE": node})
+    assert ended.exit_code == 2 and "--node must be a CANopen node id, 1 to 127" in ended.output
+
+
+@pytest.mark.parametrize(("node", "name"), [("0x20", "controller_node"), ("16", "plant_node")])
+def test_a_node_id_that_a_device_has_is_refused(tmp_path: Path, node: str, name: str) -> None:
+    loops = tmp_path / "loops.yaml"
+    loops.write_text(yaml.safe_dump({"loops": [loop_entry()]}))
+    place = ["--loops", str(loops), "--data", str(tmp_path / "data"), "--port", "0"]
+    ended = CliRunner().invoke(app, ["serve", *place, "--node", node])
+    assert ended.exit_code == 2 and f"TIC-101: {name} is {int(node, 0):#04x}" in ended.output
+    assert "start it with another --node" in ended.output and not (tmp_path / "data").exists()
+
+
+def test_the_node_id_is_that_of_every_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[serving.Setup] = []
+    monkeypatch.setattr(serving, "serve", asked.append)
+    for options in ([], ["--node", "0x7C"]):
+        assert CliRunner().invoke(app, ["serve", *options]).exit_code == 0
+    assert [setup.node for setup in asked] == [TUNER_NODE, 0x7C]

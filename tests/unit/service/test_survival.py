@@ -128,7 +128,7 @@ def test_killed_in_every_stage_it_resumes_there_and_nothing_runs_twice(
         assert read_loop(tmp_path, TAG).gains == NEW  # this controller does not go back by itself
         gateway.serve()
         found = gateway.events(url, "loop_found")
-        assert len(found) == attempt and "brought back" in found[-1]["text"]
+        assert len(found) == attempt and "the session was closed" in found[-1]["text"]
     gateway.go()
     job = gateway.over(url)
     assert (job["state"], job["attempts"]) == ("proposed", len(STAGES) + 1)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.channel import Channel, Mode, Parameters, Settings
+from controller.channel import Channel, Mode, Parameters, RelaySettings, Settings
 from plantsim.plant import LinearPlant
 
 Reals = NDArray[np.float64]
@@ -81,7 +81,7 @@ def closed_loop(
     pv = plant.pv
     for k in range(samples):
         if k == FIRST_MOVE and relay:
-            channel.start_relay(1.0, 0.02, MV, 0.0, samples, 0.0, 100.0)
+            channel.start_relay(RelaySettings(1.0, 0.02, MV, samples, 0.0, 100.0))
         elif k == FIRST_MOVE:
             channel.setpoint = PV + 1.0
         if load and k == load_at:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller.channel import Channel, Mode, Parameters, Settings
+from controller.channel import Channel, Mode, Parameters, RelaySettings, Settings
 from plantsim.plant import LinearPlant
 from tuning.fast.evidence import Evidence
 from tuning.models import TransferFunction, sign
@@ -64,7 +64,7 @@ def record(
     while len(switched) < switches and len(u) < 5000:
         k = len(u)
         if k == LISTENED:
-            channel.start_relay(1.0, 2.2 * noise, 0.0, 0.0, 10_000, -1e9, 1e9, 0.5, 3 if noise else 1)
+            channel.start_relay(RelaySettings(1.0, 2.2 * noise, 0.0, 10_000, -1e9, 1e9, 0.5, 3 if noise else 1))
         if load and k == load_at:
             plant.disturbance = load
         y.append(plant.pv + drift * k)

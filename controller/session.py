@@ -1,0 +1,240 @@
+"""The session of one channel: who tunes it, until when, what it comes back to, and which orders are in force.
+
+A tuner opens a session with a number that the controller has given out, and commands by orders whose check covers that
+number and a running count (`protocol.session`). The session ends when the tuner closes it, when the lease or the
+tuner's heartbeat runs out, when PV is lost, when the node leaves operational, or when another hand commands something;
+mode, set-point and gains then go home by the controller's own doing. Time is an argument: seconds of the controller's
+clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from controller.channel import Channel, Home, Parameters, RelaySettings
+from protocol.objects import Value
+from protocol.profile import Abort, Cause, Hand, Mode, Order, RelayState
+from protocol.sdo import SdoAbort
+from protocol.session import check_of
+
+AGAIN_S = 1.0
+"""An output that no PV has asked for is sent again after this time while PV stays away: the bus may have been too."""
+
+_NO_HOME = Home(Mode.OFF, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """What a session is opened with: tuner's node-ID, samples, and times in s of the controller's clock."""
+
+    tuner: int
+    lease_samples: int
+    lease_s: float
+    pv_silence_s: float
+    watch_s: float
+
+
+class Session:
+    """A channel and what a tuner does with it. draw: a number that has not been given out lately, never 0."""
+
+    def __init__(self, channel: Channel, draw: Callable[[], int], pv_timeout_s: float) -> None:
+        self.channel = channel
+        self.next = draw()
+        self.number = 0
+        """The number of the open session; 0: there is none."""
+        self.last = 0
+        self.count = 0
+        self.cause = Cause.NONE
+        self.hand = Hand.NONE
+        self.home = _NO_HOME
+        self.home_gains = channel.accepted
+        self.terms: Terms | None = None
+        self._draw = draw
+        self._pv_timeout_s = pv_timeout_s
+        self._answered: tuple[Order, int] | None = None
+        self._samples_left = 0
+        self._lease_until = self._heard_at = self._valid_at = 0.0
+        self._good_samples = -1
+        self.silent = True
+        """No valid PV for too long."""
+        self._unsettled = False
+        """A session has ended, and no sample has carried the output that this asks for to the plant yet."""
+        self.unasked = False
+        """The output has moved although no PV has asked for it: the device sends it and resets this."""
+        self._without_pv = False
+        """The output is one that no PV has asked for, and none has come since."""
+        self._again_at = 0.0
+
+    @property
+    def is_open(self) -> bool:
+        return self.number != 0
+
+    @property
+    def holder(self) -> int:
+        """Node-ID of the tuner; 0 without a session."""
+        return self.terms.tuner if self.terms is not None else 0
+
+    @property
+    def pv_is_valid(self) -> bool:
+        return self.channel.measuring and not self.silent
+
+    @property
+    def kept(self) -> Home:
+        """What a restart must come back to: home within a session, else the last choice."""
+        return self.home if self.is_open else self.channel.home
+
+    # -- what the tuner does
+
+    def give(
+        self, order: Order, check: int, values: Sequence[Value], now: float, store: Callable[[Parameters], None]
+    ) -> None:
+        """Puts the order in force. The last one repeated is answered as done. Raises SdoAbort.
+
+        values: as staged, in the order of `protocol.session.STAGED`.  store: keeps gains before they are accepted.
+        """
+        if self._answered == (order, check):
+            return
+        if (order is Order.OPEN) == self.is_open:
+            raise SdoAbort(Abort.DEVICE_STATE)
+        number, count = (self.next, 0) if order is Order.OPEN else (self.number, self.count)
+        if check != check_of(number, count, order, values):
+            raise SdoAbort(Abort.INVALID_VALUE)
+        try:
+            self._carry_out(order, values, now, store)
+        except ValueError:
+            raise SdoAbort(Abort.INVALID_VALUE) from None
+        self.count += 1
+        self._answered = order, check
+
+    def _carry_out(
+        self, order: Order, values: Sequence[Value], now: float, store: Callable[[Parameters], None]
+    ) -> None:
+        channel = self.channel
+        numbers = [float(value) for value in values]
+        match order:
+            case Order.OPEN:
+                self._open(Terms(int(numbers[0]), int(numbers[1]), *(ms / 1000.0 for ms in numbers[2:])), now)
+            case Order.CLOSE:
+                self.end(Cause.CLOSED)
+            case Order.SETPOINT:
+                channel.setpoint = numbers[0]
+            case Order.MODE:
+                channel.command_mode(int(numbers[0]))
+            case Order.OUTPUT:
+                channel.manual_output = numbers[0]
+            case Order.RELAY:
+                amplitude, hysteresis, working, samples, low, high, amplitude_low, average = numbers
+                channel.start_relay(
+                    RelaySettings(amplitude, hysteresis, working, int(samples), low, high, amplitude_low, int(average))
+                )
+            case Order.TRY | Order.ACCEPT:
+                if channel.mode is Mode.EXPERIMENT:
+                    raise SdoAbort(Abort.DEVICE_STATE)
+                gains = Parameters(*numbers)
+                if order is Order.TRY:
+                    channel.try_gains(gains)
+                else:
+                    store(gains)
+                    channel.accept(gains)
+
+    def _open(self, terms: Terms, now: float) -> None:
+        if self.channel.on_trial:  # somebody tries gains by hand; a session would end that
+            raise SdoAbort(Abort.DEVICE_STATE)
+        self.number, self.terms, self.home = self.next, terms, self.channel.home
+        self.home_gains = self.channel.accepted
+        self.next, self.count, self.hand = self._draw(), 0, Hand.NONE
+        self._samples_left = terms.lease_samples
+        self._lease_until, self._heard_at, self._valid_at = now + terms.lease_s, now, max(now, self._valid_at)
+
+    def renew(self, number: int, now: float) -> None:
+        """Pays for as much as the opening did. Raises SdoAbort when this session is not open (any more)."""
+        if not number or number != self.number or self.terms is None:
+            raise SdoAbort(Abort.DEVICE_STATE)
+        self._samples_left, self._lease_until = self.terms.lease_samples, now + self.terms.lease_s
+
+    def heard(self, node: int, now: float) -> None:
+        """A heartbeat of that node."""
+        if node == self.holder:
+            self._heard_at = now
+
+    # -- what time and others do
+
+    def step(self, pv: float) -> float:
+        """One sample: MV, with the ends that are counted in samples or seen in PV."""
+        if self.is_open:
+            if self.channel.relay is not None:
+                self._watch_relay(pv)
+            if not self._samples_left:
+                self.end(Cause.LEASE)
+            self._samples_left -= 1
+        mv = self.channel.step(pv)
+        if self._unsettled and not self.channel.measuring:
+            self.settle()
+            mv, self.unasked = self.channel.mv, False
+        self._unsettled = self._without_pv = False
+        return mv
+
+    def _watch_relay(self, pv: float) -> None:
+        """A PV that is no number is not out of bounds."""
+        relay = self.channel.relay
+        assert relay is not None
+        if relay.samples_left == 0:
+            self.end(Cause.RELAY_SAMPLES)
+        elif pv < relay.settings.pv_low or pv > relay.settings.pv_high:
+            self.end(Cause.PV_LIMIT)
+        else:
+            relay.samples_left -= 1
+
+    def tick(self, now: float) -> None:
+        """The ends that are counted in time. To be called a few times in the shortest of them."""
+        if self.channel.good_samples != self._good_samples:
+            self._good_samples, self._valid_at = self.channel.good_samples, now
+        terms = self.terms
+        allowed_s = terms.pv_silence_s if terms is not None else self._pv_timeout_s
+        self.silent = now - self._valid_at > allowed_s
+        if terms is None:
+            if self._unsettled:
+                self.settle()
+            elif self._without_pv and now >= self._again_at:
+                # For the first time it was said a moment ago, by `settle`, which knows no time.
+                self.unasked |= self._again_at > 0.0
+                self._again_at = now + AGAIN_S
+            return
+        if now - self._heard_at > terms.watch_s:
+            self.end(Cause.HEARTBEAT)
+        elif now > self._lease_until:
+            self.end(Cause.LEASE)
+        elif self.silent:
+            self.end(Cause.NO_PV)
+
+    def another_hand(self, what: Hand) -> None:
+        """Somebody commands something by the ordinary objects: the test is over, and what they command is theirs.
+
+        To be called before it is carried out, `settle` after it.
+        """
+        self.hand |= what
+        self._end(Cause.HAND)
+
+    def end(self, cause: Cause, operational: bool = True) -> None:
+        """Everything goes home; without a session nothing does.
+
+        operational: False when the node leaves that state and no PV will be heard any more.
+        """
+        self._end(cause)
+        self.settle(operational)
+
+    def _end(self, cause: Cause) -> None:
+        if self.is_open:
+            state = RelayState.ENDED_BY_LIMIT if cause is Cause.PV_LIMIT else RelayState.DONE
+            self.channel.go_home(self.home, state)
+            self.last, self.number, self.terms, self.cause = self.number, 0, None, cause
+            self._unsettled = True
+
+    def settle(self, operational: bool = True) -> None:
+        """Where no PV will ask for the output that the end of a session left, it is moved at once: to what the mode
+        stands for, in automatic to that of home."""
+        if (self._unsettled or self._without_pv) and not (operational and self.pv_is_valid):
+            # A hand that comes later goes on from the output that the end has left.
+            self.channel.without_pv(self.home.mv if self._unsettled else self.channel.mv)
+            self._unsettled, self._without_pv, self.unasked, self._again_at = False, True, True, 0.0

@@ -1,0 +1,72 @@
+"""What is wrong with a device, said by EMCY, in the error register (1001h) and in the error history (1003h)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from protocol.dictionary import Dictionary
+from protocol.objects import Value, lookup
+from protocol.profile import EMCY_FRAME, EMCY_REGISTER, Abort, Emcy
+from protocol.sdo import SdoAbort
+
+_MOST_REMEMBERED = len(lookup("error_field").names)
+
+
+class Emergencies:
+    """`send` takes the frame of an EMCY. Each error is known with its source: two sources may have the same."""
+
+    def __init__(self, dictionary: Dictionary, send: Callable[[bytes], None]) -> None:
+        self._send = send
+        self._errors: list[tuple[Emcy, bytes]] = []
+        self._history: list[int] = []
+        dictionary.on_read["error_register"] = lambda sub: self._register()
+        dictionary.on_read["error_field"] = self._read_history
+        dictionary.on_write["error_field"] = self._write_history
+
+    def raise_error(self, code: Emcy, detail: bytes = b"", source: bytes | None = None) -> None:
+        """Says it once per occurrence; an error that stays is not repeated until `clear_error`.
+
+        The source is the first byte of `detail`, a channel or a node, unless another is given. The same error of
+        another source is said too: whoever holds channel 2 must not miss what happens to it because channel 1 has the
+        same error.
+        """
+        error = code, detail[:1] if source is None else source
+        if error in self._errors:
+            return
+        self._errors.append(error)
+        self._history = [int(code), *self._history][:_MOST_REMEMBERED]
+        self._send(EMCY_FRAME.pack(code, EMCY_REGISTER[code], detail[:5]))
+
+    def clear_error(self, code: Emcy, source: bytes | None = None) -> None:
+        """Ends the error of one source, or of all. EMCY 0000h says it, with the register of what is left."""
+        left = [error for error in self._errors if error[0] != code or source not in (None, error[1])]
+        if len(left) < len(self._errors):
+            self._errors = left
+            self._send(EMCY_FRAME.pack(Emcy.ERROR_GONE, self._register(), b""))
+
+    def sources(self, code: Emcy) -> list[bytes]:
+        """The sources of the errors with this code that are not cleared."""
+        return [source for each, source in self._errors if each is code]
+
+    def forget(self) -> None:
+        """As at power-on, in silence."""
+        self._errors.clear()
+        self._history.clear()
+
+    def _register(self) -> int:
+        register = 0
+        for code, _ in self._errors:
+            register |= EMCY_REGISTER[code]
+        return register
+
+    def _read_history(self, sub: int) -> Value:
+        if sub == 0:
+            return len(self._history)
+        if sub > len(self._history):
+            raise SdoAbort(Abort.NO_DATA)
+        return self._history[sub - 1]
+
+    def _write_history(self, sub: int, value: Value) -> None:
+        if value != 0:
+            raise SdoAbort(Abort.INVALID_VALUE)
+        self._history.clear()

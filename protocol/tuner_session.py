@@ -1,0 +1,90 @@
+"""The tuner's side of a session: opening it, giving orders that only it can give, renewing and closing it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, dataclass
+
+from protocol.objects import Value, lookup
+from protocol.profile import Abort, Order
+from protocol.session import STAGED, check_of, object_of
+from protocol.tuner import Tuner, TunerError
+
+
+@dataclass(frozen=True, slots=True)
+class Lease:
+    """What a session is opened with, in samples and in ms of the controller's clock (`controller.session.Terms`)."""
+
+    samples: int
+    ms: int
+    pv_silence_ms: int
+    watch_ms: int
+
+
+class TunerSession:
+    """A session on the channel of one tuner. Every call raises TunerError, an abort where the controller refuses."""
+
+    def __init__(self, tuner: Tuner) -> None:
+        self.number = 0
+        """The number of the session opened or taken up last; 0: none yet."""
+        self._tuner = tuner
+        self._count = 0
+        self._staged: dict[str, Value] = {}
+
+    def open(self, lease: Lease, remember: Callable[[int], None]) -> None:
+        """remember: writes the number down before the opening is sent, so that who comes after us can close it."""
+        for last_try in (False, False, True):
+            number = int(self._tuner.number("controller_session_next"))
+            remember(number)
+            self.number, self._count = number, 0
+            self._staged.clear()
+            try:
+                self.give(Order.OPEN, (self._tuner.station.node, *astuple(lease)))
+                return
+            except TunerError as error:  # another tuner has opened, or staged, at the same time
+                if last_try or error.code != Abort.INVALID_VALUE:
+                    raise
+
+    def take_up(self, number: int) -> None:
+        """The session is one that was opened before, by us or by a process that has died."""
+        self.number = number
+        self._count = int(self._tuner.number("controller_session_count"))
+        self._staged.clear()
+
+    def give(self, order: Order, values: Sequence[Value] = (), between: Callable[[], None] = lambda: None) -> None:
+        """Stages what is not staged so already and puts it in force.
+
+        between: called before each value; what keeps the session open while an answer is slow.
+        """
+        try:
+            self._give(order, values, between)
+        except TunerError as error:
+            if error.code != Abort.INVALID_VALUE or order is Order.OPEN:
+                raise
+            # Somebody has staged other values, or an order was put in force whose answer was lost.
+            self.take_up(self.number)
+            self._give(order, values, between)
+
+    def _give(self, order: Order, values: Sequence[Value], between: Callable[[], None]) -> None:
+        sent = []
+        for name, value in zip(STAGED[order], values, strict=True):
+            entry = lookup(name).type
+            sent.append(entry.decode(entry.encode(value)))
+            if self._staged.get(name) != sent[-1]:
+                between()
+                self._tuner.write(name, float(value))
+                self._staged[name] = sent[-1]
+        between()
+        self._tuner.write(object_of(order), check_of(self.number, self._count, order, sent))
+        self._count += 1
+
+    def renew(self) -> None:
+        self._tuner.write("controller_session_renewal", self.number)
+
+    def close(self) -> None:
+        self.give(Order.CLOSE)
+
+    @property
+    def is_open(self) -> bool:
+        """Asked of the controller."""
+        return self.number != 0 and int(self._tuner.number("controller_session")) == self.number

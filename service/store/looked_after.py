@@ -1,0 +1,77 @@
+"""The loops that are looked after: those of jobs whose end did not find them home, until they are or somebody says so.
+
+The column is `JobRow.look_after`; everything that ends it writes an event of the job.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy import distinct, func, select
+from sqlalchemy.orm import Session
+
+from service.plain import plain
+from service.security import audit
+from service.store.store import Store, Write, append, set_columns
+from service.store.tables import JobRow
+
+
+def rows(store: Store, loop: str | None = None) -> Sequence[JobRow]:
+    """The jobs of this host with a loop that is looked after, or those of one loop on whatever host; the latest
+    first."""
+    mine = JobRow.host == store.host if loop is None else JobRow.loop == loop
+    with store.reading() as session:
+        wanted = select(JobRow).where(mine, JobRow.look_after.is_(True)).order_by(JobRow.number.desc())
+        return session.scalars(wanted).all()
+
+
+def count(session: Session, host: str) -> int:
+    """How many loops of a host are looked after."""
+    wanted = select(func.count(distinct(JobRow.loop))).where(JobRow.host == host, JobRow.look_after.is_(True))
+    return session.scalar(wanted) or 0
+
+
+def home_again(store: Store, job_id: str, restored: dict[str, Any], text: str) -> bool:
+    """The loop was read back. False when somebody else was faster to end it."""
+    with store.writing() as session:
+        wanted = select(JobRow).where(JobRow.id == job_id, JobRow.look_after.is_(True)).with_for_update()
+        row = session.scalars(wanted).one_or_none()
+        if row is None:
+            return False
+        row.look_after, row.restored = False, plain(restored)
+        append(session, row.id, "loop_found", {"text": text}, row.plant_time_s)
+        return True
+
+
+def opened(job_id: str, columns: dict[str, Any]) -> Write:
+    """The job has opened a session of its own: its loop is looked after for no other job. columns: what else is now
+    known of the job."""
+    text = f"looked after no more: job {job_id} has opened a session on the loop"
+
+    def write(session: Session) -> None:
+        job = session.scalars(select(JobRow).where(JobRow.id == job_id).with_for_update()).one()
+        set_columns(job, columns)
+        for row in _of_loop(session, job.loop):
+            if row.id != job_id:
+                row.look_after = False
+                append(session, row.id, "loop_found", {"text": text}, row.plant_time_s)
+
+    return write
+
+
+def dismissed(store: Store, loop: str, by: str) -> list[str]:
+    """A person answers for the loop. Returns the ids of the jobs it was looked after for."""
+    with store.writing() as session:
+        found = _of_loop(session, loop)
+        for row in found:
+            row.look_after = False
+            append(session, row.id, "dismissed", {"by": by}, row.plant_time_s)
+            before = {"look_after": True, "reason": row.reason}
+            audit.record(session, "dismiss", row.id, before=before, after={"look_after": False}, loop=loop, said_by=by)
+        return [row.id for row in found]
+
+
+def _of_loop(session: Session, loop: str) -> Sequence[JobRow]:
+    wanted = select(JobRow).where(JobRow.loop == loop, JobRow.look_after.is_(True)).order_by(JobRow.number)
+    return session.scalars(wanted.with_for_update()).all()

@@ -1,0 +1,52 @@
+"""Bugs put in on purpose: what the simulation must find. Each takes a way to replace an attribute, and does so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from controller import session
+from controller.channel import Channel, Home
+from protocol.objects import Value
+from protocol.profile import Order, RelayState
+
+Replace = Callable[[Any, str, Any], None]
+
+
+class _OfAnyCount(int):
+    """A check that is equal to that of each of the first orders of a session."""
+
+    checks: frozenset[int]
+
+    def __ne__(self, other: object) -> bool:
+        return other not in self.checks
+
+
+def count_is_not_checked(replace: Replace) -> None:
+    """The controller obeys an order of this session whatever its count."""
+    real = session.check_of
+
+    def check_of(number: int, count: int, order: Order, values: Sequence[Value]) -> int:
+        check = _OfAnyCount(real(number, count, order, values))
+        check.checks = frozenset(real(number, each, order, values) for each in range(60))
+        return check
+
+    replace(session, "check_of", check_of)
+
+
+def set_point_stays(replace: Replace) -> None:
+    """The end of a session brings mode and gains home, and leaves the set-point."""
+    go_home = Channel.go_home
+
+    def goes_home(self: Channel, home: Home, relay_state: RelayState = RelayState.DONE) -> None:
+        setpoint = self.setpoint
+        go_home(self, home, relay_state)
+        self.setpoint = setpoint
+
+    replace(Channel, "go_home", goes_home)
+
+
+BUGS: dict[str, Callable[[Replace], None]] = {
+    "count-is-not-checked": count_is_not_checked,
+    "set-point-stays": set_point_stays,
+}
