@@ -140,6 +140,7 @@ def test_a_session_is_opened_ordered_renewed_and_closed(master: Master) -> None:
     master.order(SETPOINT, 50.0)
     master.order(RELAY, 5.0, 0.0, 50.0, 100_000, 40.0, 60.0, 0.0, 1)
     assert (master.read(0x2101), master.read(0x2159)) == (EXPERIMENT, 1)
+    until(lambda: master.read(0x6410) in {45.0, 55.0})  # until then 6410h shows the last sample in automatic
     seen = set()
     began = time.monotonic()
     while time.monotonic() < began + 4.0:  # longer than the lease
