@@ -7,9 +7,11 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-DEBIAN := user-mode-linux tshark can-utils iproute2 postgresql systemd
+# A compiler: user-mode Linux alone runs on no processor with AMX (tools/uml_xstate.c).
+UML := user-mode-linux iproute2 $(shell grep -qs amx_tile /proc/cpuinfo && echo gcc libc6-dev)
+DEBIAN := $(UML) tshark can-utils postgresql systemd
 ENGINE := docker.io docker-compose
-BESIDE := debootstrap user-mode-linux iproute2 e2fsprogs
+BESIDE := $(UML) debootstrap e2fsprogs
 
 .PHONY: setup demo test compose-test check bench bench-tuning validate faults simulate system clean
 
