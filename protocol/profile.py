@@ -15,7 +15,6 @@ PLANT_NODE = 0x10
 CONTROLLER_NODE = 0x20
 TUNER_NODE = 0x7D
 """Node-ID of a gateway that is given no other."""
-LISTENER_NODE = 0x7E
 MAX_CHANNELS = 199
 REVISION = 0x00020000
 """1018h:3 of both devices. The upper half counts what they do differently on the bus, the lower half the rest."""

@@ -16,7 +16,6 @@ from typing import NamedTuple
 from protocol.bus import Bus, Frame
 from protocol.objects import Device, Object, Shape, Type, Value, lookup
 from protocol.profile import (
-    EMCY_FRAME,
     HEARTBEAT_FRAME,
     MV_FRAME,
     PLANT_NODE,
@@ -24,10 +23,8 @@ from protocol.profile import (
     STATUS_FRAME,
     UNASKED,
     Abort,
-    Cause,
     NmtState,
     channel_ids,
-    emcy_id,
     heartbeat_id,
     sdo_request_id,
     sdo_response_id,
@@ -119,10 +116,9 @@ class Tuner:
         self._sdo_timeout_s = sdo_timeout_s
         self._sdo_tries = sdo_tries
         self._pv_id, self._mv_id, self._status_id = ids.pv, ids.mv, ids.status
-        self._emcy_id = emcy_id(controller_node)
         self._alive = {heartbeat_id(node): node for node in (controller_node, plant_node) if node is not None}
         self._bus: Bus = self.station.open_bus(url)
-        self._heard = frozenset({self._pv_id, self._mv_id, self._status_id, self._emcy_id, *self._alive})
+        self._heard = frozenset({self._pv_id, self._mv_id, self._status_id, *self._alive})
         self._bus.set_filters(self._heard)
         self._answers: deque[Frame] = deque()
         self._samples: deque[BusSample] = deque()
@@ -130,11 +126,9 @@ class Tuner:
         self.beating = False
         """Only who holds the loop beats: a mere reader must not keep alive the trial of a tuner that died."""
         self.mode, self.on_trial, self.sp = 0, False, 0.0
-        self.session_is_open, self.cause = False, Cause.NONE
+        self.session_is_open = False
         self.node_states: dict[int, int] = {}
         """NMT states of controller and plant by node-ID, as their heartbeats have said last."""
-        self.emergencies: list[int] = []
-        """EMCY codes of the controller other than "error gone", until the owner clears them."""
         self.restarted = False
         """The controller sent a boot-up frame."""
 
@@ -191,13 +185,8 @@ class Tuner:
             elif can_id == self._pv_id:
                 self._pv = PV_FRAME.unpack(data)
             elif can_id == self._status_id:
-                self.mode, on_trial, self.sp, is_open, cause = STATUS_FRAME.unpack(data)
+                self.mode, on_trial, self.sp, is_open, _cause = STATUS_FRAME.unpack(data)
                 self.on_trial, self.session_is_open = bool(on_trial), bool(is_open)
-                self.cause = Cause(cause) if cause in Cause._value2member_map_ else Cause.NONE
-            elif can_id == self._emcy_id:
-                code = EMCY_FRAME.unpack(data)[0]
-                if code:
-                    self.emergencies.append(code)
             elif can_id in self._alive:
                 (state,) = HEARTBEAT_FRAME.unpack(data)
                 self.node_states[self._alive[can_id]] = state

@@ -12,7 +12,6 @@ from protocol.bus import Bus
 from protocol.dictionary import Dictionary
 from protocol.objects import Device
 from protocol.profile import (
-    EMCY_FRAME,
     MV_FRAME,
     PV_FRAME,
     STATUS_FRAME,
@@ -20,10 +19,8 @@ from protocol.profile import (
     UNASKED,
     Abort,
     Cause,
-    Emcy,
     NmtState,
     channel_ids,
-    emcy_id,
     heartbeat_id,
     sdo_request_id,
     sdo_response_id,
@@ -178,16 +175,14 @@ def test_draining_forgets_the_past(tuner: Tuner, bus: ListBus) -> None:
     assert tuner.sample(0.0) is None
 
 
-def test_emergencies_and_restarts_are_noted(tuner: Tuner, bus: ListBus) -> None:
-    for code in (Emcy.LEASE_USED_UP, Emcy.ERROR_GONE):
-        bus.incoming.append((emcy_id(NODE), EMCY_FRAME.pack(code, 0, b"")))
+def test_a_restart_is_noted(tuner: Tuner, bus: ListBus) -> None:
     bus.incoming.append((heartbeat_id(NODE), b"\0"))
     tuner.drain()
-    assert (tuner.emergencies, tuner.restarted) == ([Emcy.LEASE_USED_UP], True)
+    assert tuner.restarted
 
 
 @pytest.mark.parametrize(
-    "can_id", [IDS.pv, IDS.mv, IDS.status, emcy_id(NODE), heartbeat_id(NODE), sdo_response_id(NODE)]
+    "can_id", [IDS.pv, IDS.mv, IDS.status, heartbeat_id(NODE), sdo_response_id(NODE)]
 )
 def test_a_frame_of_the_wrong_length_does_no_harm(tuner: Tuner, bus: ListBus, can_id: int) -> None:
     bus.incoming.append((can_id, b""))
@@ -291,7 +286,6 @@ def test_the_end_of_a_session_is_heard(tuner: Tuner, bus: ListBus) -> None:
         bus.incoming.append((IDS.status, STATUS_FRAME.pack(2, 0, 50.0, is_open, cause)))
         tuner.drain()
         assert tuner.session_is_open == bool(is_open)
-        assert tuner.cause == (cause if cause != 99 else Cause.NONE), "one of a later revision is none of ours"
 
 
 def test_the_states_of_both_nodes_are_noted(tuner: Tuner, bus: ListBus) -> None:
