@@ -49,7 +49,7 @@ def compute(
     try:
         value = work(report) if reports else work()
         message: tuple[Said, Any] = (Said.RESULT, value)
-    except MemoryError:
+    except (MemoryError, SystemError):  # SystemError: of the interpreter itself where memory was refused
         message = (Said.NO_MEMORY, None)
     except BaseException as error:
         message = (Said.ERROR, error)
