@@ -94,6 +94,19 @@ def serve(
     computations: Annotated[
         int, typer.Option(min=1, envvar="LOOPWRIGHT_COMPUTATIONS", help="Tunings computed at once, of all callers.")
     ] = 2,
+    live_cpu_s: Annotated[
+        int, typer.Option(min=1, envvar="LOOPWRIGHT_LIVE_CPU_S", help="Processor time of a live loop's computation, s.")
+    ] = 120,
+    tuning_cpu_s: Annotated[
+        int, typer.Option(min=1, envvar="LOOPWRIGHT_TUNING_CPU_S", help="Processor time of a tuning, s.")
+    ] = 60,
+    dry_run_cpu_s: Annotated[
+        int, typer.Option(min=1, envvar="LOOPWRIGHT_DRY_RUN_CPU_S", help="Processor time of a dry run, s.")
+    ] = 300,
+    computation_memory_mb: Annotated[
+        int,
+        typer.Option(min=16, envvar="LOOPWRIGHT_COMPUTATION_MEMORY_MB", help="Memory of one computation, MB."),
+    ] = 512,
     keep_jobs: Annotated[
         int | None,
         typer.Option(min=1, envvar="LOOPWRIGHT_KEEP_JOBS", help="Keep samples of so many jobs per loop; default: all."),
@@ -111,6 +124,7 @@ def serve(
     from sqlalchemy.exc import SQLAlchemyError
 
     from protocol.process import node_id
+    from service.computing.limits import ComputingLimits
     from service.config import ConfigError
     from service.retention import Keep
     from service.security.limits import RequestLimits
@@ -137,6 +151,7 @@ def serve(
         loops, data, bind, port, database, host, resume,
         node=own_node, auth=auth, limits=limits, log_format="json" if log_format == "json" else "text",
         keep=Keep(keep_jobs, keep_days),
+        computing=ComputingLimits(live_cpu_s, tuning_cpu_s, dry_run_cpu_s, computation_memory_mb),
     )  # fmt: skip
     try:
         run(setup)

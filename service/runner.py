@@ -185,6 +185,9 @@ def run(
         result.value = end.value
     except Ended as ended:
         result.ended = ended
+    except MemoryError:
+        text = f"no memory was left at {now:.3f} s of plant time, in stage {stage or 'start'}"
+        result.ended = Failed(Reason.COMPUTATION_LIMIT, text)
     except Exception as defect:
         result.ended = Failed(Reason.INTERNAL, f"{type(defect).__name__}: {defect}")
         on_event(Note(f"defect in stage {stage}: {defect!r}"))

@@ -8,7 +8,6 @@ import signal
 import socket
 import threading
 from collections.abc import Callable
-from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -22,7 +21,9 @@ from protocol.profile import TUNER_NODE
 from protocol.station import Station
 from service import logs
 from service.api.app import create_app
-from service.computing import Workers
+from service.computing.limits import ComputingLimits, Kind
+from service.computing.pool import Pool
+from service.computing.rehearsals import apart
 from service.config import LoopConfig, load_site
 from service.engine.durable import POLL_S, DurableEngine
 from service.jobs import Jobs, LoopFactory
@@ -131,7 +132,7 @@ class Setup:
 
     bind: the address to listen on.  host: this host's name among those that share the database.
     resume: jobs that a dead service left go on.  poll_s: how often the engine looks for jobs, s of wall time.
-    keep: whose samples are kept.
+    keep: whose samples are kept.  computing: what one computation may take.
     node: our node-ID on every bus, another one than any other gateway's.
     auth: whether keys are asked for; None: unless the address is this machine's own.
     """
@@ -149,10 +150,11 @@ class Setup:
     limits: RequestLimits = field(default_factory=RequestLimits)
     log_format: LogFormat = "text"
     keep: Keep = field(default_factory=Keep)
+    computing: ComputingLimits = field(default_factory=ComputingLimits)
 
 
 def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None = None) -> None:
-    """Serves until SIGTERM or SIGINT; every loop is restored before it returns. tune: by default with workers.
+    """Serves until SIGTERM or SIGINT; every loop is restored before it returns. tune: by default computed by a pool.
 
     Raises ConfigError, FolderInUse, ForeignLoop, BadDatabase, NotSafe, OSError (the address cannot be had),
     SQLAlchemyError (the database cannot be reached).
@@ -168,11 +170,12 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
     if setup.auth is False and not local:
         raise NotSafe(f"without keys only this machine is served: leave out --no-auth, or --bind {setup.bind}")
     with ExitStack() as stack:
-        if tune is None:  # forked before there is anything that a child should not have
-            tune = partial(live, workers=_workers(stack))
         signals = stack.enter_context(Signals())
         # Bound before anything is started, so that a busy port is an error and not half a service.
         listener = stack.enter_context(listen(setup.bind, setup.port))
+        pool = stack.enter_context(closing(Pool(setup.computing)))
+        if tune is None:  # loads the fork server, so that the first computation of a loop need not wait for it
+            pool.submit(Kind.LIVE, os.getpid)
         store = Store(setup.data, setup.database, setup.host or LOCAL)
         try:
             keyring = Keyring(store.engine) if setup.auth or not local else None
@@ -188,14 +191,14 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
                 site.loops,
                 store,
                 open_loop or partial(open_bus_loop, Station(setup.node)),
-                tune,
-                rehearse,
+                tune or partial(live, workers=pool),
+                apart(rehearse, pool),
                 engine=engine,
                 buses=site.buses,
                 resume=setup.resume,
             )
             config = uvicorn.Config(
-                create_app(jobs, policy),
+                create_app(jobs, policy, pool=pool),
                 log_config=None,
                 log_level="warning",
                 access_log=False,
@@ -214,15 +217,6 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
                 jobs.stop()
         finally:
             store.close()
-
-
-def _workers(stack: ExitStack) -> Workers | None:
-    """None where this machine has no room for them."""
-    try:
-        return stack.enter_context(closing(Workers()))
-    except (OSError, BrokenExecutor) as error:
-        _log.warning("no processes for long computations, the service does them itself: %s", error)
-        return None
 
 
 def listen(bind: str, port: int) -> socket.socket:

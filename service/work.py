@@ -19,7 +19,7 @@ from tuning.stages.common import Facts
 from tuning.stages.settle import after_settling
 
 if TYPE_CHECKING:
-    from service.computing import Workers
+    from service.computing.beside import Workers
 
 TIME_BUDGET_T95 = {FAST: 100.0}
 OTHER_BUDGET_T95 = 500.0
@@ -78,7 +78,7 @@ def tune(
     workers: Workers | None = None,
 ) -> Outcome:
     """The procedure asked for on the live loop. workers: who computes, by default a thread."""
-    from service.computing import Computing
+    from service.computing.beside import Computing
     from service.runner import Watch, run
 
     facts = Facts(

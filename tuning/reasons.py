@@ -54,6 +54,8 @@ class Reason(StrEnum):
     NODE_NOT_OPERATIONAL = "node_not_operational"
     DEVICE_WENT_BACK = "device_went_back"
     RESTORE_UNCONFIRMED = "restore_unconfirmed"
+    COMPUTATION_LIMIT = "computation_limit"
+    COMPUTATION_LOST = "computation_lost"
     INTERNAL = "internal"
     # aborted: by another's hand on the loop, on request, or with the service
     SETPOINT_CHANGED = "setpoint_changed"
@@ -116,6 +118,10 @@ ADVICE: dict[Reason, str] = {
     "it again by itself, and sends no NMT command.",
     Reason.DEVICE_WENT_BACK: "The controller ended the test by itself (lease, heartbeat): check this machine's load.",
     Reason.RESTORE_UNCONFIRMED: "The loop could not be read back after the test: look at the controller NOW.",
+    Reason.COMPUTATION_LIMIT: "Look for a number in the model or the wishes that is far from any plant's (gain, time "
+    "constants, dead time against T95 and sample time), or permit more by the option of `loopwright serve` named.",
+    Reason.COMPUTATION_LOST: "The system ended the computation, or had no room for it: see that the machine has memory "
+    "left, then repeat.",
     Reason.INTERNAL: "This is a defect of Loopwright; please report it with the job's events.",
     Reason.OUTPUT_CHANGED: "Somebody else moved the manual output during the test; agree on the time and repeat.",
     Reason.LIMITS_CHANGED: "Somebody else changed a limit, the span or the action during the test; agree on the time "

@@ -27,6 +27,7 @@ from service.api.views import (
     live_view,
     loop_view,
 )
+from service.computing.pool import Pool
 from service.fleet import Fleet
 from service.jobs import Jobs
 from service.request import RetuneRequest
@@ -41,9 +42,15 @@ JobId = Annotated[str, Path(description="Id of the job", examples=["4f0c2a9be113
 
 
 def create_app(
-    jobs: Jobs, policy: Policy | None = None, checks: Mapping[str, operations.Check] | None = None
+    jobs: Jobs,
+    policy: Policy | None = None,
+    checks: Mapping[str, operations.Check] | None = None,
+    pool: Pool | None = None,
 ) -> FastAPI:
-    """The API over these jobs; ends them when the server shuts down. checks: what must be well to be ready."""
+    """The API over these jobs; ends them when the server shuts down. checks: what must be well to be ready.
+
+    pool: who computes tunings; None: one of its own.
+    """
 
     many = Fleet(jobs)
 
@@ -195,7 +202,7 @@ def create_app(
     def rollback(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
         return view(jobs.rollback(job_id, (decision or Decision()).by))
 
-    app.include_router(tunings.router(jobs))
+    app.include_router(tunings.router(jobs, pool or Pool()))
     return app
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 from http import HTTPStatus
 from typing import Any
 
-from fastapi import FastAPI, Request
+from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 
+from service.computing.pool import NotWanted
 from service.errors import Conflict, Stopping, UnknownLoop
 from service.journal import temporary
 from service.model_forms import BadModel
@@ -22,6 +23,8 @@ from service.tunings import BadTuning
 from tuning.reasons import ADVICE, Ended, Reason
 
 MEDIA_TYPE = "application/problem+json"
+CLIENT_GONE = 499
+"""As other servers log it: nobody is there to read the answer."""
 
 
 class Problem(BaseModel):
@@ -87,6 +90,10 @@ def install(app: FastAPI) -> None:
     async def _conflict(_request: Request, error: Exception) -> JSONResponse:
         return problem(409, str(error))
 
+    @app.exception_handler(NotWanted)
+    async def _gone(_request: Request, _error: NotWanted) -> Response:
+        return Response(status_code=CLIENT_GONE)
+
     @app.exception_handler(Stopping)
     async def _stopping(_request: Request, error: Stopping) -> JSONResponse:
         return problem(503, str(error), reason=Reason.SERVICE_STOPPED)
@@ -100,7 +107,8 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(Ended)
     async def _ended(_request: Request, error: Ended) -> JSONResponse:
-        return problem(503, error.detail, reason=error.reason)
+        asked_too_much = error.reason is Reason.COMPUTATION_LIMIT
+        return problem(422 if asked_too_much else 503, error.detail, reason=error.reason)
 
     @app.exception_handler(Exception)
     async def _defect(_request: Request, error: Exception) -> JSONResponse:

@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Callable
-from typing import Annotated, Any
+from functools import partial
+from typing import Annotated
 
-from fastapi import APIRouter, Path, Query
+from fastapi import APIRouter, Path, Query, Request
+from fastapi.concurrency import run_in_threadpool
 
 from service import tunings
 from service.alternatives import alternatives, redesigned
 from service.api import problems
+from service.api.computed import Work, computed
 from service.api.samples import sample_columns
 from service.api.tuning_views import AlternativesView, MethodView, TuningRequest, TuningsView
+from service.computing.pool import Pool
 from service.fast_record import kept
 from service.jobs import Jobs
 from service.model_forms import parse_model
 from tuning.fast.procedure import FAST
 
 
-def router(jobs: Jobs) -> APIRouter:
-    """GET /methods, POST /tunings, GET /jobs/{job_id}/alternatives."""
+def router(jobs: Jobs, pool: Pool) -> APIRouter:
+    """GET /methods, POST /tunings, GET /jobs/{job_id}/alternatives. pool: who computes."""
     routes = APIRouter()
-    one_at_a_time = asyncio.Semaphore(1)
-
-    async def computed(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        # a second of arithmetic each: many at once would crowd out the threads that attend to live loops
-        async with one_at_a_time:
-            return await asyncio.to_thread(work)
 
     @routes.get("/methods", tags=["tunings"], summary="The tuning methods")
     def methods() -> list[MethodView]:
@@ -39,9 +35,9 @@ def router(jobs: Jobs) -> APIRouter:
         summary="Tune a model by one method or all",
         responses=problems.responses(422),
     )
-    async def tune(request: TuningRequest) -> TuningsView:
-        model = parse_model(request.model)
-        return TuningsView(**await computed(lambda: tunings.tunings(model, request.method, request.options)))
+    async def tune(request: TuningRequest, http: Request) -> TuningsView:
+        work = partial(tunings.tunings, parse_model(request.model), request.method, request.options)
+        return TuningsView(**await computed(pool, work, http, lambda: jobs.stopping))
 
     @routes.get(
         "/jobs/{job_id}/alternatives",
@@ -50,6 +46,7 @@ def router(jobs: Jobs) -> APIRouter:
         responses=problems.responses(404, 409, 422),
     )
     async def job_alternatives(
+        http: Request,
         job_id: Annotated[str, Path(description="Id of the job", examples=["4f0c2a9be113"])],
         method: Annotated[
             str | None, Query(description="Only this one; without it all but the slow one, me-pso", examples=["me-pso"])
@@ -65,17 +62,19 @@ def router(jobs: Jobs) -> APIRouter:
             bool | None, Query(description="With `ms`: a PID where it pays; by default as the job had it")
         ] = None,
     ) -> AlternativesView:  # fmt: skip
-        def work() -> dict[str, Any]:
-            row, events = jobs.store.get(job_id), jobs.store.events(job_id)
-            if ms is None:
-                if derivative is not None:
-                    raise tunings.BadTuning("derivative is for another ms: give that too")
-                return alternatives(row, events, method)
-            if method not in (None, FAST):
-                raise tunings.BadTuning(f"ms is for the method fast, not for {method}: leave one of them out")
-            wanted = bool(row.request.get("derivative")) if derivative is None else derivative
-            return redesigned(row, events, kept(sample_columns(jobs.store.samples(job_id))), ms, wanted)
+        if ms is None and derivative is not None:
+            raise tunings.BadTuning("derivative is for another ms: give that too")
+        if ms is not None and method not in (None, FAST):
+            raise tunings.BadTuning(f"ms is for the method fast, not for {method}: leave one of them out")
+        work = await run_in_threadpool(wish, job_id, method, ms, derivative)
+        return AlternativesView(**await computed(pool, work, http, lambda: jobs.stopping))
 
-        return AlternativesView(**await computed(work))
+    def wish(job_id: str, method: str | None, ms: float | None, derivative: bool | None) -> Work:
+        """What is to be computed, with all that it needs of the store."""
+        row, events = jobs.store.get(job_id), jobs.store.events(job_id)
+        if ms is None:
+            return partial(alternatives, row, events, method)
+        wanted = bool(row.request.get("derivative")) if derivative is None else derivative
+        return partial(redesigned, row, events, kept(sample_columns(jobs.store.samples(job_id))), ms, wanted)
 
     return routes

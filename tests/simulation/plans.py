@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from random import Random
 from typing import Any
 
+from service.computing.limits import Kind
 from service.config import LoopConfig
 from service.loop import Loop, LoopState
 from service.plain import plain_object
@@ -133,14 +134,14 @@ def tunes(actions: tuple[Action, ...]) -> Tune:
 class Here:
     """Workers that compute at once, in no simulated time."""
 
-    def submit(self, compute: Callable[[], Any]) -> Future[Any]:
+    def submit(self, kind: Kind, work: Callable[[], Any], unwanted: Callable[[], bool]) -> Future[Any]:
         future: Future[Any] = Future()
         try:
-            future.set_result(compute())
+            future.set_result(work())
         except Exception as error:
             future.set_exception(error)
         return future
 
 
 def real(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks) -> Outcome:
-    return tune(config, request, loop, state, hooks, Here())  # type: ignore[arg-type]
+    return tune(config, request, loop, state, hooks, Here())

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from service.alternatives import DISPROVED
+from service.alternatives import DISPROVED, alternatives
 from service.model_forms import parse_model
 from service.request import PlantModel, RetuneRequest
 from service.tunings import tunings
@@ -132,7 +132,8 @@ def test_unstable_gains_are_not_to_be_tried(
     # a hundred times the gains that the method found
     monkeypatch.setattr(module, "realisable", lambda gains, _filter: (Gains(100.0 * gains.Kp, gains.Ti), ()))
     job = finished(service, client)
-    (found,) = client.get(f"{job['url']}/alternatives?method=simc").json()["methods"]
+    row, events = service.store.get(job["id"]), service.store.events(job["id"])
+    (found,) = alternatives(row, events, "simc")["methods"]
     assert not assess(FOPDT(2.0, 3.0, 1.0), Gains(found["gains"]["Kp"], found["gains"]["Ti"])).stable
     assert found["outcome"] == "tuned" and found["margins"]["stable"] is False and found["retune"] is None
 

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -28,18 +27,6 @@ def test_a_database_that_cannot_be_used_is_said_in_words(tmp_path: Path, options
     ended = CliRunner().invoke(app, ["serve", *place, *options])
     assert ended.exit_code == 2 and words in ended.output
     assert "secret" not in ended.output and "Traceback" not in ended.output
-
-
-def test_without_room_for_processes_the_service_computes_itself(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def full() -> None:
-        raise BlockingIOError(11, "Resource temporarily unavailable")
-
-    monkeypatch.setattr(serving, "Workers", full)
-    with ExitStack() as stack:
-        assert serving._workers(stack) is None
-    assert "the service does them itself" in caplog.text
 
 
 @pytest.mark.parametrize("node", ["0", "128", "x", "-3"])

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import logging
-import multiprocessing
-import os
-import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import partial
-from multiprocessing.connection import wait
-from typing import Any
+from typing import Any, Protocol
 
+from service.computing.limits import Kind
+from service.computing.pool import NoProcess, NotWanted
 from service.loop import Loop, LoopState, Restored
 from tuning.gains import Gains
 from tuning.plan import Command, Sample, Work
@@ -22,8 +20,6 @@ from tuning.reasons import Reason
 
 HELD_S = 0.3
 """Wall time for which a step may be held up: a part of the heartbeat time."""
-MOST_WORKERS = 4
-NICE = 5
 
 _SWITCH_S = 0.0005
 """How long a computation keeps the interpreter from a thread that has an answer of the bus: Python's 5 ms, twice for
@@ -47,51 +43,10 @@ def _alone() -> Iterator[None]:
             sys.setswitchinterval(usual)
 
 
-class Workers:
-    """Processes that compute for the loops of this one, which needs its interpreter for the bus.
+class Workers(Protocol):
+    """Who computes in other processes: a `Pool`."""
 
-    To be made before the process has threads: they are forked, and so have loaded what they need. What has killed one
-    ends them all; from then on computations are done here.
-    """
-
-    def __init__(self, count: int | None = None) -> None:
-        # before the fork, so that the first computation does not wait for it
-        import tuning.fast.procedure
-        import tuning.five_stage  # noqa: F401
-
-        count = count or max(1, min(MOST_WORKERS, (os.cpu_count() or 1) - 1))
-        self._pool = ProcessPoolExecutor(count, multiprocessing.get_context("fork"), _begin)
-        self._pool.submit(os.getpid).result()
-        # When one has died the pool ends the others by SIGTERM, which they do not heed, and (from Python 3.12 on) waits
-        # for them with a lock that `submit` needs.
-        for process in self._pool._processes.values():
-            process.terminate = process.kill  # type: ignore[method-assign]
-
-    def submit(self, compute: Callable[[], Any]) -> Future[Any]:
-        """Raises BrokenExecutor."""
-        return self._pool.submit(compute)
-
-    def close(self) -> None:
-        """At once: what is being computed nobody wants any more."""
-        processes = list((self._pool._processes or {}).values())
-        self._pool.shutdown(wait=False, cancel_futures=True)
-        for process in processes:
-            process.kill()
-
-
-def _begin() -> None:
-    """In the worker: it ends with the service, whatever ends that, and by nothing else."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-    os.nice(NICE)
-
-    def outlive() -> None:
-        parent = multiprocessing.parent_process()
-        assert parent is not None
-        wait([parent.sentinel])
-        os._exit(0)
-
-    threading.Thread(target=outlive, daemon=True).start()
+    def submit(self, kind: Kind, work: Callable[[], Any], unwanted: Callable[[], bool]) -> Future[Any]: ...
 
 
 class Computing:
@@ -114,12 +69,8 @@ class Computing:
         if self._workers is None:
             self._beside(work)
             return
-        try:
-            future = self._workers.submit(work.compute)
-        except BrokenExecutor:
-            self._beside(work)
-        else:
-            future.add_done_callback(partial(self._came, work))
+        future = self._workers.submit(Kind.LIVE, work.compute, lambda: self._over)
+        future.add_done_callback(partial(self._came, work))
 
     def step(self, commands: Sequence[Command]) -> Sample:
         if not self._idle.is_set() and self._loop.waits:
@@ -141,9 +92,7 @@ class Computing:
         return self._loop.begin(stop, remember)
 
     def restore(self, home: LoopState, session: int | None = None) -> Restored:
-        # What still waits for its turn nobody wants any more. In a worker it is computed in vain: a pool that breaks
-        # with a cancelled future in its queue gives no word of what is behind it.
-        self._over = True
+        self._over = True  # what is being computed, or waits for its turn, nobody wants any more
         return self._loop.restore(home, session)
 
     def accept(self, gains: Gains, instead_of: Gains) -> LoopState:
@@ -154,17 +103,16 @@ class Computing:
 
     def _came(self, work: Work[Any], future: Future[Any]) -> None:
         """From the workers; called in a thread of theirs."""
-        if future.cancelled():  # the service ends
-            self._idle.set()
-        elif isinstance(error := future.exception(), BrokenExecutor):
-            _log.warning("a worker has died; computations are done in the service from now on")
+        error = future.exception()
+        if isinstance(error, NoProcess):
+            _log.warning("%s; the service computes by itself", error.detail)
             self._beside(work)
-        else:
-            if error is not None:
-                work.fail(error)
-            else:
-                work.finish(future.result())
-            self._idle.set()
+            return
+        if error is None:
+            work.finish(future.result())
+        elif not isinstance(error, NotWanted):
+            work.fail(error)
+        self._idle.set()
 
     def _beside(self, work: Work[Any]) -> None:
         threading.Thread(target=self._do, args=(work,), daemon=True, name="computation").start()
