@@ -106,9 +106,7 @@ def test_the_file_alone_holds_everything_after_a_stop(under_test: tuple[Gateway,
 
 
 @pytest.mark.parametrize("first", SIGNALS, ids=lambda number: signal.Signals(number).name)
-def test_further_signals_do_not_cut_the_stop_short(
-    under_test: tuple[Gateway, str], tmp_path: Path, first: int
-) -> None:
+def test_further_signals_do_not_cut_the_stop_short(under_test: tuple[Gateway, str], tmp_path: Path, first: int) -> None:
     gateway, url = under_test
     held = tmp_path / f"{TAG}.held"
     held.touch()
