@@ -19,15 +19,14 @@ setup: $(VENV)/.installed
 
 # Pinned in constraints.txt: the same versions tomorrow as today.
 $(VENV)/.installed: pyproject.toml constraints.txt
-	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Loopwright needs Python 3.11 or newer")'
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@sh tools/make-venv $(PYTHON) $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
 demo: setup
 	$(BIN)/loopwright demo
 
-# What the tests on a CAN bus need from the system. Root with apt-get: installed; others are told.
+# What the tests need from the system. Root with apt-get: installed; others are told.
 system:
 	@sh tools/system-packages $(DEBIAN)
 
@@ -48,7 +47,9 @@ check: setup
 	$(BIN)/lint-imports
 	$(BIN)/python tools/audit_dependencies.py
 
+# Without them the others are measured, and the table says what was not.
 bench: setup
+	@sh tools/system-packages $(UML) postgresql
 	$(BIN)/python -m benchmarks
 
 # Writes docs/validation.md and its plots; fails when a number of a paper leaves its tolerance.

@@ -2,6 +2,9 @@
 
     python -m benchmarks
     python -m benchmarks answers engine     # only the figures of these, as JSON
+
+A benchmark that lacks something on this machine has a row that says what; the others run. The exit status is 1 when one
+of them went wrong, or one that was asked for by name could not be measured.
 """
 
 from __future__ import annotations
@@ -11,236 +14,100 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import date
 from typing import Any
 
+from benchmarks.command import CANNOT, check_names, parser_of
+from benchmarks.table import HEAD, ROWS, row
+
 WITH_VCAN = ("tools/with-vcan", "--timeout", "900", "--")
-BENCHMARKS = dict.fromkeys(("bus", "load"), WITH_VCAN) | dict.fromkeys(
-    ("rehearsal", "criterion", "response", "me_pso", "tune", "engine", "answers", "fast"), ()
-)
+NO_VCAN = "no CAN interface vcan0 is to be had, tools/with-vcan says above what to install"
 
 
-def figures(name: str) -> dict[str, Any]:
-    """The JSON object a benchmark prints; under user-mode Linux its progress comes before it.
+@dataclass(frozen=True)
+class Benchmark:
+    """command: what runs it. lacks: what to install where it ends with the status CANNOT."""
 
-    Raises CalledProcessError with its output shown.
-    """
-    print(f"{name} ...", file=sys.stderr, flush=True)
-    command = [*BENCHMARKS[name], sys.executable, "-m", f"benchmarks.{name}"]
-    found = subprocess.run(command, stdout=subprocess.PIPE, text=True)
-    if found.returncode:
-        print(found.stdout)
-        found.check_returncode()
+    command: Sequence[str]
+    lacks: str = ""
+
+
+def _on_a_bus(name: str) -> Benchmark:
+    return Benchmark((*WITH_VCAN, sys.executable, "-m", f"benchmarks.{name}"), NO_VCAN)
+
+
+BENCHMARKS = {name: Benchmark((sys.executable, "-m", f"benchmarks.{name}")) for name in ROWS} | {
+    "bus": _on_a_bus("bus"),
+    "load": _on_a_bus("load"),
+    "gateways": Benchmark(
+        (sys.executable, "-m", "benchmarks.gateways"),
+        "no PostgreSQL server is to be had: sudo apt-get install postgresql",
+    ),
+}
+
+
+@dataclass(frozen=True)
+class NotMeasured:
+    why: str
+    wrong: bool
+
+
+def figures(benchmark: Benchmark) -> dict[str, Any] | NotMeasured:
+    """The JSON object that a benchmark prints; under user-mode Linux its progress comes before it."""
+    found = subprocess.run(benchmark.command, stdout=subprocess.PIPE, text=True)
     told = "\n" + found.stdout.replace("\r", "")
-    answer: dict[str, Any] = json.JSONDecoder().raw_decode(told[told.rindex("\n{") + 1 :])[0]
+    if found.returncode == CANNOT and benchmark.lacks:
+        return NotMeasured(benchmark.lacks, wrong=False)
+    if found.returncode:
+        print(found.stdout, file=sys.stderr)
+        return NotMeasured(f"it ended with status {found.returncode}, see what it said above", wrong=True)
+    try:
+        answer: dict[str, Any] = json.JSONDecoder().raw_decode(told[told.rindex("\n{") + 1 :])[0]
+    except ValueError:
+        print(found.stdout, file=sys.stderr)
+        return NotMeasured("it ended without figures, see what it said above", wrong=True)
     return answer
 
 
-def table(
-    bus: dict[str, Any],
-    load: dict[str, Any],
-    rehearsal: dict[str, Any],
-    criterion: dict[str, Any],
-    response: dict[str, Any],
-    me_pso: dict[str, Any],
-    tune: dict[str, Any],
-    engine: dict[str, Any],
-    answers: dict[str, Any],
-    fast: dict[str, Any],
-) -> list[str]:
-    def row(what: str, figure: str, goal: str = "", met: bool | None = None) -> str:
-        return f"| {what} | {figure} | {goal} | {'' if met is None else 'met' if met else '**missed**'} |"
-
-    def ratio(name: str) -> str:
-        low, high = bus[f"{name}_ratio_range"]
-        return f"{bus[f'{name}_per_s']:,.0f}/s, {bus[f'{name}_ratio']:.2f} of bare ({low:.2f} to {high:.2f})"
-
-    def rates(by_gateways: dict[str, Any]) -> str:
-        return "/".join(f"{each['per_min']:.0f}" for each in by_gateways.values())
-
-    def growth(by_gateways: dict[str, Any]) -> float:
-        return float(by_gateways[max(by_gateways, key=int)]["per_min"] / by_gateways["1"]["per_min"])
-
-    def busy(by_gateways: dict[str, Any]) -> str:
-        return "/".join(f"{each['busy']:.1f}" for each in by_gateways.values())
-
-    timed, speed = bus["real_time_100_loops"], bus["speed_factor"]
-    many = load["retunes"][-1]
-    return [
-        "| what | figure | goal | |",
-        "| --- | --- | --- | --- |",
-        row("bare AF_CAN + struct, the same three frames", f"{bus['bare_per_s']:,.0f} samples/s"),
-        row("plant and controller devices, nobody listening", ratio("devices"), "0.5", bus["devices_ratio"] >= 0.5),
-        row("the same, a tuner takes every sample", ratio("listening"), "0.33", bus["listening_ratio"] >= 1 / 3),
-        row(
-            "the same, the live loop of a retune (plant in blocks)",
-            f"{bus['live_loop_per_s']:,.0f}/s, {bus['live_loop_ratio']:.2f} of bare",
-        ),
-        row(
-            f"times real time at Ts = 0.1 s with {'/'.join(speed)} loops",
-            "/".join(f"{each:.3g}" for each in speed.values()),
-        ),
-        row(
-            f"100 loops in real time, Ts = 0.1 s, {timed['samples']} samples: last MV late by",
-            f"{timed['late_median_ms']:.1f} ms (median), {timed['late_max_ms']:.1f} ms (worst), "
-            f"{timed['late_by_more_than_half_Ts']} samples by more than Ts/2",
-            "none by more than 50 ms",
-            timed["late_by_more_than_half_Ts"] == 0,
-        ),
-        row(
-            "the same, SYNC to last MV",
-            f"{timed['sync_to_last_mv_median_ms']:.1f} ms (median), {timed['sync_to_last_mv_max_ms']:.1f} ms (worst)",
-        ),
-        *(
-            row(
-                f"{each['loops']} loops of one node retuned by {each['method']} at the same time, Ts = 0.1 s, plant at "
-                f"{each['pace']:g} times real time",
-                f"{each['proposed']} of {each['loops']} proposed in {each['wall_s']:.0f} s, "
-                f"{each['of_plant_time']:.2f} times the plant's {each['longest_plant_s'] / each['pace']:.0f} s",
-                "all, 1.3 times",
-                each["proposed"] == each["loops"] and each["of_plant_time"] <= 1.3,
-            )
-            for each in (many, load["fast"])
-        ),
-        row(
-            "the same: what the processor lets the bus do, devices alone / with as many bare listeners",
-            f"{load['devices_alone']:.1f} / {load['listeners']:.1f} times real time",
-        ),
-        row(
-            f"the same: memory of the service with {'/'.join(str(each['loops']) for each in load['retunes'])} loops",
-            f"{'/'.join(format(each['memory_MB'], '.0f') for each in load['retunes'])} MB, "
-            f"{load['MB_per_loop']:.2f} MB for a loop more",
-            "under 5 MB",
-            load["MB_per_loop"] < 5.0,
-        ),
-        row(
-            f"rehearsal, {rehearsal['proposed']:.0f} of {rehearsal['models']} models proposed, Ts = 0.1 s",
-            f"{rehearsal['factor']:,.0f} times plant time "
-            f"({rehearsal['plant_s']:,.0f} s in {rehearsal['wall_s']:.1f} s)",
-            "2,000",
-            rehearsal["factor"] >= 2000,
-        ),
-        row("the same, peak memory", f"{rehearsal['peak_MB']:.0f} MB", "under 300 MB", rehearsal["peak_MB"] < 300),
-        row(
-            "criterion (7), one loop, against python-control + scipy",
-            f"{criterion['ratio']:.0f} times faster ({1e3 * criterion['ours_s']:.1f} ms, {criterion['plain_s']:.2f} s)",
-            "20",
-            criterion["ratio"] >= 20,
-        ),
-        row(
-            "the same, J of both results by our criterion",
-            f"{criterion['J_of_ours']:.3f} against {criterion['J_of_plain']:.3f}",
-            "the same or lower",
-            criterion["J_of_ours"] <= criterion["J_of_plain"],
-        ),
-        row(
-            "step figures, 10,000 samples, 500 to the dead time, against python-control with a 5th-order Pade",
-            f"{response['ratio']:.0f} times faster ({1e3 * response['ours_s']:.1f} ms, "
-            f"{1e3 * response['plain_s']:.0f} ms)",
-            "20",
-            response["ratio"] >= 20,
-        ),
-        row(
-            "the same, worst error of PV for a unit step against the closed form",
-            f"{response['ours_y_error']:.1e} against {response['plain_y_error']:.1e}",
-            "the same or lower",
-            response["ours_y_error"] <= response["plain_y_error"],
-        ),
-        row(
-            f"ME-PSO, no dead time, {me_pso['no_dead_time_evaluations']:,.0f} step responses",
-            f"{me_pso['no_dead_time_s']:.2f} s",
-            "2 s",
-            me_pso["no_dead_time_s"] <= 2.0,
-        ),
-        row(
-            f"ME-PSO, dead time, {me_pso['dead_time_evaluations']:,.0f} step responses",
-            f"{me_pso['dead_time_s']:.2f} s",
-            "5 s",
-            me_pso["dead_time_s"] <= 5.0,
-        ),
-        row(
-            f"loopwright tune --method all, start to exit, slowest of {tune['models']} models ({tune['slowest']})",
-            f"{tune['wall_s']:.2f} s",
-            "2 s",
-            tune["wall_s"] <= 2.0,
-        ),
-        row("the same, peak memory", f"{tune['peak_MB']:.0f} MB", "under 200 MB", tune["peak_MB"] < 200),
-        row(
-            "a job that does nothing, from asking to its written end, 60 at once, SQLite",
-            f"{engine['job_ms']:.1f} ms, of which {engine['job_ask_ms']:.1f} ms to ask",
-        ),
-        row(
-            "a stage's two events, written (SQLite, synced); what the loop's own thread waits of it",
-            f"{engine['stage_written_ms']:.1f} ms, {engine['stage_of_shortest_pct']:.2f} % of the shortest stage, 5 s; "
-            f"{engine['stage_told_ms']:.2f} ms",
-            "under 1 %",
-            engine["stage_of_shortest_pct"] < 1.0,
-        ),
-        row(
-            f"{engine['loops']:,} rehearsed loops on one PostgreSQL, {'/'.join(engine['paced'])} gateways, "
-            f"{engine['at_once']} jobs at once each, plants at {engine['pace']:g} times real time",
-            f"{rates(engine['paced'])} jobs per minute, {growth(engine['paced']):.2f} times as many with "
-            f"{max(engine['paced'], key=int)} gateways as with 1",
-        ),
-        row(
-            f"the same, plants as fast as {engine['processors']} processors go",
-            f"{rates(engine['unpaced'])} jobs per minute, {busy(engine['unpaced'])} processors busy, "
-            f"{1e3 * engine['unpaced']['1']['processor_s']:.0f} ms of processor for a job",
-        ),
-        row(
-            f"GET /jobs/ID, {answers['rate_per_s']}/s, while {answers['loops']} loops are retuned, "
-            f"p95 of {answers['rounds']} rounds",
-            f"{answers['busy_p95_ms']:.1f} ms, idle {answers['idle_p95_ms']:.1f} ms: {answers['ratio']:.1f} times "
-            f"({answers['ratio_range'][0]:.1f} to {answers['ratio_range'][1]:.1f})",
-            "3 times",
-            answers["ratio"] <= 3.0,
-        ),
-        row(
-            f"the same service with {'/'.join(answers['memory_MB'])} loops under test; all aborted and restored",
-            f"{'/'.join(format(each, '.0f') for each in answers['memory_MB'].values())} MB, "
-            f"{answers['MB_per_loop']:.2f} MB for a loop more; {answers['abort_all_s']:.1f} s",
-            "under 5 MB",
-            answers["MB_per_loop"] < 5.0,
-        ),
-        row(
-            f"fast: identification, design and verdict of one record of {fast['samples']} samples",
-            f"{fast['ours_s']:.2f} s of processor (median)",
-            "1 s",
-            fast["ours_s"] <= 1.0,
-        ),
-        row(
-            "the same, against least_squares on responses simulated step by step",
-            f"{fast['ratio']:.0f} times faster ({fast['plain_s']:.1f} s, Ms {fast['ours_Ms']:.3f} against "
-            f"{fast['plain_Ms']:.3f}, asked 1.6)",
-            "10",
-            fast["ratio"] >= 10.0,
-        ),
-        row(
-            f"the same, {fast['records']} records in a row",
-            f"{fast['each_s']:.2f} s of processor each, memory grown by {fast['grown_MB']:.1f} MB",
-            "1.5 s",
-            fast["each_s"] <= 1.5,
-        ),
-    ]
-
-
-def main() -> None:
-    if only := sys.argv[1:]:
-        print(json.dumps({name: figures(name) for name in only}, indent=1))
-        return
-    loads = [os.getloadavg()[0]]
-    found = {}
-    for name in BENCHMARKS:
-        found[name] = figures(name)
-        loads.append(os.getloadavg()[0])
-    print(
-        f"{date.today()}, Python {platform.python_version()}, {platform.machine()}, {os.cpu_count()} processors, "
-        f"vcan by with-vcan ({found['bus']['vcan']}), load average before and after each part: "
-        f"{', '.join(f'{load:.1f}' for load in loads)}\n"
+def main(argv: Sequence[str] | None = None, benchmarks: dict[str, Benchmark] = BENCHMARKS) -> int:
+    parser = parser_of(__doc__)
+    parser.add_argument(
+        "names", metavar="NAME", nargs="*", help=f"any of {', '.join(benchmarks)}; default: all of them"
     )
-    print("\n".join(table(**found)))
+    names = parser.parse_args(argv).names
+    check_names(parser, "benchmark", names, benchmarks)
+    loads = [os.getloadavg()[0]]
+    found: dict[str, dict[str, Any]] = {}
+    without: dict[str, NotMeasured] = {}
+    for name in names or benchmarks:
+        print(f"{name} ...", file=sys.stderr, flush=True)
+        answer = figures(benchmarks[name])
+        if isinstance(answer, NotMeasured):
+            without[name] = answer
+            print(f"{name}: not measured: {answer.why}", file=sys.stderr, flush=True)
+        else:
+            found[name] = answer
+        loads.append(os.getloadavg()[0])
+    if names:
+        print(json.dumps(found, indent=1))
+        return 1 if without else 0
+    vcan = f"vcan by with-vcan ({found['bus']['vcan']}), " if "bus" in found else ""
+    print(
+        f"{date.today()}, Python {platform.python_version()}, {platform.machine()}, {os.cpu_count()} processors, {vcan}"
+        f"load average before and after each part: {', '.join(f'{load:.1f}' for load in loads)}\n"
+    )
+    lines = list(HEAD)
+    for name in benchmarks:
+        lines += [row(name, f"not measured: {without[name].why}")] if name in without else ROWS[name](found[name])
+    print("\n".join(lines))
     print("\n" + json.dumps(found, indent=1), file=sys.stderr)
+    return 1 if any(each.wrong for each in without.values()) else 0
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        sys.exit(130)

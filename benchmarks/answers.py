@@ -8,7 +8,6 @@ The service is a process with plants in memory that run in real time; whoever as
 from __future__ import annotations
 
 import http.client
-import json
 import os
 import sys
 import tempfile
@@ -21,6 +20,7 @@ from urllib.parse import urlsplit
 
 import httpx
 
+from benchmarks.command import command
 from service.processes import Process
 
 LOOPS = (1, 10, 50)
@@ -162,4 +162,4 @@ def p95(times: list[float]) -> float:
 
 
 if __name__ == "__main__":
-    print(json.dumps(run(), indent=1))
+    command(__doc__, run)

@@ -7,7 +7,6 @@ Everything is in one run, and what is compared takes turns. Needs vcan0:
 
 from __future__ import annotations
 
-import json
 import os
 import socket
 import struct
@@ -19,6 +18,7 @@ from contextlib import ExitStack, contextmanager
 from statistics import median
 from typing import TypeVar
 
+from benchmarks.command import parser_of, show
 from protocol.profile import CONTROLLER_NODE, PLANT_NODE, SYNC_ID, channel_ids
 from protocol.tuner import Tuner
 from service.bus_loop import BusLoop
@@ -238,9 +238,13 @@ def run() -> dict[str, object]:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["bare-controller"]:
+    parser = parser_of(__doc__)
+    roles = ("bare-controller", "bare-plant")
+    parser.add_argument("role", nargs="?", choices=roles, help="one of its own processes; default: the benchmark")
+    role = parser.parse_args().role
+    if role == "bare-controller":
         bare_controller()
-    elif sys.argv[1:] == ["bare-plant"]:
+    elif role == "bare-plant":
         print(bare_plant())
     else:
-        print(json.dumps(run(), indent=1))
+        show(run)

@@ -8,7 +8,6 @@ for each of the eight corners, the margins from the frequency response, `scipy.o
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from itertools import product
@@ -18,6 +17,7 @@ import numpy as np
 from scipy.integrate import trapezoid
 from scipy.optimize import minimize
 
+from benchmarks.command import command
 from tuning.gains import Gains
 from tuning.margins import ultimate_point
 from tuning.models import FOPDT, Reals
@@ -110,15 +110,5 @@ def run(repeats: int = 20) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    figures = run()
-    print(json.dumps(figures, indent=1))
-    print(
-        f"criterion (7) on K={MODEL.K}, T={MODEL.T} s, L={MODEL.L} s: {figures['ours_s'] * 1e3:.1f} ms against "
-        f"{figures['plain_s']:.2f} s, {figures['ratio']:.0f} times faster; "
-        f"J {figures['J_of_ours']:.2f} against {figures['J_of_plain']:.2f}"
-    )
-
-
 if __name__ == "__main__":
-    main()
+    command(__doc__, run)

@@ -9,11 +9,11 @@ Kp and Ti of simulated step responses under a penalty on Ms.
 
 from __future__ import annotations
 
-import json
 import math
 import resource
 import sys
 import time
+from functools import partial
 from statistics import median
 
 import numpy as np
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.optimize import least_squares, minimize
 
+from benchmarks.command import parser_of, show
 from controller.channel import Channel, RelaySettings, Settings
 from controller.pid import Parameters
 from plantsim.plant import LinearPlant
@@ -181,4 +182,6 @@ def run(records: int = MANY) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(run(int(sys.argv[1]) if len(sys.argv) > 1 else MANY), indent=1))
+    parser = parser_of(__doc__)
+    parser.add_argument("records", type=int, nargs="?", default=MANY, help="one after the other (default: %(default)s)")
+    show(partial(run, parser.parse_args().records))

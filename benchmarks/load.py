@@ -9,7 +9,6 @@ writes cost is a row of `benchmarks.engine`. Needs vcan0:
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import tempfile
@@ -25,6 +24,7 @@ import yaml
 
 from benchmarks.answers import memory_MB, processor_s
 from benchmarks.bus import URL, device_samples_per_s, devices
+from benchmarks.command import command
 from plantsim.catalogue import find
 from protocol.profile import CONTROLLER_NODE, PLANT_NODE
 from protocol.tuner import Tuner
@@ -77,8 +77,8 @@ class Site:
             "plant": ("plantsim", *common, *plants, "--speed", str(pace)),
             "service": ("service", "serve", *where),
         }
-        for name, command in arguments.items():
-            process = Process(name, command, folder / f"{name}.log")
+        for name, line in arguments.items():
+            process = Process(name, line, folder / f"{name}.log")
             stack.callback(process.stop)
             self.url = process.wait_ready(START_S).split()[1]
         self.service = process
@@ -175,4 +175,4 @@ def run() -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(run(), indent=1))
+    command(__doc__, run)

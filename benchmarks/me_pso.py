@@ -8,10 +8,10 @@ horizons, 6,000 samples a response. Wall-clock times; the particles of an iterat
 
 from __future__ import annotations
 
-import json
 import time
 from statistics import median
 
+from benchmarks.command import command
 from tuning.models import TransferFunction
 from tuning.rules.me_pso import me_pso
 
@@ -45,4 +45,4 @@ def run() -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(run(), indent=1))
+    command(__doc__, run)

@@ -22,6 +22,7 @@ from functools import cache, partial
 import numpy as np
 
 from benchmarks.cases import ASKED, CASES, PLAIN, Case
+from benchmarks.command import check_names
 from benchmarks.plants import Plant
 from benchmarks.tuning import (
     T95_PERIODS,
@@ -31,7 +32,8 @@ from benchmarks.tuning import (
     kept,
     loads,
     loop_of,
-    parser_of,
+    runs_of,
+    runs_parser,
     saved,
     some,
     span_of,
@@ -148,10 +150,11 @@ def line(name: str, runs: Sequence[Ran]) -> str:
 
 
 def main() -> None:
-    parser = parser_of(__doc__)
+    parser = runs_parser(__doc__)
     parser.add_argument("--case", default="PI 1 %", help="of benchmarks.tuning: its noise and load")
     given = parser.parse_args()
-    runs = saved(given.of) if given.of else list(_runs(given))
+    check_names(parser, "case", [given.case], CASES)
+    runs = runs_of(parser, given, _runs(given))
     print(HEAD)
     for name in dict.fromkeys(each.case for each in runs):
         print(line(name, [each for each in runs if each.case == name]))

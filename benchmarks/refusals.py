@@ -6,7 +6,6 @@ python -m benchmarks.refusals docs/refusals
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 
 from PIL import Image
 
+from benchmarks.command import check_names, parser_of
 from controller.channel import Channel, Settings
 from plantsim.plant import LinearPlant
 from service.fast_picture import fast_job
@@ -177,9 +177,13 @@ def draw(folder: Path, cause: str, job: dict[str, Any]) -> Path:
 
 
 def main() -> None:
-    folder = Path(sys.argv[1])
+    parser = parser_of(__doc__)
+    parser.add_argument("folder", type=Path, help="where the pictures go")
+    parser.add_argument("causes", metavar="CAUSE", nargs="*", help=f"only of these; default: {', '.join(cases())}")
+    given = parser.parse_args()
+    folder, only = given.folder, given.causes
+    check_names(parser, "cause", only, cases())
     folder.mkdir(parents=True, exist_ok=True)
-    only = sys.argv[2:]
     for cause, case in cases().items():
         if only and cause not in only:
             continue

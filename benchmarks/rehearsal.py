@@ -12,6 +12,7 @@ import sys
 import time
 from importlib.resources import files
 
+from benchmarks.command import command
 from service.rehearsal import rehearse
 
 TS = 0.1
@@ -52,4 +53,4 @@ def run() -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(run(), indent=1))
+    command(__doc__, run)

@@ -2,14 +2,11 @@
 
 A gateway of its own process, which tunes so many of them:
 
-    python -m benchmarks.rehearsed FOLDER HOST LOOPS AT_ONCE PACE URL
-
-PACE: plant time in times of real time; 0: as fast as the processor goes.
+    python -m benchmarks.rehearsed FOLDER HOST LOOPS AT_ONCE PACE DATABASE
 """
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -18,6 +15,7 @@ from typing import Any
 
 import yaml
 
+from benchmarks.command import parser_of
 from controller.channel import Channel, Settings
 from controller.pid import Parameters
 from plantsim.plant import LinearPlant
@@ -80,14 +78,22 @@ def open_loop(_config: LoopConfig, pace: float = 0.0) -> RehearsedLoop:
 
 
 def main() -> None:
-    folder, (host, count, at_once, pace, database) = Path(sys.argv[1]), sys.argv[2:]
+    parser = parser_of(__doc__)
+    parser.add_argument("folder", type=Path, help="for its configuration and its data")
+    parser.add_argument("host", help="its name, and the beginning of its loops' tags")
+    parser.add_argument("loops", type=int, help="how many")
+    parser.add_argument("at_once", type=int, help="jobs at the same time")
+    parser.add_argument("pace", type=float, help="plant time in times of real time; 0: as fast as the processor goes")
+    parser.add_argument("database", help="the URL of a PostgreSQL database; '': a file in the folder")
+    given = parser.parse_args()
+    folder, host = given.folder, given.host
     folder.mkdir(parents=True, exist_ok=True)
     bus = "virtual:rehearsed"
-    entries = [entry(f"{host}-{n}", bus, n % 199 + 1, 1 + n // 199) for n in range(int(count))]
+    entries = [entry(f"{host}-{n}", bus, n % 199 + 1, 1 + n // 199) for n in range(given.loops)]
     file = folder / "loops.yaml"
-    file.write_text(yaml.safe_dump({"loops": entries, "buses": {bus: {"at_once": int(at_once)}}}))
-    setup = Setup(file, folder / "data", "127.0.0.1", 0, database or None, host)
-    serve(setup, partial(open_loop, pace=float(pace)))
+    file.write_text(yaml.safe_dump({"loops": entries, "buses": {bus: {"at_once": given.at_once}}}))
+    setup = Setup(file, folder / "data", "127.0.0.1", 0, given.database or None, host)
+    serve(setup, partial(open_loop, pace=given.pace))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ and settling from them; the plain one has a fifth-order Pade approximant of the 
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable
@@ -19,6 +18,7 @@ import control
 import numpy as np
 from scipy.integrate import trapezoid
 
+from benchmarks.command import command
 from tuning.figures import StepFigures
 from tuning.gains import Gains
 from tuning.models import FOPDT, Reals
@@ -99,9 +99,5 @@ def run(rounds: int = 10) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    print(json.dumps(run(), indent=1))
-
-
 if __name__ == "__main__":
-    main()
+    command(__doc__, run)

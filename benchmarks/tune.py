@@ -15,6 +15,8 @@ import sys
 import time
 from statistics import median
 
+from benchmarks.command import command
+
 MODELS = {
     "lag-dominant": '{"K": 2, "T": 50, "L": 2}',
     "balanced": '{"K": 2, "T": 10, "L": 8}',
@@ -57,4 +59,4 @@ def run() -> dict[str, float | str]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(run(), indent=1))
+    command(__doc__, run)

@@ -27,6 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.cases import ASKED, CASES, FURTHER, PI, PLAIN, Case
+from benchmarks.command import check_names, parser_of
 from benchmarks.disturbances import Disturbed
 from benchmarks.plants import REACTOR, SAMPLES_PER_PERIOD, Plant, plants
 from controller.channel import Channel, Settings
@@ -264,22 +265,47 @@ def spread(values: Sequence[float], digits: int) -> str:
     return " / ".join(f"{v:.{digits}f}" for v in (*np.percentile(values, (50, 90)), max(values)))
 
 
-def parser_of(doc: str | None) -> argparse.ArgumentParser:
+def runs_parser(doc: str | None) -> argparse.ArgumentParser:
     """With what every table of runs asks for."""
-    parser = argparse.ArgumentParser(description=(doc or "").splitlines()[0])
+    parser = parser_of(doc)
     parser.add_argument("--plants", type=int, help="so many, spread over the list; by default all")
-    parser.add_argument("--part", default="0/1", help="i/n: every n-th of these plants, from the i-th on")
-    parser.add_argument("--seeds", default="1", help="so many, or first-last")
+    parser.add_argument(
+        "--part", type=_part, default="0/1", metavar="I/N", help="every N-th of these plants, from the I-th on"
+    )
+    parser.add_argument("--seeds", type=_seeds, default="1", metavar="N", help="so many, or FIRST-LAST")
     parser.add_argument("--save", type=Path, help="a line of JSON for every run; what it holds is not run again")
     parser.add_argument("--of", type=Path, help="the table of such a file, nothing is run")
     return parser
 
 
+def _part(text: str) -> tuple[int, int]:
+    part, parts = map(int, text.split("/"))
+    if not 0 <= part < parts:
+        raise ValueError(text)
+    return part, parts
+
+
+def _seeds(text: str) -> range:
+    first, _, last = text.rpartition("-")
+    return range(int(first or 1), int(last) + 1)
+
+
+def runs_of(parser: argparse.ArgumentParser, given: argparse.Namespace, runs: Iterator[Ran]) -> list[Ran]:
+    """Those of the file that was asked for, or what is run now; at least one."""
+    found = saved(given.of) if given.of else list(runs)
+    if not found:
+        parser.exit(2, f"{parser.prog}: no run: {given.of or 'no plants or no seeds'}\n")
+    return found
+
+
 def main() -> None:
-    parser = parser_of(__doc__)
+    parser = runs_parser(__doc__)
     parser.add_argument("--cases", default=";".join(CASES), help="names, separated by ';', or 'further'")
     given = parser.parse_args()
-    runs = saved(given.of) if given.of else list(_runs(given))
+    if given.cases == "further":
+        given.cases = ";".join(FURTHER)
+    check_names(parser, "case", given.cases.split(";"), CASES | FURTHER)
+    runs = runs_of(parser, given, _runs(given))
     print(HEAD)
     for name in CASES | FURTHER:
         if of_case := [each for each in runs if each.case == name]:
@@ -297,10 +323,9 @@ def some(given: argparse.Namespace) -> tuple[list[Plant], range]:
     """The plants and seeds that were asked for."""
     everything = plants()
     step = len(everything) / min(given.plants or len(everything), len(everything))
-    part, parts = map(int, given.part.split("/"))
-    first, _, last = given.seeds.rpartition("-")
+    part, parts = given.part
     chosen = [everything[int(i * step)] for i in range(round(len(everything) / step))]
-    return chosen[part::parts], range(int(first or 1), int(last) + 1)
+    return chosen[part::parts], given.seeds
 
 
 def saved(file: Path) -> list[Ran]:
@@ -309,7 +334,7 @@ def saved(file: Path) -> list[Ran]:
 
 def _runs(given: argparse.Namespace) -> Iterator[Ran]:
     chosen, seeds = some(given)
-    cases = FURTHER if given.cases == "further" else given.cases.split(";")
+    cases = given.cases.split(";")
     done = {(ran.case, ran.plant, ran.seed): ran for ran in saved(given.save)} if given.save else {}
     # a batch that is stopped leaves rows of the same plants, drawn at random
     for seed in seeds:

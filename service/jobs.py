@@ -169,6 +169,10 @@ class Jobs:
     def running(self, job_id: str) -> Running | None:
         return self._running.get(job_id)
 
+    def under_test(self) -> dict[str, str]:
+        """The tags of the loops that a job has in its hands, by job."""
+        return {job_id: running.tag for job_id, running in self._running.copy().items()}
+
     def live(self, tag: str) -> LoopState | None:
         """The present state of a loop: from the job if one runs, else read from the bus; None on another host."""
         if tag not in self.loops:

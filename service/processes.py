@@ -56,6 +56,9 @@ class Process:
     def poll(self) -> int | None:
         return self._process.poll()
 
+    def signal(self, number: int) -> None:
+        self._process.send_signal(number)
+
     def kill(self) -> None:
         """SIGKILL: no chance to clean up."""
         self._process.kill()

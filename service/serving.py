@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import socket
-import threading
-from collections.abc import Callable
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from types import FrameType
-from typing import Any, Self
 
 import uvicorn
 
@@ -33,6 +29,7 @@ from service.retention import Keep, Retention
 from service.security.gate import Policy, is_loopback
 from service.security.keyring import Keyring
 from service.security.limits import RequestLimits
+from service.signals import Signals
 from service.store.database import BadDatabase
 from service.store.store import LOCAL, Store
 from service.work import Tune, rehearse
@@ -43,23 +40,12 @@ _log = logging.getLogger(__name__)
 
 
 class _Server(uvicorn.Server):
-    """Tells the jobs at once when a signal asks the server to end: open event streams end with their jobs, and the
-    server, which waits for its connections, does not wait for nothing."""
+    """Says when it is ready. Signals are not its own: it would raise each of them again after its shutdown, and take a
+    second SIGINT for leave to break off."""
 
-    def __init__(self, config: uvicorn.Config, jobs: Jobs) -> None:
-        super().__init__(config)
-        self._jobs = jobs
-
-    async def serve(self, sockets: list[socket.socket] | None = None) -> None:
-        with self.capture_signals():
-            # One that came before they are captured here has told the jobs only.
-            self.should_exit = self.should_exit or self._jobs.stopping
-            await self._serve(sockets)
-
-    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        tell_systemd("STOPPING=1")
-        self._jobs.request_stop()
-        super().handle_exit(sig, frame)
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
@@ -89,37 +75,6 @@ def open_bus_loop(station: Station, config: LoopConfig) -> Loop:
         station=station,
         pv_limits=(config.pv_limits.low, config.pv_limits.high),
     )
-
-
-class Signals:
-    """SIGTERM and SIGINT from the start of the service to its end: whoever is told of them first is told at once.
-
-    While requests are served the server hears them itself, and says them again when it is through.
-    """
-
-    def __init__(self) -> None:
-        self._asked = False
-        self._end: Callable[[], None] = lambda: None
-
-    def __enter__(self) -> Self:
-        self._before: dict[int, Any] = {}
-        if threading.current_thread() is threading.main_thread():
-            self._before = {each: signal.signal(each, self._hear) for each in (signal.SIGTERM, signal.SIGINT)}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for each, handler in self._before.items():
-            signal.signal(each, handler)
-
-    def tell(self, end: Callable[[], None]) -> None:
-        """Calls `end` when a signal comes, or has come."""
-        self._end = end
-        if self._asked:
-            end()
-
-    def _hear(self, _signal: int, _frame: FrameType | None) -> None:
-        self._asked = True
-        self._end()
 
 
 class NotSafe(Exception):
@@ -171,33 +126,34 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         raise NotSafe(f"without keys only this machine is served: leave out --no-auth, or --bind {setup.bind}")
     with ExitStack() as stack:
         signals = stack.enter_context(Signals())
-        # Bound before anything is started, so that a busy port is an error and not half a service.
+        # Bound before anything is started or opened: a port that is taken is one sentence and not half a service.
         listener = stack.enter_context(listen(setup.bind, setup.port))
         pool = stack.enter_context(closing(Pool(setup.computing)))
         if tune is None:  # loads the fork server, so that the first computation of a loop need not wait for it
             pool.submit(Kind.LIVE, os.getpid)
-        store = Store(setup.data, setup.database, setup.host or LOCAL)
-        try:
-            keyring = Keyring(store.engine) if setup.auth or not local else None
-            if keyring is not None and not keyring.any_valid():
-                where = f"--data {setup.data}" if setup.database is None else "with LOOPWRIGHT_DATABASE set"
-                raise NotSafe(
-                    f"keys are asked for on {setup.bind} and there is none; make one with: "
-                    f"loopwright key create NAME --scope admin {where}"
-                )
-            policy = Policy(keyring, setup.limits, local_only=True)
-            engine = DurableEngine(setup.data, store.engine if store.shared else None, store.host, setup.poll_s)
-            jobs = Jobs(
-                site.loops,
-                store,
-                open_loop or partial(open_bus_loop, Station(setup.node)),
-                tune or partial(live, workers=pool),
-                apart(rehearse, pool),
-                engine=engine,
-                buses=site.buses,
-                resume=setup.resume,
+        store = stack.enter_context(closing(Store(setup.data, setup.database, setup.host or LOCAL)))
+        keyring = Keyring(store.engine) if setup.auth or not local else None
+        if keyring is not None and not keyring.any_valid():
+            where = f"--data {setup.data}" if setup.database is None else "with LOOPWRIGHT_DATABASE set"
+            raise NotSafe(
+                f"keys are asked for on {setup.bind} and there is none; make one with: "
+                f"loopwright key create NAME --scope admin {where}"
             )
-            config = uvicorn.Config(
+        policy = Policy(keyring, setup.limits, local_only=True)
+        engine = DurableEngine(setup.data, store.engine if store.shared else None, store.host, setup.poll_s)
+        jobs = Jobs(
+            site.loops,
+            store,
+            open_loop or partial(open_bus_loop, Station(setup.node)),
+            tune or partial(live, workers=pool),
+            apart(rehearse, pool),
+            engine=engine,
+            buses=site.buses,
+            resume=setup.resume,
+        )
+        stack.callback(jobs.stop)
+        server = _Server(
+            uvicorn.Config(
                 create_app(jobs, policy, pool=pool),
                 log_config=None,
                 log_level="warning",
@@ -205,18 +161,28 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
                 server_header=False,
                 timeout_graceful_shutdown=_GRACE_S,
             )
-            retention = Retention(store, engine, setup.keep)
-            signals.tell(jobs.request_stop)
-            try:
-                jobs.boot()
-                if not jobs.stopping:
-                    retention.start()
-                    _Server(config, jobs).run(sockets=[listener])
-            finally:
-                retention.close()
-                jobs.stop()
-        finally:
-            store.close()
+        )
+        retention = stack.enter_context(closing(Retention(store, engine, setup.keep)))
+
+        def end() -> None:
+            """Open event streams end with their jobs: the server, which waits for its connections, waits for them."""
+            tell_systemd("STOPPING=1")
+            jobs.request_stop()
+            server.should_exit = True
+
+        signals.tell(end, partial(_awaited, jobs))
+        jobs.boot()
+        if not jobs.stopping:
+            retention.start()
+            server.run(sockets=[listener])
+
+
+def _awaited(jobs: Jobs) -> str:
+    """What the end of the service waits for."""
+    under_test = [f"{tag} (job {job_id})" for job_id, tag in jobs.under_test().items()]
+    if not under_test:
+        return "no loop is under test, connections and the database are being closed"
+    return f"it waits until these loops are restored and the ends of their jobs written: {', '.join(under_test)}"
 
 
 def listen(bind: str, port: int) -> socket.socket:

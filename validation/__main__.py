@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 
@@ -18,6 +19,7 @@ PLOTS = ROOT / "docs/validation"
 
 
 def main() -> int:
+    argparse.ArgumentParser(prog="python -m validation", description=__doc__.splitlines()[0]).parse_args()
     began = time.monotonic()
     references = load()
     papers = validate(references)

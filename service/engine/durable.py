@@ -15,7 +15,7 @@ from dbos import DBOS, DBOSConfig, SetWorkflowID
 from sqlalchemy import Engine as Database
 
 from service.engine import WORKFLOW_VERSION
-from service.store.database import sqlite
+from service.store.database import checkpoint, sqlite
 
 log = logging.getLogger(__name__)
 
@@ -107,6 +107,8 @@ class DurableEngine:
         if self._launched:
             self._launched = False
             DBOS.destroy()
+            if self._own is not None:
+                checkpoint(self._own)
         _run = None
         if self._own is not None:
             self._own.dispose()

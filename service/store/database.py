@@ -5,6 +5,7 @@ Nothing that waits for the database waits for ever: a request is answered with 5
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,9 @@ from alembic import command
 from alembic.config import Config
 from alembic.util import CommandError
 from sqlalchemy import Engine, create_engine, event, make_url, text
-from sqlalchemy.exc import ArgumentError
+from sqlalchemy.exc import ArgumentError, SQLAlchemyError
+
+_log = logging.getLogger(__name__)
 
 FILE = "loopwright.sqlite"
 WAIT_S = 5
@@ -60,6 +63,21 @@ def sqlite(file: Path) -> Engine:
     engine = create_engine(f"sqlite:///{file}", connect_args={"timeout": float(WAIT_S)})
     event.listen(engine, "connect", _pragmas)
     return engine
+
+
+def checkpoint(engine: Engine) -> None:
+    """Before the end: what SQLite keeps in a -wal beside its file goes into the file. Where that fails nothing is lost:
+    the next start reads both."""
+    if engine.dialect.name != "sqlite":
+        return
+    try:
+        with engine.connect() as connection:
+            busy, *_ = connection.execute(text("PRAGMA wal_checkpoint(TRUNCATE)")).one()
+    except SQLAlchemyError as error:
+        _log.error("%s: its -wal could not be emptied, the next start reads it: %s", engine.url.database, error)
+    else:
+        if busy:
+            _log.warning("%s: another process is reading, the next start reads the -wal", engine.url.database)
 
 
 def migrate(engine: Engine) -> None:

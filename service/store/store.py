@@ -20,7 +20,7 @@ from service.state_json import gains_of
 from service.states import ACTIVE, IllegalMove, JobState, check
 from service.store import chunks, retunes
 from service.store.clock import now
-from service.store.database import WAIT_S, migrate, open_database
+from service.store.database import WAIT_S, checkpoint, migrate, open_database
 from service.store.lock import FolderInUse, FolderLock, HostLock, ourselves
 from service.store.tables import ChunkRow, EventRow, JobRow, LoopRow, RetuneRow
 from tuning.plan import Sample
@@ -87,7 +87,7 @@ class Store:
             if not self.shared:
                 self._adopt()
         except BaseException:
-            self.close()
+            self._let_go()
             raise
 
     def _adopt(self) -> None:
@@ -97,6 +97,10 @@ class Store:
                 session.execute(update(table).where(table.host != self.host).values(host=self.host))
 
     def close(self) -> None:
+        checkpoint(self.engine)
+        self._let_go()
+
+    def _let_go(self) -> None:
         if self._host_lock is not None:
             self._host_lock.close()
         if hasattr(self, "engine"):

@@ -3,6 +3,7 @@
     python -m tests.unit.service.gateway FOLDER --tag TAG ... [--host NAME] [--database URL] [--no-resume]
 
 A stage lasts until FOLDER/go-STAGE (or FOLDER/go) is there; the controllers outlive the process as FOLDER/TAG.json.
+Nothing is restored while FOLDER/TAG.held is there.
 With --hours-back its clock is set back as soon as FOLDER/clock-is-back is there.
 """
 
@@ -86,6 +87,8 @@ class FileLoop:
         return Sample(0.1 * self._n, 50.0, 50.0, 40.0, int(Mode.AUTOMATIC))
 
     def restore(self, home: LoopState, session: int | None = None) -> Restored:
+        while (self._folder / f"{self._tag}.held").exists():
+            time.sleep(0.005)
         state = self.read()
         known = json.loads(self._session.read_text()) if self._session.exists() else {}
         if session is None or known.get("number") == session:

@@ -1,0 +1,67 @@
+"""SIGTERM and SIGINT, from the start of the service until all of it has ended."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+from collections.abc import Callable
+from queue import SimpleQueue
+from types import FrameType
+from typing import Any, Self
+
+_log = logging.getLogger(__name__)
+
+
+class Signals:
+    """The first signal asks the service to end. A further one hurries nothing, for loops are being restored: the log
+    says what is waited for. Once everything has ended, a further one ends the process, which is a success still."""
+
+    def __init__(self) -> None:
+        self._asked = False
+        self._end: Callable[[], None] = lambda: None
+        # A signal comes in the middle of anything: a log has locks, this queue has none.
+        self._heard: SimpleQueue[int | None] = SimpleQueue()
+        self._reporter: threading.Thread | None = None
+
+    def __enter__(self) -> Self:
+        self._before: dict[int, Any] = {}
+        if threading.current_thread() is threading.main_thread():
+            self._before = {each: signal.signal(each, self._hear) for each in (signal.SIGTERM, signal.SIGINT)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._reporter is not None:
+            self._heard.put(None)
+            self._reporter.join()
+        for each, handler in self._before.items():
+            signal.signal(each, _leave if self._asked else handler)
+
+    def tell(self, end: Callable[[], None], awaited: Callable[[], str]) -> None:
+        """Calls `end` when a signal comes, or has come. awaited: what the end of the service waits for, in words."""
+        self._end = end
+        self._reporter = threading.Thread(target=self._report, args=(awaited,), name="signals", daemon=True)
+        self._reporter.start()
+        if self._asked:
+            end()
+
+    def _hear(self, number: int, _frame: FrameType | None) -> None:
+        self._asked = True
+        self._heard.put(number)
+        self._end()
+
+    def _report(self, awaited: Callable[[], str]) -> None:
+        first = True
+        while (number := self._heard.get()) is not None:
+            name = signal.Signals(number).name
+            if first:
+                _log.info("%s: the service ends; %s", name, awaited())
+            else:
+                _log.warning("%s again: the service is ending, and is not cut short; %s", name, awaited())
+            first = False
+
+
+def _leave(_signal: int, _frame: FrameType | None) -> None:
+    """Nothing of the service is left: whatever keeps the interpreter from its end, nobody has to wait for it."""
+    os._exit(0)
