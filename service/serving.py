@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import signal
 import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
+from ipaddress import IPv4Network, IPv6Network, ip_address
 from pathlib import Path
 from types import FrameType
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import uvicorn
+from fastapi import FastAPI
 
 from protocol.profile import TUNER_NODE
 from protocol.station import Station
 from service import logs
 from service.api.app import create_app
+from service.api.connections import Connection, Connections, Listener, OnceAMinute, raise_descriptor_limit
 from service.computing import Workers
 from service.config import LoopConfig, load_site
 from service.engine.durable import POLL_S, DurableEngine
@@ -134,6 +138,7 @@ class Setup:
     keep: whose samples are kept.
     node: our node-ID on every bus, another one than any other gateway's.
     auth: whether keys are asked for; None: unless the address is this machine's own.
+    trusted_proxies: addresses and networks whose word on whom they ask for is taken (X-Forwarded-For, -Proto).
     """
 
     loops_file: Path
@@ -149,6 +154,7 @@ class Setup:
     limits: RequestLimits = field(default_factory=RequestLimits)
     log_format: LogFormat = "text"
     keep: Keep = field(default_factory=Keep)
+    trusted_proxies: tuple[IPv4Network | IPv6Network, ...] = ()
 
 
 def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None = None) -> None:
@@ -167,6 +173,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
     local = is_loopback(setup.bind)
     if setup.auth is False and not local:
         raise NotSafe(f"without keys only this machine is served: leave out --no-auth, or --bind {setup.bind}")
+    descriptors = raise_descriptor_limit()
     with ExitStack() as stack:
         if tune is None:  # forked before there is anything that a child should not have
             tune = partial(live, workers=_workers(stack))
@@ -194,14 +201,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
                 buses=site.buses,
                 resume=setup.resume,
             )
-            config = uvicorn.Config(
-                create_app(jobs, policy),
-                log_config=None,
-                log_level="warning",
-                access_log=False,
-                server_header=False,
-                timeout_graceful_shutdown=_GRACE_S,
-            )
+            config = server_config(create_app(jobs, policy), setup, descriptors)
             retention = Retention(store, engine, setup.keep)
             signals.tell(jobs.request_stop)
             try:
@@ -216,6 +216,38 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
             store.close()
 
 
+def server_config(app: FastAPI, setup: Setup, descriptors: int) -> uvicorn.Config:
+    """The HTTP server: whose word it takes on whom it serves, and how many connections of which kind it keeps.
+
+    descriptors: file descriptors of this process.
+    """
+    logging.getLogger("uvicorn.error").addFilter(OnceAMinute())
+    connections = Connections(setup.limits, descriptors, partial(_is_of, setup.trusted_proxies))
+    return uvicorn.Config(
+        app,
+        loop="asyncio",
+        http=cast(type[asyncio.Protocol], partial(Connection, connections)),
+        ws="none",
+        log_config=None,
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        proxy_headers=bool(setup.trusted_proxies),
+        forwarded_allow_ips=[str(network) for network in setup.trusted_proxies],
+        timeout_graceful_shutdown=_GRACE_S,
+    )
+
+
+def _is_of(networks: Sequence[IPv4Network | IPv6Network], address: str) -> bool:
+    if not networks:
+        return False
+    try:
+        found = ip_address(address)
+    except ValueError:
+        return False
+    return any(found in network for network in networks)
+
+
 def _workers(stack: ExitStack) -> Workers | None:
     """None where this machine has no room for them."""
     try:
@@ -225,10 +257,10 @@ def _workers(stack: ExitStack) -> Workers | None:
         return None
 
 
-def listen(bind: str, port: int) -> socket.socket:
+def listen(bind: str, port: int) -> Listener:
     """The listening socket. Raises OSError."""
     family = socket.AF_INET6 if ":" in bind else socket.AF_INET
-    listener = socket.create_server((bind, port), family=family, reuse_port=False)
+    listener = Listener(socket.create_server((bind, port), family=family, reuse_port=False).detach())
     # asyncio sets it only where a socket names its protocol; without it an answer waits 40 ms for the client's ACK.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return listener
