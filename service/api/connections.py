@@ -24,7 +24,7 @@ from service.security.limits import RequestLimits
 log = logging.getLogger(__name__)
 
 TOLD_EVERY_S = 60.0
-ACCEPTED_AT_ONCE = 32
+ACCEPTED_AT_ONCE = 16
 """Between two looks of the event loop at everything else."""
 _OUT_OF_DESCRIPTORS = (errno.EMFILE, errno.ENFILE)
 _NO_ROOM = (
@@ -84,7 +84,9 @@ class Connections:
     For one event loop.
     """
 
-    def __init__(self, limits: RequestLimits, descriptors: int, exempt: Callable[[str], bool] = lambda _: False) -> None:
+    def __init__(
+        self, limits: RequestLimits, descriptors: int, exempt: Callable[[str], bool] = lambda address: False
+    ) -> None:
         self.limits = limits
         # The other half is for buses, database and files.
         self._most = min(limits.connections, descriptors // 2)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ipaddress
 import logging
+import time
 from collections.abc import Awaitable, Callable, MutableMapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -23,6 +24,8 @@ from service.security.keys import Scope
 from service.security.limits import Buckets, RequestLimits, retry_after
 from service.security.places import COMPUTED, DECIDES, SAFE_METHODS, Full, Kind, Places, Turn, kind_of
 from service.security.principal import LOCAL, Principal, current
+from service.shared_reading import asked_at
+from service.store.database import urgent
 
 log = logging.getLogger(__name__)
 
@@ -82,10 +85,11 @@ class Gate:
         if isinstance(found, Response):
             await found(scope, receive, send)
             return
-        token = current.set(found)
+        token, arrived = current.set(found), asked_at.set(time.monotonic())
         try:
             await self._let_in(scope, receive, send, found)
         finally:
+            asked_at.reset(arrived)
             current.reset(token)
 
     async def _let_in(self, scope: AsgiScope, receive: Receive, send: Send, who: Principal) -> None:
@@ -93,6 +97,7 @@ class Gate:
         if kind is None:
             await self._app(scope, receive, send)
             return
+        urgent.set(kind in DECIDES)
         try:
             self._refuse_often(kind, client)
             self._places.check(kind, client)
