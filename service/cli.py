@@ -107,6 +107,17 @@ def serve(
         int,
         typer.Option(min=16, envvar="LOOPWRIGHT_COMPUTATION_MEMORY_MB", help="Memory of one computation, MB."),
     ] = 512,
+    connections: Annotated[
+        int, typer.Option(min=16, envvar="LOOPWRIGHT_CONNECTIONS", help="Most connections; half of one address.")
+    ] = 512,
+    trusted_proxy: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ADDRESS[/NET]",
+            envvar="LOOPWRIGHT_TRUSTED_PROXIES",
+            help="Believe X-Forwarded-For of this proxy; may be repeated. Default: of none.",
+        ),
+    ] = None,
     keep_jobs: Annotated[
         int | None,
         typer.Option(min=1, envvar="LOOPWRIGHT_KEEP_JOBS", help="Keep samples of so many jobs per loop; default: all."),
@@ -120,6 +131,7 @@ def serve(
 ) -> None:
     """The service: REST over jobs that retune live loops."""
     from argparse import ArgumentTypeError
+    from ipaddress import ip_network
 
     from sqlalchemy.exc import SQLAlchemyError
 
@@ -142,7 +154,13 @@ def serve(
         at_once=at_once,
         streams_at_once=streams,
         computations_at_once=computations,
+        connections=connections,
+        connections_of_address=connections // 2,
     )
+    try:
+        proxies = tuple(ip_network(each) for each in trusted_proxy or ())
+    except ValueError as error:
+        die(f"--trusted-proxy takes an address or a network, as 10.0.0.7 or 10.0.0.0/24: {error}", 2)
     try:
         own_node = node_id(node)
     except (ValueError, ArgumentTypeError):
@@ -150,7 +168,7 @@ def serve(
     setup = Setup(
         loops, data, bind, port, database, host, resume,
         node=own_node, auth=auth, limits=limits, log_format="json" if log_format == "json" else "text",
-        keep=Keep(keep_jobs, keep_days),
+        keep=Keep(keep_jobs, keep_days), trusted_proxies=proxies,
         computing=ComputingLimits(live_cpu_s, tuning_cpu_s, dry_run_cpu_s, computation_memory_mb),
     )  # fmt: skip
     try:

@@ -219,12 +219,14 @@ class Fleet:
             retunes.give_up(session, row.id, part.position, detail)
 
     def _abort(self, row: RetuneRow, parts: Sequence[Part]) -> None:
-        for part in parts:
-            if part.active and part.job_id is not None:
-                try:
-                    self._jobs.abort(part.job_id, f"retune {row.id}")
-                except IllegalMove:
-                    continue  # it has just ended
+        active = [part.job_id for part in parts if part.active and part.job_id is not None]
+        for job_id in active:  # all of them, before the first is written down
+            self._jobs.tell_to_stop(job_id)
+        for job_id in active:
+            try:
+                self._jobs.abort(job_id, f"retune {row.id}")
+            except IllegalMove:
+                continue  # it has just ended
 
     def _known(self) -> dict[str, tuple[LoopConfig, str]]:
         return {config.tag: (config, host) for config, host in self._jobs.everywhere()}

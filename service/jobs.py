@@ -229,11 +229,21 @@ class Jobs:
                 self._unqueued.pop(job_id, None)
 
     def abort(self, job_id: str, by: str) -> JobRow:
-        """Asks an active job to stop; it ends as aborted once the loop is restored. Raises IllegalMove."""
+        """Asks an active job to stop; it ends as aborted once the loop is restored. Raises IllegalMove.
+
+        One that runs here hears of it before it is written down: the loop does not wait for the database.
+        """
+        self.tell_to_stop(job_id)
         row = self.store.wish_to_stop(job_id, Reason.OPERATOR.value, by)
         if row.host == self.store.host:
             self._heed(job_id, Reason.OPERATOR)
         return self.store.get(job_id)
+
+    def tell_to_stop(self, job_id: str) -> None:
+        """A job that runs here hears that an operator wants it to end; returns at once, and writes nothing down."""
+        running = self._running.get(job_id)
+        if running is not None:
+            running.stop_reason = running.stop_reason or Reason.OPERATOR
 
     def _heed(
         self,

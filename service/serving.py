@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
+from ipaddress import IPv4Network, IPv6Network, ip_address
 from pathlib import Path
+from typing import cast
 
 import uvicorn
+from fastapi import FastAPI
 
 from protocol.profile import TUNER_NODE
 from protocol.station import Station
 from service import logs
 from service.api.app import create_app
+from service.api.connections import Connection, Connections, Listener, OnceAMinute, raise_descriptor_limit
 from service.computing.limits import ComputingLimits, Kind
 from service.computing.pool import Pool
 from service.computing.rehearsals import apart
@@ -90,6 +95,7 @@ class Setup:
     keep: whose samples are kept.  computing: what one computation may take.
     node: our node-ID on every bus, another one than any other gateway's.
     auth: whether keys are asked for; None: unless the address is this machine's own.
+    trusted_proxies: addresses and networks whose word on whom they ask for is taken (X-Forwarded-For, -Proto).
     """
 
     loops_file: Path
@@ -106,6 +112,7 @@ class Setup:
     log_format: LogFormat = "text"
     keep: Keep = field(default_factory=Keep)
     computing: ComputingLimits = field(default_factory=ComputingLimits)
+    trusted_proxies: tuple[IPv4Network | IPv6Network, ...] = ()
 
 
 def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None = None) -> None:
@@ -124,6 +131,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
     local = is_loopback(setup.bind)
     if setup.auth is False and not local:
         raise NotSafe(f"without keys only this machine is served: leave out --no-auth, or --bind {setup.bind}")
+    descriptors = raise_descriptor_limit()
     with ExitStack() as stack:
         signals = stack.enter_context(Signals())
         # Bound before anything is started or opened: a port that is taken is one sentence and not half a service.
@@ -152,16 +160,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
             resume=setup.resume,
         )
         stack.callback(jobs.stop)
-        server = _Server(
-            uvicorn.Config(
-                create_app(jobs, policy, pool=pool),
-                log_config=None,
-                log_level="warning",
-                access_log=False,
-                server_header=False,
-                timeout_graceful_shutdown=_GRACE_S,
-            )
-        )
+        server = _Server(server_config(create_app(jobs, policy, pool=pool), setup, descriptors))
         retention = stack.enter_context(closing(Retention(store, engine, setup.keep)))
 
         def end() -> None:
@@ -185,10 +184,42 @@ def _awaited(jobs: Jobs) -> str:
     return f"it waits until these loops are restored and the ends of their jobs written: {', '.join(under_test)}"
 
 
-def listen(bind: str, port: int) -> socket.socket:
+def server_config(app: FastAPI, setup: Setup, descriptors: int) -> uvicorn.Config:
+    """The HTTP server: whose word it takes on whom it serves, and how many connections of which kind it keeps.
+
+    descriptors: file descriptors of this process.
+    """
+    logging.getLogger("uvicorn.error").addFilter(OnceAMinute())
+    connections = Connections(setup.limits, descriptors, partial(_is_of, setup.trusted_proxies))
+    return uvicorn.Config(
+        app,
+        loop="asyncio",
+        http=cast(type[asyncio.Protocol], partial(Connection, connections)),
+        ws="none",
+        log_config=None,
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        proxy_headers=bool(setup.trusted_proxies),
+        forwarded_allow_ips=[str(network) for network in setup.trusted_proxies],
+        timeout_graceful_shutdown=_GRACE_S,
+    )
+
+
+def _is_of(networks: Sequence[IPv4Network | IPv6Network], address: str) -> bool:
+    if not networks:
+        return False
+    try:
+        found = ip_address(address)
+    except ValueError:
+        return False
+    return any(found in network for network in networks)
+
+
+def listen(bind: str, port: int) -> Listener:
     """The listening socket. Raises OSError."""
     family = socket.AF_INET6 if ":" in bind else socket.AF_INET
-    listener = socket.create_server((bind, port), family=family, reuse_port=False)
+    listener = Listener(socket.create_server((bind, port), family=family, reuse_port=False).detach())
     # asyncio sets it only where a socket names its protocol; without it an answer waits 40 ms for the client's ACK.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return listener

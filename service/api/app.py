@@ -32,6 +32,7 @@ from service.fleet import Fleet
 from service.jobs import Jobs
 from service.request import RetuneRequest
 from service.security.gate import Gate, Policy
+from service.shared_reading import SharedReading
 from service.states import ACTIVE, JobState
 from service.store.tables import JobRow
 from tuning.plan import Sample
@@ -53,6 +54,7 @@ def create_app(
     """
 
     many = Fleet(jobs)
+    readings = SharedReading(jobs.live)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -88,7 +90,7 @@ def create_app(
         config, host = jobs.owner(tag)
         not_home = next(iter(jobs.aftercare.not_home(tag)), None)
         try:
-            state = jobs.live(tag)
+            state = readings.of(tag)
         except Ended:
             if not_home is None:
                 raise

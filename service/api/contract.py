@@ -53,7 +53,7 @@ def _one(path: str, method: str, operation: dict[str, Any]) -> None:
         )
         more += (401,)
     if method != "get":
-        more += (413,)
+        more += (408, 413)  # the body did not come, or is too long
     if "requestBody" in operation:
         more += (400,)  # not text at all
     if path not in ALWAYS:

@@ -7,21 +7,25 @@ from __future__ import annotations
 
 import ipaddress
 import logging
+import time
 from collections.abc import Awaitable, Callable, MutableMapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from fastapi.concurrency import run_in_threadpool
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.datastructures import Headers
-from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from service.api import problems
+from service.security.bodies import Bodies, BodyRefused, begins_with
+from service.security.key_checks import KeyChecks, TooOften
 from service.security.keyring import Keyring
 from service.security.keys import Scope
 from service.security.limits import Buckets, RequestLimits, retry_after
+from service.security.places import COMPUTED, DECIDES, SAFE_METHODS, Full, Kind, Places, Turn, kind_of
 from service.security.principal import LOCAL, Principal, current
+from service.shared_reading import asked_at
+from service.store.database import urgent
 
 log = logging.getLogger(__name__)
 
@@ -36,8 +40,6 @@ PUBLIC = frozenset({"/healthz", "/docs", "/openapi.json"})
 ALWAYS = frozenset({"/healthz", "/readyz", "/metrics"})
 """Answered however busy the service is: that is when somebody looks."""
 _ADMIN = ("/audit",)
-_CHANGES_NOTHING = ("/tunings",)
-_SAFE = ("GET", "HEAD", "OPTIONS")
 
 
 def scope_for(method: str, path: str) -> Scope | None:
@@ -46,7 +48,7 @@ def scope_for(method: str, path: str) -> Scope | None:
         return None
     if path.startswith(_ADMIN):
         return Scope.ADMIN
-    return Scope.READ if method in _SAFE or path in _CHANGES_NOTHING else Scope.OPERATE
+    return Scope.READ if method in SAFE_METHODS or path in COMPUTED else Scope.OPERATE
 
 
 @dataclass(frozen=True)
@@ -59,20 +61,21 @@ class Policy:
 
 
 class Gate:
-    """Wraps the application."""
+    """Wraps the application.
+
+    In this order: the key, how often its holder asks, the body, a place among requests of the same kind. A body that
+    does not come takes nobody's place.
+    """
 
     def __init__(self, app: App, policy: Policy) -> None:
         self._app = app
         self._policy = policy
         limits = policy.limits
-        self._callers = Buckets(limits.rate_per_s, limits.burst)
-        self._bad_keys = Buckets(limits.bad_keys_per_s, limits.bad_keys_burst)
-        self._most = {
-            "requests": limits.at_once,
-            "streams": limits.streams_at_once,
-            "computations": limits.computations_at_once,
-        }
-        self._now = dict.fromkeys(self._most, 0)
+        # Apart: who reads too much may still stop a test.
+        self._asked, self._decided = (Buckets(limits.rate_per_s, limits.burst) for _ in range(2))
+        self._checks = None if policy.keyring is None else KeyChecks(policy.keyring, limits)
+        self._bodies = Bodies(limits)
+        self._places = Places(limits)
 
     async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -82,18 +85,37 @@ class Gate:
         if isinstance(found, Response):
             await found(scope, receive, send)
             return
-        refused = self._too_much(scope, found)
-        if refused is not None:
-            await refused(scope, receive, send)
-            return
-        token = current.set(found)
-        kind = _kind(scope["path"])
-        self._now[kind] += 1
+        token, arrived = current.set(found), asked_at.set(time.monotonic())
         try:
-            await self._pass(scope, receive, send)
+            await self._let_in(scope, receive, send, found)
         finally:
-            self._now[kind] -= 1
+            asked_at.reset(arrived)
             current.reset(token)
+
+    async def _let_in(self, scope: AsgiScope, receive: Receive, send: Send, who: Principal) -> None:
+        kind, client = kind_of(scope["method"], scope["path"]), who.key_id or who.address or "unknown"
+        if kind is None:
+            await self._app(scope, receive, send)
+            return
+        urgent.set(kind in DECIDES)
+        try:
+            self._refuse_often(kind, client)
+            self._places.check(kind, client)
+            body = await self._bodies.whole(scope, receive, client, small=kind in DECIDES)
+            if body is not None:
+                receive = begins_with(body, receive)
+            async with self._places.taken(kind, client) as turn:
+                await self._app(scope, receive, _until_it_begins(send, turn))
+        except (Full, BodyRefused) as refused:
+            await _refusal(refused.status, str(refused), 1.0)(scope, receive, send)
+        except TooOften as refused:
+            await _refusal(429, str(refused), refused.wait_s)(scope, receive, send)
+
+    def _refuse_often(self, kind: Kind, client: str) -> None:
+        if kind is Kind.WATCH:
+            return
+        if wait := (self._decided if kind in DECIDES else self._asked).take(client):
+            raise TooOften("too many requests from this caller", wait)
 
     async def _who(self, scope: AsgiScope) -> Principal | Response:
         """Who asks, or the refusal; scope["principal"] names them for the log."""
@@ -111,19 +133,16 @@ class Gate:
         kind, _, key = headers.get("authorization", "").partition(" ")
         if kind.lower() != "bearer" or not key:
             return _unauthorized("this needs an API key: Authorization: Bearer KEY")
-        row = keyring.known(key)
+        assert self._checks is not None
+        try:
+            row = await self._checks.row(key, anyone.address or "unknown")
+        except TooOften as often:
+            return _refusal(429, str(often), often.wait_s)
+        except SQLAlchemyError:
+            log.exception("the keys cannot be read")
+            return _refusal(503, "the database with the keys does not answer", 5.0)
         if row is None:
-            address = anyone.address or "unknown"
-            if wait := self._bad_keys.wait_s(address):
-                return _wait(429, "too many wrong keys from this address", wait)
-            try:
-                row = await run_in_threadpool(keyring.check, key)
-            except SQLAlchemyError:
-                log.exception("the keys cannot be read")
-                return _wait(503, "the database with the keys does not answer", 5.0)
-            if row is None:
-                self._bad_keys.take(address)
-                return _unauthorized("this key is not known, was revoked or has expired")
+            return _unauthorized("this key is not known, was revoked or has expired")
         scope["principal"], has = row.name, Scope(row.scope)
         if not has.includes(needed):
             return problems.problem(
@@ -133,40 +152,15 @@ class Gate:
             )
         return Principal(row.name, has, row.id, anyone.address)
 
-    def _too_much(self, scope: AsgiScope, who: Principal) -> Response | None:
-        if scope["path"] in ALWAYS:
-            return None
-        if wait := self._callers.take(who.key_id or who.address or "unknown"):
-            return _wait(429, "too many requests from this caller", wait)
-        kind = _kind(scope["path"])
-        if self._now[kind] >= self._most[kind]:
-            return _wait(503, f"{self._now[kind]} {kind} are being answered already, no more are taken", 1.0)
-        return None
 
-    async def _pass(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
-        most = self._policy.limits.body_bytes
-        why = f"the body is longer than the {most} bytes permitted"
-        length = Headers(scope=scope).get("content-length", "0")
-        if not length.isdigit() or int(length) > most:
-            await problems.problem(413, why)(scope, receive, send)
-            return
-        taken = 0
+def _until_it_begins(send: Send, turn: Turn) -> Send:
+    """The work is done when the answer begins: a client that is slow to take it keeps nobody waiting."""
 
-        async def counted() -> Message:
-            nonlocal taken
-            message = await receive()
-            taken += len(message.get("body", b""))
-            if taken > most:  # sent in chunks, without saying how much it will be
-                raise HTTPException(413, why)
-            return message
+    async def sending(message: Message) -> None:
+        turn.over()
+        await send(message)
 
-        await self._app(scope, counted, send)
-
-
-def _kind(path: str) -> str:
-    if path.endswith("/events"):
-        return "streams"
-    return "computations" if path in _CHANGES_NOTHING or path.endswith("/alternatives") else "requests"
+    return sending
 
 
 def _not_local(headers: Headers) -> str | None:
@@ -195,5 +189,7 @@ def _unauthorized(why: str) -> Response:
     return problems.problem(401, why, headers={"WWW-Authenticate": 'Bearer realm="loopwright"'})
 
 
-def _wait(status: int, why: str, wait_s: float) -> Response:
-    return problems.problem(status, why, headers={"Retry-After": retry_after(wait_s)})
+def _refusal(status: int, why: str, wait_s: float) -> Response:
+    """With the connection's end where the rest of a body may still come: it would be read as the next request."""
+    headers = {"Retry-After": retry_after(wait_s)} if status in (429, 503) else {"Connection": "close"}
+    return problems.problem(status, why, headers=headers)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import threading
+import hmac
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 from sqlalchemy import Engine, select
@@ -24,15 +25,26 @@ class KeyProblem(Exception):
     """The wish about a key cannot be met; the text says why."""
 
 
+@dataclass(frozen=True)
+class _Right:
+    """A key that was found right: its digest, when it was last compared with the database, and its row then."""
+
+    digest: bytes
+    at: float
+    row: KeyRow
+
+
 class Keyring:
-    """Keys of one database. `wall` gives monotonic seconds."""
+    """Keys of one database. `wall` gives monotonic seconds.
+
+    A key that was found right is kept as its digest, in memory: it is hashed once, and so is no other secret that comes
+    with its id from then on.
+    """
 
     def __init__(self, engine: Engine, wall: Callable[[], float] = time.monotonic) -> None:
         self._session = sessionmaker(engine, expire_on_commit=False)
         self._wall = wall
-        # Digest of a key seen to be right -> when it was last compared with the database.
-        self._known: dict[bytes, tuple[float, KeyRow]] = {}
-        self._one_hash_at_a_time = threading.Lock()
+        self._right: dict[str, _Right] = {}
 
     def create(self, name: str, scope: Scope, valid_for: timedelta | None = None) -> tuple[KeyRow, str]:
         """A new key; its text is given here and never again. Raises KeyProblem when a valid key has the name."""
@@ -67,31 +79,41 @@ class Keyring:
             before = _shown(row)
             row.revoked_at = now()
             audit.record(session, "key_revoke", row.id, before=before, after=_shown(row))
-            return row
+        self._right.pop(row.id, None)
+        return row
 
     def known(self, key: str) -> KeyRow | None:
         """The key's row if it was found right within the last moments: no database, no hashing."""
-        seen = self._known.get(_digest(key))
-        if seen is None or self._wall() - seen[0] > REVOKED_WITHIN_S or not valid(seen[1]):
+        seen = self._seen(key)
+        if seen is None or self._wall() - seen.at > REVOKED_WITHIN_S or not valid(seen.row):
             return None
-        return seen[1]
+        return seen.row
+
+    def was_right(self, key: str) -> bool:
+        """Whether the key was found right before, so that it only has to be seen that it is not revoked."""
+        return self._seen(key) is not None
+
+    def _seen(self, key: str) -> _Right | None:
+        seen = self._right.get(key_id_of(key) or "")
+        return seen if seen is not None and hmac.compare_digest(seen.digest, _digest(key)) else None
 
     def check(self, key: str) -> KeyRow | None:
-        """The row of a valid key, else None. A key seen before costs one query; a new one its hash too."""
+        """The row of a valid key, else None. One query, and a hash where no key of that id was found right before."""
         key_id = key_id_of(key)
         if key_id is None:
             return None
         with self._session() as session:
             row = session.get(KeyRow, key_id)
-        digest = _digest(key)
         if row is None or not valid(row):
-            self._known.pop(digest, None)
+            self._right.pop(key_id, None)
             return None
-        if digest not in self._known:
-            with self._one_hash_at_a_time:
-                if not matches(key, row.hash):
-                    return None
-        self._known[digest] = (self._wall(), row)
+        right, digest = self._right.get(key_id), _digest(key)
+        if right is not None and right.row.hash == row.hash:
+            if not hmac.compare_digest(right.digest, digest):
+                return None
+        elif not matches(key, row.hash):
+            return None
+        self._right[key_id] = _Right(digest, self._wall(), row)
         return row
 
 

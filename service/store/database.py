@@ -6,6 +6,7 @@ Nothing that waits for the database waits for ever: a request is answered with 5
 from __future__ import annotations
 
 import logging
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from alembic.config import Config
 from alembic.util import CommandError
 from sqlalchemy import Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
+from sqlalchemy.orm import Session, sessionmaker
 
 _log = logging.getLogger(__name__)
 
@@ -28,7 +30,24 @@ class BadDatabase(Exception):
     """The database setting cannot be used. The text never holds a password."""
 
 
-def open_database(folder: Path, url: str | None, name: str) -> Engine:
+urgent: ContextVar[bool] = ContextVar("urgent", default=False)
+"""Whether what is asked of the store now goes before the rest: it has connections of its own, so that a pool that is
+empty does not keep an abort waiting."""
+USUAL, RESERVE = (5, 10), (1, 3)
+"""Connections of a pool to a PostgreSQL server: those that are kept, and how many more there may be."""
+
+
+def sessions(usual: Engine, reserve: Engine) -> sessionmaker[Session]:
+    """Sessions of either engine; what is urgent has the reserve's."""
+
+    class _Session(Session):
+        def get_bind(self, *_: Any, **__: Any) -> Engine:
+            return reserve if urgent.get() else usual
+
+    return sessionmaker(class_=_Session, expire_on_commit=False)
+
+
+def open_database(folder: Path, url: str | None, name: str, pool: tuple[int, int] = USUAL) -> Engine:
     """The engine for our tables. name: how a PostgreSQL server lists the connections."""
     if url is None:
         return sqlite(folder / FILE)
@@ -41,8 +60,8 @@ def open_database(folder: Path, url: str | None, name: str) -> Engine:
         raise BadDatabase(f"the database must be postgresql://..., not {kind}://; without one a file is used")
     return create_engine(
         parsed.set(drivername="postgresql+psycopg"),
-        pool_size=5,
-        max_overflow=10,
+        pool_size=pool[0],
+        max_overflow=pool[1],
         pool_timeout=WAIT_S,
         # A connection that died while it lay idle is noticed before a transaction begins on it.
         pool_pre_ping=True,

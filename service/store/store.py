@@ -11,7 +11,7 @@ from typing import Any
 
 from sqlalchemy import delete, func, select, text, update
 from sqlalchemy.exc import IntegrityError, TimeoutError
-from sqlalchemy.orm import Session, sessionmaker
+from sqlalchemy.orm import Session
 
 from service.loop import same_gains
 from service.plain import plain
@@ -20,7 +20,7 @@ from service.state_json import gains_of
 from service.states import ACTIVE, IllegalMove, JobState, check
 from service.store import chunks, retunes
 from service.store.clock import now
-from service.store.database import WAIT_S, checkpoint, migrate, open_database
+from service.store.database import RESERVE, WAIT_S, checkpoint, migrate, open_database, sessions
 from service.store.lock import FolderInUse, FolderLock, HostLock, ourselves
 from service.store.tables import ChunkRow, EventRow, JobRow, LoopRow, RetuneRow
 from tuning.plan import Sample
@@ -76,11 +76,13 @@ class Store:
         self._folder_lock = FolderLock(folder)
         self._host_lock: HostLock | None = None
         try:
-            self.engine = open_database(folder, database, f"loopwright {host}, {ourselves()}")
+            name = f"loopwright {host}, {ourselves()}"
+            self.engine = open_database(folder, database, name)
+            self._reserve = open_database(folder, database, name, RESERVE)
             self.shared = self.engine.dialect.name != "sqlite"
             # One writer at a time inside the process: SQLite has one anyway, and does not queue them fairly.
             self._write_lock = None if self.shared else threading.Lock()
-            self._session = sessionmaker(self.engine, expire_on_commit=False)
+            self._session = sessions(self.engine, self._reserve)
             if self.shared:
                 self._host_lock = HostLock(self.engine, host)
             migrate(self.engine)
@@ -103,8 +105,9 @@ class Store:
     def _let_go(self) -> None:
         if self._host_lock is not None:
             self._host_lock.close()
-        if hasattr(self, "engine"):
-            self.engine.dispose()
+        for engine in ("engine", "_reserve"):
+            if hasattr(self, engine):
+                getattr(self, engine).dispose()
         self._folder_lock.close()
 
     def check_lock(self) -> None:

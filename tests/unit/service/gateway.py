@@ -3,6 +3,8 @@
     python -m tests.unit.service.gateway FOLDER --tag TAG ... [--host NAME] [--database URL] [--no-resume]
 
 A stage lasts until FOLDER/go-STAGE (or FOLDER/go) is there; the controllers outlive the process as FOLDER/TAG.json.
+With --hours-back its clock is set back as soon as FOLDER/clock-is-back is there. The loops of --on-bus are on a bus in
+memory, on which no node answers.
 Nothing is restored while FOLDER/TAG.held is there.
 With --hours-back its clock is set back as soon as FOLDER/clock-is-back is there.
 """
@@ -18,15 +20,18 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from ipaddress import ip_network
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from protocol.station import Station
 from service.config import LoopConfig
 from service.loop import Loop, LoopState, Restored, differences
 from service.request import RetuneRequest
-from service.serving import Setup, serve
+from service.security.limits import RequestLimits
+from service.serving import Setup, open_bus_loop, serve
 from service.state_json import loop_state, state_json
 from service.store import store
 from service.work import Hooks, Outcome
@@ -166,18 +171,30 @@ def main() -> None:
     parser.add_argument("--no-resume", action="store_true")
     parser.add_argument("--hours-back", type=float, default=0.0)
     parser.add_argument("--sigterm")
+    parser.add_argument("--auth", action="store_true")
+    parser.add_argument("--limits", type=json.loads, default={})
+    parser.add_argument("--trusted-proxy", action="append", type=ip_network, default=[])
+    parser.add_argument("--on-bus", action="append", default=[])
     asked = parser.parse_args()
     if asked.sigterm:
         sigterm(*asked.sigterm.split())
     asked.folder.mkdir(parents=True, exist_ok=True)
     set_back(asked.folder / "clock-is-back", 3600 * asked.hours_back)
     loops = asked.folder / "loops.yaml"
-    entries = [loop_entry(tag=tag, channel=n + 1) for n, tag in enumerate(asked.tag)]
+    entries = [loop_entry(tag=tag, channel=n + 1) for n, tag in enumerate((*asked.tag, *asked.on_bus))]
     loops.write_text(yaml.safe_dump({"loops": entries}))
     setup = Setup(
-        loops, asked.folder / "data", "127.0.0.1", 0, asked.database, asked.host, not asked.no_resume, poll_s=0.05
-    )
-    serve(setup, lambda config: FileLoop(asked.folder, config.tag), tune_in(asked.folder))
+        loops, asked.folder / "data", "127.0.0.1", 0, asked.database, asked.host, not asked.no_resume, poll_s=0.05,
+        auth=asked.auth or None, limits=RequestLimits(**asked.limits), trusted_proxies=tuple(asked.trusted_proxy),
+    )  # fmt: skip
+    station = Station()
+
+    def open_loop(config: LoopConfig) -> Loop:
+        if config.tag in asked.on_bus:
+            return open_bus_loop(station, config)
+        return FileLoop(asked.folder, config.tag)
+
+    serve(setup, open_loop, tune_in(asked.folder))
 
 
 if __name__ == "__main__":
