@@ -272,7 +272,6 @@ class BusLoop:
             raise
         self._renewed_at = self._station.monotonic()
         self._until_renewal = self._lease.samples // 3
-        tuner.emergencies.clear()
         tuner.restarted, tuner.session_is_open = False, True
         home = self._reading(tuner).home()
         if tuner.session_is_open:  # else a hand was on the loop meanwhile, and the status has said so
