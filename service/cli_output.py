@@ -9,6 +9,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+Url = Annotated[str, typer.Option("--url", envvar="LOOPWRIGHT_URL", help="Where the service is.")]
 AsJson = Annotated[bool, typer.Option("--json", help="JSON, for scripts.")]
 
 
