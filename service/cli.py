@@ -160,16 +160,11 @@ def list_loops(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
     if as_json:
         print_json(found)
         return
+    shown = ("tag", "description", "bus", "controller_node", "pv_unit", "t95_s", "active_job")
     show.rows(
         "loops",
         ("tag", "description", "bus", "node", "unit", "T95 s", "job", "locked"),
-        (
-            (
-                x["tag"], x["description"], x["bus"], x["controller_node"], x["pv_unit"], x["t95_s"], x["active_job"],
-                show.lock(x["locked"]),
-            )  # fmt: skip
-            for x in found
-        ),
+        ((*(x[name] for name in shown), show.lock(x["locked"])) for x in found),
     )
 
 

@@ -7,7 +7,7 @@ from urllib.parse import quote
 
 import typer
 
-from service.cli_output import AsJson, Url, print_json
+from service.cli_output import AsJson, Url, print_json, user
 from service.client import DEFAULT_URL, Client
 
 app = typer.Typer()
@@ -31,12 +31,12 @@ def one_loop(tag: Tag, url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
 def lock(
     tag: Tag,
     reason: Annotated[str, typer.Option(help="Why; whoever is refused is shown it.")],
-    by: Annotated[str, typer.Option(help="Who locks it, for the others.")] = "cli",
+    by: Annotated[str | None, typer.Option(help="Who locks it, for the others; default: who is logged in.")] = None,
     url: Url = DEFAULT_URL,
     as_json: AsJson = False,
 ) -> None:
     """Lock a loop: no test begins on it and no decision writes to it until it is unlocked."""
-    found = Client(url).post(f"/loops/{quote(tag, safe='')}/lock", {"reason": reason, "by": by})
+    found = Client(url).post(f"/loops/{quote(tag, safe='')}/lock", {"reason": reason, "by": by or user()})
     if as_json:
         print_json(found)
         return
@@ -49,12 +49,12 @@ def lock(
 @app.command()
 def unlock(
     tag: Tag,
-    by: Annotated[str, typer.Option(help="Who unlocks it, for the audit log.")] = "cli",
+    by: Annotated[str | None, typer.Option(help="Who unlocks it; default: who is logged in.")] = None,
     url: Url = DEFAULT_URL,
     as_json: AsJson = False,
 ) -> None:
     """Unlock a loop."""
-    found = Client(url).post(f"/loops/{quote(tag, safe='')}/unlock", {"by": by})
+    found = Client(url).post(f"/loops/{quote(tag, safe='')}/unlock", {"by": by or user()})
     if as_json:
         print_json(found)
     elif found["was_locked"] is None:

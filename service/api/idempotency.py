@@ -18,7 +18,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
-from starlette.routing import Match
+from starlette.routing import compile_path
 
 from service.api import problems
 from service.security.gate import App, AsgiScope, Message, Receive, Send
@@ -118,7 +118,8 @@ class Idempotent:
             return found
         created = not scope["path"].startswith(f"{effect}/")
         headers = found.headers | ({"location": effect} if created else {})
-        return Answer(_status(scope), headers, found.body)
+        status = await self._beside(lambda: _status(scope))
+        return Answer(status, headers, found.body)
 
     async def _beside(self, work: Callable[[], T]) -> T:
         return await run_sync(work, limiter=self._threads)
@@ -132,9 +133,11 @@ def _fingerprint(scope: AsgiScope, body: bytes) -> str:
 
 
 def _status(scope: AsgiScope) -> int:
-    """With which the operation succeeds."""
-    routes = (route for route in scope["app"].routes if route.matches(scope)[0] is Match.FULL)
-    return getattr(next(routes, None), "status_code", None) or 200
+    """With which the operation succeeds, as the OpenAPI document says."""
+    for path, item in scope["app"].openapi()["paths"].items():
+        if "post" in item and compile_path(path)[0].match(scope["path"]):
+            return min(int(status) for status in item["post"]["responses"])
+    return 200
 
 
 async def _body(receive: Receive) -> bytes | None:
