@@ -11,7 +11,9 @@ from service import client as client_module
 from service.client import ApiError, Client
 
 
-def through(monkeypatch: pytest.MonkeyPatch, *answers: httpx.Response | Exception) -> tuple[Client, list[httpx.Request]]:
+def through(
+    monkeypatch: pytest.MonkeyPatch, *answers: httpx.Response | Exception
+) -> tuple[Client, list[httpx.Request]]:
     """A client that gets these answers in turn, and what it has sent."""
     sent: list[httpx.Request] = []
     left = list(answers)
