@@ -9,8 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
-from service import cli_data, cli_keys, cli_tuning
-from service.cli_output import AsJson, die, print_json, read_json_object
+from service import cli_data, cli_keys, cli_loops, cli_tuning
+from service.cli_output import AsJson, Url, die, print_json, read_json_object
 from service.client import DEFAULT_URL, ApiError, Client
 
 app = typer.Typer(
@@ -21,9 +21,8 @@ app = typer.Typer(
 )
 app.add_typer(cli_keys.app, name="key")
 app.add_typer(cli_data.app)
+app.add_typer(cli_loops.app)
 _HAND_OVER: dict[str, Any] = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
-
-Url = Annotated[str, typer.Option("--url", envvar="LOOPWRIGHT_URL", help="Where the service is.")]
 
 
 def main() -> None:
@@ -194,13 +193,11 @@ def list_loops(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
     if as_json:
         print_json(found)
         return
+    shown = ("tag", "description", "bus", "controller_node", "pv_unit", "t95_s", "active_job")
     show.rows(
         "loops",
-        ("tag", "description", "bus", "node", "unit", "T95 s", "job"),
-        (
-            (x["tag"], x["description"], x["bus"], x["controller_node"], x["pv_unit"], x["t95_s"], x["active_job"])
-            for x in found
-        ),
+        ("tag", "description", "bus", "node", "unit", "T95 s", "job", "locked"),
+        ((*(x[name] for name in shown), show.lock(x["locked"])) for x in found),
     )
 
 

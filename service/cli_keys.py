@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
 import json
 import sys
 from datetime import timedelta
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli_output import die
+from service.cli_output import die, user
 from service.security.keys import Scope
 
 if TYPE_CHECKING:
@@ -98,7 +97,7 @@ class _Keys:
         except SQLAlchemyError as error:
             die(f"the database cannot be used: {getattr(error, 'orig', None) or error}", 2)
         self._keyring = Keyring(self._engine)
-        current.set(Principal(f"cli:{_user()}", Scope.ADMIN))
+        current.set(Principal(user(), Scope.ADMIN))
 
     def __enter__(self) -> Keyring:
         return self._keyring
@@ -109,10 +108,3 @@ class _Keys:
         self._engine.dispose()
         if isinstance(error, KeyProblem):
             die(str(error), 2)
-
-
-def _user() -> str:
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):
-        return "unknown"

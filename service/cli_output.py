@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import getpass
 import json
 import sys
 from pathlib import Path
@@ -9,7 +10,16 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+Url = Annotated[str, typer.Option("--url", envvar="LOOPWRIGHT_URL", help="Where the service is.")]
 AsJson = Annotated[bool, typer.Option("--json", help="JSON, for scripts.")]
+
+
+def user() -> str:
+    """Who gives the command, as the audit log names them."""
+    try:
+        return f"cli:{getpass.getuser()}"
+    except (KeyError, OSError):
+        return "cli:unknown"
 
 
 def print_json(value: object) -> None:

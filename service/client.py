@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
+import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +15,8 @@ if TYPE_CHECKING:
 DEFAULT_URL = "http://127.0.0.1:8080"
 KEY_VARIABLE = "LOOPWRIGHT_KEY"
 """In the environment and not on the command line, where every user of the machine could read it."""
+_PATIENCE_S = 30.0
+"""For the answer to a request whose connection broke while it was being answered."""
 
 
 class ApiError(Exception):
@@ -46,7 +50,28 @@ class Client:
             following = httpx.URL(answer.links["next"]["url"])
 
     def post(self, path: str, body: dict[str, Any] | None = None) -> Any:
-        return self._json("POST", path, json=body or {})
+        """When the connection breaks the request is repeated once, with the key by which the service knows it again."""
+        import httpx
+
+        request: dict[str, Any] = {"json": body or {}, "headers": {"Idempotency-Key": secrets.token_hex(16)}}
+        try:
+            answer = self._http.post(path, **request)
+        except httpx.ConnectError as error:
+            raise self._no_service(error) from error
+        except httpx.TransportError:
+            answer = self._repeated(path, request)
+        self._check(answer)
+        return answer.json()
+
+    def _repeated(self, path: str, request: dict[str, Any]) -> httpx.Response:
+        """409 with Retry-After: the service is still busy with what was sent first."""
+        give_up = time.monotonic() + _PATIENCE_S
+        while True:
+            answer = self._send("POST", path, **request)
+            wait = answer.headers.get("Retry-After", "")
+            if answer.status_code != 409 or not wait.isdigit() or time.monotonic() + int(wait) > give_up:
+                return answer
+            time.sleep(int(wait))
 
     def events(self, job_url: str) -> Iterator[tuple[str, dict[str, Any]]]:
         """(kind, data) of each event of a job until it is over; resumes when the connection breaks."""
@@ -79,14 +104,20 @@ class Client:
         return self._answer(method, path, **more).json()
 
     def _answer(self, method: str, path: str | httpx.URL, **more: Any) -> httpx.Response:
+        answer = self._send(method, path, **more)
+        self._check(answer)
+        return answer
+
+    def _send(self, method: str, path: str | httpx.URL, **more: Any) -> httpx.Response:
         import httpx
 
         try:
-            answer = self._http.request(method, path, **more)
+            return self._http.request(method, path, **more)
         except httpx.TransportError as error:
-            raise ApiError(f"no service at {self.url} ({error}); start one with: loopwright serve") from error
-        self._check(answer)
-        return answer
+            raise self._no_service(error) from error
+
+    def _no_service(self, error: Exception) -> ApiError:
+        return ApiError(f"no service at {self.url} ({error}); start one with: loopwright serve")
 
     @staticmethod
     def _check(answer: httpx.Response) -> None:

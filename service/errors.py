@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from tuning.reasons import Reason, Refused
+
 
 class UnknownLoop(Exception):
     """No loop of that tag is configured."""
@@ -17,3 +19,17 @@ class Stopping(Exception):
 
 class Conflict(Exception):
     """The job or its loop is not as the wish supposes."""
+
+
+class Locked(Refused):
+    """Somebody has locked the loop: no test begins on it, and no decision writes to it."""
+
+    def __init__(self, detail: str) -> None:
+        super().__init__(Reason.LOCKED, detail)
+
+    def __reduce__(self) -> tuple[type[Locked], tuple[str]]:  # type: ignore[override]
+        return type(self), (self.detail,)
+
+
+class LockedOtherwise(Locked):
+    """Somebody has locked the loop for another reason."""

@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.config import BusConfig, LoopConfig
-from service.errors import Stopping, UnknownLoop
+from service.errors import Locked, Stopping, UnknownLoop
 from service.jobs import Jobs
 from service.request import BadLimits, RetuneRequest, within
 from service.states import IllegalMove
@@ -25,6 +25,7 @@ from service.store import retunes
 from service.store.retunes import Part, RetuneOver, StopReason
 from service.store.store import Busy
 from service.store.tables import RetuneRow
+from tuning.reasons import Reason
 
 log = logging.getLogger(__name__)
 
@@ -210,13 +211,16 @@ class Fleet:
             except (BadLimits, UnknownLoop) as error:
                 self._give_up(row, part, str(error))
                 continue
+            except Locked as error:
+                self._give_up(row, part, error.detail, error.reason)
+                continue
             except (Stopping, RetuneOver):
                 return
             taken.update(places)
 
-    def _give_up(self, row: RetuneRow, part: Part, detail: str) -> None:
+    def _give_up(self, row: RetuneRow, part: Part, detail: str, reason: Reason | None = None) -> None:
         with self._store.writing() as session:
-            retunes.give_up(session, row.id, part.position, detail)
+            retunes.give_up(session, row.id, part.position, detail, reason)
 
     def _abort(self, row: RetuneRow, parts: Sequence[Part]) -> None:
         active = [part.job_id for part in parts if part.active and part.job_id is not None]

@@ -19,7 +19,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.aftercare import Aftercare
 from service.config import BusConfig, LoopConfig
 from service.engine import WORKFLOW_VERSION, Engine
-from service.errors import Conflict, Stopping, UnknownLoop
+from service.errors import Conflict, Locked, Stopping, UnknownLoop
 from service.exchange import ForeignGains, exchange
 from service.journal import Journal, temporary
 from service.logs import about
@@ -32,9 +32,9 @@ from service.running import Running
 from service.safe import make_safe
 from service.state_json import gains_of, loop_state, state_json
 from service.states import ACTIVE, IllegalMove, JobState, state_after
-from service.store import looked_after
+from service.store import looked_after, loop_locks
 from service.store.store import Busy, FolderInUse, NoSuchJob, Store, WithJob
-from service.store.tables import JobRow
+from service.store.tables import JobRow, LoopLockRow
 from service.work import Hooks, Outcome, Rehearse, Tune
 from tuning.plan import Event
 from tuning.reasons import Aborted, Ended, Failed, Reason
@@ -48,6 +48,9 @@ _WATCH_S = 0.2
 _RECONCILE_S = 15.0
 _AT_BOOT = 16
 _STOP_PATIENCE_S = 20.0
+_WRITES_S = 10.0
+"""Wall time for which a lock waits for a decision that has begun to write to the loop: each of its few answers comes
+within a second or two."""
 _ENDS_S = 75.0
 """Wall time in which a job that is told to stop has ended: its loop restored (tried for 4 s, and every answer of the
 last try may be late, 25 s in all), its reports and its end written or given up (twice _STOP_PATIENCE_S and a wait of
@@ -93,6 +96,8 @@ class Jobs:
         self.aftercare = Aftercare(
             loops, store, lambda config: self._open_loop(config), self._hands, machine=self._machine
         )
+        # By loop: set once a decision that writes to its controller has ended.
+        self._writes: dict[str, threading.Event] = {}
         self._lost: set[str] = set()
         # By id: jobs whose asker was told that they could not be queued, and whose end could not be written either.
         self._unqueued: dict[str, JobRow] = {}
@@ -191,7 +196,7 @@ class Jobs:
 
     # start and stop
     def start(self, tag: str, request: RetuneRequest, also: WithJob | None = None) -> JobRow:
-        """Queues a job on the host that has the loop. Raises UnknownLoop, BadLimits, Busy, Stopping.
+        """Queues a job on the host that has the loop. Raises UnknownLoop, BadLimits, Busy, Locked, Stopping.
 
         also: what is written in the same transaction; when it raises, there is no job.
         """
@@ -331,6 +336,33 @@ class Jobs:
             raise Busy(tag, active.id)
         return looked_after.dismissed(self.store, tag, by)
 
+    # locks
+    def lock(self, tag: str, reason: str, by: str) -> tuple[LoopLockRow, JobRow | None]:
+        """From now on no test begins on the loop, whatever host it is on, and no decision writes to it. Returns the
+        lock, and the job whose test was running already and goes on. Raises UnknownLoop, LockedOtherwise."""
+        self.owner(tag)
+        with self.store.writing() as session:
+            row = loop_locks.lock(session, tag, reason, by)
+        writes = self._writes.get(tag)
+        if writes is not None and not writes.wait(_WRITES_S):
+            raise Conflict(
+                f"loop {tag} is locked now, but a decision that began before is still writing to its controller; "
+                "look again in a moment"
+            )
+        active = self.store.active(tag)
+        return row, active if active is not None and active.state == JobState.RUNNING else None
+
+    def unlock(self, tag: str, by: str) -> LoopLockRow | None:
+        """What the loop was locked for; None: it was not. Raises UnknownLoop."""
+        self.owner(tag)
+        with self.store.writing() as session:
+            return loop_locks.unlock(session, tag, by)
+
+    def locks(self) -> dict[str, LoopLockRow]:
+        """The locks by loop, of every host."""
+        with self.store.reading() as session:
+            return loop_locks.every(session)
+
     # decide
     def accept(self, job_id: str, by: str) -> JobRow:
         """Makes the proposed gains the accepted ones of the controller, and reads them back.
@@ -359,16 +391,24 @@ class Jobs:
                 raise Busy(row.loop, active.id)
             if wanted is JobState.ROLLED_BACK and (declined := self.store.decline(job_id, by)) is not None:
                 return declined
+            with self.store.reading() as session:
+                loop_locks.check(session, row.loop)
             config, host = self.owner(row.loop)
             if host != self.store.host:
                 raise Conflict(f"loop {row.loop} is on the bus of host {host}: only the service there can write to it")
             old, new = gains_of(row.old_gains), gains_of((row.result or {}).get("gains"))
             before, after = (old, new) if wanted is JobState.ACCEPTED else (new, old)
             begun = self.store.decision_begun(job_id)
+            over = self._machine.event()
+
+            def begin() -> None:
+                self._writes[row.loop] = over  # a lock that finds the decision begun waits for its end
+                self.store.begin_decision(job_id, wanted, by)
+
             try:
                 loop = self._open_loop(config)
                 try:
-                    state = exchange(loop, before, after, begun, lambda: self.store.begin_decision(job_id, wanted, by))
+                    state = exchange(loop, before, after, begun, begin)
                 finally:
                     loop.close()
             except ForeignGains as foreign:
@@ -377,11 +417,16 @@ class Jobs:
                     raise
                 detail = f"declined; the controller holds {foreign.found.gains}: somebody else's, left as they are"
                 return self.store.move(job_id, wanted, by=by, restored=state_json(foreign.found), detail=detail)
+            except Locked:  # before anything was written
+                raise
             except Ended as ended:
                 self.store.decision_failed(job_id, wanted, by, f"{ended.reason.value}: {ended.detail}")
                 if ended.reason is Reason.GAINS_CHANGED:
                     raise Conflict(ended.detail) from ended
                 raise
+            finally:
+                self._writes.pop(row.loop, None)
+                over.set()
             return self.store.move(job_id, wanted, by=by, restored=state_json(state))
 
     # the thread of a job

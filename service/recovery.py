@@ -9,11 +9,13 @@ from typing import Any
 
 from service.config import LoopConfig
 from service.engine import WORKFLOW_VERSION
+from service.errors import Locked
 from service.loop import Loop
 from service.request import RetuneRequest, within
 from service.safe import Safe, look
 from service.state_json import state_json
 from service.states import JobState
+from service.store import loop_locks
 from service.store.store import Store
 from service.store.tables import JobRow
 from tuning.reasons import Reason
@@ -67,6 +69,8 @@ class Recovery:
             return Reason.SERVICE_STOPPED, "its loop is no longer configured here"
         if not self.resumes:
             return Reason.SERVICE_STOPPED, "the service was started with --no-resume"
+        if row.found is not None and (locked := self._locked(row.loop)) is not None:
+            return Reason.LOCKED, locked
         if safe is not None and safe.reason is not None:
             return safe.reason, "the loop is not as the job had found it" if safe.state else "the loop is not reached"
         if row.attempt >= MOST_ATTEMPTS:
@@ -75,6 +79,15 @@ class Recovery:
             within(config, RetuneRequest.model_validate(row.request))
         except ValueError as error:  # BadLimits too
             return Reason.BAD_LIMITS, f"the loop's configuration has changed: {error}"
+        return None
+
+    def _locked(self, loop: str) -> str | None:
+        """Who has locked the loop, in words. A job that has not begun yet is refused at its turn."""
+        try:
+            with self.store.reading() as session:
+                loop_locks.check(session, loop)
+        except Locked as locked:
+            return locked.detail
         return None
 
 

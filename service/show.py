@@ -124,6 +124,34 @@ def _certainty(job: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
         yield "measured step explained", f"{step['fit_pct']:.1f}", "%"
 
 
+def loop_report(loop: dict[str, Any]) -> None:
+    """A loop as it is now."""
+    live = loop["live"] or {}
+    unit, gains = loop["pv_unit"], live.get("gains") or {}
+    job, last = loop["active_job"], loop["last_job_state"]
+    table = Table("", "now", "unit", title=f"loop {loop['tag']}: {loop['description']}")
+    for label, value, of in (
+        ("SP", live.get("sp"), unit),
+        ("PV", live.get("pv"), unit),
+        ("MV", live.get("mv"), "%"),
+        ("mode", live.get("mode"), ""),
+        *((f"gain {name}", gains.get(name), of) for name, of in (("Kp", f"% per {unit}"), ("Ti", "s"), ("Td", "s"))),
+        ("nodes", live.get("node_state"), ""),
+        ("host", loop["host"], ""),
+        ("job", job or (last and f"none; the last one: {last}"), ""),
+        ("locked", lock(loop["locked"]), ""),
+    ):
+        table.add_row(label, cell(value), of)
+    console.print(table)
+    if loop["not_confirmed_home"]:
+        console.print(loop["not_confirmed_home"]["advice"], highlight=False)
+
+
+def lock(locked: dict[str, Any] | None) -> str | None:
+    """Who keeps tests from a loop, and why."""
+    return None if locked is None else f"by {locked['by']}: {locked['reason']}"
+
+
 def cell(value: object) -> str:
     return "-" if value is None else number(value)
 

@@ -43,6 +43,7 @@ class Reason(StrEnum):
     AMBIGUOUS = "ambiguous"
     SURPRISE = "surprise"
     DIVERGES = "diverges"
+    LOCKED = "locked"
     # failed
     PV_LIMIT = "pv_limit"
     TIME_BUDGET = "time_budget"
@@ -104,6 +105,7 @@ ADVICE: dict[Reason, str] = {
     Reason.SURPRISE: "The loop behaved differently under the new gains than under the relay: look for changes of the "
     "load or of the plant, then retune.",
     Reason.DIVERGES: "PV ran away under the new gains, which were taken back: keep the present gains, and repeat.",
+    Reason.LOCKED: "Somebody has locked the loop: ask them, or unlock it (loopwright unlock TAG), then ask again.",
     Reason.PV_LIMIT: "PV reached its limit: permit less MV deviation, or widen the PV limits if it is safe.",
     Reason.TIME_BUDGET: "The test took longer than its budget: check T95, or raise the budget.",
     Reason.BAD_SAMPLE: "A sample was not a finite number: check the sensor and its scaling.",

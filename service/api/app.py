@@ -12,8 +12,9 @@ from typing import Annotated, Literal
 from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
 from fastapi.responses import PlainTextResponse, StreamingResponse
 
-from service.api import contract, fleet, operations, problems, tunings
+from service.api import contract, fleet, locks, operations, problems, tunings
 from service.api.access import Access
+from service.api.idempotency import Idempotent
 from service.api.samples import sample_columns
 from service.api.stream import event_stream
 from service.api.views import (
@@ -34,6 +35,7 @@ from service.request import RetuneRequest
 from service.security.gate import Gate, Policy
 from service.shared_reading import SharedReading
 from service.states import ACTIVE, JobState
+from service.store.idempotency import IdempotencyKeys
 from service.store.tables import JobRow
 from tuning.plan import Sample
 from tuning.reasons import Ended
@@ -72,6 +74,7 @@ def create_app(
         docs_url=None,  # would load its scripts from elsewhere
         redoc_url=None,
     )
+    app.add_middleware(Idempotent, keys=IdempotencyKeys(jobs.store))
     app.add_middleware(Gate, policy=policy or Policy())
     app.add_middleware(Access)
     problems.install(app)
@@ -95,7 +98,8 @@ def create_app(
             if not_home is None:
                 raise
             state = None
-        shown = loop_view(config, host, jobs.store.busy().get(tag), jobs.store.last_states(tag).get(tag))
+        of_it = jobs.store.busy().get(tag), jobs.store.last_states(tag).get(tag), jobs.locks().get(tag)
+        shown = loop_view(config, host, *of_it)
         return LoopDetail(
             **shown,
             live=live_view(state) if state else None,
@@ -204,6 +208,7 @@ def create_app(
     def rollback(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
         return view(jobs.rollback(job_id, (decision or Decision()).by))
 
+    app.include_router(locks.router(jobs))
     app.include_router(tunings.router(jobs, pool or Pool()))
     return app
 

@@ -8,10 +8,22 @@ from typing import Any
 from fastapi import FastAPI
 
 from service.api import problems
+from service.api.idempotency import HEADER, MOST_CHARACTERS, PATTERN
 from service.security.gate import ALWAYS, scope_for
+from service.store.idempotency import KEPT_H
 
 _KEY = "key"
 _METHODS = ("get", "post", "put", "patch", "delete")
+_IDEMPOTENCY_KEY = {
+    "name": HEADER,
+    "in": "header",
+    "required": False,
+    "description": "Any text that the client gives to no other request, a UUID say. Repeated with the same key within "
+    f"{KEPT_H} h, the request does nothing again and is answered as it was the first time. With another path or body: "
+    "422; while the first is still being answered: 409 with Retry-After",
+    "schema": {"type": "string", "pattern": PATTERN, "maxLength": MOST_CHARACTERS + 2},
+    "example": "7f1c4f5e-2b8f-4a36-9f3a-5d0b3c1e8a77",
+}
 
 
 def install(app: FastAPI) -> None:
@@ -54,6 +66,9 @@ def _one(path: str, method: str, operation: dict[str, Any]) -> None:
         more += (401,)
     if method != "get":
         more += (408, 413)  # the body did not come, or is too long
+    if method == "post":
+        operation.setdefault("parameters", []).append(_IDEMPOTENCY_KEY)
+        more += (409, 422)
     if "requestBody" in operation:
         more += (400,)  # not text at all
     if path not in ALWAYS:

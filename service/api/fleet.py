@@ -81,7 +81,7 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, view: Callable[[JobRow], Job
             str | None, Query(max_length=64, description="From the URL of the next page, as it came")
         ] = None,
     ) -> list[LoopView]:
-        busy, last = jobs.store.busy(), jobs.store.last_states()
+        busy, last, locks = jobs.store.busy(), jobs.store.last_states(), jobs.locks()
         found: list[LoopView] = []
         for config, host in sorted(jobs.everywhere(), key=lambda one: one[0].tag):
             if cursor is not None and config.tag <= cursor:
@@ -91,7 +91,8 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, view: Callable[[JobRow], Job
             if len(found) == limit:
                 more(response, "/loops", found[-1].tag, state=state, limit=limit)
                 break
-            found.append(LoopView(**loop_view(config, host, busy.get(config.tag), last.get(config.tag))))
+            of_it = busy.get(config.tag), last.get(config.tag), locks.get(config.tag)
+            found.append(LoopView(**loop_view(config, host, *of_it)))
         return found
 
     @router.get(

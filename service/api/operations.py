@@ -65,10 +65,12 @@ class AuditView(BaseModel):
     said_by: str | None = Field(description="Who the request itself says it is from", examples=["night shift"])
     what: str = Field(
         description="retune, abort, accept, rollback, accept_failed, rollback_failed, retune_many, retune_many_abort, "
-        "dismiss, samples_delete, restore, key_create, key_revoke",
+        "dismiss, lock, unlock, samples_delete, restore, key_create, key_revoke",
         examples=["accept"],
     )
-    subject: str = Field(description="Id of the job, key, or retune of many loops", examples=["4f0c2a9be113"])
+    subject: str = Field(
+        description="Id of the job, key, or retune of many loops, or tag of the loop", examples=["4f0c2a9be113"]
+    )
     loop: str | None = Field(examples=["TIC-101"])
     before: dict[str, Any] | None = Field(description="State and gains before, where there were some")
     after: dict[str, Any] | None = Field(description="State and gains after; of a retune the request")

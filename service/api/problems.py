@@ -13,11 +13,12 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 
 from service.computing.pool import NotWanted
-from service.errors import Conflict, Stopping, UnknownLoop
+from service.errors import Conflict, Locked, Stopping, UnknownLoop
 from service.journal import temporary
 from service.model_forms import BadModel
 from service.request import BadLimits
 from service.states import IllegalMove
+from service.store.claims import StillAnswering
 from service.store.store import Busy, NoSuchJob
 from service.tunings import BadTuning
 from tuning.reasons import ADVICE, Ended, Reason
@@ -49,6 +50,17 @@ def problem(
     if reason is not None:
         body |= {"reason": reason.value, "advice": ADVICE[reason]}
     return JSONResponse(body | more, status_code=status, media_type=MEDIA_TYPE, headers=headers)
+
+
+def of_database(error: SQLAlchemyError) -> JSONResponse:
+    if not temporary(error):
+        return problem(500, f"{type(error).__name__} of the database", reason=Reason.INTERNAL)
+    detail = "the database does not answer; jobs that run go on, ask again"
+    return problem(503, detail, headers={"Retry-After": "5"})
+
+
+def still_answering(error: StillAnswering) -> JSONResponse:
+    return problem(409, str(error), headers={"Retry-After": "1"})
 
 
 def install(app: FastAPI) -> None:
@@ -94,16 +106,21 @@ def install(app: FastAPI) -> None:
     async def _gone(_request: Request, _error: NotWanted) -> Response:
         return Response(status_code=CLIENT_GONE)
 
+    @app.exception_handler(Locked)
+    async def _locked(_request: Request, error: Locked) -> JSONResponse:
+        return problem(409, error.detail, reason=error.reason)
+
+    @app.exception_handler(StillAnswering)
+    async def _answering(_request: Request, error: StillAnswering) -> JSONResponse:
+        return still_answering(error)
+
     @app.exception_handler(Stopping)
     async def _stopping(_request: Request, error: Stopping) -> JSONResponse:
         return problem(503, str(error), reason=Reason.SERVICE_STOPPED)
 
     @app.exception_handler(SQLAlchemyError)
     async def _database(_request: Request, error: SQLAlchemyError) -> JSONResponse:
-        if not temporary(error):
-            return problem(500, f"{type(error).__name__} of the database", reason=Reason.INTERNAL)
-        detail = "the database does not answer; jobs that run go on, ask again"
-        return problem(503, detail, headers={"Retry-After": "5"})
+        return of_database(error)
 
     @app.exception_handler(Ended)
     async def _ended(_request: Request, error: Ended) -> JSONResponse:

@@ -128,7 +128,6 @@ class AlternativeView(TunedView):
         examples=[{"start": "optimise", "method": "simc", "model": {"K": 0.8, "T_s": 3.0, "L_s": 1.0}}],
     )
 
-
     uncertainty: float | None = Field(
         description="With `ms`: so much larger Ms would be with the model two standard deviations off; null: no record"
     )

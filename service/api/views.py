@@ -24,7 +24,7 @@ from service.config import Limits, LoopConfig
 from service.loop import LoopState
 from service.running import Running
 from service.states import ACTIVE, JobState
-from service.store.tables import EventRow, JobRow
+from service.store.tables import EventRow, JobRow, LoopLockRow
 from tuning.five_stage import PROCEDURE
 from tuning.gains import Gains
 from tuning.reasons import ADVICE, Reason
@@ -40,6 +40,18 @@ class GainsView(BaseModel):
     Tf: float = Field(description="Derivative filter time, s", examples=[0.0])
     b: float = Field(description="Set-point weight of the proportional path", examples=[1.0])
     c: float = Field(description="Set-point weight of the derivative path", examples=[0.0])
+
+
+class LockView(BaseModel):
+    """Somebody keeps tests and decisions from a loop."""
+
+    reason: str = Field(examples=["valve is being overhauled"])
+    by: str = Field(description="Who has locked it, as they said", examples=["night shift"])
+    since: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
+
+    @classmethod
+    def of(cls, row: LoopLockRow) -> LockView:
+        return cls(reason=row.reason, by=row.by, since=row.since)
 
 
 class LoopView(BaseModel):
@@ -61,6 +73,7 @@ class LoopView(BaseModel):
     host: str = Field(description="The service that has the loop's bus", examples=["local"])
     active_job: str | None = Field(description="URL of the job that has the loop", examples=["/jobs/4f0c2a9be113"])
     last_job_state: JobState | None = Field(description="State of its latest job; dry runs do not count")
+    locked: LockView | None = Field(description="No test and no decision touches it; null: it is not locked")
 
 
 class LiveView(BaseModel):
@@ -184,10 +197,17 @@ class Decision(BaseModel):
     by: str = Field(default="api", max_length=100, examples=["operator A"])
 
 
-def loop_view(config: LoopConfig, host: str, active: str | None, last: str | None) -> dict[str, Any]:
+def loop_view(
+    config: LoopConfig, host: str, active: str | None, last: str | None, lock: LoopLockRow | None
+) -> dict[str, Any]:
     """active: the id of the job that has the loop.  last: the state of its latest one."""
     fields = config.model_dump(exclude={"noise_std_hint"})
-    return fields | {"host": host, "active_job": None if active is None else f"/jobs/{active}", "last_job_state": last}
+    return fields | {
+        "host": host,
+        "active_job": None if active is None else f"/jobs/{active}",
+        "last_job_state": last,
+        "locked": None if lock is None else LockView.of(lock),
+    }
 
 
 def live_view(state: LoopState) -> LiveView:

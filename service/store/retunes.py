@@ -13,6 +13,7 @@ from sqlalchemy.orm import Session
 
 from service.security import audit
 from service.states import ACTIVE, JobState
+from service.store import claims
 from service.store.clock import now
 from service.store.tables import JobRow, RetuneLoopRow, RetuneRow
 from tuning.reasons import Reason
@@ -40,6 +41,7 @@ OPEN = (RetuneState.RUNNING, RetuneState.STOPPING)
 WAITING, SKIPPED = "waiting", "skipped"
 _FAILURES = frozenset({JobState.REFUSED, JobState.FAILED, JobState.INTERRUPTED})
 _NOBODYS_FAULT = frozenset({Reason.OPERATOR.value, Reason.SERVICE_STOPPED.value})
+_LOCKED = Reason.LOCKED.value
 
 
 class NoSuchRetune(Exception):
@@ -77,7 +79,10 @@ class Part:
 
     @property
     def failed(self) -> bool:
-        """Ended without a proposal, and not because somebody or the end of the service stopped it."""
+        """Ended without a proposal, and not because somebody or the end of the service stopped it, or because the loop
+        is locked."""
+        if self.reason == _LOCKED:
+            return False
         if self.job_state is None:
             return self.detail is not None
         if self.job_state is JobState.ABORTED:
@@ -106,6 +111,7 @@ def add(session: Session, host: str, request: dict[str, Any], loops: Sequence[st
     session.add_all(RetuneLoopRow(retune_id=row.id, position=n, loop=loop) for n, loop in enumerate(loops))
     after = {"request": request, "loops": list(loops)}
     audit.record(session, "retune_many", row.id, after=after, said_by=requested_by)
+    claims.made(session, f"/retunes/{row.id}")
     return row
 
 
@@ -127,7 +133,14 @@ def parts(session: Session, retune_id: str) -> list[Part]:
         .order_by(RetuneLoopRow.position)
     )
     return [
-        Part(row.position, row.loop, row.job_id, JobState(state) if state else None, reason, detail or row.detail)
+        Part(
+            row.position,
+            row.loop,
+            row.job_id,
+            JobState(state) if state else None,
+            reason or row.reason,
+            detail or row.detail,
+        )
         for row, state, reason, detail in session.execute(wanted)
     ]
 
@@ -158,9 +171,9 @@ def begins(retune_id: str, position: int) -> Callable[[Session, JobRow], None]:
     return write
 
 
-def give_up(session: Session, retune_id: str, position: int, detail: str) -> None:
+def give_up(session: Session, retune_id: str, position: int, detail: str, reason: Reason | None = None) -> None:
     """Notes why a loop will have no job."""
-    _set(session, retune_id, position, detail=detail)
+    _set(session, retune_id, position, detail=detail, reason=None if reason is None else reason.value)
 
 
 def stop(session: Session, retune_id: str, reason: StopReason, detail: str, by: str | None = None) -> bool:
@@ -171,6 +184,7 @@ def stop(session: Session, retune_id: str, reason: StopReason, detail: str, by: 
     row = find(session, retune_id, lock=True)
     if row.state not in OPEN:
         raise RetuneOver(f"retune {retune_id} is {row.state} already")
+    claims.changed(session, f"/retunes/{retune_id}")
     if row.stop_reason == StopReason.OPERATOR or row.stop_reason == reason:
         return False
     row.state, row.stop_reason, row.detail = RetuneState.STOPPING.value, reason.value, detail
@@ -190,6 +204,6 @@ def end(session: Session, retune_id: str) -> None:
     row.ended_at = now()
 
 
-def _set(session: Session, retune_id: str, position: int, **columns: str) -> None:
+def _set(session: Session, retune_id: str, position: int, **columns: str | None) -> None:
     one = (RetuneLoopRow.retune_id == retune_id, RetuneLoopRow.position == position)
     session.execute(update(RetuneLoopRow).where(*one).values(**columns))

@@ -18,7 +18,7 @@ from service.plain import plain
 from service.security import audit
 from service.state_json import gains_of
 from service.states import ACTIVE, IllegalMove, JobState, check
-from service.store import chunks, retunes
+from service.store import chunks, claims, loop_locks, retunes
 from service.store.clock import now
 from service.store.database import RESERVE, WAIT_S, checkpoint, migrate, open_database, sessions
 from service.store.lock import FolderInUse, FolderLock, HostLock, ourselves
@@ -184,7 +184,7 @@ class Store:
         version: str = "0",
         also: WithJob | None = None,
     ) -> JobRow:
-        """A new queued job, on this host unless on another. Raises Busy when the loop has an active one."""
+        """A new queued job, on this host unless on another. Raises Busy when the loop has an active one, and Locked."""
         row = JobRow(
             id=secrets.token_hex(6),
             loop=loop,
@@ -198,9 +198,12 @@ class Store:
         )
         try:
             with self.writing() as session:
+                if not dry_run:
+                    loop_locks.check(session, loop)
                 session.add(row)
                 session.flush()
                 append(session, row.id, "state", {"state": row.state, "by": requested_by}, 0.0)
+                claims.made(session, f"/jobs/{row.id}")
                 audit.record(session, "retune", row.id, after=row.request, loop=loop, said_by=requested_by)
                 if also is not None:
                     also(session, row)
@@ -212,7 +215,8 @@ class Store:
         return row
 
     def move(self, job_id: str, wanted: JobState, by: str = "service", **columns: Any) -> JobRow:
-        """Moves the job as the table allows and sets the columns, in one transaction with its event."""
+        """Moves the job as the table allows and sets the columns, in one transaction with its event. Raises
+        IllegalMove, and Locked where its test is to begin."""
         with self.writing() as session:
             return _move(session, _find(session, job_id, lock=True), wanted, by, columns)
 
@@ -230,19 +234,21 @@ class Store:
             return _last_begun(session, job_id) is not None
 
     def begin_decision(self, job_id: str, wanted: JobState, by: str) -> None:
-        """Notes that the controller is about to be written to. Raises IllegalMove when another was faster."""
+        """Notes that the controller is about to be written to. Raises IllegalMove when another was faster, Locked."""
         with self.writing() as session:
             row = _find(session, job_id, lock=True)
             check(JobState(row.state), wanted)
+            loop_locks.check(session, row.loop)
             append(session, job_id, _BEGUN, {"decision": DECISIONS[wanted], "by": by}, row.plant_time_s)
 
     def resumed(self, job_id: str, told: dict[str, Any], **columns: Any) -> None:
-        """Notes that an active job has begun another attempt. Raises IllegalMove when it is over."""
+        """Notes that an active job has begun another attempt. Raises IllegalMove when it is over, Locked."""
         with self.writing() as session:
             row = _find(session, job_id, lock=True)
             state = JobState(row.state)
             if state not in ACTIVE:
                 raise IllegalMove(state, JobState.RUNNING)
+            _may_begin(session, row)
             set_columns(row, columns)
             append(session, job_id, "resumed", told, row.plant_time_s)
 
@@ -294,6 +300,7 @@ class Store:
         with self.writing() as session:
             row = _find(session, job_id, lock=True)
             check(JobState(row.state), JobState.ABORTED)
+            claims.changed(session, f"/jobs/{job_id}")
             if row.stop_reason is None:
                 row.stop_reason = reason
                 append(session, job_id, "abort_requested", {"by": by}, row.plant_time_s)
@@ -417,9 +424,17 @@ def set_columns(row: JobRow, columns: dict[str, Any]) -> None:
         setattr(row, name, plain(value))
 
 
+def _may_begin(session: Session, row: JobRow) -> None:
+    """Raises Locked."""
+    if not row.dry_run:
+        loop_locks.check(session, row.loop)
+
+
 def _move(session: Session, row: JobRow, wanted: JobState, by: str, columns: dict[str, Any]) -> JobRow:
     previous = JobState(row.state)
     check(previous, wanted)
+    if wanted is JobState.RUNNING:
+        _may_begin(session, row)
     row.state = wanted.value
     set_columns(row, columns)
     if wanted is JobState.RUNNING:
@@ -430,6 +445,7 @@ def _move(session: Session, row: JobRow, wanted: JobState, by: str, columns: dic
     told |= {key: columns[key] for key in ("reason", "detail") if columns.get(key)}
     append(session, row.id, "state", told, row.plant_time_s)
     if wanted in DECISIONS:
+        claims.changed(session, f"/jobs/{row.id}")
         _audit_decision(session, row, previous, wanted, by, (columns.get("restored") or {}).get("gains"))
     return row
 

@@ -70,6 +70,17 @@ class LoopRow(Base):
     config: Mapped[dict[str, Any]]
 
 
+class LoopLockRow(Base):
+    """A loop that somebody has locked. Apart from the loops, which each host writes anew at its start."""
+
+    __tablename__ = "loop_locks"
+
+    loop: Mapped[str] = mapped_column(primary_key=True)
+    reason: Mapped[str]
+    by: Mapped[str]
+    since: Mapped[str]
+
+
 class EventRow(Base):
     """One thing that happened in a job; seq counts from 1 within the job and is the id of the server-sent event."""
 
@@ -116,7 +127,7 @@ class RetuneRow(Base):
 
 
 class RetuneLoopRow(Base):
-    """A loop of such a retune. detail: why it has no job, when it will never have one."""
+    """A loop of such a retune. detail: why it has no job, when it will never have one; reason: from the closed list."""
 
     __tablename__ = "retune_loops"
 
@@ -124,4 +135,31 @@ class RetuneLoopRow(Base):
     position: Mapped[int] = mapped_column(primary_key=True)
     loop: Mapped[str]
     job_id: Mapped[str | None] = mapped_column(ForeignKey("jobs.id"))
+    reason: Mapped[str | None]
     detail: Mapped[str | None]
+
+
+class IdempotencyRow(Base):
+    """A key under which a client may repeat a POST, and the answer that it then gets, see service.store.idempotency.
+
+    principal: id of the API key, or `local`.  token: who answers it now, a new one at each attempt.
+    effect: URL of what the request has made or changed, written in the transaction that did so.
+    status: null while there is no answer.
+    """
+
+    __tablename__ = "idempotency_keys"
+    __table_args__ = (
+        Index("idempotency_keys_by_age", "at"),
+        Index("idempotency_keys_by_principal", "principal", "at"),
+    )
+
+    principal: Mapped[str] = mapped_column(primary_key=True)
+    key: Mapped[str] = mapped_column(primary_key=True)
+    fingerprint: Mapped[str]
+    at: Mapped[str]
+    host: Mapped[str]
+    token: Mapped[str]
+    effect: Mapped[str | None]
+    status: Mapped[int | None]
+    headers: Mapped[dict[str, Any] | None]
+    body: Mapped[bytes | None] = mapped_column(LargeBinary)

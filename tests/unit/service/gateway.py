@@ -144,7 +144,7 @@ def set_back(flag: Path, seconds: float) -> None:
     store.now = lambda: datetime.fromtimestamp(time.time(), UTC).isoformat(timespec="milliseconds")
 
 
-def sigterm(when: str, name: str) -> None:
+def ended_by(sent: signal.Signals, when: str, name: str) -> None:
     """Somebody ends this process just `before` or `after` the function MODULE:CLASS.NAME is called the first time."""
     module, _, path = name.partition(":")
     owner, function = path.split(".")
@@ -155,7 +155,7 @@ def sigterm(when: str, name: str) -> None:
         setattr(holder, function, real)
         if when == "after":
             found = real(*arguments, **more)
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), sent)
         time.sleep(0.2)
         return found if when == "after" else real(*arguments, **more)
 
@@ -175,9 +175,12 @@ def main() -> None:
     parser.add_argument("--limits", type=json.loads, default={})
     parser.add_argument("--trusted-proxy", action="append", type=ip_network, default=[])
     parser.add_argument("--on-bus", action="append", default=[])
+    parser.add_argument("--sigkill")
     asked = parser.parse_args()
     if asked.sigterm:
-        sigterm(*asked.sigterm.split())
+        ended_by(signal.SIGTERM, *asked.sigterm.split())
+    if asked.sigkill:
+        ended_by(signal.SIGKILL, *asked.sigkill.split())
     asked.folder.mkdir(parents=True, exist_ok=True)
     set_back(asked.folder / "clock-is-back", 3600 * asked.hours_back)
     loops = asked.folder / "loops.yaml"

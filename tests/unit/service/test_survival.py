@@ -25,7 +25,8 @@ pytestmark = pytest.mark.timeout(300)  # processes that start slowly on a busy m
 
 
 class Gateway:
-    """The process of tests.unit.service.gateway, started again as often as a test likes."""
+    """The process of tests.unit.service.gateway, started again as often as a test likes. first: options of the first
+    start alone."""
 
     def __init__(
         self,
@@ -35,6 +36,7 @@ class Gateway:
         host: str = "local",
         tags: Sequence[str] = (TAG,),
         more: Sequence[str] = (),
+        first: Sequence[str] = (),
     ) -> None:
         self.folder = folder
         self.database = f"sqlite:///{folder / 'data' / 'loopwright.sqlite'}"
@@ -44,7 +46,7 @@ class Gateway:
             self._arguments.append(f"--database={database}")
             self.database = database.replace("postgresql:", "postgresql+psycopg:")
         folder.mkdir(parents=True, exist_ok=True)
-        self.serve()
+        self.serve(*first)
 
     def launch(self, *more: str) -> Process:
         arguments = ("tests.unit.service.gateway", str(self.folder), *self._arguments, *more)
@@ -276,3 +278,22 @@ def test_two_gateways_on_one_database(stack: ExitStack, tmp_path: Path, postgres
     assert b.over(on_a)["state"] == "proposed"
     assert read_loop(tmp_path / "a", "A-1") == read_loop(tmp_path / "a", "A-2") == HOME
     assert b.http.post(f"{on_a}/accept").status_code == 409
+
+
+@pytest.mark.parametrize(("path", "body"), [(f"/loops/{TAG}/retune", {"ms": 1.4}), ("/retunes", {"pattern": "*"})])
+def test_killed_before_it_has_answered_a_repetition_with_the_key_begins_nothing_twice(
+    stack: ExitStack, tmp_path: Path, database: str | None, path: str, body: dict[str, Any]
+) -> None:
+    cut = "before service.store.idempotency:IdempotencyKeys.keep"
+    gateway = Gateway(stack, tmp_path, database, first=[f"--sigkill={cut}"])
+    key = {"Idempotency-Key": "once"}
+    with pytest.raises(httpx.TransportError):
+        gateway.http.post(path, json=body, headers=key)
+    gateway.serve()
+    first, again = (gateway.http.post(path, json=body, headers=key) for _ in range(2))
+    assert first.status_code == 202 and first.headers["location"] == again.headers["location"], first.text
+    assert first.json()["id"] == again.json()["id"]
+    gateway.go()
+    gateway.until(first.headers["location"], lambda found: found["ended_at"] is not None, 60)
+    assert len(gateway.http.get("/jobs").json()) == 1
+    assert len(gateway.http.get("/retunes").json()) == (path == "/retunes")

@@ -1,0 +1,186 @@
+"""The header Idempotency-Key on every POST, as ASGI middleware behind the gate: a request that is repeated with the
+same key is answered as it was the first time, and does nothing again.
+
+After the IETF draft "The Idempotency-Key HTTP Header Field", which wants quotes around the key; they may be left out.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import re
+from collections.abc import Callable
+from typing import TypeVar
+
+import anyio
+from anyio.to_thread import run_sync
+from sqlalchemy.exc import SQLAlchemyError
+from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+from starlette.routing import compile_path
+
+from service.api import problems
+from service.security.gate import App, AsgiScope, Message, Receive, Send
+from service.security.principal import LOCAL
+from service.security.principal import current as principal
+from service.store import claims
+from service.store.claims import Claim, StillAnswering
+from service.store.idempotency import KEPT_H, Answer, IdempotencyKeys, OtherRequest
+
+log = logging.getLogger(__name__)
+T = TypeVar("T")
+
+HEADER = "Idempotency-Key"
+MOST_CHARACTERS = 128
+_CHARACTERS = rf"[A-Za-z0-9._~:+/=-]{{1,{MOST_CHARACTERS}}}"
+PATTERN = rf'^(?:{_CHARACTERS}|"{_CHARACTERS}")$'
+_AT_ONCE = 4
+"""Threads of its own: requests that wait for a silent node do not keep an abort from claiming its key."""
+_WORDS = f"letters, digits and . _ ~ : + / = -, 1 to {MOST_CHARACTERS} of them, with or without quotes around"
+
+
+class Idempotent:
+    """Wraps the application."""
+
+    def __init__(self, app: App, keys: IdempotencyKeys) -> None:
+        self._app = app
+        self._keys = keys
+        self._threads = anyio.CapacityLimiter(_AT_ONCE)
+
+    async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
+        given = Headers(scope=scope).getlist(HEADER) if scope["type"] == "http" and scope["method"] == "POST" else []
+        if not given:
+            await self._app(scope, receive, send)
+            return
+        if len(given) > 1 or not re.fullmatch(PATTERN, given[0]):
+            await problems.problem(422, f"{HEADER} must be one key: {_WORDS}")(scope, receive, send)
+            return
+        try:
+            body = await _body(receive)
+        except HTTPException as error:
+            await problems.problem(error.status_code, error.detail)(scope, receive, send)
+            return
+        if body is not None:
+            await self._once(given[0].strip('"'), body, scope, receive, send)
+
+    async def _once(self, key: str, body: bytes, scope: AsgiScope, receive: Receive, send: Send) -> None:
+        who = principal.get().key_id or LOCAL
+        try:
+            claim = await self._beside(lambda: self._keys.claim(who, key, _fingerprint(scope, body)))
+        except OtherRequest:
+            why = (
+                f"{HEADER} {key} was given within the last {KEPT_H} h with another path or body: "
+                "repeat that request as it was, or give this one a key of its own"
+            )
+            await problems.problem(422, why)(scope, receive, send)
+        except StillAnswering as error:
+            await problems.still_answering(error)(scope, receive, send)
+        except SQLAlchemyError as error:
+            await problems.of_database(error)(scope, receive, send)
+        else:
+            answer = claim if isinstance(claim, Answer) else await self._answer(claim, body, scope, receive)
+            await _response(answer)(scope, receive, send)
+
+    async def _answer(self, claim: Claim, body: bytes, scope: AsgiScope, receive: Receive) -> Answer:
+        """What the application answers, kept where it is the answer for good."""
+        answer: Answer | None = None
+        try:
+            if claim.effect is None:
+                token = claims.current.set(claim)
+                try:
+                    answer = await _ask(self._app, scope, _again(body, receive))
+                finally:
+                    claims.current.reset(token)
+            else:
+                answer = await self._after_the_cut(claim.effect, scope)
+            return answer
+        finally:
+            with anyio.CancelScope(shield=True):
+                await self._conclude(claim, answer)
+
+    async def _conclude(self, claim: Claim, answer: Answer | None) -> None:
+        """An answer of success is kept, and a conflict: who was told no must not find that it was done later."""
+        try:
+            if answer is not None and (answer.status < 400 or answer.status == 409):
+                kept = answer
+                await self._beside(lambda: self._keys.keep(claim, kept))
+            else:
+                await self._beside(lambda: self._keys.let_go(claim))
+        except SQLAlchemyError as error:  # what was made or changed is known all the same
+            log.warning("the answer to %s %s could not be kept: %s", HEADER, claim.key, error)
+
+    async def _after_the_cut(self, effect: str, scope: AsgiScope) -> Answer:
+        """The answer that a service killed before giving it would have given: what was made or changed, as it is."""
+        get = {**scope, "method": "GET", "path": effect, "raw_path": effect.encode(), "query_string": b""}
+        found = await _ask(self._app, get, _again(b"", None))
+        if found.status != 200:
+            return found
+        created = not scope["path"].startswith(f"{effect}/")
+        headers = found.headers | ({"location": effect} if created else {})
+        status = await self._beside(lambda: _status(scope))
+        return Answer(status, headers, found.body)
+
+    async def _beside(self, work: Callable[[], T]) -> T:
+        return await run_sync(work, limiter=self._threads)
+
+
+def _fingerprint(scope: AsgiScope, body: bytes) -> str:
+    """Of what must be the same in a repetition."""
+    found = hashlib.sha256(f"{scope['path']}\0".encode())
+    found.update(scope.get("query_string", b"") + b"\0" + body)
+    return found.hexdigest()
+
+
+def _status(scope: AsgiScope) -> int:
+    """With which the operation succeeds, as the OpenAPI document says."""
+    for path, item in scope["app"].openapi()["paths"].items():
+        if "post" in item and compile_path(path)[0].match(scope["path"]):
+            return min(int(status) for status in item["post"]["responses"])
+    return 200
+
+
+async def _body(receive: Receive) -> bytes | None:
+    """None: the client has gone before it was whole."""
+    parts = []
+    while True:
+        message = await receive()
+        if message["type"] == "http.disconnect":
+            return None
+        parts.append(message.get("body", b""))
+        if not message.get("more_body", False):
+            return b"".join(parts)
+
+
+def _again(body: bytes, receive: Receive | None) -> Receive:
+    """The body once more, then whatever else comes; None: that the client has gone."""
+    told = False
+
+    async def replayed() -> Message:
+        nonlocal told
+        if not told:
+            told = True
+            return {"type": "http.request", "body": body, "more_body": False}
+        return {"type": "http.disconnect"} if receive is None else await receive()
+
+    return replayed
+
+
+async def _ask(app: App, scope: AsgiScope, receive: Receive) -> Answer:
+    """The whole answer of the application, which no POST gives as a stream."""
+    status, headers, parts = 500, {}, []
+
+    async def taken(message: Message) -> None:
+        nonlocal status, headers
+        if message["type"] == "http.response.start":
+            status = message["status"]
+            headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in message["headers"]}
+        elif message["type"] == "http.response.body":
+            parts.append(message.get("body", b""))
+
+    await app(scope, receive, taken)
+    return Answer(status, headers, b"".join(parts))
+
+
+def _response(answer: Answer) -> Response:
+    return Response(answer.body, answer.status, answer.headers)

@@ -1,0 +1,72 @@
+"""Routes that lock a loop and unlock it."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Body, Path
+from pydantic import BaseModel, Field
+
+from service.api import problems
+from service.api.views import Decision, LockView
+from service.jobs import Jobs
+
+_ONE_LINE = r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$"
+Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
+
+
+class LockWish(Decision):
+    """Why a loop is to be left alone, and who says so."""
+
+    reason: str = Field(
+        min_length=1, max_length=200, pattern=_ONE_LINE, description="One line of text",
+        examples=["valve is being overhauled"],
+    )  # fmt: skip
+
+
+class LockedView(BaseModel):
+    """A loop that is locked now."""
+
+    loop: str = Field(examples=["TIC-101"])
+    locked: LockView
+    running_job: str | None = Field(
+        description="URL of the job whose test was running already: it goes on", examples=["/jobs/4f0c2a9be113"]
+    )
+    note: str | None = Field(description="The same in words, and how to end the test")
+
+
+class UnlockedView(BaseModel):
+    """A loop that is not locked any more."""
+
+    loop: str = Field(examples=["TIC-101"])
+    was_locked: LockView | None = Field(description="null: it was not locked")
+
+
+def router(jobs: Jobs) -> APIRouter:
+    """POST /loops/{tag}/lock and /loops/{tag}/unlock."""
+    routes = APIRouter(tags=["loops"])
+
+    @routes.post(
+        "/loops/{tag}/lock",
+        summary="Lock a loop: no test begins on it and no decision writes to it until it is unlocked",
+        responses=problems.responses(404, 409, 422),
+    )
+    def lock(tag: Tag, wish: Annotated[LockWish, Body()]) -> LockedView:
+        row, running = jobs.lock(tag, wish.reason, wish.by)
+        url = note = None
+        if running is not None:
+            url = f"/jobs/{running.id}"
+            command = f"loopwright job {running.id} --abort"
+            note = f"a test is running and goes on: abort it with POST {url}/abort ({command})"
+        return LockedView(loop=tag, locked=LockView.of(row), running_job=url, note=note)
+
+    @routes.post(
+        "/loops/{tag}/unlock",
+        summary="Unlock a loop",
+        responses=problems.responses(404, 422),
+    )
+    def unlock(tag: Tag, decision: Annotated[Decision | None, Body()] = None) -> UnlockedView:
+        row = jobs.unlock(tag, (decision or Decision()).by)
+        return UnlockedView(loop=tag, was_locked=None if row is None else LockView.of(row))
+
+    return routes

@@ -1,0 +1,102 @@
+"""The command line's client: a POST whose connection broke is repeated once, with the key it was sent with."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import httpx
+import pytest
+
+from service import client as client_module
+from service.client import ApiError, Client
+
+
+def through(
+    monkeypatch: pytest.MonkeyPatch, *answers: httpx.Response | Exception
+) -> tuple[Client, list[httpx.Request]]:
+    """A client that gets these answers in turn, and what it has sent."""
+    sent: list[httpx.Request] = []
+    left = list(answers)
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        sent.append(request)
+        now = left.pop(0)
+        if isinstance(now, Exception):
+            raise now
+        return now
+
+    client = Client("http://gateway")
+    monkeypatch.setattr(client, "_http", httpx.Client(base_url="http://gateway", transport=httpx.MockTransport(answer)))
+    now = [0.0]
+
+    def sleep(seconds: float) -> None:
+        now[0] += seconds
+
+    monkeypatch.setattr(client_module, "time", SimpleNamespace(sleep=sleep, monotonic=lambda: now[0]))
+    return client, sent
+
+
+def keys(sent: list[httpx.Request]) -> list[str]:
+    return [request.headers["idempotency-key"] for request in sent]
+
+
+def busy() -> httpx.Response:
+    return httpx.Response(409, json={"detail": "still being answered"}, headers={"Retry-After": "1"})
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [httpx.RemoteProtocolError("server disconnected"), httpx.ReadError("reset"), httpx.WriteError("broken pipe"),
+     httpx.ReadTimeout("no answer")],
+)  # fmt: skip
+def test_a_broken_connection_is_repeated_once_with_the_same_key(
+    monkeypatch: pytest.MonkeyPatch, broken: Exception
+) -> None:
+    client, sent = through(monkeypatch, broken, httpx.Response(202, json={"id": "x"}))
+    assert client.post("/loops/TIC-101/retune", {"ms": 1.4}) == {"id": "x"}
+    first, second = keys(sent)
+    assert first == second and len(first) == 32 and sent[0].content == sent[1].content
+    client, sent = through(monkeypatch, broken, broken)
+    with pytest.raises(ApiError, match="no service at"):
+        client.post("/loops/TIC-101/retune")
+    assert len(sent) == 2
+
+
+def test_every_post_has_a_key_of_its_own_and_a_get_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    client, sent = through(monkeypatch, *(httpx.Response(200, json={}) for _ in range(3)))
+    client.post("/a")
+    client.post("/a")
+    assert len(set(keys(sent))) == 2
+    client.get("/a")
+    assert "idempotency-key" not in sent[-1].headers
+
+
+def test_a_service_that_is_not_there_is_said_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    client, sent = through(monkeypatch, httpx.ConnectError("refused"))
+    with pytest.raises(ApiError, match="start one with: loopwright serve"):
+        client.post("/a")
+    assert len(sent) == 1
+
+
+def test_what_is_still_being_answered_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    client, sent = through(monkeypatch, httpx.ReadError("reset"), busy(), busy(), httpx.Response(200, json={"id": "x"}))
+    assert client.post("/jobs/x/accept") == {"id": "x"}
+    assert len(set(keys(sent))) == 1 and len(sent) == 4
+
+
+def test_a_conflict_is_told_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also one with Retry-After where no connection broke: it is of somebody else's making."""
+    client, sent = through(monkeypatch, busy())
+    with pytest.raises(ApiError, match="still being answered"):
+        client.post("/a")
+    client, sent = through(monkeypatch, httpx.ReadError("reset"), httpx.Response(409, json={"detail": "busy"}))
+    with pytest.raises(ApiError, match="busy"):
+        client.post("/a")
+    assert len(sent) == 2
+
+
+def test_it_does_not_wait_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    client, sent = through(monkeypatch, httpx.ReadError("reset"), *(busy() for _ in range(50)))
+    with pytest.raises(ApiError, match="still being answered"):
+        client.post("/a")
+    assert len(sent) < 40
