@@ -11,7 +11,8 @@ from fastapi import APIRouter, Path, Query
 from service import tunings
 from service.alternatives import alternatives, redesigned
 from service.api import problems
-from service.api.samples import sample_columns
+from service.api.bodies import JsonRoute
+from service.api.samples import record_columns
 from service.api.tuning_views import AlternativesView, MethodView, TuningRequest, TuningsView
 from service.fast_record import kept
 from service.jobs import Jobs
@@ -21,7 +22,7 @@ from tuning.fast.procedure import FAST
 
 def router(jobs: Jobs) -> APIRouter:
     """GET /methods, POST /tunings, GET /jobs/{job_id}/alternatives."""
-    routes = APIRouter()
+    routes = APIRouter(route_class=JsonRoute)
     one_at_a_time = asyncio.Semaphore(1)
 
     async def computed(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -74,7 +75,7 @@ def router(jobs: Jobs) -> APIRouter:
             if method not in (None, FAST):
                 raise tunings.BadTuning(f"ms is for the method fast, not for {method}: leave one of them out")
             wanted = bool(row.request.get("derivative")) if derivative is None else derivative
-            return redesigned(row, events, kept(sample_columns(jobs.store.samples(job_id))), ms, wanted)
+            return redesigned(row, events, kept(record_columns(jobs.store.blocks(job_id))), ms, wanted)
 
         return AlternativesView(**await computed(work))
 

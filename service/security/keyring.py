@@ -76,6 +76,12 @@ class Keyring:
             return None
         return seen[1]
 
+    def still_valid(self, key_id: str) -> bool:
+        """Whether a key that was checked before is valid now: for an answer that lasts. One query."""
+        with self._session() as session:
+            row = session.get(KeyRow, key_id)
+        return row is not None and valid(row)
+
     def check(self, key: str) -> KeyRow | None:
         """The row of a valid key, else None. A key seen before costs one query; a new one its hash too."""
         key_id = key_id_of(key)
