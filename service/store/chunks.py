@@ -35,7 +35,9 @@ class Block:
             return [str(value) for value in row.astype(np.int64).tolist()]
         if column == "t_s":
             return [repr(value) for value in self._times(row).tolist()]
-        texts: list[str] = row.astype(str).tolist()
+        # Set-point and MV stay the same for long, and a transmitter has its steps: each value is written once.
+        distinct, places = np.unique(row.view("<i4"), return_inverse=True)
+        texts: list[str] = distinct.view("<f4").astype(str)[places].tolist()
         return texts
 
     def values(self, column: str) -> NDArray[np.float64]:
