@@ -10,6 +10,8 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from service import strict_json
+
 Url = Annotated[str, typer.Option("--url", envvar="LOOPWRIGHT_URL", help="Where the service is.")]
 AsJson = Annotated[bool, typer.Option("--json", help="JSON, for scripts.")]
 
@@ -45,9 +47,9 @@ def read_json_object(path: Path) -> dict[str, Any]:
 def json_object(text: str, source: str) -> dict[str, Any]:
     """The JSON object in a text; dies with status 2 if there is none. `source` names it in the error."""
     try:
-        found = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        die(f"{source}: not JSON: {error}", 2)
+        found = strict_json.loads(text)
+    except strict_json.BadJson as error:
+        die(f"{source}: {error}", 2)
     if not isinstance(found, dict):
         die(f"{source}: expected one JSON object", 2)
     return found

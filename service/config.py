@@ -6,7 +6,7 @@ Everything wrong with a file is reported in one go: who edits it should not have
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -106,15 +106,19 @@ class Site:
 
 
 class _OnceEach(yaml.SafeLoader):
-    """A key given twice is one too many: of two limits the last would win without a word."""
+    """A key given twice is one too many: of two limits the last would win without a word.
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+    Looked for before keys are merged (`<<`): what a mapping says itself may be other than what it is merged from.
+    """
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        node: yaml.MappingNode = super().compose_mapping_node(anchor)
         seen: set[str] = set()
         for name in (name for name, _ in node.value if isinstance(name, yaml.ScalarNode)):
             if name.value in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"{name.value!r} is given twice", name.start_mark)
+                raise yaml.composer.ComposerError(None, None, f"{name.value!r} is given twice", name.start_mark)
             seen.add(name.value)
-        return super().construct_mapping(node, deep)
+        return node
 
 
 def load_site(path: Path) -> Site:
@@ -125,6 +129,8 @@ def load_site(path: Path) -> Site:
         raise ConfigError(str(path), [error.strerror or str(error)]) from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(str(path), [f"not YAML: {error}"]) from error
+    except RecursionError:
+        raise ConfigError(str(path), ["not a list of loops: nested too deeply"]) from None
     return parse_site(document, str(path))
 
 

@@ -12,6 +12,9 @@ from tuning.fast.evidence import LEAST_LISTENED, LEAST_SWITCHES, Evidence
 from tuning.models import Reals
 from tuning.plan import Mode
 
+Columns = Mapping[str, Sequence[Any] | Reals]
+"""By the names of GET /jobs/{id}/samples."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kept:
@@ -53,8 +56,8 @@ class Kept:
         )
 
 
-def kept(columns: Mapping[str, Sequence[Any]]) -> Kept | None:
-    """columns: as of GET /jobs/{id}/samples. None where no relay was run."""
+def kept(columns: Columns) -> Kept | None:
+    """None where no relay was run."""
     stage = columns["stage"]
     first = max((i for i, name in enumerate(stage) if name == "preflight" and stage[max(i - 1, 0)] != name), default=0)
     t, sp, pv, mv, mode = (np.asarray(columns[name][first:], dtype=float) for name in ("t_s", "sp", "pv", "mv", "mode"))

@@ -72,13 +72,27 @@ class JsonLines(logging.Formatter):
 
 
 class Lines(logging.Formatter):
-    """For people: time, level, message, then the fields as name=value."""
+    """For people: time, level, message, then the fields as name=value. Lines of a traceback are indented: what begins
+    at the margin is an entry, whatever a caller has put into a path or a name."""
 
     def format(self, record: logging.LogRecord) -> str:
         at = stamp(datetime.fromtimestamp(record.created, UTC))
-        line = " ".join(
-            [at, record.levelname.lower(), record.getMessage(), *(f"{k}={v}" for k, v in fields_of(record).items())]
-        )
+        fields = (f"{name}={_one_word(str(value))}" for name, value in fields_of(record).items())
+        lines = [" ".join([at, record.levelname.lower(), escaped(record.getMessage()), *fields])]
         if record.exc_info:
-            line += "\n" + self.formatException(record.exc_info)
-        return without_keys(line)
+            lines += ["  " + escaped(line) for line in self.formatException(record.exc_info).split("\n")]
+        return without_keys("\n".join(lines))
+
+
+def escaped(text: str) -> str:
+    """The text with every character that ends a line, is not seen or turns the direction of writing as its \\-sequence:
+    a name that somebody has chosen stays on its line of the log."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def _one_word(value: str) -> str:
+    """In quotes where it would otherwise read as several fields."""
+    value = escaped(value)
+    return '"' + value.replace('"', r"\"") + '"' if any(c in value for c in ' "=') else value

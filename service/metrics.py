@@ -39,6 +39,15 @@ REQUEST_SECONDS = Histogram(
     registry=None,
 )
 IN_FLIGHT = Gauge("loopwright_http_requests_in_flight", "Requests being answered", registry=None)
+LATE_SECONDS = Histogram(
+    "loopwright_event_loop_late_seconds",
+    "How late the event loop came back to who had asked it to, s",
+    buckets=(0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 3),
+    registry=None,
+)
+LATEST_SECONDS = Gauge(
+    "loopwright_event_loop_late_worst_seconds", "The worst of that in the last minute, s", registry=None
+)
 
 
 class _OfTheStore(Collector):
@@ -89,7 +98,10 @@ class _OfTheStore(Collector):
 def registry(loops: Mapping[str, LoopConfig], store: Store) -> CollectorRegistry:
     """Everything that /metrics shows of a service."""
     found = CollectorRegistry()
-    for collector in (SAMPLES_LOST, STAGE_SECONDS, REQUESTS, REQUEST_SECONDS, IN_FLIGHT, _OfTheStore(loops, store)):
+    of_this_process = (
+        SAMPLES_LOST, STAGE_SECONDS, REQUESTS, REQUEST_SECONDS, IN_FLIGHT, LATE_SECONDS, LATEST_SECONDS,
+    )  # fmt: skip
+    for collector in (*of_this_process, _OfTheStore(loops, store)):
         found.register(collector)
     return found
 

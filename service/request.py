@@ -71,7 +71,7 @@ class PlantModel(_Coefficients):
     noise_std: NotNegative = Field(
         default=0.0, description="Standard deviation of the PV noise, PV units", examples=[0.0]
     )
-    seed: int = Field(default=1, description="Seed of the noise", examples=[1])
+    seed: int = Field(default=1, ge=0, le=2**53, description="Seed of the noise", examples=[1])
     sample_time_s: Positive | None = Field(default=None, description="Sampling period, s", examples=[0.1])
 
 

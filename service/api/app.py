@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from importlib.metadata import version
 from typing import Annotated, Literal
 
 from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
-from fastapi.responses import PlainTextResponse, StreamingResponse
+from fastapi.responses import StreamingResponse
 
 from service.api import contract, fleet, locks, operations, problems, tunings
 from service.api.access import Access
+from service.api.bodies import JsonRoute
 from service.api.idempotency import Idempotent
-from service.api.samples import sample_columns
-from service.api.stream import event_stream
+from service.api.paging import LARGEST
+from service.api.samples import Reading, csv_text, json_text, parts, takes_gzip
+from service.api.stream import event_stream, still_permitted
 from service.api.views import (
     Decision,
     DismissedView,
@@ -31,13 +31,14 @@ from service.api.views import (
 from service.computing.pool import Pool
 from service.fleet import Fleet
 from service.jobs import Jobs
+from service.lateness import watched_event_loop
 from service.request import RetuneRequest
 from service.security.gate import Gate, Policy
+from service.security.principal import current
 from service.shared_reading import SharedReading
 from service.states import ACTIVE, JobState
 from service.store.idempotency import IdempotencyKeys
 from service.store.tables import JobRow
-from tuning.plan import Sample
 from tuning.reasons import Ended
 
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
@@ -55,13 +56,16 @@ def create_app(
     pool: who computes tunings; None: one of its own.
     """
 
+    policy = policy or Policy()
+    keyring = policy.keyring
     many = Fleet(jobs)
     readings = SharedReading(jobs.live)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         many.boot()
-        yield
+        async with watched_event_loop():
+            yield
         many.close()
         jobs.stop()
 
@@ -74,8 +78,9 @@ def create_app(
         docs_url=None,  # would load its scripts from elsewhere
         redoc_url=None,
     )
+    app.router.route_class = JsonRoute
     app.add_middleware(Idempotent, keys=IdempotencyKeys(jobs.store))
-    app.add_middleware(Gate, policy=policy or Policy())
+    app.add_middleware(Gate, policy=policy)
     app.add_middleware(Access)
     problems.install(app)
     contract.install(app)
@@ -150,13 +155,15 @@ def create_app(
     )
     def events(
         job_id: JobId,
-        last_event_id: Annotated[int, Header(ge=0, description="Only events after this one", examples=[7])] = 0,
+        last_event_id: Annotated[
+            int, Header(ge=0, le=LARGEST, description="Only events after this one", examples=[7])
+        ] = 0,
     ) -> Response:
         row = jobs.store.get(job_id)
         over = JobState(row.state) not in ACTIVE
         if over and last_event_id and not jobs.store.events(job_id, last_event_id):
             return Response(status_code=204)
-        stream = event_stream(jobs, job_id, last_event_id)
+        stream = event_stream(jobs, job_id, last_event_id, still_permitted(keyring, current.get().key_id))
         return StreamingResponse(stream, media_type="text/event-stream", headers={"Cache-Control": "no-cache"})
 
     @app.get(
@@ -164,6 +171,8 @@ def create_app(
         tags=["jobs"],
         summary="The samples of a job",
         response_model=SamplesView,
+        description="Sent as it is read, compressed with gzip where the client takes that: a job of days has millions "
+        "of samples.",
         responses={
             200: {"content": {"text/csv": {"example": "stage,t_s,sp,pv,mv,mode\nrelay,12.3,50,50.2,45,3\n"}}},
             **problems.responses(404, 422),
@@ -173,12 +182,14 @@ def create_app(
         job_id: JobId,
         stage: Annotated[str | None, Query(description="Only of this stage", examples=["baseline"])] = None,
         format: Annotated[Literal["json", "csv"], Query(description="json: columns; csv: a row per sample")] = "json",
-    ) -> SamplesView | PlainTextResponse:
+        accept_encoding: Annotated[str, Header(include_in_schema=False)] = "",
+    ) -> StreamingResponse:
         jobs.store.get(job_id)
-        blocks = jobs.store.samples(job_id, stage)
-        if format == "csv":
-            return PlainTextResponse(_csv(blocks), media_type="text/csv")
-        return SamplesView(job=job_id, **sample_columns(blocks))
+        of = Reading(jobs.store, job_id, stage)
+        text, media_type = (csv_text(of), "text/csv") if format == "csv" else (json_text(of), "application/json")
+        compress = takes_gzip(accept_encoding)
+        headers = {"Vary": "Accept-Encoding"} | ({"Content-Encoding": "gzip"} if compress else {})
+        return StreamingResponse(parts(text, compress), media_type=media_type, headers=headers)
 
     @app.post(
         "/jobs/{job_id}/abort",
@@ -212,11 +223,3 @@ def create_app(
     app.include_router(tunings.router(jobs, pool or Pool()))
     return app
 
-
-def _csv(blocks: list[tuple[str, list[Sample]]]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["stage", "t_s", "sp", "pv", "mv", "mode"])
-    for name, block in blocks:
-        writer.writerows((name, *sample) for sample in block)
-    return text.getvalue()

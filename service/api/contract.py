@@ -49,6 +49,8 @@ def _complete(document: dict[str, Any]) -> None:
             "its own machine only, unless it was started with --auth.",
         }
     }
+    for never_answered in ("HTTPValidationError", "ValidationError"):
+        schemas["schemas"].pop(never_answered, None)
     for path, item in document["paths"].items():
         for method in _METHODS:
             if method in item:
@@ -70,10 +72,14 @@ def _one(path: str, method: str, operation: dict[str, Any]) -> None:
         operation.setdefault("parameters", []).append(_IDEMPOTENCY_KEY)
         more += (409, 422)
     if "requestBody" in operation:
-        more += (400,)  # not text at all
+        more += (400, 415)  # cut off; not JSON by its header
+    if operation.get("parameters"):
+        more += (422,)  # text that no database keeps
     if path not in ALWAYS:
         more += (429, 503)
     elif needed is not None:
         more += (429, 503)  # too many wrong keys; the keys cannot be read
     for status, documented in problems.documented(*more).items():
+        if status == 422:  # FastAPI documents its own object, which the service never answers with
+            operation["responses"][str(status)] = documented
         operation["responses"].setdefault(str(status), documented)

@@ -11,6 +11,7 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 
 from service.api import problems
+from service.api.bodies import JsonRoute
 from service.api.paging import LINK, Cursor, Limit, more
 from service.api.views import Decision, JobView, LoopView, loop_view
 from service.fleet import BadFleet, Fleet, FleetRequest
@@ -62,7 +63,7 @@ class RetuneView(RetuneSummary):
 
 def install(app: FastAPI, jobs: Jobs, fleet: Fleet, view: Callable[[JobRow], JobView]) -> None:
     """Adds the routes. view: a job as the API shows it."""
-    router = APIRouter()
+    router = APIRouter(route_class=JsonRoute)
 
     @router.get(
         "/loops",

@@ -8,6 +8,7 @@ from fastapi import APIRouter, Body, Path
 from pydantic import BaseModel, Field
 
 from service.api import problems
+from service.api.bodies import JsonRoute
 from service.api.views import Decision, LockView
 from service.jobs import Jobs
 
@@ -44,7 +45,7 @@ class UnlockedView(BaseModel):
 
 def router(jobs: Jobs) -> APIRouter:
     """POST /loops/{tag}/lock and /loops/{tag}/unlock."""
-    routes = APIRouter(tags=["loops"])
+    routes = APIRouter(tags=["loops"], route_class=JsonRoute)
 
     @routes.post(
         "/loops/{tag}/lock",

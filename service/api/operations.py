@@ -17,6 +17,7 @@ from service import metrics
 from service.aftercare import NotHome
 from service.api import problems
 from service.api.page import POLICY, page
+from service.api.paging import LARGEST
 from service.bus_watch import BusWatch
 from service.jobs import Jobs
 from service.security import audit
@@ -175,7 +176,7 @@ def install(app: FastAPI, jobs: Jobs, parts: Mapping[str, Check]) -> None:
     def changes(
         limit: Annotated[int, Query(ge=1, le=1000, description="At most so many")] = 100,
         before: Annotated[
-            int | None, Query(ge=1, le=2**53, description="Only those with a smaller number", examples=[17])
+            int | None, Query(ge=1, le=LARGEST, description="Only those with a smaller number", examples=[17])
         ] = None,
         what: Annotated[str | None, Query(description="Only this kind of change", examples=["accept"])] = None,
         loop: Annotated[str | None, Query(description="Only of this loop", examples=["TIC-101"])] = None,

@@ -8,9 +8,11 @@ from urllib.parse import urlencode
 
 from fastapi import Query, Response
 
+LARGEST = 2**53
+"""Of whole numbers in a query or a header: so far JSON's numbers are exact, and every database has room for them."""
 Limit = Annotated[int, Query(ge=1, le=1000, description="At most so many")]
 Cursor = Annotated[
-    int | None, Query(ge=1, le=2**53, description="From the URL of the next page, as it came", examples=[17])
+    int | None, Query(ge=1, le=LARGEST, description="From the URL of the next page, as it came", examples=[17])
 ]
 LINK: dict[int | str, dict[str, Any]] = {
     200: {

@@ -9,9 +9,10 @@ from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
-from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.exc import DataError, SQLAlchemyError
 from starlette.exceptions import HTTPException
 
+from service.api.bodies import BadBody
 from service.computing.pool import NotWanted
 from service.errors import Conflict, Locked, Stopping, UnknownLoop
 from service.journal import temporary
@@ -73,6 +74,11 @@ def install(app: FastAPI) -> None:
         detail = "; ".join(f"{e['where']}: {e['why']}" for e in errors)
         return problem(422, detail, reason=Reason.BAD_INPUT, errors=errors)
 
+    @app.exception_handler(BadBody)
+    async def _body(_request: Request, error: BadBody) -> JSONResponse:
+        errors = [{"where": error.where, "why": error.detail}]
+        return problem(422, f"{error.where}: {error.detail}", reason=Reason.BAD_INPUT, errors=errors)
+
     @app.exception_handler(HTTPException)
     async def _http(_request: Request, error: HTTPException) -> JSONResponse:
         headers = dict(error.headers) if error.headers else None
@@ -117,6 +123,11 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(Stopping)
     async def _stopping(_request: Request, error: Stopping) -> JSONResponse:
         return problem(503, str(error), reason=Reason.SERVICE_STOPPED)
+
+    @app.exception_handler(DataError)
+    async def _unkeepable(_request: Request, error: DataError) -> JSONResponse:
+        detail = f"a name or number in the request is none that the database can look for: {error.orig}"
+        return problem(422, detail, reason=Reason.BAD_INPUT)
 
     @app.exception_handler(SQLAlchemyError)
     async def _database(_request: Request, error: SQLAlchemyError) -> JSONResponse:

@@ -1,20 +1,123 @@
-"""Stored samples as columns."""
+"""The samples of a job as they go to a client: text in parts of bounded size, written block by block.
+
+A job of days has millions of samples: neither they nor their text are ever in memory together. JSON, which has a
+list for each column, is written in as many passes over the blocks.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import json
+import re
+import zlib
+from collections.abc import Iterable, Iterator
 
-from tuning.plan import Sample
+import numpy as np
+
+from service.fast_record import Columns
+from service.store.chunks import COLUMNS, Block
+from service.store.store import Store
+from tuning.models import Reals
+
+_PART = 1 << 16
+"""Characters that are handed to the server at once."""
+_GZIP_LEVEL = 4
+_NO_NUMBERS = frozenset({"nan", "inf", "-inf"})
 
 
-def sample_columns(blocks: list[tuple[str, list[Sample]]]) -> dict[str, list[Any]]:
-    """Columns of equal length, by the names of GET /jobs/{id}/samples."""
-    flat = [sample for _, block in blocks for sample in block]
-    return {
-        "stage": [name for name, block in blocks for _ in block],
-        "t_s": [sample.t for sample in flat],
-        "sp": [sample.sp for sample in flat],
-        "pv": [sample.pv for sample in flat],
-        "mv": [sample.mv for sample in flat],
-        "mode": [sample.mode for sample in flat],
-    }
+class Gone(Exception):
+    """Samples were deleted while they were read: the client must not take what it has for the whole."""
+
+
+class Reading:
+    """The samples that a job has now, of one stage or of all, to be read more than once: those that come meanwhile are
+    left out."""
+
+    def __init__(self, store: Store, job_id: str, stage: str | None = None) -> None:
+        self.job_id = job_id
+        self._store, self._stage = store, stage
+        self._last = store.last_block(job_id)
+        self._count: int | None = None
+
+    def blocks(self) -> Iterator[Block]:
+        """Raises Gone when there are fewer samples than the last time."""
+        count = 0
+        for block in self._store.blocks(self.job_id, self._stage, self._last):
+            count += block.count
+            yield block
+        if self._count not in (None, count):
+            raise Gone(f"samples of job {self.job_id} were deleted while they were read")
+        self._count = count
+
+
+def json_text(of: Reading) -> Iterator[str]:
+    """The object of GET /jobs/{id}/samples."""
+    yield f'{{"job":{json.dumps(of.job_id)}'
+    for column in ("stage", *COLUMNS):
+        yield f',"{column}":['
+        comma = ""
+        for block in of.blocks():
+            yield comma + ",".join(_json_values(block, column))
+            comma = ","
+        yield "]"
+    yield "}"
+
+
+def _json_values(block: Block, column: str) -> Iterable[str]:
+    if column == "stage":
+        return [json.dumps(block.stage)] * block.count
+    texts = block.texts(column)
+    return ["null" if text in _NO_NUMBERS else text for text in texts] if column != "mode" else texts
+
+
+def csv_text(of: Reading) -> Iterator[str]:
+    """A row for each sample, under a row of names."""
+    yield ",".join(("stage", *COLUMNS)) + "\n"
+    for block in of.blocks():
+        columns = (block.texts(column) for column in COLUMNS)
+        rows = zip([block.stage] * block.count, *columns, strict=True)
+        yield "".join(",".join(row) + "\n" for row in rows)
+
+
+def parts(text: Iterator[str], compress: bool) -> Iterator[bytes]:
+    """The text as bytes, in parts that are worth sending."""
+    if not compress:
+        yield from (part.encode() for part in _gathered(text))
+        return
+    packer = zlib.compressobj(_GZIP_LEVEL, wbits=31)  # 31: with the header of gzip
+    for part in _gathered(text):
+        if packed := packer.compress(part.encode()):
+            yield packed
+    yield packer.flush()
+
+
+def _gathered(text: Iterator[str]) -> Iterator[str]:
+    waiting: list[str] = []
+    length = 0
+    for piece in text:
+        waiting.append(piece)
+        length += len(piece)
+        if length >= _PART:
+            yield "".join(waiting)
+            waiting, length = [], 0
+    if waiting:
+        yield "".join(waiting)
+
+
+def takes_gzip(accept_encoding: str) -> bool:
+    """Whether the header Accept-Encoding names gzip, and does not rule it out (q=0)."""
+    for each in accept_encoding.lower().split(","):
+        name, _, weight = each.partition(";")
+        if name.strip() == "gzip":
+            return re.fullmatch(r"\s*q\s*=\s*0(\.0*)?\s*", weight) is None
+    return False
+
+
+def record_columns(blocks: Iterable[Block]) -> Columns:
+    """All of the samples as arrays, for who computes with them: 48 bytes each."""
+    stages: list[str] = []
+    numbers: dict[str, list[Reals]] = {column: [np.empty(0)] for column in COLUMNS}
+    for block in blocks:
+        stages += [block.stage] * block.count
+        for column in COLUMNS:
+            numbers[column].append(block.values(column))
+    return {"stage": stages} | {column: np.concatenate(found) for column, found in numbers.items()}

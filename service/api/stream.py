@@ -1,16 +1,20 @@
 """A job's events as server-sent events. The id of an event is its number in the job, so a client that was cut off
-resumes with Last-Event-ID and misses nothing. `progress` events carry no id: they are not kept."""
+resumes with Last-Event-ID and misses nothing. `progress` events carry no id: they are not kept.
+
+A stream may outlive the key it was opened with: that is asked now and then, and ends it."""
 
 from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator
+import time
+from collections.abc import AsyncIterator, Callable
 
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.jobs import Jobs
 from service.journal import temporary
+from service.security.keyring import REVOKED_WITHIN_S, Keyring
 from service.states import ACTIVE, JobState
 
 _POLL_S = 0.2
@@ -18,12 +22,28 @@ _AWAY_S = 1.0
 _KEEP_ALIVE_POLLS = 75  # 15 s: proxies close a silent connection after 30 s or more
 
 
-async def event_stream(jobs: Jobs, job_id: str, after: int) -> AsyncIterator[str]:
-    """Everything after event number `after`, then live until the job is no longer active."""
+def still_permitted(keyring: Keyring | None, key_id: str | None) -> Callable[[], bool]:
+    """Whether the key of a request is valid as yet; always where no keys are asked for."""
+    if keyring is None or key_id is None:
+        return lambda: True
+    return lambda: keyring.still_valid(key_id)
+
+
+async def event_stream(
+    jobs: Jobs, job_id: str, after: int, permitted: Callable[[], bool] = lambda: True
+) -> AsyncIterator[str]:
+    """Everything after event number `after`, then live until the job is no longer active, or the asker no longer
+    permitted to see it."""
     told = ""
     silent = 0
+    asked = time.monotonic()
     while True:
         try:
+            if time.monotonic() - asked > REVOKED_WITHIN_S:
+                if not await asyncio.to_thread(permitted):
+                    yield ": the key of this stream was revoked or has expired\n\n"
+                    return
+                asked = time.monotonic()
             # Asked before the events are read: an event written in between is then seen in the next round.
             row = await asyncio.to_thread(jobs.store.get, job_id)
             events = await asyncio.to_thread(jobs.store.events, job_id, after)

@@ -11,8 +11,9 @@ from fastapi.concurrency import run_in_threadpool
 from service import tunings
 from service.alternatives import alternatives, redesigned
 from service.api import problems
+from service.api.bodies import JsonRoute
 from service.api.computed import Work, computed
-from service.api.samples import sample_columns
+from service.api.samples import record_columns
 from service.api.tuning_views import AlternativesView, MethodView, TuningRequest, TuningsView
 from service.computing.pool import Pool
 from service.fast_record import kept
@@ -23,7 +24,7 @@ from tuning.fast.procedure import FAST
 
 def router(jobs: Jobs, pool: Pool) -> APIRouter:
     """GET /methods, POST /tunings, GET /jobs/{job_id}/alternatives. pool: who computes."""
-    routes = APIRouter()
+    routes = APIRouter(route_class=JsonRoute)
 
     @routes.get("/methods", tags=["tunings"], summary="The tuning methods")
     def methods() -> list[MethodView]:
@@ -75,6 +76,6 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
         if ms is None:
             return partial(alternatives, row, events, method)
         wanted = bool(row.request.get("derivative")) if derivative is None else derivative
-        return partial(redesigned, row, events, kept(sample_columns(jobs.store.samples(job_id))), ms, wanted)
+        return partial(redesigned, row, events, kept(record_columns(jobs.store.blocks(job_id))), ms, wanted)
 
     return routes

@@ -97,6 +97,12 @@ class Keyring:
         seen = self._right.get(key_id_of(key) or "")
         return seen if seen is not None and hmac.compare_digest(seen.digest, _digest(key)) else None
 
+    def still_valid(self, key_id: str) -> bool:
+        """Whether a key that was checked before is valid now: for an answer that lasts. One query."""
+        with self._session() as session:
+            row = session.get(KeyRow, key_id)
+        return row is not None and valid(row)
+
     def check(self, key: str) -> KeyRow | None:
         """The row of a valid key, else None. One query, and a hash where no key of that id was found right before."""
         key_id = key_id_of(key)

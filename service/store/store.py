@@ -38,6 +38,7 @@ DECISIONS = {JobState.ACCEPTED: "accept", JobState.ROLLED_BACK: "rollback"}
 _BEGUN = "decision_begun"
 """The event that a decision writes before it writes to the controller: only without it is a proposal known to have
 left the old gains in effect."""
+_BLOCKS_AT_ONCE = 16
 _ACTIVE = [state.value for state in ACTIVE]
 
 
@@ -345,8 +346,11 @@ class Store:
             _find(session, job_id, lock=True)
             append(session, job_id, kind, data, plant_time_s)
 
-    def events(self, job_id: str, after: int = 0) -> Sequence[EventRow]:
+    def events(self, job_id: str, after: int = 0, limit: int | None = None) -> Sequence[EventRow]:
+        """In order; after: only those with a larger number."""
         wanted = select(EventRow).where(EventRow.job_id == job_id, EventRow.seq > after).order_by(EventRow.seq)
+        if limit is not None:
+            wanted = wanted.limit(limit)
         with self._session() as session:
             return session.scalars(wanted).all()
 
@@ -374,16 +378,37 @@ class Store:
         last = select(ChunkRow).where(ChunkRow.job_id == job_id).order_by(ChunkRow.seq.desc()).limit(1)
         with self._session() as session:
             row = session.scalars(last).one_or_none()
-        return 0.0 if row is None else chunks.unpack(row.data, row.count, row.first_t_s)[-1].t
+        return 0.0 if row is None else chunks.unpack(_block(row))[-1].t
 
-    def samples(self, job_id: str, stage: str | None = None) -> list[tuple[str, list[Sample]]]:
-        """The blocks in order, each with the stage it belongs to."""
-        wanted = select(ChunkRow).where(ChunkRow.job_id == job_id).order_by(ChunkRow.seq)
+    def last_block(self, job_id: str) -> int:
+        """Number of the last block of samples that is kept of a job as yet; 0: there is none."""
+        with self._session() as session:
+            return session.scalar(select(func.max(ChunkRow.seq)).where(ChunkRow.job_id == job_id)) or 0
+
+    def blocks(self, job_id: str, stage: str | None = None, last: int | None = None) -> Iterator[chunks.Block]:
+        """The blocks of samples in order, up to number `last`: a few at a time, each time in a short transaction of its
+        own, so that a slow reader holds neither a connection nor the memory."""
+        wanted = select(ChunkRow).where(ChunkRow.job_id == job_id).order_by(ChunkRow.seq).limit(_BLOCKS_AT_ONCE)
         if stage is not None:
             wanted = wanted.where(ChunkRow.stage == stage)
-        with self._session() as session:
-            rows = session.scalars(wanted).all()
-        return [(row.stage, chunks.unpack(row.data, row.count, row.first_t_s)) for row in rows]
+        if last is not None:
+            wanted = wanted.where(ChunkRow.seq <= last)
+        after = 0
+        while True:
+            with self._session() as session:
+                rows = session.scalars(wanted.where(ChunkRow.seq > after)).all()
+            yield from map(_block, rows)
+            if len(rows) < _BLOCKS_AT_ONCE:
+                return
+            after = rows[-1].seq
+
+    def samples(self, job_id: str, stage: str | None = None) -> list[tuple[str, list[Sample]]]:
+        """The blocks in order, each with the stage it belongs to: all of them in memory."""
+        return [(block.stage, chunks.unpack(block)) for block in self.blocks(job_id, stage)]
+
+
+def _block(row: ChunkRow) -> chunks.Block:
+    return chunks.Block(row.stage, row.first_t_s, row.count, row.data)
 
 
 def event_of(job_id: str, kind: str, data: dict[str, Any], plant_time_s: float, **columns: Any) -> Write:

@@ -11,7 +11,7 @@ from benchmarks.rehearsed import MIDDLE, TS, entry
 from controller.channel import Channel, Settings
 from controller.pid import Parameters
 from plantsim.plant import LinearPlant
-from service.api.samples import sample_columns
+from service.api.samples import record_columns
 from service.api.views import job_view
 from service.config import LoopConfig, parse_site
 from service.jobs import Jobs
@@ -64,7 +64,7 @@ def proposal(folder: Path, size: float, at_s: float, **options: Any) -> tuple[di
         thread.join(100)
     jobs.stop()
     job = job_view(store.get(row.id), store.events(row.id), None).model_dump(mode="json")
-    samples = sample_columns(store.samples(row.id))
+    samples = {name: list(column) for name, column in record_columns(store.blocks(row.id)).items()}
     store.close()
     return job, samples
 

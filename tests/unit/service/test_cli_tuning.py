@@ -162,7 +162,7 @@ def test_exit_status_3_when_no_method_gave_gains() -> None:
     [
         (["--model", "{"], "--model: not JSON"),
         (["--model", '{"K": 2}'], "T, L: missing"),
-        (["--model", '{"K": NaN, "T": 1, "L": 1}'], "K must be a finite number, not nan"),
+        (["--model", '{"K": NaN, "T": 1, "L": 1}'], "--model: K: NaN, Infinity and what is beyond"),
         (["--model", '{"K": 2, "T": -1, "L": 1}'], "T must be a number > 0 (s), not -1"),
         (["--model", '{"K": 2, "T": 1, "L": 1, "x": 1}'], "x: not a quantity"),
         (["--model", "/nowhere/plant.json"], "No such file"),
@@ -312,3 +312,12 @@ def test_tune_imports_nothing_that_it_does_not_use() -> None:
     assert "tuning.methods" in loaded
     heavy = {"fastapi", "sqlalchemy", "matplotlib", "httpx", "can", "scipy.signal", "scipy.stats"}
     assert loaded.isdisjoint(heavy), loaded & heavy
+
+
+@pytest.mark.parametrize("command", [["tune", "--model"], ["rehearse"]])
+def test_a_plant_file_with_a_key_twice_is_refused(tmp_path: Path, command: list[str]) -> None:
+    file = tmp_path / "plant.json"
+    file.write_text('{"num": [1], "den": [3, 1], "dead_time_s": 1, "gains": {"Kp": 1, "Kp": 2}}')
+    result = run(*command, str(file))
+    assert result.exit_code == 2 and result.stdout == ""
+    assert result.stderr == f"loopwright: {file}: gains.Kp: this key is given twice: leave one of them out\n"

@@ -83,3 +83,39 @@ def test_buses_say_how_many_of_their_loops_are_tuned_at_once() -> None:
     assert len(caught.value.problems) == 2 and "no loop is on this bus" in caught.value.problems[0]
     with pytest.raises(ConfigError, match="mapping"):
         parse_site({"loops": [loop_entry()], "buses": [1]}, "loops.yaml")
+
+
+@pytest.mark.parametrize(
+    "twice",
+    [
+        "loops: []\nloops: []\n",
+        "loops:\n- tag: A\n  mv_limits: {low: 0, high: 50, low: 10}\n",
+        "loops:\n- tag: A\n  'tag': B\n",
+        "x: &a {low: 1}\ny: &b {high: 2}\nloops:\n- pv_limits:\n    <<: *a\n    <<: *b\n",
+        "loops: [{? [tag]\n: 1, tag: B, tag: C}]\n",
+    ],
+)
+def test_a_key_given_twice_is_refused_wherever_it_is(tmp_path: Path, twice: str) -> None:
+    file = tmp_path / "loops.yaml"
+    file.write_text(twice)
+    with pytest.raises(ConfigError, match="given twice"):
+        load_site(file)
+
+
+def test_a_mapping_may_say_otherwise_than_what_it_is_merged_from(tmp_path: Path) -> None:
+    """Also where it is merged into another one before it is itself complete."""
+    file = tmp_path / "loops.yaml"
+    file.write_text(
+        yaml.safe_dump({"loops": [loop_entry()]}).replace("- ", "- &one\n  <<: {t95_s: 1, notes: merged}\n  ")
+        + "- {<<: *one, tag: B, channel: 2}\n"
+    )
+    loops = load_site(file).loops
+    assert loops["TIC-101"].t95_s == loops["B"].t95_s == 9.0 and loops["B"].notes == "merged"
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "{a: " * 100_000])
+def test_nested_beyond_all_reason(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "loops.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError):
+        load_site(file)

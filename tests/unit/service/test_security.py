@@ -4,24 +4,29 @@ import hashlib
 import json
 import logging
 import sqlite3
+import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy import update
 from sqlalchemy.exc import OperationalError
 from typer.testing import CliRunner
 
 from service import cli
 from service.api.app import create_app
 from service.logs import JsonLines, Lines
+from service.request import RetuneRequest
 from service.security import audit
 from service.security.gate import Policy, is_loopback
 from service.security.keyring import REVOKED_WITHIN_S, KeyProblem, Keyring
 from service.security.keys import Scope, hash_key, matches, new_key
 from service.security.limits import Buckets, RequestLimits
+from service.security.tables import KeyRow
 from service.serving import NotSafe, Setup, serve
 from service.store.store import Store
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
@@ -414,3 +419,34 @@ def test_serve_refuses_what_is_not_safe(tmp_path: Path, bind: str, auth: bool | 
     finally:
         logging.getLogger().handlers[:] = before
         logging.captureWarnings(False)
+
+
+@pytest.mark.parametrize("how", ["revoked", "expired"])
+def test_a_stream_ends_with_the_key_that_it_was_opened_with(
+    service: Service, open_client: Open, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    monkeypatch.setattr("service.api.stream.REVOKED_WITHIN_S", 0.05)
+    asked = threading.Event()
+
+    class Watched(Keyring):
+        def still_valid(self, key_id: str) -> bool:
+            found = super().still_valid(key_id)
+            asked.set()
+            return found
+
+    keyring = Watched(service.store.engine)
+    row, key = keyring.create("a", Scope.READ, timedelta(days=1))
+    service.tune.hold.clear()
+    job = service.jobs.start(TAG, RetuneRequest()).id
+    client = open_client(keyring, key=key)
+    with ThreadPoolExecutor(1) as beside:
+        answer = beside.submit(client.get, f"/jobs/{job}/events")
+        assert asked.wait(30) and not answer.done()
+        if how == "revoked":
+            keyring.revoke(row.id)
+        else:
+            with service.store.writing() as session:
+                session.execute(update(KeyRow).values(expires_at="2020-01-01T00:00:00.000Z"))
+        text = answer.result(30).text
+    assert service.store.get(job).state == "running"
+    assert text.startswith("id: 1\n") and text.endswith(": the key of this stream was revoked or has expired\n\n")

@@ -1,0 +1,61 @@
+"""Bodies of requests: JSON, of one meaning (see `service.strict_json`), and said to be JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+from fastapi import HTTPException, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from fastapi.routing import APIRoute
+
+from service import strict_json
+
+_SHORT = 16_384
+"""Bytes that are read at once; reading a longer body would hold up the event loop."""
+
+
+class BadBody(HTTPException):
+    """The body is no JSON that can be understood. where: the place in it, as far as there is one."""
+
+    def __init__(self, why: str, where: str = "") -> None:
+        super().__init__(422, why)
+        self.where = f"body.{where}" if where else "body"
+
+
+class JsonRoute(APIRoute):
+    """Every route that takes a body is one: a test looks."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        handle = super().get_route_handler()
+        if self.body_field is None:
+            return handle
+
+        async def strictly(request: Request) -> Response:
+            strict = _JsonRequest(request.scope, request.receive)
+            if await strict.body():
+                _check_type(request.headers.get("content-type", ""))
+            return await handle(strict)
+
+        return strictly
+
+
+class _JsonRequest(Request):
+    async def json(self) -> Any:
+        if not hasattr(self, "_json"):
+            body = await self.body()
+            try:
+                if len(body) > _SHORT:
+                    self._json = await run_in_threadpool(strict_json.loads, body)
+                else:
+                    self._json = strict_json.loads(body)
+            except strict_json.BadJson as error:
+                raise BadBody(error.why, error.where) from None
+        return self._json
+
+
+def _check_type(content_type: str) -> None:
+    kind = content_type.partition(";")[0].strip().lower()
+    if kind != "application/json" and not (kind.startswith("application/") and kind.endswith("+json")):
+        said = f"not {kind[:60]}" if kind else "and it was not said what it is"
+        raise HTTPException(415, f"the body must be JSON with the header Content-Type: application/json, {said}")

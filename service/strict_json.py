@@ -1,0 +1,91 @@
+"""JSON that comes from outside, in a request or a file: one meaning for every text, or none.
+
+Refused beside what is no JSON at all: a key that an object has twice (of two values the last would win without a word),
+NaN, Infinity and numbers too large for a float, nesting deeper than anything we ask for, and text that a database
+cannot keep. A byte order mark is passed over: some editors write one.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from typing import Any
+
+DEEPEST = 16
+"""Lists and objects within each other. The deepest that is asked for anywhere is 4."""
+
+
+_LOOKED_AT = (str, float, dict, list)
+
+
+class BadJson(ValueError):
+    """The text is refused. where: the way to the place through keys and indices, as far as there is one."""
+
+    def __init__(self, why: str, where: tuple[str | int, ...] = ()) -> None:
+        self.why = why
+        self.where = ".".join(str(place)[:60] for place in where)
+        super().__init__(f"{self.where}: {why}" if where else why)
+
+
+def loads(text: str | bytes) -> Any:
+    """What the text says. Bytes are UTF-8. Raises BadJson."""
+    try:
+        text = text.decode("utf-8-sig") if isinstance(text, bytes) else text.removeprefix("\ufeff")
+        found = json.loads(text, object_pairs_hook=_object)
+    except UnicodeDecodeError as error:
+        raise BadJson(f"is not text in UTF-8: byte {error.start}") from None
+    except json.JSONDecodeError as error:
+        raise BadJson(f"not JSON: {error}") from None
+    except RecursionError:
+        raise BadJson(_too_deep()) from None
+    except ValueError as error:  # an integer of thousands of digits
+        raise BadJson(f"not a number that can be used: {error}") from None
+    _check(found)
+    return found
+
+
+class _Twice(dict[str, Any]):
+    """An object of which a key was given twice. Its place is known only when all is read."""
+
+    key = ""
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) == len(pairs):
+        return found
+    twice = _Twice(found)
+    twice.key = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
+    return twice
+
+
+def _check(found: Any) -> None:
+    """Raises BadJson with the place. Without recursion: the depth is what is checked."""
+    waiting: list[tuple[Any, tuple[str | int, ...]]] = [(found, ())]
+    while waiting:
+        value, where = waiting.pop()
+        if isinstance(value, str):
+            _check_text(value, where)
+        elif isinstance(value, float):
+            if not math.isfinite(value):
+                raise BadJson("NaN, Infinity and what is beyond 1.8e308 are not numbers here", where)
+        elif isinstance(value, dict | list):
+            if len(where) >= DEEPEST:
+                raise BadJson(_too_deep(), where)
+            if isinstance(value, _Twice):
+                raise BadJson("this key is given twice: leave one of them out", (*where, value.key))
+            if isinstance(value, dict):
+                for key in value:
+                    _check_text(key, where)
+            places = value.items() if isinstance(value, dict) else enumerate(value)
+            waiting += ((part, (*where, place)) for place, part in places if isinstance(part, _LOOKED_AT))
+
+
+def _check_text(text: str, where: tuple[str | int, ...]) -> None:
+    if "\0" in text or (not text.isascii() and any("\ud800" <= c <= "\udfff" for c in text)):
+        raise BadJson("text must not hold the character 0 or half of a surrogate pair", where)
+
+
+def _too_deep() -> str:
+    return f"lists and objects are nested more than {DEEPEST} deep"

@@ -1,0 +1,109 @@
+"""Bodies, numbers and text at the edge of the API that are none, or have more than one meaning."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.routing import APIRoute
+from fastapi.testclient import TestClient
+
+from service.api.app import create_app
+from service.api.bodies import JsonRoute
+from service.jobs import Jobs
+from service.request import RetuneRequest
+from service.store.store import Store
+from tests.unit.service.fakes import TAG, FakeController, FakeLoop, FakeTune, Service, ThreadEngine, fake_rehearse
+from tests.unit.service.postgres import Server
+
+JSON = {"Content-Type": "application/json"}
+POSTS = [f"/loops/{TAG}/retune", "/retunes", "/tunings", "/jobs/none/abort", f"/loops/{TAG}/dismiss"]
+
+
+def refused(client: TestClient, url: str, body: str | bytes, **headers: str) -> Any:
+    answer = client.post(url, content=body, headers={**JSON, **headers})
+    assert answer.headers["content-type"] == "application/problem+json", answer.text
+    return answer
+
+
+def test_every_route_with_a_body_reads_it_strictly(service: Service) -> None:
+    found = [route for route in create_app(service.jobs).routes if isinstance(route, APIRoute) and route.body_field]
+    assert found and all(isinstance(route, JsonRoute) for route in found)
+
+
+def test_a_key_given_twice_starts_nothing(client: TestClient, service: Service) -> None:
+    answer = refused(client, POSTS[0], '{"dry_run": true, "dry_run": false}')
+    assert answer.status_code == 422 and answer.json()["reason"] == "bad_input"
+    assert answer.json()["errors"] == [
+        {"where": "body.dry_run", "why": "this key is given twice: leave one of them out"}
+    ]
+    assert not service.store.recent()
+
+
+@pytest.mark.parametrize("url", POSTS)
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"[" * 1_000_000,
+        b'{"a":' * 150_000,
+        b"\xff\xfe",
+        '{"by": "x"}'.encode("utf-16"),
+        b'{"a": {"b": 1, "b": 2}}',
+        b'{"ms": NaN}',
+        b'{"ms": 1e999}',
+        b'{"ms": ' + b"9" * 5000 + b"}",
+        rb'{"by": "\u0000"}',
+        rb'{"by": "\ud800"}',
+        b"{",
+        b"null null",
+        b" ",
+    ],
+    ids=lambda body: repr(body[:20]),
+)
+def test_what_is_no_body_is_422_everywhere(client: TestClient, url: str, body: bytes) -> None:
+    assert refused(client, url, body).status_code == 422
+
+
+def test_a_body_with_a_byte_order_mark_is_read(client: TestClient) -> None:
+    body = b"\xef\xbb\xbf" + json.dumps({"model": {"K": 1.0, "T": 3.0, "L": 1.0}, "method": "simc"}).encode()
+    assert client.post("/tunings", content=body, headers=JSON).status_code == 200
+
+
+@pytest.mark.parametrize("kind", ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data", ""])
+def test_a_body_that_is_not_said_to_be_json(client: TestClient, kind: str) -> None:
+    answer = refused(client, POSTS[0], b"{}", **{"Content-Type": kind})
+    assert answer.status_code == 415 and "Content-Type: application/json" in answer.json()["detail"]
+
+
+@pytest.mark.parametrize("number", ["9" * 400, str(2**63), str(2**63 - 1), "-1", "abc", "1.5", "1e3", "٣", ""])
+@pytest.mark.parametrize("what", ["event", "/jobs?limit=", "/jobs?cursor=", "/retunes?cursor=", "/audit?before="])
+def test_whole_numbers_out_of_all_bounds(client: TestClient, service: Service, number: str, what: str) -> None:
+    if what == "event":
+        job = service.jobs.start(TAG, RetuneRequest()).id
+        service.wait(job)
+        headers = {"Last-Event-ID": number.encode()}
+        answer = client.get(f"/jobs/{job}/events", headers=headers)
+    else:
+        answer = client.get(what + number)
+    assert answer.status_code == 422, answer.text
+
+
+def test_the_last_event_there_can_be(client: TestClient, service: Service) -> None:
+    job = service.jobs.start(TAG, RetuneRequest()).id
+    service.wait(job)
+    assert client.get(f"/jobs/{job}/events", headers={"Last-Event-ID": str(2**53)}).status_code == 204
+
+
+@pytest.mark.parametrize("path", ["/loops/%00", "/jobs/a%00b", "/jobs?loop=%00", "/audit?loop=%00", "/retunes/%00"])
+def test_text_that_no_database_keeps(path: str, tmp_path: Path, postgres: Server) -> None:
+    store = Store(tmp_path, postgres.database())
+    try:
+        open_loop = lambda config: FakeLoop(FakeController())  # noqa: E731
+        jobs = Jobs({}, store, open_loop, FakeTune(), fake_rehearse, engine=ThreadEngine())
+        client = TestClient(create_app(jobs, checks={}), raise_server_exceptions=False)
+        answer = client.get(path)
+        assert answer.status_code == 422 and "NUL" in answer.json()["detail"], answer.text
+    finally:
+        store.close()
