@@ -40,6 +40,11 @@ REQUEST_SECONDS = Histogram(
 )
 IN_FLIGHT = Gauge("loopwright_http_requests_in_flight", "Requests being answered", registry=None)
 
+CLOCK_JUMPS = Counter(
+    "loopwright_clock_jumps", "Jumps of the wall clock that were seen; the ages of samples count from the last one",
+    registry=None,
+)  # fmt: skip
+
 
 class _OfTheStore(Collector):
     def __init__(self, loops: Mapping[str, LoopConfig], store: Store) -> None:
@@ -89,7 +94,8 @@ class _OfTheStore(Collector):
 def registry(loops: Mapping[str, LoopConfig], store: Store) -> CollectorRegistry:
     """Everything that /metrics shows of a service."""
     found = CollectorRegistry()
-    for collector in (SAMPLES_LOST, STAGE_SECONDS, REQUESTS, REQUEST_SECONDS, IN_FLIGHT, _OfTheStore(loops, store)):
+    counted = SAMPLES_LOST, STAGE_SECONDS, REQUESTS, REQUEST_SECONDS, IN_FLIGHT, CLOCK_JUMPS
+    for collector in (*counted, _OfTheStore(loops, store)):
         found.register(collector)
     return found
 

@@ -21,6 +21,7 @@ import uvicorn
 from protocol.profile import TUNER_NODE
 from protocol.station import Station
 from service import logs
+from service.api import operations
 from service.api.app import create_app
 from service.computing import Workers
 from service.config import LoopConfig, load_site
@@ -194,15 +195,15 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
                 buses=site.buses,
                 resume=setup.resume,
             )
+            retention = Retention(store, engine, setup.keep)
             config = uvicorn.Config(
-                create_app(jobs, policy),
+                create_app(jobs, policy, {**operations.checks(jobs), "samples": retention.note}),
                 log_config=None,
                 log_level="warning",
                 access_log=False,
                 server_header=False,
                 timeout_graceful_shutdown=_GRACE_S,
             )
-            retention = Retention(store, engine, setup.keep)
             signals.tell(jobs.request_stop)
             try:
                 jobs.boot()
