@@ -124,7 +124,7 @@ def checks(jobs: Jobs) -> dict[str, Check]:
 
     def engine() -> None:
         if jobs.stopping:
-            raise RuntimeError("the service is shutting down")
+            raise RuntimeError(jobs.why_stopping)
         if not jobs.engine.alive():
             raise RuntimeError("the engine does not run")
 

@@ -17,7 +17,7 @@ from service.journal import temporary
 from service.model_forms import BadModel
 from service.request import BadLimits
 from service.states import IllegalMove
-from service.store.store import Busy, NoSuchJob
+from service.store.store import Busy, FolderInUse, NoSuchJob
 from service.tunings import BadTuning
 from tuning.reasons import ADVICE, Ended, Reason
 
@@ -88,7 +88,8 @@ def install(app: FastAPI) -> None:
         return problem(409, str(error))
 
     @app.exception_handler(Stopping)
-    async def _stopping(_request: Request, error: Stopping) -> JSONResponse:
+    @app.exception_handler(FolderInUse)
+    async def _stopping(_request: Request, error: Exception) -> JSONResponse:
         return problem(503, str(error), reason=Reason.SERVICE_STOPPED)
 
     @app.exception_handler(SQLAlchemyError)

@@ -20,9 +20,9 @@ from service.state_json import gains_of
 from service.states import ACTIVE, IllegalMove, JobState, check
 from service.store import chunks, retunes
 from service.store.clock import now
-from service.store.database import WAIT_S, migrate, open_database
+from service.store.database import WAIT_S, migrate, open_database, postgresql
 from service.store.lock import FolderInUse, FolderLock, HostLock, ourselves
-from service.store.tables import ChunkRow, EventRow, JobRow, LoopRow, RetuneRow
+from service.store.tables import ChunkRow, EventRow, HostRow, JobRow, LoopRow, RetuneRow
 from tuning.plan import Sample
 from tuning.reasons import Reason
 
@@ -81,10 +81,14 @@ class Store:
             # One writer at a time inside the process: SQLite has one anyway, and does not queue them fairly.
             self._write_lock = None if self.shared else threading.Lock()
             self._session = sessionmaker(self.engine, expire_on_commit=False)
-            if self.shared:
-                self._host_lock = HostLock(self.engine, host)
+            if database is not None:
+                name = f"loopwright {host}, {ourselves()}"
+                self._host_lock = HostLock(postgresql(database, name, alone=True), host, folder)
+                self._host_lock.refuse()
             migrate(self.engine)
-            if not self.shared:
+            if self._host_lock is not None:
+                self._host_lock.take()
+            else:
                 self._adopt()
         except BaseException:
             self.close()
@@ -93,7 +97,7 @@ class Store:
     def _adopt(self) -> None:
         """The one host of a data folder has everything in it."""
         with self.writing() as session:
-            for table in (JobRow, LoopRow, RetuneRow):
+            for table in (JobRow, LoopRow, RetuneRow, HostRow):
                 session.execute(update(table).where(table.host != self.host).values(host=self.host))
 
     def close(self) -> None:
@@ -104,16 +108,20 @@ class Store:
         self._folder_lock.close()
 
     def check_lock(self) -> None:
-        """Raises FolderInUse when another service has taken our host name while the database was away."""
+        """Takes the lock on our host name again after the database was away. Raises FolderInUse when another service
+        has the name."""
         if self._host_lock is not None:
             self._host_lock.check()
 
     @contextmanager
     def writing(self) -> Iterator[Session]:
+        """A transaction. Raises FolderInUse when another service has our name: what was ours is that one's."""
         if self._write_lock is not None and not self._write_lock.acquire(timeout=WAIT_S):
             raise TimeoutError("another writer of this process waits for the database")
         try:
             with self._session.begin() as session:
+                if self._host_lock is not None:
+                    self._host_lock.check_claim(session)
                 yield session
         finally:
             if self._write_lock is not None:
@@ -136,8 +144,13 @@ class Store:
         A loop of a host that is not running is taken over with its active job, and looked after here if it was there:
         its bus has moved. Raises ForeignLoop when the other host is running.
         """
+        others_of = select(LoopRow).where(LoopRow.tag.in_(loops), LoopRow.host != self.host)
+        if self._host_lock is not None:
+            with self._session() as session:
+                names = {row.host for row in session.scalars(others_of)}
+            self._host_lock.wait_for(names)
         with self.writing() as session:
-            foreign = session.scalars(select(LoopRow).where(LoopRow.tag.in_(loops), LoopRow.host != self.host)).all()
+            foreign = session.scalars(others_of).all()
             free = {host: HostLock.free(session, host) for host in {row.host for row in foreign}}
             taken = [row for row in foreign if not free[row.host]]
             if taken:
