@@ -81,6 +81,8 @@ class Jobs:
         self._machine = machine or Machine()
         self.journal = Journal(store, beside=self._machine.writes_beside)
         self.stopping = False
+        self.watched = self._machine.monotonic()
+        """When the watcher last turned."""
         self.why_stopping = "the service is shutting down"
         self._open_loop = open_loop
         self._tune = tune
@@ -302,6 +304,10 @@ class Jobs:
         """Hears of jobs to stop, from whatever host; finds what the engine has lost."""
         reconciled = self._machine.monotonic()
         while not self._ended.wait(_WATCH_S):
+            self.watched = self._machine.monotonic()
+            if self.store.damaged is not None:
+                self.give_up(self.store.damaged)
+                continue
             try:
                 for job_id, reason in self.store.wishes_to_stop().items():
                     self._heed(job_id, Reason(reason))
@@ -397,6 +403,11 @@ class Jobs:
             row = self._lasting(lambda: self.store.get(job_id))
             before_s = self._lasting(lambda: self.store.last_sample_s(job_id)) if row.attempt else 0.0
         except NoSuchJob:
+            log.error(
+                "job %s was begun and is not in the database: it is lost, the database is older than the engine's file "
+                "or was damaged; look at the loops, and at `loopwright check-data`",
+                job_id,
+            )
             return
         with self._lock:
             if self.stopping or job_id in self._running or job_id in self._unqueued:

@@ -126,7 +126,7 @@ def checks(jobs: Jobs) -> dict[str, Check]:
         if jobs.stopping:
             raise RuntimeError(jobs.why_stopping)
         if not jobs.engine.alive():
-            raise RuntimeError("the engine does not run")
+            raise RuntimeError("the engine does not run: the log says why; restart the service")
 
     urls = sorted({loop.bus for loop in jobs.loops.values()})
     return {"database": database, "engine": engine, **{f"bus {url}": BusWatch(url).check for url in urls}}

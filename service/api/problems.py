@@ -17,6 +17,7 @@ from service.journal import temporary
 from service.model_forms import BadModel
 from service.request import BadLimits
 from service.states import IllegalMove
+from service.store.damage import is_damage
 from service.store.store import Busy, FolderInUse, NoSuchJob
 from service.tunings import BadTuning
 from tuning.reasons import ADVICE, Ended, Reason
@@ -94,6 +95,8 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(SQLAlchemyError)
     async def _database(_request: Request, error: SQLAlchemyError) -> JSONResponse:
+        if is_damage(cause := getattr(error, "orig", None)):
+            return problem(503, f"the service's data are damaged ({cause}): no work is taken; /readyz says what to do")
         if not temporary(error):
             return problem(500, f"{type(error).__name__} of the database", reason=Reason.INTERNAL)
         detail = "the database does not answer; jobs that run go on, ask again"

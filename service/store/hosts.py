@@ -1,16 +1,15 @@
-"""What a host keeps of itself: what its clock was seen to say, and when the database last took anything."""
+"""What a host has seen its clock say."""
 
 from __future__ import annotations
 
 from datetime import UTC, datetime
 
 from sqlalchemy import func, select
-from sqlalchemy.orm import Session
 
 from service.clock_watch import Jump, Seen
 from service.security import audit
-from service.store.clock import now, stamp
-from service.store.store import Store
+from service.store.clock import stamp
+from service.store.store import Store, of_host
 from service.store.tables import HostRow, JobRow
 
 
@@ -34,21 +33,6 @@ def keep_seen(store: Store, seen: Seen, jump: Jump | None) -> None:
         if jump is not None:
             before, after = {"expected": stamp(jump.expected)}, {"clock": stamp(jump.to), "text": jump.text}
             audit.record(session, "clock_jump", "retention", before=before, after=after)
-
-
-def try_writing(store: Store) -> None:
-    """Raises SQLAlchemyError unless the database takes something and keeps it."""
-    with store.writing() as session:
-        of_host(session, store.host).written_at = now()
-
-
-def of_host(session: Session, host: str) -> HostRow:
-    """The row of the host, made if there is none."""
-    row = session.get(HostRow, host)
-    if row is None:
-        row = HostRow(host=host)
-        session.add(row)
-    return row
 
 
 def _time(text: str) -> datetime:

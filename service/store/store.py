@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import delete, func, select, text, update
+from sqlalchemy import delete, func, select, update
 from sqlalchemy.exc import IntegrityError, TimeoutError
 from sqlalchemy.orm import Session, sessionmaker
 
@@ -20,7 +20,8 @@ from service.state_json import gains_of
 from service.states import ACTIVE, IllegalMove, JobState, check
 from service.store import chunks, retunes
 from service.store.clock import now
-from service.store.database import WAIT_S, migrate, open_database, postgresql
+from service.store.damage import Damage
+from service.store.database import FILE, WAIT_S, BadDatabase, migrate, open_database, postgresql
 from service.store.lock import FolderInUse, FolderLock, HostLock, ourselves
 from service.store.tables import ChunkRow, EventRow, HostRow, JobRow, LoopRow, RetuneRow
 from tuning.plan import Sample
@@ -75,8 +76,12 @@ class Store:
         self.folder = folder
         self._folder_lock = FolderLock(folder)
         self._host_lock: HostLock | None = None
+        self._damage = Damage(folder / FILE if database is None else None)
         try:
+            if (damaged := self._damage.look()) is not None:
+                raise BadDatabase(damaged)
             self.engine = open_database(folder, database, f"loopwright {host}, {ourselves()}")
+            self._damage.watch(self.engine)
             self.shared = self.engine.dialect.name != "sqlite"
             # One writer at a time inside the process: SQLite has one anyway, and does not queue them fairly.
             self._write_lock = None if self.shared else threading.Lock()
@@ -101,6 +106,7 @@ class Store:
                 session.execute(update(table).where(table.host != self.host).values(host=self.host))
 
     def close(self) -> None:
+        self._damage.close()
         if self._host_lock is not None:
             self._host_lock.close()
         if hasattr(self, "engine"):
@@ -132,10 +138,18 @@ class Store:
         with self._session() as session:
             yield session
 
+    @property
+    def damaged(self) -> str | None:
+        """What is wrong with the file, and what to do; None: nothing is known to be."""
+        return self._damage.words
+
     def ping(self) -> None:
-        """Raises SQLAlchemyError unless the database answers."""
-        with self._session() as session:
-            session.execute(text("SELECT 1"))
+        """Raises BadDatabase where the file is damaged, SQLAlchemyError unless the database takes and keeps something:
+        one that only answers is of no use to a job."""
+        if self.damaged is not None:
+            raise BadDatabase(self.damaged)
+        with self.writing() as session:
+            of_host(session, self.host).written_at = now()
 
     # loops
     def own_loops(self, loops: dict[str, dict[str, Any]]) -> None:
@@ -415,6 +429,15 @@ def _find(session: Session, job_id: str, lock: bool = False) -> JobRow:
     row = session.scalars(wanted.with_for_update() if lock else wanted).one_or_none()
     if row is None:
         raise NoSuchJob(job_id)
+    return row
+
+
+def of_host(session: Session, host: str) -> HostRow:
+    """What the host keeps of itself; a row is made if there is none."""
+    row = session.get(HostRow, host)
+    if row is None:
+        row = HostRow(host=host)
+        session.add(row)
     return row
 
 
