@@ -119,7 +119,7 @@ class Fleet:
     def start(self, request: FleetRequest) -> RetuneRow:
         """Begins it. Raises BadFleet when one of the loops is unknown or does not permit what is asked, Stopping."""
         if self._jobs.stopping:
-            raise Stopping("the service is shutting down")
+            raise Stopping(self._jobs.why_stopping)
         known = self._known()
         if request.pattern is not None:
             tags = sorted(tag for tag in known if fnmatchcase(tag, request.pattern))

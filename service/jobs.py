@@ -33,6 +33,7 @@ from service.safe import make_safe
 from service.state_json import gains_of, loop_state, state_json
 from service.states import ACTIVE, IllegalMove, JobState, state_after
 from service.store import looked_after, loop_locks
+from service.store.lock import CHECK_S
 from service.store.store import Busy, FolderInUse, NoSuchJob, Store, WithJob
 from service.store.tables import JobRow, LoopLockRow
 from service.work import Hooks, Outcome, Rehearse, Tune
@@ -83,6 +84,9 @@ class Jobs:
         self._machine = machine or Machine()
         self.journal = Journal(store, beside=self._machine.writes_beside)
         self.stopping = False
+        self.watched = self._machine.monotonic()
+        """When the watcher last turned."""
+        self.why_stopping = "the service is shutting down"
         self._open_loop = open_loop
         self._tune = tune
         self._rehearse = rehearse
@@ -103,6 +107,7 @@ class Jobs:
         self._unqueued: dict[str, JobRow] = {}
         self._ended = threading.Event()
         self._watcher = self._machine.thread(self._watch, "watcher")
+        self._name_holder = self._machine.thread(self._hold_name, "name holder")
 
     # at the start of the service
     def boot(self) -> None:
@@ -120,6 +125,8 @@ class Jobs:
         self.reconcile(at_once=True)
         if not self.stopping:
             self._watcher.start()
+            if self.store.shared:
+                self._name_holder.start()
             self.aftercare.start()
 
     def reconcile(self, at_once: bool = False) -> None:
@@ -203,7 +210,7 @@ class Jobs:
         config, host = self.owner(tag)
         within(config, request)
         if self.stopping:
-            raise Stopping("the service is shutting down")
+            raise Stopping(self.why_stopping)
         asked = request.asked()
         row = self.store.create(tag, asked, request.requested_by, request.dry_run, host, WORKFLOW_VERSION, also)
         try:
@@ -275,6 +282,13 @@ class Jobs:
         for running in list(self._running.values()):
             running.stop_reason = running.stop_reason or Reason.SERVICE_STOPPED
 
+    def give_up(self, why: str) -> None:
+        """Ends every job and takes no more, while requests go on being answered; why: as readiness says it."""
+        if not self.stopping:
+            log.critical("%s; every job is ended, no more are taken", why)
+            self.why_stopping = why
+            self.request_stop()
+
     def stop(self) -> None:
         """Ends every job, waits until each has restored its loop, and gives the engine up.
 
@@ -306,23 +320,35 @@ class Jobs:
         self.journal.close(_STOP_PATIENCE_S)
 
     def _watch(self) -> None:
-        """Hears of jobs to stop, from whatever host; holds the lock on our name; finds what the engine has lost."""
+        """Hears of jobs to stop, from whatever host; finds what the engine has lost."""
         reconciled = self._machine.monotonic()
         while not self._ended.wait(_WATCH_S):
+            self.watched = self._machine.monotonic()
+            if self.store.damaged is not None:
+                self.give_up(self.store.damaged)
+                continue
             try:
                 for job_id, reason in self.store.wishes_to_stop().items():
                     self._heed(job_id, Reason(reason))
                 if self._machine.monotonic() - reconciled > _RECONCILE_S:
-                    self.store.check_lock()
                     self.reconcile()
                     reconciled = self._machine.monotonic()
-            except FolderInUse as error:
-                log.critical("%s; every job is stopped", error)
-                self.request_stop()
             except SQLAlchemyError as error:
                 log.warning("the database does not answer: %s", error)
             except Exception:  # whatever it is, aborts from other hosts must go on being heard
                 log.exception("watching the jobs")
+
+    def _hold_name(self) -> None:
+        """Keeps the lock on our host name. Nothing else in this thread waits for anything: another service waits only
+        so long for us to come for it."""
+        while not self._ended.wait(CHECK_S):
+            try:
+                self.store.check_lock()
+            except FolderInUse as error:
+                self.give_up(str(error))
+                return
+            except Exception:
+                log.exception("holding the name of the host")
 
     # loops looked after
     def dismiss(self, tag: str, by: str) -> list[str]:
@@ -436,6 +462,11 @@ class Jobs:
             row = self._lasting(lambda: self.store.get(job_id))
             before_s = self._lasting(lambda: self.store.last_sample_s(job_id)) if row.attempt else 0.0
         except NoSuchJob:
+            log.error(
+                "job %s was begun and is not in the database: it is lost, the database is older than the engine's file "
+                "or was damaged; look at the loops, and at `loopwright check-data`",
+                job_id,
+            )
             return
         with self._lock:
             if self.stopping or job_id in self._running or job_id in self._unqueued:

@@ -49,6 +49,11 @@ LATEST_SECONDS = Gauge(
     "loopwright_event_loop_late_worst_seconds", "The worst of that in the last minute, s", registry=None
 )
 
+CLOCK_JUMPS = Counter(
+    "loopwright_clock_jumps", "Jumps of the wall clock that were seen; the ages of samples count from the last one",
+    registry=None,
+)  # fmt: skip
+
 
 class _OfTheStore(Collector):
     def __init__(self, loops: Mapping[str, LoopConfig], store: Store) -> None:
@@ -99,7 +104,7 @@ def registry(loops: Mapping[str, LoopConfig], store: Store) -> CollectorRegistry
     """Everything that /metrics shows of a service."""
     found = CollectorRegistry()
     of_this_process = (
-        SAMPLES_LOST, STAGE_SECONDS, REQUESTS, REQUEST_SECONDS, IN_FLIGHT, LATE_SECONDS, LATEST_SECONDS,
+        SAMPLES_LOST, STAGE_SECONDS, REQUESTS, REQUEST_SECONDS, IN_FLIGHT, LATE_SECONDS, LATEST_SECONDS, CLOCK_JUMPS,
     )  # fmt: skip
     for collector in (*of_this_process, _OfTheStore(loops, store)):
         found.register(collector)

@@ -2,21 +2,26 @@
 told, and what the engine still knows of jobs that are over, always.
 
 Jobs, their events and results stay. Which samples are deleted is in the audit log, and each job has an event of it.
+A clock that has jumped deletes nothing: service/clock_watch.py.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
+import time
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 from sqlalchemy import ColumnElement, delete, func, select
 from sqlalchemy.exc import SQLAlchemyError
 
+from service.clock_watch import ClockWatch, longest_stop
 from service.engine import Engine
+from service.metrics import CLOCK_JUMPS
 from service.security import audit
 from service.states import ACTIVE, JobState
+from service.store import hosts
 from service.store.clock import stamp
 from service.store.store import Store, append
 from service.store.tables import ChunkRow, JobRow
@@ -24,6 +29,8 @@ from service.store.tables import ChunkRow, JobRow
 log = logging.getLogger(__name__)
 
 EVERY_S = 3600.0
+LOOK_S = 60.0
+"""Wall time between two looks at the clock."""
 _AT_ONCE = 50
 _FORGOTTEN_AT_ONCE = 500
 _STOP_S = 5.0
@@ -42,10 +49,14 @@ class Keep:
         return self.jobs is not None or self.days is not None
 
 
-def tidy(store: Store, keep: Keep, at: datetime | None = None) -> int:
-    """Deletes what need not be kept of this host's jobs. Returns of how many jobs. at: the present."""
+def tidy(store: Store, keep: Keep, at: datetime | None = None, ages_from: datetime | None = None) -> int:
+    """Deletes what need not be kept of this host's jobs. Returns of how many jobs. at: the present.  ages_from: nothing
+    counts as older than this."""
+    at = at or datetime.now(UTC)
+    if keep.days is not None and ages_from is not None and ages_from > at - timedelta(days=keep.days):
+        return 0  # each job has a reason to be kept: as far as was seen, it is not old enough
     count = 0
-    while keep and (jobs := _some(store, keep, at or datetime.now(UTC))):
+    while keep and (jobs := _some(store, keep, at)):
         count += len(jobs)
     return count
 
@@ -106,10 +117,19 @@ def _why(keep: Keep) -> str:
 
 
 class Retention:
-    """Tidies now and then, in a thread."""
+    """Tidies now and then, in a thread, by a clock that it looks at more often."""
 
-    def __init__(self, store: Store, engine: Engine, keep: Keep, every_s: float = EVERY_S) -> None:
-        self._store, self._engine, self._keep, self._every_s = store, engine, keep, every_s
+    def __init__(
+        self,
+        store: Store,
+        engine: Engine,
+        keep: Keep,
+        every_s: float = EVERY_S,
+        look_s: float = LOOK_S,
+        watch: ClockWatch | None = None,
+    ) -> None:
+        self._store, self._engine, self._keep, self._every_s, self._look_s = store, engine, keep, every_s, look_s
+        self._watch = watch or ClockWatch()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="retention", daemon=True)
 
@@ -121,13 +141,45 @@ class Retention:
         if self._thread.is_alive():
             self._thread.join(_STOP_S)  # the engine waits for a database that is away
 
+    def note(self) -> str | None:
+        """Why no samples are deleted for their age at present; None: nothing keeps them."""
+        seen, days = self._watch.seen, self._keep.days
+        if seen is None or seen.ages_from is None or days is None:
+            return None
+        until = seen.ages_from + timedelta(days=days)
+        if until <= seen.at:
+            return None
+        return (
+            f"the wall clock has jumped, the ages of samples count from {stamp(seen.ages_from)}: "
+            f"none are deleted for their age before {stamp(until)}"
+        )
+
+    def look(self) -> None:
+        """Looks at the clock, and writes down what it says."""
+        before = None if self._watch.seen is not None else hosts.last_seen(self._store)
+        jump = self._watch.look(before, longest_stop(self._keep.days))
+        if jump is not None:
+            CLOCK_JUMPS.inc()
+            log.warning("%s", jump.text)
+        if self._watch.seen is not None:
+            hosts.keep_seen(self._store, self._watch.seen, jump)
+
     def _run(self) -> None:
+        tidied: float | None = None
         while not self._over.is_set():
             try:
-                tidy(self._store, self._keep)
-                forget(self._store, self._engine)
+                self.look()
+                if tidied is None or time.monotonic() - tidied >= self._every_s:
+                    self._tidy()
+                    tidied = time.monotonic()
             except SQLAlchemyError as error:
                 log.warning("what need not be kept could not be deleted, it will be later: %s", error)
             except Exception:  # whatever it is, it must be tried again
                 log.exception("what need not be kept could not be deleted")
-            self._over.wait(self._every_s)
+            self._over.wait(self._look_s)
+
+    def _tidy(self) -> None:
+        seen = self._watch.seen
+        if seen is not None:
+            tidy(self._store, self._keep, seen.at, seen.ages_from)
+        forget(self._store, self._engine)

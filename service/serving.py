@@ -20,6 +20,7 @@ from fastapi import FastAPI
 from protocol.profile import TUNER_NODE
 from protocol.station import Station
 from service import logs
+from service.api import operations
 from service.api.app import create_app
 from service.api.connections import Connection, Connections, Listener, OnceAMinute, raise_descriptor_limit
 from service.computing.limits import ComputingLimits, Kind
@@ -160,8 +161,9 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
             resume=setup.resume,
         )
         stack.callback(jobs.stop)
-        server = _Server(server_config(create_app(jobs, policy, pool=pool), setup, descriptors))
         retention = stack.enter_context(closing(Retention(store, engine, setup.keep)))
+        checks = {**operations.checks(jobs), "samples": retention.note}
+        server = _Server(server_config(create_app(jobs, policy, checks, pool), setup, descriptors))
 
         def end() -> None:
             """Open event streams end with their jobs: the server, which waits for its connections, waits for them."""

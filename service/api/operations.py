@@ -23,8 +23,8 @@ from service.jobs import Jobs
 from service.security import audit
 from service.security.tables import AuditRow
 
-Check = Callable[[], None]
-"""Returns when all is well; raises with the reason when not."""
+Check = Callable[[], str | None]
+"""Returns when all is well, with what is worth knowing; raises with the reason when not."""
 CHECK_S = 2.0
 BEHIND_S = 1.0
 FRESH_S = 2.0
@@ -39,7 +39,10 @@ class PartView(BaseModel):
     """One thing the service cannot do without."""
 
     ready: bool
-    detail: str | None = Field(description="What is wrong with it", examples=["CAN interface 'can0' cannot be opened"])
+    detail: str | None = Field(
+        description="What is wrong with it; of a part that is ready, what is worth knowing",
+        examples=["CAN interface 'can0' cannot be opened"],
+    )
 
 
 class Ready(BaseModel):
@@ -47,7 +50,8 @@ class Ready(BaseModel):
 
     ready: bool = Field(description="All of its parts are")
     parts: dict[str, PartView] = Field(
-        description="database, engine, each bus by its address, and each loop that is looked after"
+        description="database, engine, samples (what is deleted when), each bus by its address, and each loop that is "
+        "looked after"
     )
 
 
@@ -66,7 +70,7 @@ class AuditView(BaseModel):
     said_by: str | None = Field(description="Who the request itself says it is from", examples=["night shift"])
     what: str = Field(
         description="retune, abort, accept, rollback, accept_failed, rollback_failed, retune_many, retune_many_abort, "
-        "dismiss, lock, unlock, samples_delete, restore, key_create, key_revoke",
+        "dismiss, lock, unlock, samples_delete, clock_jump, restore, key_create, key_revoke",
         examples=["accept"],
     )
     subject: str = Field(
@@ -105,12 +109,12 @@ class Readiness:
     @staticmethod
     async def _one(check: Check) -> PartView:
         try:
-            await asyncio.wait_for(asyncio.to_thread(check), CHECK_S)
+            told = await asyncio.wait_for(asyncio.to_thread(check), CHECK_S)
         except TimeoutError:
             return PartView(ready=False, detail=f"no answer within {CHECK_S:g} s")
         except Exception as error:  # whatever it is, this part is not ready
             return PartView(ready=False, detail=str(error) or type(error).__name__)
-        return PartView(ready=True, detail=None)
+        return PartView(ready=True, detail=told)
 
 
 def checks(jobs: Jobs) -> dict[str, Check]:
@@ -123,9 +127,9 @@ def checks(jobs: Jobs) -> dict[str, Check]:
 
     def engine() -> None:
         if jobs.stopping:
-            raise RuntimeError("the service is shutting down")
+            raise RuntimeError(jobs.why_stopping)
         if not jobs.engine.alive():
-            raise RuntimeError("the engine does not run")
+            raise RuntimeError("the engine does not run: the log says why; restart the service")
 
     urls = sorted({loop.bus for loop in jobs.loops.values()})
     return {"database": database, "engine": engine, **{f"bus {url}": BusWatch(url).check for url in urls}}

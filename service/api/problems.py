@@ -20,7 +20,8 @@ from service.model_forms import BadModel
 from service.request import BadLimits
 from service.states import IllegalMove
 from service.store.claims import StillAnswering
-from service.store.store import Busy, NoSuchJob
+from service.store.damage import is_damage
+from service.store.store import Busy, FolderInUse, NoSuchJob
 from service.tunings import BadTuning
 from tuning.reasons import ADVICE, Ended, Reason
 
@@ -54,6 +55,8 @@ def problem(
 
 
 def of_database(error: SQLAlchemyError) -> JSONResponse:
+    if is_damage(cause := getattr(error, "orig", None)):
+        return problem(503, f"the service's data are damaged ({cause}): no work is taken; /readyz says what to do")
     if not temporary(error):
         return problem(500, f"{type(error).__name__} of the database", reason=Reason.INTERNAL)
     detail = "the database does not answer; jobs that run go on, ask again"
@@ -121,7 +124,8 @@ def install(app: FastAPI) -> None:
         return still_answering(error)
 
     @app.exception_handler(Stopping)
-    async def _stopping(_request: Request, error: Stopping) -> JSONResponse:
+    @app.exception_handler(FolderInUse)
+    async def _stopping(_request: Request, error: Exception) -> JSONResponse:
         return problem(503, str(error), reason=Reason.SERVICE_STOPPED)
 
     @app.exception_handler(DataError)

@@ -9,12 +9,14 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Collection, Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 
 from dbos import DBOS, DBOSConfig, SetWorkflowID
 from sqlalchemy import Engine as Database
 
 from service.engine import WORKFLOW_VERSION
+from service.store.damage import Damage
 from service.store.database import checkpoint, sqlite
 
 log = logging.getLogger(__name__)
@@ -43,7 +45,13 @@ class DurableEngine:
     def __init__(self, folder: Path, database: Database | None, host: str, poll_s: float = POLL_S) -> None:
         self._host = host
         self._poll_s = poll_s
+        self._damage = Damage(folder / FILE if database is None else None)
+        if self._damage.look() is not None:
+            _set_aside(folder)
+            self._damage = Damage(folder / FILE)
         self._own = sqlite(folder / FILE) if database is None else None
+        if self._own is not None:
+            self._damage.watch(self._own)
         self.database = self._own if database is None else database
         self._queues: frozenset[str] = frozenset()
         self._launched = False
@@ -100,7 +108,7 @@ class DurableEngine:
             DBOS.delete_workflows(list(job_ids))
 
     def alive(self) -> bool:
-        return self._launched
+        return self._launched and self._damage.words is None
 
     def close(self) -> None:
         global _run
@@ -110,5 +118,15 @@ class DurableEngine:
             if self._own is not None:
                 checkpoint(self._own)
         _run = None
+        self._damage.close()
         if self._own is not None:
             self._own.dispose()
+
+
+def _set_aside(folder: Path) -> None:
+    """The start finds the jobs that are not over in our own tables, and makes the file anew."""
+    aside = folder / f"damaged-{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}"
+    aside.mkdir(mode=0o700)
+    for path in folder.glob(f"{FILE}*"):
+        path.rename(aside / path.name)
+    log.warning("%s was damaged and is made anew: nothing is lost; the old one is in %s", folder / FILE, aside)

@@ -16,6 +16,7 @@ from alembic.util import CommandError
 from sqlalchemy import Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 from sqlalchemy.orm import Session, sessionmaker
+from sqlalchemy.pool import NullPool
 
 _log = logging.getLogger(__name__)
 
@@ -49,8 +50,11 @@ def sessions(usual: Engine, reserve: Engine) -> sessionmaker[Session]:
 
 def open_database(folder: Path, url: str | None, name: str, pool: tuple[int, int] = USUAL) -> Engine:
     """The engine for our tables. name: how a PostgreSQL server lists the connections."""
-    if url is None:
-        return sqlite(folder / FILE)
+    return sqlite(folder / FILE) if url is None else postgresql(url, name, pool)
+
+
+def postgresql(url: str, name: str, pool: tuple[int, int] | None) -> Engine:
+    """pool: None: each connection is made when it is asked for, and waits for no other. Raises BadDatabase."""
     try:
         parsed = make_url(url)
     except ArgumentError as error:
@@ -58,23 +62,30 @@ def open_database(folder: Path, url: str | None, name: str, pool: tuple[int, int
     if parsed.get_backend_name() != "postgresql":
         kind = parsed.get_backend_name()
         raise BadDatabase(f"the database must be postgresql://..., not {kind}://; without one a file is used")
+    parsed = parsed.set(drivername="postgresql+psycopg")
+    if pool is None:
+        return create_engine(parsed, poolclass=NullPool, connect_args=_server(name))
     return create_engine(
-        parsed.set(drivername="postgresql+psycopg"),
+        parsed,
         pool_size=pool[0],
         max_overflow=pool[1],
         pool_timeout=WAIT_S,
         # A connection that died while it lay idle is noticed before a transaction begins on it.
         pool_pre_ping=True,
-        connect_args={
-            "connect_timeout": WAIT_S,
-            "application_name": name,
-            "options": f"-c statement_timeout={STATEMENT_S}s -c lock_timeout={WAIT_S}s",
-            "keepalives_idle": WAIT_S,
-            "keepalives_interval": 1,
-            "keepalives_count": 5,
-            "tcp_user_timeout": 1000 * STATEMENT_S,
-        },
+        connect_args=_server(name),
     )
+
+
+def _server(name: str) -> dict[str, Any]:
+    return {
+        "connect_timeout": WAIT_S,
+        "application_name": name,
+        "options": f"-c statement_timeout={STATEMENT_S}s -c lock_timeout={WAIT_S}s",
+        "keepalives_idle": WAIT_S,
+        "keepalives_interval": 1,
+        "keepalives_count": 5,
+        "tcp_user_timeout": 1000 * STATEMENT_S,
+    }
 
 
 def sqlite(file: Path) -> Engine:

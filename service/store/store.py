@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import delete, func, select, text, update
+from sqlalchemy import delete, func, select, update
 from sqlalchemy.exc import IntegrityError, TimeoutError
 from sqlalchemy.orm import Session
 
@@ -20,9 +20,20 @@ from service.state_json import gains_of
 from service.states import ACTIVE, IllegalMove, JobState, check
 from service.store import chunks, claims, loop_locks, retunes
 from service.store.clock import now
-from service.store.database import RESERVE, WAIT_S, checkpoint, migrate, open_database, sessions
+from service.store.damage import Damage
+from service.store.database import (
+    FILE,
+    RESERVE,
+    WAIT_S,
+    BadDatabase,
+    checkpoint,
+    migrate,
+    open_database,
+    postgresql,
+    sessions,
+)
 from service.store.lock import FolderInUse, FolderLock, HostLock, ourselves
-from service.store.tables import ChunkRow, EventRow, JobRow, LoopRow, RetuneRow
+from service.store.tables import ChunkRow, EventRow, HostRow, JobRow, LoopRow, RetuneRow
 from tuning.plan import Sample
 from tuning.reasons import Reason
 
@@ -76,18 +87,26 @@ class Store:
         self.folder = folder
         self._folder_lock = FolderLock(folder)
         self._host_lock: HostLock | None = None
+        self._damage = Damage(folder / FILE if database is None else None)
         try:
+            if (damaged := self._damage.look()) is not None:
+                raise BadDatabase(damaged)
             name = f"loopwright {host}, {ourselves()}"
             self.engine = open_database(folder, database, name)
             self._reserve = open_database(folder, database, name, RESERVE)
+            for engine in (self.engine, self._reserve):
+                self._damage.watch(engine)
             self.shared = self.engine.dialect.name != "sqlite"
             # One writer at a time inside the process: SQLite has one anyway, and does not queue them fairly.
             self._write_lock = None if self.shared else threading.Lock()
             self._session = sessions(self.engine, self._reserve)
-            if self.shared:
-                self._host_lock = HostLock(self.engine, host)
+            if database is not None:
+                self._host_lock = HostLock(postgresql(database, name, pool=None), host, folder)
+                self._host_lock.refuse()
             migrate(self.engine)
-            if not self.shared:
+            if self._host_lock is not None:
+                self._host_lock.take()
+            else:
                 self._adopt()
         except BaseException:
             self._let_go()
@@ -96,7 +115,7 @@ class Store:
     def _adopt(self) -> None:
         """The one host of a data folder has everything in it."""
         with self.writing() as session:
-            for table in (JobRow, LoopRow, RetuneRow):
+            for table in (JobRow, LoopRow, RetuneRow, HostRow):
                 session.execute(update(table).where(table.host != self.host).values(host=self.host))
 
     def close(self) -> None:
@@ -104,6 +123,7 @@ class Store:
         self._let_go()
 
     def _let_go(self) -> None:
+        self._damage.close()
         if self._host_lock is not None:
             self._host_lock.close()
         for engine in ("engine", "_reserve"):
@@ -112,16 +132,20 @@ class Store:
         self._folder_lock.close()
 
     def check_lock(self) -> None:
-        """Raises FolderInUse when another service has taken our host name while the database was away."""
+        """Takes the lock on our host name again after the database was away. Raises FolderInUse when another service
+        has the name."""
         if self._host_lock is not None:
             self._host_lock.check()
 
     @contextmanager
     def writing(self) -> Iterator[Session]:
+        """A transaction. Raises FolderInUse when another service has our name: what was ours is that one's."""
         if self._write_lock is not None and not self._write_lock.acquire(timeout=WAIT_S):
             raise TimeoutError("another writer of this process waits for the database")
         try:
             with self._session.begin() as session:
+                if self._host_lock is not None:
+                    self._host_lock.check_claim(session)
                 yield session
         finally:
             if self._write_lock is not None:
@@ -132,10 +156,18 @@ class Store:
         with self._session() as session:
             yield session
 
+    @property
+    def damaged(self) -> str | None:
+        """What is wrong with the file, and what to do; None: nothing is known to be."""
+        return self._damage.words
+
     def ping(self) -> None:
-        """Raises SQLAlchemyError unless the database answers."""
-        with self._session() as session:
-            session.execute(text("SELECT 1"))
+        """Raises BadDatabase where the file is damaged, SQLAlchemyError unless the database takes and keeps something:
+        one that only answers is of no use to a job."""
+        if self.damaged is not None:
+            raise BadDatabase(self.damaged)
+        with self.writing() as session:
+            of_host(session, self.host).written_at = now()
 
     # loops
     def own_loops(self, loops: dict[str, dict[str, Any]]) -> None:
@@ -144,8 +176,13 @@ class Store:
         A loop of a host that is not running is taken over with its active job, and looked after here if it was there:
         its bus has moved. Raises ForeignLoop when the other host is running.
         """
+        others_of = select(LoopRow).where(LoopRow.tag.in_(loops), LoopRow.host != self.host)
+        if self._host_lock is not None:
+            with self._session() as session:
+                names = {row.host for row in session.scalars(others_of)}
+            self._host_lock.wait_for(names)
         with self.writing() as session:
-            foreign = session.scalars(select(LoopRow).where(LoopRow.tag.in_(loops), LoopRow.host != self.host)).all()
+            foreign = session.scalars(others_of).all()
             free = {host: HostLock.free(session, host) for host in {row.host for row in foreign}}
             taken = [row for row in foreign if not free[row.host]]
             if taken:
@@ -441,6 +478,15 @@ def _find(session: Session, job_id: str, lock: bool = False) -> JobRow:
     row = session.scalars(wanted.with_for_update() if lock else wanted).one_or_none()
     if row is None:
         raise NoSuchJob(job_id)
+    return row
+
+
+def of_host(session: Session, host: str) -> HostRow:
+    """What the host keeps of itself; a row is made if there is none."""
+    row = session.get(HostRow, host)
+    if row is None:
+        row = HostRow(host=host)
+        session.add(row)
     return row
 
 

@@ -79,6 +79,20 @@ class LoopLockRow(Base):
     reason: Mapped[str]
     by: Mapped[str]
     since: Mapped[str]
+class HostRow(Base):
+    """What a host keeps of itself."""
+
+    __tablename__ = "hosts"
+
+    host: Mapped[str] = mapped_column(primary_key=True)
+    # Which service has the name, on a shared database; no claim: it was given back at a clean stop.
+    claim: Mapped[str | None]
+    claimed_by: Mapped[str | None]
+    # The wall clock as it was last looked at, and the time before which nothing counts as having ended.
+    seen_at: Mapped[str | None]
+    ages_from: Mapped[str | None]
+    # When somebody last asked whether the database takes anything.
+    written_at: Mapped[str | None]
 
 
 class EventRow(Base):

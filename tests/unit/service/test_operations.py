@@ -55,6 +55,11 @@ def test_what_is_not_ready_is_named(service: Service) -> None:
     }  # fmt: skip
 
 
+def test_what_is_worth_knowing_of_a_part_that_is_ready(service: Service) -> None:
+    status, body = ready(service, samples=lambda: "none are deleted before 2027")
+    assert status == 200 and body["parts"] == {"samples": {"ready": True, "detail": "none are deleted before 2027"}}
+
+
 def test_a_service_that_stops_is_not_ready_but_alive(service: Service) -> None:
     client = TestClient(create_app(service.jobs))
     service.jobs.request_stop()

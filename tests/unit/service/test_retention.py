@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 from sqlalchemy import MetaData, Table, func, inspect, select
 
+from service.clock_watch import ClockWatch
 from service.engine.durable import DurableEngine
+from service.metrics import CLOCK_JUMPS
 from service.retention import Keep, Retention, forget, tidy
 from service.security import audit
 from service.states import JobState
@@ -142,11 +144,101 @@ def test_it_is_done_at_the_start_and_again(tmp_path: Path, monkeypatch: pytest.M
         return 0
 
     monkeypatch.setattr("service.retention.tidy", count)
-    retention = Retention(store, ThreadEngine(), Keep(jobs=1), every_s=0.001)
+    retention = Retention(store, ThreadEngine(), Keep(jobs=1), every_s=0.001, look_s=0.001)
     retention.start()
     assert twice.wait(5)
     retention.close()
-    for_ever = Retention(store, ThreadEngine(), Keep(), every_s=0.001)
+    for_ever = Retention(store, ThreadEngine(), Keep(), every_s=0.001, look_s=0.001)
     for_ever.start()
     for_ever.close()
     store.close()
+
+
+class Clocks:
+    """A wall clock that somebody sets, and the time that passes."""
+
+    def __init__(self) -> None:
+        self.wall, self.passed_s = NOW, 1000.0
+
+    def go_on(self, days: float) -> None:
+        self.wall, self.passed_s = self.wall + timedelta(days=days), self.passed_s + 86400.0 * days
+
+    def retention(self, store: Store, days: float = 30.0) -> Retention:
+        """That of a service which is started now."""
+        watch = ClockWatch(lambda: self.wall, lambda: self.passed_s)
+        return Retention(store, ThreadEngine(), Keep(days=days), watch=watch)
+
+
+def once(retention: Retention) -> None:
+    """One turn of its thread."""
+    retention.look()
+    retention._tidy()
+
+
+def test_a_clock_a_year_ahead_deletes_nothing(store: Store) -> None:
+    ids = [job(store, "A", R, X, days_ago=days) for days in (40, 20, 1)]
+    clocks = Clocks()
+    retention, before = clocks.retention(store), CLOCK_JUMPS._value.get()
+    once(retention)
+    assert kept(store, ids) == [False, True, True] and retention.note() is None
+    clocks.wall += timedelta(days=365)  # and for three days nobody sees it
+    for _ in range(3):
+        clocks.go_on(1)
+        once(retention)
+        assert kept(store, ids) == [False, True, True]
+    assert CLOCK_JUMPS._value.get() == before + 1, "it is said once"
+    note = retention.note()
+    assert note is not None and "none are deleted for their age before" in note
+    (told,) = [row for row in audit.trail(store.engine, 100) if row.what == "clock_jump"]
+    assert told.after is not None and "jumped forward by 365 days" in told.after["text"]
+    clocks.wall -= timedelta(days=365)
+    once(retention)
+    assert kept(store, ids) == [False, True, True]
+    clocks.go_on(29)
+    once(retention)
+    assert kept(store, ids) == [False, True, True]
+    clocks.go_on(1.1)  # thirty days that the service itself has seen
+    once(retention)
+    assert kept(store, ids) == [False, False, False] and retention.note() is None
+
+
+def test_a_clock_that_jumped_while_the_service_was_stopped_deletes_nothing(store: Store) -> None:
+    ids = [job(store, "A", R, X, days_ago=20)]
+    clocks = Clocks()
+    once(clocks.retention(store))
+    clocks.wall += timedelta(days=365)
+    for _ in range(2):  # the second start finds the clock where it was: the jump is remembered
+        retention = clocks.retention(store)
+        once(retention)
+        assert kept(store, ids) == [True] and retention.note() is not None
+    clocks.go_on(31)
+    once(retention)
+    assert kept(store, ids) == [False]
+
+
+def test_before_the_first_look_the_jobs_say_what_time_it_was(store: Store) -> None:
+    """A database of the version before, and a clock that is wrong at the very first start."""
+    ids = [job(store, "A", R, X, days_ago=40), job(store, "A", R, X, days_ago=0)]
+    with store.writing() as session:
+        for job_id in ids:
+            session.merge(store.get(job_id)).created_at = "2020-01-01T00:00:00.000Z"
+    clocks = Clocks()
+    clocks.wall += timedelta(days=365)
+    once(clocks.retention(store))
+    assert kept(store, ids) == [True, True]
+
+
+def test_what_a_clock_that_was_behind_has_stamped_is_not_old(store: Store) -> None:
+    """A machine whose clock stands at 2020 until it hears of the time."""
+    clocks = Clocks()
+    retention = clocks.retention(store)
+    once(retention)
+    clocks.wall -= timedelta(days=2000)
+    once(retention)
+    ids = [job(store, "A", R, X, days_ago=2000)]
+    clocks.wall += timedelta(days=2000)
+    once(retention)
+    assert kept(store, ids) == [True]
+    clocks.go_on(31)
+    once(retention)
+    assert kept(store, ids) == [False]

@@ -13,6 +13,7 @@ from sqlalchemy import Connection, inspect, text
 from sqlalchemy.exc import IntegrityError
 
 from service.states import MOVES, IllegalMove, JobState, check
+from service.store import lock
 from service.store.database import BadDatabase
 from service.store.store import Busy, FolderInUse, ForeignLoop, NoSuchJob, Store
 from service.store.tables import Base
@@ -137,7 +138,10 @@ def test_a_database_has_one_service_per_host_name(tmp_path: Path, postgres: Serv
         store.close()
 
 
-def test_a_lock_lost_with_the_server_is_taken_again_unless_another_was_faster(tmp_path: Path, postgres: Server) -> None:
+def test_a_lock_lost_with_the_server_is_taken_again_unless_another_was_faster(
+    tmp_path: Path, postgres: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lock, "PATIENCE_S", 0.5)
     database = postgres.database()
     a = Store(tmp_path / "a", database, "a")
     postgres.stop()
@@ -149,9 +153,87 @@ def test_a_lock_lost_with_the_server_is_taken_again_unless_another_was_faster(tm
     postgres.stop()
     postgres.start()
     other = Store(tmp_path / "b", database, "a")
-    with pytest.raises(FolderInUse):
+    with pytest.raises(FolderInUse, match=f"process {os.getpid()} on .* has taken the name 'a'"):
         a.check_lock()
-    for store in (a, other):
+    other.close()
+    with pytest.raises(FolderInUse):  # given back, and not to the one that was away
+        a.check_lock()
+    a.close()
+
+
+def test_who_has_a_name_has_time_to_come_for_it_after_the_server_was_restarted(
+    tmp_path: Path, postgres: Server
+) -> None:
+    """The second one starts before the first has noticed anything, and finds no lock."""
+    database = postgres.database()
+    a = Store(tmp_path / "a", database, "a")
+    postgres.stop()
+    postgres.start()
+    found: list[object] = []
+
+    def second() -> None:
+        try:
+            found.append(Store(tmp_path / "b", database, "a"))
+        except FolderInUse as error:
+            found.append(error)
+
+    starts = threading.Thread(target=second)
+    starts.start()
+    with a.reading() as session:  # it has looked, and waits
+        while not session.scalar(text("SELECT count(*) FROM pg_stat_activity WHERE query LIKE 'SELECT claim%'")):
+            session.rollback()
+    a.check_lock()
+    starts.join()
+    assert len(found) == 1 and isinstance(found[0], FolderInUse) and "served already" in str(found[0])
+    a.move(a.create("A", {}, "me", False).id, JobState.RUNNING)
+    a.close()
+
+
+def test_nobody_waits_for_the_dead_nor_for_who_has_left(
+    tmp_path: Path, postgres: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lock, "PATIENCE_S", 1e9)
+    database = postgres.database()
+    Store(tmp_path / "a", database, "a").close()
+    killed = Store(tmp_path / "b", database, "a")
+    assert killed._host_lock is not None
+    killed._host_lock._drop()
+    killed.engine.dispose()
+    killed._folder_lock.close()
+    Store(tmp_path / "b", database, "a").close()  # the same folder: its lock says that the one before is dead
+
+
+def test_who_has_lost_its_name_writes_nothing_more(
+    tmp_path: Path, postgres: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was paused, say, and has not looked yet."""
+    monkeypatch.setattr(lock, "PATIENCE_S", 0.1)
+    database = postgres.database()
+    a = Store(tmp_path / "a", database, "a")
+    job = a.create("A", {}, "me", False)
+    postgres.stop()
+    postgres.start()
+    b = Store(tmp_path / "b", database, "a")
+    b.move(job.id, JobState.RUNNING)
+    with pytest.raises(FolderInUse):
+        a.move(job.id, JobState.ABORTED)
+    assert a.get(job.id).state == "running"
+    for store in (a, b):
+        store.close()
+
+
+def test_the_loops_of_a_host_that_may_come_back_are_not_taken(tmp_path: Path, postgres: Server) -> None:
+    database = postgres.database()
+    a, b = Store(tmp_path / "a", database, "a"), Store(tmp_path / "b", database, "b")
+    a.own_loops({"X": {"tag": "X"}})
+    postgres.stop()
+    postgres.start()
+    comes = threading.Timer(0.5, a.check_lock)
+    comes.start()
+    with pytest.raises(ForeignLoop):
+        b.own_loops({"X": {"tag": "X"}})
+    comes.join()
+    for store in (a, b):
         store.close()
 
 

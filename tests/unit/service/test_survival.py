@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -21,7 +23,7 @@ from tests.unit.service.fakes import NEW, OLD, TAG
 from tests.unit.service.gateway import HOME, STAGES, read_loop
 from tests.unit.service.postgres import Server
 
-pytestmark = pytest.mark.timeout(300)  # processes that start slowly on a busy machine
+pytestmark = pytest.mark.timeout(600)  # processes that start slowly on a busy machine
 
 
 class Gateway:
@@ -56,7 +58,7 @@ class Gateway:
 
     def serve(self, *more: str) -> None:
         self.process = self.launch(*more)
-        url = self.process.wait_ready(30).split()[1]
+        url = self.process.wait_ready(120).split()[1]
         self.http = httpx.Client(base_url=url, timeout=20.0, trust_env=False)
         self._stack.callback(self.http.close)
 
@@ -68,7 +70,7 @@ class Gateway:
         assert answer.status_code == 202, answer.text
         return str(answer.headers["location"])
 
-    def until(self, url: str, wanted: Callable[[dict[str, Any]], bool], timeout_s: float = 20.0) -> dict[str, Any]:
+    def until(self, url: str, wanted: Callable[[dict[str, Any]], bool], timeout_s: float = 60.0) -> dict[str, Any]:
         deadline = time.monotonic() + timeout_s
         while True:
             answer = self.http.get(url)
@@ -87,7 +89,7 @@ class Gateway:
 
         return self.until(url, there)
 
-    def over(self, url: str, timeout_s: float = 20.0) -> dict[str, Any]:
+    def over(self, url: str, timeout_s: float = 60.0) -> dict[str, Any]:
         return self.until(url, lambda job: job["state"] not in ("queued", "running"), timeout_s)
 
     def ran(self, tag: str = TAG) -> list[str]:
@@ -157,7 +159,7 @@ def test_a_second_service_on_the_same_data_is_told_who_has_it(
         second = Process("second", arguments, tmp_path / "second.log")
         stack.callback(second.stop)
     with pytest.raises(NotReady) as refused:
-        second.wait_ready(30)
+        second.wait_ready(120)
     assert f"process {gateway.process.pid} on" in str(refused.value)
     gateway.go()
     assert gateway.over(url)["state"] == "proposed" and gateway.ran() == list(STAGES)
@@ -226,6 +228,62 @@ def test_a_database_that_is_away_for_15_s(stack: ExitStack, tmp_path: Path, post
     job = gateway.over(url)
     assert (job["state"], job["attempts"]) == ("proposed", 1)
     assert len(gateway.http.get(f"{url}/samples").json()["t_s"]) == 10 * len(STAGES)
+
+
+def test_a_second_gateway_as_the_server_comes_back_is_refused(
+    stack: ExitStack, tmp_path: Path, postgres: Server
+) -> None:
+    """The lock is gone with the server, and the first one's job runs."""
+    database = postgres.database()
+    gateway = Gateway(stack, tmp_path / "one", database)
+    url = gateway.retune()
+    gateway.in_stage(url, "relay")
+    postgres.stop()
+    postgres.start()
+    with pytest.raises(NotReady) as refused:
+        another(stack, tmp_path, database).wait_ready(60)
+    assert f"process {gateway.process.pid} on" in str(refused.value)
+    gateway.go()
+    job = gateway.over(url)
+    assert (job["state"], job["attempts"]) == ("proposed", 1)
+
+
+def test_a_gateway_that_comes_too_late_for_its_name_ends_its_tests(
+    stack: ExitStack, tmp_path: Path, postgres: Server
+) -> None:
+    """It stood still, as a machine that swaps does, while the server was restarted and another took its name."""
+    database = postgres.database()
+    gateway = Gateway(stack, tmp_path / "one", database)
+    url = gateway.retune()
+    gateway.in_stage(url, "relay")
+    os.kill(gateway.process.pid, signal.SIGSTOP)
+    try:
+        postgres.stop()
+        postgres.start()
+        other = another(stack, tmp_path, database)
+        other.wait_ready(60)
+    finally:
+        os.kill(gateway.process.pid, signal.SIGCONT)
+    deadline = time.monotonic() + 30
+    while read_loop(tmp_path / "one", TAG) != HOME and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert read_loop(tmp_path / "one", TAG) == HOME
+    answer = gateway.http.get("/readyz")
+    assert answer.status_code == 503
+    assert f"process {other.pid} on" in answer.json()["parts"]["engine"]["detail"]
+    refused = gateway.http.post(f"/loops/{TAG}/retune", json={})
+    assert refused.status_code == 503 and "has taken the name" in refused.json()["detail"]
+    job = gateway.http.get(url).json()
+    assert job["state"] == "running" and job["attempts"] == 2, "it is the other one's now"
+
+
+def another(stack: ExitStack, folder: Path, database: str) -> Process:
+    """A gateway of the same name with a data folder of its own."""
+    (folder / "other").mkdir()
+    arguments = ("tests.unit.service.gateway", str(folder / "other"), f"--tag={TAG}", f"--database={database}")
+    process = Process("another", arguments, folder / "another.log")
+    stack.callback(process.stop)
+    return process
 
 
 def test_a_clock_set_back_an_hour(stack: ExitStack, tmp_path: Path) -> None:

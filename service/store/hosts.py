@@ -1,0 +1,39 @@
+"""What a host has seen its clock say."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+from sqlalchemy import func, select
+
+from service.clock_watch import Jump, Seen
+from service.security import audit
+from service.store.clock import stamp
+from service.store.store import Store, of_host
+from service.store.tables import HostRow, JobRow
+
+
+def last_seen(store: Store) -> Seen | None:
+    """What the clock said when it was last looked at; before there was such a look, when a job last began or ended."""
+    with store.reading() as session:
+        row = session.get(HostRow, store.host)
+        if row is not None and row.seen_at is not None:
+            return Seen(_time(row.seen_at), _time(row.ages_from) if row.ages_from else None)
+        latest = select(func.max(JobRow.created_at), func.max(JobRow.ended_at)).where(JobRow.host == store.host)
+        times = [each for each in session.execute(latest).one() if each]
+        return Seen(_time(max(times))) if times else None
+
+
+def keep_seen(store: Store, seen: Seen, jump: Jump | None) -> None:
+    """Writes down what was seen, and in the audit log that the clock has jumped."""
+    with store.writing() as session:
+        row = of_host(session, store.host)
+        row.seen_at = stamp(seen.at)
+        row.ages_from = stamp(seen.ages_from) if seen.ages_from else None
+        if jump is not None:
+            before, after = {"expected": stamp(jump.expected)}, {"clock": stamp(jump.to), "text": jump.text}
+            audit.record(session, "clock_jump", "retention", before=before, after=after)
+
+
+def _time(text: str) -> datetime:
+    return datetime.fromisoformat(text).astimezone(UTC)
