@@ -188,7 +188,8 @@ def _verdict(before: Worth, after: Worth, asked: Asked, J: tuple[float | None, f
         return True, f"The present gains have {words}, the new ones {asked.worst(after)[1]}; {_errors(before, after)}."
     now, then = J
     if better and then is not None and (now is None or then * (1.0 + LEAST_GAIN) < now):
-        return True, f"{rest[0].upper()}{rest[1:]}."
+        falls = "" if now is None else f"; J falls by {100.0 * (1.0 - then / now):.0f} %"
+        return True, f"{rest[0].upper()}{rest[1:]}{falls}."
     return False, rest
 
 

@@ -116,7 +116,7 @@ def test_a_real_rehearsal_through_a_job(service: Service, method: str) -> None:
     service.wait(row.id, 60)
     jobs.stop()
     row = service.store.get(row.id)
-    assert (row.state, row.reason) == ("proposed", None), row.detail
+    assert (row.state, row.reason) == ("rehearsed", None), row.detail
     view = job_view(row, service.store.events(row.id), None)
     assert row.result is not None and view.method == method
     assert view.new_gains is not None and view.new_gains.Kp > 0
