@@ -522,11 +522,11 @@ class Jobs:
             state = state_after(outcome.ended)
             columns |= {"reason": outcome.ended.reason.value, "detail": outcome.ended.detail}
         self._lasting(lambda: self.store.move(running.job_id, state, **columns))
-        if state in GOOD:
-            log.info("job %s", state.value)
+        if outcome.ended is None:
+            log.info("job is rehearsed" if dry_run else "job proposes new gains")
         else:
-            assert outcome.ended is not None
-            log.warning("job %s, %s: %s", state.value, outcome.ended.reason.value, outcome.ended.detail)
+            level = logging.INFO if state in GOOD else logging.WARNING
+            log.log(level, "job %s, %s: %s", state.value, outcome.ended.reason.value, outcome.ended.detail)
 
     def _earlier_times(self, job_id: str) -> dict[str, float]:
         """Plant time of the stages that any attempt has finished, s."""
