@@ -30,6 +30,8 @@ def _rule(model: Model, Ms: float = 1.6, derivative: bool = False) -> Setting:
     return Setting(designed_on(model, FastOptions(Ms=Ms, derivative=derivative), 0.0).gains, {"Ms": Ms})
 
 
+ANYWAY = {"propose_anyway": True}
+"""Who chooses one of several has seen what it is worth."""
 FAST_DESIGN = Method(
     name=FAST,
     title="The design of fast",
@@ -87,7 +89,7 @@ def redesigned(
     retune = None
     if found.gains is not None:
         asked = {"num": list(model.num), "den": list(model.den), "dead_time_s": model.L}
-        retune = {"method": FAST, "start": "design", "ms": ms, "derivative": derivative, "model": asked}
+        retune = {"method": FAST, "start": "design", "ms": ms, "derivative": derivative, "model": asked} | ANYWAY
     told["methods"][0] |= {"retune": retune, **doubt}
     return {"job": row.id, "loop": row.loop, **told}
 
@@ -122,4 +124,4 @@ def _retune(found: Tuned, model: FoundModel) -> dict[str, Any] | None:
     if not (m.stable and m.Ms <= MOST_Ms and (m.GM is None or m.GM >= LEAST_GM)):
         return None
     asked = ProcessModel(K=model.K, T_s=model.T, L_s=model.L, zeta=model.zeta if isinstance(model, SOPDT) else None)
-    return {"start": "optimise", "method": found.method.name, "model": asked.model_dump(exclude_none=True)}
+    return {"start": "optimise", "method": found.method.name, "model": asked.model_dump(exclude_none=True)} | ANYWAY
