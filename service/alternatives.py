@@ -7,6 +7,7 @@ from typing import Any
 
 from service.errors import Conflict
 from service.fast_record import Kept
+from service.found_model import DISPROVED, FoundModel, found_model, model_of
 from service.request import ProcessModel
 from service.states import ACTIVE, JobState
 from service.store.tables import EventRow, JobRow
@@ -26,11 +27,11 @@ from tuning.setting import Setting
 
 
 def _rule(model: Model, Ms: float = 1.6, derivative: bool = False) -> Setting:
-    return Setting(designed_on(model, FastOptions(Ms=Ms, derivative=derivative), 0.0)[0].gains, {"Ms": Ms})
+    return Setting(designed_on(model, FastOptions(Ms=Ms, derivative=derivative), 0.0).gains, {"Ms": Ms})
 
 
-DISPROVED = (Reason.WRONG_SIGN, Reason.SURPRISE, Reason.DIVERGES, Reason.UNEXPLAINED, Reason.DISTURBED)
-"""How a job ends whose own record speaks against the model that an earlier stage had found."""
+ANYWAY = {"propose_anyway": True}
+"""Who chooses one of several has seen what it is worth."""
 FAST_DESIGN = Method(
     name=FAST,
     title="The design of fast",
@@ -80,7 +81,7 @@ def redesigned(
         else:
             Ts = (row.found or {}).get("sample_time_s") or 0.0
             sampled = delayed(model, 0.5 * Ts)
-            gains = designed_on(model, FastOptions(Ms=ms, derivative=derivative), Ts)[0].gains
+            gains = designed_on(model, FastOptions(Ms=ms, derivative=derivative), Ts).gains
         found = _tuned(gains, ms, assess(sampled, gains))
     except Ended as refusal:
         found = Tuned(FAST_DESIGN, refusal=refusal)
@@ -88,7 +89,7 @@ def redesigned(
     retune = None
     if found.gains is not None:
         asked = {"num": list(model.num), "den": list(model.den), "dead_time_s": model.L}
-        retune = {"method": FAST, "start": "design", "ms": ms, "derivative": derivative, "model": asked}
+        retune = {"method": FAST, "start": "design", "ms": ms, "derivative": derivative, "model": asked} | ANYWAY
     told["methods"][0] |= {"retune": retune, **doubt}
     return {"job": row.id, "loop": row.loop, **told}
 
@@ -98,18 +99,13 @@ def _tuned(gains: Gains, ms: float, assessed: Assessment) -> Tuned:
     return Tuned(FAST_DESIGN, gains, {"Ms": ms}, notes, assessed)
 
 
-def job_model(row: JobRow, events: Sequence[EventRow]) -> FOPDT | SOPDT | TransferFunction:
+def job_model(row: JobRow, events: Sequence[EventRow]) -> FoundModel:
     """The model of the job's result, else the last that a stage found, else the one typed in; or Conflict."""
     if JobState(row.state) in ACTIVE:
         raise Conflict(f"job {row.id} is not over: it has no model to compare methods on yet")
-    results = [event.data.get("result") for event in reversed(events) if event.kind == "stage_done"]
-    for data in [(row.result or {}).get("model"), *results, row.request.get("model")]:
-        if data and all(isinstance(data.get(name), int | float) for name in ("K", "T_s", "L_s")):
-            K, T, L, zeta = data["K"], data["T_s"], data["L_s"], data.get("zeta")
-            return FOPDT(K, T, L) if zeta is None else SOPDT(K, T, zeta, L)
-        if data and data.get("num") and data.get("den") and not data.get("cause"):
-            dead_time = data.get("dead_time_s", data.get("L_s", 0.0))
-            return TransferFunction(tuple(data["num"]), tuple(data["den"]), dead_time)
+    model = found_model(row, events) or model_of(row.request.get("model") or {})
+    if model is not None:
+        return model
     raise Conflict(f"job {row.id} ended as {row.state} before it had a model")
 
 
@@ -119,7 +115,7 @@ def _not_disproved(row: JobRow, reasons: Sequence[Reason]) -> None:
         raise Conflict(f"{text}: retune instead")
 
 
-def _retune(found: Tuned, model: FOPDT | SOPDT | TransferFunction) -> dict[str, Any] | None:
+def _retune(found: Tuned, model: FoundModel) -> dict[str, Any] | None:
     """None for gains that the service would not try on a loop (see `tuning.design`), and for those of a rule on a model
     that the five stages do not take."""
     if found.assessment is None or isinstance(model, TransferFunction):
@@ -128,4 +124,4 @@ def _retune(found: Tuned, model: FOPDT | SOPDT | TransferFunction) -> dict[str, 
     if not (m.stable and m.Ms <= MOST_Ms and (m.GM is None or m.GM >= LEAST_GM)):
         return None
     asked = ProcessModel(K=model.K, T_s=model.T, L_s=model.L, zeta=model.zeta if isinstance(model, SOPDT) else None)
-    return {"start": "optimise", "method": found.method.name, "model": asked.model_dump(exclude_none=True)}
+    return {"start": "optimise", "method": found.method.name, "model": asked.model_dump(exclude_none=True)} | ANYWAY

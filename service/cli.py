@@ -214,18 +214,22 @@ def retune(
     amplitude: Annotated[float | None, typer.Option(help="Of fast's relay, percent of MV.")] = None,
     careful: Annotated[bool, typer.Option("--careful", help="Of fast: six switches at least.")] = False,
     verify: Annotated[bool, typer.Option(help="The set-point step under the new gains.")] = True,
+    propose_anyway: Annotated[
+        bool, typer.Option("--propose-anyway", help="Also where nothing asked for gets better by more than 5 %.")
+    ] = False,
     wait: Annotated[bool, typer.Option(help="Show progress until the job is over.")] = True,
     url: Url = DEFAULT_URL,
     as_json: AsJson = False,
 ) -> None:
-    """Retune a loop, with live progress. Exit 0: proposed, 3: it ended otherwise."""
+    """Retune a loop, with live progress. Exit 0: proposed, rehearsed, or no gain to be had; 3: it ended otherwise."""
     from service import show
+    from service.states import GOOD
 
     client = Client(url)
     wishes = {
         "sp_deviation": sp_deviation, "mv_low": mv_low, "mv_high": mv_high, "dry_run": dry_run or None,
         "method": method, "ms": ms, "derivative": derivative or None, "amplitude_pct": amplitude,
-        "careful": careful or None, "verify": None if verify else False,
+        "careful": careful or None, "verify": None if verify else False, "propose_anyway": propose_anyway or None,
     }  # fmt: skip
     options = {name: value for name, value in wishes.items() if value is not None}
     job = client.post(f"/loops/{loop}/retune", {**options, "requested_by": "cli"})
@@ -239,7 +243,7 @@ def retune(
         print_json(job)
     else:
         show.job_report(job)
-    if wait and job["state"] != "proposed":
+    if wait and job["state"] not in GOOD:
         raise typer.Exit(3)
 
 
@@ -340,6 +344,9 @@ def rehearse_file(
     method: Annotated[str, typer.Option(help="fast, five-stage, or a rule of `loopwright methods`.")] = "fast",
     ms: Annotated[float | None, typer.Option(help="Of fast: 1.2 robust .. 1.6 .. 2.0 fast.")] = None,
     derivative: Annotated[bool, typer.Option("--derivative", help="Of fast: a PID, where it pays.")] = False,
+    propose_anyway: Annotated[
+        bool, typer.Option("--propose-anyway", help="Also where nothing asked for gets better by more than 5 %.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """The whole procedure on a plant model, in memory at full speed. Exits 0 whenever it answered."""
@@ -359,7 +366,7 @@ def rehearse_file(
     options: dict[str, Any] = {name: value for name, value in wishes.items() if value is not None}
     if options and method != "fast":
         die(f"--ms and --derivative are of the method fast, not of {method}", 2)
-    answer = rehearse(spec, method=method, on_event=listener, **options)
+    answer = rehearse(spec, method=method, on_event=listener, propose_anyway=propose_anyway, **options)
     if as_json:
         print_json(answer)
     else:

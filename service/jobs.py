@@ -11,7 +11,7 @@ import threading
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
@@ -22,6 +22,7 @@ from service.engine import WORKFLOW_VERSION, Engine
 from service.errors import Conflict, Locked, Stopping, UnknownLoop
 from service.exchange import ForeignGains, exchange
 from service.journal import Journal, temporary
+from service.known_loop import known
 from service.logs import about
 from service.loop import Loop, LoopState, differences, same_gains
 from service.machine import Machine
@@ -31,7 +32,7 @@ from service.request import BadLimits, RetuneRequest, within
 from service.running import Running
 from service.safe import make_safe
 from service.state_json import gains_of, loop_state, state_json
-from service.states import ACTIVE, IllegalMove, JobState, state_after
+from service.states import ACTIVE, GOOD, IllegalMove, JobState, shown, state_after
 from service.store import looked_after, loop_locks
 from service.store.lock import CHECK_S
 from service.store.store import Busy, FolderInUse, NoSuchJob, Store, WithJob
@@ -195,6 +196,10 @@ class Jobs:
         state = running.loop.latest if running and running.loop else None
         if state:
             return state
+        return self._read(tag)
+
+    def _read(self, tag: str) -> LoopState:
+        """A loop of ours, read from the bus. Raises Ended."""
         loop = self._open_loop(self.loops[tag])
         try:
             return loop.read()
@@ -407,11 +412,9 @@ class Jobs:
         row = self.store.get(job_id)
         with self._hands[row.loop]:
             row = self.store.get(job_id)
-            now = JobState(row.state)
+            now = shown(row.state, row.dry_run)
             if now not in (JobState.PROPOSED, JobState.ACCEPTED) or now is wanted:
                 raise IllegalMove(now, wanted)
-            if row.dry_run:
-                raise Conflict("a dry run touched no loop, there is nothing to accept or to roll back")
             active = self.store.active(row.loop)
             if active is not None:
                 raise Busy(row.loop, active.id)
@@ -491,7 +494,7 @@ class Jobs:
     def _to_the_end(self, running: Running, row: JobRow) -> None:
         log.info("job started, attempt %d", row.attempt + 1)
         try:
-            self._finish(running, self._run(running, row))
+            self._finish(running, self._run(running, row), row.dry_run)
         except Exception:
             log.exception("the end of the job could not be written")
 
@@ -568,7 +571,16 @@ class Jobs:
             self._check_stop(running)
             running.on_event(event)
 
-        return self._rehearse(config, request, Hooks(on_event, running.on_samples, lambda: running.stop_reason))
+        ground = self._lasting(lambda: known(self.store, row.loop, lambda: self._present(row.loop)))
+        hooks = Hooks(on_event, running.on_samples, lambda: running.stop_reason, ground=ground)
+        return self._rehearse(config, request, hooks)
+
+    def _present(self, tag: str) -> LoopState:
+        """The loop as its controller has it, or as the job that has the loop now found it. Raises Ended."""
+        active = self.store.active(tag)
+        if active is not None and active.found is not None:
+            return replace(loop_state(active.found), gains=gains_of(active.old_gains))
+        return self._read(tag)
 
     def _resumed(self, row: JobRow, text: str) -> None:
         told = {"attempt": row.attempt + 1, "text": text}
@@ -579,7 +591,7 @@ class Jobs:
         if running.stop_reason is not None:
             raise Aborted(running.stop_reason, "stopped before the next stage")
 
-    def _finish(self, running: Running, outcome: Outcome) -> None:
+    def _finish(self, running: Running, outcome: Outcome, dry_run: bool) -> None:
         running.flush()
         while not self.journal.flush(1.0):
             if self.stopping and self.journal.behind_s > _STOP_PATIENCE_S:
@@ -595,15 +607,16 @@ class Jobs:
             columns["restored"] = state_json(outcome.restored)
         elif self._lasting(lambda: self.store.get(running.job_id)).session is not None:
             columns["look_after"] = True
-        state = JobState.PROPOSED
+        state = JobState.REHEARSED if dry_run else JobState.PROPOSED
         if outcome.ended is not None:
             state = state_after(outcome.ended)
             columns |= {"reason": outcome.ended.reason.value, "detail": outcome.ended.detail}
         self._lasting(lambda: self.store.move(running.job_id, state, **columns))
         if outcome.ended is None:
-            log.info("job proposes new gains")
+            log.info("job is rehearsed" if dry_run else "job proposes new gains")
         else:
-            log.warning("job %s, %s: %s", state.value, outcome.ended.reason.value, outcome.ended.detail)
+            level = logging.INFO if state in GOOD else logging.WARNING
+            log.log(level, "job %s, %s: %s", state.value, outcome.ended.reason.value, outcome.ended.detail)
 
     def _earlier_times(self, job_id: str) -> dict[str, float]:
         """Plant time of the stages that any attempt has finished, s."""

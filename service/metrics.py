@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from protocol.tuner import sdo_retries
 from service.config import LoopConfig
-from service.states import ACTIVE, JobState
+from service.states import ACTIVE, JobState, shown
 from service.store import looked_after
 from service.store.store import Store
 from service.store.tables import JobRow
@@ -82,11 +82,13 @@ class _OfTheStore(Collector):
         yield up
 
     def _jobs(self) -> Metric:
-        by = JobRow.state, JobRow.reason
+        by = JobRow.state, JobRow.dry_run, JobRow.reason
         with Session(self._store.engine) as session:
             counts = session.execute(select(*by, func.count()).group_by(*by)).all()
         jobs = GaugeMetricFamily("loopwright_jobs", "Jobs in the database", labels=["state", "reason"])
-        found = {(state, reason or ""): count for state, reason, count in counts}
+        found: Tally[tuple[str, str]] = Tally()
+        for state, dry_run, reason, count in counts:
+            found[shown(state, dry_run).value, reason or ""] += count
         # Active states are always there: a gauge that vanishes cannot be alarmed on.
         for key in sorted(found.keys() | {(state.value, "") for state in ACTIVE | {JobState.PROPOSED}}):
             jobs.add_metric(list(key), found.get(key, 0))

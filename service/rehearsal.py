@@ -37,7 +37,7 @@ from tuning.plan import (
     SetSetpoint,
     StageDone,
 )
-from tuning.reasons import Ended, Failed, Reason, Refused
+from tuning.reasons import Ended, Failed, NoGain, Reason, Refused
 
 MOST_SAMPLES = 200_000
 """In T95: of more, a rehearsal takes minutes."""
@@ -129,12 +129,16 @@ def _gains(p: Parameters) -> Gains:
 
 
 class PresentGains(BaseModel):
-    """Of the loop before the test."""
+    """Of the loop before the test, in ISA form."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     Kp: float = Field(gt=0)
-    Ti: float = Field(0.0, ge=0, description="s; 0: no integral part")
+    Ti: float = Field(default=0.0, ge=0, description="s; 0: no integral part")
+    Td: float = Field(default=0.0, ge=0, description="s")
+    Tf: float = Field(default=0.0, ge=0, description="s, filter of the derivative")
+    b: float = Field(default=1.0, description="set-point weight of the proportional path")
+    c: float = Field(default=0.0, description="set-point weight of the derivative path")
 
 
 class PlantFile(BaseModel):
@@ -152,7 +156,8 @@ class PlantFile(BaseModel):
     seed: int = Field(1, ge=0)
     mv_limits: tuple[float, float] = (-0.5, 0.5)
     sp_deviation: float | None = Field(None, gt=0)
-    gains: PresentGains | None = Field(None, description="present PI of the loop: Kp, Ti (s)")
+    gains: PresentGains | None = Field(None, description="present gains of the loop")
+    reverse_acting: bool | None = Field(None, description="the controller's action; left out: right for the plant")
 
     @model_validator(mode="after")
     def _proper(self) -> PlantFile:
@@ -259,7 +264,7 @@ def rehearse(
         return _answer(None, RunResult(ended=Refused(Reason.BAD_INPUT, lines)), results)
     except Ended as ended:
         return _answer(None, RunResult(ended=ended), results)
-    return _answer(file, outcome, results)
+    return _answer(file, outcome, results, anyway=bool(options.get("propose_anyway")))
 
 
 def _entered(model: Model | None) -> FOPDT | SOPDT | None:
@@ -276,11 +281,12 @@ def _loop(file: PlantFile) -> tuple[RehearsedLoop, Facts]:
         file.num, file.den, file.dead_time_s, ts, noise_std=file.noise_std, seed=file.seed, mv_low=low, mv_high=high
     )
     positive = (file.num[-1] or file.num[0]) / (file.den[-1] or file.den[0]) > 0
+    reverse = positive if file.reverse_acting is None else file.reverse_acting
     span = 1e9
-    settings = Settings(mv_low=low, mv_high=high, safe_output=0.0, pv_low=-span, pv_high=span, reverse=positive)
-    present = Gains(Kp=gains.Kp, Ti=gains.Ti)
+    settings = Settings(mv_low=low, mv_high=high, safe_output=0.0, pv_low=-span, pv_high=span, reverse=reverse)
+    present = Gains(**gains.model_dump())
     channel = Channel(ts, settings, _parameters(present), 0.0, int(Mode.AUTOMATIC), 0.0)
-    facts = Facts(ts, t95, low, high, step, present, positive)
+    facts = Facts(ts, t95, low, high, step, present, reverse)
     return RehearsedLoop(plant, channel, ts), facts
 
 
@@ -297,17 +303,22 @@ def _reach(file: PlantFile) -> float:
 
 
 def _answer(
-    file: PlantFile | None, outcome: RunResult[Proposal] | RunResult[FastProposal], results: dict[str, object]
+    file: PlantFile | None,
+    outcome: RunResult[Proposal] | RunResult[FastProposal],
+    results: dict[str, object],
+    anyway: bool = False,
 ) -> dict[str, Any]:
-    """The JSON object; what is not known is null."""
+    """The JSON object; what is not known is null. anyway: a proposal is made also where there is no gain."""
     proposal, ended = outcome.value, outcome.ended
+    if proposal is not None and not proposal.comparison.gain and not anyway:
+        ended = NoGain(Reason.NO_GAIN, proposal.comparison.verdict)
     stages = dict.fromkeys((*STAGES, *FAST_STAGES))
     times = {stage: outcome.plant_time_s[stage] for stage in stages if stage in outcome.plant_time_s}
     answer: dict[str, Any] = {
         "name": file.name if file else None,
         "method": proposal.method if proposal else None,
         "chosen": dict(proposal.chosen) if proposal else None,
-        "outcome": "proposed" if proposal else "failed" if isinstance(ended, Failed) else "refused",
+        "outcome": _outcome(ended),
         "reason": ended.reason.value if ended else None,
         "detail": ended.detail if ended else None,
         "advice": ended.advice if ended else None,
@@ -315,6 +326,7 @@ def _answer(
         "model": None,
         "gains": None,
         "predicted": None,
+        "comparison": None,
         "measured": None,
         "plant_time_s": {**times, "total": sum(times.values())},
         "stages": results,
@@ -329,6 +341,7 @@ def _answer(
         gains = proposal.gains
         answer["gains"] = {"Kp": gains.Kp, "Ti": gains.Ti, "Td": gains.Td, "Tf": gains.Tf}
         answer["predicted"] = asdict(proposal.predicted)
+        answer["comparison"] = asdict(proposal.comparison)
         baseline = proposal.baseline if isinstance(proposal, Proposal) else None
         answer["measured"] = {"before": baseline, "after": proposal.verification}
         if isinstance(proposal, FastProposal):
@@ -336,6 +349,12 @@ def _answer(
         answer["notes"] = list(proposal.notes)
     clean: dict[str, Any] = plain(answer)
     return clean
+
+
+def _outcome(ended: Ended | None) -> str:
+    if ended is None:
+        return "proposed"
+    return "no_gain" if isinstance(ended, NoGain) else "failed" if isinstance(ended, Failed) else "refused"
 
 
 def _model(proposal: Proposal | FastProposal) -> object:

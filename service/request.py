@@ -176,7 +176,16 @@ class RetuneRequest(FiveStageWishes, FastWishes, Bounds):
         description="Record the set-point step with the old gains: five-stage does unless told not to; fast never does",
     )
     verify: bool = Field(default=True, description="Record the set-point step with the new gains")
-    dry_run: bool = Field(default=False, description="Rehearse in memory; the loop is not touched")
+    propose_anyway: bool = Field(
+        default=False,
+        description="Propose new gains also where nothing asked for gets better by more than 5 %; without it such a "
+        "job ends as no_gain, the present gains are kept, and the new ones are not tried on the loop",
+    )
+    dry_run: bool = Field(
+        default=False,
+        description="Rehearse in memory; the loop is not touched. On the plant given, else on the last model found on "
+        "the loop, else on a guess; the job says which",
+    )
     plant: PlantModel | None = Field(default=None, description="Plant to rehearse on; only with dry_run")
     requested_by: str = Field(default="api", max_length=100, description="Who asks", examples=["night shift"])
 

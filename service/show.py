@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from service.api.results import ComparisonView
 from service.client import Client
 
 console = Console()
@@ -19,6 +20,7 @@ _PREDICTED = (
     ("IAE, unit step", "IAE_per_unit", "s"),
     *_MARGINS,
 )
+"""Of a job of an earlier version, which has no comparison."""
 
 
 def follow(client: Client, job_url: str) -> dict[str, Any]:
@@ -65,7 +67,7 @@ def number(value: object) -> str:
 
 def job_report(job: dict[str, Any], pv_unit: str = "PV unit") -> None:
     """Everything a decision needs, as a table."""
-    table = Table(title=f"job {job['id']}: {job['loop']} {job['state']}", show_header=True)
+    table = Table(title=title(job), show_header=True)
     for heading in ("", "before", "after", "unit"):
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
     old, new = job["old_gains"] or {}, job["new_gains"] or {}
@@ -80,9 +82,8 @@ def job_report(job: dict[str, Any], pv_unit: str = "PV unit") -> None:
             ("measured settling", "settling_s", "s"),
         ):
             table.add_row(label, cell(before.get(name)), cell(after.get(name)), unit)
-    predicted, earlier = job["predicted"] or {}, job["predicted_before"] or {}
-    for label, name, unit in _PREDICTED if earlier or not after else _MARGINS:
-        table.add_row(f"predicted {label}", cell(earlier[name]) if earlier else "", cell(predicted.get(name)), unit)
+    for label, was, now, unit in _predicted(job, pv_unit):
+        table.add_row(f"predicted {label}", was, now, unit)
     for label, value, unit in (*_model(job["model"], pv_unit), *_certainty(job)):
         table.add_row(label, "", value, unit)
     ultimate = job["ultimate"] or {}
@@ -91,6 +92,49 @@ def job_report(job: dict[str, Any], pv_unit: str = "PV unit") -> None:
     console.print(table)
     if job["reason"]:
         console.print(f"[bold]{job['reason']}[/bold]: {job['detail']}\n{job['advice']}", highlight=False)
+    elif job["comparison"]:
+        console.print(job["comparison"]["verdict"], markup=False, highlight=False)
+    if on := job["rehearsed_on"]:
+        text = f"Rehearsed on {on['plant_text']}; {on['gains_text']}. Nothing was tested on the loop."
+        console.print(text, markup=False, highlight=False)
+
+
+def title(job: dict[str, Any]) -> str:
+    """What has become of the job, so that a rehearsal and a loop that stays as it is are not taken for a proposal."""
+    what = f"job {job['id']}: {job['loop']} {job['state']}"
+    if job["state"] == "no_gain":
+        return f"{what}: tuned as well as asked already, the present gains are kept"
+    if job["dry_run"] and (on := job["rehearsed_on"]):
+        done = f"job {job['id']}: {job['loop']} rehearsed"
+        return f"{done if job['state'] == 'rehearsed' else what} on {on['plant_text']}, nothing was tested"
+    return f"{what}, nothing was tested" if job["dry_run"] else what
+
+
+def _predicted(job: dict[str, Any], pv_unit: str) -> Iterator[tuple[str, str, str, str]]:
+    """Lines of the table: label, before, after, unit."""
+    if job["comparison"] is None:
+        predicted, earlier = job["predicted"] or {}, job["predicted_before"] or {}
+        for label, name, unit in _PREDICTED if earlier or not job["after"] else _MARGINS:
+            yield label, cell(earlier[name]) if earlier else "", cell(predicted.get(name)), unit
+        return
+    compared = ComparisonView.model_validate(job["comparison"])
+    for label, part, name, unit in (
+        ("overshoot", None, "overshoot_pct", "%"),
+        ("settling, set-point", "setpoint", "settling_s", "s"),
+        ("IAE, set-point", "setpoint", "IAE", "s"),
+        ("MV travel, set-point", "setpoint", "TV", f"% per {pv_unit}"),
+        ("peak, load", "load", "peak", f"{pv_unit} per %"),
+        ("settling, load", "load", "settling_s", "s"),
+        ("IAE, load", "load", "IAE", f"{pv_unit} s per %"),
+        ("MV travel, load", "load", "TV", "% per %"),
+        *((label, None, name, unit) for label, name, unit in _MARGINS),
+    ):
+        shown = []
+        for each in (compared.before, compared.after):
+            of = getattr(each, part) if part else each
+            shown.append(cell(getattr(of, name)) if each.stable else "unstable")
+        yield label, shown[0], shown[1], unit
+    yield "J, what is made small", cell(compared.J_before), cell(compared.J_after), ""
 
 
 def _model(model: dict[str, Any] | None, pv_unit: str) -> Iterator[tuple[str, str, str]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from tuning.reasons import Aborted, Ended, Refused
+from tuning.reasons import Aborted, Ended, NoGain, Refused
 
 
 class JobState(StrEnum):
@@ -13,6 +13,8 @@ class JobState(StrEnum):
     QUEUED = "queued"
     RUNNING = "running"
     PROPOSED = "proposed"
+    NO_GAIN = "no_gain"
+    REHEARSED = "rehearsed"
     ACCEPTED = "accepted"
     ROLLED_BACK = "rolled_back"
     REFUSED = "refused"
@@ -25,10 +27,15 @@ _S = JobState
 MOVES: dict[JobState, frozenset[JobState]] = {
     # A queued job may end at once: the loop cannot be read, or the service stops before its thread runs.
     _S.QUEUED: frozenset({_S.RUNNING, _S.REFUSED, _S.ABORTED, _S.FAILED, _S.INTERRUPTED}),
-    _S.RUNNING: frozenset({_S.PROPOSED, _S.REFUSED, _S.ABORTED, _S.FAILED, _S.INTERRUPTED}),
+    # A dry run that came to gains is rehearsed: there is no loop that they could be put into.
+    _S.RUNNING: frozenset(
+        {_S.PROPOSED, _S.NO_GAIN, _S.REHEARSED, _S.REFUSED, _S.ABORTED, _S.FAILED, _S.INTERRUPTED}
+    ),
     _S.PROPOSED: frozenset({_S.ACCEPTED, _S.ROLLED_BACK}),
     # An accepted change can still be taken back as long as nothing else changed the gains since.
     _S.ACCEPTED: frozenset({_S.ROLLED_BACK}),
+    _S.NO_GAIN: frozenset(),
+    _S.REHEARSED: frozenset(),
     _S.ROLLED_BACK: frozenset(),
     _S.REFUSED: frozenset(),
     _S.ABORTED: frozenset(),
@@ -36,6 +43,8 @@ MOVES: dict[JobState, frozenset[JobState]] = {
     _S.INTERRUPTED: frozenset(),
 }
 ACTIVE = frozenset({_S.QUEUED, _S.RUNNING})
+GOOD = frozenset({_S.PROPOSED, _S.NO_GAIN, _S.REHEARSED})
+"""How a job ends that came to an answer."""
 
 
 class IllegalMove(Exception):
@@ -55,6 +64,14 @@ def check(now: JobState, wanted: JobState) -> None:
 
 def state_after(ended: Ended) -> JobState:
     """The state of a job whose plan ended early."""
+    if isinstance(ended, NoGain):
+        return JobState.NO_GAIN
     if isinstance(ended, Refused):
         return JobState.REFUSED
     return JobState.ABORTED if isinstance(ended, Aborted) else JobState.FAILED
+
+
+def shown(state: str, dry_run: bool) -> JobState:
+    """The state of a stored job: dry runs of earlier versions ended as proposals."""
+    stored = JobState(state)
+    return JobState.REHEARSED if dry_run and stored is JobState.PROPOSED else stored

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from service.config import LoopConfig
+from service.ground import Ground, rehearsal_spec
 from service.loop import Loop, LoopState
 from service.plain import plain_object
 from service.request import ProcessModel, RetuneRequest
 from service.store.tables import EventRow
 from tuning.fast.procedure import FAST
 from tuning.models import Model
-from tuning.plan import Event, Plan, Sample
-from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
+from tuning.plan import Event, Note, Plan, Sample
+from tuning.reasons import Aborted, Ended, Failed, NoGain, Reason, Refused
 from tuning.stages.common import Facts
 from tuning.stages.settle import after_settling
 
@@ -35,6 +36,7 @@ class Hooks:
 
     remember: told the number of a session before it is opened.  on_home: told what the loop must come back to.
     earlier: what the earlier attempts of a job that is resumed have stored; a stage done there is not run again.
+    ground: what is known of the loop, for a rehearsal.
     """
 
     on_event: Callable[[Event], None]
@@ -43,11 +45,13 @@ class Hooks:
     earlier: Sequence[EventRow] = ()
     remember: Callable[[int], None] = lambda session: None
     on_home: Callable[[LoopState], None] = lambda home: None
+    ground: Ground = field(default_factory=Ground)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How work ended: a result, or the reason why not. Plain JSON values; plant times in s per stage."""
+    """How work ended: a result, or the reason why not; both where the figures are the reason (NoGain), and where a
+    rehearsal tells what it was done on. Plain JSON values; plant times in s per stage."""
 
     result: dict[str, Any] | None
     ended: Ended | None
@@ -110,7 +114,10 @@ def tune(
         remember=hooks.remember,
         on_home=hooks.on_home,
     )
-    return Outcome(plain_object(ran.value), ran.ended, ran.restored, dict(ran.plant_time_s))
+    ended = ran.ended
+    if ran.value is not None and not ran.value.comparison.gain and not request.propose_anyway:
+        ended = NoGain(Reason.NO_GAIN, ran.value.comparison.verdict)
+    return Outcome(plain_object(ran.value), ended, ran.restored, dict(ran.plant_time_s))
 
 
 def plan(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow] = ()) -> Plan[Any]:
@@ -143,21 +150,24 @@ def time_budget_s(method: str, facts: Facts) -> float:
 
 
 def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:
-    """The same on a model in memory; answers as the live loop would."""
+    """The same on a model in memory. Gains that bring no gain are an answer, too: whether a proposal would be made of
+    them is a question for the loop."""
     from service.rehearsal import rehearse as rehearse_spec
 
-    spec = rehearsal_spec(config, request)
+    spec, on = rehearsal_spec(config, request, hooks.ground)
+    told = plain_object(on)
+    hooks.on_event(Note(f"rehearsed on {on.plant_text}; {on.gains_text}; nothing is tested on the loop"))
     options = _options(request)
     if request.fast:
         options["model"] = _known_model(request)
     # A model typed in for a dry run is the plant itself; the procedure still starts where the request says.
     answer = rehearse_spec(spec, on_event=hooks.on_event, on_samples=hooks.on_samples, **options)
     times = {name: float(value) for name, value in (answer.get("plant_time_s") or {}).items() if name != "total"}
-    if answer["outcome"] == "proposed":
-        return Outcome(_as_proposal(answer), None, None, times)
+    if answer["outcome"] in ("proposed", "no_gain"):
+        return Outcome(_as_proposal(answer) | {"rehearsed_on": told}, None, None, times)
     reason = _reason(answer.get("reason"))
     kind = Aborted if reason in _STOPPED else Refused if answer["outcome"] == "refused" else Failed
-    return Outcome(None, kind(reason, str(answer.get("detail") or "")), None, times)
+    return Outcome({"rehearsed_on": told}, kind(reason, str(answer.get("detail") or "")), None, times)
 
 
 def _known_model(request: RetuneRequest) -> Model | None:
@@ -174,6 +184,7 @@ def _options(request: RetuneRequest) -> dict[str, Any]:
             "amplitude": request.amplitude_pct,
             "careful": request.careful,
             "verify": request.verify,
+            "propose_anyway": request.propose_anyway,
         }
     model = request.model
     return {
@@ -192,6 +203,7 @@ def _options(request: RetuneRequest) -> dict[str, Any]:
         "model_from": request.model_from,
         "baseline": request.baseline is not False,
         "verify": request.verify,
+        "propose_anyway": request.propose_anyway,
     }
 
 
@@ -205,6 +217,7 @@ def _as_proposal(answer: dict[str, Any]) -> dict[str, Any]:
         "old_gains": (answer.get("input") or {}).get("gains"),
         "gains": answer.get("gains"),
         "predicted": answer.get("predicted"),
+        "comparison": answer.get("comparison"),
         "baseline": measured.get("before"),
         "verification": measured.get("after"),
         "notes": answer.get("notes") or [],
@@ -214,29 +227,6 @@ def _as_proposal(answer: dict[str, Any]) -> dict[str, Any]:
         return told | {name: answer.get(name) for name in ("model", "predicted_before", "found", "verified")}
     known = {"K": model["K"], "T_s": model["T"], "L_s": model["L"]}
     return told | {"model": known | {key: model.get(key) for key in ("zeta", "k_source", "fit_pct")}}
-
-
-def rehearsal_spec(config: LoopConfig, request: RetuneRequest) -> dict[str, Any]:
-    """The plant to rehearse on: the one given, else the model given, else a guess from the loop's configuration."""
-    middle = 0.5 * (config.mv_limits.low + config.mv_limits.high)
-    spec: dict[str, Any] = {
-        "name": config.tag,
-        "t95_s": config.t95_s,
-        "sp_deviation": config.sp_deviation,
-        "mv_limits": [config.mv_limits.low - middle, config.mv_limits.high - middle],
-        "noise_std": config.noise_std_hint or 0.0,
-        "seed": 1,
-    }
-    if request.plant is not None:
-        return spec | request.plant.model_dump(exclude_none=True)
-    if request.model is not None:
-        plant = request.model.plant()
-        return spec | {"num": list(plant.num), "den": list(plant.den), "dead_time_s": plant.L}
-    # Nothing is known but T95 = L + 3 T (a FOPDT's 95 % time): a fifth of it as dead time is a typical loop, and a
-    # tenth of the MV range for the permitted set-point step is a loop that was sized sensibly.
-    dead_time = 0.2 * config.t95_s
-    gain = config.sp_deviation / (0.1 * (config.mv_limits.high - config.mv_limits.low))
-    return spec | {"num": [gain], "den": [(config.t95_s - dead_time) / 3.0, 1.0], "dead_time_s": dead_time}
 
 
 def _reason(text: object) -> Reason:

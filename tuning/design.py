@@ -10,11 +10,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from tuning.assess import assess
+from tuning.comparison import Asked, Comparison, IAE_over_present, Worth, compared, worth
 from tuning.gains import Gains
 from tuning.methods import METHODS, tune
 from tuning.models import FOPDT, SOPDT
 from tuning.reasons import Reason, Refused
+from tuning.robust import UNSTABLE, Criterion
 from tuning.setting import Setting
 
 MOST_Ms, LEAST_GM = 2.0, 2.0
@@ -22,6 +23,9 @@ ROUNDING = 1.002
 """A method that seeks the bound ends on it."""
 SLOWER = {"lambda_s": "larger", "tau_c_s": "larger", "c": "smaller"}
 """The options that make a rule more robust."""
+CRITERION_7 = "criterion (7): 10 ITAE + overshoot + 10 Ms, the largest with K, T and L 20 % off"
+OVER_PRESENT = "half of the set-point's and half of the load's IAE, each over that of the present gains"
+ROBUST = "robust"
 LEAST_DISTANCE = 0.45
 """From the loop's response at the measured ultimate frequency to -1."""
 
@@ -38,7 +42,7 @@ class Ultimate:
 class Predicted:
     """Of the new gains on the model: Ms, GM (ratio), PM (degrees), set-point step figures (settling into 5 %).
 
-    None where the loop has no such crossing, or does not settle.
+    None where the loop has no such crossing, does not settle, or keeps an offset (IAE).
     """
 
     Ms: float
@@ -46,7 +50,7 @@ class Predicted:
     PM_deg: float | None
     overshoot_pct: float
     settling_s: float | None
-    IAE_per_unit: float
+    IAE_per_unit: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,15 +73,15 @@ def design(
     """
     setting = _setting(method, plant, ultimate, options or {})
     gains, notes = realisable(setting.gains, METHODS[method].filter)
-    found = assess(plant, gains, band=0.05)
-    m, figures = found.margins, found.setpoint
-    if figures is None or not (m.Ms <= MOST_Ms * ROUNDING and (m.GM is None or m.GM >= LEAST_GM)):
-        GM = "none" if m.GM is None else f"{m.GM:.2f}"
-        stable = "" if figures else "the loop would be unstable: "
+    found = worth(plant, gains)
+    robust = found.Ms is not None and found.Ms <= MOST_Ms * ROUNDING and (found.GM is None or found.GM >= LEAST_GM)
+    if not robust:
+        GM = "none" if found.GM is None else f"{found.GM:.2f}"
+        shown = "the loop would be unstable" if found.Ms is None else f"Ms {found.Ms:.2f}, GM {GM}"
         raise Refused(
             Reason.NOT_ROBUST,
-            f"{method} gives Kp {gains.Kp:.4g}, Ti {gains.Ti:.4g} s, Td {gains.Td:.4g} s; on the model {stable}Ms "
-            f"{m.Ms:.2f} (at most {MOST_Ms}), GM {GM} (at least {LEAST_GM}){_slower(setting)}",
+            f"{method} gives Kp {gains.Kp:.4g}, Ti {gains.Ti:.4g} s, Td {gains.Td:.4g} s; on the model {shown} "
+            f"(Ms at most {MOST_Ms}, GM at least {LEAST_GM}){_slower(setting)}",
         )
     if ultimate is not None:
         distance = abs(1.0 - _controller(gains, 2.0 * math.pi / ultimate.Pu_s) / ultimate.Ku)
@@ -87,8 +91,45 @@ def design(
                 f"at the measured ultimate point the loop comes within {distance:.2f} of instability "
                 f"(least {LEAST_DISTANCE})",
             )
-    predicted = Predicted(m.Ms, m.GM, m.PM_deg, figures.overshoot_pct, figures.settling_s, figures.IAE)
-    return Designed(method, gains, predicted, dict(setting.chosen), setting.notes + notes)
+    return Designed(method, gains, predicted(found), dict(setting.chosen), setting.notes + notes)
+
+
+def comparison_of(
+    designed: Designed,
+    plant: FOPDT | SOPDT,
+    old_gains: Gains,
+    sample_time_s: float,
+    options: Mapping[str, object],
+    anyway: bool,
+) -> Comparison:
+    """The old gains and those of the rule on the model that these were made for.
+
+    The robust PI was asked for the bounds of this module, and for the least of its own criterion. The other rules
+    minimise nothing: their gains are worth having where they are more robust than the old ones, or bring the IAE down.
+    anyway: see `tuning.comparison.compared`.
+    """
+    before, after = worth(plant, old_gains, sample_time_s), worth(plant, designed.gains)
+    assert after.Ms is not None  # `design` sees to that
+    of_robust = designed.method == ROBUST
+    asked = Asked(MOST_Ms, GM=LEAST_GM) if of_robust else Asked(after.Ms, by=f"by {designed.method}")
+    if of_robust and isinstance(plant, FOPDT) and _plain_pi(old_gains):
+        scale_free = options.get("scale_free")
+        of = Criterion(plant, designed.chosen["horizon_s"], None if scale_free is None else bool(scale_free))
+        now, then = (None if J >= UNSTABLE else J for J in (of(g.Kp, g.Ti) for g in (old_gains, designed.gains)))
+        return compared(before, after, asked, CRITERION_7, (now, then), anyway)
+    return compared(before, after, asked, OVER_PRESENT, IAE_over_present(before, after), anyway)
+
+
+def _plain_pi(gains: Gains) -> bool:
+    """Such as criterion (7) is made for."""
+    return gains.Ti > 0.0 and gains.Td == 0.0 and gains.b == 1.0
+
+
+def predicted(found: Worth) -> Predicted:
+    """Of a stable loop."""
+    assert found.Ms is not None and found.overshoot_pct is not None and found.setpoint is not None
+    step = found.setpoint
+    return Predicted(found.Ms, found.GM, found.PM_deg, found.overshoot_pct, step.settling_s, step.IAE)
 
 
 def _slower(setting: Setting) -> str:

@@ -16,7 +16,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal, TypeVar
 
-from tuning.design import Designed, Predicted, Ultimate, design
+from tuning.comparison import Comparison
+from tuning.design import ROBUST, Designed, Predicted, Ultimate, comparison_of, design
 from tuning.estimate import fopdt_from_overshoot
 from tuning.gains import Gains
 from tuning.identify import identify
@@ -44,7 +45,7 @@ Entry = Literal["relay", "zn_pi", "estimate", "optimise"]
 
 def rule_of(method: str) -> str:
     """The method's name in `tuning.methods`: the procedure's own Stage 5 is the robust PI."""
-    return "robust" if method == PROCEDURE else method
+    return ROBUST if method == PROCEDURE else method
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +58,7 @@ class Options:
     model_from: the model it gets, "overshoot" (the paper's FOPDT estimate) or "record" (identified from the set-point
     step of Stage 3). By default five-stage takes the first; the others the second, unless it does not explain the step.
     kp_step_factor: Stage 3 multiplies Kp by this instead of adding 0.1 (Ku - Kp).
+    propose_anyway: go on where the new gains bring nothing that was asked for.
     """
 
     start: Entry = "relay"
@@ -74,6 +76,7 @@ class Options:
     method: str = PROCEDURE
     method_options: Mapping[str, object] = field(default_factory=dict)
     model_from: Literal["overshoot", "record"] | None = None
+    propose_anyway: bool = False
 
     def __post_init__(self) -> None:
         needed = {
@@ -126,7 +129,11 @@ class Model:
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """What the operator decides on. Gains in ISA form, MV per PV unit and seconds."""
+    """What the operator decides on. Gains in ISA form, MV per PV unit and seconds.
+
+    comparison: old and new gains on the model. Where it shows no gain the present gains are kept, unless a proposal was
+    asked for all the same: then there is nothing to decide on, and nothing was verified.
+    """
 
     method: str
     chosen: Mapping[str, float]
@@ -134,6 +141,7 @@ class Proposal:
     old_gains: Gains
     gains: Gains
     predicted: Predicted
+    comparison: Comparison
     ultimate: Ultimate | None
     baseline: StepResult | None
     verification: StepResult | None
@@ -235,9 +243,11 @@ def five_stage(facts: Facts, options: Options, finished: Finished = Finished()) 
         model = yield from stage("estimate", finished.estimate, estimated)
     designed = yield from stage("optimise", finished.optimise, lambda: _designed(options, model, ultimate))
     notes += designed.notes
+    compare = partial(comparison_of, designed, model.plant(), facts.old_gains, facts.sample_time_s)
+    comparison = yield from worked(partial(compare, options.method_options, options.propose_anyway))
 
     verified: StepResult | None = None
-    if options.verify:
+    if options.verify and (comparison.gain or options.propose_anyway):
         gains, predicted = designed.gains, designed.predicted
         verified = yield from stage(
             "verify", None, lambda: verification(facts, point, gains, predicted, model.K, model.L_s)
@@ -249,6 +259,7 @@ def five_stage(facts: Facts, options: Options, finished: Finished = Finished()) 
         old_gains=facts.old_gains,
         gains=designed.gains,
         predicted=designed.predicted,
+        comparison=comparison,
         ultimate=ultimate,
         baseline=baseline,
         verification=verified,

@@ -3,8 +3,9 @@
     Refused   the loop or the data does not allow a trustworthy result; nothing is broken
     Failed    something broke or ran out on the way (a node, the bus, time)
     Aborted   someone asked for it to stop
+    NoGain    the loop is tuned as well as asked already: a good end
 
-All three leave the loop as it was; the runner sees to that.
+All four leave the loop as it was; the runner sees to that.
 """
 
 from __future__ import annotations
@@ -44,6 +45,8 @@ class Reason(StrEnum):
     SURPRISE = "surprise"
     DIVERGES = "diverges"
     LOCKED = "locked"
+    # no gain
+    NO_GAIN = "no_gain"
     # failed
     PV_LIMIT = "pv_limit"
     TIME_BUDGET = "time_budget"
@@ -106,6 +109,8 @@ ADVICE: dict[Reason, str] = {
     "load or of the plant, then retune.",
     Reason.DIVERGES: "PV ran away under the new gains, which were taken back: keep the present gains, and repeat.",
     Reason.LOCKED: "Somebody has locked the loop: ask them, or unlock it (loopwright unlock TAG), then ask again.",
+    Reason.NO_GAIN: "The loop is already tuned as well as asked: nothing needs to be done. For a faster or a more "
+    "robust loop ask for another Ms, for a proposal all the same set propose_anyway.",
     Reason.PV_LIMIT: "PV reached its limit: permit less MV deviation, or widen the PV limits if it is safe.",
     Reason.TIME_BUDGET: "The test took longer than its budget: check T95, or raise the budget.",
     Reason.BAD_SAMPLE: "A sample was not a finite number: check the sensor and its scaling.",
@@ -155,6 +160,10 @@ class Refused(Ended):
 
 class Failed(Ended):
     """Something broke or ran out on the way."""
+
+
+class NoGain(Ended):
+    """Nothing asked for would get better: the present gains are kept."""
 
 
 class Aborted(Ended):

@@ -6,6 +6,8 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
+from service.ground import GainsSource, PlantSource
+
 
 class UltimateView(BaseModel):
     """The ultimate point as measured, or typed in."""
@@ -92,7 +94,69 @@ class PredictedView(BaseModel):
     PM_deg: float | None = Field(description="Degrees; null: no crossing")
     overshoot_pct: float
     settling_s: float | None = Field(description="Into 5 %, s; null: not within the response looked at")
-    IAE_per_unit: float = Field(description="Of a unit step, s")
+    IAE_per_unit: float | None = Field(description="Of a unit step, s; null: an offset stays")
+
+
+class StepWorthView(BaseModel):
+    """The answer to a unit step of the set-point (PV units), or of the load at the plant's input (percent of MV)."""
+
+    IAE: float | None = Field(
+        description="Integral of |error|. Set-point: s. Load: PV units * s per percent. null: an offset stays"
+    )
+    peak: float = Field(description="Largest change of PV. Set-point: per PV unit. Load: PV units per percent")
+    settling_s: float | None = Field(description="Into 5 %, s; null: not within the response looked at")
+    TV: float = Field(description="Total variation of MV, the effort. Set-point: percent per PV unit. Load: 1 at least")
+
+
+class WorthView(BaseModel):
+    """What gains are worth on the model found: computed, not measured. All figures are null for an unstable loop."""
+
+    stable: bool
+    Ms: float | None
+    Mt: float | None = Field(description="Largest peak of the closed loop")
+    GM: float | None = Field(description="Ratio; null: no crossing")
+    PM_deg: float | None = Field(description="Degrees; null: no crossing")
+    noise_gain: float | None = Field(description="MV's answer to a jump of PV, percent per PV unit")
+    overshoot_pct: float | None = Field(description="Of a step of the set-point, percent")
+    setpoint: StepWorthView | None
+    load: StepWorthView | None
+
+
+class ComparisonView(BaseModel):
+    """The present and the new gains on the model found, and whether what was asked for gets better."""
+
+    before: WorthView = Field(description="The present gains")
+    after: WorthView = Field(description="The new gains")
+    Ms_asked: float = Field(description="Ms was to be at most this", examples=[1.6])
+    criterion: str = Field(description="J: what the method makes as small as it can", examples=["criterion (7)"])
+    J_before: float | None = Field(description="null: the loop is not stable, or an offset stays")
+    J_after: float | None = Field(description="null: an offset stays")
+    gain: bool = Field(
+        description="What was asked for gets better by more than 5 %: a bound of robustness that the present gains "
+        "pass is kept again, or J falls. Without a gain nothing is proposed unless propose_anyway is asked for"
+    )
+    verdict: str = Field(description="The same in a sentence")
+
+
+class RehearsedOnView(BaseModel):
+    """What a dry run was done on."""
+
+    plant_source: PlantSource = Field(
+        description="given: plant or model of the request; last_model: found by the latest job of the loop that found "
+        "one; guessed: from T95 and the limits"
+    )
+    plant_job: str | None = Field(description="URL of the job that found the model", examples=["/jobs/4f0c2a9be113"])
+    plant_job_ended_at: str | None = Field(description="UTC, ISO 8601, wall time")
+    num: list[float] = Field(description="Of the plant, highest power of s first, PV units per MV percent")
+    den: list[float]
+    dead_time_s: float
+    gains_source: GainsSource = Field(
+        description="Of gains, sample time, limits and action. controller: it answered; last_job: as the latest job "
+        "had found them; assumed: neither"
+    )
+    gains_job: str | None = Field(description="URL of the job that had found them", examples=["/jobs/4f0c2a9be113"])
+    plant_text: str = Field(description="The plant in words")
+    gains_text: str = Field(description="The gains in words; why the controller did not answer, where it did not")
 
 
 class StepView(BaseModel):
@@ -120,6 +184,13 @@ def model_view(stored: dict[str, Any] | None) -> ModelView | TransferModelView |
 def verification_view(stored: dict[str, Any] | None) -> VerificationView | None:
     found: VerificationView | None = known(VerificationView, stored and stored | stored["tested"])
     return found
+
+
+def rehearsed_on_view(stored: dict[str, Any] | None) -> RehearsedOnView | None:
+    if not stored:
+        return None
+    urls = {name: f"/jobs/{stored[name]}" for name in ("plant_job", "gains_job") if stored[name] is not None}
+    return RehearsedOnView.model_validate(stored | urls)
 
 
 def known(kind: type[BaseModel], stored: dict[str, Any] | None) -> Any:

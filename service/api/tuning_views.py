@@ -125,7 +125,14 @@ class AlternativeView(TunedView):
         description="Body for POST /loops/{tag}/retune, which tries these gains on the loop without another "
         f"experiment; null without gains, where Ms is above {MOST_Ms:g} or GM below {LEAST_GM:g}, and for a rule on a "
         "model that is not K, T, L",
-        examples=[{"start": "optimise", "method": "simc", "model": {"K": 0.8, "T_s": 3.0, "L_s": 1.0}}],
+        examples=[
+            {
+                "start": "optimise",
+                "method": "simc",
+                "model": {"K": 0.8, "T_s": 3.0, "L_s": 1.0},
+                "propose_anyway": True,
+            }
+        ],
     )
 
     uncertainty: float | None = Field(

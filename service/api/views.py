@@ -9,21 +9,24 @@ from pydantic import BaseModel, Field
 
 from service.aftercare import NotHome
 from service.api.results import (
+    ComparisonView,
     EvidenceView,
     ModelView,
     PredictedView,
+    RehearsedOnView,
     StepView,
     TransferModelView,
     UltimateView,
     VerificationView,
     known,
     model_view,
+    rehearsed_on_view,
     verification_view,
 )
 from service.config import Limits, LoopConfig
 from service.loop import LoopState
 from service.running import Running
-from service.states import ACTIVE, JobState
+from service.states import ACTIVE, JobState, shown
 from service.store.tables import EventRow, JobRow, LoopLockRow
 from tuning.five_stage import PROCEDURE
 from tuning.gains import Gains
@@ -144,7 +147,11 @@ class JobView(BaseModel):
     id: str = Field(examples=["4f0c2a9be113"])
     url: str = Field(examples=["/jobs/4f0c2a9be113"])
     loop: str = Field(examples=["TIC-101"])
-    state: JobState = Field(examples=["running"])
+    state: JobState = Field(
+        description="no_gain: the loop is tuned as well as asked already, a good end; rehearsed: a dry run that came "
+        "to gains, nothing was tested",
+        examples=["running"],
+    )
     dry_run: bool
     host: str = Field(description="The service that runs it", examples=["local"])
     attempts: int = Field(description="How often it was begun: more than once after a crash", examples=[1])
@@ -163,10 +170,16 @@ class JobView(BaseModel):
     ultimate: UltimateView | None
     model: ModelView | TransferModelView | None = Field(description="As five-stage finds it, or as fast does")
     old_gains: GainsView | None
-    new_gains: GainsView | None
+    new_gains: GainsView | None = Field(description="Proposed, rehearsed, or (no_gain) not worth a proposal")
+    comparison: ComparisonView | None = Field(
+        description="Present and new gains side by side on the model, with the verdict; null: no new gains, or a job "
+        "of an earlier version"
+    )
+    rehearsed_on: RehearsedOnView | None = Field(description="Of a dry run: on which plant, under which gains")
     predicted: PredictedView | None = Field(description="The new gains on the model")
     predicted_before: PredictedView | None = Field(
-        description="fast: the old gains on the same model, in place of a measured step; null: not stable there"
+        description="fast: the old gains on the same model, in place of a measured step; null: not stable there. "
+        "`comparison` has more figures, for every method"
     )
     evidence: EvidenceView | None = Field(description="fast: what its record says; of a refused job too")
     verification: VerificationView | None = Field(description="fast: the measured step that proves the model")
@@ -233,7 +246,7 @@ def gains_view(gains: Gains) -> GainsView:
 
 def job_view(row: JobRow, events: Sequence[EventRow], running: Running | None) -> JobView:
     """The job from the store, and from its live part while it runs."""
-    state = JobState(row.state)
+    state = shown(row.state, row.dry_run)
     result = row.result or {}
     progress, remaining, plant_time = _progress(state, row, events, running)
     new = result.get("gains")
@@ -261,6 +274,8 @@ def job_view(row: JobRow, events: Sequence[EventRow], running: Running | None) -
         model=model_view(result.get("model")),
         old_gains=_stored_gains(row.old_gains or result.get("old_gains")),
         new_gains=_stored_gains(new),
+        comparison=known(ComparisonView, result.get("comparison")),
+        rehearsed_on=rehearsed_on_view(result.get("rehearsed_on")),
         predicted=known(PredictedView, result.get("predicted")),
         predicted_before=known(PredictedView, result.get("predicted_before")),
         evidence=known(EvidenceView, result.get("found") or _told(events, ("redesign", "design"), "cause")),

@@ -12,7 +12,7 @@ from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 from service.security import audit
-from service.states import ACTIVE, JobState
+from service.states import ACTIVE, JobState, shown
 from service.store import claims
 from service.store.clock import now
 from service.store.tables import JobRow, RetuneLoopRow, RetuneRow
@@ -79,7 +79,7 @@ class Part:
 
     @property
     def failed(self) -> bool:
-        """Ended without a proposal, and not because somebody or the end of the service stopped it, or because the loop
+        """Ended without an answer, and not because somebody or the end of the service stopped it, or because the loop
         is locked."""
         if self.reason == _LOCKED:
             return False
@@ -127,7 +127,7 @@ def find(session: Session, retune_id: str, lock: bool = False) -> RetuneRow:
 def parts(session: Session, retune_id: str) -> list[Part]:
     """Its loops in order."""
     wanted = (
-        select(RetuneLoopRow, JobRow.state, JobRow.reason, JobRow.detail)
+        select(RetuneLoopRow, JobRow.state, JobRow.dry_run, JobRow.reason, JobRow.detail)
         .outerjoin(JobRow, JobRow.id == RetuneLoopRow.job_id)
         .where(RetuneLoopRow.retune_id == retune_id)
         .order_by(RetuneLoopRow.position)
@@ -137,11 +137,11 @@ def parts(session: Session, retune_id: str) -> list[Part]:
             row.position,
             row.loop,
             row.job_id,
-            JobState(state) if state else None,
+            shown(state, dry) if state else None,
             reason or row.reason,
             detail or row.detail,
         )
-        for row, state, reason, detail in session.execute(wanted)
+        for row, state, dry, reason, detail in session.execute(wanted)
     ]
 
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import delete, func, select, update
+from sqlalchemy import ColumnElement, delete, func, select, update
 from sqlalchemy.exc import IntegrityError, TimeoutError
 from sqlalchemy.orm import Session
 
@@ -373,9 +373,15 @@ class Store:
         if loop is not None:
             wanted = wanted.where(JobRow.loop == loop)
         if state is not None:
-            wanted = wanted.where(JobRow.state == state.value)
+            wanted = wanted.where(is_shown_as(state))
         with self._session() as session:
             return session.scalars(wanted).all()
+
+    def tests_of(self, loop: str, limit: int) -> Sequence[JobRow]:
+        """The latest jobs of the loop first; no dry runs, which have found nothing."""
+        mine = (JobRow.loop == loop, JobRow.dry_run.is_(False))
+        with self._session() as session:
+            return session.scalars(select(JobRow).where(*mine).order_by(JobRow.number.desc()).limit(limit)).all()
 
     # events
     def append(self, job_id: str, kind: str, data: dict[str, Any], plant_time_s: float) -> None:
@@ -446,6 +452,16 @@ class Store:
 
 def _block(row: ChunkRow) -> chunks.Block:
     return chunks.Block(row.stage, row.first_t_s, row.count, row.data)
+
+
+def is_shown_as(state: JobState) -> ColumnElement[bool]:
+    """As `service.states.shown` has it."""
+    stored = JobRow.state == state.value
+    if state is JobState.PROPOSED:
+        return stored & JobRow.dry_run.is_(False)
+    if state is JobState.REHEARSED:
+        return stored | ((JobRow.state == JobState.PROPOSED.value) & JobRow.dry_run.is_(True))
+    return stored
 
 
 def event_of(job_id: str, kind: str, data: dict[str, Any], plant_time_s: float, **columns: Any) -> Write:

@@ -68,11 +68,15 @@ class Wish:
 
 @dataclass(frozen=True, slots=True)
 class Best:
-    """J: of the criterion.  cost: its parts.  Gains for a controller that acts with the plant's sign."""
+    """J: of the criterion.  cost: its parts.  least: what each of them is counted over.
+
+    Gains for a controller that acts with the plant's sign.
+    """
 
     gains: Gains
     J: float
     cost: Cost
+    least: Cost
 
 
 class Design:
@@ -178,7 +182,8 @@ class Design:
     def _judged(self, each: tuple[Gains, Cost]) -> Best:
         gains, cost = each
         assert self.least is not None  # the PI comes first
-        return Best(gains, 0.5 * cost.setpoint / self.least.setpoint + 0.5 * cost.load / self.least.load, cost)
+        J = 0.5 * cost.setpoint / self.least.setpoint + 0.5 * cost.load / self.least.load
+        return Best(gains, J, cost, self.least)
 
     def _require_stable(self, best: Best) -> None:
         if not is_stable(self.model, best.gains):

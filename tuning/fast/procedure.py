@@ -3,7 +3,8 @@
     listen - relay (biased, 4 to 10 switches) - fit and design - verify (set-point step) - fit and design again
 
 The relay is ended by the uncertainty of what would be proposed, not by a count. The gains proposed are those designed
-on the whole record, relay and set-point step.
+on the whole record, relay and set-point step. Where the design brings nothing that was asked for, the procedure ends
+with it: no new gains are tried on the loop.
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ import math
 from dataclasses import dataclass
 from functools import partial
 
+from tuning.comparison import Comparison
 from tuning.fast.design import Wish
-from tuning.fast.evidence import LEAST_LISTENED
+from tuning.fast.evidence import LEAST_LISTENED, Evidence
 from tuning.fast.experiment import Experiment
-from tuning.fast.results import FastProposal, Verified, found_of, proposed, verified
+from tuning.fast.results import FastProposal, Verified, comparison_of, found_of, proposed, verified
 from tuning.fast.verdict import Judged, judge
 from tuning.models import sign
 from tuning.plan import Note, Plan, StageDone, StageStarted
@@ -40,6 +42,7 @@ class FastOptions:
 
     amplitude: of the relay's higher side, MV units; by default half of what MV permits, adapted after the first wave.
     verify: the set-point step under the new gains; without it the relay switches six times at least, as with careful.
+    propose_anyway: go on where the new gains bring nothing that was asked for.
     """
 
     Ms: float = 1.6
@@ -49,6 +52,7 @@ class FastOptions:
     amplitude: float | None = None
     careful: bool = False
     verify: bool = True
+    propose_anyway: bool = False
 
     def wish(self) -> Wish:
         """Raises Refused, BAD_INPUT."""
@@ -77,47 +81,58 @@ def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
 
     yield from experiment.tell(*started("relay"))
     judged: Judged | None = None
-    ended: Refused | None = None
+    came: Refused | Comparison = Refused(Reason.STALLED, "the relay came to nothing")
     careful = options.careful or not options.verify
     for switches in SWITCHES[careful:]:
         in_time = yield from experiment.relay(switches)
         judged = None
         try:
-            judged = yield from experiment.computed(partial(judge, experiment.evidence(), wish))
-            ended = _wrong(facts, judged)
+            evidence = experiment.evidence()
+            judged, came = yield from experiment.computed(partial(_looked_at, facts, options, evidence))
         except Refused as refused:
-            ended = refused
-        if ended is None or not in_time:
+            came = refused
+        if isinstance(came, Comparison) or not in_time:
             break
-        yield from experiment.tell(Note(f"after {switches} switches: {ended.detail}"))
+        yield from experiment.tell(Note(f"after {switches} switches: {came.detail}"))
     # refused or not, what the record came to is told: it says why
     yield from experiment.tell(StageDone("relay", experiment.recorded()), *started("design"))
     if judged is not None:
         yield from experiment.tell(StageDone("design", found_of(judged)))
-    if ended is not None or judged is None:
-        raise ended or Refused(Reason.STALLED, "the relay came to nothing")
+    if isinstance(came, Refused):
+        raise came
+    assert judged is not None
 
     shown: Verified | None = None
-    if options.verify:
+    if options.verify and (came.gain or options.propose_anyway):
         yield from experiment.tell(*started("verify"))
         first = judged
         tested = first.best.gains
         yield from experiment.step(tested, first.period)
-        judged = yield from experiment.computed(partial(judge, experiment.evidence(), wish, first))
-        ended = _wrong(facts, judged)
+        looked = partial(_looked_at, facts, options, experiment.evidence(), first)
+        judged, came = yield from experiment.computed(looked)
         shown = verified(judged, tested, *experiment.stepped)
-        if ended is not None and ended.reason in NOT_YET:
-            yield from experiment.tell(Note(f"after the set-point step: {ended.detail}; it is stepped back"))
+        if isinstance(came, Refused) and came.reason in NOT_YET:
+            yield from experiment.tell(Note(f"after the set-point step: {came.detail}; it is stepped back"))
             yield from experiment.step_back()
-            judged = yield from experiment.computed(partial(judge, experiment.evidence(), wish, first))
-            ended = _wrong(facts, judged)
+            looked = partial(_looked_at, facts, options, experiment.evidence(), first)
+            judged, came = yield from experiment.computed(looked)
             shown = verified(judged, tested, *experiment.stepped)
         yield (StageDone("verify", shown), *started("redesign"), StageDone("redesign", found_of(judged)))
-        if ended is not None:
-            raise ended
-    chosen = {"Ms": wish.Ms, **({"N": wish.N} if judged.best.gains.Td else {})}
+        if isinstance(came, Refused):
+            raise came
     relay_at_s = experiment.trace.t[experiment.listened]
-    return (yield from experiment.computed(partial(proposed, facts, chosen, judged, shown, relay_at_s)))
+    return (yield from experiment.computed(partial(proposed, facts, wish, judged, came, shown, relay_at_s)))
+
+
+def _looked_at(
+    facts: Facts, options: FastOptions, evidence: Evidence, first: Judged | None = None
+) -> tuple[Judged, Refused | Comparison]:
+    """The verdict on the record, and why nothing is to be proposed on it, or else what the new gains are worth.
+
+    first: as `earlier` of `judge`. Raises Refused, NOT_ROBUST.
+    """
+    judged = judge(evidence, options.wish(), first)
+    return judged, _wrong(facts, judged) or comparison_of(judged, facts, options.wish(), options.propose_anyway)
 
 
 def _wrong(facts: Facts, judged: Judged) -> Refused | None:

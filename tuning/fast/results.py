@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuning.assess import assess
-from tuning.design import Predicted, Ultimate
+from tuning.comparison import Asked, Comparison, compared, weighted_IAE, worth
+from tuning.design import Predicted, Ultimate, predicted
+from tuning.fast.design import Best, Wish
 from tuning.fast.evidence import Evidence
 from tuning.fast.spread import fit_covariance
 from tuning.fast.verdict import Judged
@@ -20,6 +21,8 @@ from tuning.reasons import Ended, Reason, Refused
 from tuning.record_fit import Fit, Fitted
 from tuning.stages.common import Facts
 from tuning.stages.step_test import StepResult
+
+CRITERION = "half of the set-point's and half of the load's IAE, each over the least under the bounds asked for"
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,9 +106,11 @@ class Verified:
 class FastProposal:
     """What the operator decides on. Gains in ISA form, MV per PV unit and seconds.
 
-    predicted: of the new gains on the model, half a sample later for the sampling; predicted_before: of the old ones
-    there, None where they would not be stable.  found: None without a record.  verified: of a step after the relay;
-    verification: of one from rest.
+    comparison: old and new gains on the model, half a sample later for the sampling. Where it shows no gain the present
+    gains are kept, unless a proposal was asked for all the same: then there is nothing to decide on, and nothing was
+    verified.  predicted, predicted_before: some figures of it by themselves, predicted_before None where the old gains
+    would not be stable.  found: None without a record.  verified: of a step after the relay; verification: of one from
+    rest.
     """
 
     method: str
@@ -115,6 +120,7 @@ class FastProposal:
     gains: Gains
     predicted: Predicted
     predicted_before: Predicted | None
+    comparison: Comparison
     ultimate: Ultimate | None
     found: Found | None
     verified: Verified | None
@@ -198,12 +204,26 @@ def verified(judged: Judged, tested: Gains, size: float, duration_s: float) -> V
     )
 
 
+def comparison_of(judged: Judged, facts: Facts, wish: Wish, anyway: bool) -> Comparison:
+    """Of the old gains and those designed on the record. Raises as `comparison_on`."""
+    return comparison_on(delayed(judged.model, judged.design_delay), judged.best, facts, wish, anyway)
+
+
+def comparison_on(sampled: Model, best: Best, facts: Facts, wish: Wish, anyway: bool) -> Comparison:
+    """sampled: the model with the delay of the sampling.  anyway: see `compared`. Raises Refused, NOT_ROBUST."""
+    before, after = (worth(sampled, gains, facts.sample_time_s) for gains in (facts.old_gains, best.gains))
+    if not after.stable:
+        raise Refused(Reason.NOT_ROBUST, "the gains designed are not stable on their own model")
+    asked = Asked(wish.Ms, Mt=wish.Mt, noise_gain=wish.noise_gain)
+    J = tuple(weighted_IAE(each, best.least.setpoint, best.least.load) for each in (before, after))
+    return compared(before, after, asked, CRITERION, (J[0], J[1]), anyway)
+
+
 def proposed(
-    facts: Facts, chosen: Mapping[str, float], judged: Judged, verified: Verified | None, relay_at_s: float
+    facts: Facts, wish: Wish, judged: Judged, comparison: Comparison, verified: Verified | None, relay_at_s: float
 ) -> FastProposal:
-    """relay_at_s: plant time at which the relay began. Raises Refused, NOT_ROBUST."""
+    """relay_at_s: plant time at which the relay began."""
     found, gains = found_of(judged), judged.best.gains
-    sampled = delayed(judged.model, judged.design_delay)
     notes = [
         f"A step of the load of {load.size:+.3g} at the plant's input was found {load.t_s:.4g} s after the start of "
         f"the relay (at {relay_at_s + load.t_s:.4g} s), and allowed for."
@@ -219,12 +239,13 @@ def proposed(
         notes.append("PV drifted at a steady rate during the test; this was allowed for.")
     return FastProposal(
         method="fast",
-        chosen=chosen,
+        chosen={"Ms": wish.Ms, **({"N": wish.N} if gains.Td else {})},
         model=model_of(judged.fit, judged.chosen.best),
         old_gains=facts.old_gains,
         gains=gains,
-        predicted=predicted(sampled, gains),
-        predicted_before=predicted_before(sampled, facts.old_gains),
+        predicted=predicted(comparison.after),
+        predicted_before=predicted(comparison.before) if comparison.before.stable else None,
+        comparison=comparison,
         ultimate=ultimate(judged.model),
         found=found,
         verified=verified,
@@ -236,23 +257,6 @@ def proposed(
 def delayed(model: Model, delay: float) -> TransferFunction:
     """As a sampled controller meets it."""
     return TransferFunction(model.num, model.den, model.L + delay)
-
-
-def predicted(model: Model, gains: Gains) -> Predicted:
-    """Raises Refused, NOT_ROBUST."""
-    found = assess(model, gains, band=0.05)
-    m, figures = found.margins, found.setpoint
-    if figures is None:
-        raise Refused(Reason.NOT_ROBUST, "the gains designed are not stable on their own model")
-    return Predicted(m.Ms, m.GM, m.PM_deg, figures.overshoot_pct, figures.settling_s, figures.IAE)
-
-
-def predicted_before(model: Model, gains: Gains) -> Predicted | None:
-    """Of gains that were not made for the model: None where they are not stable there."""
-    try:
-        return predicted(model, gains)
-    except Ended:
-        return None
 
 
 def ultimate(model: Model) -> Ultimate | None:

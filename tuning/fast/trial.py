@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from functools import partial
 
-from tuning.design import Predicted
+from tuning.comparison import Comparison
+from tuning.design import predicted
 from tuning.fast.design import Best, Design
 from tuning.fast.procedure import FAST, FastOptions
-from tuning.fast.results import FastProposal, FoundModel, delayed, predicted, predicted_before, ultimate
+from tuning.fast.results import FastProposal, FoundModel, comparison_on, delayed, ultimate
+from tuning.gains import Gains
 from tuning.models import Model, TransferFunction, sign, time_constants
 from tuning.plan import Plan, StageDone, StageStarted, worked
 from tuning.reasons import Reason, Refused
@@ -22,18 +24,26 @@ __all__ = ["TRIAL_STAGES", "designed_on", "trial"]
 TRIAL_STAGES = ("preflight", "design", "verify")
 
 
-def designed_on(model: Model, options: FastOptions, sample_time_s: float) -> tuple[Best, Predicted]:
-    """The best gains on the model and what it predicts of them. Raises Refused, NOT_ROBUST."""
+def designed_on(model: Model, options: FastOptions, sample_time_s: float) -> Best:
+    """The best gains on the model. Raises Refused, NOT_ROBUST."""
     known = ultimate(model)
     # without an ultimate point the loop's time is that of its lags and dead time
     period = known.Pu_s if known else 4.0 * (model.L + float(max(time_constants(model), default=0.0)))
-    sampled = delayed(model, 0.5 * sample_time_s)
-    best = Design(sampled, options.wish(), period).best()
-    return best, predicted(sampled, best.gains)
+    return Design(delayed(model, 0.5 * sample_time_s), options.wish(), period).best()
+
+
+def _considered(model: Model, options: FastOptions, facts: Facts) -> tuple[Gains, Comparison]:
+    """The best gains on the model, beside the old ones. Raises Refused, NOT_ROBUST."""
+    best = designed_on(model, options, facts.sample_time_s)
+    sampled = delayed(model, 0.5 * facts.sample_time_s)
+    return best.gains, comparison_on(sampled, best, facts, options.wish(), options.propose_anyway)
 
 
 def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal]:
-    """On a loop in automatic and at rest. Raises Refused; restores nothing (the runner does)."""
+    """On a loop in automatic and at rest. Raises Refused; restores nothing (the runner does).
+
+    Gains that bring nothing that was asked for are tried only where `propose_anyway` is among the options.
+    """
     expected = {"preflight": facts.T95_s / 2, "design": 0.0, "verify": 6 * facts.T95_s}
     todo = TRIAL_STAGES if options.verify else TRIAL_STAGES[:2]
 
@@ -49,13 +59,11 @@ def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal
             f"the model's gain is {'positive' if sign(model) > 0.0 else 'negative'}; the controller acts "
             f"{'reverse' if facts.reverse else 'direct'}",
         )
-    best, promised = yield from worked(partial(designed_on, model, options, facts.sample_time_s))
-    sampled = delayed(model, 0.5 * facts.sample_time_s)
-    before = yield from worked(partial(predicted_before, sampled, facts.old_gains))
-    gains = best.gains
+    gains, comparison = yield from worked(partial(_considered, model, options, facts))
+    promised = predicted(comparison.after)
     yield (StageDone("design", gains),)
     shown: StepResult | None = None
-    if options.verify:
+    if options.verify and (comparison.gain or options.propose_anyway):
         yield started("verify")
         gain = model.static_gain if math.isfinite(model.static_gain) else math.nan
         shown = yield from verification(facts, point, gains, promised, gain, model.L)
@@ -69,7 +77,8 @@ def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal
         old_gains=facts.old_gains,
         gains=gains,
         predicted=promised,
-        predicted_before=before,
+        predicted_before=predicted(comparison.before) if comparison.before.stable else None,
+        comparison=comparison,
         ultimate=ultimate(model),
         found=None,
         verified=None,

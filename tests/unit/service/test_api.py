@@ -230,7 +230,7 @@ def test_a_dry_run_touches_nothing_and_does_not_block(service: Service, client: 
     service.tune.hold.clear()
     start(client)
     job = finished(service, client, dry_run=True)
-    assert job["state"] == "proposed" and job["dry_run"] is True
+    assert job["state"] == "rehearsed" and job["dry_run"] is True
     assert_problem(client.post(f"{job['url']}/accept"), 409)
 
 

@@ -220,7 +220,7 @@ def test_another_Ms_from_the_record_of_a_job(service: Service, client: TestClien
     for row in rows:
         service.wait(row.id, 60)
     asked, other = (client.get(f"/jobs/{row.id}").json() for row in rows)
-    assert asked["state"] == other["state"] == "proposed", (asked["detail"], other["detail"])
+    assert asked["state"] == other["state"] == "rehearsed", (asked["detail"], other["detail"])
     (found,) = client.get(f"{other['url']}/alternatives?ms=1.4").json()["methods"]
     assert found["outcome"] == "tuned" and 0 < found["uncertainty"] < 0.1
     for gain in ("Kp", "Ti"):

@@ -77,7 +77,7 @@ def rehearsed(service: Service, through: Through) -> str:
     row = jobs.start(TAG, RetuneRequest(dry_run=True, plant=PlantModel(**PLANT)))
     service.wait(row.id, 60)
     jobs.stop()
-    assert service.store.get(row.id).state == "proposed", service.store.get(row.id).detail
+    assert service.store.get(row.id).state == "rehearsed", service.store.get(row.id).detail
     return row.id
 
 

@@ -33,7 +33,7 @@ from service.work import Hooks, Outcome
 from tests.unit.service.fakes import OLD, RESULT, FakeController, FakeLoop, loop_entry
 from tuning.gains import Gains
 from tuning.plan import SetGains, StageStarted
-from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
+from tuning.reasons import Aborted, Ended, Failed, NoGain, Reason, Refused
 
 TAGS = ("TIC-101", "FIC-2")
 ENTRIES = [loop_entry(tag=tag, channel=n + 1) for n, tag in enumerate(TAGS)]
@@ -42,6 +42,7 @@ ENDS: dict[str, Ended | None] = {
     "refused": Refused(Reason.NOT_AT_REST, "drifts"),
     "failed": Failed(Reason.NODE_LOST, "silent"),
     "aborted": Aborted(Reason.MODE_CHANGED, "manual"),
+    "no_gain": NoGain(Reason.NO_GAIN, "as good as asked"),
 }
 MOST_ATTEMPTS = 10
 WHICH = st.integers(0, 15)
@@ -55,7 +56,8 @@ OPTIONS: tuple[dict[str, Any], ...] = (
 """A job is read back from its row after a crash: with the options of its method alone."""
 RULES = {
     "submit: queued", "submit: busy", "begin: running", "begin: again", "end: proposed", "end: refused", "end: failed",
-    "end: aborted", "abort: aborted", "abort: illegal", "accept: accepted", "accept: illegal", "accept: conflict",
+    "end: aborted", "end: no_gain", "end: rehearsed",
+    "abort: aborted", "abort: illegal", "accept: accepted", "accept: illegal", "accept: conflict",
     "accept: busy", "rollback: rolled_back", "rollback: illegal", "rollback: conflict", "rollback: busy",
     "crash: on trial", "crash: gone back", "restart: done", "by hand: done",
 }  # fmt: skip
@@ -248,8 +250,8 @@ class JobsMachine(RuleBasedStateMachine):
         job.act.end = ENDS[how]
         job.act.told.set()
         self.over(job)
-        job.state, job.begun = how, False
-        self.said("end", how)
+        job.state, job.begun = "rehearsed" if job.dry and how == "proposed" else how, False
+        self.said("end", job.state)
 
     @rule(loop=st.sampled_from(TAGS))
     def propose(self, loop: str) -> None:
@@ -285,8 +287,6 @@ class JobsMachine(RuleBasedStateMachine):
         refusal: type[Exception] | None = None
         if job.state not in legal:
             refusal, word = IllegalMove, "illegal"
-        elif job.dry:
-            refusal, word = Conflict, "conflict"
         elif self.having(job.loop):
             refusal, word = Busy, "busy"
         elif not declined and self.gains[job.loop] not in legal_gains:

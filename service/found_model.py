@@ -1,0 +1,37 @@
+"""The model that a job found on its loop, from its result or from the stages it came through."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from service.store.tables import EventRow, JobRow
+from tuning.models import FOPDT, SOPDT, TransferFunction
+from tuning.reasons import Reason
+
+FoundModel = FOPDT | SOPDT | TransferFunction
+DISPROVED = (Reason.WRONG_SIGN, Reason.SURPRISE, Reason.DIVERGES, Reason.UNEXPLAINED, Reason.DISTURBED)
+"""How a job ends whose own record speaks against the model that an earlier stage had found."""
+TYPED_IN = "typed in"
+
+
+def found_model(row: JobRow, events: Sequence[EventRow]) -> FoundModel | None:
+    """The model of the job's result, else the last that a stage found; none that was typed in."""
+    results = [event.data.get("result") for event in reversed(events) if event.kind == "stage_done"]
+    for data in [(row.result or {}).get("model"), *results]:
+        if data and TYPED_IN not in (data.get("structure"), data.get("k_source")):
+            model = model_of(data)
+            if model is not None:
+                return model
+    return None
+
+
+def model_of(data: Mapping[str, Any]) -> FoundModel | None:
+    """The model of a stored result or request; None where it has none, or one that is not to be trusted."""
+    if all(isinstance(data.get(name), int | float) for name in ("K", "T_s", "L_s")):
+        K, T, L, zeta = data["K"], data["T_s"], data["L_s"], data.get("zeta")
+        return FOPDT(K, T, L) if zeta is None else SOPDT(K, T, zeta, L)
+    if data.get("num") and data.get("den") and not data.get("cause"):
+        dead_time = data.get("dead_time_s", data.get("L_s", 0.0))
+        return TransferFunction(tuple(data["num"]), tuple(data["den"]), dead_time)
+    return None

@@ -1,0 +1,124 @@
+"""Loops that are tuned as well as asked already: the job ends as no_gain with its figures, and tries nothing on them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.rehearsed import MIDDLE, TS, AroundTheMiddle, entry
+from controller.channel import Channel, Settings
+from controller.pid import Parameters
+from service.api.views import job_view
+from service.config import LoopConfig, parse_site
+from service.jobs import Jobs
+from service.rehearsal import RehearsedLoop, rehearse
+from service.request import RetuneRequest
+from service.show import job_report, title
+from service.states import JobState
+from service.store.retunes import Part
+from service.store.store import Store
+from service.work import rehearse as dry_run
+from service.work import tune
+from tests.unit.service.fakes import ThreadEngine
+from tuning.gains import Gains
+from tuning.margins import ultimate_point
+from tuning.models import FOPDT
+from tuning.plan import Mode
+
+TAG = "TIC-1"
+PLANT = FOPDT(2.0, 6.0, 1.5 + TS / 2)
+Ku, Pu = ultimate_point(PLANT)
+SLUGGISH = Gains(0.2, 6.0)
+
+
+def retuned(folder: Path, present: Gains, **options: Any) -> dict[str, Any]:
+    """The job of a loop with these gains, as the API shows it."""
+
+    def open_loop(_: LoopConfig) -> RehearsedLoop:
+        settings = Settings(mv_low=0.0, mv_high=100.0, safe_output=MIDDLE, pv_low=-200.0, pv_high=200.0, reverse=True)
+        channel = Channel(TS, settings, Parameters(present.Kp, present.Ti), 0.0, int(Mode.AUTOMATIC), MIDDLE)
+        return RehearsedLoop(AroundTheMiddle(), channel, TS)
+
+    loops = parse_site({"loops": [entry(TAG)]}, "test").loops
+    store, engine = Store(folder), ThreadEngine()
+    jobs = Jobs(loops, store, open_loop, tune, dry_run, engine=engine)
+    jobs.boot()
+    row = jobs.start(TAG, RetuneRequest(**options))
+    for thread in list(engine._threads.values()):
+        thread.join(100)
+    jobs.stop()
+    job = job_view(store.get(row.id), store.events(row.id), None).model_dump(mode="json")
+    store.close()
+    return job
+
+
+@cache
+def own(method: str) -> Gains:
+    """What the method proposes for this loop."""
+    spec = {"num": [2.0], "den": [6.0, 1.0], "dead_time_s": 1.5, "sample_time_s": TS, "mv_limits": [-50.0, 50.0],
+            "t95_s": 20.0, "sp_deviation": 2.0, "gains": {"Kp": SLUGGISH.Kp, "Ti": SLUGGISH.Ti}}  # fmt: skip
+    answer = rehearse(spec, method)
+    assert answer["outcome"] == "proposed", answer["detail"]
+    return Gains(answer["gains"]["Kp"], answer["gains"]["Ti"])
+
+
+@pytest.mark.parametrize("method", ["fast", "five-stage", "simc"])
+def test_gains_that_the_method_itself_has_proposed_are_kept(tmp_path: Path, method: str) -> None:
+    job = retuned(tmp_path, own(method), method=method)
+    assert (job["state"], job["reason"]) == ("no_gain", "no_gain"), job["detail"]
+    assert job["detail"].startswith("Nothing asked for gets better by more than 5 %: the present gains are kept")
+    assert "already tuned as well as asked" in job["advice"]
+    # nothing new was tried on the loop, and what was found is told
+    assert "verify" not in [stage["stage"] for stage in job["stages"]]
+    assert job["restored"]["gains"]["Kp"] == pytest.approx(own(method).Kp) and not job["restored"]["on_trial"]
+    compared = job["comparison"]
+    assert not compared["gain"] and compared["verdict"] == job["detail"]
+    assert compared["after"]["load"]["IAE"] == pytest.approx(compared["before"]["load"]["IAE"], rel=0.05)
+    assert job["model"] and job["new_gains"]["Kp"] == pytest.approx(own(method).Kp, rel=0.05)
+    assert "tuned as well as asked already, the present gains are kept" in title(job)
+    job_report(job)
+
+
+@pytest.mark.parametrize("method", ["fast", "five-stage"])
+@pytest.mark.parametrize(
+    "present", [SLUGGISH, Gains(0.75 * Ku, Pu), replace(SLUGGISH, Ti=60.0)], ids=["sluggish", "swings", "slow"]
+)
+def test_badly_tuned_loops_still_get_a_proposal(tmp_path: Path, method: str, present: Gains) -> None:
+    job = retuned(tmp_path, present, method=method)
+    assert job["state"] == "proposed", job["detail"]
+    before, after = job["comparison"]["before"], job["comparison"]["after"]
+    assert job["comparison"]["gain"]
+    assert after["load"]["IAE"] < before["load"]["IAE"] or after["Ms"] < before["Ms"] / 1.05
+    assert "verify" in [stage["stage"] for stage in job["stages"]]
+
+
+def test_a_proposal_all_the_same_is_verified_as_any(tmp_path: Path) -> None:
+    job = retuned(tmp_path, own("fast"), propose_anyway=True)
+    assert (job["state"], job["reason"]) == ("proposed", None), job["detail"]
+    assert job["verification"] and not job["comparison"]["gain"]
+    assert "proposed because that was asked for" in job["comparison"]["verdict"]
+
+
+def test_gains_for_a_model_typed_in_are_not_tried_where_they_bring_nothing(tmp_path: Path) -> None:
+    model = {"num": [2.0], "den": [6.0, 1.0], "dead_time_s": 1.5}
+    kept = retuned(tmp_path / "kept", own("fast"), start="design", model=model)
+    assert kept["state"] == "no_gain" and [stage["stage"] for stage in kept["stages"]] == ["preflight", "design"]
+    tried = retuned(tmp_path / "tried", own("fast"), start="design", model=model, ms=1.3)
+    assert tried["state"] == "proposed" and tried["after"]["settled"], tried["detail"]
+
+
+def test_a_dry_run_of_such_a_loop_is_rehearsed_and_says_so(tmp_path: Path) -> None:
+    model = {"num": [2.0], "den": [6.0, 1.0], "dead_time_s": 1.5}
+    job = retuned(tmp_path, own("fast"), dry_run=True, model=model)
+    assert (job["state"], job["reason"]) == ("rehearsed", None)
+    assert job["comparison"]["verdict"].startswith("Nothing asked for gets better")
+
+
+def test_among_many_it_is_no_failure() -> None:
+    for state in (JobState.NO_GAIN, JobState.REHEARSED):
+        part = Part(1, TAG, "4f0c", state, None, None)
+        assert not part.failed and not part.waiting and part.state(True) == state.value

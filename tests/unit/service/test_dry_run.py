@@ -1,0 +1,191 @@
+"""A dry run: what it rehearses on, and that nobody takes it for a proposal."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import text
+
+from service import show
+from service.api.views import JobView, job_view
+from service.found_model import DISPROVED
+from service.ground import GainsSource, Ground, LastModel, PlantSource, rehearsal_spec
+from service.metrics import exposition, registry
+from service.request import PlantModel, RetuneRequest, TransferModel
+from service.states import JobState
+from service.work import rehearse
+from tests.unit.service.fakes import NEW, OLD, RESULT, TAG, FakeLoop, Service
+from tuning.gains import Gains
+from tuning.margins import margins
+from tuning.models import FOPDT
+from tuning.plan import Mode
+from tuning.reasons import Reason, Refused
+
+FOUND = LastModel(FOPDT(2.0, 3.0, 1.0), "4f0c", "2026-01-31T12:00:00.000Z")
+PLANT = PlantModel(num=[0.2], den=[2.4, 1.0], dead_time_s=1.8, sample_time_s=0.2)
+QUICK = {"dry_run": True, "verify": False}
+
+
+def ground_with(service: Service, **changes: Any) -> Ground:
+    return Ground(FOUND, replace(service.controller.state, **changes), silence="")
+
+
+def dry_run(service: Service, **options: Any) -> JobView:
+    """A dry run of the real procedure, to its end."""
+    jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
+    row = jobs.start(TAG, RetuneRequest(**QUICK | options))
+    service.wait(row.id, 60)
+    jobs.stop()
+    return shown(service, row.id)
+
+
+def shown(service: Service, job_id: str) -> JobView:
+    return job_view(service.store.get(job_id), service.store.events(job_id), None)
+
+
+def proposed(service: Service) -> str:
+    """The id of a live job that has proposed."""
+    row = service.jobs.start(TAG, RetuneRequest())
+    service.wait(row.id)
+    assert service.store.get(row.id).state == "proposed"
+    return row.id
+
+
+def test_the_plant_given_comes_before_the_last_model_and_that_before_a_guess(service: Service) -> None:
+    config, known = service.loops[TAG], ground_with(service)
+    model = TransferModel(num=[3.0], den=[5.0, 1.0], dead_time_s=2.0)
+    for request, ground, source, num in (
+        (RetuneRequest(dry_run=True, plant=PLANT), known, PlantSource.GIVEN, (0.2,)),
+        (RetuneRequest(dry_run=True, model=model), known, PlantSource.GIVEN, (3.0,)),
+        (RetuneRequest(dry_run=True), known, PlantSource.LAST_MODEL, (2.0,)),
+        (RetuneRequest(dry_run=True), Ground(), PlantSource.GUESSED, (0.2,)),
+    ):
+        spec, on = rehearsal_spec(config, request, ground)
+        assert (on.plant_source, on.num, tuple(spec["num"])) == (source, num, num)
+        assert (on.plant_job, on.plant_job_ended_at) == (
+            (FOUND.job, FOUND.ended_at) if source is PlantSource.LAST_MODEL else (None, None)
+        )
+
+
+def test_a_guess_fits_the_configuration_of_the_loop(service: Service) -> None:
+    config = service.loops[TAG]
+    spec, on = rehearsal_spec(config, RetuneRequest(dry_run=True), Ground())
+    time_constant, dead_time = spec["den"][0], spec["dead_time_s"]
+    assert dead_time + 3 * time_constant == pytest.approx(config.t95_s)
+    assert spec["num"][0] * 10.0 == pytest.approx(config.sp_deviation)
+    assert spec["mv_limits"] == [-50.0, 50.0] and "gains" not in spec
+    assert on.plant_text.startswith("a guessed plant (from T95 9 s")
+    assert on.gains_source is GainsSource.ASSUMED and "the controller did not answer" in on.gains_text
+
+
+def test_the_controller_gives_gains_sample_time_limits_and_action(service: Service) -> None:
+    ground = ground_with(service, gains=Gains(0.4, 3.0, 0.5, 0.1, 0.7), sample_time_s=0.05, mv_low=20.0, mv_high=80.0)
+    spec, on = rehearsal_spec(service.loops[TAG], RetuneRequest(dry_run=True), ground)
+    assert spec["gains"] == {"Kp": 0.4, "Ti": 3.0, "Td": 0.5, "Tf": 0.1, "b": 0.7, "c": 0.0}
+    assert (spec["sample_time_s"], spec["mv_limits"], spec["reverse_acting"]) == (0.05, [-30.0, 30.0], True)
+    assert on.gains_source is GainsSource.CONTROLLER
+
+
+@pytest.mark.parametrize("reverse", [True, False])
+def test_a_guessed_plant_is_one_on_which_the_present_gains_work(service: Service, reverse: bool) -> None:
+    ground = replace(ground_with(service, gains=Gains(400.0, 2.0), reverse_acting=reverse), last_model=None)
+    spec, on = rehearsal_spec(service.loops[TAG], RetuneRequest(dry_run=True), ground)
+    plant = FOPDT(spec["num"][0], spec["den"][0], spec["dead_time_s"])
+    assert margins(plant, Gains(400.0, 2.0)).stable and (plant.K > 0.0) == reverse
+    assert "the present gains are stable on it" in on.plant_text
+
+
+def test_a_dry_run_takes_the_model_that_the_last_job_found_and_the_gains_of_the_loop(service: Service) -> None:
+    job_id = proposed(service)
+    view = dry_run(service)
+    on = view.rehearsed_on
+    assert view.state is JobState.REHEARSED and on is not None
+    assert (on.plant_source, on.plant_job, on.num, on.dead_time_s) == ("last_model", f"/jobs/{job_id}", [2.0], 1.0)
+    assert on.plant_job_ended_at == service.store.get(job_id).ended_at
+    assert on.gains_source == "controller" and view.old_gains is not None and view.old_gains.Kp == OLD.Kp
+    assert view.comparison is not None and view.comparison.verdict
+    assert any(f"the model that job {job_id} found" in note for note in view.notes)
+    title = show.title(view.model_dump(mode="json"))
+    assert "rehearsed on the model that job" in title and title.endswith("nothing was tested")
+    assert "proposed" not in title
+
+
+def test_neither_a_dry_run_nor_a_model_that_was_disproved_or_typed_in_is_the_last_model(service: Service) -> None:
+    dry_run(service, plant=PLANT)
+    service.tune.ends = Refused(DISPROVED[1], "made up")
+    service.wait(service.jobs.start(TAG, RetuneRequest()).id)
+    typed_in = service.store.create(TAG, {}, "me", False)
+    result = RESULT | {"model": {"structure": "typed in", "num": [9.0], "den": [1.0, 1.0], "dead_time_s": 1.0}}
+    service.store.move(typed_in.id, JobState.RUNNING)
+    service.store.move(typed_in.id, JobState.PROPOSED, result=result)
+    view = dry_run(service)
+    assert view.rehearsed_on is not None and view.rehearsed_on.plant_source == "guessed"
+    title = show.title(view.model_dump(mode="json"))
+    assert title == (
+        f"job {view.id}: {TAG} rehearsed on a guessed plant (from T95 9 s, MV 0 to 100 %, step 2), nothing was tested"
+    )
+
+
+def test_a_controller_that_is_not_there_is_said_so_and_hinders_nothing(service: Service) -> None:
+    service.controller.absent = Reason.NODE_LOST
+    view = dry_run(service)
+    on = view.rehearsed_on
+    assert view.state is JobState.REHEARSED and on is not None
+    assert on.gains_source == "assumed" and "node_lost: node 32 does not answer" in on.gains_text
+
+
+def test_then_the_gains_are_those_that_the_last_job_left(service: Service) -> None:
+    job_id = proposed(service)
+    service.jobs.accept(job_id, "me")
+    service.controller.absent = Reason.NODE_LOST
+    view = dry_run(service)
+    on = view.rehearsed_on
+    assert on is not None and (on.gains_source, on.gains_job) == ("last_job", f"/jobs/{job_id}")
+    assert view.old_gains is not None and view.old_gains.Kp == NEW.Kp
+    assert f"as job {job_id} had found them" in on.gains_text
+
+
+def test_beside_a_test_the_gains_are_those_from_before_it(service: Service) -> None:
+    service.tune.hold.clear()
+    live = service.jobs.start(TAG, RetuneRequest())
+    assert service.tune.inside.wait(5)
+    assert service.controller.state.gains == NEW and service.controller.state.on_trial
+    view = dry_run(service)
+    assert view.old_gains is not None and view.old_gains.Kp == OLD.Kp
+    service.tune.hold.set()
+    service.wait(live.id)
+
+
+def test_a_loop_that_is_in_manual_can_be_rehearsed(service: Service) -> None:
+    service.controller.state = replace(service.controller.state, mode=Mode.MANUAL, mv=0.0)
+    assert dry_run(service).state is JobState.REHEARSED
+
+
+def test_a_refused_rehearsal_says_what_it_was_on(service: Service) -> None:
+    view = dry_run(service, plant=PlantModel(num=[-0.2], den=[2.4, 1.0], dead_time_s=1.8))
+    assert (view.state, view.reason) == (JobState.REFUSED, "wrong_sign"), view.detail
+    assert view.rehearsed_on is not None and view.rehearsed_on.plant_source == "given"
+    assert show.title(view.model_dump(mode="json")).endswith("refused on the plant given, nothing was tested")
+
+
+def test_dry_runs_of_earlier_versions_are_shown_as_rehearsed(service: Service, client: TestClient) -> None:
+    row = service.store.create(TAG, {"start": "relay"}, "me", True)
+    with service.store.engine.begin() as connection:
+        connection.execute(text("UPDATE jobs SET state = 'proposed' WHERE id = :id"), {"id": row.id})
+    old = {name: value for name, value in RESULT.items() if name != "comparison"}
+    service.store.note(row.id, result=old, old_gains=asdict(OLD))
+    live = proposed(service)
+    job = client.get(f"/jobs/{row.id}").json()
+    assert (job["state"], job["comparison"], job["rehearsed_on"]) == ("rehearsed", None, None)
+    assert [each["id"] for each in client.get("/jobs?state=rehearsed").json()] == [row.id]
+    assert [each["id"] for each in client.get("/jobs?state=proposed").json()] == [live]
+    for decision in ("accept", "rollback"):
+        assert client.post(f"/jobs/{row.id}/{decision}").status_code == 409
+    assert service.controller.state.gains == OLD
+    told = exposition(registry(service.loops, service.store)).decode()
+    assert 'loopwright_jobs{reason="",state="rehearsed"} 1.0' in told
+    assert 'loopwright_jobs{reason="",state="proposed"} 1.0' in told
+    show.job_report(job)
