@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
 from fastapi.responses import PlainTextResponse, StreamingResponse
 
-from service.api import contract, fleet, operations, problems, tunings
+from service.api import contract, fleet, operations, previews, problems, tunings
 from service.api.access import Access
 from service.api.samples import sample_columns
 from service.api.stream import event_stream
@@ -195,6 +195,7 @@ def create_app(
     def rollback(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
         return view(jobs.rollback(job_id, (decision or Decision()).by))
 
+    app.include_router(previews.router(jobs, many))
     app.include_router(tunings.router(jobs))
     return app
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ipaddress
 import logging
+import re
 from collections.abc import Awaitable, Callable, MutableMapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -36,7 +37,8 @@ PUBLIC = frozenset({"/healthz", "/docs", "/openapi.json"})
 ALWAYS = frozenset({"/healthz", "/readyz", "/metrics"})
 """Answered however busy the service is: that is when somebody looks."""
 _ADMIN = ("/audit",)
-_CHANGES_NOTHING = ("/tunings",)
+_CHANGES_NOTHING = re.compile(r"/tunings|/loops/[^/]+/retune/preview|/retunes/preview")
+"""Paths of a POST that only answers."""
 _SAFE = ("GET", "HEAD", "OPTIONS")
 
 
@@ -46,7 +48,7 @@ def scope_for(method: str, path: str) -> Scope | None:
         return None
     if path.startswith(_ADMIN):
         return Scope.ADMIN
-    return Scope.READ if method in _SAFE or path in _CHANGES_NOTHING else Scope.OPERATE
+    return Scope.READ if method in _SAFE or _CHANGES_NOTHING.fullmatch(path) else Scope.OPERATE
 
 
 @dataclass(frozen=True)
@@ -166,7 +168,7 @@ class Gate:
 def _kind(path: str) -> str:
     if path.endswith("/events"):
         return "streams"
-    return "computations" if path in _CHANGES_NOTHING or path.endswith("/alternatives") else "requests"
+    return "computations" if _CHANGES_NOTHING.fullmatch(path) or path.endswith("/alternatives") else "requests"
 
 
 def _not_local(headers: Headers) -> str | None:
