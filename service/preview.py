@@ -287,7 +287,7 @@ class FleetPreview(BaseModel):
     largest_mv_move_pct: float = Field(description="Of any of the loops, percent; at most", examples=[66.7])
     largest_mv_move_loop: str = Field(description="The loop that it is of", examples=["TIC-101"])
     longest_s: float = Field(description="Longest time of one loop, plant time, s; at most", examples=[600.0])
-    longest_loop: str = Field(description="The loop that it is of", examples=["FIC-2"])
+    longest_loop: str = Field(description="The loop that it is of", examples=["LIC-7"])
     summary: list[str] = Field(description="The same in sentences")
     loops: list[Preview] = Field(description="Each loop, in the order in which they are begun")
 
