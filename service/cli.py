@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from service import cli_data, cli_keys, cli_loops, cli_tuning
-from service.cli_output import AsJson, Url, die, print_json, read_json_object
+from service.cli_output import AsJson, Url, die, on_terminal, print_json, read_json_object
 from service.client import DEFAULT_URL, ApiError, Client
 
 app = typer.Typer(
@@ -203,7 +203,9 @@ def list_loops(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
 
 @app.command()
 def retune(
-    loop: Annotated[str, typer.Argument(help="Tag of the loop.")],
+    loop: Annotated[str, typer.Argument(help="Tag of the loop; with * or ? every loop whose tag is so.")],
+    preview: Annotated[bool, typer.Option("--preview", help="Only tell what it would do; nothing is moved.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Start without asking.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Rehearse in memory; the loop is not touched.")] = False,
     sp_deviation: Annotated[float | None, typer.Option(help="Permitted set-point step, PV units.")] = None,
     mv_low: Annotated[float | None, typer.Option(help="Lowest MV during the test, percent.")] = None,
@@ -221,18 +223,52 @@ def retune(
     url: Url = DEFAULT_URL,
     as_json: AsJson = False,
 ) -> None:
-    """Retune a loop, with live progress. Exit 0: proposed, rehearsed, or no gain to be had; 3: it ended otherwise."""
-    from service import show
-    from service.states import GOOD
-
+    """Retune a loop, with live progress. Exit 0: proposed, rehearsed, or no gain to be had; 3: it ended otherwise, or
+    (--preview) would be refused."""
+    many = any(character in loop for character in "*?")
+    if not (preview or yes or dry_run or on_terminal()):
+        die("a retune moves the process: look at it with --preview, and start it with --yes", 2)
     client = Client(url)
     wishes = {
         "sp_deviation": sp_deviation, "mv_low": mv_low, "mv_high": mv_high, "dry_run": dry_run or None,
         "method": method, "ms": ms, "derivative": derivative or None, "amplitude_pct": amplitude,
         "careful": careful or None, "verify": None if verify else False, "propose_anyway": propose_anyway or None,
+        "pattern": loop if many else None,
     }  # fmt: skip
-    options = {name: value for name, value in wishes.items() if value is not None}
-    job = client.post(f"/loops/{loop}/retune", {**options, "requested_by": "cli"})
+    body = {name: value for name, value in wishes.items() if value is not None} | {"requested_by": "cli"}
+    path = "/retunes" if many else f"/loops/{loop}/retune"
+    if preview:
+        raise typer.Exit(0 if _previewed(client, path, body, alone=True, as_json=as_json) else 3)
+    if not (yes or dry_run):
+        _previewed(client, path, body)
+        if not typer.confirm("Start?", err=True):
+            die("not started", 1)
+    started = client.post(path, body)
+    if many:
+        raise typer.Exit(_many(client, started, wait, as_json))
+    raise typer.Exit(_one(client, started, wait, as_json))
+
+
+def _previewed(client: Client, path: str, body: dict[str, Any], *, alone: bool = False, as_json: bool = False) -> bool:
+    """Tells what would be done; whether it would start. Before a question standard output is left to the report."""
+    from rich.console import Console
+
+    from service import show_preview
+
+    found = client.post(f"{path}/preview", body)
+    able = found["would_start"] == found.get("count", True)
+    if as_json:
+        print_json(found)
+    else:
+        (show_preview.many if "count" in found else show_preview.one)(found, Console(stderr=not alone))
+    return bool(able)
+
+
+def _one(client: Client, job: dict[str, Any], wait: bool, as_json: bool) -> int:
+    """Follows a job; the exit status."""
+    from service import show
+    from service.states import GOOD
+
     if wait and as_json:
         for _ in client.events(job["url"]):
             pass
@@ -243,8 +279,20 @@ def retune(
         print_json(job)
     else:
         show.job_report(job)
-    if wait and job["state"] not in GOOD:
-        raise typer.Exit(3)
+    return 3 if wait and job["state"] not in GOOD else 0
+
+
+def _many(client: Client, started: dict[str, Any], wait: bool, as_json: bool) -> int:
+    """Follows a retune of many loops; the exit status."""
+    from service import show_fleet
+    from service.states import GOOD
+
+    found = show_fleet.follow(client, started["url"], quiet=as_json) if wait else started
+    if as_json:
+        print_json(found)
+    else:
+        show_fleet.report(found)
+    return 3 if wait and any(each["state"] not in GOOD for each in found["loops"]) else 0
 
 
 @app.command()

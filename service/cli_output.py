@@ -28,6 +28,11 @@ def print_json(value: object) -> None:
     print(json.dumps(value, indent=2, allow_nan=False))
 
 
+def on_terminal() -> bool:
+    """Somebody is there to be asked."""
+    return sys.stdin.isatty()
+
+
 def die(text: str, status: int) -> NoReturn:
     print(f"loopwright: {text}", file=sys.stderr)
     raise typer.Exit(status)

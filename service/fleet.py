@@ -9,7 +9,7 @@ import logging
 import sys
 import threading
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from fnmatch import fnmatchcase
 from typing import Annotated, Self
 
@@ -121,13 +121,7 @@ class Fleet:
         if self._jobs.stopping:
             raise Stopping(self._jobs.why_stopping)
         known = self._known()
-        if request.pattern is not None:
-            tags = sorted(tag for tag in known if fnmatchcase(tag, request.pattern))
-            if not tags:
-                raise BadFleet(f"no loop has a tag like {request.pattern!r}")
-        else:
-            tags = list(dict.fromkeys(request.loops or ()))
-        options, wrong = request.options(), []
+        tags, options, wrong = _tags(request, known), request.options(), []
         for tag in tags:
             try:
                 if tag not in known:
@@ -142,6 +136,15 @@ class Fleet:
             row = retunes.add(session, self._store.host, asked, tags, request.requested_by)
         self._wake.set()
         return row
+
+    def asked(self, request: FleetRequest) -> list[LoopConfig]:
+        """The loops that it would begin, in their order. Raises BadFleet when one of them is unknown."""
+        known = self._known()
+        tags = _tags(request, known)
+        wrong = [str(UnknownLoop(tag)) for tag in tags if tag not in known]
+        if wrong:
+            raise BadFleet("; ".join(wrong))
+        return [known[tag][0] for tag in tags]
 
     def abort(self, retune_id: str, by: str) -> RetuneRow:
         """Begins no more, and asks the jobs that run to stop. Raises NoSuchRetune, RetuneOver."""
@@ -241,6 +244,16 @@ class Fleet:
         _, host, bus = place
         allows = self._jobs.at_once(bus) if host == self._store.host else BusConfig().at_once
         return min(allows, request.at_once_per_bus or allows)
+
+
+def _tags(request: FleetRequest, known: Collection[str]) -> list[str]:
+    """Raises BadFleet where no loop is like the pattern."""
+    if request.pattern is None:
+        return list(dict.fromkeys(request.loops or ()))
+    tags = sorted(tag for tag in known if fnmatchcase(tag, request.pattern))
+    if not tags:
+        raise BadFleet(f"no loop has a tag like {request.pattern!r}")
+    return tags
 
 
 _NO_PATTERN = {"pattern": None}

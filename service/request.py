@@ -261,7 +261,19 @@ def _given(request: BaseModel, options: type[BaseModel]) -> list[str]:
 
 
 def within(loop: LoopConfig, request: RetuneRequest) -> LoopConfig:
-    """The loop with the limits of this job: a request may narrow what the file permits, never widen it."""
+    """The loop with the limits of this job: a request may narrow what the file permits, never widen it.
+
+    Raises BadLimits.
+    """
+    narrowed, problems = narrow(loop, request)
+    if problems:
+        raise BadLimits("; ".join(problems))
+    return narrowed
+
+
+def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[str]]:
+    """The loop with the limits of this job, and what is wrong with those asked for; where that is something, the file's
+    own stay."""
     problems = []
     limits = {}
     for name, unit in (("mv", "%"), ("pv", loop.pv_unit)):
@@ -287,5 +299,5 @@ def within(loop: LoopConfig, request: RetuneRequest) -> LoopConfig:
     if 2 * deviation > limits["pv_limits"].high - limits["pv_limits"].low and not problems:
         problems.append(f"sp_deviation {deviation:g} {loop.pv_unit} needs at least twice that between the PV limits")
     if problems:
-        raise BadLimits("; ".join(problems))
-    return loop.model_copy(update={**limits, "sp_deviation": deviation})
+        return loop, problems
+    return loop.model_copy(update={**limits, "sp_deviation": deviation}), []

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from service.config import LoopConfig
 from service.ground import Ground, rehearsal_spec
 from service.loop import Loop, LoopState
+from service.moves import broken_limits
 from service.plain import plain_object
 from service.request import ProcessModel, RetuneRequest
 from service.store.tables import EventRow
@@ -85,21 +86,16 @@ def tune(
     from service.computing.beside import Computing
     from service.runner import Watch, run
 
-    facts = Facts(
-        sample_time_s=state.sample_time_s,
-        T95_s=config.t95_s,
-        mv_low=max(config.mv_limits.low, state.mv_low),
-        mv_high=min(config.mv_limits.high, state.mv_high),
-        sp_deviation=config.sp_deviation,
-        old_gains=state.gains,
-        reverse=state.reverse_acting,
-    )
+    facts = facts_of(config, state)
+    broken = broken_limits(config, request, state.sp)
+    if broken:
+        raise Refused(Reason.BAD_LIMITS, "; ".join(broken))
     watch = Watch(
         pv_low=config.pv_limits.low,
         pv_high=config.pv_limits.high,
         mv_low=facts.mv_low,
         mv_high=facts.mv_high,
-        max_time_s=request.max_time_s or time_budget_s(request.method, facts),
+        max_time_s=request.max_time_s or time_budget_s(request.method, facts.T95_s, facts.sample_time_s),
         max_frozen_s=FROZEN_T95 * config.t95_s,
     )
     computing = Computing(loop, workers)
@@ -118,6 +114,22 @@ def tune(
     if ran.value is not None and not ran.value.comparison.gain and not request.propose_anyway:
         ended = NoGain(Reason.NO_GAIN, ran.value.comparison.verdict)
     return Outcome(plain_object(ran.value), ended, ran.restored, dict(ran.plant_time_s))
+
+
+def facts_of(config: LoopConfig, state: LoopState) -> Facts:
+    """What the procedures know of a loop; the limits of MV are the narrower of the job's and the controller's own.
+
+    Raises Refused: BAD_LIMITS, SAMPLING_TOO_SLOW.
+    """
+    return Facts(
+        sample_time_s=state.sample_time_s,
+        T95_s=config.t95_s,
+        mv_low=max(config.mv_limits.low, state.mv_low),
+        mv_high=min(config.mv_limits.high, state.mv_high),
+        sp_deviation=config.sp_deviation,
+        old_gains=state.gains,
+        reverse=state.reverse_acting,
+    )
 
 
 def plan(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow] = ()) -> Plan[Any]:
@@ -143,10 +155,10 @@ def _procedure(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow]
     return five_stage(facts, Options(**_options(request)), finished(done))
 
 
-def time_budget_s(method: str, facts: Facts) -> float:
+def time_budget_s(method: str, t95_s: float, sample_time_s: float) -> float:
     """Plant time, s: several times what a loop of this T95 takes."""
-    budget = TIME_BUDGET_T95.get(method, OTHER_BUDGET_T95) * facts.T95_s
-    return max(budget, LEAST_BUDGET_SAMPLES * facts.sample_time_s)
+    budget = TIME_BUDGET_T95.get(method, OTHER_BUDGET_T95) * t95_s
+    return max(budget, LEAST_BUDGET_SAMPLES * sample_time_s)
 
 
 def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:

@@ -43,6 +43,15 @@ MOST_GAIN = 60.0
 Entry = Literal["relay", "zn_pi", "estimate", "optimise"]
 
 
+def stages_of(start: Entry, baseline: bool, verify: bool) -> tuple[str, ...]:
+    """The stages of a run that enters there, in their order."""
+    entered = STAGES.index(start)
+    left_out = {stage for stage, wanted in (("baseline", baseline), ("verify", verify)) if not wanted}
+    return tuple(
+        s for i, s in enumerate(STAGES) if (s in ("preflight", "baseline") or i >= entered) and s not in left_out
+    )
+
+
 def rule_of(method: str) -> str:
     """The method's name in `tuning.methods`: the procedure's own Stage 5 is the robust PI."""
     return ROBUST if method == PROCEDURE else method
@@ -174,12 +183,7 @@ def five_stage(facts: Facts, options: Options, finished: Finished = Finished()) 
         "optimise": 0.0,
         "verify": 6 * T95,
     }
-    entered = STAGES.index(options.start)
-    todo = [s for i, s in enumerate(STAGES) if s == "preflight" or i >= entered or s == "baseline"]
-    if not options.baseline:
-        todo.remove("baseline")
-    if not options.verify:
-        todo.remove("verify")
+    todo = stages_of(options.start, options.baseline, options.verify)
 
     def started(stage: str) -> tuple[StageStarted]:
         after = todo[todo.index(stage) + 1 :]

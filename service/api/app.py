@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from service.api import contract, fleet, locks, operations, problems, tunings
+from service.api import contract, fleet, locks, operations, previews, problems, tunings
 from service.api.access import Access
 from service.api.bodies import JsonRoute
 from service.api.idempotency import Idempotent
@@ -220,6 +220,7 @@ def create_app(
         return view(jobs.rollback(job_id, (decision or Decision()).by))
 
     app.include_router(locks.router(jobs))
+    app.include_router(previews.router(jobs, many))
     app.include_router(tunings.router(jobs, pool or Pool()))
     return app
 

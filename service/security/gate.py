@@ -22,7 +22,7 @@ from service.security.key_checks import KeyChecks, TooOften
 from service.security.keyring import Keyring
 from service.security.keys import Scope
 from service.security.limits import Buckets, RequestLimits, retry_after
-from service.security.places import COMPUTED, DECIDES, SAFE_METHODS, Full, Kind, Places, Turn, kind_of
+from service.security.places import DECIDES, SAFE_METHODS, Full, Kind, Places, Turn, changes_nothing, kind_of
 from service.security.principal import LOCAL, Principal, current
 from service.shared_reading import asked_at
 from service.store.database import urgent
@@ -48,7 +48,7 @@ def scope_for(method: str, path: str) -> Scope | None:
         return None
     if path.startswith(_ADMIN):
         return Scope.ADMIN
-    return Scope.READ if method in SAFE_METHODS or path in COMPUTED else Scope.OPERATE
+    return Scope.READ if method in SAFE_METHODS or changes_nothing(path) else Scope.OPERATE
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ thread, and turns are few, so that the threads of the web framework (40, shared 
 from __future__ import annotations
 
 import asyncio
+import re
 from collections import Counter
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
@@ -17,8 +18,7 @@ from enum import StrEnum
 from service.security.limits import RequestLimits
 
 SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
-COMPUTED = frozenset({"/tunings"})
-"""Change nothing although they are posted."""
+_PREVIEW = re.compile(r"/loops/[^/]+/retune/preview|/retunes/preview")
 
 
 class Kind(StrEnum):
@@ -41,13 +41,20 @@ _LAST_WORDS = {
 _WATCHED = ("/readyz", "/metrics")
 
 
+def changes_nothing(path: str) -> bool:
+    """Whether a POST to this path only answers."""
+    return path == "/tunings" or _PREVIEW.fullmatch(path) is not None
+
+
 def kind_of(method: str, path: str) -> Kind | None:
     """The kind of a request; None: it costs nothing, and is always answered."""
     if path == "/healthz":
         return None
     last = path.rpartition("/")[2]
-    if path in COMPUTED or last == "alternatives":
+    if path == "/tunings" or last == "alternatives":
         return Kind.COMPUTATION
+    if last == "preview":
+        return Kind.BUS
     if method not in SAFE_METHODS:
         return _LAST_WORDS.get(last, Kind.COMMAND)
     if path in _WATCHED:

@@ -363,6 +363,18 @@ class Store:
             found = session.execute(select(JobRow.loop, JobRow.state).where(JobRow.number.in_(last)))
             return {row.loop: row.state for row in found}
 
+    def last_models(self, loop: str | None = None) -> dict[str, JobRow]:
+        """The latest job by loop, of every host or of one loop, that has found a model on the live loop."""
+        ended = (JobState.PROPOSED.value, JobState.ACCEPTED.value, JobState.ROLLED_BACK.value)
+        last = select(func.max(JobRow.number)).where(JobRow.dry_run.is_(False), JobRow.state.in_(ended))
+        if loop is not None:
+            last = last.where(JobRow.loop == loop)
+        with self._session() as session:
+            return {
+                row.loop: row
+                for row in session.scalars(select(JobRow).where(JobRow.number.in_(last.group_by(JobRow.loop))))
+            }
+
     def recent(
         self, loop: str | None = None, state: JobState | None = None, limit: int = 50, before: int | None = None
     ) -> Sequence[JobRow]:

@@ -19,6 +19,8 @@ from tuning.stages.relay import no_oscillation
 T = TypeVar("T")
 BIAS = 0.5
 """The lower amplitude in higher ones."""
+FIRST = 0.5
+"""The amplitude that the relay begins with, of the largest that MV permits."""
 HYSTERESIS = 2.2  # standard deviations of the noise
 AVERAGED = 3
 LEAST_HYSTERESIS = 1e-3
@@ -40,6 +42,11 @@ FAR = 20.0
 """Spans of PV under the relay, at which the step under the new gains is ended."""
 
 
+def most_amplitude(mv: float, mv_low: float, mv_high: float) -> float:
+    """Of the higher side of a relay around `mv` that stays within the limits, MV units."""
+    return min(mv_high - mv, (mv - mv_low) / BIAS)
+
+
 class Experiment:
     """One record, grown by its plans. Amplitudes in MV units."""
 
@@ -49,13 +56,13 @@ class Experiment:
         self.relayed = 0
         self.switches: list[int] = []
         self.noise = noise_of(np.asarray(listened.pv))
-        self._most = min(facts.mv_high - point.mv, (point.mv - facts.mv_low) / BIAS)
+        self._most = most_amplitude(point.mv, facts.mv_low, facts.mv_high)
         if amplitude is not None and not 0.0 < amplitude <= self._most:
             raise Refused(
                 Reason.BAD_LIMITS, f"a relay amplitude of {amplitude:g} is asked for; MV permits up to {self._most:.4g}"
             )
         self._fixed = amplitude is not None
-        self.amplitude = amplitude or 0.5 * self._most
+        self.amplitude = amplitude or FIRST * self._most
         self._sides = [BIAS, 1.0]  # low, high, in amplitudes
         self._high = True
         self._raise_at = 0

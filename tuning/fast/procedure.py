@@ -64,11 +64,16 @@ class FastOptions:
             raise Refused(Reason.BAD_INPUT, f"amplitude must be a positive number, not {self.amplitude!r}")
 
 
+def fast_stages(verify: bool) -> tuple[str, ...]:
+    """The stages of a run with or without the set-point step, in their order."""
+    return FAST_STAGES if verify else FAST_STAGES[:3]
+
+
 def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
     """The whole procedure on a loop in automatic and at rest. Raises Refused; restores nothing (the runner does)."""
     T95, wish = facts.T95_s, options.wish()
     expected = {"preflight": T95 / 2, "relay": T95, "design": 0.0, "verify": 1.5 * T95, "redesign": 0.0}
-    todo = FAST_STAGES if options.verify else FAST_STAGES[:3]
+    todo = fast_stages(options.verify)
 
     def started(stage: str) -> tuple[StageStarted]:
         after = todo[todo.index(stage) + 1 :]

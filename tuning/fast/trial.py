@@ -24,6 +24,11 @@ __all__ = ["TRIAL_STAGES", "designed_on", "trial"]
 TRIAL_STAGES = ("preflight", "design", "verify")
 
 
+def trial_stages(verify: bool) -> tuple[str, ...]:
+    """The stages of a trial with or without the set-point step, in their order."""
+    return TRIAL_STAGES if verify else TRIAL_STAGES[:2]
+
+
 def designed_on(model: Model, options: FastOptions, sample_time_s: float) -> Best:
     """The best gains on the model. Raises Refused, NOT_ROBUST."""
     known = ultimate(model)
@@ -45,7 +50,7 @@ def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal
     Gains that bring nothing that was asked for are tried only where `propose_anyway` is among the options.
     """
     expected = {"preflight": facts.T95_s / 2, "design": 0.0, "verify": 6 * facts.T95_s}
-    todo = TRIAL_STAGES if options.verify else TRIAL_STAGES[:2]
+    todo = trial_stages(options.verify)
 
     def started(stage: str) -> tuple[StageStarted]:
         after = todo[todo.index(stage) + 1 :]

@@ -16,8 +16,11 @@ from tuning.stages.common import Facts, OperatingPoint, Trace, record
 
 PREFLIGHT, SETTLE = "preflight", "settle"
 LOOKS = 4
+LEAST_LISTENED_SAMPLES = 60
 MOST_NOISE = 0.10
 """Noise (standard deviation) as a share of the set-point step, above which no overshoot can be read."""
+MOST_AWAY = 0.05
+"""PV off the set-point, and its drift, as a share of the set-point step, above which the loop is not at rest."""
 LEAST_ROOM = 0.05
 """Room for MV on both sides, as a share of its permitted range."""
 
@@ -28,7 +31,9 @@ def preflight(facts: Facts, after_s: float) -> Plan[OperatingPoint]:
     return point
 
 
-def at_rest(facts: Facts, after_s: float, least_samples: int = 60) -> Plan[tuple[OperatingPoint, Trace]]:
+def at_rest(
+    facts: Facts, after_s: float, least_samples: int = LEAST_LISTENED_SAMPLES
+) -> Plan[tuple[OperatingPoint, Trace]]:
     """Looks at the loop until it is at rest, LOOKS times at most; the last look's samples come with the point.
 
     after_s: expected of the stages that follow. Each look is a stage of its own, with one of settling before it.
@@ -48,7 +53,7 @@ def at_rest(facts: Facts, after_s: float, least_samples: int = 60) -> Plan[tuple
     return (yield from look(facts, least_samples))
 
 
-def look(facts: Facts, least_samples: int = 60) -> Plan[tuple[OperatingPoint, Trace]]:
+def look(facts: Facts, least_samples: int = LEAST_LISTENED_SAMPLES) -> Plan[tuple[OperatingPoint, Trace]]:
     """Listens once, for half T95 (at least so many samples) in automatic. Raises Refused as `at_rest`."""
     trace = yield from record(max(facts.T95_s / 2, least_samples * facts.sample_time_s))
     sample = yield ()
@@ -75,7 +80,8 @@ def look(facts: Facts, least_samples: int = 60) -> Plan[tuple[OperatingPoint, Tr
     slack = 4 * noise / math.sqrt(len(pv))
     if noise > MOST_NOISE * step:
         raise Refused(Reason.NOISE_TOO_HIGH, f"noise {noise:.3g} is above {MOST_NOISE:.0%} of the step {step:.3g}")
-    if abs(drift) > 0.05 * step + 4 * slack or abs(away) > 0.05 * step + slack or spread > 0.03 * step + 2 * noise:
+    near_rest = MOST_AWAY * step
+    if abs(drift) > near_rest + 4 * slack or abs(away) > near_rest + slack or spread > 0.03 * step + 2 * noise:
         raise Refused(
             Reason.NOT_AT_REST,
             f"within {trace.t[-1] - trace.t[0]:.3g} s PV drifted by {drift:+.3g}, is {away:+.3g} off the set-point and "

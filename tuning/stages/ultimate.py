@@ -28,6 +28,8 @@ SLOPE = 2.5
 MOST_RUNS = 16
 KICK, NOISY_KICK = 0.25, 0.45
 """The step's first kick as a share of the room for MV: gains stay near Ku, so swings stay inside. Noise buys more."""
+RUN_MV_LIMIT = 0.98
+"""Of the room for MV, at which a run is ended."""
 UNCERTAIN = 0.05
 """Noise as a share of the step, above which the oscillation feeds on noise and Ku is no longer sharp."""
 
@@ -127,7 +129,7 @@ def _p_run(facts: Facts, point: OperatingPoint, K: float, step: float, period: f
     start = sample.t
     longest = max(1.2 * facts.T95_s, 6 * period)
     ask = start + 2.5 * period
-    limit = 0.98 * point.room
+    limit = RUN_MV_LIMIT * point.room
     before: Growth | None = None
     verdict: Growth | None = None
     ended = "time"

@@ -14,6 +14,8 @@ from tuning.stages.common import Facts, OperatingPoint, Trace, settle
 from tuning.stages.step_test import StepResult, step_test, unlimited
 
 MOST_STEPS = 12
+KICK_OF_ROOM = 0.7
+"""Of the room for MV: the largest first kick of a set-point step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,7 @@ def zn_pi(
 
 def allowed_step(facts: Facts, point: OperatingPoint, Kp: float, static_gain: float) -> float:
     """The largest permitted set-point step that keeps the kick and the final value of MV well inside its room."""
-    step = min(facts.sp_deviation, 0.7 * point.room / Kp)
+    step = min(facts.sp_deviation, KICK_OF_ROOM * point.room / Kp)
     if static_gain == static_gain and static_gain != 0:
         step = min(step, 0.6 * point.room * abs(static_gain))
     return step

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from typer.testing import CliRunner, Result
 
 from service import cli
 from tests.unit.service.fakes import TAG, FakeLoop, Service
+from tuning.plan import Mode
 
 PLANT = {"num": [1.0], "den": [8.0, 6.0, 1.0], "dead_time_s": 1.0, "noise_std": 0.002, "sample_time_s": 0.1}
 
@@ -22,12 +24,14 @@ class Through:
     def __init__(self, client: TestClient) -> None:
         self._client = client
         self.posted: list[dict[str, Any]] = []
+        self.paths: list[str] = []
 
     def get(self, path: str, **query: Any) -> Any:
         return self._checked(self._client.get(path, params={k: v for k, v in query.items() if v is not None}))
 
     def post(self, path: str, body: dict[str, Any] | None = None) -> Any:
         self.posted.append(body or {})
+        self.paths.append(path)
         return self._checked(self._client.post(path, json=body or {}))
 
     @staticmethod
@@ -48,7 +52,18 @@ def run(*arguments: str) -> Result:
 
 
 def test_the_options_of_fast_are_asked_for(service: Service, through: Through) -> None:
-    options = ("--ms", "1.4", "--derivative", "--amplitude", "10", "--careful", "--no-verify", "--no-wait", "--json")
+    options = (
+        "--ms",
+        "1.4",
+        "--derivative",
+        "--amplitude",
+        "10",
+        "--careful",
+        "--no-verify",
+        "--no-wait",
+        "--json",
+        "--yes",
+    )
     result = run("retune", TAG, *options)
     assert result.exit_code == 0, result.output
     (body,) = through.posted
@@ -61,9 +76,58 @@ def test_the_options_of_fast_are_asked_for(service: Service, through: Through) -
 
 
 def test_five_stage_is_asked_for_by_its_name(service: Service, through: Through) -> None:
-    result = run("retune", TAG, "--method", "five-stage", "--no-wait", "--json")
+    result = run("retune", TAG, "--method", "five-stage", "--no-wait", "--json", "--yes")
     assert result.exit_code == 0 and json.loads(result.stdout)["method"] == "five-stage"
     service.wait(json.loads(result.stdout)["id"])
+
+
+def on_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cli, "on_terminal", lambda: True)
+
+
+def test_not_on_a_terminal_a_retune_is_not_started_without_yes(service: Service, through: Through) -> None:
+    result = run("retune", TAG)
+    assert result.exit_code == 2 and "--preview" in result.output and "--yes" in result.output
+    assert through.paths == [] and service.store.recent() == []
+
+
+@pytest.mark.parametrize(("answer", "status", "jobs"), [("y\n", 0, 1), ("n\n", 1, 0), ("\n", 1, 0)])
+def test_on_a_terminal_a_retune_says_what_it_does_and_asks(
+    service: Service, through: Through, monkeypatch: pytest.MonkeyPatch, answer: str, status: int, jobs: int
+) -> None:
+    on_terminal(monkeypatch)
+    result = CliRunner().invoke(cli.app, ["retune", TAG, "--no-wait", "--json", "--ms", "1.4"], input=answer)
+    assert result.exit_code == status, result.output
+    assert "moves MV by" in result.stderr and "of plant time" in result.stderr and "Start?" in result.stderr
+    rows = service.store.recent()
+    assert len(rows) == jobs
+    if jobs:
+        assert through.posted[0] == through.posted[1]
+        report = result.stdout[result.stdout.index("{") :]  # before it, the answer as the runner echoes it
+        assert json.loads(report)["request"]["ms"] == 1.4
+        service.wait(rows[0].id)
+
+
+def test_a_preview_alone_prints_and_ends(service: Service, through: Through) -> None:
+    result = run("retune", TAG, "--preview")
+    assert result.exit_code == 0 and "moves MV by" in result.stdout
+    shown = run("retune", TAG, "--preview", "--json", "--method", "five-stage")
+    assert json.loads(shown.stdout)["method"] == "five-stage"
+    assert service.store.recent() == [] and set(through.paths) == {f"/loops/{TAG}/retune/preview"}
+    service.controller.state = replace(service.controller.state, mode=Mode.MANUAL)
+    refused = run("retune", TAG, "--preview")
+    assert refused.exit_code == 3 and "would be refused now" in refused.stdout and "wrong_mode" in refused.stdout
+
+
+def test_a_tag_with_a_wildcard_is_a_retune_of_many(service: Service, through: Through) -> None:
+    assert run("retune", "*").exit_code == 2
+    assert through.paths == []
+    result = run("retune", "*", "--preview")
+    assert result.exit_code == 0, result.output
+    assert "2 loops are retuned by fast" in result.stdout
+    begun = run("retune", "TIC-*", "--yes", "--json")
+    assert begun.exit_code == 0, begun.output
+    assert [each["loop"] for each in json.loads(begun.stdout)["loops"]] == [TAG]
 
 
 @pytest.fixture

@@ -1,0 +1,74 @@
+"""What a retune would do, before it starts: of one loop, and of many. Nothing is changed."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Body, Path
+
+from service.api import problems
+from service.fleet import Fleet, FleetRequest
+from service.jobs import Jobs
+from service.obstacles import Now
+from service.preview import FleetPreview, LastModel, Preview, fleet_preview, preview
+from service.request import RetuneRequest
+from service.state_json import loop_state
+from service.store.tables import JobRow
+from tuning.reasons import Ended
+
+Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
+
+
+def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
+    routes = APIRouter()
+
+    @routes.post(
+        "/loops/{tag}/retune/preview",
+        tags=["loops"],
+        summary="What a retune with this body would do now: moves, time, limits, and all that would refuse it",
+        responses=problems.responses(404, 422, 503),
+    )
+    def one(tag: Tag, options: Annotated[RetuneRequest | None, Body()] = None) -> Preview:
+        request = options or RetuneRequest()
+        config, _ = jobs.owner(tag)
+        return preview(config, request, _now(jobs, tag, request), _last(jobs.store.last_models(tag).get(tag)))
+
+    @routes.post(
+        "/retunes/preview",
+        tags=["retunes"],
+        summary="What a retune of many loops would do, from configuration and earlier jobs: no controller is asked",
+        responses=problems.responses(422, 503),
+    )
+    def many(wish: Annotated[FleetRequest, Body()]) -> FleetPreview:
+        options, busy, models = wish.options(), jobs.store.busy(), jobs.store.last_models()
+        return fleet_preview([
+            preview(
+                config,
+                options,
+                Now(active_job=busy.get(config.tag), stopping=jobs.stopping),
+                _last(models.get(config.tag)),
+            )
+            for config in fleet.asked(wish)
+        ])  # fmt: skip
+
+    return routes
+
+
+def _now(jobs: Jobs, tag: str, request: RetuneRequest) -> Now:
+    """What the loop is now. While a job has it, what that job has found and will bring back counts."""
+    if request.dry_run:
+        return Now(stopping=jobs.stopping)
+    active = jobs.store.active(tag)
+    if active is not None and active.found is not None:
+        return Now(loop_state(active.found), active_job=active.id, stopping=jobs.stopping)
+    holder = None if active is None else active.id
+    try:
+        return Now(jobs.live(tag), active_job=holder, stopping=jobs.stopping)
+    except Ended as silent:
+        return Now(silent=silent, active_job=holder, stopping=jobs.stopping)
+
+
+def _last(row: JobRow | None) -> LastModel | None:
+    if row is None or not row.result:
+        return None
+    return LastModel.of(row.id, row.ended_at, row.plant_time_s, row.result)

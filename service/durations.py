@@ -1,0 +1,47 @@
+"""How long the stages of a retune take, in plant time: from T95, and from the ultimate period where a model is known.
+
+The factors hold what rehearsals of the plants of `benchmarks.plants` took (the shortest and the longest of nine in
+ten), and the limits of time of the procedures.
+"""
+
+from __future__ import annotations
+
+from service.request import RetuneRequest
+from tuning.fast.experiment import BACK, MOST_PERIODS, VERIFIED_PERIODS
+from tuning.fast.procedure import LEAST_SAMPLES
+from tuning.stages.preflight import LEAST_LISTENED_SAMPLES, LOOKS
+
+PU_OF_T95 = (0.07, 0.95)
+"""The ultimate period in T95, of eight in ten of 116 self-regulating plants."""
+
+Span = tuple[float, float]
+
+
+def durations(request: RetuneRequest, t95_s: float, sample_time_s: float | None, pu_s: float | None) -> dict[str, Span]:
+    """The shortest and the longest time to be expected of each stage, s. pu_s: None where no model is known."""
+    least = LEAST_SAMPLES if request.fast and request.start == "relay" else LEAST_LISTENED_SAMPLES
+    look = max(0.5 * t95_s, least * (sample_time_s or 0.0))
+    # a loop that is not at rest is given half a T95 before each further look
+    listening = (look, LOOKS * look + (LOOKS - 1) * 0.5 * t95_s)
+    low, high = (pu_s, pu_s) if pu_s else (PU_OF_T95[0] * t95_s, PU_OF_T95[1] * t95_s)
+    nothing = (0.0, 0.0)
+    if request.fast and request.start == "design":
+        return {"preflight": listening, "design": nothing, "verify": (0.6 * t95_s, 11.0 * t95_s)}
+    if request.fast:
+        return {
+            "preflight": listening,
+            "relay": (1.8 * low, MOST_PERIODS * high),
+            "design": nothing,
+            "verify": (VERIFIED_PERIODS * low, (1.0 + BACK) * VERIFIED_PERIODS * high),
+            "redesign": nothing,
+        }
+    return {
+        "preflight": listening,
+        "baseline": (1.5 * t95_s, 7.0 * t95_s),
+        "relay": (5.0 * low, 8.0 * high + 2.0 * t95_s),
+        "ultimate": (10.0 * low, 5.0 * (6.0 * high + 2.0 * t95_s)),
+        "zn_pi": (3.0 * low, 15.0 * high + 4.0 * t95_s),
+        "estimate": nothing,
+        "optimise": nothing,
+        "verify": (4.0 * low, 5.0 * high + 4.0 * t95_s),
+    }
