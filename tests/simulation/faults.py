@@ -478,7 +478,8 @@ def real_fast(world: World) -> None:
 
 
 def real_five_stage(world: World) -> None:
-    _real(world, RetuneRequest(method="five-stage"), 2500 * world.loop.wall_s)
+    world.time_constant, world.dead_time = 36.0, 9.0  # in samples: the procedure asks for more of them per period
+    _real(world, RetuneRequest(method="five-stage"), 6000 * world.loop.wall_s)
 
 
 def real_trial(world: World) -> None:
