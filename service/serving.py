@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import signal
@@ -63,6 +64,9 @@ class _Server(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
+        # What is there now stays: a full collection, which lets no thread run, need not look through it each time.
+        gc.collect()
+        gc.freeze()
         if self.started and sockets:
             host, port = sockets[0].getsockname()[:2]
             print(f"ready http://{f'[{host}]' if ':' in host else host}:{port}", flush=True)
@@ -75,6 +79,12 @@ def tell_systemd(state: str) -> None:
     if address:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify, suppress(OSError):
             notify.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
+
+
+def _load() -> None:
+    """What the jobs import when they need it, now: the first job would hold up the loops of the others for seconds."""
+    import tuning.fast.trial
+    import tuning.five_stage  # noqa: F401
 
 
 def open_bus_loop(station: Station, config: LoopConfig) -> Loop:
@@ -174,8 +184,9 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         # Bound before anything is started, so that a busy port is an error and not half a service.
         listener = stack.enter_context(listen(setup.bind, setup.port))
         pool = stack.enter_context(closing(Pool(setup.computing)))
-        if tune is None:  # loads the fork server, so that the first computation of a loop need not wait for it
-            pool.submit(Kind.LIVE, os.getpid)
+        if tune is None:
+            pool.submit(Kind.LIVE, os.getpid)  # loads the fork server: the first computation of a loop is not to wait
+            _load()
         store = Store(setup.data, setup.database, setup.host or LOCAL)
         try:
             keyring = Keyring(store.engine) if setup.auth or not local else None

@@ -1,14 +1,20 @@
 from __future__ import annotations
 
+import asyncio
+import gc
 from pathlib import Path
+from typing import cast
 
 import pytest
+import uvicorn
 import yaml
+from fastapi import FastAPI
 from typer.testing import CliRunner
 
 from protocol.profile import TUNER_NODE
 from service import serving
 from service.cli import app
+from service.jobs import Jobs
 from tests.unit.service.fakes import loop_entry
 
 
@@ -51,3 +57,24 @@ def test_the_node_id_is_that_of_every_loop(tmp_path: Path, monkeypatch: pytest.M
     for options in ([], ["--node", "0x7C"]):
         assert CliRunner().invoke(app, ["serve", *options]).exit_code == 0
     assert [setup.node for setup in asked] == [TUNER_NODE, 0x7C]
+
+
+def test_what_is_there_at_the_start_no_collection_looks_through(capsys: pytest.CaptureFixture[str]) -> None:
+    """A full collection lets no thread run: of what is loaded it takes a tenth of a second or more."""
+
+    async def started() -> int:
+        config = uvicorn.Config(FastAPI(), log_config=None, lifespan="off")
+        config.load()
+        server = serving._Server(config, cast(Jobs, None))
+        server.lifespan = config.lifespan_class(config)
+        with serving.listen("127.0.0.1", 0) as listener:
+            await server.startup([listener])
+            count = gc.get_freeze_count()
+            await server.shutdown([listener])
+        return count
+
+    try:
+        assert gc.get_freeze_count() == 0 and asyncio.run(started()) > 10_000
+    finally:
+        gc.unfreeze()
+    assert capsys.readouterr().out.startswith("ready http://127.0.0.1:")
