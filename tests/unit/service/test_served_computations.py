@@ -20,12 +20,15 @@ import pytest
 import yaml
 
 from protocol.hub import Hub
-from tests.unit.service.fakes import loop_entry
+from tests.unit.service.fakes import TAG, loop_entry
 from tests.unit.service.processes import descendants, gone, until
 
 pytestmark = pytest.mark.timeout(300)  # processes that start slowly on a busy machine
 ENDLESS = {"model": {"K": 1e-308, "T": 10, "L": 2}, "method": "all"}
 """More than 90 s."""
+
+LONG = {"dry_run": True, "plant": {"num": [2.0], "den": [3.0, 1.0], "dead_time_s": 1.0, "sample_time_s": 0.005}}
+"""Of seconds."""
 
 
 class Served:
@@ -161,6 +164,15 @@ def test_what_costs_too_much_is_refused_by_name(tmp_path: Path, stack: ExitStack
     ):
         answer = served.asked({"model": model, "method": method}).result(200)
         assert answer.status_code == 200 or answer.json()["reason"] in ("computation_limit", "bad_input")
+
+    # a dry run is computed apart, too, and ends with its job
+    answer = httpx.post(f"{served.url}/loops/{TAG}/retune", json=LONG, trust_env=False, timeout=60)
+    until(served.computing)
+    (computing,) = served.computing()
+    job = f"{served.url}{answer.headers['location']}"
+    assert httpx.post(f"{job}/abort", trust_env=False, timeout=60).status_code == 202
+    until(lambda: gone(computing))
+    until(lambda: httpx.get(job, trust_env=False, timeout=60).json()["state"] == "aborted")
     assert served.wait_for(signal.SIGTERM) in (0, -signal.SIGTERM)
     assert "Traceback" not in served.log
 
