@@ -64,9 +64,6 @@ class _Server(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
-        # What is there now stays: a full collection, which lets no thread run, need not look through it each time.
-        gc.collect()
-        gc.freeze()
         if self.started and sockets:
             host, port = sockets[0].getsockname()[:2]
             print(f"ready http://{f'[{host}]' if ':' in host else host}:{port}", flush=True)
@@ -82,9 +79,14 @@ def tell_systemd(state: str) -> None:
 
 
 def _load() -> None:
-    """What the jobs import when they need it, now: the first job would hold up the loops of the others for seconds."""
+    """Has the jobs find everything there: one that imports what it needs, and a full collection of all that is loaded,
+    which lets no thread run, hold up the loops of the others (seconds, and 0.1 s of processor each time)."""
+    import service.bus_loop  # noqa: F401
     import tuning.fast.trial
     import tuning.five_stage  # noqa: F401
+
+    gc.collect()
+    gc.freeze()
 
 
 def open_bus_loop(station: Station, config: LoopConfig) -> Loop:
@@ -186,7 +188,6 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         pool = stack.enter_context(closing(Pool(setup.computing)))
         if tune is None:
             pool.submit(Kind.LIVE, os.getpid)  # loads the fork server: the first computation of a loop is not to wait
-            _load()
         store = Store(setup.data, setup.database, setup.host or LOCAL)
         try:
             keyring = Keyring(store.engine) if setup.auth or not local else None
@@ -218,6 +219,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
             )
             retention = Retention(store, engine, setup.keep)
             signals.tell(jobs.request_stop)
+            _load()
             try:
                 jobs.boot()
                 if not jobs.stopping:

@@ -75,6 +75,8 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
         if ms is None:
             return partial(alternatives, row, events, method)
         wanted = bool(row.request.get("derivative")) if derivative is None else derivative
-        return partial(redesigned, row, events, kept(sample_columns(jobs.store.samples(job_id))), ms, wanted)
+        fast = row.request.get("method") == FAST  # of others the model they found is designed on
+        record = kept(sample_columns(jobs.store.samples(job_id))) if fast else None
+        return partial(redesigned, row, events, record, ms, wanted)
 
     return routes

@@ -1,21 +1,19 @@
 from __future__ import annotations
 
-import asyncio
 import gc
+import sys
 from pathlib import Path
-from typing import cast
 
 import pytest
-import uvicorn
 import yaml
-from fastapi import FastAPI
 from typer.testing import CliRunner
 
 from protocol.profile import TUNER_NODE
 from service import serving
 from service.cli import app
 from service.jobs import Jobs
-from tests.unit.service.fakes import loop_entry
+from service.store.store import FolderInUse
+from tests.unit.service.fakes import FakeTune, loop_entry
 
 
 @pytest.mark.parametrize(
@@ -59,22 +57,23 @@ def test_the_node_id_is_that_of_every_loop(tmp_path: Path, monkeypatch: pytest.M
     assert [setup.node for setup in asked] == [TUNER_NODE, 0x7C]
 
 
-def test_what_is_there_at_the_start_no_collection_looks_through(capsys: pytest.CaptureFixture[str]) -> None:
+def test_when_the_jobs_begin_all_is_loaded_and_no_collection_looks_through_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A full collection lets no thread run: of what is loaded it takes a tenth of a second or more."""
+    kept = []
 
-    async def started() -> int:
-        config = uvicorn.Config(FastAPI(), log_config=None, lifespan="off")
-        config.load()
-        server = serving._Server(config, cast(Jobs, None))
-        server.lifespan = config.lifespan_class(config)
-        with serving.listen("127.0.0.1", 0) as listener:
-            await server.startup([listener])
-            count = gc.get_freeze_count()
-            await server.shutdown([listener])
-        return count
+    def boot(_jobs: Jobs) -> None:
+        kept.append(gc.get_freeze_count())
+        raise FolderInUse("that is enough")
 
+    monkeypatch.setattr(Jobs, "boot", boot)
+    loops = tmp_path / "loops.yaml"
+    loops.write_text(yaml.safe_dump({"loops": [loop_entry()]}))
+    before = gc.get_freeze_count()
     try:
-        assert gc.get_freeze_count() == 0 and asyncio.run(started()) > 10_000
+        with pytest.raises(FolderInUse, match="enough"):
+            serving.serve(serving.Setup(loops, tmp_path / "data", "127.0.0.1", 0), tune=FakeTune())
+        assert kept[0] - before > 10_000 and "tuning.five_stage" in sys.modules
     finally:
         gc.unfreeze()
-    assert capsys.readouterr().out.startswith("ready http://127.0.0.1:")
