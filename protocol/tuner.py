@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from typing import NamedTuple
@@ -125,6 +125,9 @@ class Tuner:
         self._pv = (0.0, -1)
         self.beating = False
         """Only who holds the loop beats: a mere reader must not keep alive the trial of a tuner that died."""
+        self.before_request: Callable[[], None] = lambda: None
+        """Called before each SDO but those that keep or end a session: there its lease is paid, however many there are
+        and however slow they are."""
         self.mode, self.on_trial, self.sp = 0, False, 0.0
         self.session_is_open = False
         self.node_states: dict[int, int] = {}
@@ -202,6 +205,8 @@ class Tuner:
     def read(self, name: str, sub: int | None = None, node: int | None = None) -> Value:
         """The value of an object by name, of our channel unless `sub` says otherwise."""
         entry, node, sub = self._address(name, sub, node)
+        if name not in _URGENT:
+            self.before_request()
         with self._turn(node, name):
             data = self._request(entry, node, sub, 0x40, b"\0\0\0\0")
             if data[0] & 0x02:
@@ -222,6 +227,8 @@ class Tuner:
         """Writes a number; every object the profile lets us write fits one frame."""
         entry, node, sub = self._address(name, sub, node)
         raw = entry.type.encode(value if entry.type is Type.REAL32 else int(value))
+        if name not in _URGENT:
+            self.before_request()
         with self._turn(node, name):
             self._request(entry, node, sub, 0x23 | (4 - len(raw)) << 2, raw.ljust(4, b"\0"))
 

@@ -51,30 +51,25 @@ class TunerSession:
         self._count = int(self._tuner.number("controller_session_count"))
         self._staged.clear()
 
-    def give(self, order: Order, values: Sequence[Value] = (), between: Callable[[], None] = lambda: None) -> None:
-        """Stages what is not staged so already and puts it in force.
-
-        between: called before each value; what keeps the session open while an answer is slow.
-        """
+    def give(self, order: Order, values: Sequence[Value] = ()) -> None:
+        """Stages what is not staged so already and puts it in force."""
         try:
-            self._give(order, values, between)
+            self._give(order, values)
         except TunerError as error:
             if error.code != Abort.INVALID_VALUE or order is Order.OPEN:
                 raise
             # Somebody has staged other values, or an order was put in force whose answer was lost.
             self.take_up(self.number)
-            self._give(order, values, between)
+            self._give(order, values)
 
-    def _give(self, order: Order, values: Sequence[Value], between: Callable[[], None]) -> None:
+    def _give(self, order: Order, values: Sequence[Value]) -> None:
         sent = []
         for name, value in zip(STAGED[order], values, strict=True):
             entry = lookup(name).type
             sent.append(entry.decode(entry.encode(value)))
             if self._staged.get(name) != sent[-1]:
-                between()
                 self._tuner.write(name, float(value))
                 self._staged[name] = sent[-1]
-        between()
         self._tuner.write(object_of(order), check_of(self.number, self._count, order, sent))
         self._count += 1
 

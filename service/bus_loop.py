@@ -58,6 +58,10 @@ _HALTED_S = 0.03  # without a sample: the plant has halted
 _NOT_OURS = (Abort.NO_OBJECT, Abort.NO_SUBINDEX, Abort.LENGTH, Abort.READ_ONLY, Abort.WRITE_ONLY)
 
 
+def _nothing_to_pay() -> None:
+    """There is no session of ours."""
+
+
 class BusLoop:
     """One channel of a controller node. plant_node: the plant I/O, if it offers one to ask (a simulated one does).
 
@@ -272,6 +276,7 @@ class BusLoop:
             raise
         self._renewed_at = self._station.monotonic()
         self._until_renewal = self._lease.samples // 3
+        tuner.before_request = lambda: self._renew_if_due(tuner)
         tuner.restarted, tuner.session_is_open = False, True
         home = self._reading(tuner).home()
         if tuner.session_is_open:  # else a hand was on the loop meanwhile, and the status has said so
@@ -336,7 +341,7 @@ class BusLoop:
     def _order(self, tuner: Tuner, order: Order, *values: float) -> None:
         assert self._session is not None
         try:
-            self._session.give(order, values, lambda: self._renew_if_due(tuner))
+            self._session.give(order, values)
         except TunerError as error:
             if error.code in (Abort.DEVICE_STATE, Abort.INVALID_VALUE) and not self._session.is_open:
                 raise self._over(tuner) from error
@@ -384,6 +389,7 @@ class BusLoop:
 
     def _over(self, tuner: Tuner) -> Ended:
         """Why our session has ended without us."""
+        tuner.before_request = _nothing_to_pay
         return why_over(self._reading(tuner), self._number, self._lease.pv_silence_ms / 1000.0)
 
     def _silent(self, tuner: Tuner) -> Ended:
@@ -416,6 +422,7 @@ class BusLoop:
 
     def _close(self, tuner: Tuner, number: int) -> str:
         """How the session has ended, in words."""
+        tuner.before_request = _nothing_to_pay
         if int(tuner.number("controller_session")) == number:
             session = TunerSession(tuner)
             session.take_up(number)
@@ -447,6 +454,7 @@ class BusLoop:
         """Our heartbeat ends; a plant that we ran in blocks runs on by itself, and others may take it."""
         if self._tuner is not None:
             self._tuner.beating = False
+            self._tuner.before_request = _nothing_to_pay
         if self._halted:
             with suppress(Ended), self._translated() as tuner:
                 tuner.write("plant_samples_to_run", FOREVER)

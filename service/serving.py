@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import os
 import socket
@@ -67,6 +68,17 @@ def tell_systemd(state: str) -> None:
     if address:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify, suppress(OSError):
             notify.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
+
+
+def _load() -> None:
+    """Has the jobs find everything there: one that imports what it needs, and a full collection of all that is loaded,
+    which lets no thread run, hold up the loops of the others (seconds, and 0.1 s of processor each time)."""
+    import service.bus_loop  # noqa: F401
+    import tuning.fast.trial
+    import tuning.five_stage  # noqa: F401
+
+    gc.collect()
+    gc.freeze()
 
 
 def open_bus_loop(station: Station, config: LoopConfig) -> Loop:
@@ -138,8 +150,8 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         # Bound before anything is started or opened: a port that is taken is one sentence and not half a service.
         listener = stack.enter_context(listen(setup.bind, setup.port))
         pool = stack.enter_context(closing(Pool(setup.computing)))
-        if tune is None:  # loads the fork server, so that the first computation of a loop need not wait for it
-            pool.submit(Kind.LIVE, os.getpid)
+        if tune is None:
+            pool.submit(Kind.LIVE, os.getpid)  # loads the fork server: the first computation of a loop is not to wait
         store = stack.enter_context(closing(Store(setup.data, setup.database, setup.host or LOCAL)))
         keyring = Keyring(store.engine) if setup.auth or not local else None
         if keyring is not None and not keyring.any_valid():
@@ -172,6 +184,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
             server.should_exit = True
 
         signals.tell(end, partial(_awaited, jobs))
+        _load()
         jobs.boot()
         if not jobs.stopping:
             retention.start()

@@ -76,6 +76,8 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
         if ms is None:
             return partial(alternatives, row, events, method)
         wanted = bool(row.request.get("derivative")) if derivative is None else derivative
-        return partial(redesigned, row, events, kept(record_columns(jobs.store.blocks(job_id))), ms, wanted)
+        fast = row.request.get("method") == FAST  # of others the model they found is designed on
+        record = kept(record_columns(jobs.store.blocks(job_id))) if fast else None
+        return partial(redesigned, row, events, record, ms, wanted)
 
     return routes

@@ -68,7 +68,7 @@ def _keep_to(cpu_s: float, memory_mb: int, niceness: int) -> None:
     RLIMIT_DATA: all private memory that is asked for, whether it is in use yet or not. RLIMIT_AS would count what is
     only mapped too (libraries, reserved stacks); a measured RSS would be looked at when the machine has none left.
     """
-    os.nice(niceness)
+    os.setpriority(os.PRIO_PROCESS, 0, max(niceness, os.getpriority(os.PRIO_PROCESS, 0)))
     _lower(resource.RLIMIT_CORE, 0)
     _lower(resource.RLIMIT_CPU, math.ceil(cpu_s))
     with suppress(OSError):  # not on every system

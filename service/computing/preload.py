@@ -1,13 +1,22 @@
 """What the fork server loads before it forks: imported there, so that no computation has to wait for it."""
 
+import gc
 import os
+from importlib import import_module
+
+LOADED = (
+    "service.alternatives",
+    "service.cli",  # the script `loopwright` imports it, and each process imports what the script does
+    "service.computing.rehearsals",
+    "service.rehearsal",
+    "service.tunings",
+    "tuning.fast.procedure",
+    "tuning.fast.trial",
+    "tuning.five_stage",
+)
 
 # Before numpy is loaded: a computation takes one processor, and a process with threads should not be forked.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
-
-import gc
-
-import tuning.fast.procedure
-import tuning.five_stage  # noqa: F401
-
+for name in LOADED:
+    import_module(name)
 gc.freeze()  # what is here stays, and stays shared: no collection writes to it

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -55,6 +56,10 @@ def tell_numbers(to: int, report: Callable[[int], None]) -> str:
 def tell_and_die(report: Callable[[int], None]) -> None:
     report(1)
     die()
+
+
+def modules() -> set[str]:
+    return set(sys.modules)
 
 
 def own_files() -> list[str]:

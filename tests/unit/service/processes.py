@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-_PATIENCE_S = 60.0
+_PATIENCE_S = 120.0
 
 
 def until(condition: Callable[[], object]) -> None:

@@ -161,6 +161,15 @@ class TestLease:
         assert len(times) > 2 and max(b - a for a, b in pairwise(times)) < 0.8 * LEASE_WALL_S
         assert site.controller.sessions[0].is_open
 
+    def test_is_paid_while_home_is_read_beside_many_others(self, site: Site) -> None:
+        """Thirty answers, for each of which a loop may have to wait for fifty others that begin, too."""
+        site.slow_s = 0.2
+        began_at = site.wire.clock.now
+        _, number = site.begun()
+        assert site.wire.clock.now - began_at > 2 * LEASE_WALL_S
+        site.loop.step(())
+        assert site.controller.sessions[0].is_open and site.loop._number == number
+
     def test_of_a_session_that_has_ended_is_not_paid(self, in_blocks: Site) -> None:
         in_blocks.loop.begin()
         in_blocks.controller.sessions[0].end(Cause.LEASE)

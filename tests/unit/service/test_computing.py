@@ -29,6 +29,7 @@ from tests.unit.service.computations import (
     count,
     die,
     die_once,
+    modules,
     own_files,
     refuse,
     tell_and_die,
@@ -90,6 +91,16 @@ def done(work: Work[Any], pool: Pool) -> Any:
 class TestPool:
     def test_another_process_computes(self, pool: Pool) -> None:
         assert done(Work(os.getpid), pool) != os.getpid()
+
+    def test_it_finds_everything_loaded(self, pool: Pool) -> None:
+        wanted = {
+            "tuning.five_stage",
+            "tuning.fast.trial",
+            "service.tunings",
+            "service.alternatives",
+            "service.rehearsal",
+        }
+        assert wanted <= pool.run(Kind.TUNING, modules)
 
     def test_what_it_raises_is_raised_here(self, pool: Pool) -> None:
         with pytest.raises(Refused, match="Ms 3") as refused:

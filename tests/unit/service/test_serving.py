@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import gc
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,7 +11,9 @@ from typer.testing import CliRunner
 from protocol.profile import TUNER_NODE
 from service import serving
 from service.cli import app
-from tests.unit.service.fakes import loop_entry
+from service.jobs import Jobs
+from service.store.store import FolderInUse
+from tests.unit.service.fakes import FakeTune, loop_entry
 
 
 @pytest.mark.parametrize(
@@ -51,3 +55,25 @@ def test_the_node_id_is_that_of_every_loop(tmp_path: Path, monkeypatch: pytest.M
     for options in ([], ["--node", "0x7C"]):
         assert CliRunner().invoke(app, ["serve", *options]).exit_code == 0
     assert [setup.node for setup in asked] == [TUNER_NODE, 0x7C]
+
+
+def test_when_the_jobs_begin_all_is_loaded_and_no_collection_looks_through_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A full collection lets no thread run: of what is loaded it takes a tenth of a second or more."""
+    kept = []
+
+    def boot(_jobs: Jobs) -> None:
+        kept.append(gc.get_freeze_count())
+        raise FolderInUse("that is enough")
+
+    monkeypatch.setattr(Jobs, "boot", boot)
+    loops = tmp_path / "loops.yaml"
+    loops.write_text(yaml.safe_dump({"loops": [loop_entry()]}))
+    before = gc.get_freeze_count()
+    try:
+        with pytest.raises(FolderInUse, match="enough"):
+            serving.serve(serving.Setup(loops, tmp_path / "data", "127.0.0.1", 0), tune=FakeTune())
+        assert kept[0] - before > 10_000 and "tuning.five_stage" in sys.modules
+    finally:
+        gc.unfreeze()
