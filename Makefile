@@ -33,7 +33,7 @@ system:
 # The quick tests run natively, those on a CAN bus where there is a CAN bus. Both run even if the first fails.
 test: setup system check
 	quick=0; $(BIN)/python -m pytest --ignore=tests/vcan --ignore=tests/e2e || quick=$$?; \
-	LOOPWRIGHT_REQUIRE_VCAN=1 tools/with-vcan --timeout 3600 -- $(BIN)/python -m pytest $(wildcard tests/vcan tests/e2e) && exit $$quick
+	LOOPWRIGHT_REQUIRE_VCAN=1 tools/with-vcan --again --timeout 3600 -- $(BIN)/python -m pytest $(wildcard tests/vcan tests/e2e) && exit $$quick
 
 # Where there is no container engine, one is installed as the packages above are, and runs for this test alone.
 compose-test:

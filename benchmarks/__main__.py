@@ -22,7 +22,7 @@ from typing import Any
 from benchmarks.command import CANNOT, check_names, parser_of
 from benchmarks.table import HEAD, ROWS, row
 
-WITH_VCAN = ("tools/with-vcan", "--timeout", "900", "--")
+WITH_VCAN = ("tools/with-vcan", "--again", "--timeout", "900", "--")
 NO_VCAN = "no CAN interface vcan0 is to be had, tools/with-vcan says above what to install"
 
 

@@ -1,16 +1,44 @@
-"""What the tests counted is told at the end of the run."""
+"""Which tests start processes is found out; what the tests counted is told at the end of the run."""
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
+from collections.abc import Sequence
+from functools import cache
+from types import ModuleType
 
 import pytest
+
+_STARTERS = {"subprocess", "multiprocessing", "service.processes", "service.serving", "service.computing"}
 
 _COUNTS = pytest.StashKey[dict[str, Counter[str]]]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[_COUNTS] = {}
+
+
+def pytest_collection_modifyitems(items: Sequence[pytest.Item]) -> None:
+    """Marks what may fail where processes start slowly: `python -m tests.repeat` repeats it beside a load."""
+    for item in items:
+        if isinstance(item, pytest.Function) and starts_processes(item.module):
+            item.add_marker(pytest.mark.starts_processes)
+
+
+@cache
+def starts_processes(module: ModuleType) -> bool:
+    """True where the module, or a module of the tests that it uses, has something of those that start processes."""
+    used = {value if isinstance(value, ModuleType) else _home(value) for value in vars(module).values()} - {module}
+    names = {each.__name__ for each in used if each is not None}
+    if names & _STARTERS:
+        return True
+    return any(starts_processes(each) for each in used if each is not None and each.__name__.startswith("tests."))
+
+
+def _home(value: object) -> ModuleType | None:
+    name = getattr(value, "__module__", None)
+    return sys.modules.get(name) if isinstance(name, str) else None
 
 
 @pytest.fixture(scope="session")
