@@ -6,6 +6,7 @@ import os
 import resource
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import AsyncExitStack, ExitStack, closing
 from ipaddress import ip_network
@@ -445,3 +446,18 @@ def test_who_asks_is_believed_of_trusted_proxies_only(
     assert door.ask("POST", f"/loops/{TAG}/retune", "{}", **forwarded)[0] == 202
     _, _, body = door.ask("GET", "/audit")
     assert f'"address":"{address}"'.encode() in body
+
+
+# the log
+
+
+def test_refusals_are_logged_once_a_second_for_each_address(
+    service: Service, stack: ExitStack, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    door = open_door(stack, service, rate_per_s=0.001, burst=1)
+    began = time.monotonic()
+    statuses = [door.ask("GET", "/loops")[0] for _ in range(30)]
+    assert statuses == [200] + 29 * [429]
+    lines = [record for record in caplog.records if getattr(record, "status", None) == 429]
+    assert 1 <= len(lines) <= 1 + time.monotonic() - began
