@@ -201,7 +201,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
                 buses=site.buses,
                 resume=setup.resume,
             )
-            config = server_config(create_app(jobs, policy), setup, descriptors)
+            config = server_config(create_app(jobs, policy), setup, listener, descriptors)
             retention = Retention(store, engine, setup.keep)
             signals.tell(jobs.request_stop)
             try:
@@ -216,13 +216,14 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
             store.close()
 
 
-def server_config(app: FastAPI, setup: Setup, descriptors: int) -> uvicorn.Config:
+def server_config(app: FastAPI, setup: Setup, listener: Listener, descriptors: int) -> uvicorn.Config:
     """The HTTP server: whose word it takes on whom it serves, and how many connections of which kind it keeps.
 
     descriptors: file descriptors of this process.
     """
     logging.getLogger("uvicorn.error").addFilter(OnceAMinute())
     connections = Connections(setup.limits, descriptors, partial(_is_of, setup.trusted_proxies))
+    listener.wanted = connections.wanted
     return uvicorn.Config(
         app,
         loop="asyncio",

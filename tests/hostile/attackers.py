@@ -20,7 +20,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit
 
-PAUSE_S = 0.2
+PAUSE_S = 1.0
 """After an answer that refuses: an attacker that never pauses measures its own event loop."""
 BACK_S = 5.0
 """After it was thrown out."""
