@@ -2,6 +2,7 @@
 # make setup   the Python environment in .venv         make check   types, style, import directions, packages
 # make bench   every benchmark, in one table           make validate    the five papers, recomputed
 # make faults  every fault in every stage, live: 30 min    make simulate    thousands of simulated disasters
+# make hostile an hour of hostile clients, live
 # make compose-test    the containers, with a real engine      make bench-tuning    how well "fast" tunes 121 plants
 
 PYTHON ?= python3
@@ -13,7 +14,7 @@ DEBIAN := $(UML) tshark can-utils postgresql systemd
 ENGINE := docker.io docker-compose
 BESIDE := $(UML) debootstrap e2fsprogs
 
-.PHONY: setup demo test compose-test check bench bench-tuning validate faults simulate system clean
+.PHONY: setup demo test compose-test check bench bench-tuning validate faults simulate hostile system clean
 
 setup: $(VENV)/.installed
 
@@ -66,6 +67,10 @@ SEEDS ?= 2000
 simulate: setup
 	$(if $(WRITE),,$(BIN)/python -m tests.simulation --every-call)
 	$(BIN)/python -m tests.simulation --seeds $(SEEDS) $(if $(WRITE),--write)
+
+# Hostile clients and costly work at once beside live tests; fails where anything of them shows. HOSTILE="--minutes 5"
+hostile: setup
+	$(BIN)/python -m tests.hostile $(HOSTILE)
 
 # Long; BENCH="--plants 20 --seeds 1" limits it.
 bench-tuning: setup

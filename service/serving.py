@@ -175,7 +175,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         stack.callback(jobs.stop)
         retention = stack.enter_context(closing(Retention(store, engine, setup.keep)))
         checks = {**operations.checks(jobs), "samples": retention.note}
-        server = _Server(server_config(create_app(jobs, policy, checks, pool), setup, descriptors))
+        server = _Server(server_config(create_app(jobs, policy, checks, pool), setup, listener, descriptors))
 
         def end() -> None:
             """Open event streams end with their jobs: the server, which waits for its connections, waits for them."""
@@ -199,13 +199,14 @@ def _awaited(jobs: Jobs) -> str:
     return f"it waits until these loops are restored and the ends of their jobs written: {', '.join(under_test)}"
 
 
-def server_config(app: FastAPI, setup: Setup, descriptors: int) -> uvicorn.Config:
+def server_config(app: FastAPI, setup: Setup, listener: Listener, descriptors: int) -> uvicorn.Config:
     """The HTTP server: whose word it takes on whom it serves, and how many connections of which kind it keeps.
 
     descriptors: file descriptors of this process.
     """
     logging.getLogger("uvicorn.error").addFilter(OnceAMinute())
     connections = Connections(setup.limits, descriptors, partial(_is_of, setup.trusted_proxies))
+    listener.wanted = connections.wanted
     return uvicorn.Config(
         app,
         loop="asyncio",

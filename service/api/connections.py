@@ -1,7 +1,8 @@
 """Connections: how many there may be, and how long one may keep us waiting. uvicorn bounds neither.
 
-A connection is kept while a request on it is answered; one that waits for a request, or whose request has not arrived
-whole, gives way to a new one when there is no room. So those who open many and say nothing keep nobody out.
+When there is no room a new connection that says nothing is closed at once: who wants something has said it by the time
+it is accepted. One that says something takes the place of the one that has waited longest for a request, or for the
+rest of one; a connection on which a request is answered stays. So those who open many keep nobody out, and cost little.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from service.security.limits import RequestLimits
 log = logging.getLogger(__name__)
 
 TOLD_EVERY_S = 60.0
-ACCEPTED_AT_ONCE = 16
+ACCEPTED_AT_ONCE = 8
 """Between two looks of the event loop at everything else."""
 _OUT_OF_DESCRIPTORS = (errno.EMFILE, errno.ENFILE)
 _NO_ROOM = (
@@ -96,9 +97,24 @@ class Connections:
         self._idle: dict[str, OrderedDict[Connection, None]] = {}
         self._told = Told()
 
+    def wanted(self, new: socket.socket, address: str) -> bool:
+        """Whether it may go before the event loop at all."""
+        if not self._address_is_full(address) and self._open.total() < self._most:
+            return True
+        try:
+            if new.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT):
+                return True
+        except OSError:  # nothing is there yet, or it has gone already
+            pass
+        self.refused(address)
+        return False
+
+    def _address_is_full(self, address: str) -> bool:
+        return self._open[address] >= self._most_of_address and not self._exempt(address)
+
     def admit(self, new: Connection) -> bool:
         """Makes room if there is none. False: there is no connection that could give way."""
-        if self._open[new.address] >= self._most_of_address and not self._exempt(new.address):
+        if self._address_is_full(new.address):
             found = self._give_way(new.address)
         else:
             found = self._open.total() < self._most or any(map(self._give_way, self._by_number()))
@@ -247,26 +263,29 @@ class Listener(socket.socket):
 
     def __init__(self, fileno: int) -> None:
         super().__init__(fileno=fileno)
+        self.wanted: Callable[[socket.socket, str], bool] = lambda new, address: True
         self._left = ACCEPTED_AT_ONCE
         self._spare = os.open(os.devnull, os.O_RDONLY)
         self._told = Told()
 
     def accept(self) -> tuple[socket.socket, Any]:
-        if not self._left:  # what else there is to do comes first; then we are asked again
-            self._left = ACCEPTED_AT_ONCE
-            raise BlockingIOError
-        self._left -= 1
-        try:
-            return super().accept()
-        except BlockingIOError:
-            self._left = ACCEPTED_AT_ONCE
-            raise
-        except OSError as error:
-            if error.errno not in _OUT_OF_DESCRIPTORS or not self._turn_away():
-                self._left = 0
-                raise
-            self._told.happened("a connection was turned away, all file descriptors are taken")
-            raise BlockingIOError from error
+        while self._left:
+            self._left -= 1
+            try:
+                new, address = super().accept()
+            except BlockingIOError:
+                break
+            except OSError as error:
+                if error.errno not in _OUT_OF_DESCRIPTORS or not self._turn_away():
+                    self._left = 0
+                    raise
+                self._told.happened("a connection was turned away, all file descriptors are taken")
+                continue
+            if self.wanted(new, address[0]):
+                return new, address
+            new.close()
+        self._left = ACCEPTED_AT_ONCE
+        raise BlockingIOError  # what else there is to do comes first; then we are asked again
 
     def close(self) -> None:
         super().close()

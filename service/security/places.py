@@ -82,17 +82,17 @@ class Room:
 
 
 def rooms(limits: RequestLimits) -> dict[Kind, Room]:
-    """The computing threads contend for one interpreter with those that pump the loops: few turns. Those who wait for a
-    bus need hardly any of it."""
+    """Threads that read, and show what they read, contend for one interpreter with those that pump the loops and with
+    the event loop, which gives it away in each system call: few turns. Those who wait for a bus need hardly any."""
     return {
         Kind.ABORT: Room(64, 4),
         Kind.DECISION: Room(32, 8),
-        Kind.COMMAND: Room(32, 3),
-        Kind.READ: Room(limits.at_once, 4),
+        Kind.COMMAND: Room(32, 2),
+        Kind.READ: Room(limits.at_once, 2),
         Kind.BUS: Room(32, 4),
         Kind.COMPUTATION: Room(limits.computations_at_once, limits.computations_at_once),
         Kind.STREAM: Room(limits.streams_at_once, 2),
-        Kind.WATCH: Room(16, 3),
+        Kind.WATCH: Room(16, 2),
     }
 
 

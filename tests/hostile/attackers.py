@@ -10,16 +10,17 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import itertools
 import json
 import resource
 import secrets
 import signal
 from collections import Counter
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit
 
-PAUSE_S = 0.2
+PAUSE_S = 1.0
 """After an answer that refuses: an attacker that never pauses measures its own event loop."""
 BACK_S = 5.0
 """After it was thrown out."""
@@ -126,11 +127,37 @@ async def answers_not_taken(target: Target) -> None:
     writer.close()
 
 
+async def posts_again(target: Target, who: str, path: str, bodies: Sequence[dict[str, object]]) -> None:
+    reader, writer = await target.open()
+    for body in itertools.cycle(bodies):
+        data = json.dumps(body).encode()
+        more = (f"Content-Length: {len(data)}", "Content-Type: application/json")
+        writer.write(target.head("POST", path, *more) + data)
+        if await target.answered(who, reader) in ("409", "422", "429", "503", "closed"):
+            await asyncio.sleep(PAUSE_S)
+
+
+async def costly_tunings(target: Target) -> None:
+    """Models far outside any plant."""
+    models: list[dict[str, object]] = [
+        {"model": {"K": 1e-308, "T": 1.0, "L": 1.0}},
+        {"model": {"K": 1.0, "T": 1.0, "L": 1e-9}, "method": "me-pso"},
+        {"model": {"num": [1.0], "den": [1e-12, 1e12, 1.0, 1e-9], "dead_time_s": 1.0}, "method": "all"},
+    ]
+    await posts_again(target, "tunings", "/tunings", models)
+
+
+async def costly_rehearsals(target: Target) -> None:
+    """A dry run of a plant with a dead time of weeks."""
+    model = {"K": 1.0, "T_s": 1e6, "L_s": 4e6}
+    await posts_again(target, "rehearsal", f"/loops/{target.loop}/retune", [{"dry_run": True, "model": model}])
+
+
 ATTACKERS: dict[str, Callable[[Target], Awaitable[None]]] = {
     each.__name__: each
     for each in (
         reads_of_a_silent_node, unfinished_bodies, guesses_at_a_key, idle_connections, slow_heads,
-        reads_of_the_database, answers_not_taken,
+        reads_of_the_database, answers_not_taken, costly_tunings, costly_rehearsals,
     )
 }  # fmt: skip
 

@@ -48,7 +48,7 @@ def served(app: FastAPI, descriptors: int = 4096, **changes: Any) -> Iterator[Se
     """descriptors: those that the process is taken to have.  changes: of the setup."""
     setup = replace(SETUP, **changes)
     listener = listen(setup.bind, setup.port)
-    server = uvicorn.Server(server_config(app, setup, descriptors))
+    server = uvicorn.Server(server_config(app, setup, listener, descriptors))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
     try:

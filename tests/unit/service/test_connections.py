@@ -6,6 +6,7 @@ import os
 import resource
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import AsyncExitStack, ExitStack, closing
 from ipaddress import ip_network
@@ -305,11 +306,10 @@ def test_a_revocation_empties_what_is_known(service: Service) -> None:
 
 def test_those_who_say_nothing_give_way(service: Service, stack: ExitStack, caplog: pytest.LogCaptureFixture) -> None:
     door = open_door(stack, service, connections=20, connections_of_address=10)
-    silent = [stack.enter_context(closing(door.begun())) for _ in range(30)]
     events = f"GET {running(service, door)}/events HTTP/1.1\nHost: 127.0.0.1\n\n"
     stream = stack.enter_context(closing(door.begun(events)))
     assert stream.recv(12) == b"HTTP/1.1 200"
-    silent += [stack.enter_context(closing(door.begun("GET / HTTP"))) for _ in range(30)]
+    silent = [stack.enter_context(closing(door.begun(text))) for text in 15 * ["", "", "GET / HTTP", "GET / HTTP"]]
     assert door.ask("GET", "/healthz")[0] == 200
     closed = 0
     for connection in silent:
@@ -323,7 +323,7 @@ def test_those_who_say_nothing_give_way(service: Service, stack: ExitStack, capl
     assert closed >= 50
     stream.settimeout(PATIENCE_S)
     assert stream.recv(100)  # who is answered stays
-    lines = [record for record in caplog.records if "gave way" in record.getMessage()]
+    lines = [record for record in caplog.records if "since the last such line" in record.getMessage()]
     assert len(lines) == 1 and "10 of one address" in lines[0].getMessage()
 
 
@@ -334,7 +334,8 @@ def test_where_nobody_can_give_way_one_is_refused_in_words(service: Service, sta
     for _ in range(2):
         streams.append(stack.enter_context(closing(door.begun(f"GET {job}/events HTTP/1.1\nHost: 127.0.0.1\n\n"))))
         assert streams[-1].recv(12) == b"HTTP/1.1 200"
-    answer = rest(stack.enter_context(closing(door.begun())))
+    assert rest(stack.enter_context(closing(door.begun()))) == b""
+    answer = rest(stack.enter_context(closing(door.begun("GET /healthz HTTP/1.1\nHost: 127.0.0.1\n\n"))))
     assert answer.startswith(b"HTTP/1.1 503 ") and b"Retry-After: 1" in answer and b"as many connections" in answer
     streams[0].close()
     until(lambda: not rest_is_refusal(door))
@@ -445,3 +446,18 @@ def test_who_asks_is_believed_of_trusted_proxies_only(
     assert door.ask("POST", f"/loops/{TAG}/retune", "{}", **forwarded)[0] == 202
     _, _, body = door.ask("GET", "/audit")
     assert f'"address":"{address}"'.encode() in body
+
+
+# the log
+
+
+def test_refusals_are_logged_once_a_second_for_each_address(
+    service: Service, stack: ExitStack, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    door = open_door(stack, service, rate_per_s=0.001, burst=1)
+    began = time.monotonic()
+    statuses = [door.ask("GET", "/loops")[0] for _ in range(30)]
+    assert statuses == [200] + 29 * [429]
+    lines = [record for record in caplog.records if getattr(record, "status", None) == 429]
+    assert 1 <= len(lines) <= 1 + time.monotonic() - began

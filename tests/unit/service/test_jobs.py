@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 
 import pytest
+from sqlalchemy.exc import OperationalError
 
 from service import jobs as jobs_module
 from service.api.results import ModelView, TransferModelView
@@ -138,3 +139,21 @@ def test_samples_of_a_rehearsal_are_kept(service: Service) -> None:
     jobs.stop()
     stages = [stage for stage, _ in service.store.samples(row.id)]
     assert {"preflight", "relay", "verify"} <= set(stages)
+
+
+def test_a_running_job_hears_of_an_abort_that_the_database_does_not_take(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(job_id: str, reason: str, by: str) -> None:
+        raise OperationalError("UPDATE", {}, Exception("database is locked"))
+
+    service.tune.hold.clear()
+    row = service.jobs.start(TAG, RetuneRequest())
+    assert service.tune.inside.wait(60)
+    monkeypatch.setattr(service.store, "wish_to_stop", gone)
+    with pytest.raises(OperationalError):
+        service.jobs.abort(row.id, "me")
+    service.wait(row.id, 60)
+    row = service.store.get(row.id)
+    assert (row.state, row.reason) == ("aborted", Reason.OPERATOR.value)
+    assert service.controller.state.gains == OLD

@@ -77,3 +77,23 @@ def test_when_the_jobs_begin_all_is_loaded_and_no_collection_looks_through_it(
         assert kept[0] - before > 10_000 and "tuning.five_stage" in sys.modules
     finally:
         gc.unfreeze()
+
+
+@pytest.mark.parametrize("value", ["proxy.example", "10.0.0.7/8", ""])
+def test_a_trusted_proxy_that_is_no_address_is_refused(tmp_path: Path, value: str) -> None:
+    ended = CliRunner().invoke(app, ["serve", "--data", str(tmp_path / "data"), "--trusted-proxy", value])
+    assert ended.exit_code == 2 and "--trusted-proxy takes an address or a network" in ended.output
+
+
+def test_trusted_proxies_and_connections(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[serving.Setup] = []
+    monkeypatch.setattr(serving, "serve", asked.append)
+    given = ["--trusted-proxy", "10.0.0.7", "--trusted-proxy", "10.1.0.0/16", "--connections", "100"]
+    from_environment = {"LOOPWRIGHT_TRUSTED_PROXIES": "10.0.0.7 10.1.0.0/16", "LOOPWRIGHT_CONNECTIONS": "100"}
+    assert CliRunner().invoke(app, ["serve", *given]).exit_code == 0
+    assert CliRunner().invoke(app, ["serve"], env=from_environment).exit_code == 0
+    assert CliRunner().invoke(app, ["serve"]).exit_code == 0
+    trusted = [[str(each) for each in setup.trusted_proxies] for setup in asked]
+    assert trusted == [["10.0.0.7/32", "10.1.0.0/16"], ["10.0.0.7/32", "10.1.0.0/16"], []]
+    limits = [(setup.limits.connections, setup.limits.connections_of_address) for setup in asked]
+    assert limits == [(100, 50), (100, 50), (512, 256)]

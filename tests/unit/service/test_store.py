@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import threading
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from sqlalchemy.exc import IntegrityError
 
 from service.states import MOVES, IllegalMove, JobState, check
 from service.store import lock
-from service.store.database import BadDatabase
+from service.store.database import USUAL, BadDatabase, urgent
 from service.store.store import Busy, FolderInUse, ForeignLoop, NoSuchJob, Store
 from service.store.tables import Base
 from tests.unit.service.postgres import Server
@@ -319,3 +320,17 @@ def test_nothing_leaves_an_end_and_every_state_can_be_reached() -> None:
     assert reachable == set(JobState)
     for end in ("rolled_back", "refused", "aborted", "failed", "interrupted"):
         assert not MOVES[JobState(end)]
+
+
+def test_what_is_urgent_has_connections_of_its_own(store: Store) -> None:
+    """Whatever has taken all the others, a job can be told to stop."""
+    job = store.create("L", {}, "me", False)
+    with ExitStack() as stack:
+        while store.engine.pool.checkedout() < sum(USUAL):  # type: ignore[attr-defined]
+            stack.enter_context(store.engine.connect())
+        token = urgent.set(True)
+        try:
+            assert store.wish_to_stop(job.id, "operator", "me").stop_reason == "operator"
+            assert store.get(job.id).stop_reason == "operator"
+        finally:
+            urgent.reset(token)

@@ -1,0 +1,148 @@
+"""What is measured beside the attacks: how late supervision is, how fast aborts are, what memory it takes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from protocol.bus import open_bus
+from protocol.profile import TUNER_NODE, heartbeat_id
+from protocol.station import HEARTBEAT_S
+from service.states import ACTIVE
+from tests.hostile.site import Site
+
+EXPECTED_ENDS = ("proposed", "refused")
+"""Of a test that nobody has aborted: what the procedure itself says."""
+
+
+@dataclass
+class Found:
+    """abort_s: until it was answered.  effect_s: until the job was over, its loop read back as home.
+    late_s: by which the service's heartbeat came later than it is due.  ends: of the tests, by state and reason."""
+
+    abort_s: list[float] = field(default_factory=list)
+    effect_s: list[float] = field(default_factory=list)
+    healthz_s: list[float] = field(default_factory=list)
+    late_s: list[float] = field(default_factory=list)
+    memory_MB: list[float] = field(default_factory=list)
+    ends: dict[str, int] = field(default_factory=dict)
+    refused: int = 0
+    """Requests of the operator that were told to come again."""
+
+
+class Measuring:
+    """Three threads: who listens to the heartbeat, who keeps tests running, and who aborts one again and again."""
+
+    def __init__(self, site: Site, tests: int) -> None:
+        self.found = Found()
+        self._site, self._tests = site, site.tags[:tests]
+        self._victim = site.tags[tests]
+        self._over = threading.Event()
+        self._counting = threading.Event()
+        self._threads = [threading.Thread(target=run) for run in (self._listen, self._keep_testing, self._abort)]
+        self._jobs: dict[str, str] = {}
+
+    def __enter__(self) -> Measuring:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        for thread in self._threads:
+            thread.join()
+
+    def count(self) -> None:
+        """What is found counts from now on: all tests are running."""
+        give_up = time.monotonic() + 60.0
+        while len(self._jobs) < len(self._tests) and time.monotonic() < give_up:
+            time.sleep(0.1)
+        self._counting.set()
+
+    def note_memory(self) -> None:
+        status = Path(f"/proc/{self._site.service.pid}/status").read_text().splitlines()
+        self.found.memory_MB.append(next(int(line.split()[1]) for line in status if line.startswith("VmRSS:")) / 1024)
+
+    def end_tests(self) -> None:
+        for url in self._jobs.values():
+            self._asked("POST", f"{url}/abort")
+        give_up = time.monotonic() + 60.0
+        while any(self._state(url)["state"] in tuple(ACTIVE) for url in self._jobs.values()):
+            assert time.monotonic() < give_up
+            time.sleep(0.2)
+
+    def _asked(self, method: str, path: str, **more: Any) -> httpx.Response | None:
+        """None: it is to be asked again."""
+        try:
+            answer = self._site.ask(method, path, **more)
+        except httpx.TransportError:
+            self.found.refused += 1
+            return None
+        if answer.status_code in (429, 503):
+            self.found.refused += 1
+            return None
+        return answer
+
+    def _state(self, url: str) -> dict[str, Any]:
+        while (answer := self._asked("GET", url)) is None:
+            time.sleep(0.2)
+        found: dict[str, Any] = answer.json()
+        return found
+
+    def _listen(self) -> None:
+        bus = open_bus(self._site.bus)
+        wanted = heartbeat_id(TUNER_NODE)
+        bus.set_filters({wanted})
+        last: float | None = None
+        while not self._over.is_set():
+            frame = bus.recv(0.05)
+            if frame is None or frame[0] != wanted:
+                continue
+            now = time.monotonic()
+            if last is not None and self._counting.is_set():
+                self.found.late_s.append(max(0.0, now - last - HEARTBEAT_S))
+            last = now
+        bus.close()
+
+    def _keep_testing(self) -> None:
+        while not self._over.is_set():
+            for tag in self._tests:
+                url = self._jobs.get(tag)
+                if url is not None:
+                    job = self._state(url)
+                    if job["state"] in tuple(ACTIVE):
+                        continue
+                    end = job["state"] if job["state"] in EXPECTED_ENDS else f"{job['state']} {job['reason']}"
+                    self.found.ends[end] = self.found.ends.get(end, 0) + 1
+                    if job["state"] == "proposed":
+                        self._asked("POST", f"{url}/rollback")
+                answer = self._asked("POST", f"/loops/{tag}/retune", json={"method": "five-stage"})
+                if answer is not None and answer.status_code == 202:
+                    self._jobs[tag] = answer.headers["location"]
+            self._over.wait(1.0)
+
+    def _abort(self) -> None:
+        while not self._over.is_set():
+            answer = self._asked("POST", f"/loops/{self._victim}/retune", json={})
+            if answer is None or answer.status_code != 202:
+                self._over.wait(0.2)
+                continue
+            url = answer.headers["location"]
+            while self._state(url)["stage"] is None and not self._over.is_set():
+                time.sleep(0.1)
+            began = time.monotonic()
+            answer = self._asked("POST", f"{url}/abort")
+            answered = time.monotonic() - began
+            while self._state(url)["state"] in tuple(ACTIVE):
+                time.sleep(0.02)
+            if self._counting.is_set() and answer is not None and answer.status_code == 202:
+                self.found.abort_s.append(answered)
+                self.found.effect_s.append(time.monotonic() - began)
+            began = time.monotonic()
+            if self._asked("GET", "/healthz") is not None and self._counting.is_set():
+                self.found.healthz_s.append(time.monotonic() - began)
