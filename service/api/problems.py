@@ -49,6 +49,11 @@ def problem(
     return JSONResponse(body | more, status_code=status, media_type=MEDIA_TYPE, headers=headers)
 
 
+def of_http(error: HTTPException) -> JSONResponse:
+    headers = dict(error.headers) if error.headers else None
+    return problem(error.status_code, str(error.detail), headers=headers)
+
+
 def of_database(error: SQLAlchemyError) -> JSONResponse:
     if not temporary(error):
         return problem(500, f"{type(error).__name__} of the database", reason=Reason.INTERNAL)
@@ -72,8 +77,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     async def _http(_request: Request, error: HTTPException) -> JSONResponse:
-        headers = dict(error.headers) if error.headers else None
-        return problem(error.status_code, str(error.detail), headers=headers)
+        return of_http(error)
 
     @app.exception_handler(BadLimits)
     async def _limits(_request: Request, error: BadLimits) -> JSONResponse:
