@@ -518,7 +518,10 @@ class Jobs:
         try:
             running.loop = loop
             with self._hands[row.loop]:
-                state = self._begun(loop, row)
+                try:
+                    state = self._begun(loop, row)
+                except Locked as locked:  # what an attempt before has left is home already
+                    return Outcome(None, locked, None if row.session is None else loop.read(), {})
             earlier = self.store.events(row.id) if row.found is not None else ()
             hooks = Hooks(
                 running.on_event, running.on_samples, lambda: running.stop_reason, earlier,

@@ -59,7 +59,7 @@ class Idempotent:
         try:
             body = await _body(receive)
         except HTTPException as error:
-            await problems.problem(error.status_code, error.detail)(scope, receive, send)
+            await problems.of_http(error)(scope, receive, send)
             return
         if body is not None:
             await self._once(given[0].strip('"'), body, scope, receive, send)

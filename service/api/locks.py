@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Body, Path
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from service.api import problems
 from service.api.bodies import JsonRoute
@@ -16,9 +16,15 @@ _ONE_LINE = r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$"
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 
 
-class LockWish(Decision):
+class LockWish(BaseModel):
     """Why a loop is to be left alone, and who says so."""
 
+    model_config = ConfigDict(extra="forbid")
+
+    by: str = Field(
+        default="api", max_length=100, pattern=_ONE_LINE, description="Whoever is refused is shown it",
+        examples=["night shift"],
+    )  # fmt: skip
     reason: str = Field(
         min_length=1, max_length=200, pattern=_ONE_LINE, description="One line of text",
         examples=["valve is being overhauled"],

@@ -54,6 +54,11 @@ def problem(
     return JSONResponse(body | more, status_code=status, media_type=MEDIA_TYPE, headers=headers)
 
 
+def of_http(error: HTTPException) -> JSONResponse:
+    headers = dict(error.headers) if error.headers else None
+    return problem(error.status_code, str(error.detail), headers=headers)
+
+
 def of_database(error: SQLAlchemyError) -> JSONResponse:
     if is_damage(cause := getattr(error, "orig", None)):
         return problem(503, f"the service's data are damaged ({cause}): no work is taken; /readyz says what to do")
@@ -84,8 +89,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     async def _http(_request: Request, error: HTTPException) -> JSONResponse:
-        headers = dict(error.headers) if error.headers else None
-        return problem(error.status_code, str(error.detail), headers=headers)
+        return of_http(error)
 
     @app.exception_handler(BadLimits)
     async def _limits(_request: Request, error: BadLimits) -> JSONResponse:

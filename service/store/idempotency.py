@@ -93,7 +93,7 @@ class IdempotencyKeys:
         session.execute(delete(keys).where(keys.at < stamp(at - timedelta(hours=KEPT_H))))
         here = keys.host == self._store.host if self._store.shared else true()
         unanswered = keys.status.is_(None) & keys.effect.is_(None)
-        session.execute(delete(keys).where(here, unanswered, keys.token.not_in(self._answering)))
+        session.execute(delete(keys).where(here, unanswered, keys.token.not_in(list(self._answering))))
         newest = select(keys.at).where(keys.principal == principal).order_by(keys.at.desc())
         last = session.scalar(newest.offset(self._most - 1).limit(1))
         if last is not None:

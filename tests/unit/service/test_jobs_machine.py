@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
 
 from service.config import LoopConfig, parse_site
-from service.errors import Conflict
+from service.errors import Conflict, Locked
 from service.jobs import Jobs
 from service.loop import Loop, LoopState
 from service.request import RetuneRequest
@@ -59,7 +59,8 @@ RULES = {
     "end: aborted", "end: no_gain", "end: rehearsed",
     "abort: aborted", "abort: illegal", "accept: accepted", "accept: illegal", "accept: conflict",
     "accept: busy", "rollback: rolled_back", "rollback: illegal", "rollback: conflict", "rollback: busy",
-    "crash: on trial", "crash: gone back", "restart: done", "by hand: done",
+    "crash: on trial", "crash: gone back", "restart: done", "by hand: done", "submit: locked", "begin: locked",
+    "accept: locked", "rollback: locked", "lock: done", "lock: a test runs", "unlock: done",
 }  # fmt: skip
 
 
@@ -162,6 +163,7 @@ class JobsMachine(RuleBasedStateMachine):
         self.acts: dict[str, Act] = {}
         self.jobs: list[Job] = []
         self.gains = dict.fromkeys(TAGS, OLD)
+        self.locked: set[str] = set()
         self.boot()
 
     # the service
@@ -215,7 +217,11 @@ class JobsMachine(RuleBasedStateMachine):
         self.acts[name] = act = Act(Gains(0.6 + 0.01 * n, 3.0))
         request = RetuneRequest(requested_by=name, dry_run=dry, **options)
         other = None if dry else self.having(loop)
-        if other is not None:
+        if loop in self.locked and not dry:
+            with pytest.raises(Locked):
+                self.service.start(loop, request)
+            self.said("submit", "locked")
+        elif other is not None:
             with pytest.raises(Busy) as busy:
                 self.service.start(loop, request)
             assert busy.value.job_id == other.id
@@ -234,6 +240,12 @@ class JobsMachine(RuleBasedStateMachine):
 
     def begun(self, job: Job) -> None:
         self.engine.begin(job.id)
+        if job.loop in self.locked and not job.dry:
+            self.over(job)
+            job.state = "refused"
+            assert self.store.get(job.id).reason == "locked"
+            self.said("begin", "locked")
+            return
         assert job.act.inside.wait(10)
         if job.old is None and not job.dry:
             job.old = self.gains[job.loop]
@@ -256,7 +268,7 @@ class JobsMachine(RuleBasedStateMachine):
     @rule(loop=st.sampled_from(TAGS))
     def propose(self, loop: str) -> None:
         """A job from its beginning to its end, where the loop is free: decisions are what is then tried."""
-        if self.having(loop) is None:
+        if self.having(loop) is None and loop not in self.locked:
             self.submit(loop, dry=False, begins=True, options={})
             self.ended(self.jobs[-1], "proposed")
 
@@ -289,6 +301,8 @@ class JobsMachine(RuleBasedStateMachine):
             refusal, word = IllegalMove, "illegal"
         elif self.having(job.loop):
             refusal, word = Busy, "busy"
+        elif not declined and job.loop in self.locked:
+            refusal, word = Locked, "locked"
         elif not declined and self.gains[job.loop] not in legal_gains:
             refusal, word = Conflict, "conflict"
         if refusal is None:
@@ -327,6 +341,23 @@ class JobsMachine(RuleBasedStateMachine):
             self.controllers[loop].by_hand(gains=self.gains[loop])
             self.said("by hand", "done")
 
+    @precondition(lambda self: len(self.jobs) > 2 and not self.locked)
+    @rule(loop=st.sampled_from(TAGS))
+    def lock(self, loop: str) -> None:
+        """What runs goes on, and is named."""
+        _, found = self.service.lock(loop, "valve", "me")
+        self.locked.add(loop)
+        job = self.having(loop)
+        runs = job is not None and job.state == "running"
+        assert (found.id if found else None) == (job.id if job and runs else None)
+        self.said("lock", "a test runs" if runs else "done")
+
+    @precondition(lambda self: self.locked)
+    @rule()
+    def unlock(self) -> None:
+        assert self.service.unlock(self.locked.pop(), "me") is not None
+        self.said("unlock", "done")
+
     @precondition(lambda self: any(job.begun for job in self.jobs))
     @rule(goes_back=st.booleans())
     def crash(self, goes_back: bool) -> None:
@@ -352,7 +383,7 @@ class JobsMachine(RuleBasedStateMachine):
             job.act.killed = False
             job.act.told.clear()
             job.act.inside.clear()
-            if job.attempts >= MOST_ATTEMPTS:
+            if job.attempts >= MOST_ATTEMPTS or (job.loop in self.locked and job.old is not None):
                 job.state = "interrupted"
         assert sorted(self.engine.queued) == sorted(job.id for job in self.jobs if job.active)
         self.said("crash", "gone back" if goes_back else "on trial")
