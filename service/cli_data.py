@@ -1,4 +1,4 @@
-"""`loopwright backup` and `loopwright restore`."""
+"""`loopwright backup`, `loopwright restore` and `loopwright check-data`."""
 
 from __future__ import annotations
 
@@ -54,6 +54,45 @@ def restore(
     if aside is not None:
         print(f"what was there before is in {aside}")
     print("keys are as they were in the back-up: see loopwright key list")
+
+
+@app.command("check-data")
+def check_data(
+    data: Data = Path("data"),
+    salvage: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Copy what can be read into a new file, for restore.")
+    ] = None,
+) -> None:
+    """Says what of the data can be read, and changes nothing. Exit 0: all of it, 3: something is damaged."""
+    from service.check_data import CheckProblem
+    from service.check_data import check_data as check
+    from service.check_data import salvage as copy
+    from service.store.store import FolderInUse
+
+    _only_files()
+    try:
+        reports = check(data)
+        copied = copy(data, salvage) if salvage is not None else {}
+    except FolderInUse:
+        die(f"a service is running on {data}: stop it before something is copied from it", 2)
+    except (CheckProblem, OSError) as error:
+        die(str(error), 2)
+    for report in reports:
+        rows = ", ".join(f"{table} {count}" for table, count in report.rows.items())
+        print(f"{report.file}: {'damaged' if report.wrong else 'whole'}; rows that can be read: {rows or 'none'}")
+        for line in (*report.wrong, *report.notes):
+            print(f"  {line}")
+    if salvage is not None:
+        print(f"{salvage}: {', '.join(f'{table} {count}' for table, count in copied.items())}")
+        print(f"take it with: loopwright restore {salvage} --data {data} --replace")
+    if any(report.wrong for report in reports):
+        if salvage is None:
+            print(
+                f"Stop the service and restore the last back-up: loopwright restore FILE --data {data} --replace\n"
+                f"or what can be read: loopwright check-data --data {data} --salvage FILE\n"
+                "A damaged engine.sqlite is made anew at the next start: nothing is lost with it."
+            )
+        raise typer.Exit(3)
 
 
 def _only_files() -> None:

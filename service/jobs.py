@@ -85,8 +85,7 @@ class Jobs:
         self._machine = machine or Machine()
         self.journal = Journal(store, beside=self._machine.writes_beside)
         self.stopping = False
-        self.watched = self._machine.monotonic()
-        """When the watcher last turned."""
+        self._watched = self._machine.monotonic()
         self.why_stopping = "the service is shutting down"
         self._open_loop = open_loop
         self._tune = tune
@@ -328,7 +327,7 @@ class Jobs:
         """Hears of jobs to stop, from whatever host; finds what the engine has lost."""
         reconciled = self._machine.monotonic()
         while not self._ended.wait(_WATCH_S):
-            self.watched = self._machine.monotonic()
+            self._watched = self._machine.monotonic()
             if self.store.damaged is not None:
                 self.give_up(self.store.damaged)
                 continue
@@ -342,6 +341,10 @@ class Jobs:
                 log.warning("the database does not answer: %s", error)
             except Exception:  # whatever it is, aborts from other hosts must go on being heard
                 log.exception("watching the jobs")
+
+    def unwatched_s(self) -> float:
+        """For how long nobody has heard of jobs to stop, s of wall time."""
+        return self._machine.monotonic() - self._watched
 
     def _hold_name(self) -> None:
         """Keeps the lock on our host name. Nothing else in this thread waits for anything: another service waits only

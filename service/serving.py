@@ -39,6 +39,7 @@ from service.security.limits import RequestLimits
 from service.signals import Signals
 from service.store.database import BadDatabase
 from service.store.store import LOCAL, Store
+from service.watchdog import Watchdog, interval_s
 from service.work import Tune, rehearse
 from service.work import tune as live
 
@@ -60,6 +61,9 @@ class _Server(uvicorn.Server):
             host, port = sockets[0].getsockname()[:2]
             print(f"ready http://{f'[{host}]' if ':' in host else host}:{port}", flush=True)
             tell_systemd("READY=1")
+            if (every_s := interval_s()) is not None:
+                watchdog = Watchdog(self._jobs.unwatched_s, self._jobs.store.ping, tell_systemd)
+                self._watchdog = asyncio.create_task(watchdog.run(every_s))
 
 
 def tell_systemd(state: str) -> None:

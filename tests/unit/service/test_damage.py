@@ -14,7 +14,9 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import event, text
+from typer.testing import CliRunner
 
+from service import cli
 from service.api import operations
 from service.api.app import create_app
 from service.engine import durable
@@ -104,7 +106,7 @@ def filled(folder: Path) -> list[str]:
     """Twenty jobs with samples."""
     store, ids = Store(folder), []
     for n in range(20):
-        row = store.create(f"L{n}", {}, "me", False)
+        row = store.create(f"L{n}", {"text": "x" * 1000}, "me", False)
         store.add_samples(row.id, "relay", [Sample(0.1 * k, 50.0, 50.0, 40.0 + k, 2) for k in range(1000)])
         ids.append(row.id)
     store.close()
@@ -265,3 +267,71 @@ def test_a_disk_that_takes_nothing_for_a_while(service: Service, client: TestCli
     assert sum(len(block) for _, block in service.store.samples(job_id)) == 20
     until(lambda: database(client)["ready"])
     assert client.post("/loops/FIC-2/retune", json={}).status_code == 202
+
+
+# loopwright check-data
+
+
+def run(*arguments: object) -> Any:
+    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+
+
+def test_data_that_are_whole(tmp_path: Path) -> None:
+    filled(tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    done = run("check-data", "--data", tmp_path)
+    assert done.exit_code == 0 and "whole; rows that can be read: " in done.stdout and "jobs 20," in done.stdout
+    after = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.name != "lock"}
+    assert after == {name: content for name, content in before.items() if name != "lock"}
+    store = Store(tmp_path)  # a service that runs is looked at, too
+    assert run("check-data", "--data", tmp_path).exit_code == 0
+    refused = run("check-data", "--data", tmp_path, "--salvage", tmp_path / "s")
+    assert refused.exit_code == 2 and "stop it" in refused.stderr
+    store.close()
+    assert "not a data folder" in run("check-data", "--data", tmp_path / "nothing").stderr
+
+
+def pages_of(folder: Path, table: str) -> list[int]:
+    """The numbers of the pages that hold its rows."""
+    with closing(sqlite3.connect(folder / FILE)) as connection:
+        try:
+            wanted = "SELECT pageno FROM dbstat WHERE name = ? AND pagetype IN ('leaf', 'overflow') ORDER BY path"
+            return [row[0] for row in connection.execute(wanted, (table,))]
+        except sqlite3.OperationalError:
+            pytest.skip("this SQLite does not say where its tables are")
+
+
+@pytest.mark.parametrize("table", ["events", "jobs", "sample_chunks"])
+def test_what_can_be_read_of_a_damaged_file_is_copied_and_taken(tmp_path: Path, table: str) -> None:
+    data = tmp_path / "data"
+    ids = filled(data)
+    pages = pages_of(data, table)
+    overwrite(data / FILE, (pages[len(pages) // 2] - 1) * PAGE, PAGE)
+    told = run("check-data", "--data", data)
+    assert told.exit_code == 3 and "damaged" in told.stdout and "--salvage FILE" in told.stdout
+    made = run("check-data", "--data", data, "--salvage", tmp_path / "s.sqlite")
+    assert made.exit_code == 3 and "take it with: loopwright restore" in made.stdout
+    assert run("restore", tmp_path / "s.sqlite", "--data", data, "--replace").exit_code == 0
+    store = Store(data)
+    jobs = [row.id for row in store.recent()]
+    assert set(jobs) <= set(ids) and (len(jobs) == 20 or (table == "jobs" and jobs))
+    assert any(store.events(job_id) for job_id in jobs)
+    store.create("NEW", {}, "me", False)
+    store.close()
+
+
+def test_what_a_damaged_log_still_has_is_copied(tmp_path: Path) -> None:
+    store = Store(tmp_path / "live")
+    for n in range(20):
+        store.create(f"L{n}", {}, "me", False)
+    shutil.copytree(tmp_path / "live", tmp_path / "killed")
+    store.close()
+    wal = tmp_path / "killed" / f"{FILE}-wal"
+    overwrite(wal, wal.stat().st_size * 2 // 3)
+    before = wal.read_bytes()
+    told = run("check-data", "--data", tmp_path / "killed", "--salvage", tmp_path / "s")
+    assert told.exit_code == 3 and "later transactions cannot be read" in told.stdout and wal.read_bytes() == before
+    assert run("restore", tmp_path / "s", "--data", tmp_path / "killed", "--replace").exit_code == 0
+    store = Store(tmp_path / "killed")
+    assert 0 < len(store.recent()) < 20
+    store.close()
