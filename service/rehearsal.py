@@ -178,8 +178,8 @@ class PlantFile(BaseModel):
     @model_validator(mode="after")
     def _plausible(self) -> PlantFile:
         numbers = _numbers(self.model_dump(exclude={"seed"}))
-        # the coefficients last: they may have been made of the others
-        for name, value in sorted(numbers, key=lambda each: each[0].startswith(("num", "den"))):
+        # the plant itself last: it may have been made of the others
+        for name, value in sorted(numbers, key=lambda each: each[0].startswith(("num", "den", "dead_time"))):
             if value and not SMALLEST <= abs(value) <= LARGEST:
                 raise ValueError(f"{name} is {value:g}: its size must be 0, or {SMALLEST:g} to {LARGEST:g}")
         return self
