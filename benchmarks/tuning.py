@@ -190,7 +190,9 @@ def _run(plant: Plant, case: Case, seed: int) -> tuple[RunResult[FastProposal], 
     deviation = span * max(0.5, 12.0 * case.noise)
     loop, facts = loop_of(plant, case.amplitude, deviation, case.noise * span, seed, case)
     wish = case.wish(plant)
-    options = FastOptions(wish.Ms, wish.derivative, wish.Mt, wish.noise_gain, None if case.adapted else case.amplitude)
+    amplitude = None if case.adapted else case.amplitude
+    # what is judged is the design, whatever it is worth beside the gains that the loop has to begin with
+    options = FastOptions(wish.Ms, wish.derivative, wish.Mt, wish.noise_gain, amplitude, propose_anyway=True)
     result = run(fast(facts, options), loop, watch=Watch(max_time_s=100.0 * plant.Pu), on_event=loop.hear)
     passed = sum(value for stage, value in result.plant_time_s.items() if stage not in (PREFLIGHT, SETTLE))
     return result, passed / plant.Pu, loop

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
+from numpy.linalg import LinAlgError
+
 from service.config import LoopConfig
 from service.found_model import FoundModel
 from service.loop import LoopState
@@ -13,11 +15,14 @@ from service.request import RetuneRequest
 from tuning.gains import Gains
 from tuning.margins import margins
 from tuning.models import FOPDT
+from tuning.reasons import Ended
 
 TAMEST_Ms = 2.5
 """Of the present gains on a plant that is guessed: they work, so that a plant on which they would not is no guess."""
-LOWER = 0.7
-MOST_LOWERED = 100
+LOWER, MOST_LOWERED = 0.5, 20
+"""The gain of a guess is lowered by so much, so often at most."""
+MOST_SAMPLES = 20_000
+"""In T95: of more, a rehearsal takes long, and shows nothing else."""
 
 
 class PlantSource(StrEnum):
@@ -97,8 +102,9 @@ def rehearsal_spec(config: LoopConfig, request: RetuneRequest, ground: Ground) -
     }
     if state is not None:
         low, high = max(low, state.mv_low), min(high, state.mv_high)
-        spec |= {"gains": _fields(state.gains), "sample_time_s": state.sample_time_s}
-        spec |= {"reverse_acting": state.reverse_acting}
+        spec |= {"gains": _fields(state.gains), "reverse_acting": state.reverse_acting}
+        if config.t95_s / MOST_SAMPLES <= state.sample_time_s:
+            spec["sample_time_s"] = state.sample_time_s
     middle = 0.5 * (low + high)
     spec["mv_limits"] = [low - middle, high - middle]
 
@@ -131,16 +137,19 @@ def rehearsal_spec(config: LoopConfig, request: RetuneRequest, ground: Ground) -
         gains_source=ground.gains_source,
         gains_job=ground.state_job,
         plant_text=text,
-        gains_text=_gains_text(ground),
+        gains_text=_gains_text(ground, spec.get("sample_time_s")),
     )
     return spec, on
 
 
-def _gains_text(ground: Ground) -> str:
+def _gains_text(ground: Ground, sample_time_s: float | None) -> str:
+    slower = ""
+    if ground.state is not None and sample_time_s is None:
+        slower = f"; its sample time, {ground.state.sample_time_s:g} s, is too short beside T95, a longer one is taken"
     if ground.gains_source is GainsSource.CONTROLLER:
-        return "gains, sample time, limits and action as the controller has them"
+        return "gains, sample time, limits and action as the controller has them" + slower
     known = f"as job {ground.state_job} had found them" if ground.state_job else "assumed"
-    return f"gains, sample time and action {known}: the controller did not answer ({ground.silence})"
+    return f"gains, sample time and action {known}: the controller did not answer ({ground.silence}){slower}"
 
 
 def _guess(config: LoopConfig, state: LoopState | None) -> tuple[FOPDT, bool]:
@@ -154,14 +163,17 @@ def _guess(config: LoopConfig, state: LoopState | None) -> tuple[FOPDT, bool]:
     plant = FOPDT(gain, (config.t95_s - dead_time) / 3.0, dead_time)
     if state is None:
         return plant, False
-    lowered = 0
-    while lowered < MOST_LOWERED and not _works(plant, state.gains):
-        plant, lowered = replace(plant, K=LOWER * plant.K), lowered + 1
-    return (plant if state.reverse_acting else replace(plant, K=-plant.K)), lowered > 0
+    steps = (n for n in range(MOST_LOWERED) if _works(replace(plant, K=LOWER**n * plant.K), state.gains))
+    lowered = next(steps, 0)  # of gains that work on none the rehearsal says what is wrong with them
+    K = LOWER**lowered * plant.K
+    return replace(plant, K=K if state.reverse_acting else -K), lowered > 0
 
 
 def _works(plant: FOPDT, gains: Gains) -> bool:
-    found = margins(plant, gains)
+    try:
+        found = margins(plant, gains)
+    except (Ended, ArithmeticError, LinAlgError):
+        return False
     return found.stable and found.Ms <= TAMEST_Ms
 
 

@@ -6,7 +6,7 @@ This is the one module of the service that knows plantsim and controller, and on
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -40,7 +40,9 @@ from tuning.plan import (
 from tuning.reasons import Ended, Failed, NoGain, Reason, Refused
 
 MOST_SAMPLES = 200_000
-"""In T95: of more, a rehearsal takes minutes."""
+"""In T95, and in the dead time: of more, a rehearsal takes minutes."""
+SMALLEST, LARGEST = 1e-15, 1e15
+"""Of any number of a plant, by size: with others what is computed from it leaves the floating point numbers."""
 
 
 class RehearsedLoop:
@@ -173,6 +175,27 @@ class PlantFile(BaseModel):
             raise ValueError(f"mv_limits must be [low < 0, high > 0] around the operating point, not {self.mv_limits}")
         return self
 
+    @model_validator(mode="after")
+    def _plausible(self) -> PlantFile:
+        numbers = _numbers(self.model_dump(exclude={"seed"}))
+        # the plant itself last: it may have been made of the others
+        for name, value in sorted(numbers, key=lambda each: each[0].startswith(("num", "den", "dead_time"))):
+            if value and not SMALLEST <= abs(value) <= LARGEST:
+                raise ValueError(f"{name} is {value:g}: its size must be 0, or {SMALLEST:g} to {LARGEST:g}")
+        return self
+
+
+def _numbers(value: object, name: str = "") -> Iterator[tuple[str, float]]:
+    """Every number of a plant with its name."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _numbers(item, f"{name}.{key}" if name else key)
+    elif isinstance(value, list | tuple):
+        for n, item in enumerate(value):
+            yield from _numbers(item, f"{name}[{n}]")
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield name, float(value)
+
 
 def _nice(x: float) -> float:
     """The largest 1, 2 or 5 times a power of ten that is not above x."""
@@ -198,6 +221,12 @@ def _complete(file: PlantFile) -> PlantFile:
         raise Refused(
             Reason.BAD_INPUT,
             f"sample_time_s {ts:g} is {t95 / ts:.3g} times in T95 ({t95:.4g} s); at most {MOST_SAMPLES:,} are allowed",
+        )
+    if file.dead_time_s / ts > MOST_SAMPLES:
+        raise Refused(
+            Reason.BAD_INPUT,
+            f"dead_time_s {file.dead_time_s:g} is {file.dead_time_s / ts:.3g} sample times of {ts:g} s; at most "
+            f"{MOST_SAMPLES:,} are allowed",
         )
     gains = file.gains or PresentGains(Kp=0.3 / abs(gain) if math.isfinite(gain) else 0.1, Ti=t95 / 3)
     return file.model_copy(update={"sample_time_s": ts, "t95_s": t95, "sp_deviation": step, "gains": gains})
@@ -260,11 +289,17 @@ def rehearse(
             entered = Options(method=method, model=_entered(model), **options)
             outcome = run(five_stage(facts, entered), loop, watch=watch, on_event=listen, on_samples=hear)
     except ValidationError as error:
-        lines = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'file'}: {e['msg']}" for e in error.errors())
+        lines = "; ".join(map(_line, error.errors()))
         return _answer(None, RunResult(ended=Refused(Reason.BAD_INPUT, lines)), results)
     except Ended as ended:
         return _answer(None, RunResult(ended=ended), results)
     return _answer(file, outcome, results, anyway=bool(options.get("propose_anyway")))
+
+
+def _line(error: Any) -> str:
+    where = ".".join(map(str, error["loc"]))
+    words = str(error["msg"]).removeprefix("Value error, ")
+    return f"{where}: {words}" if where else words
 
 
 def _entered(model: Model | None) -> FOPDT | SOPDT | None:

@@ -51,6 +51,10 @@ class _Server(uvicorn.Server):
     """Says when it is ready. Signals are not its own: it would raise each of them again after its shutdown, and take a
     second SIGINT for leave to break off."""
 
+    def __init__(self, config: uvicorn.Config, jobs: Jobs) -> None:
+        super().__init__(config)
+        self._jobs = jobs
+
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         yield
@@ -179,7 +183,8 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         stack.callback(jobs.stop)
         retention = stack.enter_context(closing(Retention(store, engine, setup.keep)))
         checks = {**operations.checks(jobs), "samples": retention.note}
-        server = _Server(server_config(create_app(jobs, policy, checks, pool), setup, listener, descriptors))
+        app = create_app(jobs, policy, checks, pool)
+        server = _Server(server_config(app, setup, listener, descriptors), jobs)
 
         def end() -> None:
             """Open event streams end with their jobs: the server, which waits for its connections, waits for them."""

@@ -1,4 +1,4 @@
-"""Loops that are tuned as well as asked already: the job ends as no_gain with its figures, and tries nothing."""
+"""Loops that are tuned as well as asked already: jobs end as no_gain with their figures, and try nothing on them."""
 
 from __future__ import annotations
 

@@ -36,8 +36,8 @@ _NAMES = {
     PLANT_NODE: {entry.index: entry for entry in objects_of(Device.PLANT)},
 }
 _IDS = channel_ids(1, PLANT_NODE, CONTROLLER_NODE)
-ENDINGS = ("proposed", "accepted", "rolled_back", "refused", "aborted", "failed", "interrupted", "queued", "running",
-           "no job")  # fmt: skip
+ENDINGS = ("proposed", "no_gain", "accepted", "rolled_back", "refused", "aborted", "failed", "interrupted", "queued",
+           "running", "no job")  # fmt: skip
 
 
 def in_words(at: float, who: str, what: Any) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ from typer.testing import CliRunner, Result
 from service import cli
 from tests.unit.service.fakes import TAG, FakeLoop, Service
 from tuning.plan import Mode
+from tuning.reasons import NoGain, Reason, Refused
 
 PLANT = {"num": [1.0], "den": [8.0, 6.0, 1.0], "dead_time_s": 1.0, "noise_std": 0.002, "sample_time_s": 0.1}
 
@@ -33,6 +36,12 @@ class Through:
         self.posted.append(body or {})
         self.paths.append(path)
         return self._checked(self._client.post(path, json=body or {}))
+
+    def events(self, path: str) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Ends with the job, as the stream does."""
+        while self.get(path)["state"] in ("queued", "running"):
+            time.sleep(0.005)
+        yield from ()
 
     @staticmethod
     def _checked(answer: Any) -> Any:
@@ -73,6 +82,27 @@ def test_the_options_of_fast_are_asked_for(service: Service, through: Through) -
     job = json.loads(result.stdout)
     service.wait(job["id"])
     assert job["method"] == "fast" and job["request"]["ms"] == 1.4
+
+
+def test_a_proposal_all_the_same_is_asked_for(service: Service, through: Through) -> None:
+    result = run("retune", TAG, "--propose-anyway", "--no-wait", "--json", "--yes")
+    assert through.posted == [{"propose_anyway": True, "requested_by": "cli"}]
+    service.wait(json.loads(result.stdout)["id"])
+
+
+def test_a_dry_run_does_not_call_itself_a_proposal(service: Service, through: Through) -> None:
+    result = run("retune", TAG, "--dry-run")
+    assert result.exit_code == 0, result.output
+    assert "rehearsed, nothing was tested" in result.output and "proposed" not in result.output
+
+
+def test_no_gain_is_a_good_end(service: Service, through: Through) -> None:
+    service.tune.ends = NoGain(Reason.NO_GAIN, "Nothing asked for gets better by more than 5 %")
+    result = run("retune", TAG, "--yes")
+    assert result.exit_code == 0, result.output
+    assert "no_gain: tuned as well as asked already" in " ".join(result.output.split())
+    service.tune.ends = Refused(Reason.NOT_AT_REST, "drifts")
+    assert run("retune", TAG, "--yes").exit_code == 3
 
 
 def test_five_stage_is_asked_for_by_its_name(service: Service, through: Through) -> None:

@@ -16,7 +16,7 @@ from service.ground import GainsSource, Ground, LastModel, PlantSource, rehearsa
 from service.metrics import exposition, registry
 from service.request import PlantModel, RetuneRequest, TransferModel
 from service.states import JobState
-from service.work import rehearse
+from service.work import Hooks, rehearse
 from tests.unit.service.fakes import NEW, OLD, RESULT, TAG, FakeLoop, Service
 from tuning.gains import Gains
 from tuning.margins import margins
@@ -169,6 +169,33 @@ def test_a_refused_rehearsal_says_what_it_was_on(service: Service) -> None:
     assert (view.state, view.reason) == (JobState.REFUSED, "wrong_sign"), view.detail
     assert view.rehearsed_on is not None and view.rehearsed_on.plant_source == "given"
     assert show.title(view.model_dump(mode="json")).endswith("refused on the plant given, nothing was tested")
+
+
+@pytest.mark.parametrize(
+    ("changes", "options", "words"),
+    [
+        ({"t95_s": 1e-300}, {}, "t95_s is 1e-300"),
+        ({"t95_s": 1e300}, {}, "t95_s is 1e+300"),
+        ({}, {"plant": {"num": [1.0], "den": [1e-300, 1e300, 1.0]}}, "den[0] is 1e-300"),
+        ({}, {"plant": {"num": [1.0], "den": [1.0, 1e-308]}}, "den[1] is 1e-308"),
+        ({}, {"plant": {"num": [1.0], "den": [1.0, 1.0], "dead_time_s": 1e300}}, "dead_time_s is 1e+300"),
+        ({}, {"plant": {"num": [1.0], "den": [1.0, 1.0], "dead_time_s": 4e6, "sample_time_s": 0.1}}, "4e+07 sample"),
+        ({}, {"model": {"K": 1e308, "T_s": 1.0, "L_s": 1.0}}, "num[0] is 1e+308"),
+    ],
+)
+def test_an_extreme_one_is_refused_by_name(
+    service: Service, changes: dict[str, Any], options: dict[str, Any], words: str
+) -> None:
+    config = service.loops[TAG].model_copy(update=changes)
+    quiet = Hooks(lambda event: None, lambda samples: None, lambda: None)
+    ended = rehearse(config, RetuneRequest(dry_run=True, **options), quiet).ended
+    assert ended is not None and ended.reason is Reason.BAD_INPUT and words in ended.detail, ended
+
+
+def test_a_sample_time_too_short_for_a_rehearsal_is_replaced_and_that_is_said(service: Service) -> None:
+    config = service.loops[TAG].model_copy(update={"t95_s": 30_000.0})
+    spec, on = rehearsal_spec(config, RetuneRequest(dry_run=True), ground_with(service))
+    assert "sample_time_s" not in spec and "its sample time, 0.1 s, is too short beside T95" in on.gains_text
 
 
 def test_dry_runs_of_earlier_versions_are_shown_as_rehearsed(service: Service, client: TestClient) -> None:

@@ -254,7 +254,7 @@ class JobsMachine(RuleBasedStateMachine):
         job.state, job.begun = "running", True
 
     @precondition(lambda self: any(job.begun for job in self.jobs))
-    @rule(which=st.integers(0, 9), how=st.sampled_from(sorted(ENDS)))
+    @rule(which=st.integers(0, 9), how=st.sampled_from((*sorted(ENDS), "proposed")))
     def end(self, which: int, how: str) -> None:
         self.ended(next(job for job in (*self.jobs[which:], *self.jobs) if job.begun), how)
 
@@ -410,7 +410,7 @@ class JobsMachine(RuleBasedStateMachine):
         for job in self.jobs:
             row = rows[job.id]
             assert (row.ended_at is None) == job.active
-            assert row.reason is None or row.state in ("refused", "failed", "aborted", "interrupted")
+            assert row.reason is None or row.state in ("refused", "failed", "aborted", "interrupted", "no_gain")
         assert self.store.busy() == {job.loop: job.id for job in self.jobs if job.active and not job.dry}
 
     @invariant()
