@@ -6,6 +6,7 @@ controller's feedback may take MV farther; the limits of the test hold there too
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from service.config import LoopConfig
@@ -20,6 +21,8 @@ from tuning.stages.zn_pi import KICK_OF_ROOM
 
 _COMPUTING = ("design", "redesign", "estimate", "optimise")
 _STEPPING = ("baseline", "ultimate", "zn_pi", "verify")
+_UNDER_PRESENT_GAINS, _UNDER_NEW_GAINS = 2.0, 1.4
+"""Of a set-point step: as far as PV goes in a loop that is just stable, and as `verification` lets it go."""
 _HAIR = 1e-6
 """Of a set-point: what a REAL32 on the bus cannot tell."""
 
@@ -28,7 +31,8 @@ _HAIR = 1e-6
 class Moves:
     """What a stage moves. mv_down, mv_up: how far MV is moved away from where it is, percent, both positive.
 
-    sp_up: largest step of the set-point, PV units.  first_mv: what the relay begins with, percent, None without one.
+    sp_up: largest step of the set-point, PV units.  pv: how far PV is expected to go from the set-point as it is now,
+    PV units, None where nobody can tell.  first_mv: what the relay begins with, percent, None without one.
     """
 
     stage: str
@@ -36,6 +40,7 @@ class Moves:
     mv_down: float = 0.0
     mv_up: float = 0.0
     sp_up: float = 0.0
+    pv: float | None = 0.0
     first_mv: float | None = None
 
 
@@ -68,7 +73,8 @@ def broken_limits(config: LoopConfig, request: RetuneRequest, sp: float) -> list
             f"the set-point is stepped from {sp:.6g} by up to {step:g} {unit} (sp_deviation),{overshoot} which takes "
             f"PV to {sp + share * step:.6g}, above the PV limit {high:g}: {_remedy((high - sp) / share, unit)}"
         )
-    if request.fast and "relay" in stages and sp - step < low - hair:
+    adapted = request.fast and request.amplitude_pct is None
+    if adapted and "relay" in stages and sp - step < low - hair:
         broken.append(
             f"the relay may move PV from {sp:.6g} by up to {step:g} {unit} (sp_deviation), which takes it to "
             f"{sp - step:.6g}, below the PV limit {low:g}: {_remedy(sp - low, unit)}"
@@ -82,12 +88,24 @@ def _remedy(most: float, unit: str) -> str:
     return f"ask for an sp_deviation of at most {most:.4g} {unit}, or permit more PV"
 
 
-def moves(config: LoopConfig, request: RetuneRequest, gains: Gains | None, mv: float | None) -> list[Moves]:
+@dataclass(frozen=True, slots=True)
+class Before:
+    """What is known of the loop before the test; what is not is None.
+
+    gains: in effect.  mv: now, percent.  Ku: ultimate gain of the last model, percent per PV unit.
+    """
+
+    gains: Gains | None = None
+    mv: float | None = None
+    Ku: float | None = None
+
+
+def moves(config: LoopConfig, request: RetuneRequest, before: Before) -> list[Moves]:
     """Each stage's, in their order. config: with the limits of the job, MV limits those that hold.
 
-    gains, mv: of the loop now; without them the figures are the largest that the limits leave room for.
+    Where the present gains or MV are not known, the figures are the largest that the limits leave room for.
     """
-    one = _fast if request.fast else _five_stage
+    one = _five_stage if not request.fast else _trial if request.start == "design" else _fast
     found = []
     for stage in stages_asked(request):
         if stage == "preflight":
@@ -95,61 +113,72 @@ def moves(config: LoopConfig, request: RetuneRequest, gains: Gains | None, mv: f
         elif stage in _COMPUTING:
             found.append(Moves(stage, "Nothing is moved by the test: the record is computed on."))
         else:
-            found.append(one(stage, config, request, gains, mv))
+            found.append(one(stage, config, request, before))
     return found
 
 
-def _fast(stage: str, config: LoopConfig, request: RetuneRequest, gains: Gains | None, mv: float | None) -> Moves:
-    limits, step, unit = config.mv_limits, config.sp_deviation, config.pv_unit
-    width = limits.high - limits.low
-    if stage == "relay" or request.start != "design":
-        most = width / (1.0 + BIAS) if mv is None else max(0.0, most_amplitude(mv, limits.low, limits.high))
-        given = request.amplitude_pct
-        first = given or FIRST * most
-        up = min(MOST_RAISED * given, most) if given else most
-    if stage == "relay":
-        size = "Its size stays"
-        if given is None:
-            size = f"Its size is adapted until PV clearly moves, by no more than {WIDEST_SPAN * step:g} {unit} in all"
+def _fast(stage: str, config: LoopConfig, request: RetuneRequest, before: Before) -> Moves:
+    low, high, step, unit = config.mv_limits.low, config.mv_limits.high, config.sp_deviation, config.pv_unit
+    most = (high - low) / (1.0 + BIAS) if before.mv is None else max(0.0, most_amplitude(before.mv, low, high))
+    given = request.amplitude_pct
+    first = given or FIRST * most
+    up = min(MOST_RAISED * given, most) if given else most
+    if stage != "relay":
         what = (
-            f"A relay in the controller moves MV by +{first:.4g} and -{BIAS * first:.4g} % at first. {size}; a side on "
-            "which PV stalls is raised, up to twice."
+            f"The set-point is stepped up by up to {step:g} {unit} under the new gains, on trial; it is stepped back "
+            "where the record leaves doubt."
         )
-        return Moves(stage, what, mv_down=BIAS * up, mv_up=up, first_mv=first)
-    what = f"The set-point is stepped up by up to {step:g} {unit} under the new gains, on trial"
-    if request.start == "design":
-        room = _room(limits.low, limits.high, mv)
-        return Moves(stage, what + ", and back.", KICK_OF_ROOM * room, KICK_OF_ROOM * room, step)
-    more = "; it is stepped back where the record leaves doubt."
-    return Moves(stage, what + more, up, up, step)
+        return Moves(stage, what, up, up, step, _UNDER_NEW_GAINS * step)
+    size, pv = "Its size stays", _swing(0.5 * (1.0 + BIAS) * (given or most), before.Ku)
+    if given is None:
+        size = f"Its size is adapted until PV clearly moves, by no more than {WIDEST_SPAN * step:g} {unit} in all"
+        pv = min(0.5 * WIDEST_SPAN * step, pv or math.inf)
+    what = (
+        f"A relay in the controller moves MV by +{first:.4g} and -{BIAS * first:.4g} % at first. {size}; a side on "
+        "which PV stalls is raised, up to twice."
+    )
+    return Moves(stage, what, BIAS * up, up, pv=pv, first_mv=first)
 
 
-def _five_stage(stage: str, config: LoopConfig, request: RetuneRequest, gains: Gains | None, mv: float | None) -> Moves:
-    room = _room(config.mv_limits.low, config.mv_limits.high, mv)
-    step, unit, kick = config.sp_deviation, config.pv_unit, KICK_OF_ROOM * room
+def _trial(stage: str, config: LoopConfig, request: RetuneRequest, before: Before) -> Moves:
+    kick, step = KICK_OF_ROOM * _room(config, before.mv), config.sp_deviation
+    what = f"The set-point is stepped up by up to {step:g} {config.pv_unit} under the new gains, on trial, and back."
+    return Moves(stage, what, kick, kick, step, _UNDER_NEW_GAINS * step)
+
+
+def _five_stage(stage: str, config: LoopConfig, request: RetuneRequest, before: Before) -> Moves:
+    room, step, unit, gains = _room(config, before.mv), config.sp_deviation, config.pv_unit, before.gains
+    kick = KICK_OF_ROOM * room
     if stage == "relay":
         what = f"A relay in the controller moves MV by +-{room:.4g} %, all the room there is, until PV swings evenly."
-        return Moves(stage, what, room, room, first_mv=room)
+        return Moves(stage, what, room, room, pv=_swing(room, before.Ku), first_mv=room)
     if stage == "ultimate":
         what = (
             f"Set-point steps of up to {step:g} {unit} under a P controller, two to five runs, until PV swings by "
             "itself; a run ends where MV comes to the end of its room. In between MV is held by hand."
         )
-        return Moves(stage, what, RUN_MV_LIMIT * room, RUN_MV_LIMIT * room, step)
+        run = RUN_MV_LIMIT * room
+        return Moves(stage, what, run, run, step, _UNDER_PRESENT_GAINS * step)
     if stage == "zn_pi":
         low, high = request.overshoot_window_pct
         what = (
             f"Set-point steps of up to {step:g} {unit} under a Ziegler-Nichols PI, until PV overshoots by {low:g} to "
             f"{high:g} %."
         )
-        return Moves(stage, what, kick, kick, step)
+        return Moves(stage, what, kick, kick, step, (1.0 + high / 100.0) * step)
     if gains is not None and gains.Kp > 0.0:
         step = min(step, kick / gains.Kp)  # `allowed_step` of the old gains bounds both of these
-    which = "present" if stage == "baseline" else "new"
+    which, farthest = ("present", _UNDER_PRESENT_GAINS) if stage == "baseline" else ("new", _UNDER_NEW_GAINS)
     what = f"The set-point is stepped up by up to {step:.4g} {unit} under the {which} gains, and back."
-    return Moves(stage, what, kick, kick, step)
+    return Moves(stage, what, kick, kick, step, farthest * step)
 
 
-def _room(low: float, high: float, mv: float | None) -> float:
+def _swing(amplitude: float, Ku: float | None) -> float | None:
+    """Of PV to each side under a relay, by its describing function, PV units."""
+    return 4.0 * amplitude / (math.pi * Ku) if Ku else None
+
+
+def _room(config: LoopConfig, mv: float | None) -> float:
     """On the nearer side of MV, percent."""
+    low, high = config.mv_limits.low, config.mv_limits.high
     return 0.5 * (high - low) if mv is None else max(0.0, min(high - mv, mv - low))

@@ -12,8 +12,8 @@ from pydantic import BaseModel, Field
 from service.config import Limits, LoopConfig
 from service.durations import Span, durations
 from service.loop import LoopState
-from service.moves import Moves, moves
-from service.obstacles import Now, Obstacle, obstacles
+from service.moves import Before, Moves, moves
+from service.obstacles import Now, Obstacle, Occupied, obstacles
 from service.request import RetuneRequest, narrow
 from service.work import time_budget_s
 from tuning.gains import Gains
@@ -67,6 +67,10 @@ class StagePreview(BaseModel):
     sp_low: float | None = Field(description="Set-point at least, PV units", examples=[50.0])
     sp_high: float | None = Field(description="Set-point at most, PV units", examples=[52.0])
     sp_move: float = Field(description="The largest step of the set-point, PV units", examples=[2.0])
+    pv_move: float | None = Field(
+        description="How far PV is expected to go from the present set-point, PV units; null: not known before",
+        examples=[2.8],
+    )
     duration_low_s: float = Field(description="Expected at least, plant time, s", examples=[7.0])
     duration_high_s: float = Field(description="Expected at most, plant time, s", examples=[30.0])
 
@@ -110,6 +114,10 @@ class Preview(BaseModel):
     )
     largest_mv_move_pct: float = Field(description="Of any stage, percent", examples=[50.0])
     largest_sp_move: float = Field(description="Of any stage, PV units", examples=[2.0])
+    largest_pv_move: float | None = Field(
+        description="How far PV is expected to go from the present set-point, PV units; null: not known before",
+        examples=[2.8],
+    )
     duration_low_s: float = Field(description="Of all stages, plant time, s", examples=[40.0])
     duration_high_s: float = Field(description="Of all stages, plant time, s", examples=[160.0])
     duration_basis: str = Field(description="What the estimate is made from")
@@ -127,8 +135,9 @@ def preview(config: LoopConfig, request: RetuneRequest, now: Now, last: LastMode
     limited = narrowed.model_copy(update={"mv_limits": permitted})
     pu_s = request.Pu_s or (last.Pu_s if last else None)
     times = durations(request, config.t95_s, state.sample_time_s if state else None, pu_s)
-    gains, mv, sp = (state.gains, _finite(state.mv), _finite(state.sp)) if state else (None, None, None)
-    moved = [] if request.dry_run else moves(limited, request, gains, mv)
+    mv, sp = (_finite(state.mv), _finite(state.sp)) if state else (None, None)
+    before = Before(state.gains if state else None, mv, request.Ku or (last.Ku if last else None))
+    moved = [] if request.dry_run else moves(limited, request, before)
     stages = [_stage(each, times[each.stage], permitted, mv, sp) for each in moved]
     in_the_way = obstacles(config, request, now)
     found = Preview(
@@ -145,6 +154,7 @@ def preview(config: LoopConfig, request: RetuneRequest, now: Now, last: LastMode
         first_mv_move_pct=next((_told(each.first_mv) for each in moved if each.first_mv is not None), None),
         largest_mv_move_pct=max((each.mv_move_pct for each in stages), default=0.0),
         largest_sp_move=max((each.sp_move for each in stages), default=0.0),
+        largest_pv_move=_largest_pv(stages),
         duration_low_s=_told(sum(each.duration_low_s for each in stages)),
         duration_high_s=_told(sum(each.duration_high_s for each in stages)),
         duration_basis=_basis(request, config, last),
@@ -177,13 +187,19 @@ def _stage(each: Moves, time: Span, mv_limits: Limits, mv: float | None, sp: flo
         sp_low=sp if moves_sp else None,
         sp_high=_told(sp + each.sp_up) if sp is not None and moves_sp else None,
         sp_move=_told(each.sp_up),
+        pv_move=None if each.pv is None else _told(each.pv),
         duration_low_s=_told(low),
         duration_high_s=_told(high),
     )
 
 
+def _largest_pv(stages: Sequence[StagePreview]) -> float | None:
+    known = [each.pv_move for each in stages if each.pv_move is not None]
+    return max(known, default=0.0) if len(known) == len(stages) else None
+
+
 def _obstacle(found: Obstacle, now: Now) -> ObstacleView:
-    job = f"/jobs/{now.active_job}" if found.reason.value == "busy" else None
+    job = f"/jobs/{now.active_job}" if found.reason is Occupied.BUSY else None
     return ObstacleView(reason=found.reason.value, detail=found.detail, advice=found.advice, job=job)
 
 
@@ -247,12 +263,15 @@ def _summary(found: Preview, unit: str) -> list[str]:
         return [f"A dry run of {found.loop} is computed in memory; nothing on the loop is moved."]
     first = "" if found.first_mv_move_pct is None else f"by {found.first_mv_move_pct:.3g} % at first and "
     limits = f"{found.watched.mv.low:g} .. {found.watched.mv.high:g} %"
+    goes = "How far PV goes under the relay is not known beforehand."
+    if found.largest_pv_move is not None:
+        goes = f"PV is expected to go up to {found.largest_pv_move:.3g} {unit} from the set-point as it is now."
     time, pv = duration_text(found.duration_low_s, found.duration_high_s), found.watched.pv
     lines = [
         f"A retune of {found.loop} by {found.method} moves MV {first}by at most {found.largest_mv_move_pct:.3g} %, "
         f"within {limits}, and the set-point by at most {found.largest_sp_move:.4g} {unit}.",
         f"It takes {time} of plant time; that is estimated from {found.duration_basis}.",
-        f"PV is watched within {pv.low:g} .. {pv.high:g} {unit}: beyond that the test ends.",
+        f"{goes} It is watched within {pv.low:g} .. {pv.high:g} {unit}: beyond that the test ends.",
         f"After an abort, a limit or a failure: {found.on_abort}",
         f"At the end: {found.at_the_end}",
     ]

@@ -46,6 +46,7 @@ class TestMoves:
         assert (stages["verify"].sp_low, stages["verify"].sp_high) == (50.0, 52.0)
         assert stages["preflight"].mv_move_pct == stages["design"].mv_move_pct == 0.0
         assert (found.largest_mv_move_pct, found.largest_sp_move, found.would_start) == (60.0, 2.0, True)
+        assert (relay.pv_move, stages["verify"].pv_move, found.largest_pv_move) == (2.0, 2.8, 2.8)
         assert found.first_mv_move_pct is not None and found.first_mv_move_pct <= 30.0
         assert (found.watched.pv.low, found.watched.pv.high, found.watched.max_time_s) == (0.0, 100.0, 900.0)
 
@@ -67,6 +68,7 @@ class TestMoves:
         assert found.largest_mv_move_pct == 40.0, "the room on the nearer side"
         moved = {each.stage: each.sp_move for each in found.stages}
         assert moved["relay"] == 0.0 and moved["baseline"] == moved["zn_pi"] == 2.0
+        assert found.largest_pv_move is None, "the relay takes all the room, whatever PV does"
         shorter = told(method="simc", start="zn_pi", Ku=2.0, Pu_s=3.0, baseline=False, verify=False)
         assert [each.stage for each in shorter.stages] == ["preflight", "zn_pi", "estimate", "optimise"]
 
@@ -100,6 +102,15 @@ class TestTime:
         assert ratios[1] < ratios[0]
         assert (other.known.Pu_s, other.known.model, other.known.model_job) == (3.32, "fopdt", "/jobs/abc")
         assert one.known.model is None and one.known.t95_s == 9.0
+
+    def test_the_last_model_tells_how_far_pv_goes(self) -> None:
+        """A relay of 40 % on a loop of Ku 200 % per degC: 4 * 40 / (pi * 200)."""
+        loop = LoopConfig.model_validate(loop_entry())
+        result = RESULT | {"ultimate": {"Ku": 200.0, "Pu_s": 3.32}}
+        last = LastModel.of("abc", None, 30.0, result)
+        five, fast = (preview(loop, RetuneRequest(method=m), Now(STATE), last) for m in ("five-stage", "fast"))
+        assert five.stages[2].pv_move == pytest.approx(0.2546, abs=1e-4) and five.largest_pv_move is not None
+        assert fast.stages[1].pv_move == pytest.approx(0.75 * 60.0 * 4.0 / (3.1416 * 200.0), rel=1e-3)
 
     def test_the_stages_last_as_long_as_the_whole(self) -> None:
         for method in ("fast", "five-stage"):
@@ -192,6 +203,7 @@ class TestBrokenLimits:
         config = LoopConfig.model_validate(loop_entry(pv_limits={"low": 49.0, "high": 60.0}))
         (text,) = broken_limits(config, RetuneRequest(), 50.0)
         assert "below the PV limit 49: ask for an sp_deviation of at most 1 degC" in text
+        assert broken_limits(config, RetuneRequest(amplitude_pct=5), 50.0) == [], "its size has nothing to do with it"
         known = RetuneRequest.model_validate({"start": "design", "model": {"K": 1, "T_s": 3, "L_s": 1}})
         assert broken_limits(config, known, 50.0) == [], "a trial only steps the set-point up"
 
