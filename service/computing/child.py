@@ -71,9 +71,10 @@ def _keep_to(cpu_s: float, memory_mb: int, niceness: int) -> None:
     os.setpriority(os.PRIO_PROCESS, 0, max(niceness, os.getpriority(os.PRIO_PROCESS, 0)))
     _lower(resource.RLIMIT_CORE, 0)
     _lower(resource.RLIMIT_CPU, math.ceil(cpu_s))
-    with suppress(OSError):  # not on every system
-        Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_DIE)
+    with suppress(FileNotFoundError):  # without /proc
         _lower(resource.RLIMIT_DATA, _data_bytes() + memory_mb * MB)
+    with suppress(OSError):  # where it may not be written
+        Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_DIE)
 
 
 def _lower(which: int, limit: int) -> None:
