@@ -13,7 +13,6 @@ from dataclasses import dataclass
 class RequestLimits:
     """body_bytes: of one request.  rate_per_s, burst: of one caller (key, or address without one).
     at_once, streams_at_once, computations_at_once: of all callers; a request counts in one of the three.
-    Computations take the processor from the threads that pump the loops.
     bad_keys_per_s, bad_keys_burst: wrong keys from one address."""
 
     body_bytes: int = 1 << 20
