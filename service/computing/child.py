@@ -41,13 +41,10 @@ def compute(
     """The process. reports: `work` is called with a function that takes what it reports on its way."""
     _keep_to(cpu_s, memory_mb, niceness)
     warnings.simplefilter("ignore")  # of overflows and the like: the result says what came of them
-    _Attendant(connection).start()
-
-    def report(value: object) -> None:
-        connection.send((Said.REPORT, value))
-
+    attendant = _Attendant(connection)
+    attendant.start()
     try:
-        value = work(report) if reports else work()
+        value = work(lambda report: attendant.send(Said.REPORT, report)) if reports else work()
         message: tuple[Said, Any] = (Said.RESULT, value)
     except (MemoryError, SystemError):  # SystemError: of the interpreter itself where memory was refused
         message = (Said.NO_MEMORY, None)
@@ -55,11 +52,11 @@ def compute(
         message = (Said.ERROR, error)
     with suppress(BrokenPipeError):
         try:
-            connection.send(message)
+            attendant.send(*message)
         except BrokenPipeError:
             raise
         except Exception as error:  # a result or an error that cannot be pickled
-            connection.send((Said.ERROR, RuntimeError(f"{type(error).__name__}: {error}")))
+            attendant.send(Said.ERROR, RuntimeError(f"{type(error).__name__}: {error}"))
 
 
 def _keep_to(cpu_s: float, memory_mb: int, niceness: int) -> None:
@@ -71,9 +68,10 @@ def _keep_to(cpu_s: float, memory_mb: int, niceness: int) -> None:
     os.setpriority(os.PRIO_PROCESS, 0, max(niceness, os.getpriority(os.PRIO_PROCESS, 0)))
     _lower(resource.RLIMIT_CORE, 0)
     _lower(resource.RLIMIT_CPU, math.ceil(cpu_s))
-    with suppress(OSError):  # not on every system
-        Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_DIE)
+    with suppress(FileNotFoundError):  # without /proc
         _lower(resource.RLIMIT_DATA, _data_bytes() + memory_mb * MB)
+    with suppress(OSError):  # where it may not be written
+        Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_DIE)
 
 
 def _lower(which: int, limit: int) -> None:
@@ -98,7 +96,17 @@ class _Attendant(threading.Thread):
         self._connection = connection
         self._may_run = threading.Event()
         self._may_run.set()
+        self._sending = False
         signal.signal(signal.SIGUSR1, self._hold)
+
+    def send(self, said: Said, value: object) -> None:
+        """In the main thread. It pauses before a message or behind it: who has half of one waits for the rest."""
+        self._sending = True
+        try:
+            self._connection.send((said, value))
+        finally:
+            self._sending = False
+        self._may_run.wait()
 
     def run(self) -> None:
         try:
@@ -112,4 +120,5 @@ class _Attendant(threading.Thread):
             os._exit(0)  # the service is gone, or wants no result any more
 
     def _hold(self, _signal: int, _frame: FrameType | None) -> None:
-        self._may_run.wait()
+        if not self._sending:
+            self._may_run.wait()

@@ -27,8 +27,9 @@ from service.computing.limits import MEMORY_OPTION, OPTIONS, WORDS, ComputingLim
 from tuning.reasons import Failed, Reason
 
 NICE = {Kind.LIVE: 5, Kind.TUNING: 10, Kind.DRY_RUN: 10}
-_LOOK_S = 0.1
-"""Wall time between two looks whether a computation is still wanted."""
+_LOOK_S, _LOOK_WAITING_S = 0.1, 0.5
+"""Wall time between two looks whether a computation is still wanted, one that runs and one that waits for its turn:
+fifty loops may wait at once, and each look takes the interpreter."""
 _TRIES = 2
 _AGAIN_S = 0.2
 _CLOSE_S = 30.0
@@ -105,12 +106,12 @@ class Pool:
         """The result of the work, waited for here; raises what it raises.
 
         hear: the work is called with a function, and what it gives that is given to this one, here.
-        unwanted: asked ten times a second; once true, the computation is ended and NotWanted raised.
+        unwanted: asked some times a second; once true, the computation is ended and NotWanted raised.
         Raises Failed(COMPUTATION_LIMIT | COMPUTATION_LOST), NoProcess.
         """
         with self._place(kind) as place:
             for last in range(1, _TRIES + 1):
-                while not place.turn.wait(_LOOK_S):
+                while not place.turn.wait(_LOOK_WAITING_S):
                     self._check(unwanted)
                 self._check(unwanted)
                 heard = _Heard(hear)
@@ -205,8 +206,11 @@ class Pool:
         self, kind: Kind, work: Callable[..., Any], place: _Place, reports: bool
     ) -> Iterator[tuple[ForkServerProcess, Connection]]:
         """Whatever ends it in here, the process is gone behind it. Raises NoProcess, and what pickling raises."""
-        connection, theirs = multiprocessing.Pipe()
         limits = self.limits.cpu_s(kind), self.limits.memory_mb, NICE[kind]
+        try:
+            connection, theirs = multiprocessing.Pipe()
+        except OSError as error:
+            raise _no_process(kind, error) from error
         with connection:
             with theirs:
                 process = self._context.Process(
@@ -215,8 +219,7 @@ class Pool:
                 try:
                     _start(process)
                 except (OSError, EOFError) as error:
-                    text = f"no process can be made for {WORDS[kind]} ({type(error).__name__}: {error})"
-                    raise NoProcess(Reason.COMPUTATION_LOST, text) from error
+                    raise _no_process(kind, error) from error
             try:
                 with self._changed:
                     place.control = connection
@@ -245,6 +248,11 @@ class _Heard:
         assert self._hear is not None
         self.anything = True
         self._hear(value)
+
+
+def _no_process(kind: Kind, error: Exception) -> NoProcess:
+    text = f"no process can be made for {WORDS[kind]} ({type(error).__name__}: {error})"
+    return NoProcess(Reason.COMPUTATION_LOST, text)
 
 
 def _start(process: ForkServerProcess) -> None:

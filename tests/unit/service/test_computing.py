@@ -134,6 +134,12 @@ class TestLimits:
             pool.run(Kind.TUNING, burn)
         assert over.value.reason is Reason.COMPUTATION_LIMIT and "--tuning-cpu-s" in over.value.detail
 
+    def test_those_of_a_live_loop_end_its_plan_by_name(self) -> None:
+        with closing(Pool(ComputingLimits(live_cpu_s=1), most=1)) as pool:
+            with pytest.raises(Failed, match="--live-cpu-s") as over:
+                done(Work(burn), pool)
+            assert over.value.reason is Reason.COMPUTATION_LIMIT
+
     @pytest.mark.skipif(sys.platform != "linux", reason="the system does not count it")
     def test_memory(self, pool: Pool) -> None:
         assert pool.run(Kind.TUNING, partial(ask_for, 50)) == 50 << 20

@@ -178,7 +178,7 @@ def test_what_costs_too_much_is_refused_by_name(tmp_path: Path, stack: ExitStack
 
 
 FAILING = """
-import socket, sys
+import multiprocessing, socket, sys
 from pathlib import Path
 from service.serving import Setup, serve
 from service.store.lock import FolderInUse
@@ -195,6 +195,7 @@ for _ in range(20):
             print("folder")
         except OSError as error:
             print("port")
+print(multiprocessing.active_children())
 """
 
 
@@ -204,7 +205,7 @@ def test_a_start_that_fails_leaves_nothing_and_says_nothing(tmp_path: Path) -> N
     command = [sys.executable, "-c", FAILING, str(tmp_path / "loops.yaml"), str(tmp_path / "data")]
     ended = subprocess.run(command, text=True, capture_output=True, timeout=250)
     assert (ended.returncode, ended.stderr) == (0, "")
-    assert ended.stdout.split() == ["port", "folder"] * 20
+    assert ended.stdout.split() == [*["port", "folder"] * 20, "[]"]
 
 
 def test_a_port_that_is_taken_is_all_that_is_said(tmp_path: Path) -> None:
