@@ -130,7 +130,8 @@ class FileCheck:
         self.found: list[str] = []
         self._through = threading.Event()
         self._file = file
-        self._connection = sqlite3.connect(file, check_same_thread=False)
+        # Read only: one that may write would bring the log into a damaged file as it is closed.
+        self._connection = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False)
         self._thread = threading.Thread(target=self._run, name="file check", daemon=True)
         self._thread.start()
 

@@ -116,11 +116,13 @@ def filled(folder: Path) -> list[str]:
 def test_a_damaged_page_is_said_at_the_start(tmp_path: Path) -> None:
     filled(tmp_path)
     overwrite(tmp_path / FILE, 2 * PAGE, PAGE)
+    before = (tmp_path / FILE).read_bytes()
     for _ in range(2):
         with pytest.raises(BadDatabase) as refused:
             Store(tmp_path)
         words = str(refused.value)
         assert str(tmp_path / FILE) in words and "loopwright check-data" in words and "loopwright restore" in words
+    assert (tmp_path / FILE).read_bytes() == before
 
 
 def test_a_job_that_a_damaged_log_would_lose_is_not_lost_silently(tmp_path: Path) -> None:

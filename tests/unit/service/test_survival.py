@@ -273,6 +273,8 @@ def test_a_gateway_that_comes_too_late_for_its_name_ends_its_tests(
     assert refused.status_code == 503 and "has taken the name" in refused.json()["detail"]
     job = gateway.http.get(url).json()
     assert job["state"] == "running" and job["attempts"] == 2, "it is the other one's now"
+    gateway.process.stop()
+    assert "Traceback" not in (tmp_path / "one" / "gateway.log").read_text()
 
 
 def another(stack: ExitStack, folder: Path, database: str) -> Process:
