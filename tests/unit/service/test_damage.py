@@ -139,7 +139,8 @@ def test_a_job_that_a_damaged_log_would_lose_is_not_lost_silently(tmp_path: Path
 
 def test_a_check_that_takes_long_goes_on_beside_the_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     filled(tmp_path)
-    overwrite(tmp_path / FILE, 40 * PAGE, PAGE)
+    # Where the start has nothing to read.
+    overwrite(tmp_path / FILE, (pages_of(tmp_path, "sample_chunks")[1] - 1) * PAGE, PAGE)
     monkeypatch.setattr("service.store.damage.FileCheck.wait", lambda *_: False)
     store = Store(tmp_path)
     deadline = time.monotonic() + 30
@@ -147,6 +148,15 @@ def test_a_check_that_takes_long_goes_on_beside_the_service(tmp_path: Path, monk
         time.sleep(0.01)
     assert store.damaged is not None and "check-data" in store.damaged
     store.close()
+
+
+def test_damage_that_the_start_meets_is_said_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The check is not through yet."""
+    filled(tmp_path)
+    overwrite(tmp_path / FILE, (pages_of(tmp_path, "jobs")[1] - 1) * PAGE, PAGE)
+    monkeypatch.setattr("service.store.damage.FileCheck.wait", lambda *_: False)
+    with pytest.raises(BadDatabase, match="check-data"):
+        Store(tmp_path)
 
 
 def test_the_engines_file_is_made_anew(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
