@@ -181,6 +181,8 @@ def test_the_unit_gives_no_more_than_the_service_needs(unit: Path) -> None:
     """2.5 of 10 as systemd counts; what is left is the network, the buses among it."""
     security = ["systemd-analyze", "security", "--offline=true", "--no-pager"]
     done = subprocess.run([*security, "--threshold=25", unit], capture_output=True, text=True)
+    if "unrecognized option" in done.stderr:
+        pytest.skip("this systemd can only look at units that are installed")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "Service may allocate packet sockets" not in done.stdout
 
