@@ -122,7 +122,8 @@ def serve(
         typer.Option(min=1, envvar="LOOPWRIGHT_KEEP_JOBS", help="Keep samples of so many jobs per loop; default: all."),
     ] = None,
     keep_days: Annotated[
-        float | None, typer.Option(min=0.0, envvar="LOOPWRIGHT_KEEP_DAYS", help="Keep samples so long; default: ever.")
+        float | None,
+        typer.Option(min=0.0, max=36_500, envvar="LOOPWRIGHT_KEEP_DAYS", help="Keep samples so long; default: ever."),
     ] = None,
     log_format: Annotated[
         str, typer.Option(envvar="LOOPWRIGHT_LOG_FORMAT", help="text, or json: one object a line.")

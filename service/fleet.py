@@ -23,7 +23,7 @@ from service.request import BadLimits, RetuneRequest, within
 from service.states import IllegalMove
 from service.store import retunes
 from service.store.retunes import Part, RetuneOver, StopReason
-from service.store.store import Busy
+from service.store.store import Busy, FolderInUse
 from service.store.tables import RetuneRow
 from tuning.reasons import Reason
 
@@ -108,6 +108,9 @@ class Fleet:
         while not self._over.is_set():
             try:
                 self.look()
+            except FolderInUse as error:
+                log.error("retunes of many loops are another's to drive: %s", error)
+                return
             except SQLAlchemyError as error:
                 log.warning("retunes of many loops wait for the database: %s", error)
             except Exception:

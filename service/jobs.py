@@ -318,8 +318,10 @@ class Jobs:
             try:
                 for row in self._lasting(self.store.unfinished):
                     self._heed(row.id, Reason.SERVICE_STOPPED)
-            except SQLAlchemyError as error:
+            except (SQLAlchemyError, FolderInUse) as error:
                 log.error("the end of the waiting jobs could not be written, they go on at the next start: %s", error)
+            if self._name_holder.ident is not None:
+                self._name_holder.join(_STOP_PATIENCE_S)
         self.engine.close()
         self.journal.close(_STOP_PATIENCE_S)
 
@@ -337,6 +339,8 @@ class Jobs:
                 if self._machine.monotonic() - reconciled > _RECONCILE_S:
                     self.reconcile()
                     reconciled = self._machine.monotonic()
+            except FolderInUse as error:
+                self.give_up(str(error))
             except SQLAlchemyError as error:
                 log.warning("the database does not answer: %s", error)
             except Exception:  # whatever it is, aborts from other hosts must go on being heard
@@ -498,6 +502,8 @@ class Jobs:
         log.info("job started, attempt %d", row.attempt + 1)
         try:
             self._finish(running, self._run(running, row), row.dry_run)
+        except FolderInUse as error:
+            log.error("the end of the job is another's to write: %s", error)
         except Exception:
             log.exception("the end of the job could not be written")
 

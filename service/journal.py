@@ -13,7 +13,7 @@ from collections import deque
 
 from sqlalchemy.exc import DBAPIError, InterfaceError, InternalError, OperationalError, SQLAlchemyError, TimeoutError
 
-from service.store.store import Store, Write
+from service.store.store import FolderInUse, Store, Write
 
 log = logging.getLogger(__name__)
 
@@ -107,6 +107,9 @@ class Journal:
             if len(batch) == 1:
                 log.exception("a report could not be written")
                 return 1
+        except FolderInUse as error:
+            log.error("%d reports are another's to write: %s", len(batch), error)
+            return len(batch)
         except Exception:
             if len(batch) == 1:
                 log.exception("a report could not be written")

@@ -23,7 +23,7 @@ from service.security import audit
 from service.states import ACTIVE, JobState
 from service.store import hosts
 from service.store.clock import stamp
-from service.store.store import Store, append
+from service.store.store import FolderInUse, Store, append
 from service.store.tables import ChunkRow, JobRow
 
 log = logging.getLogger(__name__)
@@ -172,6 +172,8 @@ class Retention:
                 if tidied is None or time.monotonic() - tidied >= self._every_s:
                     self._tidy()
                     tidied = time.monotonic()
+            except FolderInUse:  # another service has our name, and looks after what is to be kept
+                return
             except SQLAlchemyError as error:
                 log.warning("what need not be kept could not be deleted, it will be later: %s", error)
             except Exception:  # whatever it is, it must be tried again

@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from sqlalchemy import Engine, event
 from sqlalchemy.engine import ExceptionContext
@@ -49,7 +50,8 @@ def way_out(file: Path, what: str) -> str:
 @dataclass(frozen=True)
 class Log:
     """What a write-ahead log holds. frames: that count.  lost: whole transactions behind a damaged frame, which SQLite
-    would drop.  interrupted: the last transaction is not whole, whoever asked for it was told nothing."""
+    would drop.  interrupted: the last transaction is not whole; whoever asked for it was told nothing, unless that
+    is damage, too."""
 
     frames: int = 0
     lost: int = 0
@@ -59,7 +61,7 @@ class Log:
 def read_log(file: Path) -> Log:
     """The log beside a database file; it is not changed."""
     path = file.with_name(file.name + "-wal")
-    if not path.exists() or path.stat().st_size <= _HEADER:
+    if not path.exists() or path.stat().st_size <= _HEADER + _FRAME:
         return Log()
     with path.open("rb") as opened:
         header = opened.read(_HEADER)
@@ -99,9 +101,8 @@ def _read_frames(
     return Log(count, lost, interrupted=not lost and (broken_ended or pending > 0))
 
 
-def _frames(opened: object, page: int) -> Iterator[tuple[bytes, bytes]]:
-    read = opened.read  # type: ignore[attr-defined]
-    while len(header := read(_FRAME)) == _FRAME and len(content := read(page)) == page:
+def _frames(opened: BinaryIO, page: int) -> Iterator[tuple[bytes, bytes]]:
+    while len(header := opened.read(_FRAME)) == _FRAME and len(content := opened.read(page)) == page:
         yield header, content
 
 
@@ -119,8 +120,8 @@ def _sums(start: tuple[int, int], content: bytes, order: str) -> tuple[int, int]
 
 def _page_size(file: Path) -> int:
     with file.open("rb") as opened:
-        size = struct.unpack(">H", opened.read(18)[16:18])[0]
-    return 65536 if size == 1 else size
+        size = int.from_bytes(opened.read(18)[16:18], "big")
+    return 65536 if size == 1 else size or 4096
 
 
 class FileCheck:
@@ -130,7 +131,8 @@ class FileCheck:
         self.found: list[str] = []
         self._through = threading.Event()
         self._file = file
-        self._connection = sqlite3.connect(file, check_same_thread=False)
+        # Read only: one that may write would bring the log into a damaged file as it is closed.
+        self._connection = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False)
         self._thread = threading.Thread(target=self._run, name="file check", daemon=True)
         self._thread.start()
 

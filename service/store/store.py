@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sqlalchemy import ColumnElement, delete, func, select, update
-from sqlalchemy.exc import IntegrityError, TimeoutError
+from sqlalchemy.exc import IntegrityError, SQLAlchemyError, TimeoutError
 from sqlalchemy.orm import Session
 
 from service.loop import same_gains
@@ -108,8 +108,10 @@ class Store:
                 self._host_lock.take()
             else:
                 self._adopt()
-        except BaseException:
+        except BaseException as error:
             self._let_go()
+            if isinstance(error, SQLAlchemyError) and self.damaged is not None:
+                raise BadDatabase(self.damaged) from error
             raise
 
     def _adopt(self) -> None:

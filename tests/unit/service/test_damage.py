@@ -116,11 +116,13 @@ def filled(folder: Path) -> list[str]:
 def test_a_damaged_page_is_said_at_the_start(tmp_path: Path) -> None:
     filled(tmp_path)
     overwrite(tmp_path / FILE, 2 * PAGE, PAGE)
+    before = (tmp_path / FILE).read_bytes()
     for _ in range(2):
         with pytest.raises(BadDatabase) as refused:
             Store(tmp_path)
         words = str(refused.value)
         assert str(tmp_path / FILE) in words and "loopwright check-data" in words and "loopwright restore" in words
+    assert (tmp_path / FILE).read_bytes() == before
 
 
 def test_a_job_that_a_damaged_log_would_lose_is_not_lost_silently(tmp_path: Path) -> None:
@@ -137,7 +139,8 @@ def test_a_job_that_a_damaged_log_would_lose_is_not_lost_silently(tmp_path: Path
 
 def test_a_check_that_takes_long_goes_on_beside_the_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     filled(tmp_path)
-    overwrite(tmp_path / FILE, 40 * PAGE, PAGE)
+    # Where the start has nothing to read.
+    overwrite(tmp_path / FILE, (pages_of(tmp_path, "sample_chunks")[1] - 1) * PAGE, PAGE)
     monkeypatch.setattr("service.store.damage.FileCheck.wait", lambda *_: False)
     store = Store(tmp_path)
     deadline = time.monotonic() + 30
@@ -145,6 +148,15 @@ def test_a_check_that_takes_long_goes_on_beside_the_service(tmp_path: Path, monk
         time.sleep(0.01)
     assert store.damaged is not None and "check-data" in store.damaged
     store.close()
+
+
+def test_damage_that_the_start_meets_is_said_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The check is not through yet."""
+    filled(tmp_path)
+    overwrite(tmp_path / FILE, (pages_of(tmp_path, "jobs")[1] - 1) * PAGE, PAGE)
+    monkeypatch.setattr("service.store.damage.FileCheck.wait", lambda *_: False)
+    with pytest.raises(BadDatabase, match="check-data"):
+        Store(tmp_path)
 
 
 def test_the_engines_file_is_made_anew(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

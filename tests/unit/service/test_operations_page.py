@@ -47,7 +47,7 @@ class Machine:
 
     def __init__(self, folder: Path, database: str = "") -> None:
         self.folder = folder
-        for name in ("etc/systemd/system", "opt", "usr/local/bin", "var/lib", "var/backups", "run"):
+        for name in ("etc/systemd/system", "etc/sysctl.d", "opt", "usr/local/bin", "var/lib", "var/backups", "run"):
             (folder / name).mkdir(parents=True)
         with socket.create_server(("127.0.0.1", 0)) as free:
             self.port = free.getsockname()[1]
@@ -72,7 +72,7 @@ class Machine:
         """Runs commands of the page to the end; the first that fails ends the test."""
         text = re.sub(r"(?<![\w.])/(etc|opt|var|usr/local)/", rf"{self.folder}/\1/", commands)
         text = text.replace(":8080", f":{self.port}").replace("--bind 0.0.0.0", f"--bind 0.0.0.0 --port {self.port}")
-        text = text.replace("loopwright:CHANGE-ME@db.example:5432/loopwright", database)
+        text = text.replace("loopwright@db.example:5432/loopwright", database)
         done = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", text],
             cwd=self.folder / "clone",
@@ -98,7 +98,8 @@ def machine(tmp_path: Path) -> Iterator[Machine]:
 
 
 def test_no_section_with_commands_is_left_out() -> None:
-    tried = {"Install", "Keys", "Rotate a key", "Back up", "Restore", "Upgrade", "Add a gateway", "Watch", "Many loops"}
+    tried = {"Install", "Keys", "Rotate a key", "Back up", "Restore", "Damaged data", "Upgrade"}
+    tried |= {"Add a gateway", "Watch", "Many loops"}
     assert {section for section in SECTIONS if blocks(section)} == tried
     # Nor is anything fenced or indented that is no block of commands: each of these is taken up by name below.
     fences = re.findall(r"^ *(```.*)$", PAGE, flags=re.MULTILINE)
@@ -128,6 +129,8 @@ def test_one_machine(machine: Machine) -> None:
     assert "restored" in machine.run(restore)
     use_it = 'curl --silent -w "%{http_code}" -H "Authorization: Bearer $LOOPWRIGHT_KEY" http://127.0.0.1:8080/loops'
     assert [machine.run(use_it, key=k.strip())[-3:] for k in (new, key, later)] == ["200", "401", "401"]
+    (damaged,) = blocks("Damaged data")
+    assert "whole; rows that can be read" in machine.run(damaged)
     assert '"ready":true' in machine.run(upgrade, key=new)
     (many,) = blocks("Many loops")
     assert '"url":"/retunes/' in machine.run(many, key=new)
@@ -178,6 +181,8 @@ def test_the_unit_gives_no_more_than_the_service_needs(unit: Path) -> None:
     """2.5 of 10 as systemd counts; what is left is the network, the buses among it."""
     security = ["systemd-analyze", "security", "--offline=true", "--no-pager"]
     done = subprocess.run([*security, "--threshold=25", unit], capture_output=True, text=True)
+    if "unrecognized option" in done.stderr:
+        pytest.skip("this systemd can only look at units that are installed")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "Service may allocate packet sockets" not in done.stdout
 
