@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -18,6 +18,7 @@ from controller.pid import Parameters
 from plantsim.plant import LinearPlant, Process
 from service.loop import LoopState, Restored
 from service.plain import plain
+from service.plausible import Gain, Implausible, Size, Time, TimeOrNone, Value, check_model, check_sampling
 from service.runner import RunResult, Watch, run
 from tuning.fast.procedure import FAST, FAST_STAGES, FastOptions, FastProposal, fast
 from tuning.fast.trial import trial
@@ -38,9 +39,6 @@ from tuning.plan import (
     StageDone,
 )
 from tuning.reasons import Ended, Failed, Reason, Refused
-
-MOST_SAMPLES = 200_000
-"""In T95: of more, a rehearsal takes minutes."""
 
 
 class RehearsedLoop:
@@ -133,8 +131,8 @@ class PresentGains(BaseModel):
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    Kp: float = Field(gt=0)
-    Ti: float = Field(0.0, ge=0, description="s; 0: no integral part")
+    Kp: Gain
+    Ti: TimeOrNone = Field(0.0, description="s; 0: no integral part")
 
 
 class PlantFile(BaseModel):
@@ -146,12 +144,12 @@ class PlantFile(BaseModel):
     num: list[float] = Field(min_length=1, max_length=12, description="numerator, highest power of s first")
     den: list[float] = Field(min_length=1, max_length=12, description="denominator, highest power of s first")
     dead_time_s: float = Field(0.0, ge=0)
-    sample_time_s: float | None = Field(None, gt=0)
-    t95_s: float | None = Field(None, gt=0)
-    noise_std: float = Field(0.0, ge=0, description="standard deviation of the measurement, PV units")
+    sample_time_s: Time | None = None
+    t95_s: Time | None = None
+    noise_std: Size = Field(0.0, description="standard deviation of the measurement, PV units")
     seed: int = Field(1, ge=0)
-    mv_limits: tuple[float, float] = (-0.5, 0.5)
-    sp_deviation: float | None = Field(None, gt=0)
+    mv_limits: tuple[Value, Value] = (-0.5, 0.5)
+    sp_deviation: Annotated[Value, Field(gt=0)] | None = None
     gains: PresentGains | None = Field(None, description="present PI of the loop: Kp, Ti (s)")
 
     @model_validator(mode="after")
@@ -166,6 +164,7 @@ class PlantFile(BaseModel):
             raise ValueError("num must end with a coefficient other than 0: PV would come back from every move of MV")
         if not self.mv_limits[0] < 0 < self.mv_limits[1]:
             raise ValueError(f"mv_limits must be [low < 0, high > 0] around the operating point, not {self.mv_limits}")
+        check_model(self.num, self.den, self.dead_time_s)
         return self
 
 
@@ -189,11 +188,10 @@ def _complete(file: PlantFile) -> PlantFile:
     ts = file.sample_time_s or _nice(max(_period(file, t95) / 300, t95 / 5000))
     room = min(-file.mv_limits[0], file.mv_limits[1])
     step = file.sp_deviation or 0.2 * room * (abs(gain) if math.isfinite(gain) else 1.0)
-    if t95 / ts > MOST_SAMPLES:
-        raise Refused(
-            Reason.BAD_INPUT,
-            f"sample_time_s {ts:g} is {t95 / ts:.3g} times in T95 ({t95:.4g} s); at most {MOST_SAMPLES:,} are allowed",
-        )
+    try:
+        check_sampling(file.dead_time_s, t95, ts)
+    except Implausible as error:
+        raise Refused(Reason.BAD_INPUT, str(error)) from None
     gains = file.gains or PresentGains(Kp=0.3 / abs(gain) if math.isfinite(gain) else 0.1, Ti=t95 / 3)
     return file.model_copy(update={"sample_time_s": ts, "t95_s": t95, "sp_deviation": step, "gains": gains})
 

@@ -76,7 +76,8 @@ def test_one_stage_and_none(client: TestClient, service: Service) -> None:
 
 def test_what_is_no_number_is_null(client: TestClient, service: Service) -> None:
     job = service.store.create(TAG, {}, "test", True).id
-    service.store.add_samples(job, "relay", [Sample(0.0, 50.0, x, 1.0, 2) for x in (math.nan, math.inf, -math.inf, 0.1)])
+    values = (math.nan, math.inf, -math.inf, 0.1)
+    service.store.add_samples(job, "relay", [Sample(0.0, 50.0, pv, 1.0, 2) for pv in values])
     assert client.get(f"/jobs/{job}/samples").json()["pv"] == [None, None, None, 0.1]
     assert "relay,0.0,50.0,nan,1.0,2\n" in client.get(f"/jobs/{job}/samples?format=csv").text
 
