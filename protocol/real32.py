@@ -1,7 +1,7 @@
 """REAL32 as it comes from the bus: the decimal that was meant.
 
-0.05 travels as the float32 nearest to it, which as a double is 0.05000000074505806. Of all decimals that are this float32
-the shortest is taken; packed again it gives the same four bytes.
+0.05 travels as the float32 nearest to it, which as a double is 0.05000000074505806. Of all decimals that are this
+float32 the shortest is taken (of some powers of two one that is a digit longer). Packed again it gives the same bytes.
 """
 
 from __future__ import annotations

@@ -100,9 +100,7 @@ def test_times_are_as_they_were_counted() -> None:
     [("gzip", True), ("br;q=1.0, gzip;q=0.8", True), ("GZIP", True), ("gzip;q=0", False), ("gzip; q=0.00", False),
      ("gzip;q=0.001", True), ("", False), ("identity", False), ("xgzip", False)],
 )  # fmt: skip
-def test_compressed_for_who_takes_that(
-    client: TestClient, service: Service, accepted: str, compressed: bool
-) -> None:
+def test_compressed_for_who_takes_that(client: TestClient, service: Service, accepted: str, compressed: bool) -> None:
     job = filled(service.store, 3)
     assert takes_gzip(accepted) == compressed
     plain = client.get(f"/jobs/{job}/samples", headers={"Accept-Encoding": "identity"})
