@@ -29,6 +29,7 @@ from protocol.profile import (
     sdo_request_id,
     sdo_response_id,
 )
+from protocol.real32 import shortest
 from protocol.station import Station
 
 _WAIT_S = 0.05  # one wait on the bus: short enough to beat in time; always the same, which RawBus makes cheap
@@ -184,11 +185,13 @@ class Tuner:
                 mv, n = MV_FRAME.unpack(data)
                 pv, answered = self._pv
                 if n == answered and n != UNASKED:
-                    self._samples.append(BusSample(n, pv, mv, self.mode, self.on_trial, self.sp))
+                    sample = BusSample(n, shortest(pv), shortest(mv), self.mode, self.on_trial, self.sp)
+                    self._samples.append(sample)
             elif can_id == self._pv_id:
                 self._pv = PV_FRAME.unpack(data)
             elif can_id == self._status_id:
-                self.mode, on_trial, self.sp, is_open, _cause = STATUS_FRAME.unpack(data)
+                self.mode, on_trial, sp, is_open, _cause = STATUS_FRAME.unpack(data)
+                self.sp = shortest(sp)
                 self.on_trial, self.session_is_open = bool(on_trial), bool(is_open)
             elif can_id in self._alive:
                 (state,) = HEARTBEAT_FRAME.unpack(data)
@@ -215,10 +218,11 @@ class Tuner:
             else:
                 raw = self._segments(entry, node)
         try:
-            return entry.type.decode(raw)
+            value = entry.type.decode(raw)
         except struct.error as error:
             text = f"{name}: {len(raw)} bytes do not make a {entry.type.name}"
             raise TunerError(Kind.ABORT, text, Abort.LENGTH) from error
+        return shortest(float(value)) if entry.type is Type.REAL32 else value
 
     def number(self, name: str, sub: int | None = None, node: int | None = None) -> float:
         return float(self.read(name, sub, node))

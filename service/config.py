@@ -14,8 +14,8 @@ from typing import Annotated, Any, Self
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+from service.plausible import Positive, Size, Time, Value, check_step
+
 Node = Annotated[int, Field(ge=1, le=127)]
 
 _BUS_KINDS = ("socketcan", "socketcand", "virtual", "pcan", "kvaser", "ixxat", "vector", "slcan", "gs_usb")
@@ -34,8 +34,8 @@ class Limits(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    low: Finite
-    high: Finite
+    low: Value
+    high: Value
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -58,9 +58,9 @@ class LoopConfig(BaseModel):
     pv_unit: str = Field(min_length=1)
     mv_limits: Limits = Limits(low=0.0, high=100.0)
     pv_limits: Limits
-    t95_s: Positive
+    t95_s: Time
     sp_deviation: Positive
-    noise_std_hint: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    noise_std_hint: Size | None = None
     area: str | None = Field(default=None, min_length=1, max_length=64)
     notes: str = ""
 
@@ -75,6 +75,7 @@ class LoopConfig(BaseModel):
             raise ValueError("mv_limits must lie within 0..100 percent")
         if 2 * self.sp_deviation > self.pv_limits.high - self.pv_limits.low:
             raise ValueError(f"sp_deviation {self.sp_deviation:g} needs at least twice that between the pv_limits")
+        check_step(self.sp_deviation, self.pv_limits.low, self.pv_limits.high)
         return self
 
 

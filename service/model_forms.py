@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from service.plausible import Implausible, check_damping, check_model
 from tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 
 MOST_COEFFICIENTS = 12
@@ -48,6 +49,17 @@ def parse_model(data: object) -> Model:
     """The model that a JSON object describes, in the kind of its form; raises BadModel."""
     if not isinstance(data, Mapping):
         raise BadModel(f"a model must be a JSON object, not {_shown(data)}; {_ACCEPTED}")
+    model = _parsed(data)
+    try:
+        if "zeta" in data and isinstance(model, SOPDT):
+            check_damping(model.zeta)
+        check_model(model.num, model.den, model.L)
+    except Implausible as error:
+        raise BadModel(str(error)) from None
+    return model
+
+
+def _parsed(data: Mapping[str, object]) -> Model:
     form = _form(data)
     _match(data, form)
     if form is _TRANSFER_FUNCTION:

@@ -6,9 +6,9 @@ This is the one module of the service that knows plantsim and controller, and on
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -18,6 +18,7 @@ from controller.pid import Parameters
 from plantsim.plant import LinearPlant, Process
 from service.loop import LoopState, Restored
 from service.plain import plain
+from service.plausible import Finite, Gain, Implausible, Size, Time, TimeOrNone, Value, check_model, check_sampling
 from service.runner import RunResult, Watch, run
 from tuning.fast.procedure import FAST, FAST_STAGES, FastOptions, FastProposal, fast
 from tuning.fast.trial import trial
@@ -38,11 +39,6 @@ from tuning.plan import (
     StageDone,
 )
 from tuning.reasons import Ended, Failed, NoGain, Reason, Refused
-
-MOST_SAMPLES = 200_000
-"""In T95, and in the dead time: of more, a rehearsal takes minutes."""
-SMALLEST, LARGEST = 1e-15, 1e15
-"""Of any number of a plant, by size: with others what is computed from it leaves the floating point numbers."""
 
 
 class RehearsedLoop:
@@ -135,12 +131,12 @@ class PresentGains(BaseModel):
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    Kp: float = Field(gt=0)
-    Ti: float = Field(default=0.0, ge=0, description="s; 0: no integral part")
-    Td: float = Field(default=0.0, ge=0, description="s")
-    Tf: float = Field(default=0.0, ge=0, description="s, filter of the derivative")
-    b: float = Field(default=1.0, description="set-point weight of the proportional path")
-    c: float = Field(default=0.0, description="set-point weight of the derivative path")
+    Kp: Gain
+    Ti: TimeOrNone = Field(default=0.0, description="s; 0: no integral part")
+    Td: TimeOrNone = Field(default=0.0, description="s")
+    Tf: TimeOrNone = Field(default=0.0, description="s, filter of the derivative")
+    b: Finite = Field(default=1.0, description="set-point weight of the proportional path")
+    c: Finite = Field(default=0.0, description="set-point weight of the derivative path")
 
 
 class PlantFile(BaseModel):
@@ -152,12 +148,12 @@ class PlantFile(BaseModel):
     num: list[float] = Field(min_length=1, max_length=12, description="numerator, highest power of s first")
     den: list[float] = Field(min_length=1, max_length=12, description="denominator, highest power of s first")
     dead_time_s: float = Field(0.0, ge=0)
-    sample_time_s: float | None = Field(None, gt=0)
-    t95_s: float | None = Field(None, gt=0)
-    noise_std: float = Field(0.0, ge=0, description="standard deviation of the measurement, PV units")
+    sample_time_s: Time | None = None
+    t95_s: Time | None = None
+    noise_std: Size = Field(0.0, description="standard deviation of the measurement, PV units")
     seed: int = Field(1, ge=0)
-    mv_limits: tuple[float, float] = (-0.5, 0.5)
-    sp_deviation: float | None = Field(None, gt=0)
+    mv_limits: tuple[Value, Value] = (-0.5, 0.5)
+    sp_deviation: Annotated[Value, Field(gt=0)] | None = None
     gains: PresentGains | None = Field(None, description="present gains of the loop")
     reverse_acting: bool | None = Field(None, description="the controller's action; left out: right for the plant")
 
@@ -173,28 +169,8 @@ class PlantFile(BaseModel):
             raise ValueError("num must end with a coefficient other than 0: PV would come back from every move of MV")
         if not self.mv_limits[0] < 0 < self.mv_limits[1]:
             raise ValueError(f"mv_limits must be [low < 0, high > 0] around the operating point, not {self.mv_limits}")
+        check_model(self.num, self.den, self.dead_time_s)
         return self
-
-    @model_validator(mode="after")
-    def _plausible(self) -> PlantFile:
-        numbers = _numbers(self.model_dump(exclude={"seed"}))
-        # the plant itself last: it may have been made of the others
-        for name, value in sorted(numbers, key=lambda each: each[0].startswith(("num", "den", "dead_time"))):
-            if value and not SMALLEST <= abs(value) <= LARGEST:
-                raise ValueError(f"{name} is {value:g}: its size must be 0, or {SMALLEST:g} to {LARGEST:g}")
-        return self
-
-
-def _numbers(value: object, name: str = "") -> Iterator[tuple[str, float]]:
-    """Every number of a plant with its name."""
-    if isinstance(value, dict):
-        for key, item in value.items():
-            yield from _numbers(item, f"{name}.{key}" if name else key)
-    elif isinstance(value, list | tuple):
-        for n, item in enumerate(value):
-            yield from _numbers(item, f"{name}[{n}]")
-    elif isinstance(value, int | float) and not isinstance(value, bool):
-        yield name, float(value)
 
 
 def _nice(x: float) -> float:
@@ -217,17 +193,10 @@ def _complete(file: PlantFile) -> PlantFile:
     ts = file.sample_time_s or _nice(max(_period(file, t95) / 300, t95 / 5000))
     room = min(-file.mv_limits[0], file.mv_limits[1])
     step = file.sp_deviation or 0.2 * room * (abs(gain) if math.isfinite(gain) else 1.0)
-    if t95 / ts > MOST_SAMPLES:
-        raise Refused(
-            Reason.BAD_INPUT,
-            f"sample_time_s {ts:g} is {t95 / ts:.3g} times in T95 ({t95:.4g} s); at most {MOST_SAMPLES:,} are allowed",
-        )
-    if file.dead_time_s / ts > MOST_SAMPLES:
-        raise Refused(
-            Reason.BAD_INPUT,
-            f"dead_time_s {file.dead_time_s:g} is {file.dead_time_s / ts:.3g} sample times of {ts:g} s; at most "
-            f"{MOST_SAMPLES:,} are allowed",
-        )
+    try:
+        check_sampling(file.dead_time_s, t95, ts)
+    except Implausible as error:
+        raise Refused(Reason.BAD_INPUT, str(error)) from None
     gains = file.gains or PresentGains(Kp=0.3 / abs(gain) if math.isfinite(gain) else 0.1, Ti=t95 / 3)
     return file.model_copy(update={"sample_time_s": ts, "t95_s": t95, "sp_deviation": step, "gains": gains})
 

@@ -7,16 +7,28 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from service.config import LoopConfig
+from service.plausible import (
+    Finite,
+    Gain,
+    Implausible,
+    NotNegative,
+    Positive,
+    Size,
+    Time,
+    check_damping,
+    check_model,
+    check_option,
+    check_step,
+)
 from tuning.fast.procedure import FAST
 from tuning.five_stage import PROCEDURE, rule_of
 from tuning.methods import METHODS
 from tuning.models import FOPDT, SOPDT, TransferFunction
 from tuning.reasons import Refused
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Percent = Annotated[float, Field(gt=0, lt=74, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+LEAST_AMPLITUDE_PCT = 1e-3
+"""Of the relay: less is not to be told from nothing by a REAL32 of some ten percent."""
 
 
 class BadLimits(ValueError):
@@ -29,7 +41,7 @@ class ProcessModel(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     K: Finite = Field(description="Static gain, PV units per MV unit (percent)", examples=[0.8])
-    T_s: Positive = Field(description="Time constant, s; of second order 1/(natural frequency)", examples=[3.0])
+    T_s: Time = Field(description="Time constant, s; of second order 1/(natural frequency)", examples=[3.0])
     L_s: NotNegative = Field(description="Dead time, s", examples=[1.0])
     zeta: Positive | None = Field(default=None, description="Damping ratio; leave out for first order", examples=[1.2])
 
@@ -42,6 +54,10 @@ class ProcessModel(BaseModel):
     def _gain(self) -> Self:
         if self.K == 0:
             raise ValueError("K must not be 0")
+        if self.zeta is not None:
+            check_damping(self.zeta)
+        plant = self.plant()
+        check_model(plant.num, plant.den, plant.L)
         return self
 
 
@@ -51,6 +67,11 @@ class _Coefficients(BaseModel):
     num: list[Finite] = Field(min_length=1, max_length=12, description="Numerator", examples=[[3.0, 2.0]])
     den: list[Finite] = Field(min_length=1, max_length=12, description="Denominator", examples=[[3.0, 4.0, 1.0]])
     dead_time_s: NotNegative = Field(default=0.0, description="Dead time, s", examples=[1.0])
+
+    @model_validator(mode="after")
+    def _plausible(self) -> Self:
+        check_model(self.num, self.den, self.dead_time_s)
+        return self
 
 
 class TransferModel(_Coefficients):
@@ -68,11 +89,11 @@ class TransferModel(_Coefficients):
 class PlantModel(_Coefficients):
     """A transfer function for a dry run, coefficients by falling powers of s, deviation variables."""
 
-    noise_std: NotNegative = Field(
+    noise_std: Size = Field(
         default=0.0, description="Standard deviation of the PV noise, PV units", examples=[0.0]
     )
     seed: int = Field(default=1, ge=0, le=2**53, description="Seed of the noise", examples=[1])
-    sample_time_s: Positive | None = Field(default=None, description="Sampling period, s", examples=[0.1])
+    sample_time_s: Time | None = Field(default=None, description="Sampling period, s", examples=[0.1])
 
 
 class Bounds(BaseModel):
@@ -85,7 +106,7 @@ class Bounds(BaseModel):
     mv_high: Finite | None = Field(default=None, description="Highest MV during the test, percent", examples=[80.0])
     pv_low: Finite | None = Field(default=None, description="Abort below this PV, PV units", examples=[40.0])
     pv_high: Finite | None = Field(default=None, description="Abort above this PV, PV units", examples=[60.0])
-    max_time_s: Positive | None = Field(
+    max_time_s: Time | None = Field(
         default=None,
         description="Budget of plant time, s; by default 100 times the loop's T95 for fast, 500 times for five-stage",
         examples=[3600.0],
@@ -121,14 +142,14 @@ class FiveStageWishes(BaseModel):
         description="Model for the method: the estimate from the overshoot, or one identified from the set-point step; "
         "by default the first for five-stage, the second for the rules if it explains the step",
     )
-    Ku: Positive | None = Field(
+    Ku: Gain | None = Field(
         default=None, description="Ultimate gain, MV percent per PV unit, for start=zn_pi", examples=[2.05]
     )
-    Pu_s: Positive | None = Field(default=None, description="Ultimate period, s, for start=zn_pi", examples=[3.32])
-    Kp: Positive | None = Field(
+    Pu_s: Time | None = Field(default=None, description="Ultimate period, s, for start=zn_pi", examples=[3.32])
+    Kp: Gain | None = Field(
         default=None, description="ISA gain of the recorded PI step, MV percent per PV unit", examples=[0.9]
     )
-    Ti_s: Positive | None = Field(default=None, description="Integral time of the recorded PI step, s", examples=[2.8])
+    Ti_s: Time | None = Field(default=None, description="Integral time of the recorded PI step, s", examples=[2.8])
     overshoot_pct: Positive | None = Field(
         default=None, description="Overshoot of the recorded PI step, percent, for start=estimate", examples=[25.0]
     )
@@ -207,7 +228,10 @@ class RetuneRequest(FiveStageWishes, FastWishes, Bounds):
         if self.model_from == "record" and self.start in ("estimate", "optimise"):
             raise ValueError(f"model_from=record needs the step of stage zn_pi; the start is {self.start}")
         try:
-            METHODS[rule_of(self.method)].checked(self.method_options)
+            method = METHODS[rule_of(self.method)]
+            method.checked(self.method_options)
+            for name, value in self.method_options.items():
+                check_option(name, method.options[name].unit, value)
         except Refused as refused:
             raise ValueError(refused.detail) from refused
         return self
@@ -293,11 +317,17 @@ def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[s
             f"a relay of amplitude_pct {amplitude:g} needs {1.5 * amplitude:g} % of MV between its limits, "
             f"there are {mv.high - mv.low:g} %"
         )
+    if amplitude is not None and amplitude < LEAST_AMPLITUDE_PCT:
+        problems.append(f"a relay of amplitude_pct {amplitude:g} moves nothing; at least {LEAST_AMPLITUDE_PCT:g} %")
     deviation = request.sp_deviation or loop.sp_deviation
     if deviation > loop.sp_deviation:
         problems.append(f"sp_deviation {deviation:g} is more than the configured {loop.sp_deviation:g} {loop.pv_unit}")
     if 2 * deviation > limits["pv_limits"].high - limits["pv_limits"].low and not problems:
         problems.append(f"sp_deviation {deviation:g} {loop.pv_unit} needs at least twice that between the PV limits")
+    try:
+        check_step(deviation, limits["pv_limits"].low, limits["pv_limits"].high)
+    except Implausible as error:
+        problems.append(str(error))
     if problems:
         return loop, problems
     return loop.model_copy(update={**limits, "sp_deviation": deviation}), []

@@ -12,6 +12,7 @@ from typing import Any
 
 from service.model_forms import dump_model
 from service.plain import plain
+from service.plausible import Implausible, check_option
 from tuning.assess import Assessment, assess
 from tuning.design import realisable
 from tuning.figures import StepFigures
@@ -146,8 +147,11 @@ def _check(methods: list[Method], name: str, value: object) -> None:
     for method in knowing:
         try:
             method.checked({name: value})
+            check_option(name, method.options[name].unit, value)
         except Refused as refusal:
             refusals.append(refusal.detail)
+        except Implausible as refusal:
+            refusals.append(str(refusal))
     if len(refusals) == len(knowing):
         raise BadTuning("; ".join(dict.fromkeys(refusals)))
 

@@ -42,6 +42,8 @@ from service.store.tables import JobRow
 from tuning.reasons import Ended
 
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
+MOST_EVENTS = 2000
+"""Of a job, for its view: those of its stages come first. After them decisions that fail may be added without end."""
 JobId = Annotated[str, Path(description="Id of the job", examples=["4f0c2a9be113"])]
 
 
@@ -87,7 +89,7 @@ def create_app(
     operations.install(app, jobs, operations.checks(jobs) if checks is None else checks)
 
     def view(row: JobRow) -> JobView:
-        return job_view(row, jobs.store.events(row.id), jobs.running(row.id))
+        return job_view(row, jobs.store.events(row.id, limit=MOST_EVENTS), jobs.running(row.id))
 
     fleet.install(app, jobs, many, view)
 
@@ -161,7 +163,7 @@ def create_app(
     ) -> Response:
         row = jobs.store.get(job_id)
         over = JobState(row.state) not in ACTIVE
-        if over and last_event_id and not jobs.store.events(job_id, last_event_id):
+        if over and last_event_id and not jobs.store.events(job_id, last_event_id, limit=1):
             return Response(status_code=204)
         stream = event_stream(jobs, job_id, last_event_id, still_permitted(keyring, current.get().key_id))
         return StreamingResponse(stream, media_type="text/event-stream", headers={"Cache-Control": "no-cache"})

@@ -19,6 +19,7 @@ from service.states import ACTIVE, JobState
 
 _POLL_S = 0.2
 _AWAY_S = 1.0
+_EVENTS_AT_ONCE = 200
 _KEEP_ALIVE_POLLS = 75  # 15 s: proxies close a silent connection after 30 s or more
 
 
@@ -46,20 +47,23 @@ async def event_stream(
                 asked = time.monotonic()
             # Asked before the events are read: an event written in between is then seen in the next round.
             row = await asyncio.to_thread(jobs.store.get, job_id)
-            events = await asyncio.to_thread(jobs.store.events, job_id, after)
+            events = await asyncio.to_thread(jobs.store.events, job_id, after, _EVENTS_AT_ONCE)
         except SQLAlchemyError as error:
             if not temporary(error):
                 raise
             yield ": the database does not answer\n\n"
             await asyncio.sleep(_AWAY_S)
             continue
-        over = JobState(row.state) not in ACTIVE
+        more = len(events) == _EVENTS_AT_ONCE
+        over = JobState(row.state) not in ACTIVE and not more
         for event in events:
             after, silent = event.seq, 0
             data = {"at": event.at, "plant_time_s": event.plant_time_s, **event.data}
             yield f"id: {event.seq}\nevent: {event.kind}\ndata: {json.dumps(data)}\n\n"
         if over:
             return
+        if more:
+            continue
         progress = _progress(jobs, job_id)
         if progress and progress != told:
             told, silent = progress, 0

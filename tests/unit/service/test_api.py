@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from service.store.store import append
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
 from tuning.reasons import ADVICE, Failed, Reason, Refused
 
@@ -246,3 +247,14 @@ def test_openapi_is_the_golden_one(client: TestClient) -> None:
     if os.environ.get("LOOPWRIGHT_WRITE_GOLDEN"):
         GOLDEN.write_text(text)
     assert text == GOLDEN.read_text(), "the API changed: LOOPWRIGHT_WRITE_GOLDEN=1 writes the new golden file"
+
+
+def test_a_stream_reads_a_long_history_in_parts(service: Service, client: TestClient) -> None:
+    url = finished(service, client)["url"]
+    job_id = url.removeprefix("/jobs/")
+    with service.store.writing() as session:
+        for n in range(450):
+            append(session, job_id, "decision_begun", {"decision": "accept", "n": n}, 0.0)
+    found = events(client.get(f"{url}/events").text)
+    assert [number for number, _, _ in found] == list(range(1, len(found) + 1)) and len(found) > 450
+    assert [data["n"] for _, kind, data in found if kind == "decision_begun"] == list(range(450))

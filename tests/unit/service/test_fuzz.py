@@ -1,12 +1,14 @@
 """The OpenAPI document against the service: every operation, fed with what its schema allows and with what it forbids.
 
 No answer may be a 5xx, and none may be undocumented in status, media type, headers or shape. The examples are the same
-at every run; how many there were is in the run's summary.
+at every run; how many there were is in the run's summary. There are 5,000 of them, a minute or two for the processor;
+LOOPWRIGHT_FUZZ_CASES=50000 tries more.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import warnings
 from collections import Counter
 from collections.abc import Iterator
@@ -44,6 +46,10 @@ WITH_INPUT = [
     for method, operation in item.items()
     if operation.get("parameters") or operation.get("requestBody")
 ]
+pytestmark = pytest.mark.timeout(600)  # each test is hundreds of requests
+WITH_KEYS = 200
+EACH = max(40, (int(os.environ.get("LOOPWRIGHT_FUZZ_CASES", "5000")) - WITH_KEYS) // (2 * len(WITH_INPUT)))
+"""Cases of an operation that the document allows, and as many that it forbids."""
 CHECKS = [
     not_a_server_error,
     checks.status_code_conformance,
@@ -144,7 +150,7 @@ def test_what_the_document_allows(label: str, site: Site) -> None:
     operation = OPERATIONS[label]
     seen = set()
 
-    @settings(BOUNDED, max_examples=40)
+    @settings(BOUNDED, max_examples=EACH)
     @given(
         case=operation.as_strategy(GenerationMode.POSITIVE),
         known=st.booleans(),
@@ -171,7 +177,7 @@ def test_what_the_document_allows(label: str, site: Site) -> None:
 def test_what_the_document_forbids(label: str, site: Site) -> None:
     refused = 0
 
-    @settings(BOUNDED, max_examples=40)
+    @settings(BOUNDED, max_examples=EACH)
     @given(case=OPERATIONS[label].as_strategy(GenerationMode.NEGATIVE))
     def run(case: Any) -> None:
         nonlocal refused
@@ -185,7 +191,7 @@ def test_each_operation_asks_for_its_key(tmp_path: Path, fuzz_count: Counter[str
     site = Site(tmp_path, authenticated=True)
     seen: Counter[int] = Counter()
 
-    @settings(BOUNDED, max_examples=200)
+    @settings(BOUNDED, max_examples=WITH_KEYS)
     @given(data=st.data(), key=st.sampled_from(KEYS))
     def run(data: st.DataObject, key: str) -> None:
         label = data.draw(st.sampled_from(sorted(OPERATIONS)))

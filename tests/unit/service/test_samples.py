@@ -77,7 +77,7 @@ def test_one_stage_and_none(client: TestClient, service: Service) -> None:
 def test_what_is_no_number_is_null(client: TestClient, service: Service) -> None:
     job = service.store.create(TAG, {}, "test", True).id
     values = (math.nan, math.inf, -math.inf, 0.1)
-    service.store.add_samples(job, "relay", [Sample(0.0, 50.0, x, 1.0, 2) for x in values])
+    service.store.add_samples(job, "relay", [Sample(0.0, 50.0, pv, 1.0, 2) for pv in values])
     assert client.get(f"/jobs/{job}/samples").json()["pv"] == [None, None, None, 0.1]
     assert "relay,0.0,50.0,nan,1.0,2\n" in client.get(f"/jobs/{job}/samples?format=csv").text
 
@@ -100,9 +100,7 @@ def test_times_are_as_they_were_counted() -> None:
     [("gzip", True), ("br;q=1.0, gzip;q=0.8", True), ("GZIP", True), ("gzip;q=0", False), ("gzip; q=0.00", False),
      ("gzip;q=0.001", True), ("", False), ("identity", False), ("xgzip", False)],
 )  # fmt: skip
-def test_compressed_for_who_takes_that(
-    client: TestClient, service: Service, accepted: str, compressed: bool
-) -> None:
+def test_compressed_for_who_takes_that(client: TestClient, service: Service, accepted: str, compressed: bool) -> None:
     job = filled(service.store, 3)
     assert takes_gzip(accepted) == compressed
     plain = client.get(f"/jobs/{job}/samples", headers={"Accept-Encoding": "identity"})

@@ -1,0 +1,33 @@
+"""REAL32 as it comes from the bus: the decimal that was meant.
+
+0.05 travels as the float32 nearest to it, which as a double is 0.05000000074505806. Of all decimals that are this
+float32 the shortest is taken (of some powers of two one that is a digit longer). Packed again it gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+
+_REAL32 = struct.Struct("<f")
+_LEAST_NORMAL = 2.0**-126
+
+
+def shortest(value: float) -> float:
+    """value: a double that is a float32 exactly, as `struct` unpacks it. What is no number stays as it is."""
+    if not math.isfinite(value):
+        return value
+    packed = _REAL32.pack(value)
+    # A float32 has six digits at least, unless it is next to nothing, and with nine it is told from every other.
+    for digits in range(6 if abs(value) >= _LEAST_NORMAL else 1, 9):
+        decimal = float(f"{value:.{digits}g}")
+        if _packs_to(decimal, packed):
+            return decimal
+    return float(f"{value:.9g}")
+
+
+def _packs_to(decimal: float, packed: bytes) -> bool:
+    try:
+        return _REAL32.pack(decimal) == packed
+    except OverflowError:  # rounded up beyond the largest float32
+        return False
