@@ -129,10 +129,12 @@ def _fast(stage: str, config: LoopConfig, request: RetuneRequest, before: Before
             "where the record leaves doubt."
         )
         return Moves(stage, what, up, up, step, _UNDER_NEW_GAINS * step)
-    size, pv = "Its size stays", _swing(0.5 * (1.0 + BIAS) * (given or most), before.Ku)
+    size, mean = "Its size stays", 0.5 * (1.0 + BIAS)
+    pv = _swing(mean * first, before.Ku)
     if given is None:
-        size = f"Its size is adapted until PV clearly moves, by no more than {WIDEST_SPAN * step:g} {unit} in all"
-        pv = min(0.5 * WIDEST_SPAN * step, pv or math.inf)
+        size = f"After its first wave it is adapted, so that PV moves by at most {WIDEST_SPAN * step:g} {unit} in all"
+        if pv is not None:  # nothing bounds the first wave but MV
+            pv = max(pv, min(0.5 * WIDEST_SPAN * step, pv * most / first if first else 0.0))
     what = (
         f"A relay in the controller moves MV by +{first:.4g} and -{BIAS * first:.4g} % at first. {size}; a side on "
         "which PV stalls is raised, up to twice."
