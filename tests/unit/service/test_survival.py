@@ -61,7 +61,7 @@ class Gateway:
 
     def serve(self, *more: str) -> None:
         self.process = self.launch(*more)
-        url = self.process.wait_ready().split()[1]
+        url = self.process.wait_ready(180).split()[1]
         self.http = httpx.Client(base_url=url, timeout=60.0, trust_env=False)
         self._stack.callback(self.http.close)
 
@@ -162,7 +162,7 @@ def test_a_second_service_on_the_same_data_is_told_who_has_it(
         second = Process("second", arguments, tmp_path / "second.log")
         stack.callback(second.stop)
     with pytest.raises(NotReady) as refused:
-        second.wait_ready()
+        second.wait_ready(180)
     assert f"process {gateway.process.pid} on" in str(refused.value)
     gateway.go()
     assert gateway.over(url)["state"] == "proposed" and gateway.ran() == list(STAGES)
