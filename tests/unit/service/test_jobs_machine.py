@@ -199,7 +199,7 @@ class JobsMachine(RuleBasedStateMachine):
         return found[-1 - which // 4 % len(found)]
 
     def over(self, job: Job) -> None:
-        self.engine.threads[job.id].join(10)
+        self.engine.threads[job.id].join(60)
         assert not self.engine.threads[job.id].is_alive()
 
     # rules
@@ -232,7 +232,7 @@ class JobsMachine(RuleBasedStateMachine):
 
     def begun(self, job: Job) -> None:
         self.engine.begin(job.id)
-        assert job.act.inside.wait(10)
+        assert job.act.inside.wait(60)
         if job.old is None and not job.dry:
             job.old = self.gains[job.loop]
         job.attempts += 1
