@@ -8,7 +8,8 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-_STOP_S = 15.0
+_STOP_S = 90.0
+"""Wall time that a process has for its end, as the unit's TimeoutStopSec: a service restores its loops first."""
 
 
 class NotReady(Exception):

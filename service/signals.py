@@ -47,9 +47,10 @@ class Signals:
             end()
 
     def _hear(self, number: int, _frame: FrameType | None) -> None:
-        self._asked = True
         self._heard.put(number)
-        self._end()
+        if not self._asked:
+            self._asked = True
+            self._end()
 
     def _report(self, awaited: Callable[[], str]) -> None:
         first = True

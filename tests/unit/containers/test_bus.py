@@ -55,7 +55,7 @@ def running(answer: int, kind: str, ports: tuple[int, int, int]) -> Iterator[lis
         yield said
     finally:
         process.send_signal(signal.SIGTERM)
-        process.communicate(timeout=20)
+        process.communicate(timeout=120)
     assert process.returncode == 0
 
 
@@ -81,7 +81,7 @@ def test_without_vcan_it_is_the_hub_and_says_why_in_one_line(answer: int, kind: 
 @pytest.mark.parametrize(("answer", "words"), [(NO_MODULE, "modprobe vcan"), (NO_RIGHT, "NET_ADMIN")])
 def test_where_nothing_but_vcan_will_do_it_ends_with_that_line(answer: int, words: str) -> None:
     process = start(answer, "vcan")
-    output, errors = process.communicate(timeout=20)
+    output, errors = process.communicate(timeout=120)
     assert (process.returncode, output) == (1, "")
     assert len(errors.splitlines()) == 1 and words in errors and "hub" not in errors
 
@@ -89,7 +89,7 @@ def test_where_nothing_but_vcan_will_do_it_ends_with_that_line(answer: int, word
 def test_the_door_leads_to_the_service_once_there_is_one() -> None:
     ports = (free_port(), free_port(), free_port())
     with running(NO_MODULE, "hub", ports):
-        with socket.create_connection(("127.0.0.1", ports[1]), timeout=20) as early:
+        with socket.create_connection(("127.0.0.1", ports[1]), timeout=120) as early:
             assert early.recv(1) == b""
         with socket.create_server(("127.0.0.1", ports[2])) as service:
 
@@ -100,7 +100,7 @@ def test_the_door_leads_to_the_service_once_there_is_one() -> None:
 
             serving = threading.Thread(target=serve)
             serving.start()
-            with socket.create_connection(("127.0.0.1", ports[1]), timeout=20) as caller:
+            with socket.create_connection(("127.0.0.1", ports[1]), timeout=120) as caller:
                 caller.sendall(b"get")
                 assert caller.recv(100) == b"GET"
                 assert caller.recv(1) == b""  # the service has hung up

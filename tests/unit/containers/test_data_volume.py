@@ -25,7 +25,7 @@ def folder(tmp_path: Path) -> Path:
 def serve(folder: Path, port: int = 0) -> subprocess.CompletedProcess[str]:
     command = ["-m", "service", "serve", "--loops", f"{folder}/loops.yaml", "--data", f"{folder}/data"]
     command += ["--port", str(port)]
-    return subprocess.run([sys.executable, *command], capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run([sys.executable, *command], capture_output=True, text=True, timeout=200, check=False)
 
 
 def test_of_a_newer_version_it_is_refused_in_one_line_and_not_changed(folder: Path) -> None:

@@ -23,7 +23,7 @@ def hub() -> Iterator[Hub]:
     thread.start()
     yield hub
     hub.stop()
-    thread.join(5)
+    thread.join(60)
     assert not thread.is_alive()
 
 
@@ -42,7 +42,7 @@ def frame(number: int) -> can.Message:
 def test_a_frame_reaches_all_others_and_not_its_sender(members: list[can.BusABC]) -> None:
     members[0].send(frame(7))
     for other in members[1:]:
-        got = other.recv(5)
+        got = other.recv(60)
         assert got is not None
         assert (got.arbitration_id, got.data, got.is_extended_id) == (0x190, bytearray([7, 0, 0, 0, 0, 0, 0, 0]), False)
     assert members[0].recv(0.05) is None
@@ -52,7 +52,7 @@ def test_a_frame_reaches_all_others_and_not_its_sender(members: list[can.BusABC]
 @pytest.mark.parametrize(("can_id", "extended"), [(0, False), (0x7FF, False), (0x1FFFFFFF, True)])
 def test_every_kind_of_frame_passes(members: list[can.BusABC], data: bytes, can_id: int, extended: bool) -> None:
     members[0].send(can.Message(arbitration_id=can_id, data=data, is_extended_id=extended))
-    got = members[1].recv(5)
+    got = members[1].recv(60)
     assert got is not None
     assert (got.arbitration_id, bytes(got.data), got.is_extended_id) == (can_id, data, extended)
 
@@ -62,7 +62,7 @@ def test_nothing_is_lost_and_the_order_stays_when_a_member_reads_late(members: l
         members[0].send(frame(number))
     numbers = []
     for _ in range(3000):
-        got = members[1].recv(5)
+        got = members[1].recv(60)
         assert got is not None
         numbers.append(int.from_bytes(got.data, "little"))
     assert numbers == list(range(3000))
@@ -80,7 +80,7 @@ def test_joining_while_the_bus_is_busy_succeeds(hub: Hub, members: list[can.BusA
     try:
         for _ in range(5):
             late = can.Bus(interface="socketcand", channel="vcan0", host="127.0.0.1", port=hub.port)
-            assert late.recv(5) is not None
+            assert late.recv(60) is not None
             late.shutdown()
     finally:
         done.set()
@@ -92,7 +92,7 @@ def test_rubbish_harms_nobody_else(hub: Hub, members: list[can.BusABC], rubbish:
     with socket.create_connection(("127.0.0.1", hub.port)) as bad:
         bad.sendall(b"< open vcan0 >< rawmode >" + rubbish)
         members[0].send(frame(5))
-        got = members[1].recv(5)
+        got = members[1].recv(60)
         assert got is not None
         assert got.data[0] == 5
 
@@ -107,7 +107,7 @@ def test_as_a_process_it_says_where_it_is_and_stops_when_asked() -> None:
         assert hub.stdout is not None
         assert hub.stdout.readline().startswith("ready socketcand:127.0.0.1:")
         hub.send_signal(signal.SIGTERM)
-        assert hub.wait(10) == 0
+        assert hub.wait(120) == 0
 
 
 def test_frames_right_behind_the_greeting_are_frames() -> None:
@@ -127,9 +127,9 @@ def test_frames_right_behind_the_greeting_are_frames() -> None:
         thread = threading.Thread(target=serve)
         thread.start()
         bus = open_bus(f"socketcand:127.0.0.1:{listener.getsockname()[1]}")
-        assert bus.recv(5) == (0x190, b"\x01\x02")
+        assert bus.recv(60) == (0x190, b"\x01\x02")
         bus.close()
-        thread.join(5)
+        thread.join(60)
 
 
 def test_a_server_that_says_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:

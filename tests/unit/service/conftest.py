@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import logging
 import os
 import warnings
 from collections.abc import Iterator
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from service import logs
 from service.api.app import create_app
 from service.security.principal import SERVICE, current
 from service.store.store import Store
@@ -25,6 +27,17 @@ def as_the_service() -> Iterator[None]:
     token = current.set(SERVICE)
     yield
     current.reset(token)
+
+
+@pytest.fixture(autouse=True)
+def own_log() -> Iterator[None]:
+    """A service that ran in this process leaves its log behind, on a stream that is closed with the test."""
+    yield
+    root = logging.getLogger()
+    for handler in root.handlers.copy():
+        if isinstance(handler.formatter, (logs.Lines, logs.JsonLines)):
+            root.removeHandler(handler)
+            logging.captureWarnings(False)
 
 
 @pytest.fixture

@@ -259,7 +259,7 @@ class Service:
         jobs.boot()
         return jobs
 
-    def wait(self, job_id: str, most_s: float = 10.0) -> None:
+    def wait(self, job_id: str, most_s: float = 60.0) -> None:
         """Until the job is over."""
         deadline = time.monotonic() + most_s
         while JobState(self.store.get(job_id).state) in ACTIVE and time.monotonic() < deadline:

@@ -59,7 +59,7 @@ def left_by_a_job(service: Service, becomes: Callable[[FakeController], None]) -
     service.tune.hold.clear()
     service.tune.inside.clear()
     row = service.jobs.start(TAG, RetuneRequest())
-    assert service.tune.inside.wait(5)
+    assert service.tune.inside.wait(60)
     becomes(service.controller)
     service.tune.hold.set()
     service.wait(row.id)
@@ -156,7 +156,7 @@ def test_the_thread_looks_by_itself_and_ends_with_the_service(tmp_path: Path, mo
     service = Service(tmp_path)
     row = left_by_a_job(service, stopped)
     started(service.controller)
-    until = time.monotonic() + 10
+    until = time.monotonic() + 60
     while service.store.get(row.id).look_after and time.monotonic() < until:
         time.sleep(0.01)
     assert not service.store.get(row.id).look_after
@@ -172,7 +172,7 @@ def test_a_loop_with_an_active_job_is_that_jobs(service: Service, clock: Clock) 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(looked_after, "opened", lambda job_id, columns: lambda session: None)
         second = service.jobs.start(TAG, RetuneRequest())
-        assert service.tune.inside.wait(5)
+        assert service.tune.inside.wait(60)
     service.jobs.aftercare.look()
     assert service.store.get(row.id).look_after and service.controller.session
     service.tune.hold.set()

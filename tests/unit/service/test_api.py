@@ -47,7 +47,7 @@ def test_loops_and_live_state(client: TestClient) -> None:
 def test_live_state_of_a_busy_loop_comes_from_its_job(service: Service, client: TestClient) -> None:
     service.tune.hold.clear()
     job_id = start(client)
-    service.tune.inside.wait(5)
+    service.tune.inside.wait(60)
     loop = client.get(f"/loops/{TAG}").json()
     assert loop["live"]["gains"]["Kp"] == NEW.Kp and loop["live"]["on_trial"] is True
     assert loop["active_job"] == f"/jobs/{job_id}"
@@ -98,7 +98,7 @@ def test_busy_loop_answers_409_with_the_active_job(service: Service, client: Tes
 def test_progress_and_abort(service: Service, client: TestClient) -> None:
     service.tune.hold.clear()
     job_id = start(client)
-    service.tune.inside.wait(5)
+    service.tune.inside.wait(60)
     job = client.get(f"/jobs/{job_id}").json()
     assert job["state"] == "running" and 0 <= job["progress"] < 1 and job["remaining_plant_time_s"] > 0
     assert client.post(f"/jobs/{job_id}/abort").status_code == 202

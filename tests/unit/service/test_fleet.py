@@ -233,7 +233,7 @@ def test_a_service_stopped_in_between_goes_on_where_it_was(tmp_path: Path) -> No
     retune = first.fleet.start(asked(pattern="A-*", at_once_per_bus=1, sp_deviation=1.5, requested_by="night")).id
     first.fleet.look()
     (cut,) = first.store.unfinished()
-    assert first.tune.inside.wait(5)
+    assert first.tune.inside.wait(60)
     first.jobs.stop()  # as SIGTERM does: the job is aborted, its loop restored
     first.fleet.look()  # too late to begin anything
     first.close()
@@ -388,7 +388,7 @@ def test_loops_by_state(plant: Plant, client: TestClient) -> None:
     plant.hold()
     plant.tune.inside.clear()
     plant.jobs.start("A-3", RetuneRequest())
-    assert plant.tune.inside.wait(5)
+    assert plant.tune.inside.wait(60)
     assert tags("proposed") == ["A-1"] and tags("failed") == ["A-2"]
     assert tags("busy") == tags("running") == ["A-3"]
     assert tags("idle") == [tag for tag in TAGS if tag != "A-3"] and tags("accepted") == []

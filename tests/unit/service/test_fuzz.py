@@ -111,7 +111,7 @@ class Site:
         self.service.tune.inside.clear()
         self.service.tune.hold.clear()
         job = self.service.jobs.start("FIC-2", RetuneRequest()).id
-        assert self.service.tune.inside.wait(5)
+        assert self.service.tune.inside.wait(60)
         return job
 
     def retune(self, new: bool) -> str:

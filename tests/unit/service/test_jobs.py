@@ -25,7 +25,7 @@ from tuning.reasons import Reason
 def test_stopping_ends_the_jobs_and_waits_for_their_loops(service: Service) -> None:
     service.tune.hold.clear()
     row = service.jobs.start(TAG, RetuneRequest())
-    service.tune.inside.wait(5)
+    service.tune.inside.wait(60)
     service.jobs.stop()
     row = service.store.get(row.id)
     assert (row.state, row.reason) == ("aborted", Reason.SERVICE_STOPPED.value)
@@ -46,7 +46,7 @@ def test_a_job_that_does_not_end_holds_the_stop_up_for_a_while_only(
     monkeypatch.setattr(FakeLoop, "restore", hangs)
     row = service.jobs.start(TAG, RetuneRequest())
     try:
-        assert inside.wait(5)
+        assert inside.wait(60)
         running = service.jobs.running(row.id)
         began = time.monotonic()
         service.jobs.stop()
@@ -56,7 +56,7 @@ def test_a_job_that_does_not_end_holds_the_stop_up_for_a_while_only(
     (error,) = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
     assert row.id in error and TAG in error and "unknown" in error and "look at the controller" in error
     assert service.store.get(row.id).state == "running"  # the next start looks at its loop
-    assert running is not None and running.over.wait(5)
+    assert running is not None and running.over.wait(60)
 
 
 def test_the_stop_waits_longer_than_any_restore() -> None:

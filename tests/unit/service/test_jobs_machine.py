@@ -203,7 +203,7 @@ class JobsMachine(RuleBasedStateMachine):
         return found[-1 - which // 4 % len(found)]
 
     def over(self, job: Job) -> None:
-        self.engine.threads[job.id].join(10)
+        self.engine.threads[job.id].join(60)
         assert not self.engine.threads[job.id].is_alive()
 
     # rules
@@ -246,7 +246,7 @@ class JobsMachine(RuleBasedStateMachine):
             assert self.store.get(job.id).reason == "locked"
             self.said("begin", "locked")
             return
-        assert job.act.inside.wait(10)
+        assert job.act.inside.wait(60)
         if job.old is None and not job.dry:
             job.old = self.gains[job.loop]
         job.attempts += 1

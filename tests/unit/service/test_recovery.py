@@ -355,7 +355,7 @@ def test_what_could_not_be_queued_but_has_begun_is_stopped(service: Service, mon
 
     def taken_all_the_same(job_id: str, queue: str) -> None:
         enqueue(job_id, queue)
-        service.tune.inside.wait(5)
+        service.tune.inside.wait(60)
         raise OperationalError("INSERT", {}, Exception("no answer"))
 
     monkeypatch.setattr(service.jobs.engine, "enqueue", taken_all_the_same)
@@ -474,7 +474,7 @@ def test_a_job_that_waits_when_the_service_stops_ends_as_such(started: list[Serv
 def test_an_abort_written_by_another_host_is_heard(service: Service) -> None:
     service.tune.hold.clear()
     row = service.jobs.start(TAG, RetuneRequest())
-    service.tune.inside.wait(5)
+    service.tune.inside.wait(60)
     service.store.wish_to_stop(row.id, Reason.OPERATOR.value, "gateway B")
     service.wait(row.id)
     assert (service.store.get(row.id).state, service.controller.state) == ("aborted", HOME)

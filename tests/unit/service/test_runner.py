@@ -211,7 +211,7 @@ class TestWorkBesideTheSamples:
                 enough.set()
 
         result = run(
-            worked(lambda: enough.wait(10)), Meddled(), watch=Watch(), on_samples=heard, start_work=self.beside
+            worked(lambda: enough.wait(60)), Meddled(), watch=Watch(), on_samples=heard, start_work=self.beside
         )
         assert result.value is True
 

@@ -25,12 +25,14 @@ from service.store.tables import JobRow
 from tests.unit.service.fakes import NEW, TAG
 from tests.unit.service.gateway import HOME, STAGES, main, read_loop, write_loop
 
-pytestmark = pytest.mark.timeout(300)  # processes that start slowly on a busy machine
+pytestmark = pytest.mark.timeout(600)  # processes that start slowly on a busy machine
 ROOT = Path(__file__).parents[3]
 SESSION = 77
 
 BEFORE_IT_WORKS = (
+    "before service.serving:Store.__init__",
     "after service.serving:Store.__init__",
+    "before service.serving:Signals.tell",
     "before service.jobs:Store.own_loops",
     "before service.recovery:Recovery.recover",
     "before service.engine.durable:DurableEngine.launch",
@@ -67,7 +69,7 @@ def test_it_ends_cleanly_at_whatever_moment(tmp_path: Path) -> None:
     for number in moments:
         shutil.copytree(tmp_path / "left", tmp_path / str(number))
     command = [sys.executable, "-m", "tests.unit.service.test_start", str(tmp_path), *moments.values()]
-    subprocess.run(command, cwd=ROOT, check=True, timeout=200)
+    subprocess.run(command, cwd=ROOT, check=True, timeout=500)
     for number, when in moments.items():
         output = (tmp_path / f"{number}.log").read_text()
         assert (tmp_path / f"{number}.status").read_text() == "0", (when, output)
@@ -85,19 +87,19 @@ def test_what_it_has_left_the_next_start_goes_on_with(tmp_path: Path) -> None:
     """The engine had been given the job, and believes that it was run."""
     job_id = left(tmp_path / "one")
     first = gateway(tmp_path / "one", "--sigterm=after service.engine.durable:DurableEngine.launch")
-    assert first.communicate(timeout=120) and first.returncode == 0
+    assert first.communicate(timeout=300) and first.returncode == 0
     (tmp_path / "one" / "go").touch()
     second = gateway(tmp_path / "one")
     assert second.stdout is not None and second.stdout.readline().startswith("ready")
     with closing(create_engine(f"sqlite:///{tmp_path / 'one' / 'data' / FILE}").connect()) as database:
-        until = time.monotonic() + 60
+        until = time.monotonic() + 120
         state = ""
         while state != "proposed" and time.monotonic() < until:
             time.sleep(0.1)
             state = database.scalars(select(JobRow.state).where(JobRow.id == job_id)).one()
             database.rollback()
     second.send_signal(signal.SIGTERM)
-    second.communicate(timeout=60)
+    second.communicate(timeout=120)
     assert (state, second.returncode) == ("proposed", 0)
     assert (tmp_path / "one" / f"{TAG}.ran").read_text().split() == list(STAGES)
 

@@ -7,7 +7,6 @@ import socket
 import sqlite3
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 
 import pytest
 import yaml
+from sqlalchemy import text
 
 from service import serving
 from service.engine.durable import FILE as ENGINE_FILE
@@ -23,18 +23,11 @@ from service.store.lock import FolderLock
 from service.store.store import Store
 from tests.unit.service.fakes import NEW, TAG, loop_entry
 from tests.unit.service.gateway import HOME, read_loop
-from tests.unit.service.test_survival import Gateway
+from tests.unit.service.test_survival import Gateway, until
 
-pytestmark = pytest.mark.timeout(300)  # processes that start slowly on a busy machine
+pytestmark = pytest.mark.timeout(600)  # processes that start slowly on a busy machine
 ROOT = Path(__file__).parents[3]
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
-
-
-def until(reached: Callable[[], object], what: str, timeout_s: float = 120.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not reached():
-        assert time.monotonic() < deadline, f"not in {timeout_s:g} s: {what}"
-        time.sleep(0.02)
 
 
 @pytest.fixture
@@ -103,6 +96,17 @@ def test_the_file_alone_holds_everything_after_a_stop(under_test: tuple[Gateway,
     with closing(sqlite3.connect(alone)) as file:
         found = file.execute("SELECT state FROM jobs WHERE id = ?", (url.rpartition("/")[2],)).fetchall()
     assert found == [("aborted",)]
+
+
+def test_the_wal_is_emptied_beside_a_connection_that_is_not_given_back(tmp_path: Path) -> None:
+    """SQLite does it by itself only as the last connection is closed; a request may be answered still."""
+    store = Store(tmp_path)
+    with store.engine.connect() as held:
+        held.execute(text("SELECT count(*) FROM jobs")).one()
+        store.create(TAG, {}, "me", False)
+        assert wal(tmp_path / FILE)
+        store.close()
+        assert not wal(tmp_path / FILE)
 
 
 @pytest.mark.parametrize("first", SIGNALS, ids=lambda number: signal.Signals(number).name)

@@ -26,6 +26,13 @@ from tests.unit.service.postgres import Server
 pytestmark = pytest.mark.timeout(600)  # processes that start slowly on a busy machine
 
 
+def until(reached: Callable[[], object], what: str = "what was waited for", timeout_s: float = 120.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not reached():
+        assert time.monotonic() < deadline, f"not in {timeout_s:g} s: {what}"
+        time.sleep(0.02)
+
+
 class Gateway:
     """The process of tests.unit.service.gateway, started again as often as a test likes. first: options of the first
     start alone."""
@@ -58,8 +65,8 @@ class Gateway:
 
     def serve(self, *more: str) -> None:
         self.process = self.launch(*more)
-        url = self.process.wait_ready(120).split()[1]
-        self.http = httpx.Client(base_url=url, timeout=20.0, trust_env=False)
+        url = self.process.wait_ready(180).split()[1]
+        self.http = httpx.Client(base_url=url, timeout=60.0, trust_env=False)
         self._stack.callback(self.http.close)
 
     def go(self, stage: str = "") -> None:
@@ -70,7 +77,7 @@ class Gateway:
         assert answer.status_code == 202, answer.text
         return str(answer.headers["location"])
 
-    def until(self, url: str, wanted: Callable[[dict[str, Any]], bool], timeout_s: float = 60.0) -> dict[str, Any]:
+    def until(self, url: str, wanted: Callable[[dict[str, Any]], bool], timeout_s: float = 120.0) -> dict[str, Any]:
         deadline = time.monotonic() + timeout_s
         while True:
             answer = self.http.get(url)
@@ -89,7 +96,7 @@ class Gateway:
 
         return self.until(url, there)
 
-    def over(self, url: str, timeout_s: float = 60.0) -> dict[str, Any]:
+    def over(self, url: str, timeout_s: float = 120.0) -> dict[str, Any]:
         return self.until(url, lambda job: job["state"] not in ("queued", "running"), timeout_s)
 
     def ran(self, tag: str = TAG) -> list[str]:
@@ -159,7 +166,7 @@ def test_a_second_service_on_the_same_data_is_told_who_has_it(
         second = Process("second", arguments, tmp_path / "second.log")
         stack.callback(second.stop)
     with pytest.raises(NotReady) as refused:
-        second.wait_ready(120)
+        second.wait_ready(180)
     assert f"process {gateway.process.pid} on" in str(refused.value)
     gateway.go()
     assert gateway.over(url)["state"] == "proposed" and gateway.ran() == list(STAGES)
@@ -200,9 +207,9 @@ def test_a_locked_database_delays_nothing_but_the_answers(stack: ExitStack, tmp_
         gateway.go()
         answer = gateway.http.post(f"{url}/abort")
         assert (answer.status_code, answer.headers["retry-after"]) == (503, "5")
-        # At most one wait for another writer of the process, and one for the file.
-        assert WAIT_S <= time.monotonic() - began < 2 * WAIT_S + 3
-        assert read_loop(tmp_path, TAG) == HOME  # the job has run to its end while nothing could be written
+        # At most one wait for another writer of the process, and one for the file; the rest is for a busy machine.
+        assert WAIT_S <= time.monotonic() - began < 2 * WAIT_S + 30
+        until(lambda: read_loop(tmp_path, TAG) == HOME)  # the job runs to its end while nothing can be written
         other.execute("ROLLBACK")
     job = gateway.over(url)
     assert (job["state"], job["attempts"]) == ("proposed", 1)
@@ -221,7 +228,7 @@ def test_a_database_that_is_away_for_15_s(stack: ExitStack, tmp_path: Path, post
         gateway.go("relay")
         while time.monotonic() - began < 15:
             time.sleep(0.1)
-        assert gateway.ran() == ["relay", "ultimate"]  # the job went on
+        until(lambda: gateway.ran() == ["relay", "ultimate"])  # the job goes on
     finally:
         postgres.start()
     gateway.go()
