@@ -42,6 +42,7 @@ from service.work import Tune, rehearse
 from service.work import tune as live
 
 _GRACE_S = 10
+_ONCE_A_MINUTE = OnceAMinute()
 _log = logging.getLogger(__name__)
 
 
@@ -221,7 +222,7 @@ def server_config(app: FastAPI, setup: Setup, listener: Listener, descriptors: i
 
     descriptors: file descriptors of this process.
     """
-    logging.getLogger("uvicorn.error").addFilter(OnceAMinute())
+    logging.getLogger("uvicorn.error").addFilter(_ONCE_A_MINUTE)
     connections = Connections(setup.limits, descriptors, partial(_is_of, setup.trusted_proxies))
     listener.wanted = connections.wanted
     return uvicorn.Config(
