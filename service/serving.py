@@ -265,4 +265,7 @@ def listen(bind: str, port: int) -> Listener:
     listener = Listener(socket.create_server((bind, port), family=family, reuse_port=False).detach())
     # asyncio sets it only where a socket names its protocol; without it an answer waits 40 ms for the client's ACK.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    # The kernel hands a connection over with what its client says, or after a second in silence: those that say nothing
+    # can be told from those that are about to.
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, 1)
     return listener

@@ -311,16 +311,7 @@ def test_those_who_say_nothing_give_way(service: Service, stack: ExitStack, capl
     assert stream.recv(12) == b"HTTP/1.1 200"
     silent = [stack.enter_context(closing(door.begun(text))) for text in 15 * ["", "", "GET / HTTP", "GET / HTTP"]]
     assert door.ask("GET", "/healthz")[0] == 200
-    closed = 0
-    for connection in silent:
-        connection.setblocking(False)
-        try:
-            closed += connection.recv(1) == b""
-        except BlockingIOError:
-            continue
-        except ConnectionResetError:
-            closed += 1
-    assert closed >= 45
+    until(lambda: sum(map(is_closed, silent)) >= 45)
     stream.settimeout(PATIENCE_S)
     assert stream.recv(100)  # who is answered stays
     lines = [record for record in caplog.records if "since the last such line" in record.getMessage()]
@@ -339,6 +330,16 @@ def test_where_nobody_can_give_way_one_is_refused_in_words(service: Service, sta
     assert answer.startswith(b"HTTP/1.1 503 ") and b"Retry-After: 1" in answer and b"as many connections" in answer
     streams[0].close()
     until(lambda: not rest_is_refusal(door))
+
+
+def is_closed(connection: socket.socket) -> bool:
+    connection.setblocking(False)
+    try:
+        return connection.recv(1) == b""
+    except BlockingIOError:
+        return False
+    except ConnectionResetError:
+        return True
 
 
 def rest_is_refusal(door: Served) -> bool:
@@ -399,6 +400,8 @@ def test_without_descriptors_connections_are_turned_away(caplog: pytest.LogCaptu
     with closing(listen("127.0.0.1", 0)) as listener, ExitStack() as stack:
         listener.setblocking(False)
         clients = [stack.enter_context(closing(socket.create_connection(listener.getsockname()))) for _ in range(40)]
+        for client in clients:
+            client.sendall(b"G")
         soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
         with open(os.devnull) as free:
             lowest = free.fileno()
