@@ -44,6 +44,7 @@ from service.work import Tune, rehearse
 from service.work import tune as live
 
 _GRACE_S = 10
+_ONCE_A_MINUTE = OnceAMinute()
 _log = logging.getLogger(__name__)
 
 
@@ -213,7 +214,7 @@ def server_config(app: FastAPI, setup: Setup, listener: Listener, descriptors: i
 
     descriptors: file descriptors of this process.
     """
-    logging.getLogger("uvicorn.error").addFilter(OnceAMinute())
+    logging.getLogger("uvicorn.error").addFilter(_ONCE_A_MINUTE)
     connections = Connections(setup.limits, descriptors, partial(_is_of, setup.trusted_proxies))
     listener.wanted = connections.wanted
     return uvicorn.Config(
@@ -247,4 +248,7 @@ def listen(bind: str, port: int) -> Listener:
     listener = Listener(socket.create_server((bind, port), family=family, reuse_port=False).detach())
     # asyncio sets it only where a socket names its protocol; without it an answer waits 40 ms for the client's ACK.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    # The kernel hands a connection over with what its client says, or after a second in silence: those that say nothing
+    # can be told from those that are about to.
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, 1)
     return listener
