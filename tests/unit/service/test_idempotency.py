@@ -44,6 +44,10 @@ def post(client: TestClient, path: str, body: dict[str, Any] | None = None, **he
     return client.post(path, json=body or {}, headers=KEY | headers)
 
 
+def away(*_: Any) -> None:
+    raise OperationalError("SELECT", {}, Exception("server closed the connection"))
+
+
 def same(one: Any, other: Any) -> bool:
     names = ("content-type", "location", "content-length")
     return (one.status_code, one.content) == (other.status_code, other.content) and all(
@@ -298,6 +302,19 @@ def test_a_defect_is_no_answer_to_keep(service: Service, client: TestClient, mon
     assert post(client, RETUNE).status_code == 202
 
 
+def test_an_error_after_the_job_was_made_does_not_make_another(
+    service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(service.store, "events", away)
+        assert_problem(post(client, RETUNE), 503)
+    (job,) = service.store.recent()
+    service.wait(job.id)
+    again = post(client, RETUNE)
+    assert (again.status_code, again.headers["location"]) == (202, f"/jobs/{job.id}")
+    assert len(service.store.recent()) == 1
+
+
 def test_a_body_that_is_too_long_is_refused_with_a_key_too(service: Service) -> None:
     limits = RequestLimits(body_bytes=1000)
     client = TestClient(create_app(service.jobs, Policy(None, limits), {}), raise_server_exceptions=False)
@@ -306,9 +323,6 @@ def test_a_body_that_is_too_long_is_refused_with_a_key_too(service: Service) -> 
 
 
 def test_a_database_that_is_away(service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    def away(*_: Any) -> None:
-        raise OperationalError("SELECT", {}, Exception("server closed the connection"))
-
     with monkeypatch.context() as patch:
         patch.setattr(IdempotencyKeys, "_claim", away)
         answer = post(client, RETUNE)
