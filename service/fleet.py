@@ -56,7 +56,7 @@ class FleetRequest(RetuneRequest):
     stop_after_failures: AtOnce | None = Field(
         default=None,
         description="Begin no more loops once so many ended without a proposal; those under test go on. "
-        "What an operator aborts does not count",
+        "What an operator aborts does not count, and no_gain is a good end",
     )
 
     @model_validator(mode="after")

@@ -12,7 +12,7 @@ from service.state_json import gains_of, loop_state
 from service.states import JobState
 from service.store.store import Store
 from service.store.tables import JobRow
-from tuning.reasons import Ended, Reason
+from tuning.reasons import Ended
 
 LOOKED_AT = 50
 """Latest jobs of the loop among which a model, and the controller's last state, are looked for."""
@@ -36,7 +36,7 @@ def known(store: Store, tag: str, read: Callable[[], LoopState]) -> Ground:
 
 def _last_model(store: Store, rows: Sequence[JobRow]) -> LastModel | None:
     for row in rows:
-        if row.ended_at is None or (row.reason and Reason(row.reason) in DISPROVED):
+        if row.ended_at is None or row.reason in DISPROVED:
             continue
         model = found_model(row, store.events(row.id))
         if model is not None:

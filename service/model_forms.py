@@ -21,7 +21,9 @@ from service.plausible import Implausible, check_damping, check_model
 from tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 
 MOST_COEFFICIENTS = 12
-_BESIDE = frozenset({"name", "sample_time_s", "t95_s", "noise_std", "seed", "mv_limits", "sp_deviation", "gains"})
+_BESIDE = frozenset(
+    {"name", "sample_time_s", "t95_s", "noise_std", "seed", "mv_limits", "sp_deviation", "gains", "reverse_acting"}
+)
 
 
 class BadModel(ValueError):

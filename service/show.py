@@ -68,7 +68,8 @@ def number(value: object) -> str:
 def job_report(job: dict[str, Any], pv_unit: str = "PV unit") -> None:
     """Everything a decision needs, as a table."""
     table = Table(title=title(job), show_header=True)
-    for heading in ("", "before", "after", "unit"):
+    of_new = {"no_gain": "designed", "rehearsed": "rehearsed"}.get(job["state"], "after")
+    for heading in ("", "before", of_new, "unit"):
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
     old, new = job["old_gains"] or {}, job["new_gains"] or {}
     per = f"% per {pv_unit}"

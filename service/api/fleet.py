@@ -52,7 +52,9 @@ class RetuneSummary(BaseModel):
     ended_at: str | None = Field(description="UTC, ISO 8601, wall time")
     request: dict[str, Any] = Field(description="The options asked for")
     counts: dict[str, int] = Field(description="Number of loops by state", examples=[{"waiting": 12, "running": 4}])
-    failures: int = Field(description="Loops that ended without a proposal; aborted ones not counted", examples=[1])
+    failures: int = Field(
+        description="Loops that ended without a proposal; aborted ones and no_gain not counted", examples=[1]
+    )
     stop_reason: StopReason | None = Field(description="Why no more loops are begun", examples=["failures"])
     detail: str | None = Field(description="The same in words")
 
