@@ -44,12 +44,14 @@ class Now:
     """What is known of a loop at the moment, beside its configuration.
 
     state: as read, or as the job that has the loop has found it; None where nobody can tell.  silent: why the
-    controller could not be read.  active_job: the id of the job that has the loop.  stopping: the service is.
+    controller could not be read.  active_job: the id of the job that has the loop.  locked: who has locked the loop, in
+    words.  stopping: the service is.
     """
 
     state: LoopState | None = None
     silent: Ended | None = None
     active_job: str | None = None
+    locked: str | None = None
     stopping: bool = False
 
 
@@ -65,6 +67,8 @@ def obstacles(config: LoopConfig, request: RetuneRequest, now: Now) -> list[Obst
         return found
     if now.active_job is not None:
         found.append(Obstacle(Occupied.BUSY, f"loop {config.tag} is busy with job {now.active_job}"))
+    if now.locked is not None:
+        found.append(Obstacle(Reason.LOCKED, now.locked))
     if now.silent is not None:
         found.append(Obstacle(now.silent.reason, now.silent.detail))
     if now.state is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated
 
 from fastapi import APIRouter, Body, Path
@@ -13,6 +14,7 @@ from service.obstacles import Now
 from service.preview import FleetPreview, LastModel, Preview, fleet_preview, preview
 from service.request import RetuneRequest
 from service.state_json import loop_state
+from service.store import loop_locks
 from service.store.tables import JobRow
 from tuning.reasons import Ended
 
@@ -41,11 +43,12 @@ def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
     )
     def many(wish: Annotated[FleetRequest, Body()]) -> FleetPreview:
         options, busy, models = wish.options(), jobs.store.busy(), jobs.store.last_models()
+        locked = _locked(jobs)
         return fleet_preview([
             preview(
                 config,
                 options,
-                Now(active_job=busy.get(config.tag), stopping=jobs.stopping),
+                Now(active_job=busy.get(config.tag), locked=locked.get(config.tag), stopping=jobs.stopping),
                 _last(models.get(config.tag)),
             )
             for config in fleet.asked(wish)
@@ -60,12 +63,20 @@ def _now(jobs: Jobs, tag: str, request: RetuneRequest) -> Now:
         return Now(stopping=jobs.stopping)
     active = jobs.store.active(tag)
     if active is not None and active.found is not None:
-        return Now(loop_state(active.found), active_job=active.id, stopping=jobs.stopping)
-    holder = None if active is None else active.id
+        state, locked = loop_state(active.found), _locked(jobs).get(tag)
+        return Now(state, active_job=active.id, locked=locked, stopping=jobs.stopping)
+    found = Now(
+        active_job=None if active is None else active.id, locked=_locked(jobs).get(tag), stopping=jobs.stopping
+    )
     try:
-        return Now(jobs.live(tag), active_job=holder, stopping=jobs.stopping)
+        return replace(found, state=jobs.live(tag))
     except Ended as silent:
-        return Now(silent=silent, active_job=holder, stopping=jobs.stopping)
+        return replace(found, silent=silent)
+
+
+def _locked(jobs: Jobs) -> dict[str, str]:
+    """Of each loop that is locked, by whom, since when and why."""
+    return {tag: loop_locks.words(row) for tag, row in jobs.locks().items()}
 
 
 def _last(row: JobRow | None) -> LastModel | None:

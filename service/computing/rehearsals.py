@@ -10,6 +10,7 @@ from typing import Any
 from service.computing.limits import Kind
 from service.computing.pool import NotWanted, Pool
 from service.config import LoopConfig
+from service.ground import Ground
 from service.request import RetuneRequest
 from service.work import Hooks, Outcome, Rehearse
 from tuning.plan import Event, Sample
@@ -31,7 +32,7 @@ def apart(rehearse: Rehearse, pool: Pool) -> Rehearse:
                 else:
                     hooks.on_event(each)
 
-        work = partial(_rehearsed, rehearse, config, request)
+        work = partial(_rehearsed, rehearse, config, request, hooks.ground)
         try:
             outcome = pool.run(Kind.DRY_RUN, work, hear=hear, unwanted=lambda: hooks.stop() is not None)
         except NotWanted:
@@ -44,11 +45,11 @@ def apart(rehearse: Rehearse, pool: Pool) -> Rehearse:
 
 
 def _rehearsed(
-    rehearse: Rehearse, config: LoopConfig, request: RetuneRequest, report: Callable[[Any], None]
+    rehearse: Rehearse, config: LoopConfig, request: RetuneRequest, ground: Ground, report: Callable[[Any], None]
 ) -> Outcome:
     """In the process of the computation."""
     reports = _Reports(report)
-    outcome = rehearse(config, request, Hooks(reports.event, reports.samples, lambda: None))
+    outcome = rehearse(config, request, Hooks(reports.event, reports.samples, lambda: None, ground=ground))
     if outcome.ended is not None and outcome.ended.reason is Reason.COMPUTATION_LIMIT:
         raise MemoryError  # the runner has named it; the limit is known to the pool
     reports.hand_on()

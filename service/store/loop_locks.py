@@ -24,7 +24,7 @@ def lock(session: Session, loop: str, reason: str, by: str) -> LoopLockRow:
         session.add(row)
         audit.record(session, "lock", loop, after=_shown(row), loop=loop, said_by=by)
     elif row.reason != reason:
-        raise LockedOtherwise(_words(row))
+        raise LockedOtherwise(words(row))
     return row
 
 
@@ -43,7 +43,7 @@ def check(session: Session, loop: str) -> None:
     _hold(session, loop, read=True)
     row = session.get(LoopLockRow, loop)
     if row is not None:
-        raise Locked(_words(row))
+        raise Locked(words(row))
 
 
 def every(session: Session) -> dict[str, LoopLockRow]:
@@ -60,5 +60,6 @@ def _shown(row: LoopLockRow) -> dict[str, str]:
     return {"reason": row.reason, "by": row.by, "since": row.since}
 
 
-def _words(row: LoopLockRow) -> str:
+def words(row: LoopLockRow) -> str:
+    """Who has locked the loop, since when and why."""
     return f"loop {row.loop} is locked by {row.by} since {row.since}: {row.reason}"

@@ -174,21 +174,19 @@ def test_a_refused_rehearsal_says_what_it_was_on(service: Service) -> None:
 @pytest.mark.parametrize(
     ("changes", "options", "words"),
     [
-        ({"t95_s": 1e-300}, {}, "t95_s is 1e-300"),
-        ({"t95_s": 1e300}, {}, "t95_s is 1e+300"),
-        ({}, {"plant": {"num": [1.0], "den": [1e-300, 1e300, 1.0]}}, "den[0] is 1e-300"),
-        ({}, {"plant": {"num": [1.0], "den": [1.0, 1e-308]}}, "den[1] is 1e-308"),
-        ({}, {"plant": {"num": [1.0], "den": [1.0, 1.0], "dead_time_s": 1e300}}, "dead_time_s is 1e+300"),
-        ({}, {"plant": {"num": [1.0], "den": [1.0, 1.0], "dead_time_s": 4e6, "sample_time_s": 0.1}}, "4e+07 sample"),
-        ({}, {"model": {"K": 1e308, "T_s": 1.0, "L_s": 1.0}}, "num[0] is 1e+308"),
+        ({"t95_s": 1e-300}, {}, "t95_s: 1e-300 is no plant's"),
+        ({"t95_s": 1e300}, {}, "t95_s: 1e+300 is no plant's"),
+        ({}, {"num": [1.0], "den": [1.0, 1.0], "dead_time_s": 900.0, "sample_time_s": 0.001}, "9e+05 times in"),
     ],
 )
 def test_an_extreme_one_is_refused_by_name(
     service: Service, changes: dict[str, Any], options: dict[str, Any], words: str
 ) -> None:
+    """What the request itself shows is refused at the edge (test_plausible); this is what shows later."""
     config = service.loops[TAG].model_copy(update=changes)
+    request = RetuneRequest(dry_run=True, plant=PlantModel(**options) if options else None)
     quiet = Hooks(lambda event: None, lambda samples: None, lambda: None)
-    ended = rehearse(config, RetuneRequest(dry_run=True, **options), quiet).ended
+    ended = rehearse(config, request, quiet).ended
     assert ended is not None and ended.reason is Reason.BAD_INPUT and words in ended.detail, ended
 
 

@@ -254,6 +254,13 @@ class TestHttp:
         service.tune.hold.set()
         service.wait(job["id"])
 
+    def test_a_lock_is_told(self, service: Service, client: TestClient) -> None:
+        client.post(f"/loops/{TAG}/lock", json={"reason": "valve is being overhauled", "by": "night shift"})
+        (obstacle,) = self.ask(client)["obstacles"]
+        assert obstacle["reason"] == "locked" and "valve is being overhauled" in obstacle["detail"]
+        many = client.post("/retunes/preview", json={"loops": [TAG]}).json()
+        assert "locked" in str(many)
+
     def test_the_last_model_is_known_and_no_dry_run_counts(self, service: Service, client: TestClient) -> None:
         assert self.ask(client)["known"]["model_job"] is None
         jobs = [client.post(f"/loops/{TAG}/retune", json={"dry_run": dry}).json()["id"] for dry in (False, True)]
