@@ -249,17 +249,20 @@ class Jobs:
 
         One that runs here hears of it before it is written down: the loop does not wait for the database.
         """
-        self.tell_to_stop(job_id)
-        row = self.store.wish_to_stop(job_id, Reason.OPERATOR.value, by)
+        heard = self.tell_to_stop(job_id)
+        row = self.store.wish_to_stop(job_id, Reason.OPERATOR.value, by, heard)
         if row.host == self.store.host:
             self._heed(job_id, Reason.OPERATOR)
         return self.store.get(job_id)
 
-    def tell_to_stop(self, job_id: str) -> None:
-        """A job that runs here hears that an operator wants it to end; returns at once, and writes nothing down."""
+    def tell_to_stop(self, job_id: str) -> bool:
+        """A job that runs here hears that an operator wants it to end; returns at once, and writes nothing down. False
+        where no job hears of it."""
         running = self._running.get(job_id)
-        if running is not None:
-            running.stop_reason = running.stop_reason or Reason.OPERATOR
+        if running is None:
+            return False
+        running.stop_reason = running.stop_reason or Reason.OPERATOR
+        return running.stop_reason is Reason.OPERATOR
 
     def _heed(
         self,

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Sequence
 
 from validation.figures import draw
 from validation.references import ROOT, load
@@ -18,8 +19,8 @@ DOCUMENT = ROOT / "docs/validation.md"
 PLOTS = ROOT / "docs/validation"
 
 
-def main() -> int:
-    argparse.ArgumentParser(prog="python -m validation", description=__doc__.splitlines()[0]).parse_args()
+def main(argv: Sequence[str] | None = None) -> int:
+    argparse.ArgumentParser(prog="python -m validation", description=__doc__.splitlines()[0]).parse_args(argv)
     began = time.monotonic()
     references = load()
     papers = validate(references)

@@ -335,11 +335,16 @@ class Store:
             rows = session.execute(select(JobRow.id, JobRow.stop_reason).where(*mine))
             return {row.id: row.stop_reason for row in rows}
 
-    def wish_to_stop(self, job_id: str, reason: str, by: str) -> JobRow:
-        """Notes that the job is to stop, once. Raises IllegalMove when it is over."""
+    def wish_to_stop(self, job_id: str, reason: str, by: str, heard: bool = False) -> JobRow:
+        """Notes that the job is to stop, once. Raises IllegalMove when it is over.
+
+        heard: the job knows of this wish already, and may have ended for it by now.
+        """
         with self.writing() as session:
             row = _find(session, job_id, lock=True)
-            check(JobState(row.state), JobState.ABORTED)
+            ended_for_it = heard and (row.state, row.reason, row.stop_reason) == (JobState.ABORTED, reason, None)
+            if not ended_for_it:
+                check(JobState(row.state), JobState.ABORTED)
             claims.changed(session, f"/jobs/{job_id}")
             if row.stop_reason is None:
                 row.stop_reason = reason

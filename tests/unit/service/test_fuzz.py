@@ -212,7 +212,7 @@ def _refusal(key: str, label: str) -> int | None:
     """Written from the table in docs/operations.md, not from the code."""
     if key not in list(Scope):
         return 401
-    reads = label.startswith("GET ") or label == "POST /tunings"
+    reads = label.startswith("GET ") or label == "POST /tunings" or label.endswith("/preview")
     needs = "admin" if label == "GET /audit" else "read" if reads else "operate"
     permitted = {"read": ("read",), "operate": ("read", "operate"), "admin": ("read", "operate", "admin")}
     return None if needs in permitted[key] else 403

@@ -44,7 +44,7 @@ def post(client: TestClient, path: str, body: dict[str, Any] | None = None, **he
     return client.post(path, json=body or {}, headers=KEY | headers)
 
 
-def away(*_: Any) -> None:
+def away(*_: Any, **__: Any) -> None:
     raise OperationalError("SELECT", {}, Exception("server closed the connection"))
 
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from sqlalchemy.exc import OperationalError
@@ -14,8 +15,10 @@ from service.bus_loop import RESTORE_PATIENCE_S
 from service.loop import LoopState, Restored
 from service.progress import Progress
 from service.request import RetuneRequest
-from service.states import JobState
+from service.security import audit
+from service.states import IllegalMove, JobState
 from service.store.store import Store
+from service.store.tables import JobRow
 from service.work import rehearse
 from tests.unit.service.fakes import OLD, TAG, FakeLoop, Service
 from tuning.plan import StageStarted
@@ -144,7 +147,7 @@ def test_samples_of_a_rehearsal_are_kept(service: Service) -> None:
 def test_a_running_job_hears_of_an_abort_that_the_database_does_not_take(
     service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def gone(job_id: str, reason: str, by: str) -> None:
+    def gone(*_: object) -> None:
         raise OperationalError("UPDATE", {}, Exception("database is locked"))
 
     service.tune.hold.clear()
@@ -157,3 +160,23 @@ def test_a_running_job_hears_of_an_abort_that_the_database_does_not_take(
     row = service.store.get(row.id)
     assert (row.state, row.reason) == ("aborted", Reason.OPERATOR.value)
     assert service.controller.state.gains == OLD
+
+
+def test_a_job_that_ends_for_an_abort_before_it_is_written_down_was_aborted_by_it(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = service.store.wish_to_stop
+
+    def slow(job_id: str, *more: Any) -> JobRow:
+        service.wait(job_id, 60)
+        return write(job_id, *more)
+
+    service.tune.hold.clear()
+    row = service.jobs.start(TAG, RetuneRequest())
+    assert service.tune.inside.wait(60)
+    monkeypatch.setattr(service.store, "wish_to_stop", slow)
+    assert service.jobs.abort(row.id, "me").state == "aborted"
+    (told,) = [each for each in audit.trail(service.store.engine, 10) if each.what == "abort"]
+    assert (told.subject, told.said_by) == (row.id, "me")
+    with pytest.raises(IllegalMove):
+        service.jobs.abort(row.id, "me")

@@ -113,7 +113,7 @@ def test_no_test_begins_but_a_rehearsal_may(service: Service, client: TestClient
     job = client.post(f"/loops/{TAG}/retune", json={"dry_run": True})
     assert job.status_code == 202
     service.wait(job.json()["id"])
-    assert service.store.get(job.json()["id"]).state == "proposed"
+    assert service.store.get(job.json()["id"]).state == "rehearsed"
     client.post(f"/loops/{TAG}/unlock")
     assert client.post(f"/loops/{TAG}/retune", json={}).status_code == 202
 

@@ -158,7 +158,7 @@ class Clocks:
     """A wall clock that somebody sets, and the time that passes."""
 
     def __init__(self) -> None:
-        self.wall, self.passed_s = NOW, 1000.0
+        self.wall, self.passed_s = datetime.now(UTC), 1000.0  # jobs are stored by the clock as it is
 
     def go_on(self, days: float) -> None:
         self.wall, self.passed_s = self.wall + timedelta(days=days), self.passed_s + 86400.0 * days

@@ -100,7 +100,7 @@ def test_the_command_fails_and_names_the_row(
     monkeypatch.setattr(command, "PLOTS", tmp_path / "plots")
     monkeypatch.setattr(command, "load", lambda: changed)
     monkeypatch.setattr(command, "validate", lambda found: [imc.check(found)])
-    assert command.main() == 1
+    assert command.main([]) == 1
     assert "FAILED: IMC-based PID, Table 1, row IMC-PID, disturbance: IAE printed 5.0" in capsys.readouterr().err
     assert "IAE **failed**" in (tmp_path / "validation.md").read_text(encoding="utf-8")
     assert len(list((tmp_path / "plots").iterdir())) == len(names(references))
