@@ -27,6 +27,7 @@ pytestmark = pytest.mark.timeout(300)  # processes that start slowly on a busy m
 ENDLESS = {"model": {"K": 2, "T": 10, "L": 1e4}, "method": "me-pso", "options": {"horizon_s": 1e8}}
 """More than 60 s of processor time."""
 
+SHORT = {"model": {"K": 2, "T": 10, "L": 2}, "method": "simc"}
 LONG = {"dry_run": True, "plant": {"num": [2.0], "den": [3.0, 1.0], "dead_time_s": 1.0, "sample_time_s": 0.005}}
 """Of seconds."""
 
@@ -60,6 +61,8 @@ class Served:
         assert ready.startswith("ready"), self._log.read_text()
         self.url = ready.split()[1]
         self.port = int(self.url.rpartition(":")[2])
+        # The service begins with a computation of its own, so that the fork server is there: then it is over.
+        assert self.asked(SHORT).result(200).status_code == 200
 
     @staticmethod
     def _end(process: subprocess.Popen[str]) -> None:
@@ -77,7 +80,7 @@ class Served:
     def asked_and_left(self, body: dict[str, Any]) -> socket.socket:
         """The connection of a client that has asked and does not read the answer."""
         text = json.dumps(body).encode()
-        client = socket.create_connection(("127.0.0.1", self.port))
+        client = self._stack.enter_context(socket.create_connection(("127.0.0.1", self.port)))
         head = f"POST /tunings HTTP/1.1\r\nHost: localhost:{self.port}\r\nContent-Type: application/json\r\n"
         client.sendall(f"{head}Content-Length: {len(text)}\r\n\r\n".encode() + text)
         return client

@@ -105,7 +105,7 @@ def test_the_command_fails_and_names_the_row(
     assert "IAE **failed**" in (tmp_path / "validation.md").read_text(encoding="utf-8")
     assert len(list((tmp_path / "plots").iterdir())) == len(names(references))
     monkeypatch.setattr(command, "load", lambda: references)
-    assert command.main() == 0
+    assert command.main([]) == 0
 
 
 TENTH = Column("x", 2, Tolerance("for the test", absolute=0.1), own=Tolerance("for the test", relative=0.01))
