@@ -27,7 +27,6 @@ Fault = Callable[[int], Sequence[float]]
 """Of a frame's COB-ID: the delays in s after which copies are passed on; none: the frame is lost."""
 
 
-
 def _address_of(order: Order) -> bytes:
     return lookup(object_of(order)).index.to_bytes(2, "little") + b"\x01"
 

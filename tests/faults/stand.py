@@ -22,7 +22,7 @@ from controller.device import Kept
 from controller.memory import write
 from controller.pid import Parameters
 from protocol.profile import Mode
-from service.store.chunks import unpack
+from service.store.chunks import Block, unpack
 from service.store.tables import ChunkRow
 from tests.e2e.plantsite import MODEL_14, Plantsite
 from tests.faults.ending import Eye, Home, Stalls
@@ -104,7 +104,7 @@ class Stand:
         engine = create_engine(address.replace("postgresql:", "postgresql+psycopg:"))
         mine = select(ChunkRow).where(ChunkRow.job_id == url.rsplit("/", 1)[1]).order_by(ChunkRow.seq)
         with Session(engine) as session:
-            blocks = [unpack(row.data, row.count, row.first_t_s) for row in session.scalars(mine)]
+            blocks = [unpack(Block(row.stage, row.first_t_s, row.count, row.data)) for row in session.scalars(mine)]
         self.left = [round(sample.t / LOOP.ts) for block in blocks for sample in block]
         engine.dispose()
         self.site.serve()

@@ -20,7 +20,7 @@ from tests.unit.service.fakes import ThreadEngine
 from tuning.fast.procedure import FAST_STAGES
 from tuning.five_stage import STAGES
 from tuning.plan import Command, Sample
-from tuning.stages.settle import SETTLE
+from tuning.stages.preflight import SETTLE
 
 TAG = "TIC-1"
 LIVE = [stage for stage in STAGES if stage not in ("estimate", "optimise")]  # those that take samples

@@ -14,7 +14,8 @@ from service.work import plan
 from tuning.plan import Event, Mode, Plan, SetMode, SetOutput, StageStarted
 from tuning.reasons import Reason
 from tuning.stages.common import Facts
-from tuning.stages.settle import LOOKS, SETTLE
+from tuning.stages.preflight import SETTLE
+from tuning.stages.settle import LOOKS
 
 TAG = "TIC-1"
 CUT_OFF = [EventRow(kind="loop_found", data={})]

@@ -9,6 +9,7 @@ from controller import session
 from controller.channel import Channel, Home
 from protocol.objects import Value
 from protocol.profile import Order, RelayState
+from protocol.session import check_of as check_of_order
 
 Replace = Callable[[Any, str, Any], None]
 
@@ -24,7 +25,7 @@ class _OfAnyCount(int):
 
 def count_is_not_checked(replace: Replace) -> None:
     """The controller obeys an order of this session whatever its count."""
-    real = session.check_of
+    real = check_of_order
 
     def check_of(number: int, count: int, order: Order, values: Sequence[Value]) -> int:
         check = _OfAnyCount(real(number, count, order, values))

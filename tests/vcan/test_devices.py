@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 
 import canopen
 import pytest
+from canopen.sdo.base import SdoVariable
 
 from protocol.bus import Bus, BusError, open_bus
 from protocol.eds import FILES, FOLDER
@@ -102,7 +103,7 @@ def loop(start: Start) -> None:
     start("plantsim", "--model", "fopdt", "--ts", "0.1", "--speed", "max")
 
 
-def sdo(network: canopen.Network, name: str) -> canopen.sdo.SdoVariable:
+def sdo(network: canopen.Network, name: str) -> SdoVariable:
     entry = lookup(name)
     node = network[PLANT if entry.device is Device.PLANT else CONTROLLER]
     found = node.sdo[entry.index]

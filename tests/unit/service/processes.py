@@ -1,4 +1,4 @@
-"""Looks at processes, for tests."""
+"""Waits for conditions and looks at processes, for tests."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-_PATIENCE_S = 120.0
+PATIENCE_S = 120.0
+"""Wall time after which a test gives up; a busy machine is no reason to fail."""
 
 
-def until(condition: Callable[[], object]) -> None:
-    give_up = time.monotonic() + _PATIENCE_S
+def until(condition: Callable[[], object], what: str = "what was waited for") -> None:
+    give_up = time.monotonic() + PATIENCE_S
     while not condition():
-        assert time.monotonic() < give_up
+        assert time.monotonic() < give_up, f"not in {PATIENCE_S:g} s: {what}"
         time.sleep(0.01)
 
 

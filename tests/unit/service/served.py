@@ -5,8 +5,7 @@ from __future__ import annotations
 import http.client
 import socket
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from service.serving import Setup, listen, server_config
+from tests.unit.service.processes import until
 
 SETUP = Setup(Path(), Path(), "127.0.0.1", 0)
 PATIENCE_S = 60.0
@@ -58,13 +58,6 @@ def served(app: FastAPI, descriptors: int = 4096, **changes: Any) -> Iterator[Se
         server.should_exit = True
         thread.join()
         listener.close()
-
-
-def until(wanted: Callable[[], object]) -> None:
-    give_up = time.monotonic() + PATIENCE_S
-    while not wanted():
-        assert time.monotonic() < give_up
-        time.sleep(0.005)
 
 
 def rest(connection: socket.socket) -> bytes:

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from service.alternatives import DISPROVED, alternatives
+from service.alternatives import alternatives
+from service.found_model import DISPROVED
 from service.model_forms import parse_model
 from service.request import PlantModel, RetuneRequest
 from service.tunings import tunings

@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import closing
 from functools import partial
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,6 @@ import pytest
 
 from protocol.bus import open_bus
 from protocol.hub import Hub
-from service.computing import pool as pool_module
 from service.computing.beside import Computing
 from service.computing.limits import ComputingLimits, Kind
 from service.computing.pool import NoProcess, NotWanted, Pool
@@ -178,7 +178,7 @@ class TestDeath:
         def full(_process: object) -> None:
             raise BlockingIOError(11, "Resource temporarily unavailable")
 
-        monkeypatch.setattr(pool_module.ForkServerProcess, "start", full)
+        monkeypatch.setattr(ForkServerProcess, "start", full)
         assert done(Work(os.getpid), pool) == os.getpid()
         assert "the service computes by itself" in caplog.text
         with pytest.raises(NoProcess, match="no process can be made for the tuning"):

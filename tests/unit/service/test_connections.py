@@ -25,7 +25,8 @@ from service.security.limits import RequestLimits
 from service.security.places import Full, Kind, Places, Room, kind_of
 from service.serving import listen
 from tests.unit.service.fakes import TAG, FakeLoop, Service
-from tests.unit.service.served import PATIENCE_S, Served, rest, served, until
+from tests.unit.service.processes import until
+from tests.unit.service.served import PATIENCE_S, Served, rest, served
 from tuning.reasons import Failed, Reason
 
 UNFINISHED = (

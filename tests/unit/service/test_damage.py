@@ -6,7 +6,7 @@ import logging
 import shutil
 import sqlite3
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from service.store.damage import Log, read_log
 from service.store.database import FILE, BadDatabase
 from service.store.store import Store, event_of
 from tests.unit.service.fakes import OLD, TAG, Service
+from tests.unit.service.processes import until
 from tuning.plan import Sample
 
 
@@ -187,13 +188,6 @@ def client(service: Service) -> Iterator[TestClient]:
 @pytest.fixture(autouse=True)
 def asked_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(operations, "FRESH_S", 0.0)
-
-
-def until(wanted: Callable[[], object], most_s: float = 60.0) -> None:
-    deadline = time.monotonic() + most_s
-    while not wanted():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 def database(client: TestClient) -> Any:

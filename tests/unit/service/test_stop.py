@@ -18,12 +18,14 @@ from sqlalchemy import text
 
 from service import serving
 from service.engine.durable import FILE as ENGINE_FILE
+from service.signals import Signals
 from service.store.database import FILE
 from service.store.lock import FolderLock
 from service.store.store import Store
 from tests.unit.service.fakes import NEW, TAG, loop_entry
 from tests.unit.service.gateway import HOME, read_loop
-from tests.unit.service.test_survival import Gateway, until
+from tests.unit.service.processes import until
+from tests.unit.service.test_survival import Gateway
 
 pytestmark = pytest.mark.timeout(600)  # processes that start slowly on a busy machine
 ROOT = Path(__file__).parents[3]
@@ -146,7 +148,7 @@ def test_a_signal_after_everything_has_ended_ends_a_process_that_hangs(tmp_path:
 
 def test_signals_that_nobody_sent_are_the_callers_again() -> None:
     before = [signal.getsignal(each) for each in SIGNALS]
-    with serving.Signals():
+    with Signals():
         assert [signal.getsignal(each) for each in SIGNALS] != before
     assert [signal.getsignal(each) for each in SIGNALS] == before
 

@@ -22,15 +22,9 @@ from service.store.tables import EventRow
 from tests.unit.service.fakes import NEW, OLD, TAG
 from tests.unit.service.gateway import HOME, STAGES, read_loop
 from tests.unit.service.postgres import Server
+from tests.unit.service.processes import until
 
 pytestmark = pytest.mark.timeout(600)  # processes that start slowly on a busy machine
-
-
-def until(reached: Callable[[], object], what: str = "what was waited for", timeout_s: float = 120.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not reached():
-        assert time.monotonic() < deadline, f"not in {timeout_s:g} s: {what}"
-        time.sleep(0.02)
 
 
 class Gateway:
