@@ -27,7 +27,8 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 demo: setup
 	$(BIN)/loopwright demo
 
-# What the tests need from the system. Root with apt-get: installed; others are told.
+# Installs the Debian packages that the tests need; a user who is not root, or a machine without apt-get, is told
+# which they are.
 system:
 	@sh tools/system-packages $(DEBIAN)
 

@@ -194,7 +194,7 @@ class RetuneRequest(FiveStageWishes, FastWishes, Bounds):
     )
     baseline: bool | None = Field(
         default=None,
-        description="Record the set-point step with the old gains: five-stage does unless told not to; fast never does",
+        description="Record the set-point step with the old gains: five-stage does by default; fast never does",
     )
     verify: bool = Field(default=True, description="Record the set-point step with the new gains")
     propose_anyway: bool = Field(

@@ -16,11 +16,11 @@ import anyio
 from anyio.to_thread import run_sync
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.datastructures import Headers
-from starlette.exceptions import HTTPException
 from starlette.responses import Response
 from starlette.routing import compile_path
 
 from service.api import problems
+from service.security.bodies import begins_with
 from service.security.gate import App, AsgiScope, Message, Receive, Send
 from service.security.principal import LOCAL
 from service.security.principal import current as principal
@@ -56,11 +56,7 @@ class Idempotent:
         if len(given) > 1 or not re.fullmatch(PATTERN, given[0]):
             await problems.problem(422, f"{HEADER} must be one key: {_WORDS}")(scope, receive, send)
             return
-        try:
-            body = await _body(receive)
-        except HTTPException as error:
-            await problems.of_http(error)(scope, receive, send)
-            return
+        body = await _body(receive)
         if body is not None:
             await self._once(given[0].strip('"'), body, scope, receive, send)
 
@@ -89,7 +85,7 @@ class Idempotent:
             if claim.effect is None:
                 token = claims.current.set(claim)
                 try:
-                    answer = await _ask(self._app, scope, _again(body, receive))
+                    answer = await _ask(self._app, scope, begins_with(body, receive))
                 finally:
                     claims.current.reset(token)
             else:
@@ -113,7 +109,7 @@ class Idempotent:
     async def _after_the_cut(self, effect: str, scope: AsgiScope) -> Answer:
         """The answer that a service killed before giving it would have given: what was made or changed, as it is."""
         get = {**scope, "method": "GET", "path": effect, "raw_path": effect.encode(), "query_string": b""}
-        found = await _ask(self._app, get, _again(b"", None))
+        found = await _ask(self._app, get, begins_with(b"", _gone))
         if found.status != 200:
             return found
         created = not scope["path"].startswith(f"{effect}/")
@@ -152,18 +148,9 @@ async def _body(receive: Receive) -> bytes | None:
             return b"".join(parts)
 
 
-def _again(body: bytes, receive: Receive | None) -> Receive:
-    """The body once more, then whatever else comes; None: that the client has gone."""
-    told = False
-
-    async def replayed() -> Message:
-        nonlocal told
-        if not told:
-            told = True
-            return {"type": "http.request", "body": body, "more_body": False}
-        return {"type": "http.disconnect"} if receive is None else await receive()
-
-    return replayed
+async def _gone() -> Message:
+    """What the application receives from a client that has gone."""
+    return {"type": "http.disconnect"}
 
 
 async def _ask(app: App, scope: AsgiScope, receive: Receive) -> Answer:
