@@ -25,6 +25,7 @@ from protocol.profile import (
     MV_FRAME,
     PLANT_NODE,
     PV_FRAME,
+    RENEWAL_FRAME,
     STATUS_FRAME,
     UNASKED,
     Abort,
@@ -36,6 +37,7 @@ from protocol.profile import (
     Order,
     ParameterCommand,
     channel_ids,
+    renewal_id,
 )
 from protocol.runtime import Runtime
 from protocol.sdo import SdoAbort
@@ -168,8 +170,13 @@ class ControllerDevice:
         runtime.handlers = {
             **{each.pv: partial(self._on_pv, at) for at, each in enumerate(ids)},
             **{each.command: partial(self._on_command, at) for at, each in enumerate(ids)},
+            renewal_id(node): self._on_renewal,
         }
-        runtime.lengths = {each.pv: PV_FRAME.size for each in ids} | {each.command: COMMAND_FRAME.size for each in ids}
+        runtime.lengths = {
+            **{each.pv: PV_FRAME.size for each in ids},
+            **{each.command: COMMAND_FRAME.size for each in ids},
+            renewal_id(node): RENEWAL_FRAME.size,
+        }
         runtime.on_tick = self._on_tick
         runtime.on_leave_operational = self._on_leave_operational
         runtime.on_heartbeat = self._on_heartbeat
@@ -290,6 +297,18 @@ class ControllerDevice:
 
     def _renew(self, sub: int, value: Value) -> None:
         self.sessions[sub - 1].renew(int(value), self.runtime.clock())
+
+    def _on_renewal(self, data: bytes) -> None:
+        """A renewal by RPDO waits for no turn and no answer. One of a session that is over is answered with the status,
+        which the tuner must have missed."""
+        number, sub = RENEWAL_FRAME.unpack(data)
+        if not 1 <= sub <= len(self.sessions):
+            return
+        try:
+            self._renew(sub, number)
+        except SdoAbort:
+            self._told[sub - 1] = None
+            self._report_if_new(sub - 1)
 
     @contextmanager
     def _another_hand(self, sub: int, what: Hand) -> Iterator[Channel]:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from protocol.objects import Device, Object, Shape, Type, lookup
-from protocol.profile import CONTROLLER_NODE, PLANT_NODE, channel_ids
+from protocol.profile import CONTROLLER_NODE, PLANT_NODE, channel_ids, renewal_id
 
 _ON_SYNC = 1
 _ON_ARRIVAL_OR_CHANGE = 255
 _RPDO, _TPDO = 0x1400, 0x1800
+_RENEWAL_SLOT = 0x1FF
+"""Behind the PDOs of the last channel."""
 _NO_REMOTE_REQUEST = 1 << 30
 """In the COB-ID of a transmitted PDO: who asks for it by a remote frame is not answered."""
 
@@ -21,8 +23,12 @@ def pdo_objects(
 
     Channel 1 of the controller has RPDO1 PV, RPDO2 command, TPDO2 MV, TPDO3 status (TPDO1, analogue inputs in CiA 404,
     is left out: the device measures nothing); channel k has RPDO 2k-1, 2k and TPDO 2k, 2k+1. Channel k of the plant has
-    RPDO k and TPDO k.
+    RPDO k and TPDO k. RPDO512 of the controller renews the lease of a session, of whichever channel.
     """
+    if device is Device.CONTROLLER:
+        renewal = ("controller_renewal_session", "controller_renewal_channel")
+        cob_id = renewal_id(controller_node)
+        yield from _pdo(_RPDO + _RENEWAL_SLOT, cob_id, _ON_ARRIVAL_OR_CHANGE, 0, renewal, True)
     for channel in range(1, channels + 1):
         ids = channel_ids(channel, plant_node, controller_node)
         own = channel == 1

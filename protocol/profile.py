@@ -16,7 +16,7 @@ CONTROLLER_NODE = 0x20
 TUNER_NODE = 0x7D
 """Node-ID of a gateway that is given no other."""
 MAX_CHANNELS = 199
-REVISION = 0x00020000
+REVISION = 0x00030000
 """1018h:3 of both devices. The upper half counts what they do differently on the bus, the lower half the rest."""
 
 NMT_ID = 0x000
@@ -34,6 +34,8 @@ STATUS_FRAME = Struct("<BBfBB")
 """Mode U8, set in effect U8 (0 accepted, 1 on trial), set-point REAL32, session U8 (0 none, 1 open), cause U8."""
 COMMAND_FRAME = Struct("<f")
 """Set point REAL32."""
+RENEWAL_FRAME = Struct("<IB")
+"""Number U32 of the session whose lease is renewed, channel U8."""
 SYNC_FRAME = Struct("<B")
 NMT_FRAME = Struct("<BB")
 """Command U8, node-ID U8 (0 = all)."""
@@ -201,6 +203,11 @@ def sdo_response_id(node: int) -> int:
 
 def heartbeat_id(node: int) -> int:
     return 0x700 + node
+
+
+def renewal_id(controller_node: int) -> int:
+    """COB-ID of the renewals of all channels: of the default RPDO4, which no channel of `channel_ids` comes up to."""
+    return 0x500 + controller_node
 
 
 class ChannelIds(NamedTuple):

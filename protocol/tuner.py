@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from typing import NamedTuple
@@ -20,12 +20,14 @@ from protocol.profile import (
     MV_FRAME,
     PLANT_NODE,
     PV_FRAME,
+    RENEWAL_FRAME,
     STATUS_FRAME,
     UNASKED,
     Abort,
     NmtState,
     channel_ids,
     heartbeat_id,
+    renewal_id,
     sdo_request_id,
     sdo_response_id,
 )
@@ -36,6 +38,8 @@ _WAIT_S = 0.05  # one wait on the bus: short enough to beat in time; always the 
 _TAKE_IN_S = 0.1
 _ABORT = 0x80
 _URGENT = ("controller_session_renewal", "controller_order_close")
+RENEWAL_S = 0.5
+"""How often the lease of a session is renewed, by frames that nobody answers: some may be lost."""
 
 ABORT_TEXT = {
     Abort.TOGGLE: "toggle bit not alternated",
@@ -126,9 +130,9 @@ class Tuner:
         self._pv = (0.0, -1)
         self.beating = False
         """Only who holds the loop beats: a mere reader must not keep alive the trial of a tuner that died."""
-        self.before_request: Callable[[], None] = lambda: None
-        """Called before each SDO but those that keep or end a session: there its lease is paid, however many there are
-        and however slow they are."""
+        self.session = 0
+        """The number of the session whose lease is renewed in every wait in here; 0: none."""
+        self._renewed_at = 0.0
         self.mode, self.on_trial, self.sp = 0, False, 0.0
         self.session_is_open = False
         self.node_states: dict[int, int] = {}
@@ -147,10 +151,20 @@ class Tuner:
         self.beating = True
         self.station.beat(self._url, self._bus, self.station.monotonic())
 
+    def keep(self, session: int) -> None:
+        """The lease of that session, just paid for, is renewed from now on; 0: no lease is any more."""
+        self.session, self._renewed_at = session, self.station.monotonic()
+
     def heartbeat(self) -> float:
-        """Sends our heartbeat when it is due and no other loop on this bus has sent it. The time on the clock, which it
-        takes a system call to read in some virtual machines."""
-        return self.station.beat_if_due(self._url, self._bus) if self.beating else self.station.monotonic()
+        """Sends our heartbeat when it is due and no other loop on this bus has sent it, and the renewal of our session.
+        The time on the clock, which it takes a system call to read in some virtual machines."""
+        if not self.beating:
+            return self.station.monotonic()
+        now = self.station.beat_if_due(self._url, self._bus)
+        if self.session and now - self._renewed_at >= RENEWAL_S:
+            self._renewed_at = now
+            self._bus.send(renewal_id(self._controller), RENEWAL_FRAME.pack(self.session, self._channel))
+        return now
 
     def sample(self, timeout_s: float) -> BusSample | None:
         """The next sample in order; None when none came within `timeout_s` of wall time."""
@@ -208,8 +222,6 @@ class Tuner:
     def read(self, name: str, sub: int | None = None, node: int | None = None) -> Value:
         """The value of an object by name, of our channel unless `sub` says otherwise."""
         entry, node, sub = self._address(name, sub, node)
-        if name not in _URGENT:
-            self.before_request()
         with self._turn(node, name):
             data = self._request(entry, node, sub, 0x40, b"\0\0\0\0")
             if data[0] & 0x02:
@@ -231,8 +243,6 @@ class Tuner:
         """Writes a number; every object the profile lets us write fits one frame."""
         entry, node, sub = self._address(name, sub, node)
         raw = entry.type.encode(value if entry.type is Type.REAL32 else int(value))
-        if name not in _URGENT:
-            self.before_request()
         with self._turn(node, name):
             self._request(entry, node, sub, 0x23 | (4 - len(raw)) << 2, raw.ljust(4, b"\0"))
 
@@ -252,7 +262,7 @@ class Tuner:
 
         Outside of it the answers, which are to others then, are not received: of fifty loops each would wake for all.
         """
-        with self.station.turns(self._url, node).take(urgent=name in _URGENT):
+        with self.station.turns(self._url, node).take(name in _URGENT, self.heartbeat):
             self._bus.set_filters(self._heard | {sdo_response_id(node)})
             try:
                 yield

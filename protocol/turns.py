@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+
+_SLICE_S = 0.05
+"""Of a wait: short enough to beat in time."""
 
 
 class Turns:
@@ -22,14 +25,15 @@ class Turns:
         self._urgent: deque[threading.Lock] = deque()
 
     @contextmanager
-    def take(self, urgent: bool = False) -> Iterator[None]:
-        self._enter(self._urgent if urgent else self._waiting)
+    def take(self, urgent: bool = False, meanwhile: Callable[[], object] = lambda: None) -> Iterator[None]:
+        """meanwhile: called again and again while others have their turn."""
+        self._enter(self._urgent if urgent else self._waiting, meanwhile)
         try:
             yield
         finally:
             self._leave()
 
-    def _enter(self, queue: deque[threading.Lock]) -> None:
+    def _enter(self, queue: deque[threading.Lock], meanwhile: Callable[[], object]) -> None:
         with self._guard:
             if not self._taken:
                 self._taken = True
@@ -37,7 +41,17 @@ class Turns:
             mine = threading.Lock()
             mine.acquire()
             queue.append(mine)
-        mine.acquire()  # until who was before us hands its turn on
+        try:
+            while not mine.acquire(timeout=_SLICE_S):  # until who was before us hands its turn on
+                meanwhile()
+        except BaseException:
+            with self._guard:
+                has_turn = mine not in queue
+                if not has_turn:
+                    queue.remove(mine)
+            if has_turn:
+                self._leave()
+            raise
 
     def _leave(self) -> None:
         with self._guard:

@@ -39,6 +39,8 @@ HEARTBEAT_WATCH_MS = 1000
 """Time of the controller's clock without our heartbeat after which it ends the session."""
 LEASE_WALL_S = 3.0
 LEASE_IN_BLOCKS_S = 30.0
+CONFIRM_S = 10.0
+"""How often the controller is asked whether the session is still open: an SDO, which waits for its turn with others."""
 PV_SILENCE_IN_BLOCKS_S = 60.0
 """A plant that we hold sends no PV, and a block may wait for a computation."""
 OTHERS_S = LEASE_WALL_S + 1.0
@@ -56,10 +58,6 @@ _AGAIN_S = 0.05
 _HALTED_S = 0.03  # without a sample: the plant has halted
 
 _NOT_OURS = (Abort.NO_OBJECT, Abort.NO_SUBINDEX, Abort.LENGTH, Abort.READ_ONLY, Abort.WRITE_ONLY)
-
-
-def _nothing_to_pay() -> None:
-    """There is no session of ours."""
 
 
 class BusLoop:
@@ -101,8 +99,7 @@ class BusLoop:
         self._sample_time_s = 0.0
         self._silence_s = SILENCE_S
         self._lease = Lease(SHORTEST_LEASE, 1, 1, 1)
-        self._until_renewal = 0
-        self._renewed_at = 0.0
+        self._confirmed_at = 0.0
         self._number = 0
         """The number of the session that we have opened last; 0: there is none."""
         self._first_n: int | None = None
@@ -155,7 +152,7 @@ class BusLoop:
         with self._translated() as tuner:
             self._commands += commands
             if self._left <= 0:
-                self._renew_if_due(tuner)
+                self._confirm_if_due(tuner)
                 for command in self._commands:
                     self._carry_out(tuner, command)
                 self._commands.clear()
@@ -247,7 +244,7 @@ class BusLoop:
             if tuner.sample(_HALTED_S) is None:
                 return
             self._heed_stop("while the plant was brought to a halt")
-            self._renew_if_due(tuner)
+            self._confirm_if_due(tuner)
             if now > give_up:
                 text = f"plant node {self._plant:02X}h runs on although it has been told to halt (2011h)"
                 raise Failed(Reason.SAMPLES_LOST, text)
@@ -274,9 +271,8 @@ class BusLoop:
             if error.code == Abort.DEVICE_STATE:
                 raise self._in_use(tuner) from error
             raise
-        self._renewed_at = self._station.monotonic()
-        self._until_renewal = self._lease.samples // 3
-        tuner.before_request = lambda: self._renew_if_due(tuner)
+        self._confirmed_at = self._station.monotonic()
+        tuner.keep(self._number)
         tuner.restarted, tuner.session_is_open = False, True
         home = self._reading(tuner).home()
         if tuner.session_is_open:  # else a hand was on the loop meanwhile, and the status has said so
@@ -347,10 +343,10 @@ class BusLoop:
                 raise self._over(tuner) from error
             raise
 
-    def _renew_if_due(self, tuner: Tuner) -> None:
-        """Pays for more when a third is used up, by samples or by wall time."""
-        waited_s = self._station.monotonic() - self._renewed_at
-        if self._until_renewal > 0 and waited_s * 3000.0 < self._lease.ms:
+    def _confirm_if_due(self, tuner: Tuner) -> None:
+        """Asks whether the session is still ours: the tuner renews its lease by frames without an answer, and a status
+        frame that tells of its end may be lost."""
+        if self._station.monotonic() - self._confirmed_at < CONFIRM_S:
             return
         assert self._session is not None
         try:
@@ -359,7 +355,7 @@ class BusLoop:
             if error.code == Abort.DEVICE_STATE:
                 raise self._over(tuner) from error
             raise
-        self._until_renewal, self._renewed_at = self._lease.samples // 3, self._station.monotonic()
+        self._confirmed_at = self._station.monotonic()
 
     def _heed_stop(self, when: str) -> None:
         reason = self._stop()
@@ -378,7 +374,7 @@ class BusLoop:
             give_up = give_up or now + self._silence_s
             if now > give_up:
                 raise self._silent(tuner)
-            self._renew_if_due(tuner)
+            self._confirm_if_due(tuner)
             self._heed_stop("while waiting for a sample")
 
     def _see_whether_it_is_over(self, tuner: Tuner) -> None:
@@ -389,7 +385,7 @@ class BusLoop:
 
     def _over(self, tuner: Tuner) -> Ended:
         """Why our session has ended without us."""
-        tuner.before_request = _nothing_to_pay
+        tuner.keep(0)
         return why_over(self._reading(tuner), self._number, self._lease.pv_silence_ms / 1000.0)
 
     def _silent(self, tuner: Tuner) -> Ended:
@@ -414,7 +410,6 @@ class BusLoop:
         if passed > self._max_gap + 1:
             raise Failed(Reason.SAMPLES_LOST, f"{passed - 1} samples missing before sample {found.n}")
         self._left -= passed if self._in_blocks else 0
-        self._until_renewal -= passed
         self._passed += passed
         return Sample((self._passed - 1) * self._sample_time_s, found.sp, found.pv, found.mv, found.mode)
 
@@ -422,7 +417,7 @@ class BusLoop:
 
     def _close(self, tuner: Tuner, number: int) -> str:
         """How the session has ended, in words."""
-        tuner.before_request = _nothing_to_pay
+        tuner.keep(0)
         if int(tuner.number("controller_session")) == number:
             session = TunerSession(tuner)
             session.take_up(number)
@@ -454,7 +449,7 @@ class BusLoop:
         """Our heartbeat ends; a plant that we ran in blocks runs on by itself, and others may take it."""
         if self._tuner is not None:
             self._tuner.beating = False
-            self._tuner.before_request = _nothing_to_pay
+            self._tuner.keep(0)
         if self._halted:
             with suppress(Ended), self._translated() as tuner:
                 tuner.write("plant_samples_to_run", FOREVER)

@@ -67,9 +67,13 @@ class SimTurns(Turns):
         self._lock = Lock(simulation)
 
     @contextmanager
-    def take(self, urgent: bool = False) -> Iterator[None]:
-        with self._lock:
+    def take(self, urgent: bool = False, meanwhile: Callable[[], object] = lambda: None) -> Iterator[None]:
+        while not self._lock.acquire(timeout=0.05):
+            meanwhile()
+        try:
             yield
+        finally:
+            self._lock.release()
 
 
 class SimStation(Station):

@@ -15,6 +15,7 @@ from protocol.profile import (
     HEARTBEAT_FRAME,
     NMT_FRAME,
     NMT_ID,
+    RENEWAL_FRAME,
     STATUS_FRAME,
     TUNER_NODE,
     Abort,
@@ -26,6 +27,7 @@ from protocol.profile import (
     channel_ids,
     emcy_id,
     heartbeat_id,
+    renewal_id,
     sdo_request_id,
     sdo_response_id,
 )
@@ -137,6 +139,10 @@ class Rig:
         """The session's number."""
         assert self.order(Order.OPEN, TUNER_NODE, samples, 60_000, silence_ms, watch_ms, sub=sub) is None
         return int(self.read("controller_session", sub))
+
+    def renew(self, number: int, sub: int = 1) -> None:
+        self.client.send(renewal_id(CONTROLLER), RENEWAL_FRAME.pack(number, sub))
+        self.pump()
 
     def relay(self, sub: int = 1, amplitude: float = 4.0, low: float = 40.0, high: float = 60.0) -> None:
         assert self.order(Order.RELAY, amplitude, 0.0, 50.0, 10_000, low, high, 0.0, 1, sub=sub) is None

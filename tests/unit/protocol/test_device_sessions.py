@@ -181,6 +181,28 @@ class TestEnds:
         assert rig.write("controller_session_renewal", number) is Abort.DEVICE_STATE
         assert rig.read("controller_session_last") == number
 
+    def test_a_renewal_by_pdo_pays_for_the_session_that_it_names(self) -> None:
+        rig = Rig(channels=2)
+        rig.run(3)
+        first, second = rig.open(samples=5), rig.open(samples=5, sub=2)
+        for _ in range(4):
+            rig.run(4)
+            rig.renew(first, 1)
+            rig.renew(second, 1)
+            rig.renew(first, 3)
+        assert [rig.read("controller_session", sub) for sub in (1, 2)] == [first, 0]
+        rig.run(6)
+        assert rig.read("controller_session") == 0
+
+    def test_a_renewal_of_a_session_that_is_over_is_answered_with_the_status(self, rig: Rig) -> None:
+        number = rig.open()
+        rig.order(Order.CLOSE)
+        rig.run(1)
+        told = len(rig.wire.sent(IDS.status))
+        for times, which in enumerate((number, number + 1, 0), 1):
+            rig.renew(which)
+            assert len(rig.wire.sent(IDS.status)) == told + times and rig.session() == (False, Cause.CLOSED)
+
     def test_each_channel_says_and_clears_its_own_error(self) -> None:
         rig = Rig(channels=2)
         rig.run(1)

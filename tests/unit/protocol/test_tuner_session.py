@@ -167,14 +167,3 @@ def test_a_refusal_for_good_is_told(site: Site) -> None:
     assert site.device.channels[0].setpoint == 51.0, "and the session goes on"
 
 
-def test_whoever_pays_is_asked_before_each_value_and_not_before_a_renewal(site: Site) -> None:
-    tuner, times = site.tuner(), []
-    session = TunerSession(tuner)
-    session.open(LEASE, lambda number: None)
-    before = len(site.written)
-    tuner.before_request = lambda: times.append(len(site.written) - before)
-    session.give(Order.RELAY, RELAY)
-    assert times == list(range(len(RELAY) + 1))
-    session.renew()
-    session.close()
-    assert len(times) == len(RELAY) + 1

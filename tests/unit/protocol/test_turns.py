@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import threading
 import time
+from contextlib import suppress
 
 import pytest
 
@@ -64,6 +65,58 @@ def test_what_is_urgent_goes_first() -> None:
     for thread in threads:
         thread.join(60)
     assert order == [1, 3, 5, 0, 2, 4]
+
+
+def test_who_waits_is_asked_again_and_again_what_else_it_has_to_do() -> None:
+    turns, asked, had = Turns(), [], []
+
+    def ask() -> None:
+        with turns.take(meanwhile=lambda: asked.append(0)):
+            had.append(0)
+
+    with turns.take():
+        thread = threading.Thread(target=ask)
+        thread.start()
+        deadline = time.monotonic() + 60
+        while len(asked) < 3 and time.monotonic() < deadline:
+            time.sleep(0.001)
+    thread.join(60)
+    assert len(asked) >= 3 and had == [0]
+
+
+def test_who_gives_up_while_waiting_keeps_nobody_else_from_a_turn() -> None:
+    turns, seen = Turns(), []
+
+    def give_up() -> None:
+        seen.append(0)
+        raise ConnectionError
+
+    def ask() -> None:
+        with suppress(ConnectionError), turns.take(meanwhile=give_up):
+            pass
+
+    with turns.take():
+        thread = threading.Thread(target=ask)
+        thread.start()
+        thread.join(60)
+    assert seen == [0] and not turns._waiting
+    with turns.take():
+        pass
+
+
+def test_who_gives_up_just_as_its_turn_comes_hands_it_on() -> None:
+    turns = Turns()
+    turn = turns.take()
+    turn.__enter__()
+
+    def give_up() -> None:
+        turn.__exit__(None, None, None)
+        raise ConnectionError
+
+    with pytest.raises(ConnectionError), turns.take(meanwhile=give_up):
+        pass
+    with turns.take():
+        pass
 
 
 def test_an_error_inside_hands_the_turn_on() -> None:

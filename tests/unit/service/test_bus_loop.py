@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 
 import pytest
 
@@ -29,7 +28,8 @@ from protocol.profile import (
     emcy_id,
     heartbeat_id,
 )
-from service.bus_loop import LEASE_WALL_S, BusLoop
+from protocol.tuner import RENEWAL_S
+from service.bus_loop import CONFIRM_S, LEASE_WALL_S, BusLoop
 from tests.unit.service.bus_site import FOUND, NEW, RELAY, Gateway, Site
 from tuning.gains import Gains
 from tuning.plan import Command, Mode, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
@@ -72,7 +72,7 @@ class TestBeginning:
     @pytest.mark.parametrize("device", ["controller", "plant"])
     def test_versions_that_differ_are_named_on_both_sides(self, site: Site, device: str) -> None:
         getattr(site, device).dictionary.set("identity", 0x00010003, 3)
-        with pytest.raises(Refused, match=rf"{device} node .*revision 1\.3 .*this service 2\.0") as caught:
+        with pytest.raises(Refused, match=rf"{device} node .*revision 1\.3 .*this service 3\.0") as caught:
             site.loop.begin()
         assert caught.value.reason is Reason.DEVICE_MISMATCH
         assert site.names() == []
@@ -135,14 +135,14 @@ class TestBeginning:
 
 
 class TestLease:
-    def test_is_paid_before_commands_are_sent(self, in_blocks: Site) -> None:
+    def test_is_confirmed_before_commands_are_sent(self, in_blocks: Site) -> None:
         loop = in_blocks.loop
         loop.begin()
         in_blocks.names()
         for _ in range(100):
             loop.step(())
-        assert in_blocks.names() == [], "until a third is used up nothing is paid"
-        loop._renewed_at -= loop._lease.ms / 3000.0
+        assert in_blocks.names() == [], "renewals wait for no answer"
+        loop._confirmed_at -= CONFIRM_S
         loop.step((SetSetpoint(50.1),))
         assert in_blocks.names() == [RENEWAL, "controller_session_setpoint", "controller_order_setpoint"]
 
@@ -156,10 +156,39 @@ class TestLease:
         site.loop.step(commands)
         site.slow_s = 0.0
         written = site.written
-        times = [paid, *(at for name, at in written if name == RENEWAL), written[-1][1]]
-        assert written[-1][1] - paid > LEASE_WALL_S
-        assert len(times) > 2 and max(b - a for a, b in pairwise(times)) < 0.8 * LEASE_WALL_S
+        assert written[-1][1] - paid > LEASE_WALL_S and RENEWAL not in dict(written)
+        site.pass_time(0.01)
         assert site.controller.sessions[0].is_open
+
+    def test_is_paid_while_others_have_their_turn_with_the_node(self, site: Site) -> None:
+        """An SDO server answers one at a time, and who waits for it is alive."""
+        site.begun()
+        turn = site.gateway.turns("wire", CONTROLLER_NODE).take()
+        turn.__enter__()
+        began_at = site.wire.clock.now
+
+        def others() -> float:
+            site.pass_time(0.2)
+            if site.wire.clock.now - began_at > 2 * LEASE_WALL_S:
+                site.gateway.monotonic = site.wire.clock
+                turn.__exit__(None, None, None)
+            return site.wire.clock.now
+
+        site.gateway.monotonic = others
+        site.loop.step((SetSetpoint(50.1),))
+        assert site.wire.clock.now - began_at > 2 * LEASE_WALL_S
+        assert site.controller.sessions[0].is_open and site.channel.setpoint == pytest.approx(50.1)
+
+    def test_an_end_whose_status_was_lost_is_told_again(self, site: Site) -> None:
+        """A renewal of a session that is over has an answer all the same."""
+        site.begun()
+        site.controller.sessions[0].end(Cause.LEASE)
+        site.controller._told[0] = site.controller._told[0] and (*site.controller._told[0][:3], False, Cause.LEASE)
+        began_at = site.wire.clock.now
+        with pytest.raises(Failed, match="cause: lease"):
+            while True:
+                site.loop.step(())
+        assert site.wire.clock.now - began_at < 2 * RENEWAL_S
 
     def test_is_paid_while_home_is_read_beside_many_others(self, site: Site) -> None:
         """Thirty answers, for each of which a loop may have to wait for fifty others that begin, too."""
