@@ -9,6 +9,7 @@ clock.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -20,6 +21,10 @@ from protocol.session import check_of
 
 AGAIN_S = 1.0
 """An output that no PV has asked for is sent again after this time while PV stays away: the bus may have been too."""
+
+HELD_UP_S, CATCH_UP_S, CATCH_UP_AGAIN_S = 0.25, 0.5, 3.0
+"""Where more than HELD_UP_S lie between two looks at the clock, usually 20 ms, the controller itself has stood still.
+It then has CATCH_UP_S to read what has come meanwhile before it takes anybody for silent, once in CATCH_UP_AGAIN_S."""
 
 _NO_HOME = Home(Mode.OFF, 0.0, 0.0, 0.0)
 
@@ -55,6 +60,7 @@ class Session:
         self._answered: tuple[Order, int] | None = None
         self._samples_left = 0
         self._lease_until = self._heard_at = self._valid_at = 0.0
+        self._ticked_at, self._caught_up_at = math.inf, -math.inf
         self._good_samples = -1
         self.silent = True
         """No valid PV for too long."""
@@ -187,12 +193,17 @@ class Session:
             relay.samples_left -= 1
 
     def tick(self, now: float) -> None:
-        """The ends that are counted in time. To be called a few times in the shortest of them."""
+        """The ends that are counted in time. To be called every 20 ms or so."""
+        if now - self._ticked_at > HELD_UP_S and now - self._caught_up_at > CATCH_UP_AGAIN_S:
+            self._caught_up_at = now + CATCH_UP_S
+        self._ticked_at = now
+        caught_up = now >= self._caught_up_at
         if self.channel.good_samples != self._good_samples:
             self._good_samples, self._valid_at = self.channel.good_samples, now
         terms = self.terms
         allowed_s = terms.pv_silence_s if terms is not None else self._pv_timeout_s
-        self.silent = now - self._valid_at > allowed_s
+        if caught_up or self.silent:
+            self.silent = now - self._valid_at > allowed_s
         if terms is None:
             if self._unsettled:
                 self.settle()
@@ -201,7 +212,7 @@ class Session:
                 self.unasked |= self._again_at > 0.0
                 self._again_at = now + AGAIN_S
             return
-        if now - self._heard_at > terms.watch_s:
+        if caught_up and now - self._heard_at > terms.watch_s:
             self.end(Cause.HEARTBEAT)
         elif now > self._lease_until:
             self.end(Cause.LEASE)

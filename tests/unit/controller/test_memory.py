@@ -135,9 +135,7 @@ class TestPowerCut:
         assert disk.syncs == 4, "the file and its folder, each time"
 
     @pytest.mark.parametrize("missing", ["file", "folder"])
-    def test_without_either_sync_it_would_not(
-        self, disk: Disk, missing: str, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_without_either_sync_it_would_not(self, disk: Disk, missing: str, monkeypatch: pytest.MonkeyPatch) -> None:
         """That the test above can fail."""
         file, sync = disk._folder / "kept.json", os.fsync
         write(file, KEPT)

@@ -302,6 +302,40 @@ class TestWatches:
             bench.samples(1)
         assert bench.session.cause is Cause.HEARTBEAT
 
+    def test_a_controller_that_stood_still_first_reads_what_has_come(self, bench: Bench) -> None:
+        bench.open(TUNER, 10**6, 60_000, 1000, 1000)
+        bench.samples(3)
+        bench.now += 1.5
+        bench.session.tick(bench.now)
+        assert bench.session.is_open and bench.session.pv_is_valid
+        bench.session.heard(TUNER, bench.now)
+        bench.samples(9)
+        assert bench.session.is_open
+
+    @pytest.mark.parametrize(("beating", "cause"), [(False, Cause.HEARTBEAT), (True, Cause.NO_PV)])
+    def test_what_does_not_come_then_either_is_missed(self, bench: Bench, beating: bool, cause: Cause) -> None:
+        bench.open(TUNER, 10**6, 60_000, 1000, 1000)
+        bench.samples(3)
+        bench.now += 1.5
+        bench.silence(0.48, beating)
+        assert bench.session.is_open
+        bench.silence(0.06, beating)
+        assert bench.session.cause is cause
+
+    def test_a_controller_that_stands_still_again_and_again_waits_once(self, bench: Bench) -> None:
+        bench.open(TUNER, 10**6, 60_000, 1000, 1000)
+        began_at = bench.now
+        while bench.session.is_open:
+            bench.now += 0.4
+            bench.session.tick(bench.now)
+        assert bench.session.cause is Cause.HEARTBEAT and bench.now - began_at <= 1.3
+
+    def test_a_lease_runs_out_while_the_controller_stands_still(self, bench: Bench) -> None:
+        bench.open(TUNER, 10**6, 1000, 1000, 1000)
+        bench.now += 1.5
+        bench.session.tick(bench.now)
+        assert bench.session.cause is Cause.LEASE
+
     def test_a_tuner_that_beats_keeps_it(self, bench: Bench) -> None:
         bench.open(TUNER, 10**6, 60_000, 1000, 1000)
         for _ in range(50):
