@@ -115,6 +115,8 @@ def retuned(folder: Path, loops: int, pace: float, method: str = "five-stage") -
     ends = Counter(job["reason"] or job["state"] for job in jobs)
     longest = max(job["plant_time_s"] for job in jobs)
     told(f"{method}: {loops} loops at {pace:g} times real time: {wall:.1f} s, {dict(ends)}")
+    if not longest:
+        raise RuntimeError(f"none of {loops} tests came to the end of a stage: {dict(ends)}")
     return {
         "method": method,
         "loops": loops,
