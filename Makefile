@@ -13,6 +13,7 @@ UML := user-mode-linux iproute2 $(shell grep -qs amx_tile /proc/cpuinfo && echo 
 DEBIAN := $(UML) tshark can-utils postgresql systemd
 ENGINE := docker.io docker-compose
 BESIDE := $(UML) debootstrap e2fsprogs
+PARALLEL := --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 .PHONY: setup demo test compose-test check bench bench-tuning validate faults simulate hostile system clean
 
@@ -32,9 +33,10 @@ demo: setup
 system:
 	@sh tools/system-packages $(DEBIAN)
 
-# The quick tests run natively, those on a CAN bus where there is a CAN bus. Both run even if the first fails.
+# The quick tests run natively, on two cores, in their order, a file on one of them; those on a CAN bus where there is a
+# CAN bus. Both run even if the first fails.
 test: setup system check
-	quick=0; $(BIN)/python -m pytest --ignore=tests/vcan --ignore=tests/e2e || quick=$$?; \
+	quick=0; $(BIN)/python -m pytest $(PARALLEL) --ignore=tests/vcan --ignore=tests/e2e || quick=$$?; \
 	LOOPWRIGHT_REQUIRE_VCAN=1 tools/with-vcan --again --timeout 3600 -- $(BIN)/python -m pytest $(wildcard tests/vcan tests/e2e) && exit $$quick
 
 # Where there is no container engine, one is installed as the packages above are, and runs for this test alone.

@@ -470,7 +470,10 @@ class Jobs:
 
     # the thread of a job
     def work(self, job_id: str) -> None:
-        """Runs a job to its end, or its rest after a crash. Called by the engine; a job that is over is left alone."""
+        """Runs a job to its end, or its rest after a crash. Called by the engine; a job that is over is left alone.
+
+        Raises FolderInUse: the job is another's by now.
+        """
         try:
             row = self._lasting(lambda: self.store.get(job_id))
             before_s = self._lasting(lambda: self.store.last_sample_s(job_id)) if row.attempt else 0.0
@@ -507,6 +510,7 @@ class Jobs:
             self._finish(running, self._run(running, row), row.dry_run)
         except FolderInUse as error:
             log.error("the end of the job is another's to write: %s", error)
+            raise
         except Exception:
             log.exception("the end of the job could not be written")
 

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from functools import cache
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -51,6 +52,21 @@ def fuzz_count(pytestconfig: pytest.Config) -> Counter[str]:
 def machine_count(pytestconfig: pytest.Config) -> Counter[str]:
     """What the state machine over jobs did, by rule and outcome."""
     return pytestconfig.stash[_COUNTS].setdefault("State machine over jobs", Counter())
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Where several processes share the tests (pytest-xdist), each hands over what its own have counted."""
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["counts"] = {
+            title: dict(each) for title, each in session.config.stash[_COUNTS].items()
+        }
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    counts = node.config.stash[_COUNTS]
+    for title, found in getattr(node, "workeroutput", {}).get("counts", {}).items():
+        counts.setdefault(title, Counter()).update(found)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:

@@ -13,7 +13,8 @@ class Engine(Protocol):
     """Runs a job of each of this host's queues when there is room, and once more after a crash."""
 
     def launch(self, run: Callable[[str], None], queues: Mapping[str, int]) -> None:
-        """From now on calls `run` with the ids of jobs, in threads, so many of each queue at once."""
+        """From now on calls `run` with the ids of jobs, in threads, so many of each queue at once. Where it raises
+        FolderInUse, the job is another host's, and left alone."""
         ...
 
     def enqueue(self, job_id: str, queue: str) -> None:

@@ -18,6 +18,7 @@ from sqlalchemy import Engine as Database
 from service.engine import WORKFLOW_VERSION
 from service.store.damage import Damage
 from service.store.database import checkpoint, sqlite
+from service.store.lock import FolderInUse
 
 log = logging.getLogger(__name__)
 
@@ -30,10 +31,18 @@ _OVER = ("SUCCESS", "ERROR", "CANCELLED", "MAX_RECOVERY_ATTEMPTS_EXCEEDED")
 _run: Callable[[str], None] | None = None
 
 
+class _Left(BaseException):
+    """A workflow that is another's by now ends with it. After a result, or an Exception, DBOS would wait in this thread
+    until the other one's is recorded, and so would the end of the process."""
+
+
 @DBOS.workflow(name="job", max_recovery_attempts=None)
 def _job(job_id: str) -> None:
     if _run is not None:
-        _run(job_id)
+        try:
+            _run(job_id)
+        except FolderInUse as error:
+            raise _Left from error
 
 
 class DurableEngine:

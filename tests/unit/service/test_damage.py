@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 import sqlite3
-import time
+import threading
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -23,7 +23,7 @@ from service.engine import durable
 from service.engine.durable import DurableEngine
 from service.request import RetuneRequest
 from service.states import JobState
-from service.store.damage import Log, read_log
+from service.store.damage import FileCheck, Log, read_log
 from service.store.database import FILE, BadDatabase
 from service.store.store import Store, event_of
 from tests.unit.service.fakes import OLD, TAG, Service
@@ -142,11 +142,18 @@ def test_a_check_that_takes_long_goes_on_beside_the_service(tmp_path: Path, monk
     filled(tmp_path)
     # Where the start has nothing to read.
     overwrite(tmp_path / FILE, (pages_of(tmp_path, "sample_chunks")[1] - 1) * PAGE, PAGE)
-    monkeypatch.setattr("service.store.damage.FileCheck.wait", lambda *_: False)
+    opened, check = threading.Event(), FileCheck._run
+
+    def beside(self: FileCheck) -> None:
+        opened.wait(60)
+        check(self)
+
+    monkeypatch.setattr(FileCheck, "_run", beside)
+    monkeypatch.setattr(FileCheck, "wait", lambda *_: False)
     store = Store(tmp_path)
-    deadline = time.monotonic() + 30
-    while store.damaged is None and time.monotonic() < deadline:
-        time.sleep(0.01)
+    assert store.damaged is None
+    opened.set()
+    until(lambda: store.damaged is not None)
     assert store.damaged is not None and "check-data" in store.damaged
     store.close()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -148,15 +149,19 @@ def test_then_the_gains_are_those_that_the_last_job_left(service: Service) -> No
     assert f"as job {job_id} had found them" in on.gains_text
 
 
-def test_beside_a_test_the_gains_are_those_from_before_it(service: Service) -> None:
+def test_beside_a_test_the_gains_are_those_from_before_it(tmp_path: Path) -> None:
+    service = Service(tmp_path, rehearse=rehearse)  # one service: another one's start would go on with the test
     service.tune.hold.clear()
     live = service.jobs.start(TAG, RetuneRequest())
-    assert service.tune.inside.wait(5)
+    assert service.tune.inside.wait(60)
     assert service.controller.state.gains == NEW and service.controller.state.on_trial
-    view = dry_run(service)
+    row = service.jobs.start(TAG, RetuneRequest(**QUICK))
+    service.wait(row.id, 60)
+    view = shown(service, row.id)
     assert view.old_gains is not None and view.old_gains.Kp == OLD.Kp
     service.tune.hold.set()
     service.wait(live.id)
+    service.close()
 
 
 def test_a_loop_that_is_in_manual_can_be_rehearsed(service: Service) -> None:

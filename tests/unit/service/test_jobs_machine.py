@@ -352,6 +352,14 @@ class JobsMachine(RuleBasedStateMachine):
         assert (found.id if found else None) == (job.id if job and runs else None)
         self.said("lock", "a test runs" if runs else "done")
 
+    @precondition(lambda self: not self.locked and any(job.state == "accepted" for job in self.jobs))
+    @rule()
+    def lock_what_is_accepted(self) -> None:
+        """And try to take it back: by chance alone that takes thousands of steps."""
+        job = next(job for job in reversed(self.jobs) if job.state == "accepted")
+        self.lock(job.loop)
+        assert not self.decide(job, "rollback", self.service.rollback, ("proposed", "accepted"))
+
     @precondition(lambda self: self.locked)
     @rule()
     def unlock(self) -> None:

@@ -124,13 +124,15 @@ def test_what_they_hold_and_when_they_end(tmp_path: Path, stack: ExitStack) -> N
     # what they hold
     client = served.asked_and_left(ENDLESS)
     until(served.computing)
-    ours = {
-        name for name in files_of(served.process.pid) if name.startswith("socket:") or str(tmp_path / "data") in name
-    }
     found = descendants(served.process.pid)
     assert len(found) >= 3  # the fork server, the tracker of multiprocessing, the computation
-    for pid in found:
-        assert len(ours) >= 4 and not ours & files_of(pid), pid
+
+    def shared() -> set[str]:
+        ours = {name for name in files_of(served.process.pid) if name.startswith("socket:") or str(served.data) in name}
+        assert len(ours) >= 4
+        return ours & set().union(*map(files_of, found))
+
+    until(lambda: not shared())  # it gives its own end away, and lets go of it a little after the process is there
 
     # the client goes away
     (computing,) = served.computing()
