@@ -77,6 +77,7 @@ def create_app(
         description="Retunes PI loops by itself. Gains are in ISA form, MV in percent, times in plant seconds "
         "unless they say wall. A retune ends as a proposal; the loop keeps its gains until it is accepted.",
         lifespan=lifespan,
+        openapi_url=None,  # would make the document anew for each who asks: operations.py has it
         docs_url=None,  # would load its scripts from elsewhere
         redoc_url=None,
     )

@@ -271,6 +271,15 @@ class _Links(HTMLParser):
         self.text += data
 
 
+def test_document_and_page_are_made_once(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Anybody may ask for them, without a key and as often as they like."""
+    paths = ("/openapi.json", "/docs")
+    first = [client.get(path).content for path in paths]
+    monkeypatch.delattr(operations, "page")
+    monkeypatch.setattr(client.app, "openapi", lambda: pytest.fail("it was made again"))
+    assert [client.get(path).content for path in paths] == first
+
+
 def test_the_page_shows_every_operation_and_loads_nothing(client: TestClient) -> None:
     answer = client.get("/docs")
     page = _Links()
