@@ -132,11 +132,7 @@ def check_sampling(dead_time_s: float, t95_s: float, sample_time_s: float) -> No
     """Of a plant to rehearse on. Raises Implausible."""
     if not LEAST_TIME_S <= t95_s <= MOST_TIME_S:
         raise Implausible(f"t95_s {t95_s:.3g}; permitted are {LEAST_TIME_S:g} to {MOST_TIME_S:g} s: correct t95_s")
-    if dead_time_s > 10.0 * t95_s:
-        raise Implausible(
-            f"a dead time of {dead_time_s:.3g} s with a T95 of {t95_s:.3g} s, in which it is contained; permitted are "
-            f"{10.0 * t95_s:.3g} s: correct t95_s"
-        )
+    check_dead_time(dead_time_s, t95_s)
     if not LEAST_TIME_S <= sample_time_s <= t95_s:
         raise Implausible(
             f"sample_time_s {sample_time_s:.3g} with a T95 of {t95_s:.3g} s; permitted are {LEAST_TIME_S:g} s to T95: "
@@ -148,6 +144,15 @@ def check_sampling(dead_time_s: float, t95_s: float, sample_time_s: float) -> No
                 f"sample_time_s {sample_time_s:g} is {time_s / sample_time_s:.3g} times in {name} ({time_s:.4g} s); "
                 f"at most {MOST_SAMPLES:,} are allowed: sample more slowly, or correct that time"
             )
+
+
+def check_dead_time(dead_time_s: float, t95_s: float) -> None:
+    """Of a plant to rehearse on, beside the T95 of its loop. Raises Implausible."""
+    if dead_time_s > 10.0 * t95_s:
+        raise Implausible(
+            f"a dead time of {dead_time_s:.3g} s with a T95 of {t95_s:.3g} s, in which it is contained; permitted are "
+            f"{10.0 * t95_s:.3g} s: correct t95_s"
+        )
 
 
 def check_step(sp_deviation: float, pv_low: float, pv_high: float) -> None:

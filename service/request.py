@@ -16,6 +16,7 @@ from service.plausible import (
     Size,
     Time,
     check_damping,
+    check_dead_time,
     check_model,
     check_option,
     check_step,
@@ -89,9 +90,7 @@ class TransferModel(_Coefficients):
 class PlantModel(_Coefficients):
     """A transfer function for a dry run, coefficients by falling powers of s, deviation variables."""
 
-    noise_std: Size = Field(
-        default=0.0, description="Standard deviation of the PV noise, PV units", examples=[0.0]
-    )
+    noise_std: Size = Field(default=0.0, description="Standard deviation of the PV noise, PV units", examples=[0.0])
     seed: int = Field(default=1, ge=0, le=2**53, description="Seed of the noise", examples=[1])
     sample_time_s: Time | None = Field(default=None, description="Sampling period, s", examples=[0.1])
 
@@ -326,8 +325,18 @@ def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[s
         problems.append(f"sp_deviation {deviation:g} {loop.pv_unit} needs at least twice that between the PV limits")
     try:
         check_step(deviation, limits["pv_limits"].low, limits["pv_limits"].high)
+        check_dead_time(_given_dead_time_s(request), loop.t95_s)  # here, where it costs no job and no process
     except Implausible as error:
         problems.append(str(error))
     if problems:
         return loop, problems
     return loop.model_copy(update={**limits, "sp_deviation": deviation}), []
+
+
+def _given_dead_time_s(request: RetuneRequest) -> float:
+    """Of the plant that a dry run is to be on; 0 where none is given."""
+    if not request.dry_run:
+        return 0.0
+    if request.plant is not None:
+        return request.plant.dead_time_s
+    return request.model.plant().L if request.model is not None else 0.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from importlib.metadata import version
 from typing import Annotated, Literal
@@ -77,6 +77,7 @@ def create_app(
         description="Retunes PI loops by itself. Gains are in ISA form, MV in percent, times in plant seconds "
         "unless they say wall. A retune ends as a proposal; the loop keeps its gains until it is accepted.",
         lifespan=lifespan,
+        openapi_url=None,  # would make the document anew for each who asks: operations.py has it
         docs_url=None,  # would load its scripts from elsewhere
         redoc_url=None,
     )
@@ -88,10 +89,14 @@ def create_app(
     contract.install(app)
     operations.install(app, jobs, operations.checks(jobs) if checks is None else checks)
 
-    def view(row: JobRow) -> JobView:
-        return job_view(row, jobs.store.events(row.id, limit=MOST_EVENTS), jobs.running(row.id))
+    def views(rows: Sequence[JobRow]) -> list[JobView]:
+        events = jobs.store.events_of([row.id for row in rows], limit=MOST_EVENTS)
+        return [job_view(row, events[row.id], jobs.running(row.id)) for row in rows]
 
-    fleet.install(app, jobs, many, view)
+    def view(row: JobRow) -> JobView:
+        return views([row])[0]
+
+    fleet.install(app, jobs, many, views)
 
     @app.get(
         "/loops/{tag}", tags=["loops"], summary="A loop and its present state", responses=problems.responses(404, 503)
@@ -225,4 +230,3 @@ def create_app(
     app.include_router(previews.router(jobs, many))
     app.include_router(tunings.router(jobs, pool or Pool()))
     return app
-

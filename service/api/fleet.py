@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Body, FastAPI, Path, Query, Request, Response
@@ -63,8 +63,8 @@ class RetuneView(RetuneSummary):
     loops: list[PartView] = Field(description="In the order in which they are begun")
 
 
-def install(app: FastAPI, jobs: Jobs, fleet: Fleet, view: Callable[[JobRow], JobView]) -> None:
-    """Adds the routes. view: a job as the API shows it."""
+def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[JobRow]], list[JobView]]) -> None:
+    """Adds the routes. views: jobs as the API shows them."""
     router = APIRouter(route_class=JsonRoute)
 
     @router.get(
@@ -109,7 +109,7 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, view: Callable[[JobRow], Job
         rows = jobs.store.recent(tag, None, limit + 1, cursor)
         if len(rows) > limit:
             more(response, f"/loops/{tag}/jobs", rows[limit - 1].number, limit=limit)
-        return [view(row) for row in rows[:limit]]
+        return views(rows[:limit])
 
     @router.get("/jobs", tags=["jobs"], summary="The latest jobs first", responses={**LINK, **problems.responses(422)})
     def job_list(
@@ -122,7 +122,7 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, view: Callable[[JobRow], Job
         rows = jobs.store.recent(loop, state, limit + 1, cursor)
         if len(rows) > limit:
             more(response, "/jobs", rows[limit - 1].number, loop=loop, state=state, limit=limit)
-        return [view(row) for row in rows[:limit]]
+        return views(rows[:limit])
 
     @router.post(
         "/retunes",

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import cache
 from typing import Annotated, Any
 from urllib.parse import urlencode
 
@@ -195,9 +197,16 @@ def install(app: FastAPI, jobs: Jobs, parts: Mapping[str, Check]) -> None:
 
     app.include_router(router)
 
+    # Made once: anybody may ask for them without a key, and each making holds the interpreter for milliseconds.
+    made_once = cache(lambda: (json.dumps(app.openapi()).encode(), page(app.openapi()).encode()))
+
+    @app.get("/openapi.json", include_in_schema=False)
+    def document() -> Response:
+        return Response(made_once()[0], media_type="application/json")
+
     @app.get("/docs", include_in_schema=False)
     def docs() -> HTMLResponse:
-        return HTMLResponse(page(app.openapi()), headers={"Content-Security-Policy": POLICY})
+        return HTMLResponse(made_once()[1], headers={"Content-Security-Policy": POLICY})
 
 
 def _view(row: AuditRow) -> AuditView:

@@ -50,6 +50,7 @@ _BEGUN = "decision_begun"
 """The event that a decision writes before it writes to the controller: only without it is a proposal known to have
 left the old gains in effect."""
 _BLOCKS_AT_ONCE = 16
+_JOBS_AT_ONCE = 100
 _ACTIVE = [state.value for state in ACTIVE]
 
 
@@ -415,6 +416,17 @@ class Store:
             wanted = wanted.limit(limit)
         with self._session() as session:
             return session.scalars(wanted).all()
+
+    def events_of(self, job_ids: Sequence[str], limit: int) -> dict[str, list[EventRow]]:
+        """The first events of each of these jobs, in order: a query for a hundred jobs, not for each."""
+        found: dict[str, list[EventRow]] = {job_id: [] for job_id in job_ids}
+        with self._session() as session:
+            for begin in range(0, len(job_ids), _JOBS_AT_ONCE):
+                some = job_ids[begin : begin + _JOBS_AT_ONCE]
+                theirs = select(EventRow).where(EventRow.job_id.in_(some), EventRow.seq <= limit)
+                for event in session.scalars(theirs.order_by(EventRow.job_id, EventRow.seq)):
+                    found[event.job_id].append(event)
+        return found
 
     def restored(self, source: str) -> int:
         """Ends what was active when a back-up was made: its experiment is long over. Returns how many jobs."""

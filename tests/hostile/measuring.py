@@ -10,12 +10,12 @@ from typing import Any
 
 import httpx
 
-from protocol.bus import open_bus
-from protocol.profile import TUNER_NODE, heartbeat_id
 from protocol.station import HEARTBEAT_S
 from service.states import ACTIVE
 from tests.hostile.site import Site
 
+MACHINE_LATE_S = 0.01
+"""A process that only sleeps and is woken later than that was held up by the machine."""
 EXPECTED_ENDS = ("proposed", "refused")
 """Of a test that nobody has aborted: what the procedure itself says."""
 
@@ -23,20 +23,38 @@ EXPECTED_ENDS = ("proposed", "refused")
 @dataclass
 class Found:
     """abort_s: until it was answered.  effect_s: until the job was over, its loop read back as home.
-    late_s: by which the service's heartbeat came later than it is due.  ends: of the tests, by state and reason."""
+    late_s: by which the service's heartbeat came later than it is due.  machine_late_s: by which a process that only
+    sleeps was woken later than it had asked.  late_alone_s: late_s while that one was not late.
+    ends: of the tests, by state and reason."""
 
     abort_s: list[float] = field(default_factory=list)
     effect_s: list[float] = field(default_factory=list)
     healthz_s: list[float] = field(default_factory=list)
     late_s: list[float] = field(default_factory=list)
+    late_alone_s: list[float] = field(default_factory=list)
+    machine_late_s: list[float] = field(default_factory=list)
     memory_MB: list[float] = field(default_factory=list)
     ends: dict[str, int] = field(default_factory=dict)
     refused: int = 0
     """Requests of the operator that were told to come again."""
 
 
+def late_alone(heartbeat: list[tuple[float, float]], machine: list[tuple[float, float]]) -> list[float]:
+    """The lateness of the heartbeats between which the machine kept no sleeping process waiting. Both in order."""
+    held_up = [(at - late_s, at) for at, late_s in machine if late_s > MACHINE_LATE_S]
+    found, next_ = [], 0
+    for at, late_s in heartbeat:
+        before = at - late_s - HEARTBEAT_S
+        while next_ < len(held_up) and held_up[next_][1] < before:
+            next_ += 1
+        if next_ == len(held_up) or held_up[next_][0] > at:
+            found.append(late_s)
+    return found
+
+
 class Measuring:
-    """Three threads: who listens to the heartbeat, who keeps tests running, and who aborts one again and again."""
+    """A process that listens to the heartbeat, and two threads: who keeps tests running, and who aborts one again and
+    again."""
 
     def __init__(self, site: Site, tests: int) -> None:
         self.found = Found()
@@ -44,8 +62,10 @@ class Measuring:
         self._victim = site.tags[tests]
         self._over = threading.Event()
         self._counting = threading.Event()
-        self._threads = [threading.Thread(target=run) for run in (self._listen, self._keep_testing, self._abort)]
+        self._threads = [threading.Thread(target=run) for run in (self._keep_testing, self._abort)]
         self._jobs: dict[str, str] = {}
+        self._listener = site.listener()
+        self._counts_from = float("inf")
 
     def __enter__(self) -> Measuring:
         for thread in self._threads:
@@ -56,12 +76,20 @@ class Measuring:
         self._over.set()
         for thread in self._threads:
             thread.join()
+        self._listener.stop()
+        late = self._site.late()
+        heartbeat, machine = (
+            [(at, late_s) for at, late_s in late[of] if at >= self._counts_from] for of in ("heartbeat", "machine")
+        )
+        self.found.late_s, self.found.machine_late_s = ([late_s for _, late_s in of] for of in (heartbeat, machine))
+        self.found.late_alone_s = late_alone(heartbeat, machine)
 
     def count(self) -> None:
         """What is found counts from now on: all tests are running."""
         give_up = time.monotonic() + 60.0
         while len(self._jobs) < len(self._tests) and time.monotonic() < give_up:
             time.sleep(0.1)
+        self._counts_from = time.monotonic()
         self._counting.set()
 
     def note_memory(self) -> None:
@@ -93,21 +121,6 @@ class Measuring:
             time.sleep(0.2)
         found: dict[str, Any] = answer.json()
         return found
-
-    def _listen(self) -> None:
-        bus = open_bus(self._site.bus)
-        wanted = heartbeat_id(TUNER_NODE)
-        bus.set_filters({wanted})
-        last: float | None = None
-        while not self._over.is_set():
-            frame = bus.recv(0.05)
-            if frame is None or frame[0] != wanted:
-                continue
-            now = time.monotonic()
-            if last is not None and self._counting.is_set():
-                self.found.late_s.append(max(0.0, now - last - HEARTBEAT_S))
-            last = now
-        bus.close()
 
     def _keep_testing(self) -> None:
         while not self._over.is_set():

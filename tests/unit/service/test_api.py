@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy import event
 
 from service.store.store import append
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
@@ -238,6 +239,27 @@ def test_a_dry_run_touches_nothing_and_does_not_block(service: Service, client: 
 def test_stopping_takes_no_new_work(service: Service, client: TestClient) -> None:
     service.jobs.request_stop()
     assert assert_problem(client.post(f"/loops/{TAG}/retune", json={}), 503)["reason"] == "service_stopped"
+
+
+def test_a_list_of_jobs_asks_the_database_as_often_however_long_it_is(service: Service, client: TestClient) -> None:
+    """A thousand jobs were a thousand queries, in which one who asked again and again kept a thread busy for ever."""
+    asked: list[str] = []
+
+    def listed() -> list[dict[str, Any]]:
+        asked.clear()
+        found: list[dict[str, Any]] = client.get("/jobs").json()
+        return found
+
+    @event.listens_for(service.store.engine, "before_cursor_execute")
+    def note(_connection: object, _cursor: object, statement: str, *_: object) -> None:
+        if "FROM events" in statement:
+            asked.append(statement)
+
+    jobs = [finished(service, client, dry_run=True) for _ in range(3)]
+    assert listed() == jobs[::-1] and len(asked) == 1
+    assert service.store.events_of([], limit=10) == {}
+    some = service.store.events_of([job["id"] for job in jobs], limit=2)
+    assert [[each.seq for each in found] for found in some.values()] == [[1, 2]] * 3
 
 
 def test_openapi_is_the_golden_one(client: TestClient) -> None:

@@ -465,3 +465,17 @@ def test_refusals_are_logged_once_a_second_for_each_address(
     assert statuses == [200] + 29 * [429]
     lines = [record for record in caplog.records if getattr(record, "status", None) == 429]
     assert 1 <= len(lines) <= 1 + time.monotonic() - began
+
+
+def test_so_are_bodies_that_end_with_their_connection(
+    service: Service, stack: ExitStack, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    door = open_door(stack, service)
+    began = time.monotonic()
+    for _ in range(30):
+        door.begun(UNFINISHED).close()
+    assert door.ask("GET", "/healthz")[0] == 200  # behind them: the ends of all have been seen
+    time.sleep(0.5)
+    lines = [record for record in caplog.records if getattr(record, "status", None) == 400]
+    assert 1 <= len(lines) <= 1 + time.monotonic() - began

@@ -271,6 +271,25 @@ class _Links(HTMLParser):
         self.text += data
 
 
+def test_document_and_page_are_made_once(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Anybody may ask for them, without a key and as often as they like."""
+    paths = ("/openapi.json", "/docs")
+    first = [client.get(path).content for path in paths]
+    monkeypatch.delattr(operations, "page")
+    monkeypatch.setattr(client.app, "openapi", lambda: pytest.fail("it was made again"))
+    assert [client.get(path).content for path in paths] == first
+
+
+def test_no_request_waits_for_the_random_numbers_of_the_system(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a system call the event loop gives the interpreter away, and waits behind every thread that has work."""
+    monkeypatch.setattr("random.SystemRandom.randbytes", lambda *_: pytest.fail("asked for in the event loop"))
+    answers = [client.get("/healthz") for _ in range(2)]
+    first, second = (answer.headers["x-request-id"] for answer in answers)
+    assert re.fullmatch("[0-9a-f]{8}", first) and first != second
+
+
 def test_the_page_shows_every_operation_and_loads_nothing(client: TestClient) -> None:
     answer = client.get("/docs")
     page = _Links()

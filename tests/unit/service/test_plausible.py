@@ -60,6 +60,20 @@ def test_nor_is_it_rehearsed_on(client: TestClient, service: Service, model: dic
     assert not service.store.recent()
 
 
+@pytest.mark.parametrize(
+    "plant",
+    [{"model": {"K": 1.0, "T_s": 1e6, "L_s": 4e6}}, {"plant": {"num": [1.0], "den": [1e6, 1.0], "dead_time_s": 4e6}}],
+)
+def test_a_dead_time_far_beyond_the_t95_of_the_loop_makes_no_job(
+    client: TestClient, service: Service, plant: dict[str, Any]
+) -> None:
+    """It was refused by the dry run, in a process of its own and after the controller had been read: who asked again at
+    once kept the service busy with that, and other loops of that controller waiting for their turn."""
+    answer = client.post(f"/loops/{TAG}/retune", json={"dry_run": True, **plant})
+    assert answer.status_code == 422 and "permitted are 90 s" in answer.json()["detail"]
+    assert not service.store.recent()
+
+
 def test_every_plant_of_the_benchmarks_and_the_papers_is_plausible() -> None:
     found = plants()
     assert len(found) == 121
