@@ -122,6 +122,10 @@ class Measuring:
         found: dict[str, Any] = answer.json()
         return found
 
+    def _note_end(self, job: dict[str, Any]) -> None:
+        end = job["state"] if job["state"] in EXPECTED_ENDS else f"{job['state']} {job['reason']}"
+        self.found.ends[end] = self.found.ends.get(end, 0) + 1
+
     def _keep_testing(self) -> None:
         while not self._over.is_set():
             for tag in self._tests:
@@ -130,8 +134,7 @@ class Measuring:
                     job = self._state(url)
                     if job["state"] in tuple(ACTIVE):
                         continue
-                    end = job["state"] if job["state"] in EXPECTED_ENDS else f"{job['state']} {job['reason']}"
-                    self.found.ends[end] = self.found.ends.get(end, 0) + 1
+                    self._note_end(job)
                     if job["state"] == "proposed":
                         self._asked("POST", f"{url}/rollback")
                 answer = self._asked("POST", f"/loops/{tag}/retune", json={"method": "five-stage"})
@@ -146,8 +149,13 @@ class Measuring:
                 self._over.wait(0.2)
                 continue
             url = answer.headers["location"]
-            while self._state(url)["stage"] is None and not self._over.is_set():
+            while (job := self._state(url))["stage"] is None and job["state"] in tuple(ACTIVE):
+                if self._over.is_set():
+                    break
                 time.sleep(0.1)
+            if job["state"] not in tuple(ACTIVE):  # it came to its end before it had a stage
+                self._note_end(job)
+                continue
             began = time.monotonic()
             answer = self._asked("POST", f"{url}/abort")
             answered = time.monotonic() - began
