@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from typing import NamedTuple
@@ -40,6 +40,8 @@ _ABORT = 0x80
 _URGENT = ("controller_session_renewal", "controller_order_close")
 RENEWAL_S = 0.5
 """How often the lease of a session is renewed, by frames that nobody answers: some may be lost."""
+TURN_S = 10.0
+"""A loop that waits longer for its turn with a node renews nothing any more: whoever has the turn hangs."""
 
 ABORT_TEXT = {
     Abort.TOGGLE: "toggle bit not alternated",
@@ -133,6 +135,7 @@ class Tuner:
         self.session = 0
         """The number of the session whose lease is renewed in every wait in here; 0: none."""
         self._renewed_at = 0.0
+        self._heed_stop: Callable[[], None] = lambda: None
         self.mode, self.on_trial, self.sp = 0, False, 0.0
         self.session_is_open = False
         self.node_states: dict[int, int] = {}
@@ -151,9 +154,12 @@ class Tuner:
         self.beating = True
         self.station.beat(self._url, self._bus, self.station.monotonic())
 
-    def keep(self, session: int) -> None:
-        """The lease of that session, just paid for, is renewed from now on; 0: no lease is any more."""
-        self.session, self._renewed_at = session, self.station.monotonic()
+    def keep(self, session: int, heed_stop: Callable[[], None] = lambda: None) -> None:
+        """The lease of that session, just paid for, is renewed from now on; 0: no lease is any more.
+
+        heed_stop: called while the loop waits for its turn with a node; raises where somebody wants an end.
+        """
+        self.session, self._renewed_at, self._heed_stop = session, self.station.monotonic(), heed_stop
 
     def heartbeat(self) -> float:
         """Sends our heartbeat when it is due and no other loop on this bus has sent it, and the renewal of our session.
@@ -262,7 +268,14 @@ class Tuner:
 
         Outside of it the answers, which are to others then, are not received: of fifty loops each would wake for all.
         """
-        with self.station.turns(self._url, node).take(name in _URGENT, self.heartbeat):
+        waits_since = self.station.monotonic()
+
+        def meanwhile() -> None:
+            self._heed_stop()
+            if self.station.monotonic() - waits_since < TURN_S:
+                self.heartbeat()
+
+        with self.station.turns(self._url, node).take(name in _URGENT, meanwhile):
             self._bus.set_filters(self._heard | {sdo_response_id(node)})
             try:
                 yield

@@ -272,7 +272,7 @@ class BusLoop:
                 raise self._in_use(tuner) from error
             raise
         self._confirmed_at = self._station.monotonic()
-        tuner.keep(self._number)
+        tuner.keep(self._number, lambda: self._heed_stop("while other loops had their turn with the node"))
         tuner.restarted, tuner.session_is_open = False, True
         home = self._reading(tuner).home()
         if tuner.session_is_open:  # else a hand was on the loop meanwhile, and the status has said so

@@ -28,7 +28,7 @@ from protocol.profile import (
     emcy_id,
     heartbeat_id,
 )
-from protocol.tuner import RENEWAL_S
+from protocol.tuner import RENEWAL_S, TURN_S
 from service.bus_loop import CONFIRM_S, LEASE_WALL_S, BusLoop
 from tests.unit.service.bus_site import FOUND, NEW, RELAY, Gateway, Site
 from tuning.gains import Gains
@@ -178,6 +178,38 @@ class TestLease:
         site.loop.step((SetSetpoint(50.1),))
         assert site.wire.clock.now - began_at > 2 * LEASE_WALL_S
         assert site.controller.sessions[0].is_open and site.channel.setpoint == pytest.approx(50.1)
+
+    def test_is_paid_no_longer_where_whoever_has_the_turn_hangs(self, site: Site) -> None:
+        site.begun()
+        turn = site.gateway.turns("wire", CONTROLLER_NODE).take()
+        turn.__enter__()
+        began_at = site.wire.clock.now
+
+        def others() -> float:
+            site.pass_time(0.2)
+            if not site.controller.sessions[0].is_open:
+                site.gateway.monotonic = site.wire.clock
+                turn.__exit__(None, None, None)
+            return site.wire.clock.now
+
+        site.gateway.monotonic = others
+        with pytest.raises(Failed) as caught:
+            site.loop.step((SetSetpoint(50.1),))
+        assert caught.value.reason is Reason.DEVICE_WENT_BACK and site.channel.setpoint == 50.0
+        assert TURN_S < site.wire.clock.now - began_at < TURN_S + LEASE_WALL_S
+
+    def test_an_abort_does_not_wait_for_the_turn(self, site: Site) -> None:
+        wanted: list[Reason] = []
+        site.let_run()
+        home = site.loop.begin(lambda: wanted[0] if wanted else None)
+        turn = site.gateway.turns("wire", CONTROLLER_NODE).take()
+        turn.__enter__()
+        wanted.append(Reason.OPERATOR)
+        with pytest.raises(Aborted, match="had their turn"):
+            site.loop.step((SetSetpoint(50.1),))
+        turn.__exit__(None, None, None)
+        site.loop.restore(home)
+        assert site.is_home() and not site.controller.sessions[0].is_open
 
     def test_an_end_whose_status_was_lost_is_told_again(self, site: Site) -> None:
         """A renewal of a session that is over has an answer all the same."""
