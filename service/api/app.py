@@ -90,7 +90,7 @@ def create_app(
     operations.install(app, jobs, operations.checks(jobs) if checks is None else checks)
 
     def views(rows: Sequence[JobRow]) -> list[JobView]:
-        events = jobs.store.events_of([row.id for row in rows], limit=MOST_EVENTS)
+        events = jobs.store.events_by_job([row.id for row in rows], limit=MOST_EVENTS)
         return [job_view(row, events[row.id], jobs.running(row.id)) for row in rows]
 
     def view(row: JobRow) -> JobView:

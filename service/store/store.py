@@ -417,7 +417,7 @@ class Store:
         with self._session() as session:
             return session.scalars(wanted).all()
 
-    def events_of(self, job_ids: Sequence[str], limit: int) -> dict[str, list[EventRow]]:
+    def events_by_job(self, job_ids: Sequence[str], limit: int) -> dict[str, list[EventRow]]:
         """The first events of each of these jobs, in order: a query for a hundred jobs, not for each."""
         found: dict[str, list[EventRow]] = {job_id: [] for job_id in job_ids}
         with self._session() as session:

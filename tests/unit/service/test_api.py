@@ -257,8 +257,8 @@ def test_a_list_of_jobs_asks_the_database_as_often_however_long_it_is(service: S
 
     jobs = [finished(service, client, dry_run=True) for _ in range(3)]
     assert listed() == jobs[::-1] and len(asked) == 1
-    assert service.store.events_of([], limit=10) == {}
-    some = service.store.events_of([job["id"] for job in jobs], limit=2)
+    assert service.store.events_by_job([], limit=10) == {}
+    some = service.store.events_by_job([job["id"] for job in jobs], limit=2)
     assert [[each.seq for each in found] for found in some.values()] == [[1, 2]] * 3
 
 

@@ -306,7 +306,7 @@ def test_an_error_after_the_job_was_made_does_not_make_another(
     service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(service.store, "events_of", away)
+        patch.setattr(service.store, "events_by_job", away)
         assert_problem(post(client, RETUNE), 503)
     (job,) = service.store.recent()
     service.wait(job.id)
