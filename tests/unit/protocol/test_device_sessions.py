@@ -198,10 +198,10 @@ class TestEnds:
         number = rig.open()
         rig.order(Order.CLOSE)
         rig.run(1)
-        told = len(rig.wire.sent(IDS.status))
+        before = len(rig.wire.sent(IDS.status))
         for times, which in enumerate((number, number + 1, 0), 1):
             rig.renew(which)
-            assert len(rig.wire.sent(IDS.status)) == told + times and rig.session() == (False, Cause.CLOSED)
+            assert len(rig.wire.sent(IDS.status)) == before + times and rig.session() == (False, Cause.CLOSED)
 
     def test_each_channel_says_and_clears_its_own_error(self) -> None:
         rig = Rig(channels=2)

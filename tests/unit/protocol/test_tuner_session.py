@@ -165,5 +165,3 @@ def test_a_refusal_for_good_is_told(site: Site) -> None:
     assert refused.value.code == Abort.INVALID_VALUE
     session.give(Order.SETPOINT, (51.0,))
     assert site.device.channels[0].setpoint == 51.0, "and the session goes on"
-
-

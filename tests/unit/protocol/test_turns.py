@@ -1,12 +1,12 @@
 from __future__ import annotations
 
 import threading
-import time
 from contextlib import suppress
 
 import pytest
 
 from protocol.turns import Turns
+from tests.unit.service.processes import until
 
 
 def test_everybody_has_a_turn_in_the_order_of_asking() -> None:
@@ -20,9 +20,7 @@ def test_everybody_has_a_turn_in_the_order_of_asking() -> None:
     with turns.take():
         for waiting, thread in enumerate(threads, 1):
             thread.start()
-            deadline = time.monotonic() + 60
-            while len(turns._waiting) < waiting and time.monotonic() < deadline:
-                time.sleep(0.001)
+            until(lambda count=waiting: len(turns._waiting) >= count)
     for thread in threads:
         thread.join(60)
     assert order == list(range(8))
@@ -39,9 +37,7 @@ def test_who_asks_again_at_once_comes_after_who_waits() -> None:
     thread = threading.Thread(target=ask)
     with turns.take():
         thread.start()
-        deadline = time.monotonic() + 60
-        while not turns._waiting and time.monotonic() < deadline:
-            time.sleep(0.001)
+        until(lambda: turns._waiting)
     with turns.take():
         order.append("the same again")
     thread.join(60)
@@ -59,9 +55,7 @@ def test_what_is_urgent_goes_first() -> None:
     with turns.take():
         for waiting, thread in enumerate(threads, 1):
             thread.start()
-            deadline = time.monotonic() + 60
-            while len(turns._waiting) + len(turns._urgent) < waiting and time.monotonic() < deadline:
-                time.sleep(0.001)
+            until(lambda count=waiting: len(turns._waiting) + len(turns._urgent) >= count)
     for thread in threads:
         thread.join(60)
     assert order == [1, 3, 5, 0, 2, 4]
@@ -77,11 +71,9 @@ def test_who_waits_is_asked_again_and_again_what_else_it_has_to_do() -> None:
     with turns.take():
         thread = threading.Thread(target=ask)
         thread.start()
-        deadline = time.monotonic() + 60
-        while len(asked) < 3 and time.monotonic() < deadline:
-            time.sleep(0.001)
+        until(lambda: len(asked) >= 3)
     thread.join(60)
-    assert len(asked) >= 3 and had == [0]
+    assert had == [0]
 
 
 def test_who_gives_up_while_waiting_keeps_nobody_else_from_a_turn() -> None:
