@@ -28,8 +28,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 demo: setup
 	$(BIN)/loopwright demo
 
-# Installs the Debian packages that the tests need; a user who is not root, or a machine without apt-get, is told
-# which they are.
+# Installs the Debian packages that the tests need. Without root or apt-get it prints the line to type.
 system:
 	@sh tools/system-packages $(DEBIAN)
 

@@ -4,8 +4,8 @@
 
 A process of its own, so that what it costs to attack is not counted as the service's, and of the lowest priority: real
 attackers have a machine of their own, and where they share the service's, what is measured is to be the service and not
-the processor time that they take from it. For the same reason who is refused pauses. It says what it was answered, by
-attacker and status, when it is told to end (SIGTERM).
+the processor time that they take from it. For the same reason who is refused pauses. On SIGTERM it
+prints what it was answered, by attacker and status, and ends.
 """
 
 from __future__ import annotations

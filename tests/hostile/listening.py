@@ -2,8 +2,8 @@
 
     python -m tests.hostile.listening BUS
 
-A process of its own, so that what the rest of the measuring does is not counted as the service's. When it is told to
-end (SIGTERM) it says what was late, when (in monotonic time, which all processes of a machine share) and by how much.
+A process of its own, so that what the rest of the measuring does is not counted as the service's. On SIGTERM it prints
+what was late, when (in monotonic time, which all processes of a machine share) and by how much, and ends.
 What the machine does to a process that wants nothing but 10 ms of sleep it does to the service, too.
 """
 
