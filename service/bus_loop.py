@@ -35,8 +35,9 @@ from tuning.gains import Gains
 from tuning.plan import Command, Mode, Sample, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
 from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 
-HEARTBEAT_WATCH_MS = 1000
-"""Time of the controller's clock without our heartbeat after which it ends the session."""
+WATCH_S = 1.5
+"""Time of the controller's clock without our heartbeat, or without PV (at least three sampling periods), after which it
+ends the session. Virtual machines were seen to stand still for 1.3 s."""
 LEASE_WALL_S = 3.0
 LEASE_IN_BLOCKS_S = 30.0
 CONFIRM_S = 10.0
@@ -304,9 +305,9 @@ class BusLoop:
             samples, lease_s, silence_s = FOREVER, LEASE_IN_BLOCKS_S, PV_SILENCE_IN_BLOCKS_S
         else:
             samples, lease_s = math.ceil(LEASE_WALL_S * self._pace / self._sample_time_s), LEASE_WALL_S
-            silence_s = max(SILENCE_S, 3.0 * self._sample_time_s / self._pace)
-        ms = (math.ceil(1000.0 * lease_s), math.ceil(1000.0 * silence_s))
-        return Lease(min(max(samples, SHORTEST_LEASE), FOREVER), *ms, HEARTBEAT_WATCH_MS)
+            silence_s = max(WATCH_S, 3.0 * self._sample_time_s / self._pace)
+        ms = (math.ceil(1000.0 * wait_s) for wait_s in (lease_s, silence_s, WATCH_S))
+        return Lease(min(max(samples, SHORTEST_LEASE), FOREVER), *ms)
 
     # -- on the way
 

@@ -49,7 +49,7 @@ class FaultyHub(Hub):
         self.sample_number = 0
         """Of the latest PV, whoever sent it."""
         self.answered = 0
-        """Of the latest MV, with which a sample has passed whole."""
+        """Of the latest MV that was passed on as the answer to the latest PV: that sample was there to be stored."""
         self.first_of_session = 0
         """The number of the first sample after the session was opened."""
         self.commanded = 0
@@ -96,14 +96,17 @@ class FaultyHub(Hub):
         for other in self._members:
             if other is not sender and other is not self._onlooker and other.raw_from is not None:
                 other.queue += frame
+        _, _, can_id, _, data, *_ = frame.split()
+        if int(can_id, 16) == _MV and len(data) == 2 * MV_FRAME.size:
+            number = MV_FRAME.unpack(bytes.fromhex(data.decode()))[1]
+            if number == self.sample_number:
+                self.answered = number
 
     def _witness(self, can_id: int, data: bytes) -> None:
         if can_id == _PV and len(data) == 2 * PV_FRAME.size:
             self.sample_number = PV_FRAME.unpack(bytes.fromhex(data.decode()))[1]
             if self._taken:
                 self._taken, self.first_of_session = False, self.sample_number
-        elif can_id == _MV and len(data) == 2 * MV_FRAME.size:
-            self.answered = MV_FRAME.unpack(bytes.fromhex(data.decode()))[1]
         elif can_id == sdo_request_id(CONTROLLER_NODE):
             request = bytes.fromhex(data.decode())
             if request[:1] != b"\x23":

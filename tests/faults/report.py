@@ -41,7 +41,7 @@ Each cell: how the job ended (from the second attempt on, the number of the atte
 The loop is model 14 of the 50, sampled at {ts:g} s, run at {pace:g} times real time. *proposed* means that the whole
 procedure came to its end in spite of the fault. What is tried in some stages only does not hang on the stage. A run
 in which the machine itself stood still for 0.4 s is repeated, twice at most, unless its end is bad: the heartbeat time
-is 1 s, and `device_went_back` with no fault in sight is such a machine's.
+is 1.5 s, and `device_went_back` with no fault in sight is such a machine's.
 """
 
 EARLIER = """

@@ -39,6 +39,8 @@ BLOCKS_WALL_S = 0.006
 _BLOCKS_FRAME_S = 0.002
 """A plant that runs as fast as the answers come keeps the simulation busy: there, the bus is a slow one."""
 _LOOK_S = 0.25
+_OVER_S = 1.9
+"""The 1.5 s for which the heartbeat of a tuner may be missing, and a little."""
 _PATIENCE_S = 75.0
 """Within which, after the last fault and without its plan's time, a job has ended: the restoring of a loop that does
 not answer takes up to 25 s, a start waits for another tuner and listens, and the person asks again."""
@@ -206,9 +208,9 @@ class World:
             def look() -> None:
                 now = controller.device.sessions[0].number
                 if now == number and not (gateway.is_up and gateway.busy()):
-                    self.invariants.say(f"a dead tuner's session is open: {1.4:g} s after its death")
+                    self.invariants.say(f"a dead tuner's session is open: {_OVER_S:g} s after its death")
 
-            self.simulation.after(1.4, look)
+            self.simulation.after(_OVER_S, look)
 
     def permit(self, row: JobRow) -> None:
         """A person decides: either set of the job may be the accepted one from now on."""
