@@ -20,8 +20,8 @@ from tuning.gains import Gains
 
 
 @dataclass(frozen=True, slots=True)
-class LastModel:
-    """The last model that a retune of this loop has found. ultimate: None where the model has none.
+class LastProposal:
+    """The last retune of this loop that ended in a proposal. Ku, Pu_s: None where its model has none.
 
     ended_at: UTC, ISO 8601, of the job.  plant_time_s: what it took.
     """
@@ -35,7 +35,7 @@ class LastModel:
     plant_time_s: float
 
     @classmethod
-    def of(cls, job_id: str, ended_at: str | None, plant_time_s: float, result: Mapping[str, Any]) -> LastModel:
+    def of(cls, job_id: str, ended_at: str | None, plant_time_s: float, result: Mapping[str, Any]) -> LastProposal:
         """From the result of a job that ended in a proposal."""
         ultimate, model = result.get("ultimate") or {}, result.get("model") or {}
         order = "sopdt" if model.get("zeta") is not None else "fopdt"
@@ -127,7 +127,7 @@ class Preview(BaseModel):
     known: KnownPlant
 
 
-def preview(config: LoopConfig, request: RetuneRequest, now: Now, last: LastModel | None) -> Preview:
+def preview(config: LoopConfig, request: RetuneRequest, now: Now, last: LastProposal | None) -> Preview:
     """Of one loop. now: without a state the figures are the largest that the configured limits leave room for."""
     narrowed, _ = narrow(config, request)
     state = None if request.dry_run else now.state
@@ -209,7 +209,7 @@ def _budget_s(request: RetuneRequest, config: LoopConfig, state: LoopState | Non
     return time_budget_s(request.method, config.t95_s, state.sample_time_s)
 
 
-def _basis(request: RetuneRequest, config: LoopConfig, last: LastModel | None) -> str:
+def _basis(request: RetuneRequest, config: LoopConfig, last: LastProposal | None) -> str:
     if request.dry_run:
         return "a dry run takes no time of the plant"
     if request.Pu_s:
@@ -245,7 +245,7 @@ def _gains_text(gains: Gains) -> str:
     return f"the gains it has now (Kp {gains.Kp:.4g}, Ti {gains.Ti:.4g} s)"
 
 
-def _known(config: LoopConfig, last: LastModel | None) -> KnownPlant:
+def _known(config: LoopConfig, last: LastProposal | None) -> KnownPlant:
     return KnownPlant(
         t95_s=config.t95_s,
         noise_std=config.noise_std_hint,

@@ -11,7 +11,7 @@ from service.api import problems
 from service.fleet import Fleet, FleetRequest
 from service.jobs import Jobs
 from service.obstacles import Now
-from service.preview import FleetPreview, LastModel, Preview, fleet_preview, preview
+from service.preview import FleetPreview, LastProposal, Preview, fleet_preview, preview
 from service.request import RetuneRequest
 from service.state_json import loop_state
 from service.store import loop_locks
@@ -79,7 +79,7 @@ def _locked(jobs: Jobs) -> dict[str, str]:
     return {tag: loop_locks.words(row) for tag, row in jobs.locks().items()}
 
 
-def _last(row: JobRow | None) -> LastModel | None:
+def _last(row: JobRow | None) -> LastProposal | None:
     if row is None or not row.result:
         return None
-    return LastModel.of(row.id, row.ended_at, row.plant_time_s, row.result)
+    return LastProposal.of(row.id, row.ended_at, row.plant_time_s, row.result)

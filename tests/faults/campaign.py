@@ -26,7 +26,7 @@ HOME_WITHIN_S = 6.0
 OVER_WITHIN_S = 300.0
 """A job that is still active then is one for ever."""
 STALL_S = 0.4
-"""A machine that stands still so long may itself cost a job its session (samples of a fast loop are lost): what comes of the
+"""A machine that stands still so long may itself cost a job its session (a fast loop loses samples): what comes of the
 fault is looked for again, but for a bad end, which stands."""
 REPEATS = 2
 RESULTS = Path(__file__).with_name("results.json")

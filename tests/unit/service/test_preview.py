@@ -12,7 +12,7 @@ from service.config import LoopConfig
 from service.loop import LoopState
 from service.moves import broken_limits
 from service.obstacles import Now
-from service.preview import LastModel, Preview, duration_text, preview
+from service.preview import LastProposal, Preview, duration_text, preview
 from service.request import RetuneRequest, within
 from service.security.gate import scope_for
 from service.security.keys import Scope
@@ -96,7 +96,7 @@ class TestMoves:
 class TestTime:
     def test_the_last_model_narrows_the_estimate(self) -> None:
         loop = LoopConfig.model_validate(loop_entry())
-        last = LastModel.of("abc", "2026-01-31T12:00:00.000Z", 30.0, RESULT)
+        last = LastProposal.of("abc", "2026-01-31T12:00:00.000Z", 30.0, RESULT)
         one, other = (preview(loop, RetuneRequest(), Now(STATE), known) for known in (None, last))
         assert "T95 9 s" in one.duration_basis and "abc" in other.duration_basis
         ratios = [each.duration_high_s / each.duration_low_s for each in (one, other)]
@@ -108,7 +108,7 @@ class TestTime:
         """A relay of 40 % on a loop of Ku 200 % per degC: 4 * 40 / (pi * 200)."""
         loop = LoopConfig.model_validate(loop_entry())
         result = RESULT | {"ultimate": {"Ku": 200.0, "Pu_s": 3.32}}
-        last = LastModel.of("abc", None, 30.0, result)
+        last = LastProposal.of("abc", None, 30.0, result)
         five, fast = (preview(loop, RetuneRequest(method=m), Now(STATE), last) for m in ("five-stage", "fast"))
         assert five.stages[2].pv_move == pytest.approx(0.2546, abs=1e-4) and five.largest_pv_move is not None
         assert fast.stages[1].pv_move == pytest.approx(0.75 * 60.0 * 4.0 / (3.1416 * 200.0), rel=1e-3)
