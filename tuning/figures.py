@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.integrate import trapezoid
 
 from tuning.models import Reals
 
@@ -146,7 +145,7 @@ def _rise(t: Reals, y: Reals) -> float | None:
 def _mean_until(t: Reals, values: Reals, end: float) -> float:
     last = int(np.searchsorted(t, end, side="right"))
     kept, at = values[:last], t[:last]
-    area = float(trapezoid(kept, at))
+    area = float(np.trapezoid(kept, at))
     if last < len(t):
         there = float(np.interp(end, t[last - 1 : last + 1], values[last - 1 : last + 1]))
         area += 0.5 * (float(kept[-1]) + there) * (end - float(at[-1]))

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid, trapezoid
 from scipy.optimize import least_squares
 
 from tuning.gains import Gains
@@ -30,8 +29,9 @@ def two_areas_of(t: Reals, y: Reals, step: float, y0: float) -> FOPDT:
     at its end; NO_RESPONSE.
     """
     time, share, K = _normalised(t, y, step, y0)
-    A0 = float(trapezoid(1.0 - share, time))
-    below = np.interp(A0, time, cumulative_trapezoid(share, time, initial=0))
+    A0 = float(np.trapezoid(1.0 - share, time))
+    areas = np.diff(time) * (share[1:] + share[:-1]) / 2.0
+    below = np.interp(A0, time, np.concatenate(([0.0], np.cumsum(areas))))
     return fopdt_of_areas(K, A0, float(below))
 
 
@@ -41,8 +41,8 @@ def moments_of(t: Reals, y: Reals, step: float, y0: float) -> FOPDT:
     mean = integral of 1 - y/K, variance = 2 * integral of t*(1 - y/K) - mean^2: noise late in the record weighs most.
     """
     time, share, K = _normalised(t, y, step, y0)
-    mean = float(trapezoid(1.0 - share, time))
-    return fopdt_of_moments(K, mean, 2.0 * float(trapezoid(time * (1.0 - share), time)) - mean * mean)
+    mean = float(np.trapezoid(1.0 - share, time))
+    return fopdt_of_moments(K, mean, 2.0 * float(np.trapezoid(time * (1.0 - share), time)) - mean * mean)
 
 
 def fit_step(t: Reals, y: Reals, step: float, y0: float, K: float | None = None) -> FOPDT:
@@ -135,7 +135,7 @@ def fit_closed_loop(t: Reals, y: Reals, gains: Gains, step: float, y0: float, K:
 def _static_gain(time: Reals, share: Reals, gains: Gains) -> float:
     """A first idea of the gain: with integral action from the error's integral, Ti/(K*Kp); else from the end."""
     if gains.Ti > 0.0:
-        area = float(trapezoid(1.0 - share, time))
+        area = float(np.trapezoid(1.0 - share, time))
         # from a record that ends too early the area is too small, at worst negative
         return gains.Ti / (gains.Kp * max(area, 0.05 * float(time[-1])))
     ends = min(max(float(np.mean(share[-max(len(share) // 20, 1) :])), 0.01), 0.99 * gains.b)

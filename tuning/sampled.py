@@ -6,7 +6,7 @@ a sample and u[k-m] for the rest of it, so in controllable form x' = A x + e_n u
     x[k+1] = Phi(1) x[k] + G0 u[k-m] + G1 u[k-m-1]
     G0 = integral of Phi*e_n over 1-f,   G1 = Phi(1-f) * integral of Phi*e_n over f
 
-The states are then sums over one short recursion, run by scipy's compiled filter.
+The states are then sums over one short recursion.
 """
 
 from __future__ import annotations
@@ -17,11 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from tuning.models import Reals
-
-_ONE = np.ones(1)
+from tuning.recursion import recursive
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +45,7 @@ class Pulses:
         common = np.zeros((plants, len(u) + taps - 2))
         for row, recursion, delay in zip(common, self.recursion, self.delay, strict=True):
             if (length := len(u) - 1 - int(delay)) > 0:
-                row[len(row) - length :] = lfilter(_ONE, recursion, u[:length])
+                row[len(row) - length :] = recursive(recursion, u[:length])
         out = common[:, : len(u), None] * forward[:, None, -1]
         for k in range(1, taps - 1):
             out += common[:, k : k + len(u), None] * forward[:, None, -1 - k]

@@ -5,6 +5,7 @@ import os
 from importlib import import_module
 
 LOADED = (
+    "scipy.signal",  # tuning imports it when it first needs it
     "service.alternatives",
     "service.cli",  # the script `loopwright` imports it, and each process imports what the script does
     "service.computing.rehearsals",

@@ -15,9 +15,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 from tuning.models import Model, Reals
+from tuning.recursion import recursive
 from tuning.sampled import pulses
 
 STEPS_PER_PERIOD = 80
@@ -66,7 +66,7 @@ class LoopCost:
         steps = min(MOST_STEPS, int((PERIODS * self.period + INTEGRAL_TIMES * Ti) / h))
         pulse = np.zeros(steps)
         pulse[0] = 1.0
-        common = lfilter(np.ones(1), D, pulse)
+        common = recursive(D, pulse)
         BF = np.convolve(self._B, filtered)
         error = AF
         if Td > 0.0:
@@ -74,7 +74,7 @@ class LoopCost:
         return Cost(self._integral(error, common), self._integral(BF, common))
 
     def _integral(self, forward: Reals, common: Reals) -> float:
-        return self.h * float(np.abs(lfilter(forward, np.ones(1), common)).sum())
+        return self.h * float(np.abs(np.convolve(forward, common)[: len(common)]).sum())
 
 
 def _sum(a: Reals, b: Reals) -> Reals:
