@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from service.config import LoopConfig, parse_site
 from service.jobs import Jobs
@@ -137,6 +140,22 @@ class FakeLoop:
 
     def close(self) -> None:
         self._controller.open -= 1
+
+
+@contextmanager
+def held_acceptances() -> Iterator[tuple[threading.Event, threading.Event]]:
+    """Acceptances wait in the controller. Yields what is set as one is there, and what is to be set to let it go on."""
+    inside, free = threading.Event(), threading.Event()
+    accept = FakeLoop.accept
+
+    def slow(loop: FakeLoop, gains: Gains, instead_of: Gains) -> LoopState:
+        inside.set()
+        assert free.wait(20)
+        return accept(loop, gains, instead_of)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(FakeLoop, "accept", slow)
+        yield inside, free
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ from sqlalchemy.exc import OperationalError
 
 from service.api.app import create_app
 from service.jobs import Jobs
-from service.loop import LoopState
 from service.request import RetuneRequest
 from service.security import audit
 from service.security.gate import Policy
@@ -27,10 +26,9 @@ from service.store import claims
 from service.store.claims import Claim, StillAnswering
 from service.store.idempotency import MOST_BYTES, Answer, IdempotencyKeys, OtherRequest
 from service.store.store import Store
-from tests.unit.service.fakes import NEW, TAG, FakeLoop, Service
+from tests.unit.service.fakes import NEW, TAG, Service, held_acceptances
 from tests.unit.service.postgres import Server
 from tests.unit.service.test_api import GOLDEN, assert_problem
-from tuning.gains import Gains
 from tuning.reasons import Reason
 
 KEY = {"Idempotency-Key": "7f1c4f5e-2b8f-4a36-9f3a-5d0b3c1e8a77"}
@@ -210,21 +208,10 @@ def test_a_get_has_no_need_of_it(client: TestClient) -> None:
     assert client.get("/loops", headers={"Idempotency-Key": "a b"}).status_code == 200
 
 
-def test_while_the_first_is_being_answered(
-    service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_while_the_first_is_being_answered(service: Service, client: TestClient) -> None:
     """409 with Retry-After, and the answer of the first when there is one."""
     job = proposed(service)
-    inside, free = threading.Event(), threading.Event()
-    accept = FakeLoop.accept
-
-    def slow(loop: FakeLoop, gains: Gains, instead_of: Gains) -> LoopState:
-        inside.set()
-        assert free.wait(20)
-        return accept(loop, gains, instead_of)
-
-    monkeypatch.setattr(FakeLoop, "accept", slow)
-    with ThreadPoolExecutor(1) as pool:
+    with held_acceptances() as (inside, free), ThreadPoolExecutor(1) as pool:
         first = pool.submit(post, client, f"/jobs/{job}/accept")
         try:
             assert inside.wait(10)

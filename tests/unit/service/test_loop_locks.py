@@ -44,6 +44,7 @@ from tests.unit.service.fakes import (
     Service,
     ThreadEngine,
     fake_rehearse,
+    held_acceptances,
     loop_entry,
 )
 from tests.unit.service.postgres import Server
@@ -51,7 +52,6 @@ from tests.unit.service.test_api import assert_problem
 from tests.unit.service.test_decisions import begun, proposed
 from tests.unit.service.test_fleet import Deaf, idle_jobs
 from tests.unit.service.test_jobs_machine import HandEngine
-from tuning.gains import Gains
 from tuning.reasons import Reason
 
 WHY = "valve is being overhauled"
@@ -156,19 +156,10 @@ def test_a_lock_that_comes_as_a_decision_reads_the_loop(
     assert not [row for row in audit.trail(service.store.engine, 100) if row.what.endswith("_failed")]
 
 
-def test_a_lock_waits_for_a_decision_that_writes(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lock_waits_for_a_decision_that_writes(service: Service) -> None:
     """When it is answered, nothing writes any more."""
     job = proposed(service)
-    inside, free = threading.Event(), threading.Event()
-    accept = FakeLoop.accept
-
-    def slow(loop: FakeLoop, gains: Gains, instead_of: Gains) -> LoopState:
-        inside.set()
-        assert free.wait(20)
-        return accept(loop, gains, instead_of)
-
-    monkeypatch.setattr(FakeLoop, "accept", slow)
-    with ThreadPoolExecutor(2) as pool:
+    with held_acceptances() as (inside, free), ThreadPoolExecutor(2) as pool:
         decision = pool.submit(service.jobs.accept, job, "me")
         assert inside.wait(10)
         lock = pool.submit(service.jobs.lock, TAG, WHY, "me")
