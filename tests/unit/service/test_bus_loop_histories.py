@@ -29,6 +29,8 @@ from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 
 OLD = Gains(200.0, 12.0)
 BY_HAND = ControllerMode.MANUAL
+OVER_S = 1.7
+"""A session whose tuner is silent is over then: it watches for 1.5 s."""
 MOVES: dict[str, tuple[Command, ...]] = {
     "set-point": (SetSetpoint(50.25),),
     "gains": (SetGains(NEW), SetSetpoint(50.25)),
@@ -90,7 +92,7 @@ class TestKills:
             site.gateway.kill_at(call)
             with contextlib.suppress(Killed):
                 under_test(site, "relay")
-            site.pass_time(1.2)
+            site.pass_time(OVER_S)
             assert site.is_home(), call
 
     def test_one_while_the_bus_is_away_for_the_recovery(self) -> None:
@@ -115,7 +117,7 @@ class TestKills:
             site.gateway.kill_at(call)
             with contextlib.suppress(Killed):
                 site.loop.accept(NEW, OLD)
-            site.pass_time(1.2)
+            site.pass_time(OVER_S)
             assert site.is_home() and site.channel.accepted.Kp in (200.0, 150.0), call
             _, again = site.another()
             assert again.accept(NEW, OLD).gains == NEW
@@ -128,7 +130,7 @@ class TestLateFrames:
         under_test(site, move)
         late = [frame for frame in site.gateway.sent if frame[0] == sdo_request_id(CONTROLLER_NODE)]
         site.gateway.dead = True
-        site.pass_time(1.5)
+        site.pass_time(OVER_S)
         assert site.is_home()
         for frame in (*late, *random.Random(1).sample(late, len(late))):
             site.replay(frame)
@@ -142,7 +144,7 @@ class TestLateFrames:
         under_test(site, move)
         late = [frame for frame in site.gateway.sent if frame[0] == sdo_request_id(CONTROLLER_NODE)]
         site.gateway.dead = True
-        site.pass_time(1.5)
+        site.pass_time(OVER_S)
         _, loop = site.another()
         numbers: list[int] = []
         home = loop.begin(remember=numbers.append)
@@ -164,7 +166,7 @@ class TestLateFrames:
             )
             site.loop.begin()
         assert len(site.gateway.sent) > sent
-        site.pass_time(1.2)
+        site.pass_time(OVER_S)
         assert site.is_home() and site.controller.sessions[0].cause in (Cause.HEARTBEAT, Cause.CLOSED)
 
 
@@ -354,7 +356,7 @@ class TestTwoGateways:
     def test_who_was_held_up_while_another_took_the_loop_is_told_that_its_own_session_is_over(self) -> None:
         site = Site()
         home, number = under_test(site, "set-point")
-        site.pass_time(1.5)
+        site.pass_time(OVER_S)
         _, second = site.another(0x7C)
         theirs = second.begin()
         second.step((SetSetpoint(50.1),))
@@ -370,7 +372,7 @@ class TestTwoGateways:
         site = Site(Ts=Ts)
         under_test(site, "set-point", samples=1)
         site.gateway.dead = True
-        site.pass_time(1.2, beating=0x7C)
+        site.pass_time(OVER_S, beating=0x7C)
         assert site.is_home() and site.controller.sessions[0].cause is Cause.HEARTBEAT
 
     def test_nor_does_the_next_one_begin_before_it_is_home(self) -> None:
@@ -388,4 +390,4 @@ class TestTwoGateways:
         died_at = site.wire.clock.now
         _, again = site.another(TUNER_NODE)
         again.begin()
-        assert site.wire.clock.now - died_at < 1.5, "not the lease, which takes 3 s, in blocks 30 s"
+        assert site.wire.clock.now - died_at < OVER_S + 0.3, "not the lease, which takes 3 s, in blocks 30 s"
