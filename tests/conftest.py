@@ -1,55 +1,30 @@
-"""Which tests start processes is found out; what the tests counted is told at the end of the run.
-
-A test that starts processes and failed while the machine itself stood still runs again, twice at most; it is named at
-the end. None does where the plug-in that repeats is off (`-p no:rerunfailures`), as in `python -m tests.repeat`.
-"""
+"""Which tests start processes is found out; what the tests counted is told at the end of the run."""
 
 from __future__ import annotations
 
 import sys
-import time
 from collections import Counter
 from collections.abc import Sequence
-from functools import cache, partial
+from functools import cache
 from types import ModuleType
 from typing import Any
 
 import pytest
 
-from tests.standstills import Standstills
-
 _STARTERS = {"subprocess", "multiprocessing", "service.processes", "service.serving", "service.computing"}
 
 _COUNTS = pytest.StashKey[dict[str, Counter[str]]]()
-_STANDSTILLS = pytest.StashKey[Standstills]()
-_BEGAN = pytest.StashKey[float]()
-_REPEATS = 2
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[_COUNTS] = {}
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: Sequence[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items: Sequence[pytest.Item]) -> None:
     """Marks what may fail where processes start slowly: `python -m tests.repeat` repeats it beside a load."""
     for item in items:
         if isinstance(item, pytest.Function) and starts_processes(item.module):
             item.add_marker(pytest.mark.starts_processes)
-            if config.pluginmanager.hasplugin("rerunfailures"):
-                item.add_marker(pytest.mark.flaky(reruns=_REPEATS, condition=partial(_machine_stood_still, item)))
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup(item: pytest.Item) -> None:
-    if item.get_closest_marker("flaky") and _STANDSTILLS not in item.config.stash:
-        item.config.stash[_STANDSTILLS] = standstills = Standstills()
-        item.config.add_cleanup(standstills.close)
-    item.stash[_BEGAN] = time.monotonic()
-
-
-def _machine_stood_still(item: pytest.Item, error: BaseException | None = None) -> bool:
-    """Whether it did while this test ran."""
-    return item.config.stash[_STANDSTILLS].longest_s(item.stash[_BEGAN]) > 0.0
 
 
 @cache

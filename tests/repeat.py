@@ -53,8 +53,7 @@ def once(arguments: Sequence[str], folder: Path) -> tuple[str, dict[str, str]]:
     """pytest's last line, and what failed."""
     report = folder / "report.xml"
     report.unlink(missing_ok=True)
-    without = ("-p", "no:cacheprovider", "-p", "no:rerunfailures")
-    told = ("-q", *without, "--tb=short", "-o", "junit_logging=all", f"--junitxml={report}")
+    told = ("-q", "-p", "no:cacheprovider", "--tb=short", "-o", "junit_logging=all", f"--junitxml={report}")
     ran = subprocess.run([sys.executable, "-m", "pytest", *told, *arguments], stdout=subprocess.PIPE, text=True)
     last = next((line for line in reversed(ran.stdout.splitlines()) if line.strip()), "")
     if ran.returncode not in RAN or not report.exists():
