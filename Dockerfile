@@ -19,6 +19,7 @@ COPY plantsim plantsim
 COPY controller controller
 COPY service service
 COPY containers containers
+COPY src src
 # Without pip and the libraries' own tests, which nobody runs in here.
 RUN /opt/loopwright/bin/pip install --no-cache-dir --quiet --no-deps . \
     && /opt/loopwright/bin/pip uninstall --quiet --yes pip setuptools 2>/dev/null \
@@ -35,5 +36,5 @@ ENV PATH=/opt/loopwright/bin:$PATH PYTHONUNBUFFERED=1 MPLCONFIGDIR=/tmp
 USER loopwright
 WORKDIR /data
 EXPOSE 8080
-HEALTHCHECK --interval=5s --timeout=5s --start-period=60s --retries=3 CMD ["python", "-m", "containers.health", "service"]
+HEALTHCHECK --interval=5s --timeout=5s --start-period=60s --retries=3 CMD ["python", "-m", "loopwright.containers.health", "service"]
 CMD ["loopwright", "serve", "--loops", "/etc/loopwright/loops.yaml", "--data", "/data"]

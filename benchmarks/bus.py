@@ -19,9 +19,9 @@ from statistics import median
 from typing import TypeVar
 
 from benchmarks.command import parser_of, show
-from protocol.profile import CONTROLLER_NODE, PLANT_NODE, SYNC_ID, channel_ids
-from protocol.tuner import Tuner
-from service.bus_loop import BusLoop
+from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, SYNC_ID, channel_ids
+from loopwright.protocol.tuner import Tuner
+from loopwright.service.bus_loop import BusLoop
 
 T = TypeVar("T")
 INTERFACE = "vcan0"
@@ -99,8 +99,8 @@ def devices(loops: int, speed: str) -> Iterator[None]:
     models = [f"--model=model-{k % 50 + 1}" for k in range(loops)]
     with ExitStack() as stack:
         gains = ("--kp", "0.1", "--ti", "20", "--sp", "50")
-        stack.enter_context(process("controller", "--bus", URL, "--channels", str(loops), *gains))
-        stack.enter_context(process("plantsim", "--bus", URL, *models, "--ts", str(TS), "--speed", speed))
+        stack.enter_context(process("loopwright.controller", "--bus", URL, "--channels", str(loops), *gains))
+        stack.enter_context(process("loopwright.plantsim", "--bus", URL, *models, "--ts", str(TS), "--speed", speed))
         time.sleep(0.5)
         yield
 
@@ -230,8 +230,7 @@ def run() -> dict[str, object]:
         "devices_ratio_range": [min(a / b for b, a, _, _ in rounds), max(a / b for b, a, _, _ in rounds)],
         "listening_ratio_range": [min(a / b for b, _, a, _ in rounds), max(a / b for b, _, a, _ in rounds)],
         "speed_factor": {
-            str(loops): told(f"speed factor, {loops} loops", TS * device_samples_per_s(loops))
-            for loops in LOOPS
+            str(loops): told(f"speed factor, {loops} loops", TS * device_samples_per_s(loops)) for loops in LOOPS
         },
         "real_time_100_loops": real_time(),
     }

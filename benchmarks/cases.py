@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from benchmarks.disturbances import Disturbance
 from benchmarks.plants import SAMPLES_PER_PERIOD, Plant
-from tuning.fast.design import Wish
+from loopwright.tuning.fast.design import Wish
 
 ASKED = 1.6
 PI = Wish(ASKED)

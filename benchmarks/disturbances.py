@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plantsim.plant import Plant
+from loopwright.plantsim.plant import Plant
 
 SPIKE = 10.0
 """Standard deviations of the noise."""

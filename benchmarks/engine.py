@@ -1,6 +1,6 @@
 """What durable jobs cost on a file: per job and per stage. The mathematics of a job is left out.
 
-    python -m benchmarks.engine
+python -m benchmarks.engine
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from pathlib import Path
 
 from benchmarks.command import command
 from benchmarks.rehearsed import entry, open_loop
-from service.config import LoopConfig, parse_site
-from service.engine.durable import DurableEngine
-from service.jobs import Jobs
-from service.loop import Loop, LoopState
-from service.request import RetuneRequest
-from service.running import Running
-from service.store.store import Store
-from service.work import Hooks, Outcome, rehearse
-from tuning.plan import StageDone, StageStarted
+from loopwright.service.config import LoopConfig, parse_site
+from loopwright.service.engine.durable import DurableEngine
+from loopwright.service.jobs import Jobs
+from loopwright.service.loop import Loop, LoopState
+from loopwright.service.request import RetuneRequest
+from loopwright.service.running import Running
+from loopwright.service.store.store import Store
+from loopwright.service.work import Hooks, Outcome, rehearse
+from loopwright.tuning.plan import StageDone, StageStarted
 
 STAGES = 500
 NO_WORK = 60

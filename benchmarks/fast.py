@@ -22,19 +22,19 @@ from scipy.linalg import expm
 from scipy.optimize import least_squares, minimize
 
 from benchmarks.command import parser_of, show
-from controller.channel import Channel, RelaySettings, Settings
-from controller.pid import Parameters
-from plantsim.plant import LinearPlant
-from tuning.fast.design import Wish
-from tuning.fast.evidence import Evidence
-from tuning.fast.verdict import judge
-from tuning.gains import Gains
-from tuning.margins import margins
-from tuning.models import TransferFunction
-from tuning.plan import Mode
-from tuning.record_fit import Fit
-from tuning.stories import STRUCTURES
-from tuning.structures import Structure
+from loopwright.controller.channel import Channel, RelaySettings, Settings
+from loopwright.controller.pid import Parameters
+from loopwright.plantsim.plant import LinearPlant
+from loopwright.tuning.fast.design import Wish
+from loopwright.tuning.fast.evidence import Evidence
+from loopwright.tuning.fast.verdict import judge
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins
+from loopwright.tuning.models import TransferFunction
+from loopwright.tuning.plan import Mode
+from loopwright.tuning.record_fit import Fit
+from loopwright.tuning.stories import STRUCTURES
+from loopwright.tuning.structures import Structure
 
 NUM, DEN, L, TS = (1.0,), (2.0, 7.0, 7.0, 2.0), 0.53, 0.085
 NOISE = 0.01

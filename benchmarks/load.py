@@ -25,11 +25,11 @@ import yaml
 from benchmarks.answers import memory_MB, processor_s
 from benchmarks.bus import URL, device_samples_per_s, devices
 from benchmarks.command import command
-from plantsim.catalogue import find
-from protocol.profile import CONTROLLER_NODE, PLANT_NODE
-from protocol.tuner import Tuner
-from service.processes import Process
-from service.states import ACTIVE
+from loopwright.plantsim.catalogue import find
+from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE
+from loopwright.protocol.tuner import Tuner
+from loopwright.service.processes import Process
+from loopwright.service.states import ACTIVE
 
 TS = 0.1
 MANY, PACE = 50, 1.0
@@ -73,9 +73,9 @@ class Site:
         common = ("--bus", URL, "--ts", str(TS))
         where = ("--loops", str(folder / "loops.yaml"), "--data", str(folder / "data"), "--port", "0")
         arguments = {
-            "controller": ("controller", *common, "--config", str(folder / "channels.yaml")),
-            "plant": ("plantsim", *common, *plants, "--speed", str(pace)),
-            "service": ("service", "serve", *where),
+            "controller": ("loopwright.controller", *common, "--config", str(folder / "channels.yaml")),
+            "plant": ("loopwright.plantsim", *common, *plants, "--speed", str(pace)),
+            "service": ("loopwright.service", "serve", *where),
         }
         for name, line in arguments.items():
             process = Process(name, line, folder / f"{name}.log")

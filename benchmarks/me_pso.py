@@ -12,8 +12,8 @@ import time
 from statistics import median
 
 from benchmarks.command import command
-from tuning.models import TransferFunction
-from tuning.rules.me_pso import me_pso
+from loopwright.tuning.models import TransferFunction
+from loopwright.tuning.rules.me_pso import me_pso
 
 WITHOUT = TransferFunction((1.0,), (1.0, 3.0, 3.0, 1.0))
 WITH = TransferFunction((1.0,), (0.25, 1.0, 1.0), 1.0)

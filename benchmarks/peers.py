@@ -39,18 +39,18 @@ from benchmarks.tuning import (
     span_of,
     spread,
 )
-from plantsim.plant import LinearPlant
-from service.runner import Watch, run
-from tuning.five_stage import Options, five_stage
-from tuning.gains import Gains
-from tuning.methods import METHODS
-from tuning.models import integrators
-from tuning.plan import Plan, StageStarted
-from tuning.reasons import Ended
-from tuning.recorded_step import fit_step
-from tuning.stages.common import Facts
-from tuning.stages.preflight import PREFLIGHT, SETTLE, preflight
-from tuning.stages.relay import relay_test
+from loopwright.plantsim.plant import LinearPlant
+from loopwright.service.runner import Watch, run
+from loopwright.tuning.five_stage import Options, five_stage
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.methods import METHODS
+from loopwright.tuning.models import integrators
+from loopwright.tuning.plan import Plan, StageStarted
+from loopwright.tuning.reasons import Ended
+from loopwright.tuning.recorded_step import fit_step
+from loopwright.tuning.stages.common import Facts
+from loopwright.tuning.stages.preflight import PREFLIGHT, SETTLE, preflight
+from loopwright.tuning.stages.relay import relay_test
 
 SAMPLES = 1500
 """Of a step's record at most: a longer one is of averages."""

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import ss2tf
 
-from plantsim import reactor
-from tuning.margins import ultimate_point
-from tuning.models import TransferFunction
+from loopwright.plantsim import reactor
+from loopwright.tuning.margins import ultimate_point
+from loopwright.tuning.models import TransferFunction
 
 SAMPLES_PER_PERIOD = 80
 REACTOR = "reactor"
@@ -41,7 +41,7 @@ class Plant:
 def plants() -> list[Plant]:
     batch = json.loads((Path(__file__).parent.parent / "tests/data/plants-batch.json").read_text())["processes"]
     found = [Plant(p["id"], tuple(p["num"]), tuple(p["den"]), p["delay"], p["Ku"], p["Tu"]) for p in batch]
-    for m in json.loads((files("plantsim") / "models-50.json").read_text())["models"]:
+    for m in json.loads((files("loopwright.plantsim") / "models-50.json").read_text())["models"]:
         found.append(_of(f"model-{m['id']}", TransferFunction(tuple(m["num"]), tuple(m["den"]), m["delay"])))
     found.append(_of(REACTOR, linear_reactor()))
     return found

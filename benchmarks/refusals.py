@@ -14,18 +14,18 @@ from typing import Any
 from PIL import Image
 
 from benchmarks.command import check_names, parser_of
-from controller.channel import Channel, Settings
-from plantsim.plant import LinearPlant
-from service.fast_picture import fast_job
-from service.fast_record import kept
-from service.plain import plain
-from service.rehearsal import RehearsedLoop, _parameters
-from service.runner import Watch, run
-from tuning.fast.procedure import FastOptions, fast
-from tuning.fast.results import Found
-from tuning.gains import Gains
-from tuning.plan import Event, Mode, Sample, StageDone, StageStarted
-from tuning.stages.common import Facts
+from loopwright.controller.channel import Channel, Settings
+from loopwright.plantsim.plant import LinearPlant
+from loopwright.service.fast_picture import fast_job
+from loopwright.service.fast_record import kept
+from loopwright.service.plain import plain
+from loopwright.service.rehearsal import RehearsedLoop, _parameters
+from loopwright.service.runner import Watch, run
+from loopwright.tuning.fast.procedure import FastOptions, fast
+from loopwright.tuning.fast.results import Found
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Event, Mode, Sample, StageDone, StageStarted
+from loopwright.tuning.stages.common import Facts
 
 TS, T95, MIDDLE, SP = 0.1, 26.0, 50.0, 20.0
 OLD = Gains(1.0, 10.0)

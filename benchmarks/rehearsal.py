@@ -1,6 +1,6 @@
 """Rehearsal of the 50 models, preflight to verification, at Ts = 0.1 s on one processor: plant time per wall time.
 
-    python -m benchmarks.rehearsal
+python -m benchmarks.rehearsal
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import time
 from importlib.resources import files
 
 from benchmarks.command import command
-from service.rehearsal import rehearse
+from loopwright.service.rehearsal import rehearse
 
 TS = 0.1
 
@@ -22,7 +22,7 @@ def run() -> dict[str, float]:
     """Times in s; memory is the peak of the whole process, MB."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    models = json.loads((files("plantsim") / "models-50.json").read_text())["models"]
+    models = json.loads((files("loopwright.plantsim") / "models-50.json").read_text())["models"]
     plant_s, proposed = 0.0, 0
     wall, processor = time.perf_counter(), time.process_time()
     for model in models:

@@ -16,13 +16,13 @@ from typing import Any
 import yaml
 
 from benchmarks.command import parser_of
-from controller.channel import Channel, Settings
-from controller.pid import Parameters
-from plantsim.plant import LinearPlant
-from service.config import LoopConfig
-from service.rehearsal import RehearsedLoop
-from service.serving import Setup, serve
-from tuning.plan import Command, Mode, Sample
+from loopwright.controller.channel import Channel, Settings
+from loopwright.controller.pid import Parameters
+from loopwright.plantsim.plant import LinearPlant
+from loopwright.service.config import LoopConfig
+from loopwright.service.rehearsal import RehearsedLoop
+from loopwright.service.serving import Setup, serve
+from loopwright.tuning.plan import Command, Mode, Sample
 
 TS = 0.1
 MIDDLE = 50.0

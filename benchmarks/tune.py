@@ -30,7 +30,7 @@ REPEATS = 5
 
 def once(model: str) -> tuple[float, float, float]:
     """(wall-clock s, processor s, peak MB) of one process."""
-    command = [sys.executable, "-m", "service", "tune", "--method", "all", "--json", "--model", model]
+    command = [sys.executable, "-m", "loopwright.service", "tune", "--method", "all", "--json", "--model", model]
     start = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.PIPE)
     assert process.stdout is not None

@@ -30,27 +30,27 @@ from benchmarks.cases import ASKED, CASES, FURTHER, PI, PLAIN, Case
 from benchmarks.command import check_names, parser_of
 from benchmarks.disturbances import Disturbed
 from benchmarks.plants import REACTOR, SAMPLES_PER_PERIOD, Plant, plants
-from controller.channel import Channel, Settings
-from controller.pid import Parameters
-from plantsim import reactor
-from plantsim.plant import LinearPlant
-from plantsim.plant import Plant as Simulated
-from plantsim.reactor import Reactor
-from service.fast_record import kept as recorded
-from service.rehearsal import RehearsedLoop
-from service.runner import RunResult, Watch, run
-from tuning.fast.design import Design, Wish
-from tuning.fast.evidence import Evidence
-from tuning.fast.experiment import Experiment
-from tuning.fast.procedure import LEAST_SAMPLES, FastOptions, FastProposal, fast
-from tuning.fast.verdict import judge_again
-from tuning.gains import Gains
-from tuning.margins import margins
-from tuning.models import sign
-from tuning.plan import Command, Event, Mode, Plan, Sample, StageStarted
-from tuning.reasons import Ended
-from tuning.stages.common import Facts
-from tuning.stages.preflight import PREFLIGHT, SETTLE, at_rest
+from loopwright.controller.channel import Channel, Settings
+from loopwright.controller.pid import Parameters
+from loopwright.plantsim import reactor
+from loopwright.plantsim.plant import LinearPlant
+from loopwright.plantsim.plant import Plant as Simulated
+from loopwright.plantsim.reactor import Reactor
+from loopwright.service.fast_record import kept as recorded
+from loopwright.service.rehearsal import RehearsedLoop
+from loopwright.service.runner import RunResult, Watch, run
+from loopwright.tuning.fast.design import Design, Wish
+from loopwright.tuning.fast.evidence import Evidence
+from loopwright.tuning.fast.experiment import Experiment
+from loopwright.tuning.fast.procedure import LEAST_SAMPLES, FastOptions, FastProposal, fast
+from loopwright.tuning.fast.verdict import judge_again
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins
+from loopwright.tuning.models import sign
+from loopwright.tuning.plan import Command, Event, Mode, Plan, Sample, StageStarted
+from loopwright.tuning.reasons import Ended
+from loopwright.tuning.stages.common import Facts
+from loopwright.tuning.stages.preflight import PREFLIGHT, SETTLE, at_rest
 
 T95_PERIODS = 3.0
 WRONG = 0.1

@@ -14,9 +14,9 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 
-from containers import keeper
-from containers.vcan import NoVcan, make
-from protocol.hub import Hub
+from loopwright.containers import keeper
+from loopwright.containers.vcan import NoVcan, make
+from loopwright.protocol.hub import Hub
 
 INTERFACE = "vcan0"
 DOOR, SERVICE = 8081, 8080
@@ -24,7 +24,9 @@ _CHUNK = 65536
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m containers.bus", description="The bus of docker-compose.yml.")
+    parser = argparse.ArgumentParser(
+        prog="python -m loopwright.containers.bus", description="The bus of docker-compose.yml."
+    )
     parser.add_argument("--kind", choices=("auto", "vcan", "hub"), default="auto", help="auto: vcan if it can be had")
     try:
         with _bus(parser.parse_args(argv).kind) as url:

@@ -10,8 +10,8 @@ import sys
 import time
 from typing import Any
 
-from service import show
-from service.client import ApiError, Client
+from loopwright.service import show
+from loopwright.service.client import ApiError, Client
 
 URL = "http://127.0.0.1:8080"
 

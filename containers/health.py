@@ -1,8 +1,8 @@
 """Health checks of docker-compose.yml: exit status 0, or 1 and what is wrong. Light enough to run every few seconds.
 
-    python -m containers.health bus             the bus is kept
-    python -m containers.health node 0x20       a heartbeat of this node within 2 s
-    python -m containers.health service [URL]   the service answers
+python -m loopwright.containers.health bus             the bus is kept
+python -m loopwright.containers.health node 0x20       a heartbeat of this node within 2 s
+python -m loopwright.containers.health service [URL]   the service answers
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Sequence
 
-from containers import keeper
+from loopwright.containers import keeper
 
 SERVICE = "http://127.0.0.1:8080"
 _HEARTBEAT = 0x700
@@ -22,7 +22,7 @@ _WAIT_S = 2.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m containers.health", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m loopwright.containers.health", description=__doc__.split("\n")[0])
     parser.add_argument("what", choices=("bus", "node", "service"))
     parser.add_argument("argument", nargs="?", help="node: its number; service: where it is")
     options = parser.parse_args(argv)

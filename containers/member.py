@@ -1,6 +1,6 @@
 """Runs a command on the bus of this network namespace, for as long as there is that bus.
 
-    python -m containers.member [--set NAME=VALUE] [--write TEMPLATE FILE] -- COMMAND...
+    python -m loopwright.containers.member [--set NAME=VALUE] [--write TEMPLATE FILE] -- COMMAND...
 
 {bus} in an argument, and in TEMPLATE, which is written to FILE, stands for the bus's address, {NAME} for VALUE. When
 the bus goes, the command is ended as by `docker stop`, and this container with it: started anew, it joins the new bus.
@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 
-from containers import keeper
+from loopwright.containers import keeper
 
 BUS_GONE = 75
 """Exit status, "try again" (EX_TEMPFAIL)."""
@@ -32,7 +32,7 @@ _BUS_RESTARTS_S = 3.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m containers.member", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m loopwright.containers.member", description=__doc__.split("\n")[0])
     parser.add_argument("--need", metavar="VARIABLE", help="of the environment, without which nothing is started")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="{NAME} filled in too")
     parser.add_argument("--write", nargs=2, type=Path, metavar=("TEMPLATE", "FILE"), help="with all of them filled in")

@@ -1,4 +1,4 @@
-"""The controller process: python -m controller --bus socketcan:vcan0 --kp 2 --ti 10 --sp 50"""
+"""The controller process: python -m loopwright.controller --bus socketcan:vcan0 --kp 2 --ti 10 --sp 50"""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from controller.channel import Settings
-from controller.device import ControllerChannel, ControllerDevice
-from controller.memory import FileKeeper, KeptError, remembered
-from controller.pid import Parameters
-from protocol.process import ConfigError, node_id, read_channels, run_device
-from protocol.profile import CONTROLLER_NODE, PLANT_NODE, Mode
+from loopwright.controller.channel import Settings
+from loopwright.controller.device import ControllerChannel, ControllerDevice
+from loopwright.controller.memory import FileKeeper, KeptError, remembered
+from loopwright.controller.pid import Parameters
+from loopwright.protocol.process import ConfigError, node_id, read_channels, run_device
+from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, Mode
 
 _MODES = {"off": Mode.OFF, "manual": Mode.MANUAL, "automatic": Mode.AUTOMATIC}
 _NUMBERS = {

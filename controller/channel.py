@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from controller.pid import Parameters, Pid
-from controller.relay import Relay, RelaySettings
-from protocol.profile import Mode, RelayState
+from loopwright.controller.pid import Parameters, Pid
+from loopwright.controller.relay import Relay, RelaySettings
+from loopwright.protocol.profile import Mode, RelayState
 
 __all__ = ["Channel", "Home", "Mode", "Parameters", "RelaySettings", "RelayState", "Settings"]
 

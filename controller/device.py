@@ -13,13 +13,13 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Protocol
 
-from controller.channel import Channel, Home, Settings
-from controller.pid import Parameters
-from controller.session import Session
-from protocol.bus import Bus
-from protocol.dictionary import Dictionary, Writer
-from protocol.objects import Device, Value
-from protocol.profile import (
+from loopwright.controller.channel import Channel, Home, Settings
+from loopwright.controller.pid import Parameters
+from loopwright.controller.session import Session
+from loopwright.protocol.bus import Bus
+from loopwright.protocol.dictionary import Dictionary, Writer
+from loopwright.protocol.objects import Device, Value
+from loopwright.protocol.profile import (
     COMMAND_FRAME,
     CONTROLLER_NODE,
     MV_FRAME,
@@ -39,9 +39,9 @@ from protocol.profile import (
     channel_ids,
     renewal_id,
 )
-from protocol.runtime import Runtime
-from protocol.sdo import SdoAbort
-from protocol.session import GAINS, STAGED, object_of
+from loopwright.protocol.runtime import Runtime
+from loopwright.protocol.sdo import SdoAbort
+from loopwright.protocol.session import GAINS, STAGED, object_of
 
 _SHORTEST_PV_TIMEOUT_S = 1.0
 _PV_TIMEOUT_SAMPLES = 3

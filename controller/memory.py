@@ -15,10 +15,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from controller.device import Kept
-from controller.pid import Parameters
-from protocol.durable import put_in_place
-from protocol.profile import Mode
+from loopwright.controller.device import Kept
+from loopwright.controller.pid import Parameters
+from loopwright.protocol.durable import put_in_place
+from loopwright.protocol.profile import Mode
 
 FORM = "loopwright controller 2"
 FORM_1 = "loopwright controller 1"

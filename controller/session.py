@@ -13,11 +13,11 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from controller.channel import Channel, Home, Parameters, RelaySettings
-from protocol.objects import Value
-from protocol.profile import Abort, Cause, Hand, Mode, Order, RelayState
-from protocol.sdo import SdoAbort
-from protocol.session import check_of
+from loopwright.controller.channel import Channel, Home, Parameters, RelaySettings
+from loopwright.protocol.objects import Value
+from loopwright.protocol.profile import Abort, Cause, Hand, Mode, Order, RelayState
+from loopwright.protocol.sdo import SdoAbort
+from loopwright.protocol.session import check_of
 
 AGAIN_S = 1.0
 """An output that no PV has asked for is sent again after this time while PV stays away: the bus may have been too."""

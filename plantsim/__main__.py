@@ -1,4 +1,4 @@
-"""The plant process: python -m plantsim --bus socketcan:vcan0 --model model-4 --ts 0.1 --speed max"""
+"""The plant process: python -m loopwright.plantsim --bus socketcan:vcan0 --model model-4 --ts 0.1 --speed max"""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import os
 import sys
 from collections.abc import Sequence
 
-from plantsim.catalogue import find
-from plantsim.device import PlantChannel, PlantDevice
-from protocol.process import ConfigError, node_id, read_channels, run_device
-from protocol.profile import CONTROLLER_NODE, PLANT_NODE
+from loopwright.plantsim.catalogue import find
+from loopwright.plantsim.device import PlantChannel, PlantDevice
+from loopwright.protocol.process import ConfigError, node_id, read_channels, run_device
+from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE
 
 
 def main(argv: Sequence[str] | None = None) -> int:

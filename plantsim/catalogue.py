@@ -13,8 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.resources import files
 
-from plantsim.plant import LinearPlant, Plant
-from plantsim.reactor import MV_NOMINAL, STEADY_STATE, Reactor
+from loopwright.plantsim.plant import LinearPlant, Plant
+from loopwright.plantsim.reactor import MV_NOMINAL, STEADY_STATE, Reactor
 
 Build = Callable[[float, float, int], Plant]
 
@@ -89,7 +89,7 @@ def find(name: str) -> Entry:
 
 
 def _printed_models() -> list[Entry]:
-    data = json.loads(files("plantsim").joinpath("models-50.json").read_text(encoding="utf-8"))
+    data = json.loads(files("loopwright.plantsim").joinpath("models-50.json").read_text(encoding="utf-8"))
     entries = []
     for row in data["models"]:
         computed = row["computed"]

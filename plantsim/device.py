@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from plantsim.plant import Plant
-from protocol.bus import Bus
-from protocol.dictionary import Dictionary
-from protocol.objects import Device, Value
-from protocol.profile import (
+from loopwright.plantsim.plant import Plant
+from loopwright.protocol.bus import Bus
+from loopwright.protocol.dictionary import Dictionary
+from loopwright.protocol.objects import Device, Value
+from loopwright.protocol.profile import (
     CONTROLLER_NODE,
     FOREVER,
     MV_FRAME,
@@ -27,8 +27,8 @@ from protocol.profile import (
     OnMissingAnswer,
     channel_ids,
 )
-from protocol.runtime import Runtime
-from protocol.sdo import SdoAbort
+from loopwright.protocol.runtime import Runtime
+from loopwright.protocol.sdo import SdoAbort
 
 _MOST_CATCH_UP = 5
 """Periods the pace may lag behind the wall clock before it gives the lost time up."""

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from plantsim.models import sampled
+from loopwright.plantsim.models import sampled
 
 
 class Process(Protocol):

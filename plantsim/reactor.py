@@ -17,7 +17,7 @@ import math
 import random
 from collections import deque
 
-from plantsim.models import split_dead_time
+from loopwright.plantsim.models import split_dead_time
 
 FEED_A = 1000.0  # CAi, mol/m3
 FEED_B = 1000.0  # CBi, mol/m3

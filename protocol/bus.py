@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import can
 from can.interfaces.socketcand import SocketCanDaemonBus
 
-from protocol.bus_state import ERROR_FRAME, TOLD, BusState, state_after, what_to_do, what_to_do_elsewhere
+from loopwright.protocol.bus_state import ERROR_FRAME, TOLD, BusState, state_after, what_to_do, what_to_do_elsewhere
 
 Frame = tuple[int, bytes]
 

@@ -7,10 +7,10 @@ import struct
 from collections.abc import Callable
 from itertools import chain
 
-from protocol.objects import Device, Object, Shape, Type, Value, default_of, objects_of
-from protocol.pdos import pdo_objects
-from protocol.profile import CONTROLLER_NODE, PLANT_NODE, Abort
-from protocol.sdo import SdoAbort
+from loopwright.protocol.objects import Device, Object, Shape, Type, Value, default_of, objects_of
+from loopwright.protocol.pdos import pdo_objects
+from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, Abort
+from loopwright.protocol.sdo import SdoAbort
 
 Reader = Callable[[int], Value]
 """Sub-index (the channel, for objects of a channel) to value."""

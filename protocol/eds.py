@@ -1,7 +1,7 @@
 """EDS files (CiA 306) of both devices, written from the object table. The committed ones describe one channel.
 
-    python -m protocol.eds plant [CHANNELS]          prints one
-    python -m protocol.eds --write                   writes protocol/eds_files/
+    python -m loopwright.protocol.eds plant [CHANNELS]          prints one
+    python -m loopwright.protocol.eds --write                   writes protocol/eds_files/
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
-from protocol.objects import Device, Object, Shape, Type, default_of, lookup, objects_of
-from protocol.pdos import pdo_objects
-from protocol.profile import CONTROLLER_NODE, PLANT_NODE, REVISION
+from loopwright.protocol.objects import Device, Object, Shape, Type, default_of, lookup, objects_of
+from loopwright.protocol.pdos import pdo_objects
+from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, REVISION
 
 FILES = {Device.PLANT: "loopwright_plant.eds", Device.CONTROLLER: "loopwright_controller.eds"}
 FOLDER = Path(__file__).parent / "eds_files"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from protocol.dictionary import Dictionary
-from protocol.objects import Value, lookup
-from protocol.profile import EMCY_FRAME, EMCY_REGISTER, Abort, Emcy
-from protocol.sdo import SdoAbort
+from loopwright.protocol.dictionary import Dictionary
+from loopwright.protocol.objects import Value, lookup
+from loopwright.protocol.profile import EMCY_FRAME, EMCY_REGISTER, Abort, Emcy
+from loopwright.protocol.sdo import SdoAbort
 
 _MOST_REMEMBERED = len(lookup("error_field").names)
 

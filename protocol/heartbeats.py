@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from protocol.profile import Abort
-from protocol.sdo import SdoAbort
+from loopwright.protocol.profile import Abort
+from loopwright.protocol.sdo import SdoAbort
 
 
 class Producer:

@@ -172,7 +172,9 @@ def _frame(words: list[bytes]) -> bytes | None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m protocol.hub", description="A CAN bus on 127.0.0.1, without CAN.")
+    parser = argparse.ArgumentParser(
+        prog="python -m loopwright.protocol.hub", description="A CAN bus on 127.0.0.1, without CAN."
+    )
     parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="0: any free one (default: %(default)s)")
     try:
         hub = Hub(parser.parse_args(argv).port)

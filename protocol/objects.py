@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
-from protocol.profile import REVISION, SYNC_COUNTER_OVERFLOW, SYNC_ID, Order
+from loopwright.protocol.profile import REVISION, SYNC_COUNTER_OVERFLOW, SYNC_ID, Order
 
 Value = int | float | str
 

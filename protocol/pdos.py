@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from protocol.objects import Device, Object, Shape, Type, lookup
-from protocol.profile import CONTROLLER_NODE, PLANT_NODE, channel_ids, renewal_id
+from loopwright.protocol.objects import Device, Object, Shape, Type, lookup
+from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, channel_ids, renewal_id
 
 _ON_SYNC = 1
 _ON_ARRIVAL_OR_CHANGE = 255

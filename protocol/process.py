@@ -13,8 +13,8 @@ from typing import Any, Protocol
 
 import yaml
 
-from protocol.bus import Bus, BusError, open_bus
-from protocol.runtime import Runtime
+from loopwright.protocol.bus import Bus, BusError, open_bus
+from loopwright.protocol.runtime import Runtime
 
 
 class ConfigError(Exception):

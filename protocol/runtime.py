@@ -13,12 +13,12 @@ import time
 from collections.abc import Callable, Iterable
 from functools import partial
 
-from protocol.bus import Bus, BusError
-from protocol.dictionary import Dictionary
-from protocol.emergencies import Emergencies
-from protocol.heartbeats import Consumer, Producer
-from protocol.objects import Value
-from protocol.profile import (
+from loopwright.protocol.bus import Bus, BusError
+from loopwright.protocol.dictionary import Dictionary
+from loopwright.protocol.emergencies import Emergencies
+from loopwright.protocol.heartbeats import Consumer, Producer
+from loopwright.protocol.objects import Value
+from loopwright.protocol.profile import (
     HEARTBEAT_FRAME,
     NMT_FRAME,
     NMT_ID,
@@ -30,7 +30,7 @@ from protocol.profile import (
     sdo_request_id,
     sdo_response_id,
 )
-from protocol.sdo import SdoServer
+from loopwright.protocol.sdo import SdoServer
 
 Handler = Callable[[bytes], None]
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 
-from protocol.profile import Abort
-from protocol.sdo_block import LONGEST, BlockUpload
+from loopwright.protocol.profile import Abort
+from loopwright.protocol.sdo_block import LONGEST, BlockUpload
 
 _HEADER = struct.Struct("<BHB")
 _ABORT = struct.Struct("<BHBI")

@@ -6,8 +6,8 @@ import struct
 import zlib
 from collections.abc import Sequence
 
-from protocol.objects import Value, lookup
-from protocol.profile import REVISION, Order
+from loopwright.protocol.objects import Value, lookup
+from loopwright.protocol.profile import REVISION, Order
 
 GAINS = ("kp", "ti", "td", "tf", "b", "c")
 

@@ -12,9 +12,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from protocol.bus import Bus, open_bus
-from protocol.profile import HEARTBEAT_FRAME, TUNER_NODE, NmtState, heartbeat_id
-from protocol.turns import Turns
+from loopwright.protocol.bus import Bus, open_bus
+from loopwright.protocol.profile import HEARTBEAT_FRAME, TUNER_NODE, NmtState, heartbeat_id
+from loopwright.protocol.turns import Turns
 
 HEARTBEAT_S = 0.1
 LISTEN_S = 2.0
@@ -97,4 +97,3 @@ class Station:
                     )
         finally:
             bus.close()
-

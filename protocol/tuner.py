@@ -13,9 +13,9 @@ from contextlib import contextmanager
 from enum import StrEnum
 from typing import NamedTuple
 
-from protocol.bus import Bus, Frame
-from protocol.objects import Device, Object, Shape, Type, Value, lookup
-from protocol.profile import (
+from loopwright.protocol.bus import Bus, Frame
+from loopwright.protocol.objects import Device, Object, Shape, Type, Value, lookup
+from loopwright.protocol.profile import (
     HEARTBEAT_FRAME,
     MV_FRAME,
     PLANT_NODE,
@@ -31,8 +31,8 @@ from protocol.profile import (
     sdo_request_id,
     sdo_response_id,
 )
-from protocol.real32 import shortest
-from protocol.station import Station
+from loopwright.protocol.real32 import shortest
+from loopwright.protocol.station import Station
 
 _WAIT_S = 0.05  # one wait on the bus: short enough to beat in time; always the same, which RawBus makes cheap
 _TAKE_IN_S = 0.1

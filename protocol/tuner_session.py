@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass
 
-from protocol.objects import Value, lookup
-from protocol.profile import Abort, Order
-from protocol.session import STAGED, check_of, object_of
-from protocol.tuner import Tuner, TunerError
+from loopwright.protocol.objects import Value, lookup
+from loopwright.protocol.profile import Abort, Order
+from loopwright.protocol.session import STAGED, check_of, object_of
+from loopwright.protocol.tuner import Tuner, TunerError
 
 
 @dataclass(frozen=True, slots=True)

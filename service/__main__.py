@@ -1,5 +1,5 @@
-"""python -m service: the same as the `loopwright` command."""
+"""python -m loopwright.service: the same as the `loopwright` command."""
 
-from service.cli import main
+from loopwright.service.cli import main
 
 main()

@@ -13,16 +13,16 @@ from typing import Any
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.config import LoopConfig
-from service.logs import about
-from service.loop import Loop
-from service.machine import Machine
-from service.safe import Safe, look
-from service.state_json import state_json
-from service.store import looked_after
-from service.store.store import Store
-from service.store.tables import JobRow
-from tuning.reasons import ADVICE, Reason
+from loopwright.service.config import LoopConfig
+from loopwright.service.logs import about
+from loopwright.service.loop import Loop
+from loopwright.service.machine import Machine
+from loopwright.service.safe import Safe, look
+from loopwright.service.state_json import state_json
+from loopwright.service.store import looked_after
+from loopwright.service.store.store import Store
+from loopwright.service.store.tables import JobRow
+from loopwright.tuning.reasons import ADVICE, Reason
 
 log = logging.getLogger(__name__)
 

@@ -5,25 +5,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from service.errors import Conflict
-from service.fast_record import Kept
-from service.found_model import DISPROVED, FoundModel, found_model, model_of
-from service.request import ProcessModel
-from service.states import ACTIVE, JobState
-from service.store.tables import EventRow, JobRow
-from service.tunings import Tuned, answer, tune_each
-from tuning.assess import Assessment, assess
-from tuning.design import LEAST_GM, MOST_Ms
-from tuning.fast.design import Wish
-from tuning.fast.procedure import FAST, FastOptions
-from tuning.fast.results import delayed
-from tuning.fast.trial import designed_on
-from tuning.fast.verdict import judge_again
-from tuning.gains import Gains
-from tuning.methods import METHODS, Method
-from tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
-from tuning.reasons import Ended, Reason, Refused
-from tuning.setting import Setting
+from loopwright.service.errors import Conflict
+from loopwright.service.fast_record import Kept
+from loopwright.service.found_model import DISPROVED, FoundModel, found_model, model_of
+from loopwright.service.request import ProcessModel
+from loopwright.service.states import ACTIVE, JobState
+from loopwright.service.store.tables import EventRow, JobRow
+from loopwright.service.tunings import Tuned, answer, tune_each
+from loopwright.tuning.assess import Assessment, assess
+from loopwright.tuning.design import LEAST_GM, MOST_Ms
+from loopwright.tuning.fast.design import Wish
+from loopwright.tuning.fast.procedure import FAST, FastOptions
+from loopwright.tuning.fast.results import delayed
+from loopwright.tuning.fast.trial import designed_on
+from loopwright.tuning.fast.verdict import judge_again
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.methods import METHODS, Method
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
+from loopwright.tuning.reasons import Ended, Reason, Refused
+from loopwright.tuning.setting import Setting
 
 
 def _rule(model: Model, Ms: float = 1.6, derivative: bool = False) -> Setting:

@@ -12,10 +12,10 @@ from pathlib import Path
 from alembic.config import Config
 from alembic.script import ScriptDirectory
 
-from protocol.durable import put_in_place, sync
-from service.store.database import FILE
-from service.store.lock import FolderLock
-from service.store.store import Store
+from loopwright.protocol.durable import put_in_place, sync
+from loopwright.service.store.database import FILE
+from loopwright.service.store.lock import FolderLock
+from loopwright.service.store.store import Store
 
 
 class BackupProblem(Exception):
@@ -92,7 +92,7 @@ def _check(path: Path) -> None:
     if wrong:
         raise BackupProblem(f"{path} is damaged: {'; '.join(wrong)}")
     config = Config()
-    config.set_main_option("script_location", "service.store:migrations")
+    config.set_main_option("script_location", "loopwright.service.store:migrations")
     known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
     if revision is None or revision[0] not in known:
         raise BackupProblem(f"{path} was made by another version: its revision {revision and revision[0]} is not known")

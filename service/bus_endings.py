@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from protocol.profile import Cause, Hand
-from protocol.tuner import Tuner
-from service.bus_reading import BusReading
-from service.loop import LoopState, Restored, differences, same
-from tuning.plan import Mode
-from tuning.reasons import Aborted, Ended, Failed, Reason
+from loopwright.protocol.profile import Cause, Hand
+from loopwright.protocol.tuner import Tuner
+from loopwright.service.bus_reading import BusReading
+from loopwright.service.loop import LoopState, Restored, differences, same
+from loopwright.tuning.plan import Mode
+from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
 
 _HANDS = {
     Hand.SETPOINT: (Reason.SETPOINT_CHANGED, "set-point", {"set-point"}),

@@ -16,24 +16,24 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import astuple
 
-from protocol.bus import BusError
-from protocol.profile import (
+from loopwright.protocol.bus import BusError
+from loopwright.protocol.profile import (
     FOREVER,
     Abort,
     NmtState,
     Order,
     samples_between,
 )
-from protocol.station import NodeTaken, Station
-from protocol.tuner import BusSample, Kind, Tuner, TunerError
-from protocol.tuner_session import Lease, TunerSession
-from service.bus_endings import cause_of, read_back, why_over, words_of
-from service.bus_reading import BusReading, not_operational
-from service.loop import LoopState, Restored, same_gains
-from service.metrics import SAMPLES_LOST
-from tuning.gains import Gains
-from tuning.plan import Command, Mode, Sample, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
-from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
+from loopwright.protocol.station import NodeTaken, Station
+from loopwright.protocol.tuner import BusSample, Kind, Tuner, TunerError
+from loopwright.protocol.tuner_session import Lease, TunerSession
+from loopwright.service.bus_endings import cause_of, read_back, why_over, words_of
+from loopwright.service.bus_reading import BusReading, not_operational
+from loopwright.service.loop import LoopState, Restored, same_gains
+from loopwright.service.metrics import SAMPLES_LOST
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Command, Mode, Sample, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
+from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 
 WATCH_S = 1.5
 """Time of the controller's clock without our heartbeat, or without PV (at least three sampling periods), after which it

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from protocol.objects import Device, default_of, lookup
-from protocol.profile import REVISION, NmtState, OnMissingAnswer
-from protocol.session import GAINS
-from protocol.tuner import Tuner, TunerError
-from service.loop import OPERATIONAL, LoopState
-from tuning.gains import Gains
-from tuning.plan import Mode
-from tuning.reasons import Failed, Reason, Refused
+from loopwright.protocol.objects import Device, default_of, lookup
+from loopwright.protocol.profile import REVISION, NmtState, OnMissingAnswer
+from loopwright.protocol.session import GAINS
+from loopwright.protocol.tuner import Tuner, TunerError
+from loopwright.service.loop import OPERATIONAL, LoopState
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Mode
+from loopwright.tuning.reasons import Failed, Reason, Refused
 
 SILENT = "silent"
 _WHEN_SILENT: dict[int, str] = {

@@ -6,8 +6,8 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 
-from protocol.bus import Bus, BusError, open_bus
-from protocol.bus_state import BusState
+from loopwright.protocol.bus import Bus, BusError, open_bus
+from loopwright.protocol.bus_state import BusState
 
 _LISTENED_TO = "socketcan:"
 """Its error frames reach who is open when they are sent; a hub has none."""

@@ -10,11 +10,11 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from protocol.durable import put_in_place
-from service.engine.durable import FILE as ENGINE_FILE
-from service.store.damage import read_log
-from service.store.database import FILE
-from service.store.lock import FolderInUse, FolderLock
+from loopwright.protocol.durable import put_in_place
+from loopwright.service.engine.durable import FILE as ENGINE_FILE
+from loopwright.service.store.damage import read_log
+from loopwright.service.store.database import FILE
+from loopwright.service.store.lock import FolderInUse, FolderLock
 
 
 class CheckProblem(Exception):

@@ -9,9 +9,9 @@ from typing import Annotated, Any
 
 import typer
 
-from service import cli_data, cli_keys, cli_loops, cli_tuning
-from service.cli_output import AsJson, Url, die, on_terminal, print_json, read_json_object
-from service.client import DEFAULT_URL, ApiError, Client
+from loopwright.service import cli_data, cli_keys, cli_loops, cli_tuning
+from loopwright.service.cli_output import AsJson, Url, die, on_terminal, print_json, read_json_object
+from loopwright.service.client import DEFAULT_URL, ApiError, Client
 
 app = typer.Typer(
     help="Retunes PI loops by itself, over CANopen, and ends safe whatever fails.",
@@ -37,7 +37,7 @@ def main() -> None:
 @app.command(context_settings=_HAND_OVER, add_help_option=False)
 def plant(context: typer.Context) -> None:
     """A simulated plant on the bus (see plant --help)."""
-    from plantsim.__main__ import main as run
+    from loopwright.plantsim.__main__ import main as run
 
     sys.exit(run(context.args))
 
@@ -45,7 +45,7 @@ def plant(context: typer.Context) -> None:
 @app.command(context_settings=_HAND_OVER, add_help_option=False)
 def controller(context: typer.Context) -> None:
     """A PI(D) controller on the bus (see controller --help)."""
-    from controller.__main__ import main as run
+    from loopwright.controller.__main__ import main as run
 
     sys.exit(run(context.args))
 
@@ -53,7 +53,7 @@ def controller(context: typer.Context) -> None:
 @app.command(context_settings=_HAND_OVER, add_help_option=False)
 def hub(context: typer.Context) -> None:
     """A CAN bus on 127.0.0.1 for systems without SocketCAN (see hub --help)."""
-    from protocol.hub import main as run
+    from loopwright.protocol.hub import main as run
 
     sys.exit(run(context.args))
 
@@ -135,15 +135,15 @@ def serve(
 
     from sqlalchemy.exc import SQLAlchemyError
 
-    from protocol.process import node_id
-    from service.computing.limits import ComputingLimits
-    from service.config import ConfigError
-    from service.retention import Keep
-    from service.security.limits import RequestLimits
-    from service.serving import NotSafe, Setup
-    from service.serving import serve as run
-    from service.store.database import BadDatabase
-    from service.store.store import FolderInUse, ForeignLoop
+    from loopwright.protocol.process import node_id
+    from loopwright.service.computing.limits import ComputingLimits
+    from loopwright.service.config import ConfigError
+    from loopwright.service.retention import Keep
+    from loopwright.service.security.limits import RequestLimits
+    from loopwright.service.serving import NotSafe, Setup
+    from loopwright.service.serving import serve as run
+    from loopwright.service.store.database import BadDatabase
+    from loopwright.service.store.store import FolderInUse, ForeignLoop
 
     if log_format not in ("text", "json"):
         die(f"--log-format must be text or json, not {log_format!r}", 2)
@@ -188,7 +188,7 @@ def serve(
 @app.command("loops")
 def list_loops(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
     """The configured loops."""
-    from service import show
+    from loopwright.service import show
 
     found = Client(url).pages("/loops")
     if as_json:
@@ -254,7 +254,7 @@ def _previewed(client: Client, path: str, body: dict[str, Any], *, alone: bool =
     """Tells what would be done; whether it would start. Before a question standard output is left to the report."""
     from rich.console import Console
 
-    from service import show_preview
+    from loopwright.service import show_preview
 
     found = client.post(f"{path}/preview", body)
     able = found["would_start"] == found.get("count", True)
@@ -267,8 +267,8 @@ def _previewed(client: Client, path: str, body: dict[str, Any], *, alone: bool =
 
 def _one(client: Client, job: dict[str, Any], wait: bool, as_json: bool) -> int:
     """Follows a job; the exit status."""
-    from service import show
-    from service.states import GOOD
+    from loopwright.service import show
+    from loopwright.service.states import GOOD
 
     if wait and as_json:
         for _ in client.events(job["url"]):
@@ -285,8 +285,8 @@ def _one(client: Client, job: dict[str, Any], wait: bool, as_json: bool) -> int:
 
 def _many(client: Client, started: dict[str, Any], wait: bool, as_json: bool) -> int:
     """Follows a retune of many loops; the exit status."""
-    from service import show_fleet
-    from service.states import GOOD
+    from loopwright.service import show_fleet
+    from loopwright.service.states import GOOD
 
     found = show_fleet.follow(client, started["url"], quiet=as_json) if wait else started
     if as_json:
@@ -317,7 +317,7 @@ def list_jobs(
     as_json: AsJson = False,
 ) -> None:
     """The latest jobs."""
-    from service import show
+    from loopwright.service import show
 
     found = Client(url).get("/jobs", loop=loop)
     if as_json:
@@ -339,7 +339,7 @@ def one_job(
     as_json: AsJson = False,
 ) -> None:
     """A job; or a decision about it."""
-    from service import show
+    from loopwright.service import show
 
     client = Client(url)
     path = f"/jobs/{job_id}"
@@ -350,7 +350,7 @@ def one_job(
     if follow:
         job = show.follow(client, path)
     if plot is not None:
-        from service.picture import NoPicture, job_picture
+        from loopwright.service.picture import NoPicture, job_picture
 
         cli_tuning.check_plot(plot)
         unit = client.get(f"/loops/{job['loop']}")["pv_unit"]
@@ -381,7 +381,7 @@ def alternatives_of_job(
     if as_json:
         print_json(found)
         return
-    from service import show_tunings
+    from loopwright.service import show_tunings
 
     show_tunings.tunings(found)
     show_tunings.to_try(found)
@@ -399,9 +399,9 @@ def rehearse_file(
     as_json: AsJson = False,
 ) -> None:
     """The whole procedure on a plant model, in memory at full speed. Exits 0 whenever it answered."""
-    from service import show
-    from service.rehearsal import rehearse
-    from tuning.plan import Event, StageStarted
+    from loopwright.service import show
+    from loopwright.service.rehearsal import rehearse
+    from loopwright.tuning.plan import Event, StageStarted
 
     spec = read_json_object(plant_file)
 
@@ -436,7 +436,7 @@ def demo(
     hub_only: Annotated[bool, typer.Option("--hub", help="Use the loopback hub even if there is a vcan0.")] = False,
 ) -> None:
     """Retunes a badly tuned loop before your eyes: bus, plant, controller and service as processes."""
-    from service.demo import DemoFailed, run_demo
+    from loopwright.service.demo import DemoFailed, run_demo
 
     try:
         run_demo(folder, speed, hub_only)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli_output import die
+from loopwright.service.cli_output import die
 
 app = typer.Typer()
 
@@ -22,7 +22,7 @@ def backup(
     replace: Annotated[bool, typer.Option("--replace", help="Write over an existing file.")] = False,
 ) -> None:
     """Copies the data folder's database while the service runs: jobs, samples, keys, audit log."""
-    from service.backup import BackupProblem, back_up
+    from loopwright.service.backup import BackupProblem, back_up
 
     _only_files()
     try:
@@ -39,9 +39,9 @@ def restore(
     replace: Annotated[bool, typer.Option("--replace", help="Keep what is there aside, and take the back-up.")] = False,
 ) -> None:
     """Makes a back-up the data of a stopped service. Jobs that were active in it end as interrupted."""
-    from service.backup import BackupProblem
-    from service.backup import restore as run
-    from service.store.store import FolderInUse
+    from loopwright.service.backup import BackupProblem
+    from loopwright.service.backup import restore as run
+    from loopwright.service.store.store import FolderInUse
 
     _only_files()
     try:
@@ -64,10 +64,10 @@ def check_data(
     ] = None,
 ) -> None:
     """Says what of the data can be read, and changes nothing. Exit 0: all of it, 3: something is damaged."""
-    from service.check_data import CheckProblem
-    from service.check_data import check_data as check
-    from service.check_data import salvage as copy
-    from service.store.store import FolderInUse
+    from loopwright.service.check_data import CheckProblem
+    from loopwright.service.check_data import check_data as check
+    from loopwright.service.check_data import salvage as copy
+    from loopwright.service.store.store import FolderInUse
 
     _only_files()
     try:

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli_output import die, user
-from service.security.keys import Scope
+from loopwright.service.cli_output import die, user
+from loopwright.service.security.keys import Scope
 
 if TYPE_CHECKING:
-    from service.security.keyring import Keyring
+    from loopwright.service.security.keyring import Keyring
 
 app = typer.Typer(help="API keys: made, listed, revoked.", no_args_is_help=True)
 
@@ -49,7 +49,7 @@ def create(
 @app.command("list")
 def list_keys(data: Data = Path("data"), database: Database = None, as_json: AsJson = False) -> None:
     """Every key there ever was. What is secret about them is not kept."""
-    from service.security.keyring import valid
+    from loopwright.service.security.keyring import valid
 
     with _Keys(data, database) as keys:
         rows = keys.list()
@@ -58,7 +58,7 @@ def list_keys(data: Data = Path("data"), database: Database = None, as_json: AsJ
     if as_json:
         print(json.dumps(found, indent=2))
         return
-    from service import show
+    from loopwright.service import show
 
     show.rows("keys", (*names, "valid"), (tuple(row.values()) for row in found))
 
@@ -81,9 +81,9 @@ class _Keys:
     def __init__(self, data: Path, database: str | None, make: bool = False) -> None:
         from sqlalchemy.exc import SQLAlchemyError
 
-        from service.security.keyring import Keyring
-        from service.security.principal import Principal, current
-        from service.store.database import FILE, BadDatabase, migrate, open_database
+        from loopwright.service.security.keyring import Keyring
+        from loopwright.service.security.principal import Principal, current
+        from loopwright.service.store.database import FILE, BadDatabase, migrate, open_database
 
         if database is None and make:
             data.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -103,7 +103,7 @@ class _Keys:
         return self._keyring
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        from service.security.keyring import KeyProblem
+        from loopwright.service.security.keyring import KeyProblem
 
         self._engine.dispose()
         if isinstance(error, KeyProblem):

@@ -7,8 +7,8 @@ from urllib.parse import quote
 
 import typer
 
-from service.cli_output import AsJson, Url, print_json, user
-from service.client import DEFAULT_URL, Client
+from loopwright.service.cli_output import AsJson, Url, print_json, user
+from loopwright.service.client import DEFAULT_URL, Client
 
 app = typer.Typer()
 
@@ -18,7 +18,7 @@ Tag = Annotated[str, typer.Argument(help="Tag of the loop.")]
 @app.command("loop")
 def one_loop(tag: Tag, url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
     """A loop and its present state."""
-    from service import show
+    from loopwright.service import show
 
     found = Client(url).get(f"/loops/{quote(tag, safe='')}")
     if as_json:

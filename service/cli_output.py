@@ -10,7 +10,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from service import strict_json
+from loopwright.service import strict_json
 
 Url = Annotated[str, typer.Option("--url", envvar="LOOPWRIGHT_URL", help="Where the service is.")]
 AsJson = Annotated[bool, typer.Option("--json", help="JSON, for scripts.")]

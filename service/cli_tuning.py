@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli_output import AsJson, die, json_object, print_json, read_json_object
+from loopwright.service.cli_output import AsJson, die, json_object, print_json, read_json_object
 
 PICTURES = (".png", ".svg", ".pdf")
 Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Picture: .png, .svg or .pdf.")]
@@ -17,13 +17,13 @@ Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Pictu
 
 def methods(as_json: AsJson = False) -> None:
     """The tuning methods, what each is for and its options."""
-    from service import tunings
+    from loopwright.service import tunings
 
     found = tunings.methods_json()
     if as_json:
         print_json(found)
         return
-    from service import show_tunings
+    from loopwright.service import show_tunings
 
     show_tunings.methods(found)
 
@@ -40,8 +40,8 @@ def tune(
     """Gains for a process model by one method or all, compared on it. Exit 0: gains found, 3: none."""
     # the matrices are small: threads of the linear algebra cost more than they save
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from service import tunings
-    from service.model_forms import BadModel, parse_model
+    from loopwright.service import tunings
+    from loopwright.service.model_forms import BadModel, parse_model
 
     check_plot(plot)
     try:
@@ -53,13 +53,13 @@ def tune(
         die(str(error), 2)
     answer = tunings.answer(plant, found)
     if plot is not None:
-        from service.plots import responses
+        from loopwright.service.plots import responses
 
         _save(plot, responses, plant, found)
     if as_json:
         print_json(answer)
     else:
-        from service import show_tunings
+        from loopwright.service import show_tunings
 
         show_tunings.tunings(answer)
     if all(each["outcome"] == "refused" for each in answer["methods"]):
@@ -75,10 +75,10 @@ def identify(
     as_json: AsJson = False,
 ) -> None:
     """A process model from a recorded test of any shape. Exit 0: a model found, 3: none."""
-    from service.identified import identified, refused
-    from service.record import RecordError, load_record
-    from tuning.identify import identify as fit
-    from tuning.reasons import Reason, Refused
+    from loopwright.service.identified import identified, refused
+    from loopwright.service.record import RecordError, load_record
+    from loopwright.tuning.identify import identify as fit
+    from loopwright.tuning.reasons import Reason, Refused
 
     check_plot(plot)
     try:
@@ -94,13 +94,13 @@ def identify(
     else:
         answer = identified(found, record)
         if plot is not None:
-            from service.plots import record_and_model
+            from loopwright.service.plots import record_and_model
 
             _save(plot, record_and_model, record, found)
     if as_json:
         print_json(answer)
     else:
-        from service import show_tunings
+        from loopwright.service import show_tunings
 
         show_tunings.identified(answer)
     if answer["outcome"] == "refused":

@@ -11,10 +11,10 @@ from typing import Any
 
 import yaml
 
-from service import show
-from service.client import ApiError, Client
-from service.picture import NoPicture, job_picture
-from service.processes import NotReady, Process
+from loopwright.service import show
+from loopwright.service.client import ApiError, Client
+from loopwright.service.picture import NoPicture, job_picture
+from loopwright.service.processes import NotReady, Process
 
 TAG = "TIC-101"
 PV_UNIT = "degC"
@@ -91,18 +91,18 @@ def _start(stack: ExitStack, folder: Path, speed: str, hub_only: bool) -> Client
         bus = "socketcan:vcan0"
         show.console.print("bus        vcan0")
     else:
-        bus = process("hub", "protocol.hub", "--port", "0").split()[1]
+        bus = process("hub", "loopwright.protocol.hub", "--port", "0").split()[1]
     ts = str(SAMPLE_TIME_S)
     plant = ["--bus", bus, "--model", "model-14", "--ts", ts, "--speed", speed, "--noise", NOISE]
     kp, ti = BAD_GAINS
     # The plant last: at full speed it waits for nobody, and takes what the processor gives.
     tuning = ["--kp", kp, "--ti", ti, "--sp", "50", "--ts", ts]
-    process("controller", "controller", "--bus", bus, "--channels", "1", *tuning)
+    process("controller", "loopwright.controller", "--bus", bus, "--channels", "1", *tuning)
     loops = folder / "loops.yaml"
     loops.write_text(loops_yaml(bus), encoding="utf-8")
-    serve = ("service", "serve", "--loops", str(loops), "--data", str(folder / "data"), "--port", "0")
+    serve = ("loopwright.service", "serve", "--loops", str(loops), "--data", str(folder / "data"), "--port", "0")
     url = process("service", *serve).split()[1]
-    process("plant", "plantsim", *plant)
+    process("plant", "loopwright.plantsim", *plant)
     return Client(url)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tuning.reasons import Reason, Refused
+from loopwright.tuning.reasons import Reason, Refused
 
 
 class UnknownLoop(Exception):

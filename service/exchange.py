@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from service.errors import Conflict
-from service.loop import Loop, LoopState, same_gains
-from tuning.gains import Gains
-from tuning.reasons import Failed, Reason
+from loopwright.service.errors import Conflict
+from loopwright.service.loop import Loop, LoopState, same_gains
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.reasons import Failed, Reason
 
 
 class ForeignGains(Conflict):

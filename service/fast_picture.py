@@ -10,14 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from service.fast_record import Kept
-from tuning.assess import assess
-from tuning.fast.choice import choose
-from tuning.gains import Gains
-from tuning.models import TransferFunction
-from tuning.reasons import Ended
-from tuning.record_fit import Fit, averaged
-from tuning.response import step_response
+from loopwright.service.fast_record import Kept
+from loopwright.tuning.assess import assess
+from loopwright.tuning.fast.choice import choose
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import TransferFunction
+from loopwright.tuning.reasons import Ended
+from loopwright.tuning.record_fit import Fit, averaged
+from loopwright.tuning.response import step_response
 
 GREY, RED, BLUE, GREEN = "0.55", "tab:red", "tab:blue", "tab:green"
 SHOWN_SETTLINGS = 2.5

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from tuning.fast.evidence import LEAST_LISTENED, LEAST_SWITCHES, Evidence
-from tuning.models import Reals
-from tuning.plan import Mode
+from loopwright.tuning.fast.evidence import LEAST_LISTENED, LEAST_SWITCHES, Evidence
+from loopwright.tuning.models import Reals
+from loopwright.tuning.plan import Mode
 
 Columns = Mapping[str, Sequence[Any] | Reals]
 """By the names of GET /jobs/{id}/samples."""

@@ -16,16 +16,16 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.config import BusConfig, LoopConfig
-from service.errors import Locked, Stopping, UnknownLoop
-from service.jobs import Jobs
-from service.request import BadLimits, RetuneRequest, within
-from service.states import IllegalMove
-from service.store import retunes
-from service.store.retunes import Part, RetuneOver, StopReason
-from service.store.store import Busy, FolderInUse
-from service.store.tables import RetuneRow
-from tuning.reasons import Reason
+from loopwright.service.config import BusConfig, LoopConfig
+from loopwright.service.errors import Locked, Stopping, UnknownLoop
+from loopwright.service.jobs import Jobs
+from loopwright.service.request import BadLimits, RetuneRequest, within
+from loopwright.service.states import IllegalMove
+from loopwright.service.store import retunes
+from loopwright.service.store.retunes import Part, RetuneOver, StopReason
+from loopwright.service.store.store import Busy, FolderInUse
+from loopwright.service.store.tables import RetuneRow
+from loopwright.tuning.reasons import Reason
 
 log = logging.getLogger(__name__)
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from service.store.tables import EventRow, JobRow
-from tuning.models import FOPDT, SOPDT, TransferFunction
-from tuning.reasons import Reason
+from loopwright.service.store.tables import EventRow, JobRow
+from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
+from loopwright.tuning.reasons import Reason
 
 FoundModel = FOPDT | SOPDT | TransferFunction
 DISPROVED = (Reason.WRONG_SIGN, Reason.SURPRISE, Reason.DIVERGES, Reason.UNEXPLAINED, Reason.DISTURBED)

@@ -8,14 +8,14 @@ from typing import Any
 
 from numpy.linalg import LinAlgError
 
-from service.config import LoopConfig
-from service.found_model import FoundModel
-from service.loop import LoopState
-from service.request import RetuneRequest
-from tuning.gains import Gains
-from tuning.margins import margins
-from tuning.models import FOPDT
-from tuning.reasons import Ended
+from loopwright.service.config import LoopConfig
+from loopwright.service.found_model import FoundModel
+from loopwright.service.loop import LoopState
+from loopwright.service.request import RetuneRequest
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins
+from loopwright.tuning.models import FOPDT
+from loopwright.tuning.reasons import Ended
 
 TAMEST_Ms = 2.5
 """Of the present gains on a plant that is guessed: they work, so that a plant on which they would not is no guess."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from service.model_forms import dump_model
-from service.plain import plain
-from service.record import Record
-from tuning.identify import Identified
-from tuning.reasons import Refused
+from loopwright.service.model_forms import dump_model
+from loopwright.service.plain import plain
+from loopwright.service.record import Record
+from loopwright.tuning.identify import Identified
+from loopwright.tuning.reasons import Refused
 
 
 def identified(found: Identified, record: Record) -> dict[str, Any]:

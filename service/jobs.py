@@ -16,30 +16,30 @@ from typing import Any, TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.aftercare import Aftercare
-from service.config import BusConfig, LoopConfig
-from service.engine import WORKFLOW_VERSION, Engine
-from service.errors import Conflict, Locked, Stopping, UnknownLoop
-from service.exchange import ForeignGains, exchange
-from service.journal import Journal, temporary
-from service.known_loop import known
-from service.logs import about
-from service.loop import Loop, LoopState, differences, same_gains
-from service.machine import Machine
-from service.observed import ObservedLoop
-from service.recovery import Recovery
-from service.request import BadLimits, RetuneRequest, within
-from service.running import Running
-from service.safe import make_safe
-from service.state_json import gains_of, loop_state, state_json
-from service.states import ACTIVE, GOOD, IllegalMove, JobState, shown, state_after
-from service.store import looked_after, loop_locks
-from service.store.lock import CHECK_S
-from service.store.store import Busy, FolderInUse, NoSuchJob, Store, WithJob
-from service.store.tables import JobRow, LoopLockRow
-from service.work import Hooks, Outcome, Rehearse, Tune
-from tuning.plan import Event
-from tuning.reasons import Aborted, Ended, Failed, Reason
+from loopwright.service.aftercare import Aftercare
+from loopwright.service.config import BusConfig, LoopConfig
+from loopwright.service.engine import WORKFLOW_VERSION, Engine
+from loopwright.service.errors import Conflict, Locked, Stopping, UnknownLoop
+from loopwright.service.exchange import ForeignGains, exchange
+from loopwright.service.journal import Journal, temporary
+from loopwright.service.known_loop import known
+from loopwright.service.logs import about
+from loopwright.service.loop import Loop, LoopState, differences, same_gains
+from loopwright.service.machine import Machine
+from loopwright.service.observed import ObservedLoop
+from loopwright.service.recovery import Recovery
+from loopwright.service.request import BadLimits, RetuneRequest, within
+from loopwright.service.running import Running
+from loopwright.service.safe import make_safe
+from loopwright.service.state_json import gains_of, loop_state, state_json
+from loopwright.service.states import ACTIVE, GOOD, IllegalMove, JobState, shown, state_after
+from loopwright.service.store import looked_after, loop_locks
+from loopwright.service.store.lock import CHECK_S
+from loopwright.service.store.store import Busy, FolderInUse, NoSuchJob, Store, WithJob
+from loopwright.service.store.tables import JobRow, LoopLockRow
+from loopwright.service.work import Hooks, Outcome, Rehearse, Tune
+from loopwright.tuning.plan import Event
+from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")

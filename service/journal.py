@@ -13,7 +13,7 @@ from collections import deque
 
 from sqlalchemy.exc import DBAPIError, InterfaceError, InternalError, OperationalError, SQLAlchemyError, TimeoutError
 
-from service.store.store import FolderInUse, Store, Write
+from loopwright.service.store.store import FolderInUse, Store, Write
 
 log = logging.getLogger(__name__)
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from service.found_model import DISPROVED, found_model
-from service.ground import Ground, LastModel
-from service.loop import LoopState
-from service.state_json import gains_of, loop_state
-from service.states import JobState
-from service.store.store import Store
-from service.store.tables import JobRow
-from tuning.reasons import Ended
+from loopwright.service.found_model import DISPROVED, found_model
+from loopwright.service.ground import Ground, LastModel
+from loopwright.service.loop import LoopState
+from loopwright.service.state_json import gains_of, loop_state
+from loopwright.service.states import JobState
+from loopwright.service.store.store import Store
+from loopwright.service.store.tables import JobRow
+from loopwright.tuning.reasons import Ended
 
 LOOKED_AT = 50
 """Latest jobs of the loop among which a model, and the controller's last state, are looked for."""

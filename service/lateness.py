@@ -11,7 +11,7 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 
-from service.metrics import LATE_SECONDS, LATEST_SECONDS
+from loopwright.service.metrics import LATE_SECONDS, LATEST_SECONDS
 
 log = logging.getLogger(__name__)
 

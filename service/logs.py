@@ -15,8 +15,8 @@ from datetime import UTC, datetime
 from types import MappingProxyType
 from typing import Any, Literal
 
-from service.security.keys import KEY_PATTERN
-from service.store.clock import stamp
+from loopwright.service.security.keys import KEY_PATTERN
+from loopwright.service.store.clock import stamp
 
 LogFormat = Literal["text", "json"]
 FIELDS = ("job", "loop", "request", "who", "method", "path", "status", "ms", "address")

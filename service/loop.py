@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from tuning.gains import Gains
-from tuning.plan import Command, Mode, Sample
-from tuning.reasons import Reason
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Command, Mode, Sample
+from loopwright.tuning.reasons import Reason
 
 OPERATIONAL = "operational"
 

@@ -12,12 +12,12 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
-from protocol.tuner import sdo_retries
-from service.config import LoopConfig
-from service.states import ACTIVE, JobState, shown
-from service.store import looked_after
-from service.store.store import Store
-from service.store.tables import JobRow
+from loopwright.protocol.tuner import sdo_retries
+from loopwright.service.config import LoopConfig
+from loopwright.service.states import ACTIVE, JobState, shown
+from loopwright.service.store import looked_after
+from loopwright.service.store.store import Store
+from loopwright.service.store.tables import JobRow
 
 disable_created_metrics()  # type: ignore[no-untyped-call]
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"

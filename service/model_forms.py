@@ -17,8 +17,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from service.plausible import Implausible, check_damping, check_model
-from tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
+from loopwright.service.plausible import Implausible, check_damping, check_model
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 
 MOST_COEFFICIENTS = 12
 _BESIDE = frozenset(

@@ -9,15 +9,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from service.config import LoopConfig
-from service.request import RetuneRequest
-from tuning.fast.experiment import BIAS, FIRST, MOST_RAISED, WIDEST_SPAN, most_amplitude
-from tuning.fast.procedure import fast_stages
-from tuning.fast.trial import trial_stages
-from tuning.five_stage import stages_of
-from tuning.gains import Gains
-from tuning.stages.ultimate import RUN_MV_LIMIT
-from tuning.stages.zn_pi import KICK_OF_ROOM
+from loopwright.service.config import LoopConfig
+from loopwright.service.request import RetuneRequest
+from loopwright.tuning.fast.experiment import BIAS, FIRST, MOST_RAISED, WIDEST_SPAN, most_amplitude
+from loopwright.tuning.fast.procedure import fast_stages
+from loopwright.tuning.fast.trial import trial_stages
+from loopwright.tuning.five_stage import stages_of
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.stages.ultimate import RUN_MV_LIMIT
+from loopwright.tuning.stages.zn_pi import KICK_OF_ROOM
 
 _COMPUTING = ("design", "redesign", "estimate", "optimise")
 _STEPPING = ("baseline", "ultimate", "zn_pi", "verify")

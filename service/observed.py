@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from service.loop import Loop, LoopState, Restored
-from tuning.gains import Gains
-from tuning.plan import Command, Mode, Sample, SetGains
-from tuning.reasons import Reason
+from loopwright.service.loop import Loop, LoopState, Restored
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Command, Mode, Sample, SetGains
+from loopwright.tuning.reasons import Reason
 
 
 class ObservedLoop:

@@ -6,16 +6,16 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
-from service.config import LoopConfig
-from service.loop import OPERATIONAL, LoopState
-from service.moves import broken_limits, stages_asked
-from service.request import RetuneRequest, narrow
-from service.work import facts_of
-from tuning.fast.experiment import BIAS, most_amplitude
-from tuning.models import sign
-from tuning.plan import Mode
-from tuning.reasons import ADVICE, Ended, Reason, Refused
-from tuning.stages.preflight import LEAST_ROOM, LOOKS, MOST_AWAY, MOST_NOISE
+from loopwright.service.config import LoopConfig
+from loopwright.service.loop import OPERATIONAL, LoopState
+from loopwright.service.moves import broken_limits, stages_asked
+from loopwright.service.request import RetuneRequest, narrow
+from loopwright.service.work import facts_of
+from loopwright.tuning.fast.experiment import BIAS, most_amplitude
+from loopwright.tuning.models import sign
+from loopwright.tuning.plan import Mode
+from loopwright.tuning.reasons import ADVICE, Ended, Reason, Refused
+from loopwright.tuning.stages.preflight import LEAST_ROOM, LOOKS, MOST_AWAY, MOST_NOISE
 
 
 class Occupied(StrEnum):

@@ -8,8 +8,8 @@ from typing import Any
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from service.client import Client
-from service.fast_record import kept
+from loopwright.service.client import Client
+from loopwright.service.fast_record import kept
 
 LEAD_IN = 20
 """Samples shown before the step."""
@@ -25,7 +25,7 @@ def job_picture(path: Path, client: Client, job: dict[str, Any], pv_unit: str) -
     Raises NoPicture.
     """
     if job["method"] == "fast" and (record := kept(client.get(f"{job['url']}/samples"))) is not None:
-        from service.fast_picture import fast_job
+        from loopwright.service.fast_picture import fast_job
 
         fast_job(path, job, record, pv_unit)
         return

@@ -11,13 +11,13 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from service.model_forms import describe, dump_model
-from service.record import Record
-from service.tunings import Tuned
-from tuning.identify import Identified
-from tuning.methods import METHODS
-from tuning.models import Model
-from tuning.response import Response, step_response
+from loopwright.service.model_forms import describe, dump_model
+from loopwright.service.record import Record
+from loopwright.service.tunings import Tuned
+from loopwright.tuning.identify import Identified
+from loopwright.tuning.methods import METHODS
+from loopwright.tuning.models import Model
+from loopwright.tuning.response import Response, step_response
 
 _COLOURS = colormaps["tab10"]
 _LINES = ("-", "--", ":", "-.")

@@ -9,14 +9,14 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from service.config import Limits, LoopConfig
-from service.durations import Span, durations
-from service.loop import LoopState
-from service.moves import Before, Moves, moves
-from service.obstacles import Now, Obstacle, Occupied, obstacles
-from service.request import RetuneRequest, narrow
-from service.work import time_budget_s
-from tuning.gains import Gains
+from loopwright.service.config import Limits, LoopConfig
+from loopwright.service.durations import Span, durations
+from loopwright.service.loop import LoopState
+from loopwright.service.moves import Before, Moves, moves
+from loopwright.service.obstacles import Now, Obstacle, Occupied, obstacles
+from loopwright.service.request import RetuneRequest, narrow
+from loopwright.service.work import time_budget_s
+from loopwright.tuning.gains import Gains
 
 
 @dataclass(frozen=True, slots=True)

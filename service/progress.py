@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tuning.plan import StageStarted
+from loopwright.tuning.plan import StageStarted
 
 
 class Progress:

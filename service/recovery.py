@@ -7,18 +7,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from service.config import LoopConfig
-from service.engine import WORKFLOW_VERSION
-from service.errors import Locked
-from service.loop import Loop
-from service.request import RetuneRequest, within
-from service.safe import Safe, look
-from service.state_json import state_json
-from service.states import JobState
-from service.store import loop_locks
-from service.store.store import Store
-from service.store.tables import JobRow
-from tuning.reasons import Reason
+from loopwright.service.config import LoopConfig
+from loopwright.service.engine import WORKFLOW_VERSION
+from loopwright.service.errors import Locked
+from loopwright.service.loop import Loop
+from loopwright.service.request import RetuneRequest, within
+from loopwright.service.safe import Safe, look
+from loopwright.service.state_json import state_json
+from loopwright.service.states import JobState
+from loopwright.service.store import loop_locks
+from loopwright.service.store.store import Store
+from loopwright.service.store.tables import JobRow
+from loopwright.tuning.reasons import Reason
 
 log = logging.getLogger(__name__)
 

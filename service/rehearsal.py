@@ -13,20 +13,30 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from controller.channel import Channel, RelaySettings, Settings
-from controller.pid import Parameters
-from plantsim.plant import LinearPlant, Process
-from service.loop import LoopState, Restored
-from service.plain import plain
-from service.plausible import Finite, Gain, Implausible, Size, Time, TimeOrNone, Value, check_model, check_sampling
-from service.runner import RunResult, Watch, run
-from tuning.fast.procedure import FAST, FAST_STAGES, FastOptions, FastProposal, fast
-from tuning.fast.trial import trial
-from tuning.five_stage import STAGES, Facts, Options, Proposal, five_stage
-from tuning.gains import Gains
-from tuning.margins import ultimate_point
-from tuning.models import FOPDT, SOPDT, Model, TransferFunction
-from tuning.plan import (
+from loopwright.controller.channel import Channel, RelaySettings, Settings
+from loopwright.controller.pid import Parameters
+from loopwright.plantsim.plant import LinearPlant, Process
+from loopwright.service.loop import LoopState, Restored
+from loopwright.service.plain import plain
+from loopwright.service.plausible import (
+    Finite,
+    Gain,
+    Implausible,
+    Size,
+    Time,
+    TimeOrNone,
+    Value,
+    check_model,
+    check_sampling,
+)
+from loopwright.service.runner import RunResult, Watch, run
+from loopwright.tuning.fast.procedure import FAST, FAST_STAGES, FastOptions, FastProposal, fast
+from loopwright.tuning.fast.trial import trial
+from loopwright.tuning.five_stage import STAGES, Facts, Options, Proposal, five_stage
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import ultimate_point
+from loopwright.tuning.models import FOPDT, SOPDT, Model, TransferFunction
+from loopwright.tuning.plan import (
     Command,
     Event,
     Mode,
@@ -38,7 +48,7 @@ from tuning.plan import (
     SetSetpoint,
     StageDone,
 )
-from tuning.reasons import Ended, Failed, NoGain, Reason, Refused
+from loopwright.tuning.reasons import Ended, Failed, NoGain, Reason, Refused
 
 
 class RehearsedLoop:

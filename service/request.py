@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from service.config import LoopConfig
-from service.plausible import (
+from loopwright.service.config import LoopConfig
+from loopwright.service.plausible import (
     Finite,
     Gain,
     Implausible,
@@ -21,11 +21,11 @@ from service.plausible import (
     check_option,
     check_step,
 )
-from tuning.fast.procedure import FAST
-from tuning.five_stage import PROCEDURE, rule_of
-from tuning.methods import METHODS
-from tuning.models import FOPDT, SOPDT, TransferFunction
-from tuning.reasons import Refused
+from loopwright.tuning.fast.procedure import FAST
+from loopwright.tuning.five_stage import PROCEDURE, rule_of
+from loopwright.tuning.methods import METHODS
+from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
+from loopwright.tuning.reasons import Refused
 
 Percent = Annotated[float, Field(gt=0, lt=74, allow_inf_nan=False)]
 LEAST_AMPLITUDE_PCT = 1e-3

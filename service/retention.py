@@ -16,15 +16,15 @@ from datetime import UTC, datetime, timedelta
 from sqlalchemy import ColumnElement, delete, func, select
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.clock_watch import ClockWatch, longest_stop
-from service.engine import Engine
-from service.metrics import CLOCK_JUMPS
-from service.security import audit
-from service.states import ACTIVE, JobState
-from service.store import hosts
-from service.store.clock import stamp
-from service.store.store import FolderInUse, Store, append
-from service.store.tables import ChunkRow, JobRow
+from loopwright.service.clock_watch import ClockWatch, longest_stop
+from loopwright.service.engine import Engine
+from loopwright.service.metrics import CLOCK_JUMPS
+from loopwright.service.security import audit
+from loopwright.service.states import ACTIVE, JobState
+from loopwright.service.store import hosts
+from loopwright.service.store.clock import stamp
+from loopwright.service.store.store import FolderInUse, Store, append
+from loopwright.service.store.tables import ChunkRow, JobRow
 
 log = logging.getLogger(__name__)
 

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
-from service.loop import Loop, LoopState
-from tuning.plan import (
+from loopwright.service.loop import Loop, LoopState
+from loopwright.tuning.plan import (
     Command,
     Event,
     Note,
@@ -27,7 +27,7 @@ from tuning.plan import (
     StageStarted,
     Work,
 )
-from tuning.reasons import Aborted, Ended, Failed, Reason
+from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
 
 T = TypeVar("T")
 CHUNK = 200

@@ -8,14 +8,14 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from service.journal import Journal
-from service.metrics import STAGE_SECONDS
-from service.observed import ObservedLoop
-from service.plain import plain_object
-from service.progress import Progress
-from service.store.store import block_of, event_of
-from tuning.plan import Event, Note, Sample, StageDone, StageStarted
-from tuning.reasons import Reason
+from loopwright.service.journal import Journal
+from loopwright.service.metrics import STAGE_SECONDS
+from loopwright.service.observed import ObservedLoop
+from loopwright.service.plain import plain_object
+from loopwright.service.progress import Progress
+from loopwright.service.store.store import block_of, event_of
+from loopwright.tuning.plan import Event, Note, Sample, StageDone, StageStarted
+from loopwright.tuning.reasons import Reason
 
 _BLOCK_SAMPLES = 4096
 _BLOCK_WALL_S = 1.0

@@ -6,11 +6,11 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from service.config import LoopConfig
-from service.loop import Loop, LoopState
-from service.state_json import loop_state
-from service.store.tables import JobRow
-from tuning.reasons import Ended, Reason
+from loopwright.service.config import LoopConfig
+from loopwright.service.loop import Loop, LoopState
+from loopwright.service.state_json import loop_state
+from loopwright.service.store.tables import JobRow
+from loopwright.tuning.reasons import Ended, Reason
 
 log = logging.getLogger(__name__)
 

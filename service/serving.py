@@ -18,30 +18,30 @@ from typing import cast
 import uvicorn
 from fastapi import FastAPI
 
-from protocol.profile import TUNER_NODE
-from protocol.station import Station
-from service import logs
-from service.api import operations
-from service.api.app import create_app
-from service.api.connections import Connection, Connections, Listener, OnceAMinute, raise_descriptor_limit
-from service.computing.limits import ComputingLimits, Kind
-from service.computing.pool import Pool
-from service.computing.rehearsals import apart
-from service.config import LoopConfig, load_site
-from service.engine.durable import POLL_S, DurableEngine
-from service.jobs import Jobs, LoopFactory
-from service.logs import LogFormat
-from service.loop import Loop
-from service.retention import Keep, Retention
-from service.security.gate import Policy, is_loopback
-from service.security.keyring import Keyring
-from service.security.limits import RequestLimits
-from service.signals import Signals
-from service.store.database import BadDatabase
-from service.store.store import LOCAL, Store
-from service.watchdog import Watchdog, interval_s
-from service.work import Tune, rehearse
-from service.work import tune as live
+from loopwright.protocol.profile import TUNER_NODE
+from loopwright.protocol.station import Station
+from loopwright.service import logs
+from loopwright.service.api import operations
+from loopwright.service.api.app import create_app
+from loopwright.service.api.connections import Connection, Connections, Listener, OnceAMinute, raise_descriptor_limit
+from loopwright.service.computing.limits import ComputingLimits, Kind
+from loopwright.service.computing.pool import Pool
+from loopwright.service.computing.rehearsals import apart
+from loopwright.service.config import LoopConfig, load_site
+from loopwright.service.engine.durable import POLL_S, DurableEngine
+from loopwright.service.jobs import Jobs, LoopFactory
+from loopwright.service.logs import LogFormat
+from loopwright.service.loop import Loop
+from loopwright.service.retention import Keep, Retention
+from loopwright.service.security.gate import Policy, is_loopback
+from loopwright.service.security.keyring import Keyring
+from loopwright.service.security.limits import RequestLimits
+from loopwright.service.signals import Signals
+from loopwright.service.store.database import BadDatabase
+from loopwright.service.store.store import LOCAL, Store
+from loopwright.service.watchdog import Watchdog, interval_s
+from loopwright.service.work import Tune, rehearse
+from loopwright.service.work import tune as live
 
 _GRACE_S = 10
 _ONCE_A_MINUTE = OnceAMinute()
@@ -82,9 +82,9 @@ def tell_systemd(state: str) -> None:
 def _load() -> None:
     """Has the jobs find everything there: one that imports what it needs, and a full collection of all that is loaded,
     which lets no thread run, hold up the loops of the others (seconds, and 0.1 s of processor each time)."""
-    import service.bus_loop  # noqa: F401
-    import tuning.fast.trial
-    import tuning.five_stage  # noqa: F401
+    import loopwright.service.bus_loop
+    import loopwright.tuning.fast.trial
+    import loopwright.tuning.five_stage  # noqa: F401
 
     gc.collect()
     gc.freeze()
@@ -92,7 +92,7 @@ def _load() -> None:
 
 def open_bus_loop(station: Station, config: LoopConfig) -> Loop:
     """The live loop of a configuration."""
-    from service.bus_loop import BusLoop
+    from loopwright.service.bus_loop import BusLoop
 
     return BusLoop(
         config.bus,

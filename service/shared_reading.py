@@ -10,7 +10,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from tuning.reasons import Ended
+from loopwright.tuning.reasons import Ended
 
 T = TypeVar("T")
 

@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from service.api.results import ComparisonView
-from service.client import Client
+from loopwright.service.api.results import ComparisonView
+from loopwright.service.client import Client
 
 console = Console()
 _MARGINS = (("GM", "GM", ""), ("PM", "PM_deg", "deg"), ("Ms", "Ms", ""))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from service.client import Client
-from service.show import console, rows
+from loopwright.service.client import Client
+from loopwright.service.show import console, rows
 
 LOOK_S = 1.0
 _OVER = ("done", "stopped", "aborted")

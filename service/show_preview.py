@@ -7,8 +7,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from service.preview import duration_text
-from service.show import number
+from loopwright.service.preview import duration_text
+from loopwright.service.show import number
 
 
 def one(found: dict[str, Any], console: Console) -> None:

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from service.model_forms import describe
+from loopwright.service.model_forms import describe
 
 console = Console(highlight=False)
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from service.errors import Conflict
-from service.loop import LoopState
-from tuning.gains import Gains
-from tuning.plan import Mode
+from loopwright.service.errors import Conflict
+from loopwright.service.loop import LoopState
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Mode
 
 
 def gains_of(data: dict[str, Any] | None) -> Gains:

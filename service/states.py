@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from tuning.reasons import Aborted, Ended, NoGain, Refused
+from loopwright.tuning.reasons import Aborted, Ended, NoGain, Refused
 
 
 class JobState(StrEnum):
@@ -28,9 +28,7 @@ MOVES: dict[JobState, frozenset[JobState]] = {
     # A queued job may end at once: the loop cannot be read, or the service stops before its thread runs.
     _S.QUEUED: frozenset({_S.RUNNING, _S.REFUSED, _S.ABORTED, _S.FAILED, _S.INTERRUPTED}),
     # A dry run that came to gains is rehearsed: there is no loop that they could be put into.
-    _S.RUNNING: frozenset(
-        {_S.PROPOSED, _S.NO_GAIN, _S.REHEARSED, _S.REFUSED, _S.ABORTED, _S.FAILED, _S.INTERRUPTED}
-    ),
+    _S.RUNNING: frozenset({_S.PROPOSED, _S.NO_GAIN, _S.REHEARSED, _S.REFUSED, _S.ABORTED, _S.FAILED, _S.INTERRUPTED}),
     _S.PROPOSED: frozenset({_S.ACCEPTED, _S.ROLLED_BACK}),
     # An accepted change can still be taken back as long as nothing else changed the gains since.
     _S.ACCEPTED: frozenset({_S.ROLLED_BACK}),

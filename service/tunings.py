@@ -10,17 +10,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from service.model_forms import dump_model
-from service.plain import plain
-from service.plausible import Implausible, check_option
-from tuning.assess import Assessment, assess
-from tuning.design import realisable
-from tuning.figures import StepFigures
-from tuning.forms import to_parallel
-from tuning.gains import Gains
-from tuning.methods import METHODS, Method, Option
-from tuning.models import Model
-from tuning.reasons import Ended, Failed, Reason, Refused
+from loopwright.service.model_forms import dump_model
+from loopwright.service.plain import plain
+from loopwright.service.plausible import Implausible, check_option
+from loopwright.tuning.assess import Assessment, assess
+from loopwright.tuning.design import realisable
+from loopwright.tuning.figures import StepFigures
+from loopwright.tuning.forms import to_parallel
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.methods import METHODS, Method, Option
+from loopwright.tuning.models import Model
+from loopwright.tuning.reasons import Ended, Failed, Reason, Refused
 
 ALL = "all"
 FORM = "ISA: u = Kp*(b*SP - PV + integral(SP - PV)/Ti + Td*d/dt(c*SP - PV)/(1 + Tf*s)); Ti = 0: no integral"
@@ -132,7 +132,6 @@ def methods_json() -> list[dict[str, Any]]:
         }
         for method in METHODS.values()
     ]
-
 
 
 def _check(methods: list[Method], name: str, value: object) -> None:

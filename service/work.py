@@ -6,22 +6,22 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
-from service.config import LoopConfig
-from service.ground import Ground, rehearsal_spec
-from service.loop import Loop, LoopState
-from service.moves import broken_limits
-from service.plain import plain_object
-from service.request import ProcessModel, RetuneRequest
-from service.store.tables import EventRow
-from tuning.fast.procedure import FAST
-from tuning.models import Model
-from tuning.plan import Event, Note, Plan, Sample
-from tuning.reasons import Aborted, Ended, Failed, NoGain, Reason, Refused
-from tuning.stages.common import Facts
-from tuning.stages.settle import after_settling
+from loopwright.service.config import LoopConfig
+from loopwright.service.ground import Ground, rehearsal_spec
+from loopwright.service.loop import Loop, LoopState
+from loopwright.service.moves import broken_limits
+from loopwright.service.plain import plain_object
+from loopwright.service.request import ProcessModel, RetuneRequest
+from loopwright.service.store.tables import EventRow
+from loopwright.tuning.fast.procedure import FAST
+from loopwright.tuning.models import Model
+from loopwright.tuning.plan import Event, Note, Plan, Sample
+from loopwright.tuning.reasons import Aborted, Ended, Failed, NoGain, Reason, Refused
+from loopwright.tuning.stages.common import Facts
+from loopwright.tuning.stages.settle import after_settling
 
 if TYPE_CHECKING:
-    from service.computing.beside import Workers
+    from loopwright.service.computing.beside import Workers
 
 TIME_BUDGET_T95 = {FAST: 100.0}
 OTHER_BUDGET_T95 = 500.0
@@ -83,8 +83,8 @@ def tune(
     workers: Workers | None = None,
 ) -> Outcome:
     """The procedure asked for on the live loop. workers: who computes, by default a thread."""
-    from service.computing.beside import Computing
-    from service.runner import Watch, run
+    from loopwright.service.computing.beside import Computing
+    from loopwright.service.runner import Watch, run
 
     facts = facts_of(config, state)
     broken = broken_limits(config, request, state.sp)
@@ -142,14 +142,14 @@ def plan(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow] = ())
 
 def _procedure(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow]) -> Plan[Any]:
     if request.fast:
-        from tuning.fast.procedure import FastOptions, fast
-        from tuning.fast.trial import trial
+        from loopwright.tuning.fast.procedure import FastOptions, fast
+        from loopwright.tuning.fast.trial import trial
 
         wishes = FastOptions(**_options(request))
         known = _known_model(request)
         return fast(facts, wishes) if known is None else trial(facts, wishes, known)
-    from service.checkpoints import finished
-    from tuning.five_stage import Options, five_stage
+    from loopwright.service.checkpoints import finished
+    from loopwright.tuning.five_stage import Options, five_stage
 
     done = ((event.data["stage"], event.data["result"]) for event in earlier if event.kind == "stage_done")
     return five_stage(facts, Options(**_options(request)), finished(done))
@@ -164,7 +164,7 @@ def time_budget_s(method: str, t95_s: float, sample_time_s: float) -> float:
 def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:
     """The same on a model in memory. Gains that bring no gain are an answer, too: whether a proposal would be made of
     them is a question for the loop."""
-    from service.rehearsal import rehearse as rehearse_spec
+    from loopwright.service.rehearsal import rehearse as rehearse_spec
 
     spec, on = rehearsal_spec(config, request, hooks.ground)
     told = plain_object(on)

@@ -11,7 +11,13 @@ from typing import Any
 
 import pytest
 
-_STARTERS = {"subprocess", "multiprocessing", "service.processes", "service.serving", "service.computing"}
+_STARTERS = {
+    "subprocess",
+    "multiprocessing",
+    "loopwright.service.processes",
+    "loopwright.service.serving",
+    "loopwright.service.computing",
+}
 
 _COUNTS = pytest.StashKey[dict[str, Counter[str]]]()
 

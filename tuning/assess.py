@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tuning.figures import StepFigures
-from tuning.gains import Gains
-from tuning.margins import Margins, margins
-from tuning.models import Model
-from tuning.response import step_figures
+from loopwright.tuning.figures import StepFigures
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import Margins, margins
+from loopwright.tuning.models import Model
+from loopwright.tuning.response import step_figures
 
 
 @dataclass(frozen=True, slots=True)

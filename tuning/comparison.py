@@ -11,11 +11,11 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from tuning.assess import assess
-from tuning.figures import StepFigures
-from tuning.gains import Gains
-from tuning.models import Model, integrators
-from tuning.reasons import Ended
+from loopwright.tuning.assess import assess
+from loopwright.tuning.figures import StepFigures
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import Model, integrators
+from loopwright.tuning.reasons import Ended
 
 LEAST_GAIN = 0.05
 """Of a bound or of J, as a fraction: less is not worth a change of a loop that works."""

@@ -22,10 +22,10 @@ from enum import StrEnum
 
 import numpy as np
 
-from tuning.dead_time import DeadTimeLoop
-from tuning.models import Model, Reals, time_constants
-from tuning.reasons import Reason, Refused
-from tuning.state_space import exponentials, gain_unit, normalised, state_space, time_sum
+from loopwright.tuning.dead_time import DeadTimeLoop
+from loopwright.tuning.models import Model, Reals, time_constants
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.state_space import exponentials, gain_unit, normalised, state_space, time_sum
 
 BAND = 0.05
 DIVERGED = 1e9

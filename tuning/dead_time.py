@@ -14,8 +14,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy.linalg import expm
 
-from tuning.models import Complexes, Model, Reals, sign
-from tuning.state_space import state_space
+from loopwright.tuning.models import Complexes, Model, Reals, sign
+from loopwright.tuning.state_space import state_space
 
 MOST_NODES = 64
 LOCAL = 6

@@ -10,13 +10,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from tuning.comparison import Asked, Comparison, IAE_over_present, Worth, compared, worth
-from tuning.gains import Gains
-from tuning.methods import METHODS, tune
-from tuning.models import FOPDT, SOPDT
-from tuning.reasons import Reason, Refused
-from tuning.robust import UNSTABLE, Criterion
-from tuning.setting import Setting
+from loopwright.tuning.comparison import Asked, Comparison, IAE_over_present, Worth, compared, worth
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.methods import METHODS, tune
+from loopwright.tuning.models import FOPDT, SOPDT
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.robust import UNSTABLE, Criterion
+from loopwright.tuning.setting import Setting
 
 MOST_Ms, LEAST_GM = 2.0, 2.0
 ROUNDING = 1.002

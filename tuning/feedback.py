@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tuning.models import Reals
+from loopwright.tuning.models import Reals
 
 LEFT = 0.1
 """What a law of the present PV and the two before leaves, in what MV's own past leaves: more is no feedback."""

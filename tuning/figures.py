@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuning.models import Reals
+from loopwright.tuning.models import Reals
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tuning.models import Reals
-from tuning.record_fit import LOG_STEP, Fit, Fitted, S
+from loopwright.tuning.models import Reals
+from loopwright.tuning.record_fit import LOG_STEP, Fit, Fitted, S
 
 
 def sensitivities(fit: Fit[S], found: Fitted) -> Reals:

@@ -8,15 +8,15 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from tuning.fit_spread import sensitivities, slopes_of
-from tuning.models import Model, Reals, TransferFunction
-from tuning.reasons import Reason, Refused
-from tuning.record_fit import FLOOR, LOG_STEP, MOVING, Fit, Fitted, Hypothesis, count
-from tuning.recorded import Recorded
-from tuning.residual import colour, whiteness
-from tuning.starts import starts
-from tuning.structures import Plant, Structure
-from tuning.varpro import Bounded, covariance, descend, solve
+from loopwright.tuning.fit_spread import sensitivities, slopes_of
+from loopwright.tuning.models import Model, Reals, TransferFunction
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.record_fit import FLOOR, LOG_STEP, MOVING, Fit, Fitted, Hypothesis, count
+from loopwright.tuning.recorded import Recorded
+from loopwright.tuning.residual import colour, whiteness
+from loopwright.tuning.starts import starts
+from loopwright.tuning.structures import Plant, Structure
+from loopwright.tuning.varpro import Bounded, covariance, descend, solve
 
 # rms of a residual, as a part of PV's span, of which it does not matter what it consists of
 UNIMPORTANT = 1.5e-3

@@ -16,22 +16,22 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal, TypeVar
 
-from tuning.comparison import Comparison
-from tuning.design import ROBUST, Designed, Predicted, Ultimate, comparison_of, design
-from tuning.estimate import fopdt_from_overshoot
-from tuning.gains import Gains
-from tuning.identify import identify
-from tuning.methods import METHODS
-from tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
-from tuning.plan import Plan, StageDone, StageStarted, worked
-from tuning.reasons import Reason, Refused
-from tuning.stages.common import Facts, OperatingPoint, Trace, to_rest
-from tuning.stages.preflight import preflight
-from tuning.stages.relay import RelayResult, relay_test
-from tuning.stages.step_test import StepResult, step_test
-from tuning.stages.ultimate import UltimateResult, ultimate_gain
-from tuning.stages.verification import verification
-from tuning.stages.zn_pi import ZnResult, allowed_step, zn_pi
+from loopwright.tuning.comparison import Comparison
+from loopwright.tuning.design import ROBUST, Designed, Predicted, Ultimate, comparison_of, design
+from loopwright.tuning.estimate import fopdt_from_overshoot
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.identify import identify
+from loopwright.tuning.methods import METHODS
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
+from loopwright.tuning.plan import Plan, StageDone, StageStarted, worked
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.stages.common import Facts, OperatingPoint, Trace, to_rest
+from loopwright.tuning.stages.preflight import preflight
+from loopwright.tuning.stages.relay import RelayResult, relay_test
+from loopwright.tuning.stages.step_test import StepResult, step_test
+from loopwright.tuning.stages.ultimate import UltimateResult, ultimate_gain
+from loopwright.tuning.stages.verification import verification
+from loopwright.tuning.stages.zn_pi import ZnResult, allowed_step, zn_pi
 
 __all__ = ["STAGES", "Facts", "Options", "Proposal", "five_stage"]
 

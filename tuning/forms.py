@@ -13,8 +13,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from tuning.gains import Gains
-from tuning.reasons import Reason, Refused
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.reasons import Reason, Refused
 
 
 @dataclass(frozen=True, slots=True)

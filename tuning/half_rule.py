@@ -16,8 +16,8 @@ from typing import Literal
 
 import numpy as np
 
-from tuning.models import FOPDT, SOPDT, Complexes, Integrating, Model, TransferFunction
-from tuning.reasons import Reason, Refused
+from loopwright.tuning.models import FOPDT, SOPDT, Complexes, Integrating, Model, TransferFunction
+from loopwright.tuning.reasons import Reason, Refused
 
 REAL = 0.01
 """A pole with |Im/p| below this is real: a pole of high multiplicity comes from its coefficients as a small ring."""

@@ -22,14 +22,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tuning.feedback import follows_from_pv
-from tuning.fitting import WHITE_ABOVE, Problem
-from tuning.models import Integrating, Model, Reals, TransferFunction
-from tuning.record_fit import MOVING, QUIET, Fitted, count
-from tuning.recorded import recorded
-from tuning.richer import Search, confounded
-from tuning.stories import EARNED, by_bic
-from tuning.structures import FIRST, INTEGRATOR, LAGGED_INTEGRATOR, SECOND
+from loopwright.tuning.feedback import follows_from_pv
+from loopwright.tuning.fitting import WHITE_ABOVE, Problem
+from loopwright.tuning.models import Integrating, Model, Reals, TransferFunction
+from loopwright.tuning.record_fit import MOVING, QUIET, Fitted, count
+from loopwright.tuning.recorded import recorded
+from loopwright.tuning.richer import Search, confounded
+from loopwright.tuning.stories import EARNED, by_bic
+from loopwright.tuning.structures import FIRST, INTEGRATOR, LAGGED_INTEGRATOR, SECOND
 
 STRUCTURES = (INTEGRATOR, FIRST, LAGGED_INTEGRATOR, SECOND)
 # difference of BIC of a structure worth naming beside the best

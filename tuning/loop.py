@@ -14,9 +14,9 @@ import numpy as np
 from scipy.fft import next_fast_len
 from scipy.linalg import matrix_balance, toeplitz
 
-from tuning.gains import Gains
-from tuning.models import Model, Reals, sign, time_constants
-from tuning.stability import open_loop
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import Model, Reals, sign, time_constants
+from loopwright.tuning.stability import open_loop
 
 SMALL_BLOCK = 100
 """States of a block up to which all blocks come from powers of one matrix instead of one convolution each."""

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize_scalar
 
-from tuning.gains import Gains
-from tuning.models import Complexes, Model, Reals
-from tuning.reasons import Reason, Refused
-from tuning.stability import is_stable, open_loop
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import Complexes, Model, Reals
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.stability import is_stable, open_loop
 
 POINTS_PER_DECADE = 600
 

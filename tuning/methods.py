@@ -12,24 +12,24 @@ from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
 from typing import Literal
 
-from tuning.half_rule import exact, half_rule
-from tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction, integrators
-from tuning.reasons import Reason, Refused
-from tuning.rules import tyreus_luyben, ziegler_nichols
-from tuning.rules.amigo import amigo
-from tuning.rules.chien_hrones_reswick import chien_hrones_reswick
-from tuning.rules.cohen_coon import cohen_coon
-from tuning.rules.common import in_words
-from tuning.rules.direct_synthesis import PAPER_C, STABLE_C, direct_synthesis
-from tuning.rules.imc import imc_pi, imc_pid
-from tuning.rules.kappa_tau import kappa_tau
-from tuning.rules.lambda_tuning import lambda_tuning
-from tuning.rules.me_pso import ROBUST_MS, me_pso
-from tuning.rules.robust import robust
-from tuning.rules.s_plane import s_plane
-from tuning.rules.simc import simc
-from tuning.setting import Setting
-from tuning.tangent import tangent
+from loopwright.tuning.half_rule import exact, half_rule
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction, integrators
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.rules import tyreus_luyben, ziegler_nichols
+from loopwright.tuning.rules.amigo import amigo
+from loopwright.tuning.rules.chien_hrones_reswick import chien_hrones_reswick
+from loopwright.tuning.rules.cohen_coon import cohen_coon
+from loopwright.tuning.rules.common import in_words
+from loopwright.tuning.rules.direct_synthesis import PAPER_C, STABLE_C, direct_synthesis
+from loopwright.tuning.rules.imc import imc_pi, imc_pid
+from loopwright.tuning.rules.kappa_tau import kappa_tau
+from loopwright.tuning.rules.lambda_tuning import lambda_tuning
+from loopwright.tuning.rules.me_pso import ROBUST_MS, me_pso
+from loopwright.tuning.rules.robust import robust
+from loopwright.tuning.rules.s_plane import s_plane
+from loopwright.tuning.rules.simc import simc
+from loopwright.tuning.setting import Setting
+from loopwright.tuning.tangent import tangent
 
 Value = float | str | bool | None
 

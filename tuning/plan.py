@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Generic, NamedTuple, TypeVar, cast
 
-from tuning.gains import Gains
+from loopwright.tuning.gains import Gains
 
 T = TypeVar("T")
 

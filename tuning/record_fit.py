@@ -10,10 +10,10 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from tuning.models import Reals, TransferFunction
-from tuning.sampled import pulses
-from tuning.structures import Structure
-from tuning.varpro import REDUNDANT, Bounded, Linear, descend, solve
+from loopwright.tuning.models import Reals, TransferFunction
+from loopwright.tuning.sampled import pulses
+from loopwright.tuning.structures import Structure
+from loopwright.tuning.varpro import REDUNDANT, Bounded, Linear, descend, solve
 
 FLOOR = 2e-4
 """Of the residual in spans of PV: data without noise would ask for ever more parameters."""

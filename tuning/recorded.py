@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tuning.models import Reals
-from tuning.reasons import Reason, Refused
+from loopwright.tuning.models import Reals
+from loopwright.tuning.reasons import Reason, Refused
 
 LEAST_SAMPLES = 20
 LEAST_AFTER_THE_FIRST_MOVE = 10

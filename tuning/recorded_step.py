@@ -10,11 +10,11 @@ import math
 import numpy as np
 from scipy.optimize import least_squares
 
-from tuning.gains import Gains
-from tuning.models import FOPDT, Reals
-from tuning.reasons import Reason, Refused
-from tuning.reduction import fopdt_of_areas, fopdt_of_moments
-from tuning.response import step_response
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import FOPDT, Reals
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.reduction import fopdt_of_areas, fopdt_of_moments
+from loopwright.tuning.response import step_response
 
 LEAST_SAMPLES = 20
 FINE = 4000

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from tuning.models import Reals
+    from loopwright.tuning.models import Reals
 
 
 def recursive(recursion: Reals, u: Reals) -> Reals:

@@ -8,8 +8,8 @@ from collections.abc import Iterable
 import numpy as np
 from scipy.linalg import expm
 
-from tuning.models import FOPDT, Model, integrators
-from tuning.reasons import Reason, Refused
+from loopwright.tuning.models import FOPDT, Model, integrators
+from loopwright.tuning.reasons import Reason, Refused
 
 
 def moments(model: Model) -> FOPDT:

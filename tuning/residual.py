@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import chdtrc  # scipy.stats takes 0.4 s to import
 
-from tuning.models import Reals
+from loopwright.tuning.models import Reals
 
 
 def whiteness(residual: Reals, searched: int) -> float:

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuning.figures import StepFigures, response_figures
-from tuning.gains import Gains
-from tuning.loop import Loop
-from tuning.models import Model, Reals, TransferFunction, integrators
-from tuning.reasons import Reason, Refused
-from tuning.stability import is_stable, open_loop
+from loopwright.tuning.figures import StepFigures, response_figures
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.loop import Loop
+from loopwright.tuning.models import Model, Reals, TransferFunction, integrators
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.stability import is_stable, open_loop
 
 MAX_STEPS = 40_000
 LONGER = 24

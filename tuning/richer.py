@@ -11,15 +11,22 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tuning.fitting import WHITE_ABOVE, Problem
-from tuning.margins import ultimate_point
-from tuning.models import TransferFunction
-from tuning.reasons import Ended
-from tuning.record_fit import QUIET, Fitted
-from tuning.residual import whiteness
-from tuning.stories import PLAIN, by_bic, fits, stories, timed_again
-from tuning.stories import STRUCTURES as SEVEN
-from tuning.structures import INTEGRATOR, INTEGRATOR_WITH_ZERO, LAGGED_INTEGRATOR, SECOND, SECOND_WITH_ZERO, THIRD
+from loopwright.tuning.fitting import WHITE_ABOVE, Problem
+from loopwright.tuning.margins import ultimate_point
+from loopwright.tuning.models import TransferFunction
+from loopwright.tuning.reasons import Ended
+from loopwright.tuning.record_fit import QUIET, Fitted
+from loopwright.tuning.residual import whiteness
+from loopwright.tuning.stories import PLAIN, by_bic, fits, stories, timed_again
+from loopwright.tuning.stories import STRUCTURES as SEVEN
+from loopwright.tuning.structures import (
+    INTEGRATOR,
+    INTEGRATOR_WITH_ZERO,
+    LAGGED_INTEGRATOR,
+    SECOND,
+    SECOND_WITH_ZERO,
+    THIRD,
+)
 
 STRUCTURES = (*SEVEN, THIRD, INTEGRATOR, LAGGED_INTEGRATOR, INTEGRATOR_WITH_ZERO)
 SLOWEST = 1.0

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy.optimize import minimize
 
-from tuning.gains import Gains
-from tuning.margins import ultimate_point
-from tuning.models import FOPDT, Reals
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import ultimate_point
+from loopwright.tuning.models import FOPDT, Reals
 
 WEIGHTS = (10.0, 1.0, 10.0)
 SPREAD = 0.2

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.models import Reals
-from tuning.recursion import recursive
+from loopwright.tuning.models import Reals
+from loopwright.tuning.recursion import recursive
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy import optimize
 
-from tuning.models import Reals
+from loopwright.tuning.models import Reals
 
 Cost = Callable[[Reals], Reals]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from tuning.gains import Gains
+from loopwright.tuning.gains import Gains
 
 
 @dataclass(frozen=True, slots=True)

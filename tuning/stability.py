@@ -12,9 +12,9 @@ import math
 
 import numpy as np
 
-from tuning.gains import Gains
-from tuning.models import Model, Reals, sign
-from tuning.reasons import Reason, Refused
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import Model, Reals, sign
+from loopwright.tuning.reasons import Reason, Refused
 
 ON_AXIS = 1e-9
 """A root this near to the imaginary axis, relative to its size, counts as unstable."""

@@ -10,9 +10,9 @@ import math
 import numpy as np
 from scipy.fft import next_fast_len
 
-from tuning.models import Reals
-from tuning.sampled import states
-from tuning.structures import Structure
+from loopwright.tuning.models import Reals
+from loopwright.tuning.sampled import states
+from loopwright.tuning.structures import Structure
 
 RATIO = 2.0
 DAMPING_RATIOS = (0.15, 0.4, 0.7)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import matrix_balance
 
-from tuning.models import Model, Reals, TransferFunction, integrators, sign, time_constants
+from loopwright.tuning.models import Model, Reals, TransferFunction, integrators, sign, time_constants
 
 
 @dataclass(frozen=True, slots=True)

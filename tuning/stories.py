@@ -13,10 +13,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.models import Reals
-from tuning.record_fit import QUIET, Fit, Fitted, Hypothesis, Signals, averaged
-from tuning.sampled import pulses
-from tuning.structures import (
+from loopwright.tuning.models import Reals
+from loopwright.tuning.record_fit import QUIET, Fit, Fitted, Hypothesis, Signals, averaged
+from loopwright.tuning.sampled import pulses
+from loopwright.tuning.structures import (
     FIRST,
     FIRST_FED,
     INTEGRATOR,

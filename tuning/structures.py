@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuning.models import FOPDT, SOPDT, Integrating, Reals
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Reals
 
 Plant = FOPDT | SOPDT | Integrating
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from tuning.models import FOPDT, SOPDT
-from tuning.reasons import Reason, Refused
+from loopwright.tuning.models import FOPDT, SOPDT
+from loopwright.tuning.reasons import Reason, Refused
 
 
 def tangent(model: SOPDT) -> FOPDT:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.models import Reals
+from loopwright.tuning.models import Reals
 
 Rows = NDArray[np.int64]
 Flags = NDArray[np.bool_]

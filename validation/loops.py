@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from tuning.gains import Gains
-from tuning.models import FOPDT, SOPDT, Reals, TransferFunction
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import FOPDT, SOPDT, Reals, TransferFunction
 from validation.references import References
 
 FIVE_LAGS = TransferFunction((1.0,), (1.0, 5.0, 10.0, 10.0, 5.0, 1.0))

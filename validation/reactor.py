@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from scipy import signal
 
-from plantsim.reactor import INLET, MV_NOMINAL, STEADY_STATE, derivative
-from tuning.estimate import fopdt_from_overshoot
-from tuning.gains import Gains
-from tuning.margins import ultimate_point
-from tuning.models import FOPDT, Reals, TransferFunction
-from tuning.response import step_figures
-from tuning.robust import optimise
+from loopwright.plantsim.reactor import INLET, MV_NOMINAL, STEADY_STATE, derivative
+from loopwright.tuning.estimate import fopdt_from_overshoot
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import ultimate_point
+from loopwright.tuning.models import FOPDT, Reals, TransferFunction
+from loopwright.tuning.response import step_figures
+from loopwright.tuning.robust import optimise
 from validation import tolerances as tol
 from validation.checks import Cell, Claim, Column, Row, Table
 

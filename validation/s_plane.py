@@ -6,10 +6,10 @@ from statistics import mean
 
 import numpy as np
 
-from tuning.gains import Gains
-from tuning.models import Model, TransferFunction
-from tuning.response import step_figures, step_response
-from tuning.rules.s_plane import design, s_plane
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import Model, TransferFunction
+from loopwright.tuning.response import step_figures, step_response
+from loopwright.tuning.rules.s_plane import design, s_plane
 from validation import tolerances as tol
 from validation.checks import Cell, Claim, Column, Figure, Paper, Row, Table
 from validation.loops import numerator, of_numerator, plant, samples

@@ -7,9 +7,9 @@ import random
 import time
 from collections.abc import Callable
 
-from service.logs import about
-from service.metrics import IN_FLIGHT, REQUEST_SECONDS, REQUESTS
-from service.security.gate import App, AsgiScope, Message, Receive, Send
+from loopwright.service.logs import about
+from loopwright.service.metrics import IN_FLIGHT, REQUEST_SECONDS, REQUESTS
+from loopwright.service.security.gate import App, AsgiScope, Message, Receive, Send
 
 log = logging.getLogger(__name__)
 

@@ -10,14 +10,14 @@ from typing import Annotated, Literal
 from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from service.api import contract, fleet, locks, operations, previews, problems, tunings
-from service.api.access import Access
-from service.api.bodies import JsonRoute
-from service.api.idempotency import Idempotent
-from service.api.paging import LARGEST
-from service.api.samples import Reading, csv_text, json_text, parts, takes_gzip
-from service.api.stream import event_stream, still_permitted
-from service.api.views import (
+from loopwright.service.api import contract, fleet, locks, operations, previews, problems, tunings
+from loopwright.service.api.access import Access
+from loopwright.service.api.bodies import JsonRoute
+from loopwright.service.api.idempotency import Idempotent
+from loopwright.service.api.paging import LARGEST
+from loopwright.service.api.samples import Reading, csv_text, json_text, parts, takes_gzip
+from loopwright.service.api.stream import event_stream, still_permitted
+from loopwright.service.api.views import (
     Decision,
     DismissedView,
     JobView,
@@ -28,18 +28,18 @@ from service.api.views import (
     live_view,
     loop_view,
 )
-from service.computing.pool import Pool
-from service.fleet import Fleet
-from service.jobs import Jobs
-from service.lateness import watched_event_loop
-from service.request import RetuneRequest
-from service.security.gate import Gate, Policy
-from service.security.principal import current
-from service.shared_reading import SharedReading
-from service.states import ACTIVE, JobState
-from service.store.idempotency import IdempotencyKeys
-from service.store.tables import JobRow
-from tuning.reasons import Ended
+from loopwright.service.computing.pool import Pool
+from loopwright.service.fleet import Fleet
+from loopwright.service.jobs import Jobs
+from loopwright.service.lateness import watched_event_loop
+from loopwright.service.request import RetuneRequest
+from loopwright.service.security.gate import Gate, Policy
+from loopwright.service.security.principal import current
+from loopwright.service.shared_reading import SharedReading
+from loopwright.service.states import ACTIVE, JobState
+from loopwright.service.store.idempotency import IdempotencyKeys
+from loopwright.service.store.tables import JobRow
+from loopwright.tuning.reasons import Ended
 
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 MOST_EVENTS = 2000

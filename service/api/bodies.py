@@ -9,7 +9,7 @@ from fastapi import HTTPException, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.routing import APIRoute
 
-from service import strict_json
+from loopwright.service import strict_json
 
 _SHORT = 16_384
 """Bytes that are read at once; reading a longer body would hold up the event loop."""

@@ -9,9 +9,9 @@ from typing import Any
 
 from fastapi import Request
 
-from service.computing.limits import Kind
-from service.computing.pool import NotWanted, Pool
-from service.errors import Stopping
+from loopwright.service.computing.limits import Kind
+from loopwright.service.computing.pool import NotWanted, Pool
+from loopwright.service.errors import Stopping
 
 Work = Callable[[], dict[str, Any]]
 

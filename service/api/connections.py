@@ -20,7 +20,7 @@ from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from service.security.limits import RequestLimits
+from loopwright.service.security.limits import RequestLimits
 
 log = logging.getLogger(__name__)
 

@@ -7,10 +7,10 @@ from typing import Any
 
 from fastapi import FastAPI
 
-from service.api import problems
-from service.api.idempotency import HEADER, MOST_CHARACTERS, PATTERN
-from service.security.gate import ALWAYS, scope_for
-from service.store.idempotency import KEPT_H
+from loopwright.service.api import problems
+from loopwright.service.api.idempotency import HEADER, MOST_CHARACTERS, PATTERN
+from loopwright.service.security.gate import ALWAYS, scope_for
+from loopwright.service.store.idempotency import KEPT_H
 
 _KEY = "key"
 _METHODS = ("get", "post", "put", "patch", "delete")

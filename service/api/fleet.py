@@ -10,16 +10,16 @@ from fastapi import APIRouter, Body, FastAPI, Path, Query, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 
-from service.api import problems
-from service.api.bodies import JsonRoute
-from service.api.paging import LINK, Cursor, Limit, more
-from service.api.views import Decision, JobView, LoopView, loop_view
-from service.fleet import BadFleet, Fleet, FleetRequest
-from service.jobs import Jobs
-from service.states import JobState
-from service.store.retunes import NoSuchRetune, Part, RetuneOver, RetuneState, StopReason
-from service.store.tables import JobRow, RetuneRow
-from tuning.reasons import Reason
+from loopwright.service.api import problems
+from loopwright.service.api.bodies import JsonRoute
+from loopwright.service.api.paging import LINK, Cursor, Limit, more
+from loopwright.service.api.views import Decision, JobView, LoopView, loop_view
+from loopwright.service.fleet import BadFleet, Fleet, FleetRequest
+from loopwright.service.jobs import Jobs
+from loopwright.service.states import JobState
+from loopwright.service.store.retunes import NoSuchRetune, Part, RetuneOver, RetuneState, StopReason
+from loopwright.service.store.tables import JobRow, RetuneRow
+from loopwright.tuning.reasons import Reason
 
 RetuneId = Annotated[str, Path(description="Id of the retune", examples=["9d1b7c02aa45"])]
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]

@@ -19,14 +19,14 @@ from starlette.datastructures import Headers
 from starlette.responses import Response
 from starlette.routing import compile_path
 
-from service.api import problems
-from service.security.bodies import begins_with
-from service.security.gate import App, AsgiScope, Message, Receive, Send
-from service.security.principal import LOCAL
-from service.security.principal import current as principal
-from service.store import claims
-from service.store.claims import Claim, StillAnswering
-from service.store.idempotency import KEPT_H, Answer, IdempotencyKeys, OtherRequest
+from loopwright.service.api import problems
+from loopwright.service.security.bodies import begins_with
+from loopwright.service.security.gate import App, AsgiScope, Message, Receive, Send
+from loopwright.service.security.principal import LOCAL
+from loopwright.service.security.principal import current as principal
+from loopwright.service.store import claims
+from loopwright.service.store.claims import Claim, StillAnswering
+from loopwright.service.store.idempotency import KEPT_H, Answer, IdempotencyKeys, OtherRequest
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")

@@ -7,10 +7,10 @@ from typing import Annotated
 from fastapi import APIRouter, Body, Path
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.api import problems
-from service.api.bodies import JsonRoute
-from service.api.views import Decision, LockView
-from service.jobs import Jobs
+from loopwright.service.api import problems
+from loopwright.service.api.bodies import JsonRoute
+from loopwright.service.api.views import Decision, LockView
+from loopwright.service.jobs import Jobs
 
 _ONE_LINE = r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$"
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]

@@ -15,15 +15,15 @@ from fastapi import APIRouter, FastAPI, Query, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import BaseModel, Field
 
-from service import metrics
-from service.aftercare import NotHome
-from service.api import problems
-from service.api.page import POLICY, page
-from service.api.paging import LARGEST
-from service.bus_watch import BusWatch
-from service.jobs import Jobs
-from service.security import audit
-from service.security.tables import AuditRow
+from loopwright.service import metrics
+from loopwright.service.aftercare import NotHome
+from loopwright.service.api import problems
+from loopwright.service.api.page import POLICY, page
+from loopwright.service.api.paging import LARGEST
+from loopwright.service.bus_watch import BusWatch
+from loopwright.service.jobs import Jobs
+from loopwright.service.security import audit
+from loopwright.service.security.tables import AuditRow
 
 Check = Callable[[], str | None]
 """Returns when all is well, with what is worth knowing; raises with the reason when not."""

@@ -7,16 +7,16 @@ from typing import Annotated
 
 from fastapi import APIRouter, Body, Path
 
-from service.api import problems
-from service.fleet import Fleet, FleetRequest
-from service.jobs import Jobs
-from service.obstacles import Now
-from service.preview import FleetPreview, LastProposal, Preview, fleet_preview, preview
-from service.request import RetuneRequest
-from service.state_json import loop_state
-from service.store import loop_locks
-from service.store.tables import JobRow
-from tuning.reasons import Ended
+from loopwright.service.api import problems
+from loopwright.service.fleet import Fleet, FleetRequest
+from loopwright.service.jobs import Jobs
+from loopwright.service.obstacles import Now
+from loopwright.service.preview import FleetPreview, LastProposal, Preview, fleet_preview, preview
+from loopwright.service.request import RetuneRequest
+from loopwright.service.state_json import loop_state
+from loopwright.service.store import loop_locks
+from loopwright.service.store.tables import JobRow
+from loopwright.tuning.reasons import Ended
 
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 
@@ -65,9 +65,7 @@ def _now(jobs: Jobs, tag: str, request: RetuneRequest) -> Now:
     if active is not None and active.found is not None:
         state, locked = loop_state(active.found), _locked(jobs).get(tag)
         return Now(state, active_job=active.id, locked=locked, stopping=jobs.stopping)
-    found = Now(
-        active_job=None if active is None else active.id, locked=_locked(jobs).get(tag), stopping=jobs.stopping
-    )
+    found = Now(active_job=None if active is None else active.id, locked=_locked(jobs).get(tag), stopping=jobs.stopping)
     try:
         return replace(found, state=jobs.live(tag))
     except Ended as silent:

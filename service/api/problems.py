@@ -12,18 +12,18 @@ from pydantic import BaseModel, Field
 from sqlalchemy.exc import DataError, SQLAlchemyError
 from starlette.exceptions import HTTPException
 
-from service.api.bodies import BadBody
-from service.computing.pool import NotWanted
-from service.errors import Conflict, Locked, Stopping, UnknownLoop
-from service.journal import temporary
-from service.model_forms import BadModel
-from service.request import BadLimits
-from service.states import IllegalMove
-from service.store.claims import StillAnswering
-from service.store.damage import is_damage
-from service.store.store import Busy, FolderInUse, NoSuchJob
-from service.tunings import BadTuning
-from tuning.reasons import ADVICE, Ended, Reason
+from loopwright.service.api.bodies import BadBody
+from loopwright.service.computing.pool import NotWanted
+from loopwright.service.errors import Conflict, Locked, Stopping, UnknownLoop
+from loopwright.service.journal import temporary
+from loopwright.service.model_forms import BadModel
+from loopwright.service.request import BadLimits
+from loopwright.service.states import IllegalMove
+from loopwright.service.store.claims import StillAnswering
+from loopwright.service.store.damage import is_damage
+from loopwright.service.store.store import Busy, FolderInUse, NoSuchJob
+from loopwright.service.tunings import BadTuning
+from loopwright.tuning.reasons import ADVICE, Ended, Reason
 
 MEDIA_TYPE = "application/problem+json"
 CLIENT_GONE = 499

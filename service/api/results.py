@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from service.ground import GainsSource, PlantSource
+from loopwright.service.ground import GainsSource, PlantSource
 
 
 class UltimateView(BaseModel):

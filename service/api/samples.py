@@ -13,10 +13,10 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from service.fast_record import Columns
-from service.store.chunks import COLUMNS, Block
-from service.store.store import Store
-from tuning.models import Reals
+from loopwright.service.fast_record import Columns
+from loopwright.service.store.chunks import COLUMNS, Block
+from loopwright.service.store.store import Store
+from loopwright.tuning.models import Reals
 
 _PART = 1 << 16
 """Characters that are handed to the server at once."""

@@ -12,10 +12,10 @@ from collections.abc import AsyncIterator, Callable
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.jobs import Jobs
-from service.journal import temporary
-from service.security.keyring import REVOKED_WITHIN_S, Keyring
-from service.states import ACTIVE, JobState
+from loopwright.service.jobs import Jobs
+from loopwright.service.journal import temporary
+from loopwright.service.security.keyring import REVOKED_WITHIN_S, Keyring
+from loopwright.service.states import ACTIVE, JobState
 
 _POLL_S = 0.2
 _AWAY_S = 1.0

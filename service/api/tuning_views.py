@@ -6,9 +6,9 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.api.views import GainsView
-from tuning.design import LEAST_GM, MOST_Ms
-from tuning.reasons import Reason
+from loopwright.service.api.views import GainsView
+from loopwright.tuning.design import LEAST_GM, MOST_Ms
+from loopwright.tuning.reasons import Reason
 
 
 class OptionView(BaseModel):

@@ -8,18 +8,18 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Request
 from fastapi.concurrency import run_in_threadpool
 
-from service import tunings
-from service.alternatives import alternatives, redesigned
-from service.api import problems
-from service.api.bodies import JsonRoute
-from service.api.computed import Work, computed
-from service.api.samples import record_columns
-from service.api.tuning_views import AlternativesView, MethodView, TuningRequest, TuningsView
-from service.computing.pool import Pool
-from service.fast_record import kept
-from service.jobs import Jobs
-from service.model_forms import parse_model
-from tuning.fast.procedure import FAST
+from loopwright.service import tunings
+from loopwright.service.alternatives import alternatives, redesigned
+from loopwright.service.api import problems
+from loopwright.service.api.bodies import JsonRoute
+from loopwright.service.api.computed import Work, computed
+from loopwright.service.api.samples import record_columns
+from loopwright.service.api.tuning_views import AlternativesView, MethodView, TuningRequest, TuningsView
+from loopwright.service.computing.pool import Pool
+from loopwright.service.fast_record import kept
+from loopwright.service.jobs import Jobs
+from loopwright.service.model_forms import parse_model
+from loopwright.tuning.fast.procedure import FAST
 
 
 def router(jobs: Jobs, pool: Pool) -> APIRouter:

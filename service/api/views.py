@@ -7,8 +7,8 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from service.aftercare import NotHome
-from service.api.results import (
+from loopwright.service.aftercare import NotHome
+from loopwright.service.api.results import (
     ComparisonView,
     EvidenceView,
     ModelView,
@@ -23,14 +23,14 @@ from service.api.results import (
     rehearsed_on_view,
     verification_view,
 )
-from service.config import Limits, LoopConfig
-from service.loop import LoopState
-from service.running import Running
-from service.states import ACTIVE, JobState, shown
-from service.store.tables import EventRow, JobRow, LoopLockRow
-from tuning.five_stage import PROCEDURE
-from tuning.gains import Gains
-from tuning.reasons import ADVICE, Reason
+from loopwright.service.config import Limits, LoopConfig
+from loopwright.service.loop import LoopState
+from loopwright.service.running import Running
+from loopwright.service.states import ACTIVE, JobState, shown
+from loopwright.service.store.tables import EventRow, JobRow, LoopLockRow
+from loopwright.tuning.five_stage import PROCEDURE
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.reasons import ADVICE, Reason
 
 
 class GainsView(BaseModel):

@@ -11,12 +11,12 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, Protocol
 
-from service.computing.limits import Kind
-from service.computing.pool import NoProcess, NotWanted
-from service.loop import Loop, LoopState, Restored
-from tuning.gains import Gains
-from tuning.plan import Command, Sample, Work
-from tuning.reasons import Reason
+from loopwright.service.computing.limits import Kind
+from loopwright.service.computing.pool import NoProcess, NotWanted
+from loopwright.service.loop import Loop, LoopState, Restored
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Command, Sample, Work
+from loopwright.tuning.reasons import Reason
 
 HELD_S = 0.3
 """Wall time for which a step may be held up: a part of the heartbeat time."""

@@ -19,7 +19,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from service.computing.limits import MB
+from loopwright.service.computing.limits import MB
 
 PAUSE, GO_ON = b"pause", b"go on"
 _FIRST_TO_DIE = "500"

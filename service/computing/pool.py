@@ -22,9 +22,9 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerProcess
 from typing import Any
 
-from service.computing.child import GO_ON, PAUSE, Said, compute
-from service.computing.limits import MEMORY_OPTION, OPTIONS, WORDS, ComputingLimits, Kind, at_once
-from tuning.reasons import Failed, Reason
+from loopwright.service.computing.child import GO_ON, PAUSE, Said, compute
+from loopwright.service.computing.limits import MEMORY_OPTION, OPTIONS, WORDS, ComputingLimits, Kind, at_once
+from loopwright.tuning.reasons import Failed, Reason
 
 NICE = {Kind.LIVE: 5, Kind.TUNING: 10, Kind.DRY_RUN: 10}
 _LOOK_S, _LOOK_WAITING_S = 0.1, 0.5
@@ -89,7 +89,7 @@ class Pool:
         self.limits = limits or ComputingLimits()
         self._most = most or at_once()
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(["service.computing.preload"])
+        self._context.set_forkserver_preload(["loopwright.service.computing.preload"])
         self._numbers = itertools.count()
         self._places: list[_Place] = []
         self._changed = threading.Condition()

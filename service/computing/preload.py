@@ -6,14 +6,14 @@ from importlib import import_module
 
 LOADED = (
     "scipy.signal",  # tuning imports it when it first needs it
-    "service.alternatives",
-    "service.cli",  # the script `loopwright` imports it, and each process imports what the script does
-    "service.computing.rehearsals",
-    "service.rehearsal",
-    "service.tunings",
-    "tuning.fast.procedure",
-    "tuning.fast.trial",
-    "tuning.five_stage",
+    "loopwright.service.alternatives",
+    "loopwright.service.cli",  # the script `loopwright` imports it, and each process imports what the script does
+    "loopwright.service.computing.rehearsals",
+    "loopwright.service.rehearsal",
+    "loopwright.service.tunings",
+    "loopwright.tuning.fast.procedure",
+    "loopwright.tuning.fast.trial",
+    "loopwright.tuning.five_stage",
 )
 
 # Before numpy is loaded: a computation takes one processor, and a process with threads should not be forked.

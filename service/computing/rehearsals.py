@@ -7,14 +7,14 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from service.computing.limits import Kind
-from service.computing.pool import NotWanted, Pool
-from service.config import LoopConfig
-from service.ground import Ground
-from service.request import RetuneRequest
-from service.work import Hooks, Outcome, Rehearse
-from tuning.plan import Event, Sample
-from tuning.reasons import Aborted, Reason
+from loopwright.service.computing.limits import Kind
+from loopwright.service.computing.pool import NotWanted, Pool
+from loopwright.service.config import LoopConfig
+from loopwright.service.ground import Ground
+from loopwright.service.request import RetuneRequest
+from loopwright.service.work import Hooks, Outcome, Rehearse
+from loopwright.tuning.plan import Event, Sample
+from loopwright.tuning.reasons import Aborted, Reason
 
 SAMPLES_AT_ONCE = 1000
 TOLD_AFTER_S = 0.2

@@ -15,10 +15,10 @@ from pathlib import Path
 from dbos import DBOS, DBOSConfig, SetWorkflowID
 from sqlalchemy import Engine as Database
 
-from service.engine import WORKFLOW_VERSION
-from service.store.damage import Damage
-from service.store.database import checkpoint, sqlite
-from service.store.lock import FolderInUse
+from loopwright.service.engine import WORKFLOW_VERSION
+from loopwright.service.store.damage import Damage
+from loopwright.service.store.database import checkpoint, sqlite
+from loopwright.service.store.lock import FolderInUse
 
 log = logging.getLogger(__name__)
 

@@ -8,9 +8,9 @@ from typing import Any
 from sqlalchemy import Engine, select
 from sqlalchemy.orm import Session
 
-from service.security.principal import current
-from service.security.tables import AuditRow
-from service.store.clock import now
+from loopwright.service.security.principal import current
+from loopwright.service.security.tables import AuditRow
+from loopwright.service.store.clock import now
 
 
 def record(

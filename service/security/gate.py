@@ -16,16 +16,16 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.datastructures import Headers
 from starlette.responses import Response
 
-from service.api import problems
-from service.security.bodies import Bodies, BodyRefused, begins_with
-from service.security.key_checks import KeyChecks, TooOften
-from service.security.keyring import Keyring
-from service.security.keys import Scope
-from service.security.limits import Buckets, RequestLimits, retry_after
-from service.security.places import DECIDES, SAFE_METHODS, Full, Kind, Places, Turn, changes_nothing, kind_of
-from service.security.principal import LOCAL, Principal, current
-from service.shared_reading import asked_at
-from service.store.database import urgent
+from loopwright.service.api import problems
+from loopwright.service.security.bodies import Bodies, BodyRefused, begins_with
+from loopwright.service.security.key_checks import KeyChecks, TooOften
+from loopwright.service.security.keyring import Keyring
+from loopwright.service.security.keys import Scope
+from loopwright.service.security.limits import Buckets, RequestLimits, retry_after
+from loopwright.service.security.places import DECIDES, SAFE_METHODS, Full, Kind, Places, Turn, changes_nothing, kind_of
+from loopwright.service.security.principal import LOCAL, Principal, current
+from loopwright.service.shared_reading import asked_at
+from loopwright.service.store.database import urgent
 
 log = logging.getLogger(__name__)
 

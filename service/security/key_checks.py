@@ -16,10 +16,10 @@ from contextlib import asynccontextmanager
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.security.keyring import Keyring
-from service.security.keys import key_id_of
-from service.security.limits import Buckets, RequestLimits
-from service.security.tables import KeyRow
+from loopwright.service.security.keyring import Keyring
+from loopwright.service.security.keys import key_id_of
+from loopwright.service.security.limits import Buckets, RequestLimits
+from loopwright.service.security.tables import KeyRow
 
 
 class TooOften(Exception):

@@ -12,10 +12,10 @@ from datetime import UTC, datetime, timedelta
 from sqlalchemy import Engine, select
 from sqlalchemy.orm import sessionmaker
 
-from service.security import audit
-from service.security.keys import Scope, hash_key, key_id_of, matches, new_key
-from service.security.tables import KeyRow
-from service.store.clock import now, stamp
+from loopwright.service.security import audit
+from loopwright.service.security.keys import Scope, hash_key, key_id_of, matches, new_key
+from loopwright.service.security.tables import KeyRow
+from loopwright.service.store.clock import now, stamp
 
 REVOKED_WITHIN_S = 2.0
 """How long a key that was just used may still be taken for valid after it was revoked."""

@@ -15,7 +15,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from enum import StrEnum
 
-from service.security.limits import RequestLimits
+from loopwright.service.security.limits import RequestLimits
 
 SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
 _PREVIEW = re.compile(r"/loops/[^/]+/retune/preview|/retunes/preview")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextvars import ContextVar
 from dataclasses import dataclass
 
-from service.security.keys import Scope
+from loopwright.service.security.keys import Scope
 
 
 @dataclass(frozen=True)

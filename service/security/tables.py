@@ -7,7 +7,7 @@ from typing import Any
 from sqlalchemy import Index
 from sqlalchemy.orm import Mapped, mapped_column
 
-from service.store.tables import Base
+from loopwright.service.store.tables import Base
 
 
 class KeyRow(Base):

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.plan import Sample
+from loopwright.tuning.plan import Sample
 
 COLUMNS = ("t_s", "sp", "pv", "mv", "mode")
 

@@ -9,7 +9,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, CursorResult, update
 from sqlalchemy.orm import Session
 
-from service.store.tables import IdempotencyRow
+from loopwright.service.store.tables import IdempotencyRow
 
 
 class StillAnswering(Exception):

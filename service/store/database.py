@@ -113,7 +113,7 @@ def checkpoint(engine: Engine) -> None:
 def migrate(engine: Engine) -> None:
     """Makes the tables, or brings them to the present revision. Raises BadDatabase when they are of a later one."""
     config = Config()
-    config.set_main_option("script_location", "service.store:migrations")
+    config.set_main_option("script_location", "loopwright.service.store:migrations")
     with engine.begin() as connection:
         if engine.dialect.name != "sqlite":
             connection.execute(text("SET LOCAL lock_timeout = 0"))

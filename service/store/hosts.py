@@ -6,11 +6,11 @@ from datetime import UTC, datetime
 
 from sqlalchemy import func, select
 
-from service.clock_watch import Jump, Seen
-from service.security import audit
-from service.store.clock import stamp
-from service.store.store import Store, of_host
-from service.store.tables import HostRow, JobRow
+from loopwright.service.clock_watch import Jump, Seen
+from loopwright.service.security import audit
+from loopwright.service.store.clock import stamp
+from loopwright.service.store.store import Store, of_host
+from loopwright.service.store.tables import HostRow, JobRow
 
 
 def last_seen(store: Store) -> Seen | None:

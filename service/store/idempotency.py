@@ -16,11 +16,11 @@ from sqlalchemy import delete, select, true, update
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from service.store.claims import Claim, StillAnswering
-from service.store.clock import stamp
-from service.store.lock import HostLock
-from service.store.store import Store
-from service.store.tables import IdempotencyRow
+from loopwright.service.store.claims import Claim, StillAnswering
+from loopwright.service.store.clock import stamp
+from loopwright.service.store.lock import HostLock
+from loopwright.service.store.store import Store
+from loopwright.service.store.tables import IdempotencyRow
 
 KEPT_H = 24
 MOST_KEYS = 5000

@@ -11,10 +11,10 @@ from typing import Any
 from sqlalchemy import distinct, func, select
 from sqlalchemy.orm import Session
 
-from service.plain import plain
-from service.security import audit
-from service.store.store import Store, Write, append, set_columns
-from service.store.tables import JobRow
+from loopwright.service.plain import plain
+from loopwright.service.security import audit
+from loopwright.service.store.store import Store, Write, append, set_columns
+from loopwright.service.store.tables import JobRow
 
 
 def rows(store: Store, loop: str | None = None) -> Sequence[JobRow]:

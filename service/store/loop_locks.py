@@ -9,10 +9,10 @@ from __future__ import annotations
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from service.errors import Locked, LockedOtherwise
-from service.security import audit
-from service.store.clock import now
-from service.store.tables import LoopLockRow, LoopRow
+from loopwright.service.errors import Locked, LockedOtherwise
+from loopwright.service.security import audit
+from loopwright.service.store.clock import now
+from loopwright.service.store.tables import LoopLockRow, LoopRow
 
 
 def lock(session: Session, loop: str, reason: str, by: str) -> LoopLockRow:

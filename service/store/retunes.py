@@ -11,12 +11,12 @@ from typing import Any
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
-from service.security import audit
-from service.states import ACTIVE, JobState, shown
-from service.store import claims
-from service.store.clock import now
-from service.store.tables import JobRow, RetuneLoopRow, RetuneRow
-from tuning.reasons import Reason
+from loopwright.service.security import audit
+from loopwright.service.states import ACTIVE, JobState, shown
+from loopwright.service.store import claims
+from loopwright.service.store.clock import now
+from loopwright.service.store.tables import JobRow, RetuneLoopRow, RetuneRow
+from loopwright.tuning.reasons import Reason
 
 
 class RetuneState(StrEnum):

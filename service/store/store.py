@@ -13,15 +13,15 @@ from sqlalchemy import ColumnElement, delete, func, select, update
 from sqlalchemy.exc import IntegrityError, SQLAlchemyError, TimeoutError
 from sqlalchemy.orm import Session
 
-from service.loop import same_gains
-from service.plain import plain
-from service.security import audit
-from service.state_json import gains_of
-from service.states import ACTIVE, IllegalMove, JobState, check
-from service.store import chunks, claims, loop_locks, retunes
-from service.store.clock import now
-from service.store.damage import Damage
-from service.store.database import (
+from loopwright.service.loop import same_gains
+from loopwright.service.plain import plain
+from loopwright.service.security import audit
+from loopwright.service.state_json import gains_of
+from loopwright.service.states import ACTIVE, IllegalMove, JobState, check
+from loopwright.service.store import chunks, claims, loop_locks, retunes
+from loopwright.service.store.clock import now
+from loopwright.service.store.damage import Damage
+from loopwright.service.store.database import (
     FILE,
     RESERVE,
     WAIT_S,
@@ -32,10 +32,10 @@ from service.store.database import (
     postgresql,
     sessions,
 )
-from service.store.lock import FolderInUse, FolderLock, HostLock, ourselves
-from service.store.tables import ChunkRow, EventRow, HostRow, JobRow, LoopRow, RetuneRow
-from tuning.plan import Sample
-from tuning.reasons import Reason
+from loopwright.service.store.lock import FolderInUse, FolderLock, HostLock, ourselves
+from loopwright.service.store.tables import ChunkRow, EventRow, HostRow, JobRow, LoopRow, RetuneRow
+from loopwright.tuning.plan import Sample
+from loopwright.tuning.reasons import Reason
 
 __all__ = ["Busy", "FolderInUse", "ForeignLoop", "NoSuchJob", "Store", "WithJob", "Write", "now"]
 

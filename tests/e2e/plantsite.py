@@ -14,13 +14,13 @@ import httpx
 import pytest
 import yaml
 
-from protocol.profile import FOREVER
-from protocol.tuner import Tuner
-from service.bus_loop import BusLoop
-from service.demo import vcan_usable
-from service.loop import LoopState
-from service.processes import Process
-from tuning.plan import Mode
+from loopwright.protocol.profile import FOREVER
+from loopwright.protocol.tuner import Tuner
+from loopwright.service.bus_loop import BusLoop
+from loopwright.service.demo import vcan_usable
+from loopwright.service.loop import LoopState
+from loopwright.service.processes import Process
+from loopwright.tuning.plan import Mode
 
 NEEDS_VCAN = [
     pytest.mark.skipif(
@@ -116,14 +116,14 @@ class Plantsite:
     def start_plant(self) -> None:
         case = self.case
         model = ("--model", case.model, "--ts", str(case.ts), "--speed", self._speed)
-        self.plant = self.launch("plant", "plantsim", "--bus", self.bus, *model)
+        self.plant = self.launch("plant", "loopwright.plantsim", "--bus", self.bus, *model)
 
     def start_controller(self) -> None:
         case = self.case
         gains = ("--kp", str(case.kp), "--ti", str(case.ti), "--sp", str(case.sp))
         kept = ("--keep", str(self._folder / "kept.json"))
         where = ("--bus", self.bus, "--ts", str(case.ts))
-        self.controller = self.launch("controller", "controller", *where, *gains, *kept)
+        self.controller = self.launch("controller", "loopwright.controller", *where, *gains, *kept)
 
     def launch(self, name: str, *arguments: str) -> Process:
         """Starts a process and does not wait for it."""
@@ -147,7 +147,7 @@ class Plantsite:
         loops = self._folder / "loops.yaml"
         loops.write_text(yaml.safe_dump({"loops": [loop, *(loop | change for change in self._more_loops)]}))
         serve = ("serve", "--loops", str(loops), "--data", str(self.data), "--port", "0", *self._served_with)
-        return self.launch("service", *self._launcher, "service", *serve)
+        return self.launch("service", *self._launcher, "loopwright.service", *serve)
 
     def _connect(self) -> None:
         self.service = self._service

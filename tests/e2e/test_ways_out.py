@@ -17,8 +17,8 @@ from typing import Any
 
 import pytest
 
-from protocol.profile import Mode
-from protocol.tuner import Kind, TunerError
+from loopwright.protocol.profile import Mode
+from loopwright.protocol.tuner import Kind, TunerError
 from tests.e2e.plantsite import BUS, MODEL_14, NEEDS_VCAN, STAGES, TAG, Plantsite, Stage
 
 pytestmark = NEEDS_VCAN
@@ -221,12 +221,21 @@ def test_sample_times_that_differ_and_a_wrong_action(here: Plantsite, stage: str
     here.write("plant_samples_to_run", 0)
     own = ("--bus", BUS, "--ts", "0.05", "--node")
     controller = here.launch(
-        "direct", "controller", *own, "0x21", "--plant-node", "0x11", "--channels", "2",
+        "direct", "loopwright.controller", *own, "0x21", "--plant-node", "0x11", "--channels", "2",
         "--kp", "80", "--ti", "1.2", "--direct",
     )  # fmt: skip
     controller.wait_ready()
     plant = here.launch(
-        "plant2", "plantsim", *own, "0x11", "--controller-node", "0x21", "--model", MODEL_14.model, "--speed", "max"
+        "plant2",
+        "loopwright.plantsim",
+        *own,
+        "0x11",
+        "--controller-node",
+        "0x21",
+        "--model",
+        MODEL_14.model,
+        "--speed",
+        "max",
     )
     plant.wait_ready()
     try:

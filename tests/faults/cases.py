@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from protocol.profile import CONTROLLER_NODE, PLANT_NODE
+from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE
 from tests.e2e.plantsite import STAGES
 from tests.faults import injections as do
 from tests.faults.injections import AWAY_S, CLIENTS, LOCKED_S, Injection

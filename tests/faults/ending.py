@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from protocol.profile import Mode, NmtState
-from protocol.tuner import Tuner, TunerError
+from loopwright.protocol.profile import Mode, NmtState
+from loopwright.protocol.tuner import Tuner, TunerError
 from tests.faults.faulty_hub import FaultyHub
 
 NEAR = 1.0

@@ -9,9 +9,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 
-from protocol.hub import Hub, _Member
-from protocol.objects import lookup
-from protocol.profile import (
+from loopwright.protocol.hub import Hub, _Member
+from loopwright.protocol.objects import lookup
+from loopwright.protocol.profile import (
     CONTROLLER_NODE,
     MV_FRAME,
     PLANT_NODE,
@@ -21,7 +21,7 @@ from protocol.profile import (
     sdo_request_id,
     sdo_response_id,
 )
-from protocol.session import object_of
+from loopwright.protocol.session import object_of
 
 Fault = Callable[[int], Sequence[float]]
 """Of a frame's COB-ID: the delays in s after which copies are passed on; none: the frame is lost."""

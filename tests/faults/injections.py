@@ -19,8 +19,8 @@ from dataclasses import replace
 import httpx
 from sqlalchemy import create_engine, text
 
-from protocol.bus import open_bus
-from protocol.profile import (
+from loopwright.protocol.bus import open_bus
+from loopwright.protocol.profile import (
     CONTROLLER_NODE,
     HEARTBEAT_FRAME,
     NMT_FRAME,
@@ -36,15 +36,15 @@ from protocol.profile import (
     sdo_request_id,
     sdo_response_id,
 )
-from protocol.station import Station
-from service.backup import back_up, restore
-from service.bus_loop import BusLoop
-from service.processes import NotReady
+from loopwright.protocol.station import Station
+from loopwright.service.backup import back_up, restore
+from loopwright.service.bus_loop import BusLoop
+from loopwright.service.processes import NotReady
+from loopwright.tuning.reasons import Ended, Reason
 from tests.e2e.plantsite import TAG
 from tests.faults.ending import Home, unsafe
 from tests.faults.faulty_hub import Fault, well
 from tests.faults.stand import HOME, LOOP, Stand
-from tuning.reasons import Ended, Reason
 
 Harm = Iterator[Home | None]
 Injection = Callable[[Stand, str], AbstractContextManager[Home | None]]

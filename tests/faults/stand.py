@@ -18,12 +18,12 @@ import httpx
 from sqlalchemy import create_engine, select
 from sqlalchemy.orm import Session
 
-from controller.device import Kept
-from controller.memory import write
-from controller.pid import Parameters
-from protocol.profile import Mode
-from service.store.chunks import Block, unpack
-from service.store.tables import ChunkRow
+from loopwright.controller.device import Kept
+from loopwright.controller.memory import write
+from loopwright.controller.pid import Parameters
+from loopwright.protocol.profile import Mode
+from loopwright.service.store.chunks import Block, unpack
+from loopwright.service.store.tables import ChunkRow
 from tests.e2e.plantsite import MODEL_14, Plantsite
 from tests.faults.ending import Eye, Home, Stalls
 from tests.faults.faulty_hub import FaultyHub, well

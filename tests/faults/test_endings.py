@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from protocol.profile import Mode
+from loopwright.protocol.profile import Mode
 from tests.faults import campaign, report
 from tests.faults.cases import FAULTS
 from tests.faults.ending import Glance, unsafe

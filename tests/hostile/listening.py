@@ -16,9 +16,9 @@ import sys
 import threading
 import time
 
-from protocol.bus import open_bus
-from protocol.profile import TUNER_NODE, heartbeat_id
-from protocol.station import HEARTBEAT_S
+from loopwright.protocol.bus import open_bus
+from loopwright.protocol.profile import TUNER_NODE, heartbeat_id
+from loopwright.protocol.station import HEARTBEAT_S
 
 NAP_S = 0.01
 

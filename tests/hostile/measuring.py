@@ -10,8 +10,8 @@ from typing import Any
 
 import httpx
 
-from protocol.station import HEARTBEAT_S
-from service.states import ACTIVE
+from loopwright.protocol.station import HEARTBEAT_S
+from loopwright.service.states import ACTIVE
 from tests.hostile.site import Site
 
 MACHINE_LATE_S = 0.01

@@ -10,16 +10,16 @@ from typing import Any
 import httpx
 import yaml
 
-from plantsim.catalogue import find
-from protocol.profile import CONTROLLER_NODE, PLANT_NODE
-from service.bus_loop import BusLoop
-from service.demo import vcan_usable
-from service.loop import LoopState
-from service.processes import Process
-from service.security.keyring import Keyring
-from service.security.keys import Scope
-from service.store.store import Store
-from tuning.plan import Mode
+from loopwright.plantsim.catalogue import find
+from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE
+from loopwright.service.bus_loop import BusLoop
+from loopwright.service.demo import vcan_usable
+from loopwright.service.loop import LoopState
+from loopwright.service.processes import Process
+from loopwright.service.security.keyring import Keyring
+from loopwright.service.security.keys import Scope
+from loopwright.service.store.store import Store
+from loopwright.tuning.plan import Mode
 
 TS_S = 0.1
 MODELS = (18, 29, 12, 14)
@@ -38,7 +38,7 @@ class Site:
         self.tags = [f"T-{n}" for n in range(loops)]
         self.bus = "socketcan:vcan0"
         if not vcan_usable():
-            self.bus = self._start("hub", "protocol.hub", "--port", "0").split()[1]
+            self.bus = self._start("hub", "loopwright.protocol.hub", "--port", "0").split()[1]
         facts = [find(f"model-{MODELS[n % len(MODELS)]}").facts for n in range(loops)]
         entries: list[dict[str, Any]] = []
         gains: list[dict[str, Any]] = []
@@ -55,9 +55,9 @@ class Site:
         (folder / "loops.yaml").write_text(yaml.safe_dump({"loops": entries, "buses": {self.bus: {"at_once": loops}}}))
         (folder / "channels.yaml").write_text(yaml.safe_dump(gains))
         common = ("--bus", self.bus, "--ts", str(TS_S))
-        self._start("controller", "controller", *common, "--config", str(folder / "channels.yaml"))
+        self._start("controller", "loopwright.controller", *common, "--config", str(folder / "channels.yaml"))
         plants = (f"--model=model-{MODELS[n % len(MODELS)]}" for n in range(loops))
-        self._start("plant", "plantsim", *common, *plants, "--speed", "1")
+        self._start("plant", "loopwright.plantsim", *common, *plants, "--speed", "1")
         with closing(Store(folder / "data")) as store:
             keyring = Keyring(store.engine)
             self.operator, self.stranger, self.guessed = (
@@ -66,7 +66,7 @@ class Site:
             )
         self.home = {tag: self.read(tag) for tag in self.tags}
         where = ("--loops", str(folder / "loops.yaml"), "--data", str(folder / "data"), "--port", "0", "--auth")
-        self.url = self._start("service", "service", "serve", *where).split()[1]
+        self.url = self._start("service", "loopwright.service", "serve", *where).split()[1]
 
     def _start(self, name: str, *command: str) -> str:
         process = Process(name, command, self._folder / f"{name}.log")

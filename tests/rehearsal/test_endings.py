@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from service.rehearsal import rehearse
-from tuning.models import FOPDT
-from tuning.reasons import ADVICE, Reason
+from loopwright.service.rehearsal import rehearse
+from loopwright.tuning.models import FOPDT
+from loopwright.tuning.reasons import ADVICE, Reason
 
 LAG = {"num": [2], "den": [5, 1], "dead_time_s": 1}
 

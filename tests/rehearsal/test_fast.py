@@ -9,10 +9,10 @@ import pytest
 from benchmarks.cases import ASKED, FURTHER
 from benchmarks.plants import plants
 from benchmarks.tuning import fast_run
-from service.rehearsal import rehearse
-from tuning.gains import Gains
-from tuning.margins import margins, ultimate_point
-from tuning.models import TransferFunction
+from loopwright.service.rehearsal import rehearse
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins, ultimate_point
+from loopwright.tuning.models import TransferFunction
 
 PLANTS: dict[str, dict[str, Any]] = {
     "first order": {"num": [2.0], "den": [10.0, 1.0], "dead_time_s": 2.03},

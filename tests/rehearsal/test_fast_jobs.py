@@ -8,22 +8,22 @@ from typing import Any
 import pytest
 
 from benchmarks.rehearsed import MIDDLE, TS, entry
-from controller.channel import Channel, Settings
-from controller.pid import Parameters
-from plantsim.plant import LinearPlant
-from service.api.samples import record_columns
-from service.api.views import job_view
-from service.config import LoopConfig, parse_site
-from service.jobs import Jobs
-from service.rehearsal import RehearsedLoop
-from service.request import RetuneRequest
-from service.store.store import Store
-from service.work import rehearse, tune
+from loopwright.controller.channel import Channel, Settings
+from loopwright.controller.pid import Parameters
+from loopwright.plantsim.plant import LinearPlant
+from loopwright.service.api.samples import record_columns
+from loopwright.service.api.views import job_view
+from loopwright.service.config import LoopConfig, parse_site
+from loopwright.service.jobs import Jobs
+from loopwright.service.rehearsal import RehearsedLoop
+from loopwright.service.request import RetuneRequest
+from loopwright.service.store.store import Store
+from loopwright.service.work import rehearse, tune
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins
+from loopwright.tuning.models import FOPDT
+from loopwright.tuning.plan import Mode
 from tests.unit.service.fakes import ThreadEngine
-from tuning.gains import Gains
-from tuning.margins import margins
-from tuning.models import FOPDT
-from tuning.plan import Mode
 
 TAG = "TIC-1"
 K, T, L = 2.0, 6.0, 1.5

@@ -9,12 +9,14 @@ from typing import Any
 
 import pytest
 
-from service.rehearsal import rehearse
-from tuning.gains import Gains
-from tuning.margins import margins
-from tuning.models import TransferFunction
+from loopwright.service.rehearsal import rehearse
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins
+from loopwright.tuning.models import TransferFunction
 
-MODELS_50: list[dict[str, Any]] = json.loads((resources.files("plantsim") / "models-50.json").read_text())["models"]
+MODELS_50: list[dict[str, Any]] = json.loads((resources.files("loopwright.plantsim") / "models-50.json").read_text())[
+    "models"
+]
 
 
 def spec_of(model: dict[str, Any], **more: Any) -> dict[str, Any]:

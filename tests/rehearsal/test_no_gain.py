@@ -10,24 +10,24 @@ from typing import Any
 import pytest
 
 from benchmarks.rehearsed import MIDDLE, TS, AroundTheMiddle, entry
-from controller.channel import Channel, Settings
-from controller.pid import Parameters
-from service.api.views import job_view
-from service.config import LoopConfig, parse_site
-from service.jobs import Jobs
-from service.rehearsal import RehearsedLoop, rehearse
-from service.request import RetuneRequest
-from service.show import job_report, title
-from service.states import JobState
-from service.store.retunes import Part
-from service.store.store import Store
-from service.work import rehearse as dry_run
-from service.work import tune
+from loopwright.controller.channel import Channel, Settings
+from loopwright.controller.pid import Parameters
+from loopwright.service.api.views import job_view
+from loopwright.service.config import LoopConfig, parse_site
+from loopwright.service.jobs import Jobs
+from loopwright.service.rehearsal import RehearsedLoop, rehearse
+from loopwright.service.request import RetuneRequest
+from loopwright.service.show import job_report, title
+from loopwright.service.states import JobState
+from loopwright.service.store.retunes import Part
+from loopwright.service.store.store import Store
+from loopwright.service.work import rehearse as dry_run
+from loopwright.service.work import tune
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import ultimate_point
+from loopwright.tuning.models import FOPDT
+from loopwright.tuning.plan import Mode
 from tests.unit.service.fakes import ThreadEngine
-from tuning.gains import Gains
-from tuning.margins import ultimate_point
-from tuning.models import FOPDT
-from tuning.plan import Mode
 
 TAG = "TIC-1"
 PLANT = FOPDT(2.0, 6.0, 1.5 + TS / 2)

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from benchmarks.refusals import cases, draw, rehearsed
-from service.fast_record import kept
-from tuning.fast.design import Wish
-from tuning.fast.verdict import judge_again
-from tuning.reasons import ADVICE, Reason
+from loopwright.service.fast_record import kept
+from loopwright.tuning.fast.design import Wish
+from loopwright.tuning.fast.verdict import judge_again
+from loopwright.tuning.reasons import ADVICE, Reason
 
 PAGE = (Path(__file__).parents[2] / "docs" / "refusals.md").read_text(encoding="utf-8")
 WITH_FIT = {"unexplained", "disturbed", "uncertain", "surprise", "diverges"}

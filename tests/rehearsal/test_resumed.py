@@ -8,16 +8,16 @@ from typing import Any
 
 import pytest
 
-from controller.channel import Channel, Settings
-from plantsim.plant import LinearPlant
-from service.checkpoints import finished
-from service.plain import plain_object
-from service.rehearsal import RehearsedLoop, _parameters
-from service.runner import Watch, run
-from tuning.five_stage import STAGES, Facts, Finished, Options, five_stage
-from tuning.gains import Gains
-from tuning.plan import Event, Mode, StageDone, StageStarted
-from tuning.reasons import Reason
+from loopwright.controller.channel import Channel, Settings
+from loopwright.plantsim.plant import LinearPlant
+from loopwright.service.checkpoints import finished
+from loopwright.service.plain import plain_object
+from loopwright.service.rehearsal import RehearsedLoop, _parameters
+from loopwright.service.runner import Watch, run
+from loopwright.tuning.five_stage import STAGES, Facts, Finished, Options, five_stage
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Event, Mode, StageDone, StageStarted
+from loopwright.tuning.reasons import Reason
 
 TS, T95 = 0.1, 20.0
 OLD = Gains(0.2, 6.0)

@@ -10,17 +10,17 @@ from typing import Any
 import pytest
 
 from benchmarks.rehearsed import entry, open_loop
-from service.config import parse_site
-from service.jobs import Jobs
-from service.rehearsal import RehearsedLoop
-from service.request import RetuneRequest
-from service.store.store import Store
-from service.work import rehearse, tune
+from loopwright.service.config import parse_site
+from loopwright.service.jobs import Jobs
+from loopwright.service.rehearsal import RehearsedLoop
+from loopwright.service.request import RetuneRequest
+from loopwright.service.store.store import Store
+from loopwright.service.work import rehearse, tune
+from loopwright.tuning.fast.procedure import FAST_STAGES
+from loopwright.tuning.five_stage import STAGES
+from loopwright.tuning.plan import Command, Sample
+from loopwright.tuning.stages.preflight import SETTLE
 from tests.unit.service.fakes import ThreadEngine
-from tuning.fast.procedure import FAST_STAGES
-from tuning.five_stage import STAGES
-from tuning.plan import Command, Sample
-from tuning.stages.preflight import SETTLE
 
 TAG = "TIC-1"
 LIVE = [stage for stage in STAGES if stage not in ("estimate", "optimise")]  # those that take samples

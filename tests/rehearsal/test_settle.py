@@ -5,17 +5,17 @@ from __future__ import annotations
 import pytest
 
 from benchmarks.rehearsed import entry, open_loop
-from service.config import parse_site
-from service.loop import Loop
-from service.request import RetuneRequest
-from service.runner import RunResult, Watch, run
-from service.store.tables import EventRow
-from service.work import plan
-from tuning.plan import Event, Mode, Plan, SetMode, SetOutput, StageStarted
-from tuning.reasons import Reason
-from tuning.stages.common import Facts
-from tuning.stages.preflight import SETTLE
-from tuning.stages.settle import LOOKS
+from loopwright.service.config import parse_site
+from loopwright.service.loop import Loop
+from loopwright.service.request import RetuneRequest
+from loopwright.service.runner import RunResult, Watch, run
+from loopwright.service.store.tables import EventRow
+from loopwright.service.work import plan
+from loopwright.tuning.plan import Event, Mode, Plan, SetMode, SetOutput, StageStarted
+from loopwright.tuning.reasons import Reason
+from loopwright.tuning.stages.common import Facts
+from loopwright.tuning.stages.preflight import SETTLE
+from loopwright.tuning.stages.settle import LOOKS
 
 TAG = "TIC-1"
 CUT_OFF = [EventRow(kind="loop_found", data={})]

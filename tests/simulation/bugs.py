@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from controller import session
-from controller.channel import Channel, Home
-from protocol.objects import Value
-from protocol.profile import Order, RelayState
-from protocol.session import check_of as check_of_order
+from loopwright.controller import session
+from loopwright.controller.channel import Channel, Home
+from loopwright.protocol.objects import Value
+from loopwright.protocol.profile import Order, RelayState
+from loopwright.protocol.session import check_of as check_of_order
 
 Replace = Callable[[Any, str, Any], None]
 

@@ -10,13 +10,13 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 
-from controller.channel import Settings
-from controller.device import ControllerChannel, ControllerDevice
-from plantsim.device import PlantChannel, PlantDevice
-from plantsim.plant import LinearPlant, Plant
-from protocol.bus import BusError
-from protocol.objects import Value
-from protocol.runtime import Runtime
+from loopwright.controller.channel import Settings
+from loopwright.controller.device import ControllerChannel, ControllerDevice
+from loopwright.plantsim.device import PlantChannel, PlantDevice
+from loopwright.plantsim.plant import LinearPlant, Plant
+from loopwright.protocol.bus import BusError
+from loopwright.protocol.objects import Value
+from loopwright.protocol.runtime import Runtime
 from tests.simulation.disk import Disk, PowerCut
 from tests.simulation.scheduler import Process, Simulation, Timer
 from tests.simulation.wire import Port, Wire

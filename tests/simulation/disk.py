@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from controller.device import Kept
+from loopwright.controller.device import Kept
 from tests.simulation.scheduler import Simulation
 
 SOON_S = 0.4

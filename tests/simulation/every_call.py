@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from protocol.profile import Mode
+from loopwright.protocol.profile import Mode
 from tests.simulation import plans
 from tests.simulation.history import Ending, Loop, World
 from tests.simulation.scheduler import Process

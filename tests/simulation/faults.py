@@ -6,7 +6,7 @@ import math
 import struct
 from typing import Any
 
-from protocol.profile import (
+from loopwright.protocol.profile import (
     CONTROLLER_NODE,
     PLANT_NODE,
     NmtCommand,
@@ -14,7 +14,7 @@ from protocol.profile import (
     channel_ids,
     sdo_request_id,
 )
-from service.request import ProcessModel, RetuneRequest
+from loopwright.service.request import ProcessModel, RetuneRequest
 from tests.simulation import plans
 from tests.simulation.gateway import Gateway
 from tests.simulation.history import World

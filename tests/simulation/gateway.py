@@ -17,18 +17,18 @@ from typing import Any, TypeVar
 
 from sqlalchemy import event, text
 
-from protocol.station import Station
-from protocol.turns import Turns
-from service.bus_loop import BusLoop
-from service.bus_reading import BusReading
-from service.config import LoopConfig
-from service.jobs import Jobs
-from service.loop import Loop, LoopState, Restored
-from service.machine import Machine
-from service.states import ACTIVE, JobState
-from service.store.store import Store
-from service.store.tables import Base, JobRow
-from service.work import Tune
+from loopwright.protocol.station import Station
+from loopwright.protocol.turns import Turns
+from loopwright.service.bus_loop import BusLoop
+from loopwright.service.bus_reading import BusReading
+from loopwright.service.config import LoopConfig
+from loopwright.service.jobs import Jobs
+from loopwright.service.loop import Loop, LoopState, Restored
+from loopwright.service.machine import Machine
+from loopwright.service.states import ACTIVE, JobState
+from loopwright.service.store.store import Store
+from loopwright.service.store.tables import Base, JobRow
+from loopwright.service.work import Tune
 from tests.simulation.scheduler import Killed, Process, Simulation, Task
 from tests.simulation.wire import Port, Wire
 

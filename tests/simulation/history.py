@@ -7,18 +7,18 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Any
 
-from controller.channel import Settings
-from controller.device import ControllerChannel
-from controller.pid import Parameters
-from plantsim.plant import LinearPlant
-from protocol.profile import CONTROLLER_NODE, PLANT_NODE, Mode, NmtState
-from service.config import Limits, LoopConfig
-from service.loop import LoopState
-from service.request import RetuneRequest
-from service.state_json import state_json
-from service.states import ACTIVE, JobState
-from service.store.tables import JobRow
-from service.work import Tune
+from loopwright.controller.channel import Settings
+from loopwright.controller.device import ControllerChannel
+from loopwright.controller.pid import Parameters
+from loopwright.plantsim.plant import LinearPlant
+from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, Mode, NmtState
+from loopwright.service.config import Limits, LoopConfig
+from loopwright.service.loop import LoopState
+from loopwright.service.request import RetuneRequest
+from loopwright.service.state_json import state_json
+from loopwright.service.states import ACTIVE, JobState
+from loopwright.service.store.tables import JobRow
+from loopwright.service.work import Tune
 from tests.simulation import plans
 from tests.simulation.devices import Controller, PlantNode
 from tests.simulation.gateway import Gateway, ReadLoop, SimStation

@@ -13,14 +13,22 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from controller.pid import Parameters
-from controller.relay import Relay
-from controller.session import Session
-from protocol.objects import Value
-from protocol.profile import COMMAND_FRAME, Cause, Mode, NmtState, OnMissingAnswer, ParameterCommand, channel_ids
-from service.loop import LoopState
-from service.states import ACTIVE, JobState
-from service.store.tables import JobRow
+from loopwright.controller.pid import Parameters
+from loopwright.controller.relay import Relay
+from loopwright.controller.session import Session
+from loopwright.protocol.objects import Value
+from loopwright.protocol.profile import (
+    COMMAND_FRAME,
+    Cause,
+    Mode,
+    NmtState,
+    OnMissingAnswer,
+    ParameterCommand,
+    channel_ids,
+)
+from loopwright.service.loop import LoopState
+from loopwright.service.states import ACTIVE, JobState
+from loopwright.service.store.tables import JobRow
 from tests.simulation.devices import Controller, PlantNode
 from tests.simulation.disk import AGAIN_S, SOON_S
 from tests.simulation.scheduler import START, Simulation

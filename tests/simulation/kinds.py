@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from random import Random
 
-from protocol.profile import Mode
+from loopwright.protocol.profile import Mode
 from tests.simulation import faults
 from tests.simulation.history import Ending, Loop, World
 

@@ -7,18 +7,26 @@ from collections.abc import Callable
 from random import Random
 from typing import TYPE_CHECKING, Any
 
-from protocol.bus import BusError
-from protocol.profile import COMMAND_FRAME, NMT_FRAME, NMT_ID, Mode, NmtCommand, ParameterCommand, channel_ids
-from protocol.tuner import Tuner, TunerError
-from service.errors import Conflict, Stopping
-from service.jobs import Jobs
-from service.request import BadLimits, RetuneRequest
-from service.states import ACTIVE, IllegalMove, JobState
-from service.store.store import Busy
+from loopwright.protocol.bus import BusError
+from loopwright.protocol.profile import (
+    COMMAND_FRAME,
+    NMT_FRAME,
+    NMT_ID,
+    Mode,
+    NmtCommand,
+    ParameterCommand,
+    channel_ids,
+)
+from loopwright.protocol.tuner import Tuner, TunerError
+from loopwright.service.errors import Conflict, Stopping
+from loopwright.service.jobs import Jobs
+from loopwright.service.request import BadLimits, RetuneRequest
+from loopwright.service.states import ACTIVE, IllegalMove, JobState
+from loopwright.service.store.store import Busy
+from loopwright.tuning.reasons import Ended, Reason
 from tests.simulation.gateway import Gateway, SimStation
 from tests.simulation.scheduler import Process
 from tests.simulation.wire import Port
-from tuning.reasons import Ended, Reason
 
 if TYPE_CHECKING:
     from tests.simulation.history import World

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from random import Random
 from typing import Any
 
-from service.computing.limits import Kind
-from service.config import LoopConfig
-from service.loop import Loop, LoopState
-from service.plain import plain_object
-from service.request import RetuneRequest
-from service.runner import Watch, run
-from service.work import Hooks, Outcome, Tune, tune
-from tuning.gains import Gains
-from tuning.plan import (
+from loopwright.service.computing.limits import Kind
+from loopwright.service.config import LoopConfig
+from loopwright.service.loop import Loop, LoopState
+from loopwright.service.plain import plain_object
+from loopwright.service.request import RetuneRequest
+from loopwright.service.runner import Watch, run
+from loopwright.service.work import Hooks, Outcome, Tune, tune
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import (
     Mode,
     Note,
     Plan,
@@ -29,7 +29,7 @@ from tuning.plan import (
     StageStarted,
     Work,
 )
-from tuning.reasons import Reason, Refused
+from loopwright.tuning.reasons import Reason, Refused
 
 PROPOSED = Gains(0.75, 8.0, 0.0, 0.0, 0.5, 0.0)
 TRIED = Gains(1.25, 4.0, 0.0, 0.0, 1.0, 0.0)

@@ -7,8 +7,8 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import Any
 
-from protocol.objects import Device, objects_of
-from protocol.profile import (
+from loopwright.protocol.objects import Device, objects_of
+from loopwright.protocol.profile import (
     CONTROLLER_NODE,
     EMCY_FRAME,
     MV_FRAME,

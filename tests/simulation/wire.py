@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
-from protocol.bus import BusError, Frame
+from loopwright.protocol.bus import BusError, Frame
 from tests.simulation.scheduler import Killed, Process, Simulation, Task
 
 FRAME_S = 0.00012

@@ -12,14 +12,14 @@ from collections.abc import Callable, Iterator, Sequence
 
 import pytest
 
-from protocol.bus import open_bus
-from protocol.profile import COMMAND_FRAME, channel_ids
-from service.bus_loop import BusLoop
-from service.loop import LoopState
-from service.runner import Watch, run
-from tuning.gains import Gains
-from tuning.plan import Mode, Plan, Sample, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
-from tuning.reasons import Ended, Failed, Reason, Refused
+from loopwright.protocol.bus import open_bus
+from loopwright.protocol.profile import COMMAND_FRAME, channel_ids
+from loopwright.service.bus_loop import BusLoop
+from loopwright.service.loop import LoopState
+from loopwright.service.runner import Watch, run
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Mode, Plan, Sample, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
+from loopwright.tuning.reasons import Ended, Failed, Reason, Refused
 
 CONTROLLER, PLANT = 0x20, 0x10
 GAINS = Gains(Kp=60.0, Ti=7.0)
@@ -67,7 +67,7 @@ def start() -> Iterator[Start]:
 @pytest.fixture(params=["vcan", "hub"])
 def url(request: pytest.FixtureRequest, start: Start) -> str:
     if request.param == "hub":
-        return str(start("protocol.hub", "--port", "0").ready)  # type: ignore[attr-defined]
+        return str(start("loopwright.protocol.hub", "--port", "0").ready)  # type: ignore[attr-defined]
     if not has_vcan():
         if os.environ.get("LOOPWRIGHT_REQUIRE_VCAN"):
             pytest.fail("no vcan0")
@@ -80,9 +80,21 @@ on_vcan = pytest.mark.parametrize("url", ["vcan"], indirect=True)
 
 def start_loop(start: Start, url: str, speed: str = "max") -> dict[str, subprocess.Popen[str]]:
     controller = start(
-        "controller", "--bus", url, "--channels", "1", "--kp", str(GAINS.Kp), "--ti", str(GAINS.Ti), "--sp", "50"
+        "loopwright.controller",
+        "--bus",
+        url,
+        "--channels",
+        "1",
+        "--kp",
+        str(GAINS.Kp),
+        "--ti",
+        str(GAINS.Ti),
+        "--sp",
+        "50",
     )
-    plant = start("plantsim", "--bus", url, "--model", "model-1", "--ts", "0.1", "--speed", speed, "--seed", "7")
+    plant = start(
+        "loopwright.plantsim", "--bus", url, "--model", "model-1", "--ts", "0.1", "--speed", speed, "--seed", "7"
+    )
     return {"controller": controller, "plant": plant}
 
 
@@ -187,9 +199,9 @@ def test_gains_are_accepted_and_stay(loop: BusLoop) -> None:
 
 TRIAL = """
 import sys
-from service.bus_loop import BusLoop
-from tuning.gains import Gains
-from tuning.plan import Mode, SetGains, SetMode, SetSetpoint
+from loopwright.service.bus_loop import BusLoop
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Mode, SetGains, SetMode, SetSetpoint
 loop = BusLoop(sys.argv[1], 0x20, 0x10)
 loop.begin()
 commands = (SetGains(Gains(80.0, 6.0)), SetSetpoint(50.5), SetMode(Mode.MANUAL))

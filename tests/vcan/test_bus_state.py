@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from protocol.bus import Bus, BusError, open_bus
-from protocol.bus_state import BusState
+from loopwright.protocol.bus import Bus, BusError, open_bus
+from loopwright.protocol.bus_state import BusState
 
 INTERFACE = "vcan0"
 

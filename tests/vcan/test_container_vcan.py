@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from containers.vcan import NoVcan, make, remove
-from service.demo import vcan_usable
+from loopwright.containers.vcan import NoVcan, make, remove
+from loopwright.service.demo import vcan_usable
 from tests.e2e.plantsite import NEEDS_VCAN
 
 pytestmark = NEEDS_VCAN

@@ -15,10 +15,10 @@ import canopen
 import pytest
 from canopen.sdo.base import SdoVariable
 
-from protocol.bus import Bus, BusError, open_bus
-from protocol.eds import FILES, FOLDER
-from protocol.objects import Device, lookup
-from protocol.profile import (
+from loopwright.protocol.bus import Bus, BusError, open_bus
+from loopwright.protocol.eds import FILES, FOLDER
+from loopwright.protocol.objects import Device, lookup
+from loopwright.protocol.profile import (
     EMCY_FRAME,
     HEARTBEAT_FRAME,
     MV_FRAME,
@@ -34,7 +34,7 @@ from protocol.profile import (
     emcy_id,
     heartbeat_id,
 )
-from protocol.session import STAGED, check_of, object_of
+from loopwright.protocol.session import STAGED, check_of, object_of
 
 INTERFACE = "vcan0"
 URL = f"socketcan:{INTERFACE}"
@@ -99,8 +99,8 @@ def listener() -> Iterator[Bus]:
 
 @pytest.fixture
 def loop(start: Start) -> None:
-    start("controller", "--kp", "200", "--ti", "12", "--sp", "50")
-    start("plantsim", "--model", "fopdt", "--ts", "0.1", "--speed", "max")
+    start("loopwright.controller", "--kp", "200", "--ti", "12", "--sp", "50")
+    start("loopwright.plantsim", "--model", "fopdt", "--ts", "0.1", "--speed", "max")
 
 
 def sdo(network: canopen.Network, name: str) -> SdoVariable:
@@ -215,8 +215,8 @@ class TestLoop:
 
 def test_each_says_when_the_other_is_gone(start: Start, network: canopen.Network, listener: Bus) -> None:
     listener.set_filters({emcy_id(PLANT), emcy_id(CONTROLLER)})
-    controller = start("controller", "--kp", "200", "--ti", "12")
-    plant = start("plantsim", "--model", "fopdt", "--speed", "max")
+    controller = start("loopwright.controller", "--kp", "200", "--ti", "12")
+    plant = start("loopwright.plantsim", "--model", "fopdt", "--speed", "max")
     wait_for(lambda: bool(network[PLANT].sdo[0x2000].raw > 100))
     controller.send_signal(signal.SIGSTOP)
     hear_emergency(listener, PLANT, Emcy.NO_ANSWER)
@@ -227,7 +227,7 @@ def test_each_says_when_the_other_is_gone(start: Start, network: canopen.Network
 
 
 def test_ends_cleanly_on_sigterm(start: Start) -> None:
-    for process in (start("controller"), start("plantsim", "--model", "reactor", "--speed", "1")):
+    for process in (start("loopwright.controller"), start("loopwright.plantsim", "--model", "reactor", "--speed", "1")):
         process.terminate()
         assert process.wait(PATIENCE_S) == 0
 

@@ -13,17 +13,17 @@ from pathlib import Path
 
 import pytest
 
-from protocol.station import Station
-from service.bus_loop import BusLoop
+from loopwright.protocol.station import Station
+from loopwright.service.bus_loop import BusLoop
+from loopwright.tuning.gains import Gains
 from tests.vcan.test_bus_loop import CONTROLLER, GAINS, PLANT, TRIED, Start, as_configured, on_vcan, start, url  # noqa: F401
-from tuning.gains import Gains
 
 HOME_WITHIN_S = 3.0
 GATEWAY = """
 import sys
-from protocol.station import Station
-from service.bus_loop import BusLoop
-from tuning.plan import Mode, SetMode, SetRelay, SetSetpoint
+from loopwright.protocol.station import Station
+from loopwright.service.bus_loop import BusLoop
+from loopwright.tuning.plan import Mode, SetMode, SetRelay, SetSetpoint
 url, node, channel = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 loop = BusLoop(url, 0x20, 0x10, channel, station=Station(node))
 loop.begin()
@@ -50,8 +50,10 @@ def gateway(url: str, node: int, channel: int) -> Iterator[subprocess.Popen[str]
 @pytest.mark.parametrize("Ts", [0.05, 1.0])
 def test_of_two_gateways_the_one_that_is_killed_leaves_its_loop_at_home(start: Start, url: str, Ts: float) -> None:  # noqa: F811
     gains = ("--kp", str(GAINS.Kp), "--ti", str(GAINS.Ti), "--sp", "50", "--ts", str(Ts))
-    start("controller", "--bus", url, "--channels", "2", *gains)
-    start("plantsim", "--bus", url, "--model", "model-1", "--model", "model-1", "--ts", str(Ts), "--speed", "1")
+    start("loopwright.controller", "--bus", url, "--channels", "2", *gains)
+    start(
+        "loopwright.plantsim", "--bus", url, "--model", "model-1", "--model", "model-1", "--ts", str(Ts), "--speed", "1"
+    )
     with gateway(url, 0x7D, 1) as one, gateway(url, 0x7C, 2):
         observer = BusLoop(url, CONTROLLER, PLANT, station=Station(0x7B))
         beside = BusLoop(url, CONTROLLER, PLANT, 2, station=Station(0x7B))
@@ -82,7 +84,7 @@ def fsync(descriptor):
     for each in folder.iterdir():
         (copy / each.name).write_bytes(contents.get(each.stat().st_ino, b""))
 os.fsync = fsync
-from controller.__main__ import main
+from loopwright.controller.__main__ import main
 sys.exit(main())
 """
 """A controller that copies, at each sync of the folder, what is on the disk by then: files that were synced."""
@@ -93,7 +95,7 @@ def test_gains_that_are_confirmed_survive_a_power_cut(start: Start, url: str, tm
     folder, synced = tmp_path / "disk", tmp_path / "synced"
     folder.mkdir()
     options = ["--bus", url, "--kp", str(GAINS.Kp), "--ti", str(GAINS.Ti), "--sp", "50", "--keep"]
-    start("plantsim", "--bus", url, "--model", "model-1", "--ts", "0.1", "--speed", "20")
+    start("loopwright.plantsim", "--bus", url, "--model", "model-1", "--ts", "0.1", "--speed", "20")
     command = [sys.executable, "-c", WATCHED, str(folder), str(synced), *options, str(folder / "kept.json")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as controller:
         loop = BusLoop(url, CONTROLLER, PLANT)
@@ -104,7 +106,7 @@ def test_gains_that_are_confirmed_survive_a_power_cut(start: Start, url: str, tm
         finally:
             controller.kill()
     shutil.rmtree(folder)
-    start("controller", *options, str(synced / "kept.json"))
+    start("loopwright.controller", *options, str(synced / "kept.json"))
     state = loop.read()
     assert state.gains == Gains(TRIED.Kp, TRIED.Ti) and (state.sp, state.on_trial) == (50.0, False)
     loop.close()

@@ -10,14 +10,14 @@ import pytest
 from benchmarks.cases import ASKED
 from benchmarks.plants import Plant, plants
 from benchmarks.tuning import cost_over_best, loop_of, span_of
-from service.bus_loop import BusLoop
-from service.runner import Watch, run
+from loopwright.service.bus_loop import BusLoop
+from loopwright.service.runner import Watch, run
+from loopwright.tuning.fast.procedure import FastOptions, fast
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins
+from loopwright.tuning.plan import Mode
+from loopwright.tuning.stages.common import Facts
 from tests.vcan.test_bus_loop import CONTROLLER, PLANT, Start, start, url  # noqa: F401
-from tuning.fast.procedure import FastOptions, fast
-from tuning.gains import Gains
-from tuning.margins import margins
-from tuning.plan import Mode
-from tuning.stages.common import Facts
 
 MODELS = (1, 2, 4, 6, 10, 12, 14, 16, 18, 20, 22, 24)
 PERCENT = 100.0
@@ -40,9 +40,13 @@ def test_the_bus_gives_what_the_rehearsal_gives(start: Start, url: str, number: 
     span = AMPLITUDE * span_of(plant)
     present = Gains(15.0 * plant.Ku, round(2.0 * plant.Pu, 3))
     kp, ti = f"{present.Kp:.6g}", f"{present.Ti:.6g}"
-    start("controller", "--bus", url, "--channels", "1", "--kp", kp, "--ti", ti, "--sp", "50", "--ts", str(Ts))
+    start(
+        "loopwright.controller", "--bus", url, "--channels", "1", "--kp", kp, "--ti", ti, "--sp", "50", "--ts", str(Ts)
+    )
     noise, speed = f"{NOISE * span:.6g}", f"{Ts / WALL_S:.6g}"
-    start("plantsim", "--bus", url, "--model", plant.name, "--ts", str(Ts), "--speed", speed, "--noise", noise)
+    start(
+        "loopwright.plantsim", "--bus", url, "--model", plant.name, "--ts", str(Ts), "--speed", speed, "--noise", noise
+    )
 
     facts = Facts(Ts, 3.0 * plant.Pu, 0.0, 100.0, 0.5 * span, present)
     loop = BusLoop(url, CONTROLLER, PLANT)

@@ -16,9 +16,9 @@ from canopen.objectdictionary import ODVariable
 from canopen.objectdictionary.datatypes import NUMBER_TYPES
 from canopen.sdo.client import BlockUploadStream
 
-from protocol.eds import FILES, FOLDER
-from protocol.objects import Device
-from protocol.profile import TUNER_NODE, Abort, Emcy, NmtState
+from loopwright.protocol.eds import FILES, FOLDER
+from loopwright.protocol.objects import Device
+from loopwright.protocol.profile import TUNER_NODE, Abort, Emcy, NmtState
 from tests.vcan.test_devices import INTERFACE, PATIENCE_S, Start, has_vcan, pytestmark, start
 
 __all__ = ["has_vcan", "pytestmark", "start"]
@@ -40,8 +40,8 @@ def network() -> Iterator[canopen.Network]:
 
 @pytest.fixture(autouse=True)
 def devices(start: Start) -> None:
-    start("controller", "--kp", "200", "--ti", "12", "--sp", "50")
-    start("plantsim", "--model", "fopdt", "--ts", "0.1", "--speed", "1")
+    start("loopwright.controller", "--kp", "200", "--ti", "12", "--sp", "50")
+    start("loopwright.plantsim", "--model", "fopdt", "--ts", "0.1", "--speed", "1")
 
 
 def entries(node: canopen.RemoteNode) -> Iterator[ODVariable]:

@@ -51,8 +51,8 @@ def vcan() -> None:
 @pytest.fixture
 def loop() -> Iterator[None]:
     started = [
-        ("controller", "--bus", f"socketcan:{INTERFACE}", "--kp", "200", "--ti", "12", "--sp", "50"),
-        ("plantsim", "--bus", f"socketcan:{INTERFACE}", "--model", "fopdt", "--ts", "0.1", "--speed", "20"),
+        ("loopwright.controller", "--bus", f"socketcan:{INTERFACE}", "--kp", "200", "--ti", "12", "--sp", "50"),
+        ("loopwright.plantsim", "--bus", f"socketcan:{INTERFACE}", "--model", "fopdt", "--ts", "0.1", "--speed", "20"),
     ]
     running = []
     for arguments in started:

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from protocol.bus import open_bus
-from protocol.profile import (
+from loopwright.protocol.bus import open_bus
+from loopwright.protocol.profile import (
     NMT_FRAME,
     NMT_ID,
     SYNC_ID,
@@ -28,10 +28,10 @@ from protocol.profile import (
     sdo_request_id,
     sdo_response_id,
 )
-from service.bus_loop import BusLoop
-from service.runner import Watch, run
-from tuning.gains import Gains
-from tuning.plan import Mode, Plan, SetGains, SetMode, SetRelay, SetSetpoint
+from loopwright.service.bus_loop import BusLoop
+from loopwright.service.runner import Watch, run
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Mode, Plan, SetGains, SetMode, SetRelay, SetSetpoint
 
 INTERFACE = "vcan0"
 URL = f"socketcan:{INTERFACE}"
@@ -132,8 +132,8 @@ def decode(file: Path) -> list[tuple[int, str, str]]:
 
 def test_wireshark_reads_a_session_as_canopen(tmp_path: Path) -> None:
     file = tmp_path / "session.pcapng"
-    controller = ("controller", "--kp", "60", "--ti", "7", "--sp", "50")
-    plant = ("plantsim", "--model", "model-1", "--ts", "0.1", "--speed", "20", "--seed", "7")
+    controller = ("loopwright.controller", "--kp", "60", "--ti", "7", "--sp", "50")
+    plant = ("loopwright.plantsim", "--model", "model-1", "--ts", "0.1", "--speed", "20", "--seed", "7")
     with captured(file), started(*controller), started(*plant):
         session()
     frames = decode(file)

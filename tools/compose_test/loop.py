@@ -11,8 +11,8 @@ TAG = "TIC-101"
 # The controller's own word, over the bus: not the service's, which is being killed.
 _LOOK = """
 import json, sys, time
-from containers import keeper
-from service.bus_loop import BusLoop
+from loopwright.containers import keeper
+from loopwright.service.bus_loop import BusLoop
 url, _ = keeper.join(5.0)
 loop = BusLoop(url, 0x20, 0x10)
 print("looking", flush=True)
@@ -24,8 +24,8 @@ for _ in range(400):
 """
 _PACE = """
 import sys
-from containers import keeper
-from protocol.tuner import Tuner
+from loopwright.containers import keeper
+from loopwright.protocol.tuner import Tuner
 url, _ = keeper.join(5.0)
 Tuner(url, 0x20, 0x10).write("plant_pace", float(sys.argv[1]))
 """

@@ -53,7 +53,7 @@ def _wrong_base() -> None:
 
 def _no_database() -> None:
     """The profile alone, without the other half of it."""
-    command = ("python", "-m", "containers.member", "--need=LOOPWRIGHT_DATABASE", "--", "true")
+    command = ("python", "-m", "loopwright.containers.member", "--need=LOOPWRIGHT_DATABASE", "--", "true")
     expect("two gateways, no database named", read_all("docker", "run", "--rm", "--network", "none", IMAGE, *command),
            "LOOPWRIGHT_DATABASE is not set")  # fmt: skip
 
@@ -61,7 +61,7 @@ def _no_database() -> None:
 def bus_says(kind: str, ready: bool, *options: str) -> str:
     """The first words of a bus container with these options, or its last if it is not to be ready."""
     name = f"{IMAGE}-bus"
-    command = ("python", "-m", "containers.bus", "--kind", kind)
+    command = ("python", "-m", "loopwright.containers.bus", "--kind", kind)
     output("docker", "run", "--detach", "--network", "none", "--name", name, *options, IMAGE, *command)
 
     def enough() -> bool:

@@ -10,11 +10,11 @@ import shutil
 from pathlib import Path
 from alembic import command
 from alembic.config import Config
-from service.store.database import FILE, sqlite
+from loopwright.service.store.database import FILE, sqlite
 for path in Path("/data").iterdir():
     shutil.rmtree(path) if path.is_dir() else path.unlink()
 config = Config()
-config.set_main_option("script_location", "service.store:migrations")
+config.set_main_option("script_location", "loopwright.service.store:migrations")
 with sqlite(Path("/data") / FILE).begin() as connection:
     config.attributes["connection"] = connection
     command.upgrade(config, "0001")

@@ -8,9 +8,9 @@ from functools import partial, reduce
 
 import numpy as np
 
-from tuning.fast.evidence import Evidence
-from tuning.record_fit import QUIET, Fit, Fitted, Hypothesis
-from tuning.stories import better, by_bic, fits, stories, under
+from loopwright.tuning.fast.evidence import Evidence
+from loopwright.tuning.record_fit import QUIET, Fit, Fitted, Hypothesis
+from loopwright.tuning.stories import better, by_bic, fits, stories, under
 
 RIVAL = 10.0
 """Of BIC: structures this near to the best could be true as well."""

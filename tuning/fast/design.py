@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize
 
-from tuning.fast.loop_cost import Cost, LoopCost
-from tuning.fast.robust_gain import encircles_not, largest_gains
-from tuning.gains import Gains
-from tuning.models import Complexes, Model, Reals, TransferFunction, sign
-from tuning.reasons import Reason, Refused
-from tuning.stability import is_stable
+from loopwright.tuning.fast.loop_cost import Cost, LoopCost
+from loopwright.tuning.fast.robust_gain import encircles_not, largest_gains
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import Complexes, Model, Reals, TransferFunction, sign
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.stability import is_stable
 
 POINTS = 440
 LOWEST, HIGHEST = 10**-2.8, 10**1.6
@@ -125,9 +125,7 @@ class Design:
         everything = [each for candidates in scanned for each in candidates]
         if not everything:
             raise Refused(Reason.NOT_ROBUST, f"no PI on the model has an Ms of at most {self.wish.Ms:g}")
-        self.least = Cost(
-            min(cost.setpoint for _, cost in everything), min(cost.load for _, cost in everything)
-        )
+        self.least = Cost(min(cost.setpoint for _, cost in everything), min(cost.load for _, cost in everything))
         best = min((self._judged(each) for each in everything), key=_value)
         step = math.log(TI[1] / TI[0])
         for _ in range(HALVINGS):

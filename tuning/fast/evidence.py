@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuning.models import Reals
-from tuning.reasons import Reason, Refused
-from tuning.record_fit import averaged
+from loopwright.tuning.models import Reals
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.record_fit import averaged
 
 LEAST_LISTENED = 60
 """Averages in which the time at rest must still be told, for noise and offset."""
@@ -43,9 +43,7 @@ class Evidence:
                 Reason.CANNOT_OSCILLATE, f"the relay switched {len(self.switches)} times; {LEAST_SWITCHES} are needed"
             )
         if self.listened < LEAST_LISTENED:
-            raise Refused(
-                Reason.BAD_INPUT, f"{self.listened} samples at rest; at least {LEAST_LISTENED} are needed"
-            )
+            raise Refused(Reason.BAD_INPUT, f"{self.listened} samples at rest; at least {LEAST_LISTENED} are needed")
         if not self.span > 0.0:
             raise Refused(Reason.NO_RESPONSE, "PV did not move at all under the relay")
 

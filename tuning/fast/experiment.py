@@ -8,13 +8,25 @@ from typing import TypeVar
 
 import numpy as np
 
-from tuning.fast.evidence import LEAST_SWITCHES, Evidence, noise_of, period
-from tuning.fast.results import Recorded
-from tuning.gains import Gains
-from tuning.plan import Command, Event, Mode, Plan, Sample, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint, Work
-from tuning.reasons import Reason, Refused
-from tuning.stages.common import Facts, OperatingPoint, Trace
-from tuning.stages.relay import no_oscillation
+from loopwright.tuning.fast.evidence import LEAST_SWITCHES, Evidence, noise_of, period
+from loopwright.tuning.fast.results import Recorded
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import (
+    Command,
+    Event,
+    Mode,
+    Plan,
+    Sample,
+    SetGains,
+    SetMode,
+    SetOutput,
+    SetRelay,
+    SetSetpoint,
+    Work,
+)
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.stages.common import Facts, OperatingPoint, Trace
+from loopwright.tuning.stages.relay import no_oscillation
 
 T = TypeVar("T")
 BIAS = 0.5

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuning.models import Model, Reals
-from tuning.recursion import recursive
-from tuning.sampled import pulses
+from loopwright.tuning.models import Model, Reals
+from loopwright.tuning.recursion import recursive
+from loopwright.tuning.sampled import pulses
 
 STEPS_PER_PERIOD = 80
 PERIODS, INTEGRAL_TIMES = 20.0, 15.0

@@ -7,20 +7,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuning.comparison import Asked, Comparison, compared, weighted_IAE, worth
-from tuning.design import Predicted, Ultimate, predicted
-from tuning.fast.design import Best, Wish
-from tuning.fast.evidence import Evidence
-from tuning.fast.spread import fit_covariance
-from tuning.fast.verdict import Judged
-from tuning.fit_spread import slopes_of
-from tuning.gains import Gains
-from tuning.margins import margins, ultimate_point
-from tuning.models import Model, Reals, TransferFunction
-from tuning.reasons import Ended, Reason, Refused
-from tuning.record_fit import Fit, Fitted
-from tuning.stages.common import Facts
-from tuning.stages.step_test import StepResult
+from loopwright.tuning.comparison import Asked, Comparison, compared, weighted_IAE, worth
+from loopwright.tuning.design import Predicted, Ultimate, predicted
+from loopwright.tuning.fast.design import Best, Wish
+from loopwright.tuning.fast.evidence import Evidence
+from loopwright.tuning.fast.spread import fit_covariance
+from loopwright.tuning.fast.verdict import Judged
+from loopwright.tuning.fit_spread import slopes_of
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins, ultimate_point
+from loopwright.tuning.models import Model, Reals, TransferFunction
+from loopwright.tuning.reasons import Ended, Reason, Refused
+from loopwright.tuning.record_fit import Fit, Fitted
+from loopwright.tuning.stages.common import Facts
+from loopwright.tuning.stages.step_test import StepResult
 
 CRITERION = "half of the set-point's and half of the load's IAE, each over the least under the bounds asked for"
 

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from tuning.models import Complexes, Reals
+from loopwright.tuning.models import Complexes, Reals
 
 HIGHEST_END, LOWEST_END = math.radians(45.0), math.radians(-225.0)
 """Phase of 1 + L at the lowest frequency, unwrapped from the highest: -90 degrees for one integrator, -180 for two."""

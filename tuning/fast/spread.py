@@ -7,12 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tuning.fast.design import controller
-from tuning.fast.evidence import Evidence
-from tuning.fit_spread import sensitivities
-from tuning.gains import Gains
-from tuning.models import Complexes, Reals, TransferFunction, sign
-from tuning.record_fit import LOG_STEP, Fit, Fitted
+from loopwright.tuning.fast.design import controller
+from loopwright.tuning.fast.evidence import Evidence
+from loopwright.tuning.fit_spread import sensitivities
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import Complexes, Reals, TransferFunction, sign
+from loopwright.tuning.record_fit import LOG_STEP, Fit, Fitted
 
 NEAR_THE_PEAK = 0.7
 """Of |S|: where it is less, an error of the model costs nothing."""

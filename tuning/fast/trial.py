@@ -5,19 +5,19 @@ from __future__ import annotations
 import math
 from functools import partial
 
-from tuning.comparison import Comparison
-from tuning.design import predicted
-from tuning.fast.design import Best, Design
-from tuning.fast.procedure import FAST, FastOptions
-from tuning.fast.results import FastProposal, FoundModel, comparison_on, delayed, ultimate
-from tuning.gains import Gains
-from tuning.models import Model, TransferFunction, sign, time_constants
-from tuning.plan import Plan, StageDone, StageStarted, worked
-from tuning.reasons import Reason, Refused
-from tuning.stages.common import Facts
-from tuning.stages.preflight import preflight
-from tuning.stages.step_test import StepResult
-from tuning.stages.verification import verification
+from loopwright.tuning.comparison import Comparison
+from loopwright.tuning.design import predicted
+from loopwright.tuning.fast.design import Best, Design
+from loopwright.tuning.fast.procedure import FAST, FastOptions
+from loopwright.tuning.fast.results import FastProposal, FoundModel, comparison_on, delayed, ultimate
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import Model, TransferFunction, sign, time_constants
+from loopwright.tuning.plan import Plan, StageDone, StageStarted, worked
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.stages.common import Facts
+from loopwright.tuning.stages.preflight import preflight
+from loopwright.tuning.stages.step_test import StepResult
+from loopwright.tuning.stages.verification import verification
 
 __all__ = ["TRIAL_STAGES", "designed_on", "trial"]
 

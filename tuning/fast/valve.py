@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tuning.fast.evidence import Evidence
-from tuning.models import Reals
-from tuning.record_fit import Fit, Fitted, Hypothesis
-from tuning.stories import EARNED
+from loopwright.tuning.fast.evidence import Evidence
+from loopwright.tuning.models import Reals
+from loopwright.tuning.record_fit import Fit, Fitted, Hypothesis
+from loopwright.tuning.stories import EARNED
 
 SIZES = (0.03, 0.06, 0.11, 0.19, 0.31)  # of MV's largest move
 LEAST_STICK = 0.04

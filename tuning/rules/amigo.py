@@ -14,9 +14,9 @@ essentially monotone step responses, any L/T. The PID's set-point weight is 0 fo
 
 from __future__ import annotations
 
-from tuning.models import FOPDT, Integrating
-from tuning.rules.common import needs_dead_time, no_lag, one_of, setting
-from tuning.setting import Setting
+from loopwright.tuning.models import FOPDT, Integrating
+from loopwright.tuning.rules.common import needs_dead_time, no_lag, one_of, setting
+from loopwright.tuning.setting import Setting
 
 CONTROLLERS = ("pi", "pid")
 

@@ -11,10 +11,10 @@ Source: K. L. Chien, J. A. Hrones, J. B. Reswick, On the automatic control of ge
 
 from __future__ import annotations
 
-from tuning.models import FOPDT
-from tuning.reasons import Reason, Refused
-from tuning.rules.common import one_of, ratio_within, setting
-from tuning.setting import Setting
+from loopwright.tuning.models import FOPDT
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.rules.common import one_of, ratio_within, setting
+from loopwright.tuning.setting import Setting
 
 CONTROLLERS = ("p", "pi", "pid")
 AIMS = ("setpoint", "load")

@@ -16,10 +16,10 @@ unstable, and refused.
 
 from __future__ import annotations
 
-from tuning.models import FOPDT
-from tuning.reasons import Reason, Refused
-from tuning.rules.common import one_of, ratio_within, refuse_unstable, setting
-from tuning.setting import Setting
+from loopwright.tuning.models import FOPDT
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.rules.common import one_of, ratio_within, refuse_unstable, setting
+from loopwright.tuning.setting import Setting
 
 CONTROLLERS = ("p", "pi", "pid")
 VARIANTS = ("original", "tau")

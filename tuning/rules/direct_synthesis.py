@@ -20,10 +20,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from tuning.models import FOPDT, SOPDT
-from tuning.reasons import Reason, Refused
-from tuning.rules.common import needs_dead_time, positive, setting
-from tuning.setting import Setting
+from loopwright.tuning.models import FOPDT, SOPDT
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.rules.common import needs_dead_time, positive, setting
+from loopwright.tuning.setting import Setting
 
 PAPER_C = 6.0 - 4.0 * math.sqrt(2.0)
 NO_OVERSHOOT_C = math.exp(-1.0)

@@ -15,10 +15,10 @@ from __future__ import annotations
 
 import math
 
-from tuning.models import FOPDT
-from tuning.reasons import Reason, Refused
-from tuning.rules.common import ratio_within, setting
-from tuning.setting import Setting
+from loopwright.tuning.models import FOPDT
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.rules.common import ratio_within, setting
+from loopwright.tuning.setting import Setting
 
 MS = (1.4, 2.0)
 RATIO = (0.1, 5.5)

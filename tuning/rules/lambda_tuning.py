@@ -11,10 +11,10 @@ refused: the loop then counts on a dead time known exactly.
 
 from __future__ import annotations
 
-from tuning.models import FOPDT, Integrating
-from tuning.reasons import Reason, Refused
-from tuning.rules.common import needs_dead_time, no_lag, positive, setting
-from tuning.setting import Setting
+from loopwright.tuning.models import FOPDT, Integrating
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.rules.common import needs_dead_time, no_lag, positive, setting
+from loopwright.tuning.setting import Setting
 
 
 def lambda_tuning(model: FOPDT | Integrating, *, lambda_s: float | None = None) -> Setting:

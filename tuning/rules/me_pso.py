@@ -15,13 +15,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tuning.complex_criterion import ComplexCriterion, Weighting
-from tuning.gains import Gains
-from tuning.margins import ultimate_point
-from tuning.models import Model, Reals
-from tuning.reasons import Reason, Refused
-from tuning.search import Cost, Found, differential_evolution, multi_epoch_swarm, nelder_mead
-from tuning.setting import Setting
+from loopwright.tuning.complex_criterion import ComplexCriterion, Weighting
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import ultimate_point
+from loopwright.tuning.models import Model, Reals
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.search import Cost, Found, differential_evolution, multi_epoch_swarm, nelder_mead
+from loopwright.tuning.setting import Setting
 
 OPTIMISERS: dict[str, Callable[[Cost, int, int], Found]] = {
     "me-pso": multi_epoch_swarm,

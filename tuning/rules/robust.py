@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from tuning.models import FOPDT
-from tuning.robust import optimise
-from tuning.rules.common import positive, ratio_within, setting
-from tuning.setting import Setting
+from loopwright.tuning.models import FOPDT
+from loopwright.tuning.robust import optimise
+from loopwright.tuning.rules.common import positive, ratio_within, setting
+from loopwright.tuning.setting import Setting
 
 RATIO = (0.02, 20.0)
 """L/T. The search takes about 0.1 s inside, and many times as long outside."""

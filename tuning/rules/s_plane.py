@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from tuning.dead_time import DeadTimeLoop
-from tuning.gains import Gains
-from tuning.models import Complexes, Model, Reals, TransferFunction
-from tuning.reasons import Reason, Refused
-from tuning.setting import Setting
-from tuning.state_space import gain_unit, normalised, time_sum
+from loopwright.tuning.dead_time import DeadTimeLoop
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import Complexes, Model, Reals, TransferFunction
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.setting import Setting
+from loopwright.tuning.state_space import gain_unit, normalised, time_sum
 
 MU = (0.01, 10.0)
 K1 = (0.01, 100.0)

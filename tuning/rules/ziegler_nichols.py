@@ -13,10 +13,18 @@ is for L/T up to 1; below 0.1 the dead time is too short to be read from a step,
 
 from __future__ import annotations
 
-from tuning.margins import ultimate_point
-from tuning.models import FOPDT, Integrating, Model, integrators
-from tuning.rules.common import needs_dead_time, one_of, positive, ratio_within, refuse_unstable, setting, stable_plant
-from tuning.setting import Setting
+from loopwright.tuning.margins import ultimate_point
+from loopwright.tuning.models import FOPDT, Integrating, Model, integrators
+from loopwright.tuning.rules.common import (
+    needs_dead_time,
+    one_of,
+    positive,
+    ratio_within,
+    refuse_unstable,
+    setting,
+    stable_plant,
+)
+from loopwright.tuning.setting import Setting
 
 CONTROLLERS = ("p", "pi", "pid")
 RATIO = (0.1, 1.0)

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.gains import Gains
-from tuning.plan import Command, Event, Mode, Plan, Sample, SetMode, SetOutput, SetSetpoint
-from tuning.reasons import Reason, Refused
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Command, Event, Mode, Plan, Sample, SetMode, SetOutput, SetSetpoint
+from loopwright.tuning.reasons import Reason, Refused
 
 Array = NDArray[np.float64]
 

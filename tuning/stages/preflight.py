@@ -10,9 +10,9 @@ import math
 
 import numpy as np
 
-from tuning.plan import Mode, Note, Plan, StageStarted
-from tuning.reasons import Reason, Refused
-from tuning.stages.common import Facts, OperatingPoint, Trace, record
+from loopwright.tuning.plan import Mode, Note, Plan, StageStarted
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.stages.common import Facts, OperatingPoint, Trace, record
 
 PREFLIGHT, SETTLE = "preflight", "settle"
 LOOKS = 4

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuning.oscillation import harmonic
-from tuning.plan import Mode, Plan, SetMode, SetRelay
-from tuning.reasons import Reason, Refused
-from tuning.stages.common import Facts, OperatingPoint, Trace, to_rest
+from loopwright.tuning.oscillation import harmonic
+from loopwright.tuning.plan import Mode, Plan, SetMode, SetRelay
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.stages.common import Facts, OperatingPoint, Trace, to_rest
 
 STEADY = 0.10
 LEAST_SAMPLES_PER_PERIOD = 22

@@ -5,10 +5,10 @@ from __future__ import annotations
 from contextlib import closing, suppress
 from typing import TypeVar
 
-from tuning.plan import Plan, StageDone, StageStarted
-from tuning.reasons import Refused
-from tuning.stages.common import Facts
-from tuning.stages.preflight import SETTLE, look
+from loopwright.tuning.plan import Plan, StageDone, StageStarted
+from loopwright.tuning.reasons import Refused
+from loopwright.tuning.stages.common import Facts
+from loopwright.tuning.stages.preflight import SETTLE, look
 
 T = TypeVar("T")
 

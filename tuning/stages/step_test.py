@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuning.gains import Gains
-from tuning.plan import Plan, SetSetpoint
-from tuning.reasons import Reason, Refused
-from tuning.stages.common import Array, Facts, OperatingPoint, Trace, same, settle
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Plan, SetSetpoint
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.stages.common import Array, Facts, OperatingPoint, Trace, same, settle
 
 
 @dataclass(frozen=True, slots=True)

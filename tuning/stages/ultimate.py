@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuning.gains import Gains
-from tuning.oscillation import Growth, fit_growth
-from tuning.plan import Mode, Note, Plan, SetGains, SetMode, SetSetpoint
-from tuning.reasons import Reason, Refused
-from tuning.stages.common import Facts, OperatingPoint, Trace, same, to_rest
-from tuning.stages.relay import RelayResult
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.oscillation import Growth, fit_growth
+from loopwright.tuning.plan import Mode, Note, Plan, SetGains, SetMode, SetSetpoint
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.stages.common import Facts, OperatingPoint, Trace, same, to_rest
+from loopwright.tuning.stages.relay import RelayResult
 
 GAP = 0.01
 EQUAL = 0.002

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-from tuning.design import Predicted
-from tuning.gains import Gains
-from tuning.plan import Mode, Plan, SetGains, SetMode, SetSetpoint
-from tuning.reasons import Reason, Refused
-from tuning.stages.common import Facts, OperatingPoint, settle
-from tuning.stages.step_test import StepResult, step_test, unlimited
-from tuning.stages.zn_pi import allowed_step
+from loopwright.tuning.design import Predicted
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Mode, Plan, SetGains, SetMode, SetSetpoint
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.stages.common import Facts, OperatingPoint, settle
+from loopwright.tuning.stages.step_test import StepResult, step_test, unlimited
+from loopwright.tuning.stages.zn_pi import allowed_step
 
 
 def verification(

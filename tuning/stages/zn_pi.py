@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tuning.gains import Gains
-from tuning.plan import Mode, Note, Plan, SetGains, SetMode, SetSetpoint
-from tuning.reasons import Reason, Refused
-from tuning.stages.common import Facts, OperatingPoint, Trace, settle
-from tuning.stages.step_test import StepResult, step_test, unlimited
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Mode, Note, Plan, SetGains, SetMode, SetSetpoint
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.stages.common import Facts, OperatingPoint, Trace, settle
+from loopwright.tuning.stages.step_test import StepResult, step_test, unlimited
 
 MOST_STEPS = 12
 KICK_OF_ROOM = 0.7

@@ -12,14 +12,14 @@ from contextlib import contextmanager
 
 import pytest
 
-from containers import keeper
-from protocol.bus import open_bus
+from loopwright.containers import keeper
+from loopwright.protocol.bus import open_bus
 
 # The kernel's answers to the first netlink message, wherever the test runs.
 RUN = """
 import os, sys
-from containers import bus, keeper, vcan
-from protocol.hub import Hub
+from loopwright.containers import bus, keeper, vcan
+from loopwright.protocol.hub import Hub
 keeper.ADDRESS = ("127.0.0.1", int(sys.argv[1]))
 bus.DOOR, bus.SERVICE = int(sys.argv[2]), int(sys.argv[3])
 bus.Hub = lambda: Hub(0)

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from service.demo import loops_yaml
-from service.store.database import FILE, migrate, sqlite
+from loopwright.service.demo import loops_yaml
+from loopwright.service.store.database import FILE, migrate, sqlite
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def serve(folder: Path, port: int = 0) -> subprocess.CompletedProcess[str]:
-    command = ["-m", "service", "serve", "--loops", f"{folder}/loops.yaml", "--data", f"{folder}/data"]
+    command = ["-m", "loopwright.service", "serve", "--loops", f"{folder}/loops.yaml", "--data", f"{folder}/data"]
     command += ["--port", str(port)]
     return subprocess.run([sys.executable, *command], capture_output=True, text=True, timeout=200, check=False)
 

@@ -9,10 +9,10 @@ from contextlib import contextmanager
 
 import pytest
 
-from containers import health
-from protocol.bus import open_bus
-from protocol.hub import Hub
-from protocol.profile import heartbeat_id
+from loopwright.containers import health
+from loopwright.protocol.bus import open_bus
+from loopwright.protocol.hub import Hub
+from loopwright.protocol.profile import heartbeat_id
 
 
 @pytest.fixture

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from containers import keeper
-from containers.member import BUS_GONE
+from loopwright.containers import keeper
+from loopwright.containers.member import BUS_GONE
 
 URL = "socketcand:127.0.0.1:1"
 RUN = """
 import sys
-from containers import keeper, member
+from loopwright.containers import keeper, member
 keeper.join.__defaults__ = (("127.0.0.1", int(sys.argv[1])),)
 member._BUS_RESTARTS_S = 0.0
 member._JOIN_S = 0.2

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 
 import pytest
 
-from controller.channel import Channel, Home, Mode, Parameters, RelayState, Settings
-from controller.session import Session
-from protocol.profile import Abort, Cause, Hand, Order
-from protocol.sdo import SdoAbort
-from protocol.session import check_of
+from loopwright.controller.channel import Channel, Home, Mode, Parameters, RelayState, Settings
+from loopwright.controller.session import Session
+from loopwright.protocol.profile import Abort, Cause, Hand, Order
+from loopwright.protocol.sdo import SdoAbort
+from loopwright.protocol.session import check_of
 
 TUNER = 0x7D
 PI, OTHER = Parameters(1.0, Ti=5.0), Parameters(4.0, Ti=1.0, b=0.25)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.channel import Channel, Home, Mode, Parameters, RelaySettings, RelayState, Settings
+from loopwright.controller.channel import Channel, Home, Mode, Parameters, RelaySettings, RelayState, Settings
 
 Ts = 0.1
 P, P2 = Parameters(3.0), Parameters(0.5)

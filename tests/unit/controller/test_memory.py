@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from controller.__main__ import main
-from controller.channel import Mode
-from controller.device import Kept
-from controller.memory import FORM, FORM_1, FileKeeper, KeptError, remembered, write
-from controller.pid import Parameters
+from loopwright.controller.__main__ import main
+from loopwright.controller.channel import Mode
+from loopwright.controller.device import Kept
+from loopwright.controller.memory import FORM, FORM_1, FileKeeper, KeptError, remembered, write
+from loopwright.controller.pid import Parameters
 
 KEPT = [
     Kept(Parameters(2.5, 10.0, 1.0, 0.1, 0.8, 0.0), Mode.MANUAL, 51.5, 40.0),

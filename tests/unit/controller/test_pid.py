@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.channel import Channel, Mode, Parameters, Settings
-from plantsim.plant import LinearPlant
+from loopwright.controller.channel import Channel, Mode, Parameters, Settings
+from loopwright.plantsim.plant import LinearPlant
 
 Ts = 0.1
 WIDE = Settings(mv_low=-1e9, mv_high=1e9, pv_low=-1e9, pv_high=1e9)

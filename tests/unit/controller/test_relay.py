@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.channel import Channel, Mode, Parameters, RelaySettings, RelayState, Settings
-from controller.relay import MAX_AVERAGED, Relay
-from plantsim.plant import LinearPlant
+from loopwright.controller.channel import Channel, Mode, Parameters, RelaySettings, RelayState, Settings
+from loopwright.controller.relay import MAX_AVERAGED, Relay
+from loopwright.plantsim.plant import LinearPlant
 
 PI = Parameters(1.0, Ti=5.0)
 PLAIN = RelaySettings(10.0, 0.0, 50.0, 1000, 0.0, 100.0)

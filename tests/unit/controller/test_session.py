@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.channel import Home, Mode, Parameters, RelayState
-from protocol.profile import Abort, Cause, Hand, Order
-from protocol.sdo import SdoAbort
-from protocol.session import check_of
+from loopwright.controller.channel import Home, Mode, Parameters, RelayState
+from loopwright.protocol.profile import Abort, Cause, Hand, Order
+from loopwright.protocol.sdo import SdoAbort
+from loopwright.protocol.session import check_of
 from tests.unit.controller.sessions import NO_NUMBERS, ORDERS, OTHER, PI, RELAY, TERMS, TRIED, TUNER, Bench
 
 EACH_ORDER = pytest.mark.parametrize("order", ORDERS, ids=lambda order: order.name.lower())

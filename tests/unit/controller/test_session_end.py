@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.channel import Channel, Mode
-from protocol.profile import Cause, Hand, Order
+from loopwright.controller.channel import Channel, Mode
+from loopwright.protocol.profile import Cause, Hand, Order
 from tests.unit.controller.sessions import (
     CAUSES,
     HOMES,

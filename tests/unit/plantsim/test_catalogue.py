@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from plantsim.catalogue import CATALOGUE, Entry, TransferFunction, find
+from loopwright.plantsim.catalogue import CATALOGUE, Entry, TransferFunction, find
 
 LINEAR = [(entry, entry.model) for entry in CATALOGUE.values() if entry.model is not None]
 BY_NAME = pytest.mark.parametrize(("entry", "model"), LINEAR, ids=[entry.name for entry, _ in LINEAR])

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from plantsim.plant import LinearPlant
+from loopwright.plantsim.plant import LinearPlant
 
 FIVE_LAGS = [1, 5, 10, 10, 5, 1]
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from controller.channel import Channel, Mode, Parameters, Settings
-from plantsim.reactor import INLET, MV_NOMINAL, STEADY_STATE, Reactor, derivative
+from loopwright.controller.channel import Channel, Mode, Parameters, Settings
+from loopwright.plantsim.reactor import INLET, MV_NOMINAL, STEADY_STATE, Reactor, derivative
 
 
 def pvs(sample_time: float, duration: float, mv: float) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Collection
 
-from protocol.bus import Frame
+from loopwright.protocol.bus import Frame
 
 
 class Clock:

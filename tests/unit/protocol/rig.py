@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from controller.channel import Settings
-from controller.device import ControllerChannel, ControllerDevice, Keeper
-from controller.pid import Parameters
-from plantsim.catalogue import find
-from plantsim.device import PlantChannel, PlantDevice
-from protocol.objects import Value, lookup
-from protocol.profile import (
+from loopwright.controller.channel import Settings
+from loopwright.controller.device import ControllerChannel, ControllerDevice, Keeper
+from loopwright.controller.pid import Parameters
+from loopwright.plantsim.catalogue import find
+from loopwright.plantsim.device import PlantChannel, PlantDevice
+from loopwright.protocol.objects import Value, lookup
+from loopwright.protocol.profile import (
     EMCY_FRAME,
     HEARTBEAT_FRAME,
     NMT_FRAME,
@@ -31,7 +31,7 @@ from protocol.profile import (
     sdo_request_id,
     sdo_response_id,
 )
-from protocol.session import STAGED, check_of, object_of
+from loopwright.protocol.session import STAGED, check_of, object_of
 from tests.unit.protocol.memory_bus import Wire
 
 PLANT, CONTROLLER = 0x10, 0x20

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 import can
 import pytest
 
-from protocol import bus as bus_module
-from protocol.bus import BusError, LibraryBus, RawBus
-from protocol.bus_state import BusState, state_after
+from loopwright.protocol import bus as bus_module
+from loopwright.protocol.bus import BusError, LibraryBus, RawBus
+from loopwright.protocol.bus_state import BusState, state_after
 
 ACTIVE, WARNING, PASSIVE, BUS_OFF = BusState
 BUSOFF, RESTARTED = 0x040, 0x100

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from protocol.profile import COMMAND_FRAME, Cause, Hand, Mode, Order, ParameterCommand
+from loopwright.protocol.profile import COMMAND_FRAME, Cause, Hand, Mode, Order, ParameterCommand
 from tests.unit.protocol.rig import IDS, KP, Rig
 
 

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import pytest
 
-from controller.device import Kept
-from protocol.objects import lookup
-from protocol.profile import (
+from loopwright.controller.device import Kept
+from loopwright.protocol.objects import lookup
+from loopwright.protocol.profile import (
     COMMAND_FRAME,
     MV_FRAME,
     PV_FRAME,
@@ -23,7 +23,7 @@ from protocol.profile import (
     channel_ids,
     emcy_id,
 )
-from protocol.session import check_of, object_of
+from loopwright.protocol.session import check_of, object_of
 from tests.unit.protocol.rig import CONTROLLER, IDS, KP, Rig
 
 TERMS = (TUNER_NODE, 100, 3000, 1000, 1000)

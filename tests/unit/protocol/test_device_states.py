@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import pytest
 
-from controller.device import Kept
-from protocol.objects import lookup
-from protocol.profile import (
+from loopwright.controller.device import Kept
+from loopwright.protocol.objects import lookup
+from loopwright.protocol.profile import (
     MV_FRAME,
     UNASKED,
     Abort,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from protocol.profile import (
+from loopwright.protocol.profile import (
     FOREVER,
     MV_FRAME,
     PV_FRAME,

@@ -8,10 +8,10 @@ from binascii import crc_hqx
 
 import pytest
 
-from protocol.dictionary import Dictionary
-from protocol.objects import Device, Value, lookup
-from protocol.profile import Abort
-from protocol.sdo import SdoAbort, SdoServer
+from loopwright.protocol.dictionary import Dictionary
+from loopwright.protocol.objects import Device, Value, lookup
+from loopwright.protocol.profile import Abort
+from loopwright.protocol.sdo import SdoAbort, SdoServer
 
 REAL = struct.Struct("<f")
 

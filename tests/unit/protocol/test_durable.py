@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from protocol.durable import put_in_place
+from loopwright.protocol.durable import put_in_place
 
 
 def test_the_file_is_synced_before_it_is_renamed_and_the_folder_after(

@@ -11,11 +11,11 @@ from pathlib import Path
 import canopen
 import pytest
 
-from protocol.dictionary import Dictionary
-from protocol.eds import FILES, FOLDER, eds
-from protocol.objects import OBJECTS, Device, Shape, Type, default_of, lookup, objects_of
-from protocol.pdos import pdo_objects
-from protocol.profile import CONTROLLER_NODE, MAX_CHANNELS, PLANT_NODE, REVISION, channel_ids
+from loopwright.protocol.dictionary import Dictionary
+from loopwright.protocol.eds import FILES, FOLDER, eds
+from loopwright.protocol.objects import OBJECTS, Device, Shape, Type, default_of, lookup, objects_of
+from loopwright.protocol.pdos import pdo_objects
+from loopwright.protocol.profile import CONTROLLER_NODE, MAX_CHANNELS, PLANT_NODE, REVISION, channel_ids
 
 NODE = {Device.PLANT: PLANT_NODE, Device.CONTROLLER: CONTROLLER_NODE}
 DEVICES = list(FILES)
@@ -89,7 +89,11 @@ def test_what_a_pdo_maps_may_be_mapped_that_way(device: Device, channels: int) -
 def test_default_pdos_are_those_of_the_profile() -> None:
     controller = {entry.index: entry for entry in pdo_objects(Device.CONTROLLER, 1)}
     assert {index: entry.defaults[0] for index, entry in controller.items() if index & 0x200 == 0} == {
-        0x1400: 0x190, 0x1401: 0x320, 0x15FF: 0x520, 0x1801: 0x400002A0, 0x1802: 0x400003A0,
+        0x1400: 0x190,
+        0x1401: 0x320,
+        0x15FF: 0x520,
+        0x1801: 0x400002A0,
+        0x1802: 0x400003A0,
     }
     assert controller[0x1A02].defaults == (0x21010108, 0x21210108, 0x64020120, 0x21380108, 0x21330108)
     plant = {entry.index: entry for entry in pdo_objects(Device.PLANT, 1)}

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 import can
 import pytest
 
-from protocol.bus import BusError, open_bus
-from protocol.hub import Hub
+from loopwright.protocol.bus import BusError, open_bus
+from loopwright.protocol.hub import Hub
 
 
 @pytest.fixture
@@ -102,7 +102,7 @@ def test_only_this_machine_can_reach_it(hub: Hub) -> None:
 
 
 def test_as_a_process_it_says_where_it_is_and_stops_when_asked() -> None:
-    command = [sys.executable, "-m", "protocol.hub", "--port", "0"]
+    command = [sys.executable, "-m", "loopwright.protocol.hub", "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as hub:
         assert hub.stdout is not None
         assert hub.stdout.readline().startswith("ready socketcand:127.0.0.1:")
@@ -133,7 +133,7 @@ def test_frames_right_behind_the_greeting_are_frames() -> None:
 
 
 def test_a_server_that_says_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("protocol.bus._GREETED_S", 0.2)
+    monkeypatch.setattr("loopwright.protocol.bus._GREETED_S", 0.2)
     with (
         socket.create_server(("127.0.0.1", 0)) as listener,  # the kernel accepts for it
         pytest.raises(BusError, match="cannot be opened: timed out"),

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from protocol.real32 import shortest
+from loopwright.protocol.real32 import shortest
 
 
 def travelled(value: float) -> float:

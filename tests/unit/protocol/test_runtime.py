@@ -6,12 +6,12 @@ import struct
 
 import pytest
 
-from plantsim.catalogue import find
-from plantsim.device import PlantChannel, PlantDevice
-from protocol.bus import BusError
-from protocol.dictionary import Dictionary
-from protocol.objects import Device, lookup
-from protocol.profile import (
+from loopwright.plantsim.catalogue import find
+from loopwright.plantsim.device import PlantChannel, PlantDevice
+from loopwright.protocol.bus import BusError
+from loopwright.protocol.dictionary import Dictionary
+from loopwright.protocol.objects import Device, lookup
+from loopwright.protocol.profile import (
     FOREVER,
     MV_FRAME,
     NMT_FRAME,
@@ -27,7 +27,7 @@ from protocol.profile import (
     sdo_request_id,
     sdo_response_id,
 )
-from protocol.runtime import Runtime
+from loopwright.protocol.runtime import Runtime
 from tests.unit.protocol.memory_bus import Wire
 
 NODE = 0x20
@@ -254,8 +254,13 @@ class TestPlant:
     def rig(self) -> Rig:
         rig = Rig()
         self.plant = PlantDevice(
-            rig.wire.open(), [PlantChannel(find("fopdt").build, noise_std=0.5)], sample_time_s=0.2, pace=0.0, run=2,
-            node=NODE, clock=rig.wire.clock,
+            rig.wire.open(),
+            [PlantChannel(find("fopdt").build, noise_std=0.5)],
+            sample_time_s=0.2,
+            pace=0.0,
+            run=2,
+            node=NODE,
+            clock=rig.wire.clock,
         )
         self.ids = channel_ids(1, NODE)
         rig.runtime = self.plant.runtime
@@ -277,8 +282,14 @@ class TestPlant:
 
     def test_reset_node_has_everything_as_at_power_on(self, rig: Rig) -> None:
         written = {
-            "plant_pace": 5.0, "plant_answer_timeout": 1, "plant_on_missing_answer": 2, "plant_safe_output": 7.0,
-            "plant_disturbance": 3.0, "plant_noise": 0.25, "plant_seed": 9, "plant_mv": 33.0,
+            "plant_pace": 5.0,
+            "plant_answer_timeout": 1,
+            "plant_on_missing_answer": 2,
+            "plant_safe_output": 7.0,
+            "plant_disturbance": 3.0,
+            "plant_noise": 0.25,
+            "plant_seed": 9,
+            "plant_mv": 33.0,
         }
         fresh = [self.plant.dictionary.read(lookup(name).index, lookup(name).count(1)) for name in written]
         self.answer(rig, 2)
@@ -330,7 +341,7 @@ def test_trouble_with_the_bus_is_said_once(
             rig.runtime.stop()
         raise BusError(troubles.pop(0))
 
-    monkeypatch.setattr("protocol.runtime._PAUSE_AFTER_BUS_ERROR_S", 0.0)
+    monkeypatch.setattr("loopwright.protocol.runtime._PAUSE_AFTER_BUS_ERROR_S", 0.0)
     monkeypatch.setattr(rig.runtime, "poll", poll)
     rig.runtime.run()
     assert capsys.readouterr().err.splitlines() == ["node 20h: bus-off", "node 20h: it is down"]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from protocol.bus import Frame
-from protocol.profile import HEARTBEAT_FRAME, TUNER_NODE, NmtState, heartbeat_id
-from protocol.station import HEARTBEAT_S, LISTEN_S, NodeTaken, Station
+from loopwright.protocol.bus import Frame
+from loopwright.protocol.profile import HEARTBEAT_FRAME, TUNER_NODE, NmtState, heartbeat_id
+from loopwright.protocol.station import HEARTBEAT_S, LISTEN_S, NodeTaken, Station
 from tests.unit.protocol.memory_bus import MemoryBus, Wire
 
 BEAT = HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL)

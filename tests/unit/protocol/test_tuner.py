@@ -8,10 +8,10 @@ from collections.abc import Callable, Collection
 
 import pytest
 
-from protocol.bus import Bus
-from protocol.dictionary import Dictionary
-from protocol.objects import Device
-from protocol.profile import (
+from loopwright.protocol.bus import Bus
+from loopwright.protocol.dictionary import Dictionary
+from loopwright.protocol.objects import Device
+from loopwright.protocol.profile import (
     MV_FRAME,
     PV_FRAME,
     STATUS_FRAME,
@@ -25,9 +25,9 @@ from protocol.profile import (
     sdo_request_id,
     sdo_response_id,
 )
-from protocol.sdo import SdoServer
-from protocol.station import HEARTBEAT_S, Station
-from protocol.tuner import Kind, Tuner, TunerError
+from loopwright.protocol.sdo import SdoServer
+from loopwright.protocol.station import HEARTBEAT_S, Station
+from loopwright.protocol.tuner import Kind, Tuner, TunerError
 
 NODE, PLANT = 0x20, 0x10
 IDS = channel_ids(1)
@@ -181,9 +181,7 @@ def test_a_restart_is_noted(tuner: Tuner, bus: ListBus) -> None:
     assert tuner.restarted
 
 
-@pytest.mark.parametrize(
-    "can_id", [IDS.pv, IDS.mv, IDS.status, heartbeat_id(NODE), sdo_response_id(NODE)]
-)
+@pytest.mark.parametrize("can_id", [IDS.pv, IDS.mv, IDS.status, heartbeat_id(NODE), sdo_response_id(NODE)])
 def test_a_frame_of_the_wrong_length_does_no_harm(tuner: Tuner, bus: ListBus, can_id: int) -> None:
     bus.incoming.append((can_id, b""))
     bus.incoming.extend(sample(3))

@@ -6,14 +6,14 @@ import itertools
 
 import pytest
 
-from controller.device import ControllerChannel, ControllerDevice
-from controller.pid import Parameters
-from protocol.bus import Frame
-from protocol.objects import BY_NAME, lookup
-from protocol.profile import CONTROLLER_NODE, Abort, Order, sdo_request_id, sdo_response_id
-from protocol.station import Station
-from protocol.tuner import Kind, Tuner, TunerError
-from protocol.tuner_session import Lease, TunerSession
+from loopwright.controller.device import ControllerChannel, ControllerDevice
+from loopwright.controller.pid import Parameters
+from loopwright.protocol.bus import Frame
+from loopwright.protocol.objects import BY_NAME, lookup
+from loopwright.protocol.profile import CONTROLLER_NODE, Abort, Order, sdo_request_id, sdo_response_id
+from loopwright.protocol.station import Station
+from loopwright.protocol.tuner import Kind, Tuner, TunerError
+from loopwright.protocol.tuner_session import Lease, TunerSession
 from tests.unit.protocol.memory_bus import MemoryBus, Wire
 
 LEASE = Lease(1000, 60_000, 60_000, 60_000)

@@ -5,7 +5,7 @@ from contextlib import suppress
 
 import pytest
 
-from protocol.turns import Turns
+from loopwright.protocol.turns import Turns
 from tests.unit.service.processes import until
 
 

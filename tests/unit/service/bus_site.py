@@ -9,14 +9,14 @@ import itertools
 import math
 from collections.abc import Callable
 
-from controller.channel import Channel, Mode, Settings
-from controller.device import ControllerChannel, ControllerDevice
-from controller.pid import Parameters
-from plantsim.catalogue import find
-from plantsim.device import PlantChannel, PlantDevice
-from protocol.bus import Frame
-from protocol.objects import BY_NAME, Device, lookup
-from protocol.profile import (
+from loopwright.controller.channel import Channel, Mode, Settings
+from loopwright.controller.device import ControllerChannel, ControllerDevice
+from loopwright.controller.pid import Parameters
+from loopwright.plantsim.catalogue import find
+from loopwright.plantsim.device import PlantChannel, PlantDevice
+from loopwright.protocol.bus import Frame
+from loopwright.protocol.objects import BY_NAME, Device, lookup
+from loopwright.protocol.profile import (
     CONTROLLER_NODE,
     FOREVER,
     HEARTBEAT_FRAME,
@@ -29,12 +29,12 @@ from protocol.profile import (
     heartbeat_id,
     sdo_request_id,
 )
-from protocol.station import Station
-from service.bus_loop import BusLoop
-from service.loop import LoopState
+from loopwright.protocol.station import Station
+from loopwright.service.bus_loop import BusLoop
+from loopwright.service.loop import LoopState
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import SetRelay
 from tests.unit.protocol.memory_bus import MemoryBus, Wire
-from tuning.gains import Gains
-from tuning.plan import SetRelay
 
 NAMES = {entry.index: name for name, entry in BY_NAME.items() if entry.device is not Device.PLANT}
 FOUND, NEW = Parameters(200.0, 12.0), Gains(150.0, 9.0)

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from tuning.reasons import Reason, Refused
+from loopwright.tuning.reasons import Reason, Refused
 
 
 def refuse() -> None:

@@ -12,18 +12,18 @@ from typing import Any
 
 import pytest
 
-from service.config import LoopConfig, parse_site
-from service.jobs import Jobs
-from service.loop import OPERATIONAL, Loop, LoopState, Restored, differences, same_gains
-from service.request import RetuneRequest
-from service.states import ACTIVE, JobState
-from service.store.store import Store
-from service.work import Hooks, Outcome, Rehearse
-from tuning.design import Predicted
-from tuning.gains import Gains
-from tuning.plan import Command, Mode, Note, Sample, SetGains, SetSetpoint, StageDone, StageStarted
-from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
-from tuning.stages.step_test import StepResult
+from loopwright.service.config import LoopConfig, parse_site
+from loopwright.service.jobs import Jobs
+from loopwright.service.loop import OPERATIONAL, Loop, LoopState, Restored, differences, same_gains
+from loopwright.service.request import RetuneRequest
+from loopwright.service.states import ACTIVE, JobState
+from loopwright.service.store.store import Store
+from loopwright.service.work import Hooks, Outcome, Rehearse
+from loopwright.tuning.design import Predicted
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Command, Mode, Note, Sample, SetGains, SetSetpoint, StageDone, StageStarted
+from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason, Refused
+from loopwright.tuning.stages.step_test import StepResult
 
 OLD, NEW = Gains(0.5, 2.0), Gains(0.75, 3.0)
 TAG = "TIC-101"

@@ -26,18 +26,18 @@ from typing import Any
 
 import yaml
 
-from protocol.station import Station
-from service.config import LoopConfig
-from service.loop import Loop, LoopState, Restored, differences
-from service.request import RetuneRequest
-from service.security.limits import RequestLimits
-from service.serving import Setup, open_bus_loop, serve
-from service.state_json import loop_state, state_json
-from service.store import store
-from service.work import Hooks, Outcome
+from loopwright.protocol.station import Station
+from loopwright.service.config import LoopConfig
+from loopwright.service.loop import Loop, LoopState, Restored, differences
+from loopwright.service.request import RetuneRequest
+from loopwright.service.security.limits import RequestLimits
+from loopwright.service.serving import Setup, open_bus_loop, serve
+from loopwright.service.state_json import loop_state, state_json
+from loopwright.service.store import store
+from loopwright.service.work import Hooks, Outcome
+from loopwright.tuning.plan import Command, Mode, Sample, SetGains, SetSetpoint, StageDone, StageStarted
+from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
 from tests.unit.service.fakes import NEW, OLD, RESULT, Found, loop_entry
-from tuning.plan import Command, Mode, Sample, SetGains, SetSetpoint, StageDone, StageStarted
-from tuning.reasons import Aborted, Ended, Failed, Reason
 
 STAGES = ("relay", "ultimate", "zn_pi", "estimate", "verify")
 HOME = LoopState(Mode.AUTOMATIC, 50.0, 50.0, 40.0, OLD, False, 0.0, 100.0, 0.1, True)

@@ -13,21 +13,21 @@ import pytest
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner
 
-from service import aftercare, cli
-from service.aftercare import EVERY_S, LONGEST_S, Aftercare
-from service.api.app import create_app
-from service.client import Client
-from service.metrics import exposition, registry
-from service.request import RetuneRequest
-from service.security import audit
-from service.state_json import state_json
-from service.store import looked_after
-from service.store.store import Store
-from service.store.tables import JobRow, LoopRow
+from loopwright.service import aftercare, cli
+from loopwright.service.aftercare import EVERY_S, LONGEST_S, Aftercare
+from loopwright.service.api.app import create_app
+from loopwright.service.client import Client
+from loopwright.service.metrics import exposition, registry
+from loopwright.service.request import RetuneRequest
+from loopwright.service.security import audit
+from loopwright.service.state_json import state_json
+from loopwright.service.store import looked_after
+from loopwright.service.store.store import Store
+from loopwright.service.store.tables import JobRow, LoopRow
+from loopwright.tuning.plan import Mode
+from loopwright.tuning.reasons import Reason
 from tests.unit.service.fakes import TAG, FakeController, Service, loop_entry
 from tests.unit.service.postgres import Server
-from tuning.plan import Mode
-from tuning.reasons import Reason
 
 HOME = FakeController().state
 STOPPED = "node 20h is pre-operational"

@@ -9,9 +9,9 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import event
 
-from service.store.store import append
+from loopwright.service.store.store import append
+from loopwright.tuning.reasons import ADVICE, Failed, Reason, Refused
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
-from tuning.reasons import ADVICE, Failed, Reason, Refused
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "openapi.json"
 

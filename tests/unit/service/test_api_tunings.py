@@ -8,20 +8,20 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from service.alternatives import alternatives
-from service.found_model import DISPROVED
-from service.model_forms import parse_model
-from service.request import PlantModel, RetuneRequest
-from service.tunings import tunings
-from service.work import rehearse
+from loopwright.service.alternatives import alternatives
+from loopwright.service.found_model import DISPROVED
+from loopwright.service.model_forms import parse_model
+from loopwright.service.request import PlantModel, RetuneRequest
+from loopwright.service.tunings import tunings
+from loopwright.service.work import rehearse
+from loopwright.tuning.design import design
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins
+from loopwright.tuning.methods import METHODS
+from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
+from loopwright.tuning.reasons import Reason, Refused
 from tests.unit.service.fakes import RESULT, TAG, FakeLoop, Service
 from tests.unit.service.test_api import assert_problem, finished, start
-from tuning.design import design
-from tuning.gains import Gains
-from tuning.margins import margins
-from tuning.methods import METHODS
-from tuning.models import FOPDT, SOPDT, TransferFunction
-from tuning.reasons import Reason, Refused
 
 FAST = [name for name, method in METHODS.items() if not method.slow]
 
@@ -127,8 +127,8 @@ def test_the_slow_method_on_request(service: Service, client: TestClient) -> Non
 def test_unstable_gains_are_not_to_be_tried(
     service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from service import tunings as module
-    from tuning.assess import assess
+    from loopwright.service import tunings as module
+    from loopwright.tuning.assess import assess
 
     # a hundred times the gains that the method found
     monkeypatch.setattr(module, "realisable", lambda gains, _filter: (Gains(100.0 * gains.Kp, gains.Ti), ()))

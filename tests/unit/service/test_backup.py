@@ -12,15 +12,15 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from service import cli
-from service.backup import BackupProblem, back_up, restore
-from service.request import RetuneRequest
-from service.security.keyring import Keyring
-from service.security.keys import Scope
-from service.states import JobState
-from service.store.store import FolderInUse, Store
+from loopwright.service import cli
+from loopwright.service.backup import BackupProblem, back_up, restore
+from loopwright.service.request import RetuneRequest
+from loopwright.service.security.keyring import Keyring
+from loopwright.service.security.keys import Scope
+from loopwright.service.states import JobState
+from loopwright.service.store.store import FolderInUse, Store
+from loopwright.tuning.plan import Sample
 from tests.unit.service.fakes import TAG, Service
-from tuning.plan import Sample
 
 
 @pytest.fixture
@@ -180,7 +180,7 @@ def test_a_back_up_of_the_first_revision_is_brought_to_the_present_one(data: Pat
 
     engine = create_engine(f"sqlite:///{tmp_path / 'old'}")
     config = Config()
-    config.set_main_option("script_location", "service.store:migrations")
+    config.set_main_option("script_location", "loopwright.service.store:migrations")
     with engine.begin() as connection:
         config.attributes["connection"] = connection
         command.upgrade(config, "0001")

@@ -10,13 +10,13 @@ import pytest
 from fastapi.routing import APIRoute
 from fastapi.testclient import TestClient
 
-from service.api.app import create_app
-from service.api.bodies import JsonRoute
-from service.jobs import Jobs
-from service.request import RetuneRequest
-from service.security.bodies import SMALL
-from service.security.places import DECIDES, kind_of
-from service.store.store import Store
+from loopwright.service.api.app import create_app
+from loopwright.service.api.bodies import JsonRoute
+from loopwright.service.jobs import Jobs
+from loopwright.service.request import RetuneRequest
+from loopwright.service.security.bodies import SMALL
+from loopwright.service.security.places import DECIDES, kind_of
+from loopwright.service.store.store import Store
 from tests.unit.service.fakes import TAG, FakeController, FakeLoop, FakeTune, Service, ThreadEngine, fake_rehearse
 from tests.unit.service.postgres import Server
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import pytest
 
-from controller.channel import Mode as ControllerMode
-from controller.device import Kept
-from controller.pid import Parameters
-from protocol.objects import Value
-from protocol.profile import (
+from loopwright.controller.channel import Mode as ControllerMode
+from loopwright.controller.device import Kept
+from loopwright.controller.pid import Parameters
+from loopwright.protocol.objects import Value
+from loopwright.protocol.profile import (
     CONTROLLER_NODE,
     EMCY_FRAME,
     HEARTBEAT_FRAME,
@@ -28,12 +28,12 @@ from protocol.profile import (
     emcy_id,
     heartbeat_id,
 )
-from protocol.tuner import RENEWAL_S, TURN_S
-from service.bus_loop import CONFIRM_S, LEASE_WALL_S, BusLoop
+from loopwright.protocol.tuner import RENEWAL_S, TURN_S
+from loopwright.service.bus_loop import CONFIRM_S, LEASE_WALL_S, BusLoop
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Command, Mode, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
+from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 from tests.unit.service.bus_site import FOUND, NEW, RELAY, Gateway, Site
-from tuning.gains import Gains
-from tuning.plan import Command, Mode, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
-from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 
 RENEWAL = "controller_session_renewal"
 

@@ -8,9 +8,9 @@ from collections.abc import Callable
 
 import pytest
 
-from controller.channel import Mode as ControllerMode
-from controller.pid import Parameters
-from protocol.profile import (
+from loopwright.controller.channel import Mode as ControllerMode
+from loopwright.controller.pid import Parameters
+from loopwright.protocol.profile import (
     CONTROLLER_NODE,
     HEARTBEAT_FRAME,
     PLANT_NODE,
@@ -21,11 +21,11 @@ from protocol.profile import (
     heartbeat_id,
     sdo_request_id,
 )
-from service.loop import Restored
+from loopwright.service.loop import Restored
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Command, Mode, SetGains, SetMode, SetOutput, SetSetpoint
+from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 from tests.unit.service.bus_site import NEW, RELAY, Killed, Site
-from tuning.gains import Gains
-from tuning.plan import Command, Mode, SetGains, SetMode, SetOutput, SetSetpoint
-from tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 
 OLD = Gains(200.0, 12.0)
 BY_HAND = ControllerMode.MANUAL

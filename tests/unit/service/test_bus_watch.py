@@ -7,9 +7,9 @@ from collections.abc import Collection
 
 import pytest
 
-from protocol.bus import BusError, Frame
-from protocol.bus_state import BusState
-from service.bus_watch import BusWatch
+from loopwright.protocol.bus import BusError, Frame
+from loopwright.protocol.bus_state import BusState
+from loopwright.service.bus_watch import BusWatch
 
 
 class Interface:

@@ -13,10 +13,10 @@ import pytest
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner, Result
 
-from service import cli
+from loopwright.service import cli
+from loopwright.tuning.plan import Mode
+from loopwright.tuning.reasons import NoGain, Reason, Refused
 from tests.unit.service.fakes import TAG, FakeLoop, Service
-from tuning.plan import Mode
-from tuning.reasons import NoGain, Reason, Refused
 
 PLANT = {"num": [1.0], "den": [8.0, 6.0, 1.0], "dead_time_s": 1.0, "noise_std": 0.002, "sample_time_s": 0.1}
 
@@ -163,10 +163,10 @@ def test_a_tag_with_a_wildcard_is_a_retune_of_many(service: Service, through: Th
 @pytest.fixture
 def rehearsed(service: Service, through: Through) -> str:
     """The id of a job that has rehearsed."""
-    from service.work import rehearse
+    from loopwright.service.work import rehearse
 
     jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
-    from service.request import PlantModel, RetuneRequest
+    from loopwright.service.request import PlantModel, RetuneRequest
 
     row = jobs.start(TAG, RetuneRequest(dry_run=True, plant=PlantModel(**PLANT)))
     service.wait(row.id, 60)

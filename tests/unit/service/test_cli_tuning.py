@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from plantsim.plant import LinearPlant
-from service.cli import app
-from tuning.methods import METHODS
-from tuning.reasons import Reason
+from loopwright.plantsim.plant import LinearPlant
+from loopwright.service.cli import app
+from loopwright.tuning.methods import METHODS
+from loopwright.tuning.reasons import Reason
 
 MODELS = {
     "lag-dominant": '{"K": 2, "T": 50, "L": 2}',
@@ -309,7 +309,7 @@ def test_tune_imports_nothing_that_it_does_not_use() -> None:
     )
     ran = subprocess.run([sys.executable, "-c", code, MODELS["balanced"]], capture_output=True, text=True, check=True)
     loaded = set(ran.stderr.split())
-    assert "tuning.methods" in loaded
+    assert "loopwright.tuning.methods" in loaded
     heavy = {"fastapi", "sqlalchemy", "matplotlib", "httpx", "can", "scipy.signal", "scipy.stats"}
     assert loaded.isdisjoint(heavy), loaded & heavy
 

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import httpx
 import pytest
 
-from service import client as client_module
-from service.client import ApiError, Client
+from loopwright.service import client as client_module
+from loopwright.service.client import ApiError, Client
 
 
 def through(

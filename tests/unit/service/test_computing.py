@@ -17,12 +17,14 @@ from typing import Any
 
 import pytest
 
-from protocol.bus import open_bus
-from protocol.hub import Hub
-from service.computing.beside import Computing
-from service.computing.limits import ComputingLimits, Kind
-from service.computing.pool import NoProcess, NotWanted, Pool
-from service.store.store import Store
+from loopwright.protocol.bus import open_bus
+from loopwright.protocol.hub import Hub
+from loopwright.service.computing.beside import Computing
+from loopwright.service.computing.limits import ComputingLimits, Kind
+from loopwright.service.computing.pool import NoProcess, NotWanted, Pool
+from loopwright.service.store.store import Store
+from loopwright.tuning.plan import Work
+from loopwright.tuning.reasons import Failed, Reason, Refused
 from tests.unit.service.computations import (
     ask_for,
     burn,
@@ -37,8 +39,6 @@ from tests.unit.service.computations import (
 )
 from tests.unit.service.fakes import FakeController, FakeLoop
 from tests.unit.service.processes import gone, until
-from tuning.plan import Work
-from tuning.reasons import Failed, Reason, Refused
 
 
 @pytest.fixture(scope="module")
@@ -94,11 +94,11 @@ class TestPool:
 
     def test_it_finds_everything_loaded(self, pool: Pool) -> None:
         wanted = {
-            "tuning.five_stage",
-            "tuning.fast.trial",
-            "service.tunings",
-            "service.alternatives",
-            "service.rehearsal",
+            "loopwright.tuning.five_stage",
+            "loopwright.tuning.fast.trial",
+            "loopwright.service.tunings",
+            "loopwright.service.alternatives",
+            "loopwright.service.rehearsal",
         }
         assert wanted <= pool.run(Kind.TUNING, modules)
 
@@ -293,8 +293,8 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
-from service.computing.limits import Kind
-from service.computing.pool import Pool
+from loopwright.service.computing.limits import Kind
+from loopwright.service.computing.pool import Pool
 from tests.unit.service.computations import burn
 pool = Pool(most=1)
 pool.submit(Kind.DRY_RUN, partial(burn, Path(sys.argv[1])))

@@ -16,19 +16,19 @@ from fastapi.testclient import TestClient
 from sqlalchemy import event, text
 from typer.testing import CliRunner
 
-from service import cli
-from service.api import operations
-from service.api.app import create_app
-from service.engine import durable
-from service.engine.durable import DurableEngine
-from service.request import RetuneRequest
-from service.states import JobState
-from service.store.damage import FileCheck, Log, read_log
-from service.store.database import FILE, BadDatabase
-from service.store.store import Store, event_of
+from loopwright.service import cli
+from loopwright.service.api import operations
+from loopwright.service.api.app import create_app
+from loopwright.service.engine import durable
+from loopwright.service.engine.durable import DurableEngine
+from loopwright.service.request import RetuneRequest
+from loopwright.service.states import JobState
+from loopwright.service.store.damage import FileCheck, Log, read_log
+from loopwright.service.store.database import FILE, BadDatabase
+from loopwright.service.store.store import Store, event_of
+from loopwright.tuning.plan import Sample
 from tests.unit.service.fakes import OLD, TAG, Service
 from tests.unit.service.processes import until
-from tuning.plan import Sample
 
 
 def overwrite(path: Path, at: int, length: int = 100) -> None:
@@ -162,7 +162,7 @@ def test_damage_that_the_start_meets_is_said_in_words(tmp_path: Path, monkeypatc
     """The check is not through yet."""
     filled(tmp_path)
     overwrite(tmp_path / FILE, (pages_of(tmp_path, "jobs")[1] - 1) * PAGE, PAGE)
-    monkeypatch.setattr("service.store.damage.FileCheck.wait", lambda *_: False)
+    monkeypatch.setattr("loopwright.service.store.damage.FileCheck.wait", lambda *_: False)
     with pytest.raises(BadDatabase, match="check-data"):
         Store(tmp_path)
 

@@ -10,14 +10,14 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy.exc import OperationalError
 
-from service.errors import Conflict
-from service.loop import LoopState
-from service.request import RetuneRequest
-from service.security import audit
-from service.states import IllegalMove, JobState
+from loopwright.service.errors import Conflict
+from loopwright.service.loop import LoopState
+from loopwright.service.request import RetuneRequest
+from loopwright.service.security import audit
+from loopwright.service.states import IllegalMove, JobState
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.fakes import NEW, OLD, TAG, FakeLoop, Service
-from tuning.gains import Gains
-from tuning.reasons import Failed, Reason
 
 Patch = pytest.MonkeyPatch
 BY_HAND = Gains(0.9, 4.0)

@@ -12,10 +12,10 @@ from typing import Any
 import httpx
 import pytest
 
-from service.processes import Process
-from service.security.keyring import Keyring
-from service.security.keys import Scope
-from service.store.store import Store
+from loopwright.service.processes import Process
+from loopwright.service.security.keyring import Keyring
+from loopwright.service.security.keys import Scope
+from loopwright.service.store.store import Store
 from tests.unit.service.fakes import TAG
 from tests.unit.service.gateway import HOME, read_loop
 
@@ -95,7 +95,7 @@ class Door:
             return None
         return found
 
-    def until(self, wanted: Callable[[], bool], patience_s: float = 60.0) -> None:
+    def until(self, wanted: Callable[[], bool], patience_s: float = 180.0) -> None:
         give_up = time.monotonic() + patience_s
         while not wanted():
             assert time.monotonic() < give_up

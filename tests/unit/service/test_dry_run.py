@@ -10,20 +10,20 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import text
 
-from service import show
-from service.api.views import JobView, job_view
-from service.found_model import DISPROVED
-from service.ground import GainsSource, Ground, LastModel, PlantSource, rehearsal_spec
-from service.metrics import exposition, registry
-from service.request import PlantModel, RetuneRequest, TransferModel
-from service.states import JobState
-from service.work import Hooks, rehearse
+from loopwright.service import show
+from loopwright.service.api.views import JobView, job_view
+from loopwright.service.found_model import DISPROVED
+from loopwright.service.ground import GainsSource, Ground, LastModel, PlantSource, rehearsal_spec
+from loopwright.service.metrics import exposition, registry
+from loopwright.service.request import PlantModel, RetuneRequest, TransferModel
+from loopwright.service.states import JobState
+from loopwright.service.work import Hooks, rehearse
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins
+from loopwright.tuning.models import FOPDT
+from loopwright.tuning.plan import Mode
+from loopwright.tuning.reasons import Reason, Refused
 from tests.unit.service.fakes import NEW, OLD, RESULT, TAG, FakeLoop, Service
-from tuning.gains import Gains
-from tuning.margins import margins
-from tuning.models import FOPDT
-from tuning.plan import Mode
-from tuning.reasons import Reason, Refused
 
 FOUND = LastModel(FOPDT(2.0, 3.0, 1.0), "4f0c", "2026-01-31T12:00:00.000Z")
 PLANT = PlantModel(num=[0.2], den=[2.4, 1.0], dead_time_s=1.8, sample_time_s=0.2)

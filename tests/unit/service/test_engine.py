@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from sqlalchemy import Engine as Database
 
-from service.engine.durable import DurableEngine
-from service.store.database import open_database
+from loopwright.service.engine.durable import DurableEngine
+from loopwright.service.store.database import open_database
 
 Make = Callable[[str], DurableEngine]
 

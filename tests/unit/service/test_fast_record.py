@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.fast_record import kept
-from service.rehearsal import rehearse
-from tuning.fast.choice import choose
-from tuning.plan import Event, Mode, Sample, StageStarted
-from tuning.record_fit import Fit
+from loopwright.service.fast_record import kept
+from loopwright.service.rehearsal import rehearse
+from loopwright.tuning.fast.choice import choose
+from loopwright.tuning.plan import Event, Mode, Sample, StageStarted
+from loopwright.tuning.record_fit import Fit
 
 SPEC = {"num": [-1.5], "den": [8.0, 1.0], "dead_time_s": 2.0, "sample_time_s": 0.1, "noise_std": 0.002, "t95_s": 26.0}
 

@@ -11,16 +11,17 @@ import pytest
 from fastapi.testclient import TestClient
 from pydantic import ValidationError
 
-from service.api.app import create_app
-from service.client import Client
-from service.config import BusConfig, parse_site
-from service.fleet import BadFleet, Fleet, FleetRequest
-from service.jobs import Jobs
-from service.request import RetuneRequest
-from service.security import audit
-from service.states import JobState
-from service.store.retunes import NoSuchRetune, Part, RetuneOver
-from service.store.store import Store
+from loopwright.service.api.app import create_app
+from loopwright.service.client import Client
+from loopwright.service.config import BusConfig, parse_site
+from loopwright.service.fleet import BadFleet, Fleet, FleetRequest
+from loopwright.service.jobs import Jobs
+from loopwright.service.request import RetuneRequest
+from loopwright.service.security import audit
+from loopwright.service.states import JobState
+from loopwright.service.store.retunes import NoSuchRetune, Part, RetuneOver
+from loopwright.service.store.store import Store
+from loopwright.tuning.reasons import Aborted, Failed, Reason, Refused
 from tests.unit.service.fakes import (
     FakeController,
     FakeLoop,
@@ -31,7 +32,6 @@ from tests.unit.service.fakes import (
     loop_entry,
 )
 from tests.unit.service.postgres import Server
-from tuning.reasons import Aborted, Failed, Reason, Refused
 
 ENTRIES = [
     loop_entry(tag=f"{area}-{n}", area=area or None, bus=f"virtual:{bus}", channel=n + 1, controller_node=node)

@@ -21,14 +21,14 @@ from fastapi.testclient import TestClient
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from service.api.app import create_app
-from service.request import RetuneRequest
-from service.security.gate import Policy
-from service.security.keyring import Keyring
-from service.security.keys import Scope
-from service.security.limits import RequestLimits
+from loopwright.service.api.app import create_app
+from loopwright.service.request import RetuneRequest
+from loopwright.service.security.gate import Policy
+from loopwright.service.security.keyring import Keyring
+from loopwright.service.security.keys import Scope
+from loopwright.service.security.limits import RequestLimits
+from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.fakes import TAG, Service
-from tuning.reasons import Failed, Reason
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")

@@ -14,22 +14,22 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy.exc import OperationalError
 
-from service.api.app import create_app
-from service.jobs import Jobs
-from service.request import RetuneRequest
-from service.security import audit
-from service.security.gate import Policy
-from service.security.keyring import Keyring
-from service.security.keys import Scope
-from service.security.limits import RequestLimits
-from service.store import claims
-from service.store.claims import Claim, StillAnswering
-from service.store.idempotency import MOST_BYTES, Answer, IdempotencyKeys, OtherRequest
-from service.store.store import Store
+from loopwright.service.api.app import create_app
+from loopwright.service.jobs import Jobs
+from loopwright.service.request import RetuneRequest
+from loopwright.service.security import audit
+from loopwright.service.security.gate import Policy
+from loopwright.service.security.keyring import Keyring
+from loopwright.service.security.keys import Scope
+from loopwright.service.security.limits import RequestLimits
+from loopwright.service.store import claims
+from loopwright.service.store.claims import Claim, StillAnswering
+from loopwright.service.store.idempotency import MOST_BYTES, Answer, IdempotencyKeys, OtherRequest
+from loopwright.service.store.store import Store
+from loopwright.tuning.reasons import Reason
 from tests.unit.service.fakes import NEW, TAG, Service, held_acceptances
 from tests.unit.service.postgres import Server
 from tests.unit.service.test_api import GOLDEN, assert_problem
-from tuning.reasons import Reason
 
 KEY = {"Idempotency-Key": "7f1c4f5e-2b8f-4a36-9f3a-5d0b3c1e8a77"}
 RETUNE = f"/loops/{TAG}/retune"
@@ -325,7 +325,7 @@ def test_a_database_that_is_away(service: Service, client: TestClient, monkeypat
 
 
 def test_a_long_answer_is_computed_again(service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.store.idempotency.MOST_BYTES", 10)
+    monkeypatch.setattr("loopwright.service.store.idempotency.MOST_BYTES", 10)
     first, again = post(client, "/tunings", MODEL), post(client, "/tunings", MODEL)
     assert first.status_code == again.status_code == 200 and first.json() == again.json()
     assert post(client, "/tunings", MODEL | {"method": "amigo"}).status_code == 200  # nothing is kept
@@ -478,7 +478,7 @@ def test_who_was_taken_over_from_makes_no_second_job(two: tuple[Store, Store], m
     """A gateway whose lock was lost for a moment is taken for gone while it is still answering."""
     here, there = (IdempotencyKeys(store) for store in two)
     first = claim(here, "a")
-    monkeypatch.setattr("service.store.lock.HostLock.free", lambda *_: True)
+    monkeypatch.setattr("loopwright.service.store.lock.HostLock.free", lambda *_: True)
     second = claim(there, "a")
     for store, held, jobs in ((two[0], first, 0), (two[1], second, 1)):
         token = claims.current.set(held)

@@ -8,21 +8,21 @@ from typing import Any
 import pytest
 from sqlalchemy.exc import OperationalError
 
-from service import jobs as jobs_module
-from service.api.results import ModelView, TransferModelView
-from service.api.views import job_view
-from service.bus_loop import RESTORE_PATIENCE_S
-from service.loop import LoopState, Restored
-from service.progress import Progress
-from service.request import RetuneRequest
-from service.security import audit
-from service.states import IllegalMove, JobState
-from service.store.store import Store
-from service.store.tables import JobRow
-from service.work import rehearse
+from loopwright.service import jobs as jobs_module
+from loopwright.service.api.results import ModelView, TransferModelView
+from loopwright.service.api.views import job_view
+from loopwright.service.bus_loop import RESTORE_PATIENCE_S
+from loopwright.service.loop import LoopState, Restored
+from loopwright.service.progress import Progress
+from loopwright.service.request import RetuneRequest
+from loopwright.service.security import audit
+from loopwright.service.states import IllegalMove, JobState
+from loopwright.service.store.store import Store
+from loopwright.service.store.tables import JobRow
+from loopwright.service.work import rehearse
+from loopwright.tuning.plan import StageStarted
+from loopwright.tuning.reasons import Reason
 from tests.unit.service.fakes import OLD, TAG, FakeLoop, Service
-from tuning.plan import StageStarted
-from tuning.reasons import Reason
 
 
 def test_stopping_ends_the_jobs_and_waits_for_their_loops(service: Service) -> None:

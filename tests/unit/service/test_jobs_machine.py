@@ -20,20 +20,20 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
 
-from service.config import LoopConfig, parse_site
-from service.errors import Conflict, Locked
-from service.jobs import Jobs
-from service.loop import Loop, LoopState
-from service.request import RetuneRequest
-from service.states import IllegalMove
-from service.store import database
-from service.store.database import FILE
-from service.store.store import Busy, Store
-from service.work import Hooks, Outcome
+from loopwright.service.config import LoopConfig, parse_site
+from loopwright.service.errors import Conflict, Locked
+from loopwright.service.jobs import Jobs
+from loopwright.service.loop import Loop, LoopState
+from loopwright.service.request import RetuneRequest
+from loopwright.service.states import IllegalMove
+from loopwright.service.store import database
+from loopwright.service.store.database import FILE
+from loopwright.service.store.store import Busy, Store
+from loopwright.service.work import Hooks, Outcome
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import SetGains, StageStarted
+from loopwright.tuning.reasons import Aborted, Ended, Failed, NoGain, Reason, Refused
 from tests.unit.service.fakes import OLD, RESULT, FakeController, FakeLoop, loop_entry
-from tuning.gains import Gains
-from tuning.plan import SetGains, StageStarted
-from tuning.reasons import Aborted, Ended, Failed, NoGain, Reason, Refused
 
 TAGS = ("TIC-101", "FIC-2")
 ENTRIES = [loop_entry(tag=tag, channel=n + 1) for n, tag in enumerate(TAGS)]

@@ -11,11 +11,11 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
-from service.journal import Journal
-from service.running import Running
-from service.store.store import Store, Write, event_of
-from service.store.tables import ChunkRow
-from tuning.plan import Sample, StageDone, StageStarted
+from loopwright.service.journal import Journal
+from loopwright.service.running import Running
+from loopwright.service.store.store import Store, Write, event_of
+from loopwright.service.store.tables import ChunkRow
+from loopwright.tuning.plan import Sample, StageDone, StageStarted
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from service.api.app import create_app
-from service.lateness import EVERY_S, Lateness, watched_event_loop
+from loopwright.service.api.app import create_app
+from loopwright.service.lateness import EVERY_S, Lateness, watched_event_loop
 from tests.unit.service.fakes import Service
 
 HELD_S = 0.3

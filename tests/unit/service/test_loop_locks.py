@@ -16,24 +16,25 @@ from rich.console import Console
 from sqlalchemy.orm import Session
 from typer.testing import CliRunner
 
-from service import cli, show
-from service.api.app import create_app
-from service.backup import back_up, restore
-from service.client import Client
-from service.config import parse_site
-from service.errors import Locked, UnknownLoop
-from service.fleet import Fleet, FleetRequest
-from service.jobs import Jobs
-from service.loop import LoopState
-from service.request import RetuneRequest
-from service.security import audit
-from service.security.gate import Policy
-from service.security.keyring import Keyring
-from service.security.keys import Scope
-from service.state_json import state_json
-from service.states import JobState
-from service.store import loop_locks
-from service.store.store import Busy, Store
+from loopwright.service import cli, show
+from loopwright.service.api.app import create_app
+from loopwright.service.backup import back_up, restore
+from loopwright.service.client import Client
+from loopwright.service.config import parse_site
+from loopwright.service.errors import Locked, UnknownLoop
+from loopwright.service.fleet import Fleet, FleetRequest
+from loopwright.service.jobs import Jobs
+from loopwright.service.loop import LoopState
+from loopwright.service.request import RetuneRequest
+from loopwright.service.security import audit
+from loopwright.service.security.gate import Policy
+from loopwright.service.security.keyring import Keyring
+from loopwright.service.security.keys import Scope
+from loopwright.service.state_json import state_json
+from loopwright.service.states import JobState
+from loopwright.service.store import loop_locks
+from loopwright.service.store.store import Busy, Store
+from loopwright.tuning.reasons import Reason
 from tests.unit.service.fakes import (
     NEW,
     OLD,
@@ -52,7 +53,6 @@ from tests.unit.service.test_api import assert_problem
 from tests.unit.service.test_decisions import begun, proposed
 from tests.unit.service.test_fleet import Deaf, idle_jobs
 from tests.unit.service.test_jobs_machine import HandEngine
-from tuning.reasons import Reason
 
 WHY = "valve is being overhauled"
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.model_forms import BadModel, describe, dump_model, parse_model
-from tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
+from loopwright.service.model_forms import BadModel, describe, dump_model, parse_model
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 
 FORMS: list[tuple[dict[str, Any], Model]] = [
     ({"K": 2, "T": 10, "L": 3}, FOPDT(2.0, 10.0, 3.0)),

@@ -15,17 +15,17 @@ from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
 from sqlalchemy.exc import OperationalError
 
-from protocol.tuner import Kind, Tuner, TunerError, sdo_retries
-from service.api import operations
-from service.api.app import create_app
-from service.api.operations import Readiness
-from service.bus_watch import BusWatch
-from service.logs import JsonLines, about
-from service.metrics import SAMPLES_LOST
-from service.serving import listen, tell_systemd
+from loopwright.protocol.tuner import Kind, Tuner, TunerError, sdo_retries
+from loopwright.service.api import operations
+from loopwright.service.api.app import create_app
+from loopwright.service.api.operations import Readiness
+from loopwright.service.bus_watch import BusWatch
+from loopwright.service.logs import JsonLines, about
+from loopwright.service.metrics import SAMPLES_LOST
+from loopwright.service.serving import listen, tell_systemd
+from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.fakes import TAG, Service
 from tests.unit.service.test_api import finished, start
-from tuning.reasons import Failed, Reason
 
 
 def test_alive(client: TestClient) -> None:
@@ -212,14 +212,16 @@ def test_lines_of_a_job_carry_job_and_loop(
         bad = finished(service, client)["id"]
     finally:
         logging.getLogger().removeHandler(keep)
-    told = [(x["message"].partition(",")[0], x["job"], x["loop"]) for x in lines if x["logger"] == "service.jobs"]
+    told = [
+        (x["message"].partition(",")[0], x["job"], x["loop"]) for x in lines if x["logger"] == "loopwright.service.jobs"
+    ]
     assert told == [
         ("job started", job, TAG), ("job proposes new gains", job, TAG),
         ("job started", bad, TAG), ("a defect in the job", bad, TAG), ("job failed", bad, TAG),
     ]  # fmt: skip
     (failure,) = [x for x in lines if "exception" in x]
     assert "ValueError: a defect" in failure["exception"] and failure["level"] == "error"
-    (asked, _) = [x for x in lines if x["logger"] == "service.api.access" and x["method"] == "POST"]
+    (asked, _) = [x for x in lines if x["logger"] == "loopwright.service.api.access" and x["method"] == "POST"]
     assert (asked["loop"], asked["status"], asked["who"]) == (TAG, 202, "local")
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z", asked["at"])
 

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from benchmarks.plants import plants
-from service.config import ConfigError, parse_site
-from service.model_forms import BadModel, dump_model, parse_model
-from service.plausible import Implausible, check_model, check_sampling
-from service.rehearsal import rehearse
-from service.request import BadLimits, RetuneRequest, within
-from service.tunings import BadTuning, tune_model
+from loopwright.service.config import ConfigError, parse_site
+from loopwright.service.model_forms import BadModel, dump_model, parse_model
+from loopwright.service.plausible import Implausible, check_model, check_sampling
+from loopwright.service.rehearsal import rehearse
+from loopwright.service.request import BadLimits, RetuneRequest, within
+from loopwright.service.tunings import BadTuning, tune_model
 from tests.unit.service.fakes import TAG, Service, loop_entry
 from validation.references import References, load
 

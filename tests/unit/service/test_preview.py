@@ -8,19 +8,19 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from service.config import LoopConfig
-from service.loop import LoopState
-from service.moves import broken_limits
-from service.obstacles import Now
-from service.preview import LastProposal, Preview, duration_text, preview
-from service.request import RetuneRequest, within
-from service.security.gate import scope_for
-from service.security.keys import Scope
-from service.store.store import Store
-from service.work import Hooks, tune
+from loopwright.service.config import LoopConfig
+from loopwright.service.loop import LoopState
+from loopwright.service.moves import broken_limits
+from loopwright.service.obstacles import Now
+from loopwright.service.preview import LastProposal, Preview, duration_text, preview
+from loopwright.service.request import RetuneRequest, within
+from loopwright.service.security.gate import scope_for
+from loopwright.service.security.keys import Scope
+from loopwright.service.store.store import Store
+from loopwright.service.work import Hooks, tune
+from loopwright.tuning.plan import Mode
+from loopwright.tuning.reasons import Failed, Reason, Refused
 from tests.unit.service.fakes import RESULT, TAG, FakeController, FakeLoop, Service, loop_entry
-from tuning.plan import Mode
-from tuning.reasons import Failed, Reason, Refused
 
 STATE = FakeController().state
 NARROW = {"pv_limits": {"low": 49.0, "high": 53.0}}

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.record import RecordError, load_record, parse_record
+from loopwright.service.record import RecordError, load_record, parse_record
+from loopwright.tuning.identify import identify
+from loopwright.tuning.models import FOPDT
 from tests.unit.tuning.recordings import FIRST_ORDER, open_loop, step
-from tuning.identify import identify
-from tuning.models import FOPDT
 
 
 def values(column: np.ndarray | None) -> list[float]:

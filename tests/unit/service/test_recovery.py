@@ -12,16 +12,19 @@ import pytest
 from sqlalchemy import inspect, text
 from sqlalchemy.exc import OperationalError
 
-from service.config import parse_site
-from service.engine import WORKFLOW_VERSION
-from service.jobs import Jobs
-from service.loop import LoopState
-from service.recovery import MOST_ATTEMPTS
-from service.request import RetuneRequest
-from service.state_json import state_json
-from service.states import IllegalMove, JobState
-from service.store.store import Store
-from service.store.tables import JobRow
+from loopwright.service.config import parse_site
+from loopwright.service.engine import WORKFLOW_VERSION
+from loopwright.service.jobs import Jobs
+from loopwright.service.loop import LoopState
+from loopwright.service.recovery import MOST_ATTEMPTS
+from loopwright.service.request import RetuneRequest
+from loopwright.service.state_json import state_json
+from loopwright.service.states import IllegalMove, JobState
+from loopwright.service.store.store import Store
+from loopwright.service.store.tables import JobRow
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Mode
+from loopwright.tuning.reasons import Reason
 from tests.unit.service.fakes import (
     NEW,
     OLD,
@@ -35,9 +38,6 @@ from tests.unit.service.fakes import (
     loop_entry,
 )
 from tests.unit.service.test_store import migrate
-from tuning.gains import Gains
-from tuning.plan import Mode
-from tuning.reasons import Reason
 
 HOME = FakeController().state
 ON_TRIAL = replace(HOME, gains=NEW, on_trial=True, sp=52.0)

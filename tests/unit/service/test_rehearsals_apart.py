@@ -10,18 +10,18 @@ from pathlib import Path
 
 import pytest
 
-from service.computing.limits import ComputingLimits
-from service.computing.pool import Pool
-from service.computing.rehearsals import apart
-from service.config import LoopConfig, parse_site
-from service.request import RetuneRequest
-from service.runner import Watch, run
-from service.states import JobState
-from service.work import Hooks, Outcome, rehearse
+from loopwright.service.computing.limits import ComputingLimits
+from loopwright.service.computing.pool import Pool
+from loopwright.service.computing.rehearsals import apart
+from loopwright.service.config import LoopConfig, parse_site
+from loopwright.service.request import RetuneRequest
+from loopwright.service.runner import Watch, run
+from loopwright.service.states import JobState
+from loopwright.service.work import Hooks, Outcome, rehearse
+from loopwright.tuning.plan import Event, Mode, Plan, Sample, StageStarted
+from loopwright.tuning.reasons import Aborted, Failed, Reason
 from tests.unit.service.fakes import TAG, FakeController, FakeLoop, Service, loop_entry
 from tests.unit.service.processes import until
-from tuning.plan import Event, Mode, Plan, Sample, StageStarted
-from tuning.reasons import Aborted, Failed, Reason
 
 CONFIG = parse_site({"loops": [loop_entry()]}, "test").loops[TAG]
 ASKED = RetuneRequest(dry_run=True)

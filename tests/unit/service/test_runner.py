@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from controller.channel import Channel, Settings
-from controller.pid import Parameters
-from plantsim.plant import LinearPlant
-from service.loop import LoopState, Restored, differences
-from service.rehearsal import RehearsedLoop
-from service.runner import RunResult, Watch, run
-from tuning.gains import Gains
-from tuning.plan import (
+from loopwright.controller.channel import Channel, Settings
+from loopwright.controller.pid import Parameters
+from loopwright.plantsim.plant import LinearPlant
+from loopwright.service.loop import LoopState, Restored, differences
+from loopwright.service.rehearsal import RehearsedLoop
+from loopwright.service.runner import RunResult, Watch, run
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import (
     Command,
     Event,
     Mode,
@@ -34,7 +34,7 @@ from tuning.plan import (
     Work,
     worked,
 )
-from tuning.reasons import Aborted, Failed, Reason, Refused
+from loopwright.tuning.reasons import Aborted, Failed, Reason, Refused
 
 TS = 0.1
 OLD = Gains(Kp=0.15, Ti=5.0)

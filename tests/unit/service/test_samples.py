@@ -21,13 +21,13 @@ from hypothesis import strategies as st
 from sqlalchemy import delete
 from sqlalchemy.pool import QueuePool
 
-from service.api.app import create_app
-from service.api.samples import Gone, Reading, csv_text, json_text, parts, record_columns, takes_gzip
-from service.store import chunks
-from service.store.store import Store
-from service.store.tables import ChunkRow
+from loopwright.service.api.app import create_app
+from loopwright.service.api.samples import Gone, Reading, csv_text, json_text, parts, record_columns, takes_gzip
+from loopwright.service.store import chunks
+from loopwright.service.store.store import Store
+from loopwright.service.store.tables import ChunkRow
+from loopwright.tuning.plan import Sample
 from tests.unit.service.fakes import TAG, Service
-from tuning.plan import Sample
 
 TS = 0.1
 LONG = 4096

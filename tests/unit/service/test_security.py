@@ -17,22 +17,22 @@ from sqlalchemy import update
 from sqlalchemy.exc import OperationalError
 from typer.testing import CliRunner
 
-from service import cli
-from service.api.app import create_app
-from service.logs import JsonLines, Lines
-from service.request import RetuneRequest
-from service.security import audit
-from service.security.gate import Policy, is_loopback
-from service.security.keyring import REVOKED_WITHIN_S, KeyProblem, Keyring
-from service.security.keys import Scope, hash_key, matches, new_key
-from service.security.limits import Buckets, RequestLimits
-from service.security.tables import KeyRow
-from service.serving import NotSafe, Setup, serve
-from service.store.store import Store
+from loopwright.service import cli
+from loopwright.service.api.app import create_app
+from loopwright.service.logs import JsonLines, Lines
+from loopwright.service.request import RetuneRequest
+from loopwright.service.security import audit
+from loopwright.service.security.gate import Policy, is_loopback
+from loopwright.service.security.keyring import REVOKED_WITHIN_S, KeyProblem, Keyring
+from loopwright.service.security.keys import Scope, hash_key, matches, new_key
+from loopwright.service.security.limits import Buckets, RequestLimits
+from loopwright.service.security.tables import KeyRow
+from loopwright.service.serving import NotSafe, Setup, serve
+from loopwright.service.store.store import Store
+from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
 from tests.unit.service.postgres import Server
 from tests.unit.service.test_api import assert_problem
-from tuning.reasons import Failed, Reason
 
 Open = Callable[..., TestClient]
 
@@ -356,11 +356,11 @@ def test_no_key_gets_into_a_log(
     client = open_client(keyring, key=key)
     client.post(f"/loops/{TAG}/retune?key={key}", json={"requested_by": key})
     client.get(f"/jobs/{key}")
-    logging.getLogger("service").error("somebody typed %s", key)
+    logging.getLogger("loopwright.service").error("somebody typed %s", key)
     try:
         raise ValueError(key)
     except ValueError:
-        logging.getLogger("service").exception("and here")
+        logging.getLogger("loopwright.service").exception("and here")
     secret = secret_of(key)
     assert any(secret in record.getMessage() for record in caplog.records)  # else nothing would be proved
     for formatter in (JsonLines(), Lines()):
@@ -425,7 +425,7 @@ def test_serve_refuses_what_is_not_safe(tmp_path: Path, bind: str, auth: bool | 
 def test_a_stream_ends_with_the_key_that_it_was_opened_with(
     service: Service, open_client: Open, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    monkeypatch.setattr("service.api.stream.REVOKED_WITHIN_S", 0.05)
+    monkeypatch.setattr("loopwright.service.api.stream.REVOKED_WITHIN_S", 0.05)
     asked = threading.Event()
 
     class Watched(Keyring):

@@ -19,7 +19,7 @@ import httpx
 import pytest
 import yaml
 
-from protocol.hub import Hub
+from loopwright.protocol.hub import Hub
 from tests.unit.service.fakes import TAG, loop_entry
 from tests.unit.service.processes import descendants, gone, until
 
@@ -52,7 +52,7 @@ class Served:
 
     def start(self) -> None:
         where = ["--loops", str(self._loops), "--data", str(self.data), "--port", str(self.port)]
-        command = [sys.executable, "-m", "service", "serve", *where, *self._more]
+        command = [sys.executable, "-m", "loopwright.service", "serve", *where, *self._more]
         with self._log.open("a") as log:
             self.process = subprocess.Popen(
                 command, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True
@@ -188,9 +188,9 @@ def test_what_costs_too_much_is_refused_by_name(tmp_path: Path, stack: ExitStack
 FAILING = """
 import multiprocessing, socket, sys
 from pathlib import Path
-from service.serving import Setup, serve
-from service.store.lock import FolderInUse
-from service.store.store import Store
+from loopwright.service.serving import Setup, serve
+from loopwright.service.store.lock import FolderInUse
+from loopwright.service.store.store import Store
 loops, data = Path(sys.argv[1]), Path(sys.argv[2])
 taken = socket.create_server(("127.0.0.1", 0))
 port = taken.getsockname()[1]
@@ -222,7 +222,7 @@ def test_a_port_that_is_taken_is_all_that_is_said(tmp_path: Path) -> None:
         port = taken.getsockname()[1]
         where = ["--loops", str(tmp_path / "loops.yaml"), "--data", str(tmp_path / "data"), "--port", str(port)]
         ended = subprocess.run(
-            [sys.executable, "-m", "service", "serve", *where], text=True, capture_output=True, timeout=250
+            [sys.executable, "-m", "loopwright.service", "serve", *where], text=True, capture_output=True, timeout=250
         )
     assert (ended.returncode, ended.stdout) == (2, "")
     assert len(ended.stderr.splitlines()) == 1 and f"127.0.0.1:{port}" in ended.stderr

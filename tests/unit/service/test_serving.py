@@ -8,11 +8,11 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from protocol.profile import TUNER_NODE
-from service import serving
-from service.cli import app
-from service.jobs import Jobs
-from service.store.store import FolderInUse
+from loopwright.protocol.profile import TUNER_NODE
+from loopwright.service import serving
+from loopwright.service.cli import app
+from loopwright.service.jobs import Jobs
+from loopwright.service.store.store import FolderInUse
 from tests.unit.service.fakes import FakeTune, loop_entry
 
 
@@ -74,7 +74,7 @@ def test_when_the_jobs_begin_all_is_loaded_and_no_collection_looks_through_it(
     try:
         with pytest.raises(FolderInUse, match="enough"):
             serving.serve(serving.Setup(loops, tmp_path / "data", "127.0.0.1", 0), tune=FakeTune())
-        assert kept[0] - before > 10_000 and "tuning.five_stage" in sys.modules
+        assert kept[0] - before > 10_000 and "loopwright.tuning.five_stage" in sys.modules
     finally:
         gc.unfreeze()
 

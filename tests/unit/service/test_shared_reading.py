@@ -7,8 +7,8 @@ from contextvars import copy_context
 
 import pytest
 
-from service.shared_reading import SharedReading, asked_at
-from tuning.reasons import Ended, Failed, Reason
+from loopwright.service.shared_reading import SharedReading, asked_at
+from loopwright.tuning.reasons import Ended, Failed, Reason
 
 PATIENCE_S = 60.0
 

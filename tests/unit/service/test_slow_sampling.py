@@ -10,16 +10,16 @@ from functools import partial
 
 from fastapi.testclient import TestClient
 
-from controller.channel import Mode, Settings
-from controller.device import ControllerChannel, ControllerDevice
-from plantsim.catalogue import find
-from plantsim.device import PlantChannel, PlantDevice
-from protocol.bus import open_bus
-from protocol.station import Station
-from service.api.app import create_app
-from service.jobs import Jobs
-from service.serving import open_bus_loop
-from service.work import tune
+from loopwright.controller.channel import Mode, Settings
+from loopwright.controller.device import ControllerChannel, ControllerDevice
+from loopwright.plantsim.catalogue import find
+from loopwright.plantsim.device import PlantChannel, PlantDevice
+from loopwright.protocol.bus import open_bus
+from loopwright.protocol.station import Station
+from loopwright.service.api.app import create_app
+from loopwright.service.jobs import Jobs
+from loopwright.service.serving import open_bus_loop
+from loopwright.service.work import tune
 from tests.unit.service.bus_site import FOUND
 from tests.unit.service.fakes import TAG, Service, ThreadEngine, fake_rehearse
 

@@ -16,12 +16,12 @@ from pathlib import Path
 import pytest
 from sqlalchemy import create_engine, select
 
-from service.engine import WORKFLOW_VERSION
-from service.state_json import state_json
-from service.states import JobState
-from service.store.database import FILE
-from service.store.store import Store
-from service.store.tables import JobRow
+from loopwright.service.engine import WORKFLOW_VERSION
+from loopwright.service.state_json import state_json
+from loopwright.service.states import JobState
+from loopwright.service.store.database import FILE
+from loopwright.service.store.store import Store
+from loopwright.service.store.tables import JobRow
 from tests.unit.service.fakes import NEW, TAG
 from tests.unit.service.gateway import HOME, STAGES, main, read_loop, write_loop
 

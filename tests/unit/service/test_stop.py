@@ -16,12 +16,12 @@ import pytest
 import yaml
 from sqlalchemy import text
 
-from service import serving
-from service.engine.durable import FILE as ENGINE_FILE
-from service.signals import Signals
-from service.store.database import FILE
-from service.store.lock import FolderLock
-from service.store.store import Store
+from loopwright.service import serving
+from loopwright.service.engine.durable import FILE as ENGINE_FILE
+from loopwright.service.signals import Signals
+from loopwright.service.store.database import FILE
+from loopwright.service.store.lock import FolderLock
+from loopwright.service.store.store import Store
 from tests.unit.service.fakes import NEW, TAG, loop_entry
 from tests.unit.service.gateway import HOME, read_loop
 from tests.unit.service.processes import until
@@ -213,7 +213,7 @@ def test_a_start_that_fails_is_one_sentence_and_leaves_nothing(
 ) -> None:
     data = tmp_path / "data"
     place = [f"--loops={loops_in(tmp_path)}", f"--data={data}", "--port=0"]
-    command = [sys.executable, "-m", "service", "serve", *place, *given(data, stack)]
+    command = [sys.executable, "-m", "loopwright.service", "serve", *place, *given(data, stack)]
     with (tmp_path / "errors").open("w") as errors:
         process = subprocess.Popen(command, cwd=ROOT, stderr=errors, start_new_session=True)
         assert process.wait(120) == 2

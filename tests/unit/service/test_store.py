@@ -13,13 +13,13 @@ from alembic.migration import MigrationContext
 from sqlalchemy import Connection, inspect, text
 from sqlalchemy.exc import IntegrityError
 
-from service.states import MOVES, IllegalMove, JobState, check
-from service.store import lock
-from service.store.database import USUAL, BadDatabase, urgent
-from service.store.store import Busy, FolderInUse, ForeignLoop, NoSuchJob, Store
-from service.store.tables import Base
+from loopwright.service.states import MOVES, IllegalMove, JobState, check
+from loopwright.service.store import lock
+from loopwright.service.store.database import USUAL, BadDatabase, urgent
+from loopwright.service.store.store import Busy, FolderInUse, ForeignLoop, NoSuchJob, Store
+from loopwright.service.store.tables import Base
+from loopwright.tuning.plan import Sample
 from tests.unit.service.postgres import Server
-from tuning.plan import Sample
 
 
 def test_migrations_make_the_tables_of_the_code(store: Store) -> None:
@@ -30,7 +30,7 @@ def test_migrations_make_the_tables_of_the_code(store: Store) -> None:
 
 def migrate(connection: Connection, revision: str) -> None:
     config = Config()
-    config.set_main_option("script_location", "service.store:migrations")
+    config.set_main_option("script_location", "loopwright.service.store:migrations")
     config.attributes["connection"] = connection
     (command.upgrade if revision == "head" else command.downgrade)(config, revision)
 

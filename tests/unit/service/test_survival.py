@@ -16,9 +16,9 @@ import pytest
 from sqlalchemy import create_engine, select
 from sqlalchemy.orm import Session
 
-from service.processes import NotReady, Process
-from service.store.database import WAIT_S
-from service.store.tables import EventRow
+from loopwright.service.processes import NotReady, Process
+from loopwright.service.store.database import WAIT_S
+from loopwright.service.store.tables import EventRow
 from tests.unit.service.fakes import NEW, OLD, TAG
 from tests.unit.service.gateway import HOME, STAGES, read_loop
 from tests.unit.service.postgres import Server

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from sqlalchemy.exc import OperationalError
 
-from service import watchdog
-from service.processes import Process
-from service.watchdog import Watchdog, interval_s
+from loopwright.service import watchdog
+from loopwright.service.processes import Process
+from loopwright.service.watchdog import Watchdog, interval_s
 from tests.unit.service.fakes import TAG, Service
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.gains import Gains
+from loopwright.tuning.gains import Gains
 
 
 def response(gains: Gains, s: NDArray[np.complex128]) -> NDArray[np.complex128]:

@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import Complexes, Model, Reals, sign
 from tests.unit.tuning.isa import response
-from tuning.gains import Gains
-from tuning.models import Complexes, Model, Reals, sign
 
 
 def error_squares(model: Model, gains: Gains, low: float, high: float) -> tuple[float, float]:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.channel import Channel, Mode, Parameters, RelaySettings, Settings
-from plantsim.plant import LinearPlant
+from loopwright.controller.channel import Channel, Mode, Parameters, RelaySettings, Settings
+from loopwright.plantsim.plant import LinearPlant
 
 Reals = NDArray[np.float64]
 MV, PV, FIRST_MOVE = 30.0, 50.0, 50

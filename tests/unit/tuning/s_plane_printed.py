@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tuning.models import Reals
+from loopwright.tuning.models import Reals
 
 
 def first_order(k: float, T: float, alpha: float, mu: float) -> tuple[float, float]:

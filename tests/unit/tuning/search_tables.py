@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from loopwright.tuning.models import TransferFunction
 from tests.unit.tuning.tables import ROOT
-from tuning.models import TransferFunction
 
 TABLES: dict[str, Any] = json.loads((ROOT / "tests/data/s-plane-me-pso-tables.json").read_text(encoding="utf-8"))
 S_PLANE: dict[str, Any] = TABLES["paper_a"]

@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tuning.gains import Gains
-from tuning.models import FOPDT, TransferFunction
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import FOPDT, TransferFunction
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from loopwright.tuning.assess import assess
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import ultimate_point
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.response import step_figures, step_response
 from tests.unit.tuning.tables import MODELS as TABLE_MODELS
 from tests.unit.tuning.tables import ROOT, transfer_function
-from tuning.assess import assess
-from tuning.gains import Gains
-from tuning.margins import ultimate_point
-from tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
-from tuning.reasons import Reason, Refused
-from tuning.response import step_figures, step_response
 
 LOOPS: dict[str, Any] = json.loads((ROOT / "tests/data/loops-recomputed.json").read_text(encoding="utf-8"))
 

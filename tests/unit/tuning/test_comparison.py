@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import pytest
 
-from tuning.comparison import Asked, Comparison, Worth, compared, weighted_IAE, worth
-from tuning.design import comparison_of, design
-from tuning.fast.procedure import FastOptions
-from tuning.fast.results import comparison_on
-from tuning.fast.trial import designed_on
-from tuning.gains import Gains
-from tuning.margins import margins, ultimate_point
-from tuning.models import FOPDT, Integrating, Model
-from tuning.response import step_figures
-from tuning.stages.common import Facts
+from loopwright.tuning.comparison import Asked, Comparison, Worth, compared, weighted_IAE, worth
+from loopwright.tuning.design import comparison_of, design
+from loopwright.tuning.fast.procedure import FastOptions
+from loopwright.tuning.fast.results import comparison_on
+from loopwright.tuning.fast.trial import designed_on
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins, ultimate_point
+from loopwright.tuning.models import FOPDT, Integrating, Model
+from loopwright.tuning.response import step_figures
+from loopwright.tuning.stages.common import Facts
 
 PLANT = FOPDT(2.0, 6.0, 1.5)
 SAMPLE_S = 0.1

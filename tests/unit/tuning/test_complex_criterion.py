@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from loopwright.tuning.complex_criterion import DIVERGED, ComplexCriterion, Weighting
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, Reals, TransferFunction
+from loopwright.tuning.reasons import Refused
+from loopwright.tuning.response import step_response
 from tests.unit.tuning.search_tables import HORIZON_S, ME_PSO, PLANTS
-from tuning.complex_criterion import DIVERGED, ComplexCriterion, Weighting
-from tuning.gains import Gains
-from tuning.margins import margins
-from tuning.models import FOPDT, SOPDT, Integrating, Model, Reals, TransferFunction
-from tuning.reasons import Refused
-from tuning.response import step_response
 
 RECOMPUTED: dict[str, dict[str, Any]] = ME_PSO["recomputed"]["table4_at_printed_settings"]
 PRINTED: dict[str, dict[str, Any]] = ME_PSO["printed"]["table4"]

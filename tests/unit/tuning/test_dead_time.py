@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
+from loopwright.tuning.dead_time import DeadTimeLoop
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins, ultimate_point
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
+from loopwright.tuning.response import step_response
 from tests.unit.tuning.parseval import error_squares
-from tuning.dead_time import DeadTimeLoop
-from tuning.gains import Gains
-from tuning.margins import margins, ultimate_point
-from tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
-from tuning.response import step_response
 
 PI_LOOPS: list[tuple[Model, Gains]] = [
     (TransferFunction((1.0,), (0.25, 1.0, 1.0), 1.0), Gains(0.508, 0.508 * 2.344)),

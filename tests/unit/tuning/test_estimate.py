@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from loopwright.tuning.estimate import fopdt_from_overshoot
+from loopwright.tuning.margins import ultimate_point
+from loopwright.tuning.models import FOPDT
+from loopwright.tuning.response import step_figures
 from tests.unit.tuning.tables import EQUIPOLE5, GOLDEN, ziegler_nichols
-from tuning.estimate import fopdt_from_overshoot
-from tuning.margins import ultimate_point
-from tuning.models import FOPDT
-from tuning.response import step_figures
 
 
 @pytest.mark.parametrize("row", GOLDEN["formula2_on_exact_fopdt"]["rows"], ids=lambda r: f"d={r[0]}")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from loopwright.tuning.fast.choice import choose
+from loopwright.tuning.fast.valve import end, play, stick, suspect
+from loopwright.tuning.record_fit import Fit
 from tests.unit.tuning.fast.records import BENCHES, record
-from tuning.fast.choice import choose
-from tuning.fast.valve import end, play, stick, suspect
-from tuning.record_fit import Fit
 
 U = np.array([0.0, 1.0, 0.9, 0.7, 0.4, 0.5, -0.5, -0.45, 0.0])
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from loopwright.tuning.fitting import Problem
+from loopwright.tuning.models import FOPDT
+from loopwright.tuning.record_fit import MOVING, QUIET, Hypothesis
+from loopwright.tuning.recorded import recorded
+from loopwright.tuning.structures import FIRST
 from tests.unit.tuning.recordings import NEGATIVE, moves, open_loop
-from tuning.fitting import Problem
-from tuning.models import FOPDT
-from tuning.record_fit import MOVING, QUIET, Hypothesis
-from tuning.recorded import recorded
-from tuning.structures import FIRST
 
 LOAD_AT = 300
 

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.unit.tuning.isa import response
-from tuning.forms import (
+from loopwright.tuning.forms import (
     Parallel,
     Reciprocal,
     Series,
@@ -22,8 +21,9 @@ from tuning.forms import (
     to_reciprocal,
     to_series,
 )
-from tuning.gains import Gains
-from tuning.reasons import Reason, Refused
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.reasons import Reason, Refused
+from tests.unit.tuning.isa import response
 
 S = 1j * np.geomspace(1e-4, 1e4, 200)
 

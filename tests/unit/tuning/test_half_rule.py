@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from loopwright.tuning.half_rule import exact, half_rule
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.tangent import tangent
 from tests.unit.tuning.rules.tables import OBJECTS, plant, sopdt
 from tests.unit.tuning.tables import EQUIPOLE5, TABLES
-from tuning.half_rule import exact, half_rule
-from tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
-from tuning.reasons import Reason, Refused
-from tuning.tangent import tangent
 
 W = np.geomspace(1e-3, 1e2, 100)
 lags = st.lists(st.floats(0.01, 100.0), min_size=1, max_size=6)

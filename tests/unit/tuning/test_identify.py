@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from loopwright.tuning.identify import Identified, identify
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
+from loopwright.tuning.reasons import Reason, Refused
 from tests.unit.tuning import recordings
 from tests.unit.tuning.recordings import (
     COMPLEX_POLES,
@@ -30,9 +33,6 @@ from tests.unit.tuning.recordings import (
     open_loop,
     step,
 )
-from tuning.identify import Identified, identify
-from tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
-from tuning.reasons import Reason, Refused
 
 CASES = {
     "first order": (FIRST_ORDER, FOPDT(2.0, 10.0, 2.03)),

@@ -10,12 +10,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter
 
-from controller.channel import Channel, Mode, Parameters, Settings
-from plantsim.plant import LinearPlant
+from loopwright.controller.channel import Channel, Mode, Parameters, Settings
+from loopwright.plantsim.plant import LinearPlant
+from loopwright.tuning.feedback import follows_from_pv
+from loopwright.tuning.identify import Identified, identify
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
 from tests.unit.tuning import recordings
-from tuning.feedback import follows_from_pv
-from tuning.identify import Identified, identify
-from tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
 
 Reals = NDArray[np.float64]
 FINE, TS, FIRST_MOVE = 20, 0.1, 50

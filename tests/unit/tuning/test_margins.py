@@ -9,11 +9,11 @@ import control
 import numpy as np
 import pytest
 
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins, ultimate_point
+from loopwright.tuning.models import FOPDT, TransferFunction
+from loopwright.tuning.reasons import Reason, Refused
 from tests.unit.tuning.tables import EQUIPOLE5, GOLDEN, MODELS, TABLES, table4_model, transfer_function
-from tuning.gains import Gains
-from tuning.margins import margins, ultimate_point
-from tuning.models import FOPDT, TransferFunction
-from tuning.reasons import Reason, Refused
 
 # Table 1: one controller, designed for the full plant, on five reduced models of it
 PLANTS_PI = Gains(Kp=0.887, Ti=0.887 / 0.225)

@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 
+from loopwright.tuning.complex_criterion import Weighting
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.rules.me_pso import me_pso
+from loopwright.tuning.setting import Setting
 from tests.unit.tuning.search_tables import HORIZON_S, ME_PSO, PLANTS
-from tuning.complex_criterion import Weighting
-from tuning.gains import Gains
-from tuning.margins import margins
-from tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
-from tuning.reasons import Reason, Refused
-from tuning.rules.me_pso import me_pso
-from tuning.setting import Setting
 
 BEST: dict[str, dict[str, dict[str, Any]]] = ME_PSO["recomputed"]["best_found"]
 DOMAINS: dict[str, dict[str, list[float]]] = ME_PSO["printed"]["domains"]

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
+from loopwright.tuning.methods import METHODS, Method, Option, tune
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
+from loopwright.tuning.reasons import Reason, Refused
 from tests.unit.tuning.tables import ROOT
-from tuning.methods import METHODS, Method, Option, tune
-from tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
-from tuning.reasons import Reason, Refused
 
 NAMES = [
     "zn-ultimate", "zn-step", "tyreus-luyben", "cohen-coon", "chr", "kappa-tau", "amigo", "lambda", "simc", "imc-pi",

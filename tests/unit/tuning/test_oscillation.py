@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tuning.oscillation import fit_growth, harmonic
+from loopwright.tuning.oscillation import fit_growth, harmonic
 
 
 def signal(growth: float, period: float, noise: float = 0.0, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.half_rule import half_rule
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.recorded_step import fit_closed_loop, fit_step, moments_of, two_areas_of
+from loopwright.tuning.reduction import moments, two_areas
+from loopwright.tuning.response import step_response
 from tests.unit.tuning.tables import EQUIPOLE5, TABLES
-from tuning.gains import Gains
-from tuning.half_rule import half_rule
-from tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
-from tuning.reasons import Reason, Refused
-from tuning.recorded_step import fit_closed_loop, fit_step, moments_of, two_areas_of
-from tuning.reduction import moments, two_areas
-from tuning.response import step_response
 
 PLANTS_PI = Gains(Kp=0.887, Ti=0.887 / 0.225)
 # five equal lags: 1 - y is the tail of a Poisson sum

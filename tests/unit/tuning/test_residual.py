@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from tuning.residual import colour, whiteness
+from loopwright.tuning.residual import colour, whiteness
 
 
 def test_white_noise_is_called_coloured_as_rarely_as_promised() -> None:

@@ -8,12 +8,12 @@ import control
 import numpy as np
 import pytest
 
+from loopwright.tuning.figures import figures_of
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import ultimate_point
+from loopwright.tuning.models import FOPDT, TransferFunction
+from loopwright.tuning.response import step_figures, step_response
 from tests.unit.tuning.tables import EQUIPOLE5, MODELS, TABLES, table4_model, transfer_function, ziegler_nichols
-from tuning.figures import figures_of
-from tuning.gains import Gains
-from tuning.margins import ultimate_point
-from tuning.models import FOPDT, TransferFunction
-from tuning.response import step_figures, step_response
 
 
 @pytest.mark.parametrize("row", TABLES["table2"]["rows"], ids=lambda r: r["model"])

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins
+from loopwright.tuning.models import FOPDT
+from loopwright.tuning.response import step_response
+from loopwright.tuning.robust import UNSTABLE, Criterion, optimise
 from tests.unit.tuning.tables import GOLDEN, TABLES, table4_model
-from tuning.gains import Gains
-from tuning.margins import margins
-from tuning.models import FOPDT
-from tuning.response import step_response
-from tuning.robust import UNSTABLE, Criterion, optimise
 
 
 def plain_criterion(model: FOPDT, gains: Gains, horizon: float) -> float:

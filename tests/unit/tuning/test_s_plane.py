@@ -11,14 +11,14 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, Reals, TransferFunction
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.rules.s_plane import Design, Minimum, _Rational, design, s_plane
 from tests.unit.tuning.parseval import error_squares
 from tests.unit.tuning.s_plane_printed import J0_J1, first_order, second_order, third_order
 from tests.unit.tuning.search_tables import OBJECTS, PLANTS, S_PLANE
-from tuning.gains import Gains
-from tuning.margins import margins
-from tuning.models import FOPDT, SOPDT, Integrating, Model, Reals, TransferFunction
-from tuning.reasons import Reason, Refused
-from tuning.rules.s_plane import Design, Minimum, _Rational, design, s_plane
 
 TAU_S, K1 = S_PLANE["tau"], S_PLANE["objects"]["third"]["k1"]
 ROWS = [

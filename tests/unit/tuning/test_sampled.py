@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from plantsim.plant import LinearPlant
-from tuning.sampled import states
+from loopwright.plantsim.plant import LinearPlant
+from loopwright.tuning.sampled import states
 
 Ts = 0.1
 DENOMINATORS = [

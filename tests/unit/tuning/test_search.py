@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from tuning.models import Reals
-from tuning.search import Cost, Found, differential_evolution, multi_epoch_swarm, nelder_mead
+from loopwright.tuning.models import Reals
+from loopwright.tuning.search import Cost, Found, differential_evolution, multi_epoch_swarm, nelder_mead
 
 SEARCHES = [multi_epoch_swarm, differential_evolution, nelder_mead]
 LEAST = np.array([0.31, 0.72])

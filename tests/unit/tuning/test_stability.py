@@ -10,12 +10,12 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins, ultimate_point
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.stability import is_stable, unstable_poles
 from tests.unit.tuning.tables import MODELS, transfer_function
-from tuning.gains import Gains
-from tuning.margins import margins, ultimate_point
-from tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
-from tuning.reasons import Reason, Refused
-from tuning.stability import is_stable, unstable_poles
 
 sizes = st.floats(0.05, 20.0)
 

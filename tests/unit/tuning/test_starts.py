@@ -3,12 +3,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from loopwright.tuning.fitting import Problem
+from loopwright.tuning.record_fit import MOVING, QUIET
+from loopwright.tuning.recorded import recorded
+from loopwright.tuning.starts import starts
+from loopwright.tuning.structures import FIRST, SECOND, SECOND_WITH_ZERO, Structure
 from tests.unit.tuning.recordings import COMPLEX_POLES, FIRST_ORDER, INVERSE_RESPONSE, Loop, moves, open_loop
-from tuning.fitting import Problem
-from tuning.record_fit import MOVING, QUIET
-from tuning.recorded import recorded
-from tuning.starts import starts
-from tuning.structures import FIRST, SECOND, SECOND_WITH_ZERO, Structure
 
 
 @pytest.mark.parametrize("nuisance", [False, True])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
-from tuning.state_space import exponentials, gain_unit, normalised, state_space, time_sum
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
+from loopwright.tuning.state_space import exponentials, gain_unit, normalised, state_space, time_sum
 
 MODELS: list[Model] = [
     FOPDT(-2.0, 5.0, 1.0),

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from tuning.models import Reals
-from tuning.varpro import Bounded, covariance, descend, solve
+from loopwright.tuning.models import Reals
+from loopwright.tuning.varpro import Bounded, covariance, descend, solve
 
 T = np.linspace(0.0, 5.0, 200)
 

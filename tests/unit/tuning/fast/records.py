@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller.channel import Channel, Mode, Parameters, RelaySettings, Settings
-from plantsim.plant import LinearPlant
-from tuning.fast.evidence import Evidence
-from tuning.models import TransferFunction, sign
+from loopwright.controller.channel import Channel, Mode, Parameters, RelaySettings, Settings
+from loopwright.plantsim.plant import LinearPlant
+from loopwright.tuning.fast.evidence import Evidence
+from loopwright.tuning.models import TransferFunction, sign
 
 LISTENED = 130
 

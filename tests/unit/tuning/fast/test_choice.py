@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
+from loopwright.tuning.fast.choice import choose
+from loopwright.tuning.margins import ultimate_point
+from loopwright.tuning.models import TransferFunction
+from loopwright.tuning.record_fit import QUIET, Fit, Hypothesis
+from loopwright.tuning.structures import FIRST_FED, SECOND_FED
 from tests.unit.tuning.fast.records import BENCHES, FIRST, FIVE_LAGS, THREE_LAGS, Bench, record
-from tuning.fast.choice import choose
-from tuning.margins import ultimate_point
-from tuning.models import TransferFunction
-from tuning.record_fit import QUIET, Fit, Hypothesis
-from tuning.structures import FIRST_FED, SECOND_FED
 
 
 def error_near_the_crossover(bench: Bench, found: TransferFunction) -> float:

@@ -7,16 +7,16 @@ import math
 import numpy as np
 import pytest
 
+from loopwright.tuning.fast.design import Design, Wish, controller, frequencies
+from loopwright.tuning.fast.loop_cost import LoopCost
+from loopwright.tuning.fast.robust_gain import encircles_not, largest_gains
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins, ultimate_point
+from loopwright.tuning.models import TransferFunction, sign
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.response import step_figures
+from loopwright.tuning.stability import is_stable
 from tests.unit.tuning.fast.records import BENCHES, FIVE_LAGS, INTEGRATES, INVERSE, THREE_LAGS
-from tuning.fast.design import Design, Wish, controller, frequencies
-from tuning.fast.loop_cost import LoopCost
-from tuning.fast.robust_gain import encircles_not, largest_gains
-from tuning.gains import Gains
-from tuning.margins import margins, ultimate_point
-from tuning.models import TransferFunction, sign
-from tuning.reasons import Reason, Refused
-from tuning.response import step_figures
-from tuning.stability import is_stable
 
 LOOPS = [
     (THREE_LAGS.model, Gains(0.8, 4.0)),

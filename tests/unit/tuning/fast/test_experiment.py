@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from tuning.fast.experiment import Experiment
-from tuning.gains import Gains
-from tuning.plan import Mode, Sample
-from tuning.reasons import Reason, Refused
-from tuning.stages.common import Facts, OperatingPoint, Trace
+from loopwright.tuning.fast.experiment import Experiment
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Mode, Sample
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.stages.common import Facts, OperatingPoint, Trace
 
 
 def test_a_PV_that_stands_still_while_MV_switches_is_refused() -> None:

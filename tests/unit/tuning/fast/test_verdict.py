@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from loopwright.tuning.fast.design import Wish
+from loopwright.tuning.fast.spread import peak, seen_covariance
+from loopwright.tuning.fast.verdict import judge
+from loopwright.tuning.margins import margins
+from loopwright.tuning.models import TransferFunction
+from loopwright.tuning.reasons import Reason, Refused
 from tests.unit.tuning.fast.records import BENCHES, FIRST, THREE_LAGS, record
-from tuning.fast.design import Wish
-from tuning.fast.spread import peak, seen_covariance
-from tuning.fast.verdict import judge
-from tuning.margins import margins
-from tuning.models import TransferFunction
-from tuning.reasons import Reason, Refused
 
 
 def true_Ms(name: str, noise: float, seed: int = 1) -> tuple[float, float, str | None]:

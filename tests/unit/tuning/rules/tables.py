@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
 from tests.unit.tuning.tables import ROOT
-from tuning.models import FOPDT, SOPDT, TransferFunction
 
 TABLES: dict[str, Any] = json.loads((ROOT / "tests/data/tuning-rules-tables.json").read_text(encoding="utf-8"))
 OBJECTS: dict[str, dict[str, float]] = TABLES["direct_synthesis"]["objects"]

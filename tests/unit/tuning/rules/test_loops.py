@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from scipy.special import lambertw
 
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins
+from loopwright.tuning.methods import tune
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, Reals
+from loopwright.tuning.reasons import Refused
+from loopwright.tuning.rules.direct_synthesis import PAPER_C, direct_synthesis, gain_range
+from loopwright.tuning.rules.imc import SAFE, UNSTABLE_ZERO
 from tests.unit.tuning.isa import response
 from tests.unit.tuning.rules.tables import OBJECTS, TABLES, sopdt
-from tuning.gains import Gains
-from tuning.margins import margins
-from tuning.methods import tune
-from tuning.models import FOPDT, SOPDT, Integrating, Model, Reals
-from tuning.reasons import Refused
-from tuning.rules.direct_synthesis import PAPER_C, direct_synthesis, gain_range
-from tuning.rules.imc import SAFE, UNSTABLE_ZERO
 
 W = np.geomspace(1e-4, 1e2, 60_000)
 

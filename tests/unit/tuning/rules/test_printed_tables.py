@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
+from loopwright.tuning.forms import to_reciprocal
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.margins import margins, ultimate_point
+from loopwright.tuning.methods import tune
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.rules import tyreus_luyben, ziegler_nichols
 from tests.unit.tuning.rules.tables import OBJECTS, TABLES, moments, plant, sopdt
-from tuning.forms import to_reciprocal
-from tuning.gains import Gains
-from tuning.margins import margins, ultimate_point
-from tuning.methods import tune
-from tuning.models import FOPDT, SOPDT, Integrating, Model
-from tuning.reasons import Reason, Refused
-from tuning.rules import tyreus_luyben, ziegler_nichols
 
 SETTINGS = TABLES["direct_synthesis"]["settings"]
 

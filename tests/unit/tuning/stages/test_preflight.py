@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import pytest
 
-from tuning.gains import Gains
-from tuning.plan import Mode, Sample, StageStarted
-from tuning.reasons import Reason, Refused
-from tuning.stages.common import Facts, OperatingPoint, Trace
-from tuning.stages.preflight import LOOKS, at_rest
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Mode, Sample, StageStarted
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.stages.common import Facts, OperatingPoint, Trace
+from loopwright.tuning.stages.preflight import LOOKS, at_rest
 
 TS, T95, SP = 0.1, 20.0, 50.0
 FACTS = Facts(TS, T95, 0.0, 100.0, 1.0, Gains(1.0, 10.0))
