@@ -18,10 +18,10 @@ from scipy.integrate import trapezoid
 from scipy.optimize import minimize
 
 from benchmarks.command import command
+from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import ultimate_point
 from loopwright.tuning.models import FOPDT, Reals
-from loopwright.tuning.robust import UNSTABLE, Criterion, Optimum, optimise
+from loopwright.tuning.rules.robust_pi import UNSTABLE, Criterion, Optimum, optimise
 
 MODEL = FOPDT(K=2.0, T=5.0, L=2.5)
 HORIZON_S = 40.0

@@ -25,16 +25,16 @@ from benchmarks.command import parser_of, show
 from loopwright.controller.channel import Channel, RelaySettings, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
+from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.fast.design import Wish
-from loopwright.tuning.fast.evidence import Evidence
+from loopwright.tuning.fast.record import Evidence
 from loopwright.tuning.fast.verdict import judge
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import margins
+from loopwright.tuning.identification.disturbances import STRUCTURES
+from loopwright.tuning.identification.output_error import Fit
+from loopwright.tuning.identification.structures import Structure
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.plan import Mode
-from loopwright.tuning.record_fit import Fit
-from loopwright.tuning.stories import STRUCTURES
-from loopwright.tuning.structures import Structure
 
 NUM, DEN, L, TS = (1.0,), (2.0, 7.0, 7.0, 2.0), 0.53, 0.085
 NOISE = 0.01

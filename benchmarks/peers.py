@@ -41,16 +41,16 @@ from benchmarks.tuning import (
 )
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.runner import Watch, run
-from loopwright.tuning.five_stage import Options, five_stage
+from loopwright.tuning.experiments.preflight import PREFLIGHT, SETTLE, preflight
+from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.five_stage.procedure import Options, five_stage
+from loopwright.tuning.five_stage.relay import relay_test
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.methods import METHODS
+from loopwright.tuning.identification.step_fits import fit_step
 from loopwright.tuning.models import integrators
 from loopwright.tuning.plan import Plan, StageStarted
 from loopwright.tuning.reasons import Ended
-from loopwright.tuning.recorded_step import fit_step
-from loopwright.tuning.stages.common import Facts
-from loopwright.tuning.stages.preflight import PREFLIGHT, SETTLE, preflight
-from loopwright.tuning.stages.relay import relay_test
+from loopwright.tuning.rules.registry import METHODS
 
 SAMPLES = 1500
 """Of a step's record at most: a longer one is of averages."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.signal import ss2tf
 
 from loopwright.plantsim import reactor
-from loopwright.tuning.margins import ultimate_point
+from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.models import TransferFunction
 
 SAMPLES_PER_PERIOD = 80

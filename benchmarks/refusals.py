@@ -21,11 +21,11 @@ from loopwright.service.fast_record import kept
 from loopwright.service.plain import plain
 from loopwright.service.rehearsal import RehearsedLoop, _parameters
 from loopwright.service.runner import Watch, run
+from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.procedure import FastOptions, fast
-from loopwright.tuning.fast.results import Found
+from loopwright.tuning.fast.proposal import Found
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Event, Mode, Sample, StageDone, StageStarted
-from loopwright.tuning.stages.common import Facts
 
 TS, T95, MIDDLE, SP = 0.1, 26.0, 50.0, 20.0
 OLD = Gains(1.0, 10.0)

@@ -19,10 +19,10 @@ import numpy as np
 from scipy.integrate import trapezoid
 
 from benchmarks.command import command
-from loopwright.tuning.figures import StepFigures
+from loopwright.tuning.analysis.step_figures import StepFigures
+from loopwright.tuning.analysis.step_response import step_figures, step_response
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, Reals
-from loopwright.tuning.response import step_figures, step_response
 
 MODEL = FOPDT(K=2.0, T=5.0, L=2.5)
 C = 6.0 - 4.0 * math.sqrt(2.0)

@@ -39,18 +39,18 @@ from loopwright.plantsim.reactor import Reactor
 from loopwright.service.fast_record import kept as recorded
 from loopwright.service.rehearsal import RehearsedLoop
 from loopwright.service.runner import RunResult, Watch, run
+from loopwright.tuning.analysis.margins import margins
+from loopwright.tuning.experiments.preflight import PREFLIGHT, SETTLE, at_rest
+from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.design import Design, Wish
-from loopwright.tuning.fast.evidence import Evidence
-from loopwright.tuning.fast.experiment import Experiment
 from loopwright.tuning.fast.procedure import LEAST_SAMPLES, FastOptions, FastProposal, fast
+from loopwright.tuning.fast.record import Evidence
+from loopwright.tuning.fast.relay_test import Experiment
 from loopwright.tuning.fast.verdict import judge_again
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import margins
 from loopwright.tuning.models import sign
 from loopwright.tuning.plan import Command, Event, Mode, Plan, Sample, StageStarted
 from loopwright.tuning.reasons import Ended
-from loopwright.tuning.stages.common import Facts
-from loopwright.tuning.stages.preflight import PREFLIGHT, SETTLE, at_rest
 
 T95_PERIODS = 3.0
 WRONG = 0.1

@@ -12,18 +12,18 @@ from loopwright.service.request import ProcessModel
 from loopwright.service.states import ACTIVE, JobState
 from loopwright.service.store.tables import EventRow, JobRow
 from loopwright.service.tunings import Tuned, answer, tune_each
-from loopwright.tuning.assess import Assessment, assess
-from loopwright.tuning.design import LEAST_GM, MOST_Ms
+from loopwright.tuning.analysis.assessment import Assessment, assess
 from loopwright.tuning.fast.design import Wish
+from loopwright.tuning.fast.design_trial import designed_on
 from loopwright.tuning.fast.procedure import FAST, FastOptions
-from loopwright.tuning.fast.results import delayed
-from loopwright.tuning.fast.trial import designed_on
+from loopwright.tuning.fast.proposal import delayed
 from loopwright.tuning.fast.verdict import judge_again
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.methods import METHODS, Method
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 from loopwright.tuning.reasons import Ended, Reason, Refused
-from loopwright.tuning.setting import Setting
+from loopwright.tuning.rules.design import LEAST_GM, MOST_Ms
+from loopwright.tuning.rules.registry import METHODS, Method
+from loopwright.tuning.rules.setting import Setting
 
 
 def _rule(model: Model, Ms: float = 1.6, derivative: bool = False) -> Setting:
@@ -116,8 +116,8 @@ def _not_disproved(row: JobRow, reasons: Sequence[Reason]) -> None:
 
 
 def _retune(found: Tuned, model: FoundModel) -> dict[str, Any] | None:
-    """None for gains that the service would not try on a loop (see `tuning.design`), and for those of a rule on a model
-    that the five stages do not take."""
+    """None for gains that the service would not try on a loop (see `tuning.rules.design`), and for those of a rule on a
+    model that the five stages do not take."""
     if found.assessment is None or isinstance(model, TransferFunction):
         return None
     m = found.assessment.margins

@@ -9,7 +9,7 @@ from typing import Any, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
-from loopwright.tuning.five_stage import Finished
+from loopwright.tuning.five_stage.procedure import Finished
 
 
 def finished(results: Iterable[tuple[str, Mapping[str, Any] | None]]) -> Finished:

@@ -77,7 +77,7 @@ def identify(
     """A process model from a recorded test of any shape. Exit 0: a model found, 3: none."""
     from loopwright.service.identified import identified, refused
     from loopwright.service.record import RecordError, load_record
-    from loopwright.tuning.identify import identify as fit
+    from loopwright.tuning.identification.identify import identify as fit
     from loopwright.tuning.reasons import Reason, Refused
 
     check_plot(plot)

@@ -7,9 +7,9 @@ ten), and the limits of time of the procedures.
 from __future__ import annotations
 
 from loopwright.service.request import RetuneRequest
-from loopwright.tuning.fast.experiment import BACK, MOST_PERIODS, VERIFIED_PERIODS
+from loopwright.tuning.experiments.preflight import LEAST_LISTENED_SAMPLES, LOOKS
 from loopwright.tuning.fast.procedure import LEAST_SAMPLES
-from loopwright.tuning.stages.preflight import LEAST_LISTENED_SAMPLES, LOOKS
+from loopwright.tuning.fast.relay_test import BACK, MOST_PERIODS, VERIFIED_PERIODS
 
 PU_OF_T95 = (0.07, 0.95)
 """The ultimate period in T95, of eight in ten of 116 self-regulating plants."""

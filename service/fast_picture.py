@@ -11,13 +11,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from loopwright.service.fast_record import Kept
-from loopwright.tuning.assess import assess
-from loopwright.tuning.fast.choice import choose
+from loopwright.tuning.analysis.assessment import assess
+from loopwright.tuning.analysis.step_response import step_response
+from loopwright.tuning.fast.structure_choice import choose
 from loopwright.tuning.gains import Gains
+from loopwright.tuning.identification.output_error import Fit, averaged
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.reasons import Ended
-from loopwright.tuning.record_fit import Fit, averaged
-from loopwright.tuning.response import step_response
 
 GREY, RED, BLUE, GREEN = "0.55", "tab:red", "tab:blue", "tab:green"
 SHOWN_SETTLINGS = 2.5

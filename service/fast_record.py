@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from loopwright.tuning.fast.evidence import LEAST_LISTENED, LEAST_SWITCHES, Evidence
+from loopwright.tuning.fast.record import LEAST_LISTENED, LEAST_SWITCHES, Evidence
 from loopwright.tuning.models import Reals
 from loopwright.tuning.plan import Mode
 

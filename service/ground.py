@@ -12,8 +12,8 @@ from loopwright.service.config import LoopConfig
 from loopwright.service.found_model import FoundModel
 from loopwright.service.loop import LoopState
 from loopwright.service.request import RetuneRequest
+from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import margins
 from loopwright.tuning.models import FOPDT
 from loopwright.tuning.reasons import Ended
 

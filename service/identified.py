@@ -8,7 +8,7 @@ from typing import Any
 from loopwright.service.model_forms import dump_model
 from loopwright.service.plain import plain
 from loopwright.service.record import Record
-from loopwright.tuning.identify import Identified
+from loopwright.tuning.identification.identify import Identified
 from loopwright.tuning.reasons import Refused
 
 

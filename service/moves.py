@@ -1,6 +1,6 @@
 """What the stages of a retune move, and how far at most: known before anything is moved.
 
-Figures are what the procedures command by themselves (`tuning.fast.experiment`, `tuning.stages`). In automatic the
+Figures are what the procedures command by themselves (`tuning.fast.relay_test`, `tuning.five_stage`). In automatic the
 controller's feedback may take MV farther; the limits of the test hold there too.
 """
 
@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 from loopwright.service.config import LoopConfig
 from loopwright.service.request import RetuneRequest
-from loopwright.tuning.fast.experiment import BIAS, FIRST, MOST_RAISED, WIDEST_SPAN, most_amplitude
+from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
+from loopwright.tuning.fast.design_trial import trial_stages
 from loopwright.tuning.fast.procedure import fast_stages
-from loopwright.tuning.fast.trial import trial_stages
-from loopwright.tuning.five_stage import stages_of
+from loopwright.tuning.fast.relay_test import BIAS, FIRST, MOST_RAISED, WIDEST_SPAN, most_amplitude
+from loopwright.tuning.five_stage.procedure import stages_of
+from loopwright.tuning.five_stage.ultimate_gain import RUN_MV_LIMIT
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.stages.ultimate import RUN_MV_LIMIT
-from loopwright.tuning.stages.zn_pi import KICK_OF_ROOM
 
 _COMPUTING = ("design", "redesign", "estimate", "optimise")
 _STEPPING = ("baseline", "ultimate", "zn_pi", "verify")

@@ -11,11 +11,11 @@ from loopwright.service.loop import OPERATIONAL, LoopState
 from loopwright.service.moves import broken_limits, stages_asked
 from loopwright.service.request import RetuneRequest, narrow
 from loopwright.service.work import facts_of
-from loopwright.tuning.fast.experiment import BIAS, most_amplitude
+from loopwright.tuning.experiments.preflight import LEAST_ROOM, LOOKS, MOST_AWAY, MOST_NOISE
+from loopwright.tuning.fast.relay_test import BIAS, most_amplitude
 from loopwright.tuning.models import sign
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import ADVICE, Ended, Reason, Refused
-from loopwright.tuning.stages.preflight import LEAST_ROOM, LOOKS, MOST_AWAY, MOST_NOISE
 
 
 class Occupied(StrEnum):

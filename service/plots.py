@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 from loopwright.service.model_forms import describe, dump_model
 from loopwright.service.record import Record
 from loopwright.service.tunings import Tuned
-from loopwright.tuning.identify import Identified
-from loopwright.tuning.methods import METHODS
+from loopwright.tuning.analysis.step_response import Response, step_response
+from loopwright.tuning.identification.identify import Identified
 from loopwright.tuning.models import Model
-from loopwright.tuning.response import Response, step_response
+from loopwright.tuning.rules.registry import METHODS
 
 _COLOURS = colormaps["tab10"]
 _LINES = ("-", "--", ":", "-.")

@@ -30,11 +30,11 @@ from loopwright.service.plausible import (
     check_sampling,
 )
 from loopwright.service.runner import RunResult, Watch, run
+from loopwright.tuning.analysis.margins import ultimate_point
+from loopwright.tuning.fast.design_trial import trial
 from loopwright.tuning.fast.procedure import FAST, FAST_STAGES, FastOptions, FastProposal, fast
-from loopwright.tuning.fast.trial import trial
-from loopwright.tuning.five_stage import STAGES, Facts, Options, Proposal, five_stage
+from loopwright.tuning.five_stage.procedure import STAGES, Facts, Options, Proposal, five_stage
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import ultimate_point
 from loopwright.tuning.models import FOPDT, SOPDT, Model, TransferFunction
 from loopwright.tuning.plan import (
     Command,
@@ -241,9 +241,9 @@ def rehearse(
 ) -> dict[str, Any]:
     """Preflight to verification on a model in memory. Returns the JSON object of `loopwright rehearse`.
 
-    spec: the fields of `PlantFile`.  method: "fast", "five-stage", or the five stages with a rule of `tuning.methods`.
-    model: what to design for; fast then needs no relay.  options: those of `tuning.fast.procedure.FastOptions`, or of
-    `tuning.five_stage.Options`.
+    spec: the fields of `PlantFile`.  method: "fast", "five-stage", or a rule of `tuning.rules.registry` in place of the
+    fifth stage.  model: what to design for; fast then needs no relay.  options: those of
+    `tuning.fast.procedure.FastOptions`, or of `tuning.five_stage.procedure.Options`.
     A spec that cannot be used gives outcome "refused", reason "bad_input".
     """
     results: dict[str, object] = {}

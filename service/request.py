@@ -22,10 +22,10 @@ from loopwright.service.plausible import (
     check_step,
 )
 from loopwright.tuning.fast.procedure import FAST
-from loopwright.tuning.five_stage import PROCEDURE, rule_of
-from loopwright.tuning.methods import METHODS
+from loopwright.tuning.five_stage.procedure import PROCEDURE, rule_of
 from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
 from loopwright.tuning.reasons import Refused
+from loopwright.tuning.rules.registry import METHODS
 
 Percent = Annotated[float, Field(gt=0, lt=74, allow_inf_nan=False)]
 LEAST_AMPLITUDE_PCT = 1e-3

@@ -83,8 +83,8 @@ def _load() -> None:
     """Has the jobs find everything there: one that imports what it needs, and a full collection of all that is loaded,
     which lets no thread run, hold up the loops of the others (seconds, and 0.1 s of processor each time)."""
     import loopwright.service.bus_loop
-    import loopwright.tuning.fast.trial
-    import loopwright.tuning.five_stage  # noqa: F401
+    import loopwright.tuning.fast.design_trial
+    import loopwright.tuning.five_stage.procedure  # noqa: F401
 
     gc.collect()
     gc.freeze()

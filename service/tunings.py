@@ -1,7 +1,7 @@
 """A model tuned by one method or by all: the one call behind `loopwright tune` and POST /tunings.
 
-The gains are those a controller can carry out (see `tuning.design.realisable`), and margins and step figures are of
-just these, on the model as given with its exact dead time.
+The gains are those a controller can carry out (see `tuning.rules.design.realisable`), and margins and step figures are
+of just these, on the model as given with its exact dead time.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from typing import Any
 from loopwright.service.model_forms import dump_model
 from loopwright.service.plain import plain
 from loopwright.service.plausible import Implausible, check_option
-from loopwright.tuning.assess import Assessment, assess
-from loopwright.tuning.design import realisable
-from loopwright.tuning.figures import StepFigures
-from loopwright.tuning.forms import to_parallel
+from loopwright.tuning.analysis.assessment import Assessment, assess
+from loopwright.tuning.analysis.step_figures import StepFigures
+from loopwright.tuning.gain_forms import to_parallel
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.methods import METHODS, Method, Option
 from loopwright.tuning.models import Model
 from loopwright.tuning.reasons import Ended, Failed, Reason, Refused
+from loopwright.tuning.rules.design import realisable
+from loopwright.tuning.rules.registry import METHODS, Method, Option
 
 ALL = "all"
 FORM = "ISA: u = Kp*(b*SP - PV + integral(SP - PV)/Ti + Td*d/dt(c*SP - PV)/(1 + Tf*s)); Ti = 0: no integral"

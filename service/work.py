@@ -13,12 +13,12 @@ from loopwright.service.moves import broken_limits
 from loopwright.service.plain import plain_object
 from loopwright.service.request import ProcessModel, RetuneRequest
 from loopwright.service.store.tables import EventRow
+from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.experiments.settle import after_settling
 from loopwright.tuning.fast.procedure import FAST
 from loopwright.tuning.models import Model
 from loopwright.tuning.plan import Event, Note, Plan, Sample
 from loopwright.tuning.reasons import Aborted, Ended, Failed, NoGain, Reason, Refused
-from loopwright.tuning.stages.common import Facts
-from loopwright.tuning.stages.settle import after_settling
 
 if TYPE_CHECKING:
     from loopwright.service.computing.beside import Workers
@@ -142,14 +142,14 @@ def plan(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow] = ())
 
 def _procedure(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow]) -> Plan[Any]:
     if request.fast:
+        from loopwright.tuning.fast.design_trial import trial
         from loopwright.tuning.fast.procedure import FastOptions, fast
-        from loopwright.tuning.fast.trial import trial
 
         wishes = FastOptions(**_options(request))
         known = _known_model(request)
         return fast(facts, wishes) if known is None else trial(facts, wishes, known)
     from loopwright.service.checkpoints import finished
-    from loopwright.tuning.five_stage import Options, five_stage
+    from loopwright.tuning.five_stage.procedure import Options, five_stage
 
     done = ((event.data["stage"], event.data["result"]) for event in earlier if event.kind == "stage_done")
     return five_stage(facts, Options(**_options(request)), finished(done))

@@ -6,13 +6,13 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
-from loopwright.tuning.assess import assess
+from loopwright.tuning.analysis.assessment import assess
+from loopwright.tuning.analysis.stability import is_stable
+from loopwright.tuning.analysis.step_response import step_figures
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.methods import tune
 from loopwright.tuning.models import SOPDT
-from loopwright.tuning.response import step_figures
 from loopwright.tuning.rules.direct_synthesis import PAPER_C
-from loopwright.tuning.stability import is_stable
+from loopwright.tuning.rules.registry import tune
 from validation import tolerances as tol
 from validation.checks import Cell, Claim, Column, Figure, Paper, Row, Table
 from validation.loops import ideal_pid, sopdt

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from statistics import mean, median
 
-from loopwright.tuning.estimate import fopdt_from_overshoot
+from loopwright.tuning.analysis.margins import ultimate_point
+from loopwright.tuning.analysis.stability import is_stable
+from loopwright.tuning.analysis.step_response import step_figures
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import ultimate_point
+from loopwright.tuning.identification.overshoot import fopdt_from_overshoot
 from loopwright.tuning.models import FOPDT
-from loopwright.tuning.response import step_figures
-from loopwright.tuning.stability import is_stable
 from validation import tolerances as tol
 from validation.checks import Cell, Claim, Column, Row, Table
 from validation.loops import FIVE_LAGS, plant

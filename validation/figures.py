@@ -9,11 +9,11 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from loopwright.tuning.analysis.step_response import step_response
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.methods import tune
 from loopwright.tuning.models import Model
-from loopwright.tuning.response import step_response
-from loopwright.tuning.robust import optimise
+from loopwright.tuning.rules.registry import tune
+from loopwright.tuning.rules.robust_pi import optimise
 from validation import direct_synthesis, five_stage, imc, me_pso, reactor, s_plane
 from validation.loops import FIVE_LAGS, ideal_pid, of_numerator, plant, sopdt
 from validation.references import References

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from scipy.optimize import brentq
 
+from loopwright.tuning.analysis.margins import margins, ultimate_point
+from loopwright.tuning.analysis.step_response import step_figures, step_response
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.half_rule import half_rule
-from loopwright.tuning.margins import margins, ultimate_point
+from loopwright.tuning.identification.step_fits import fit_closed_loop, fit_step
 from loopwright.tuning.models import FOPDT
-from loopwright.tuning.recorded_step import fit_closed_loop, fit_step
-from loopwright.tuning.reduction import two_areas
-from loopwright.tuning.response import step_figures, step_response
-from loopwright.tuning.robust import optimise
+from loopwright.tuning.reduction.half_rule import half_rule
+from loopwright.tuning.reduction.moments_and_areas import two_areas
+from loopwright.tuning.rules.robust_pi import optimise
 from validation import reactor
 from validation import tolerances as tol
 from validation.checks import Cell, Column, Figure, Paper, Row, Table

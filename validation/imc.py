@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from scipy.integrate import trapezoid
 
+from loopwright.tuning.analysis.stability import is_stable
+from loopwright.tuning.analysis.step_response import step_figures, step_response
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.methods import tune
 from loopwright.tuning.models import FOPDT, Integrating, Reals
-from loopwright.tuning.response import step_figures, step_response
-from loopwright.tuning.stability import is_stable
+from loopwright.tuning.rules.registry import tune
 from validation import tolerances as tol
 from validation.checks import Cell, Claim, Column, Figure, Paper, Row, Table
 from validation.loops import ideal_pid

@@ -6,13 +6,13 @@ from functools import cache
 
 import numpy as np
 
-from loopwright.tuning.complex_criterion import ComplexCriterion, Weighting
-from loopwright.tuning.forms import to_reciprocal
+from loopwright.tuning.gain_forms import to_reciprocal
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.methods import tune
 from loopwright.tuning.models import Model, TransferFunction
 from loopwright.tuning.reasons import Refused
+from loopwright.tuning.rules.complex_criterion import ComplexCriterion, Weighting
 from loopwright.tuning.rules.me_pso import me_pso
+from loopwright.tuning.rules.registry import tune
 from validation import tolerances as tol
 from validation.checks import Cell, Claim, Column, Figure, Paper, Row, Table
 from validation.euler import Rational, euler_indices

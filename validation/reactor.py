@@ -8,12 +8,12 @@ import numpy as np
 from scipy import signal
 
 from loopwright.plantsim.reactor import INLET, MV_NOMINAL, STEADY_STATE, derivative
-from loopwright.tuning.estimate import fopdt_from_overshoot
+from loopwright.tuning.analysis.margins import ultimate_point
+from loopwright.tuning.analysis.step_response import step_figures
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import ultimate_point
+from loopwright.tuning.identification.overshoot import fopdt_from_overshoot
 from loopwright.tuning.models import FOPDT, Reals, TransferFunction
-from loopwright.tuning.response import step_figures
-from loopwright.tuning.robust import optimise
+from loopwright.tuning.rules.robust_pi import optimise
 from validation import tolerances as tol
 from validation.checks import Cell, Claim, Column, Row, Table
 

@@ -6,9 +6,9 @@ from statistics import mean
 
 import numpy as np
 
+from loopwright.tuning.analysis.step_response import step_figures, step_response
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Model, TransferFunction
-from loopwright.tuning.response import step_figures, step_response
 from loopwright.tuning.rules.s_plane import design, s_plane
 from validation import tolerances as tol
 from validation.checks import Cell, Claim, Column, Figure, Paper, Row, Table

@@ -7,8 +7,8 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from loopwright.service.api.views import GainsView
-from loopwright.tuning.design import LEAST_GM, MOST_Ms
 from loopwright.tuning.reasons import Reason
+from loopwright.tuning.rules.design import LEAST_GM, MOST_Ms
 
 
 class OptionView(BaseModel):

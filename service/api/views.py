@@ -28,7 +28,7 @@ from loopwright.service.loop import LoopState
 from loopwright.service.running import Running
 from loopwright.service.states import ACTIVE, JobState, shown
 from loopwright.service.store.tables import EventRow, JobRow, LoopLockRow
-from loopwright.tuning.five_stage import PROCEDURE
+from loopwright.tuning.five_stage.procedure import PROCEDURE
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import ADVICE, Reason
 

@@ -12,8 +12,8 @@ LOADED = (
     "loopwright.service.rehearsal",
     "loopwright.service.tunings",
     "loopwright.tuning.fast.procedure",
-    "loopwright.tuning.fast.trial",
-    "loopwright.tuning.five_stage",
+    "loopwright.tuning.fast.design_trial",
+    "loopwright.tuning.five_stage.procedure",
 )
 
 # Before numpy is loaded: a computation takes one processor, and a process with threads should not be forked.

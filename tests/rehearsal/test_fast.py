@@ -10,8 +10,8 @@ from benchmarks.cases import ASKED, FURTHER
 from benchmarks.plants import plants
 from benchmarks.tuning import fast_run
 from loopwright.service.rehearsal import rehearse
+from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import margins, ultimate_point
 from loopwright.tuning.models import TransferFunction
 
 PLANTS: dict[str, dict[str, Any]] = {

@@ -19,8 +19,8 @@ from loopwright.service.rehearsal import RehearsedLoop
 from loopwright.service.request import RetuneRequest
 from loopwright.service.store.store import Store
 from loopwright.service.work import rehearse, tune
+from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import margins
 from loopwright.tuning.models import FOPDT
 from loopwright.tuning.plan import Mode
 from tests.unit.service.fakes import ThreadEngine

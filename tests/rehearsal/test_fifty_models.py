@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from loopwright.service.rehearsal import rehearse
+from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import margins
 from loopwright.tuning.models import TransferFunction
 
 MODELS_50: list[dict[str, Any]] = json.loads((resources.files("loopwright.plantsim") / "models-50.json").read_text())[

@@ -23,8 +23,8 @@ from loopwright.service.store.retunes import Part
 from loopwright.service.store.store import Store
 from loopwright.service.work import rehearse as dry_run
 from loopwright.service.work import tune
+from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import ultimate_point
 from loopwright.tuning.models import FOPDT
 from loopwright.tuning.plan import Mode
 from tests.unit.service.fakes import ThreadEngine

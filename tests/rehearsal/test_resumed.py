@@ -14,7 +14,7 @@ from loopwright.service.checkpoints import finished
 from loopwright.service.plain import plain_object
 from loopwright.service.rehearsal import RehearsedLoop, _parameters
 from loopwright.service.runner import Watch, run
-from loopwright.tuning.five_stage import STAGES, Facts, Finished, Options, five_stage
+from loopwright.tuning.five_stage.procedure import STAGES, Facts, Finished, Options, five_stage
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Event, Mode, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason

@@ -16,10 +16,10 @@ from loopwright.service.rehearsal import RehearsedLoop
 from loopwright.service.request import RetuneRequest
 from loopwright.service.store.store import Store
 from loopwright.service.work import rehearse, tune
+from loopwright.tuning.experiments.preflight import SETTLE
 from loopwright.tuning.fast.procedure import FAST_STAGES
-from loopwright.tuning.five_stage import STAGES
+from loopwright.tuning.five_stage.procedure import STAGES
 from loopwright.tuning.plan import Command, Sample
-from loopwright.tuning.stages.preflight import SETTLE
 from tests.unit.service.fakes import ThreadEngine
 
 TAG = "TIC-1"

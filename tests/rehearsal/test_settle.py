@@ -11,11 +11,11 @@ from loopwright.service.request import RetuneRequest
 from loopwright.service.runner import RunResult, Watch, run
 from loopwright.service.store.tables import EventRow
 from loopwright.service.work import plan
+from loopwright.tuning.experiments.preflight import SETTLE
+from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.experiments.settle import LOOKS
 from loopwright.tuning.plan import Event, Mode, Plan, SetMode, SetOutput, StageStarted
 from loopwright.tuning.reasons import Reason
-from loopwright.tuning.stages.common import Facts
-from loopwright.tuning.stages.preflight import SETTLE
-from loopwright.tuning.stages.settle import LOOKS
 
 TAG = "TIC-1"
 CUT_OFF = [EventRow(kind="loop_found", data={})]

@@ -12,11 +12,11 @@ from benchmarks.plants import Plant, plants
 from benchmarks.tuning import cost_over_best, loop_of, span_of
 from loopwright.service.bus_loop import BusLoop
 from loopwright.service.runner import Watch, run
+from loopwright.tuning.analysis.margins import margins
+from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.procedure import FastOptions, fast
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import margins
 from loopwright.tuning.plan import Mode
-from loopwright.tuning.stages.common import Facts
 from tests.vcan.test_bus_loop import CONTROLLER, PLANT, Start, start, url  # noqa: F401
 
 MODELS = (1, 2, 4, 6, 10, 12, 14, 16, 18, 20, 22, 24)

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize
 
-from loopwright.tuning.fast.loop_cost import Cost, LoopCost
-from loopwright.tuning.fast.robust_gain import encircles_not, largest_gains
+from loopwright.tuning.analysis.stability import is_stable
+from loopwright.tuning.fast.gain_bounds import encircles_not, largest_gains
+from loopwright.tuning.fast.iae import Cost, LoopCost
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Complexes, Model, Reals, TransferFunction, sign
 from loopwright.tuning.reasons import Reason, Refused
-from loopwright.tuning.stability import is_stable
 
 POINTS = 440
 LOWEST, HIGHEST = 10**-2.8, 10**1.6

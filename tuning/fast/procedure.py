@@ -13,17 +13,17 @@ import math
 from dataclasses import dataclass
 from functools import partial
 
-from loopwright.tuning.comparison import Comparison
+from loopwright.tuning.analysis.comparison import Comparison
+from loopwright.tuning.experiments.preflight import at_rest
+from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.design import Wish
-from loopwright.tuning.fast.evidence import LEAST_LISTENED, Evidence
-from loopwright.tuning.fast.experiment import Experiment
-from loopwright.tuning.fast.results import FastProposal, Verified, comparison_of, found_of, proposed, verified
+from loopwright.tuning.fast.proposal import FastProposal, Verified, comparison_of, found_of, proposed, verified
+from loopwright.tuning.fast.record import LEAST_LISTENED, Evidence
+from loopwright.tuning.fast.relay_test import Experiment
 from loopwright.tuning.fast.verdict import Judged, judge
 from loopwright.tuning.models import sign
 from loopwright.tuning.plan import Note, Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
-from loopwright.tuning.stages.common import Facts
-from loopwright.tuning.stages.preflight import at_rest
 
 __all__ = ["FAST", "FAST_STAGES", "FastOptions", "FastProposal", "fast"]
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from loopwright.tuning.fast.choice import Chosen, choose
 from loopwright.tuning.fast.design import Best, Design, Wish
-from loopwright.tuning.fast.evidence import Evidence
-from loopwright.tuning.fast.spread import colour, difference_of_rivals, peak, uncertainty_of_Ms
-from loopwright.tuning.fast.valve import suspect
+from loopwright.tuning.fast.record import Evidence
+from loopwright.tuning.fast.structure_choice import Chosen, choose
+from loopwright.tuning.fast.uncertainty import colour, difference_of_rivals, peak, uncertainty_of_Ms
+from loopwright.tuning.fast.valve_faults import suspect
 from loopwright.tuning.gains import Gains
+from loopwright.tuning.identification.output_error import Fit, Fitted
 from loopwright.tuning.models import TransferFunction
-from loopwright.tuning.record_fit import Fit, Fitted
 
 MOST_RESIDUAL, UNIMPORTANT = 1.35, 0.004
 """Of the residual: in noises at rest; in spans of PV, below which it does not matter."""

@@ -1,4 +1,4 @@
 """Tuning rules, one family a file. A rule is `rule(model, *, option=...) -> Setting`.
 
-`tuning.methods` lists them all.
+`tuning.rules.registry` lists them all.
 """

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from loopwright.tuning.models import FOPDT, Integrating
 from loopwright.tuning.rules.common import needs_dead_time, no_lag, one_of, setting
-from loopwright.tuning.setting import Setting
+from loopwright.tuning.rules.setting import Setting
 
 CONTROLLERS = ("pi", "pid")
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 from loopwright.tuning.models import FOPDT
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.common import one_of, ratio_within, setting
-from loopwright.tuning.setting import Setting
+from loopwright.tuning.rules.setting import Setting
 
 CONTROLLERS = ("p", "pi", "pid")
 AIMS = ("setpoint", "load")

@@ -19,7 +19,7 @@ from __future__ import annotations
 from loopwright.tuning.models import FOPDT
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.common import one_of, ratio_within, refuse_unstable, setting
-from loopwright.tuning.setting import Setting
+from loopwright.tuning.rules.setting import Setting
 
 CONTROLLERS = ("p", "pi", "pid")
 VARIANTS = ("original", "tau")

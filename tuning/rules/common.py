@@ -7,11 +7,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import margins
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model
 from loopwright.tuning.reasons import Reason, Refused
-from loopwright.tuning.setting import Setting
+from loopwright.tuning.rules.setting import Setting
 
 
 def setting(

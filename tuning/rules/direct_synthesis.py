@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from loopwright.tuning.models import FOPDT, SOPDT
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.common import needs_dead_time, positive, setting
-from loopwright.tuning.setting import Setting
+from loopwright.tuning.rules.setting import Setting
 
 PAPER_C = 6.0 - 4.0 * math.sqrt(2.0)
 NO_OVERSHOOT_C = math.exp(-1.0)

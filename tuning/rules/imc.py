@@ -29,7 +29,7 @@ import math
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.common import needs_dead_time, no_lag, one_of, positive, setting
-from loopwright.tuning.setting import Setting
+from loopwright.tuning.rules.setting import Setting
 
 FORMS = ("zero", "all-pass")
 SAFE = {"taylor": 0.5, "all-pass": 0.25, "zero": 0.8, "integrating": 2.0}

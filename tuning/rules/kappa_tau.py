@@ -18,7 +18,7 @@ import math
 from loopwright.tuning.models import FOPDT
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.common import ratio_within, setting
-from loopwright.tuning.setting import Setting
+from loopwright.tuning.rules.setting import Setting
 
 MS = (1.4, 2.0)
 RATIO = (0.1, 5.5)

@@ -14,7 +14,7 @@ from __future__ import annotations
 from loopwright.tuning.models import FOPDT, Integrating
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.common import needs_dead_time, no_lag, positive, setting
-from loopwright.tuning.setting import Setting
+from loopwright.tuning.rules.setting import Setting
 
 
 def lambda_tuning(model: FOPDT | Integrating, *, lambda_s: float | None = None) -> Setting:

@@ -15,13 +15,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from loopwright.tuning.complex_criterion import ComplexCriterion, Weighting
+from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import ultimate_point
 from loopwright.tuning.models import Model, Reals
 from loopwright.tuning.reasons import Reason, Refused
-from loopwright.tuning.search import Cost, Found, differential_evolution, multi_epoch_swarm, nelder_mead
-from loopwright.tuning.setting import Setting
+from loopwright.tuning.rules.complex_criterion import ComplexCriterion, Weighting
+from loopwright.tuning.rules.global_search import Cost, Found, differential_evolution, multi_epoch_swarm, nelder_mead
+from loopwright.tuning.rules.setting import Setting
 
 OPTIMISERS: dict[str, Callable[[Cost, int, int], Found]] = {
     "me-pso": multi_epoch_swarm,

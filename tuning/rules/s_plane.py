@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from loopwright.tuning.dead_time import DeadTimeLoop
+from loopwright.tuning.analysis.monodromy import DeadTimeLoop
+from loopwright.tuning.analysis.state_space import gain_unit, normalised, time_sum
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Complexes, Model, Reals, TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
-from loopwright.tuning.setting import Setting
-from loopwright.tuning.state_space import gain_unit, normalised, time_sum
+from loopwright.tuning.rules.setting import Setting
 
 MU = (0.01, 10.0)
 K1 = (0.01, 100.0)

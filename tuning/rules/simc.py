@@ -16,12 +16,12 @@ from __future__ import annotations
 
 import math
 
-from loopwright.tuning.forms import Series, of_series
-from loopwright.tuning.half_rule import exact, half_rule
+from loopwright.tuning.gain_forms import Series, of_series
 from loopwright.tuning.models import FOPDT, Integrating, Model, TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.reduction.half_rule import exact, half_rule
 from loopwright.tuning.rules.common import in_words, one_of, positive, setting
-from loopwright.tuning.setting import Setting
+from loopwright.tuning.rules.setting import Setting
 
 CONTROLLERS = ("pi", "pid")
 

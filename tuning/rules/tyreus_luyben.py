@@ -10,10 +10,10 @@ dominated by their lag; the PI of variant "0.45", Ti = Pu/0.45, is what the ME-P
 
 from __future__ import annotations
 
-from loopwright.tuning.margins import ultimate_point
+from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.models import Model, integrators
 from loopwright.tuning.rules.common import one_of, positive, refuse_unstable, setting, stable_plant
-from loopwright.tuning.setting import Setting
+from loopwright.tuning.rules.setting import Setting
 
 CONTROLLERS = ("pi", "pid")
 VARIANTS = ("2.2", "0.45")

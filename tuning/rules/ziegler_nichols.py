@@ -13,7 +13,7 @@ is for L/T up to 1; below 0.1 the dead time is too short to be read from a step,
 
 from __future__ import annotations
 
-from loopwright.tuning.margins import ultimate_point
+from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.models import FOPDT, Integrating, Model, integrators
 from loopwright.tuning.rules.common import (
     needs_dead_time,
@@ -24,7 +24,7 @@ from loopwright.tuning.rules.common import (
     setting,
     stable_plant,
 )
-from loopwright.tuning.setting import Setting
+from loopwright.tuning.rules.setting import Setting
 
 CONTROLLERS = ("p", "pi", "pid")
 RATIO = (0.1, 1.0)

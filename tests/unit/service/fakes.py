@@ -19,11 +19,11 @@ from loopwright.service.request import RetuneRequest
 from loopwright.service.states import ACTIVE, JobState
 from loopwright.service.store.store import Store
 from loopwright.service.work import Hooks, Outcome, Rehearse
-from loopwright.tuning.design import Predicted
+from loopwright.tuning.analysis.comparison import Predicted
+from loopwright.tuning.experiments.step_test import StepResult
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Mode, Note, Sample, SetGains, SetSetpoint, StageDone, StageStarted
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason, Refused
-from loopwright.tuning.stages.step_test import StepResult
 
 OLD, NEW = Gains(0.5, 2.0), Gains(0.75, 3.0)
 TAG = "TIC-101"

@@ -14,12 +14,12 @@ from loopwright.service.model_forms import parse_model
 from loopwright.service.request import PlantModel, RetuneRequest
 from loopwright.service.tunings import tunings
 from loopwright.service.work import rehearse
-from loopwright.tuning.design import design
+from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import margins
-from loopwright.tuning.methods import METHODS
 from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.rules.design import design
+from loopwright.tuning.rules.registry import METHODS
 from tests.unit.service.fakes import RESULT, TAG, FakeLoop, Service
 from tests.unit.service.test_api import assert_problem, finished, start
 
@@ -128,7 +128,7 @@ def test_unstable_gains_are_not_to_be_tried(
     service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from loopwright.service import tunings as module
-    from loopwright.tuning.assess import assess
+    from loopwright.tuning.analysis.assessment import assess
 
     # a hundred times the gains that the method found
     monkeypatch.setattr(module, "realisable", lambda gains, _filter: (Gains(100.0 * gains.Kp, gains.Ti), ()))

@@ -15,8 +15,8 @@ from typer.testing import CliRunner, Result
 
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.cli import app
-from loopwright.tuning.methods import METHODS
 from loopwright.tuning.reasons import Reason
+from loopwright.tuning.rules.registry import METHODS
 
 MODELS = {
     "lag-dominant": '{"K": 2, "T": 50, "L": 2}',
@@ -309,7 +309,7 @@ def test_tune_imports_nothing_that_it_does_not_use() -> None:
     )
     ran = subprocess.run([sys.executable, "-c", code, MODELS["balanced"]], capture_output=True, text=True, check=True)
     loaded = set(ran.stderr.split())
-    assert "loopwright.tuning.methods" in loaded
+    assert "loopwright.tuning.rules.registry" in loaded
     heavy = {"fastapi", "sqlalchemy", "matplotlib", "httpx", "can", "scipy.signal", "scipy.stats"}
     assert loaded.isdisjoint(heavy), loaded & heavy
 

@@ -94,8 +94,8 @@ class TestPool:
 
     def test_it_finds_everything_loaded(self, pool: Pool) -> None:
         wanted = {
-            "loopwright.tuning.five_stage",
-            "loopwright.tuning.fast.trial",
+            "loopwright.tuning.five_stage.procedure",
+            "loopwright.tuning.fast.design_trial",
             "loopwright.service.tunings",
             "loopwright.service.alternatives",
             "loopwright.service.rehearsal",

@@ -18,8 +18,8 @@ from loopwright.service.metrics import exposition, registry
 from loopwright.service.request import PlantModel, RetuneRequest, TransferModel
 from loopwright.service.states import JobState
 from loopwright.service.work import Hooks, rehearse
+from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import margins
 from loopwright.tuning.models import FOPDT
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Reason, Refused

@@ -9,9 +9,9 @@ import pytest
 
 from loopwright.service.fast_record import kept
 from loopwright.service.rehearsal import rehearse
-from loopwright.tuning.fast.choice import choose
+from loopwright.tuning.fast.structure_choice import choose
+from loopwright.tuning.identification.output_error import Fit
 from loopwright.tuning.plan import Event, Mode, Sample, StageStarted
-from loopwright.tuning.record_fit import Fit
 
 SPEC = {"num": [-1.5], "den": [8.0, 1.0], "dead_time_s": 2.0, "sample_time_s": 0.1, "noise_std": 0.002, "t95_s": 26.0}
 

@@ -74,7 +74,7 @@ def test_when_the_jobs_begin_all_is_loaded_and_no_collection_looks_through_it(
     try:
         with pytest.raises(FolderInUse, match="enough"):
             serving.serve(serving.Setup(loops, tmp_path / "data", "127.0.0.1", 0), tune=FakeTune())
-        assert kept[0] - before > 10_000 and "loopwright.tuning.five_stage" in sys.modules
+        assert kept[0] - before > 10_000 and "loopwright.tuning.five_stage.procedure" in sys.modules
     finally:
         gc.unfreeze()
 

@@ -15,7 +15,7 @@ from tests.repeat import once
 from tests.unit.containers import test_bus, test_data_volume
 from tests.unit.protocol import test_hub
 from tests.unit.service import test_computing, test_serving, test_start, test_stop, test_survival
-from tests.unit.tuning import test_margins
+from tests.unit.tuning.analysis import test_margins
 
 TESTS = """
 def test_is_good():

@@ -8,7 +8,7 @@ import numpy as np
 
 from loopwright.controller.channel import Channel, Mode, Parameters, RelaySettings, Settings
 from loopwright.plantsim.plant import LinearPlant
-from loopwright.tuning.fast.evidence import Evidence
+from loopwright.tuning.fast.record import Evidence
 from loopwright.tuning.models import TransferFunction, sign
 
 LISTENED = 130

@@ -7,15 +7,15 @@ import math
 import numpy as np
 import pytest
 
+from loopwright.tuning.analysis.margins import margins, ultimate_point
+from loopwright.tuning.analysis.stability import is_stable
+from loopwright.tuning.analysis.step_response import step_figures
 from loopwright.tuning.fast.design import Design, Wish, controller, frequencies
-from loopwright.tuning.fast.loop_cost import LoopCost
-from loopwright.tuning.fast.robust_gain import encircles_not, largest_gains
+from loopwright.tuning.fast.gain_bounds import encircles_not, largest_gains
+from loopwright.tuning.fast.iae import LoopCost
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import margins, ultimate_point
 from loopwright.tuning.models import TransferFunction, sign
 from loopwright.tuning.reasons import Reason, Refused
-from loopwright.tuning.response import step_figures
-from loopwright.tuning.stability import is_stable
 from tests.unit.tuning.fast.records import BENCHES, FIVE_LAGS, INTEGRATES, INVERSE, THREE_LAGS
 
 LOOPS = [

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.fast.design import Wish
-from loopwright.tuning.fast.spread import peak, seen_covariance
+from loopwright.tuning.fast.uncertainty import peak, seen_covariance
 from loopwright.tuning.fast.verdict import judge
-from loopwright.tuning.margins import margins
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
 from tests.unit.tuning.fast.records import BENCHES, FIRST, THREE_LAGS, record

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.special import lambertw
 
+from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import margins
-from loopwright.tuning.methods import tune
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, Reals
 from loopwright.tuning.reasons import Refused
 from loopwright.tuning.rules.direct_synthesis import PAPER_C, direct_synthesis, gain_range
 from loopwright.tuning.rules.imc import SAFE, UNSTABLE_ZERO
+from loopwright.tuning.rules.registry import tune
 from tests.unit.tuning.isa import response
 from tests.unit.tuning.rules.tables import OBJECTS, TABLES, sopdt
 

@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
-from loopwright.tuning.forms import to_reciprocal
+from loopwright.tuning.analysis.margins import margins, ultimate_point
+from loopwright.tuning.gain_forms import to_reciprocal
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.margins import margins, ultimate_point
-from loopwright.tuning.methods import tune
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules import tyreus_luyben, ziegler_nichols
+from loopwright.tuning.rules.registry import tune
 from tests.unit.tuning.rules.tables import OBJECTS, TABLES, moments, plant, sopdt
 
 SETTINGS = TABLES["direct_synthesis"]["settings"]

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from loopwright.tuning.methods import METHODS, tune
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 from loopwright.tuning.reasons import Refused
-from loopwright.tuning.setting import Setting
+from loopwright.tuning.rules.registry import METHODS, tune
+from loopwright.tuning.rules.setting import Setting
 
 # the printed criterion of the robust PI is not free of the unit of time, and a search goes another way after the first
 # rounding: see their own tests

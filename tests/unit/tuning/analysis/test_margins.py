@@ -1,0 +1,138 @@
+"""Margins and ultimate points against the paper's tables and, without dead time, against python-control."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+
+from loopwright.tuning.analysis.margins import margins, ultimate_point
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import FOPDT, TransferFunction
+from loopwright.tuning.reasons import Reason, Refused
+from tests.unit.tuning.tables import EQUIPOLE5, GOLDEN, MODELS, TABLES, table4_model, transfer_function
+
+# Table 1: one controller, designed for the full plant, on five reduced models of it
+PLANTS_PI = Gains(Kp=0.887, Ti=0.887 / 0.225)
+
+
+@pytest.mark.parametrize("row", TABLES["table1"]["rows"], ids=lambda r: r["method"])
+def test_table_1(row: dict[str, Any]) -> None:
+    p, recomputed = row["printed"], row["recomputed"]
+    model = FOPDT(p["k"], p["T"], row.get("settled", p)["tau"])
+    found = margins(model, PLANTS_PI)
+    assert pytest.approx(recomputed["GM"], rel=0.005) == found.GM
+    assert found.PM_deg == pytest.approx(recomputed["PM"], abs=0.3)
+
+
+@pytest.mark.parametrize("row", TABLES["table2"]["rows"], ids=lambda r: r["model"])
+def test_table_2(row: dict[str, Any]) -> None:
+    p, recomputed = row["printed"], row["recomputed"]
+    found = margins(EQUIPOLE5, Gains(Kp=p["kp"], Ti=p["kp"] / p["ki"]))
+    assert pytest.approx(recomputed["GM"], rel=0.005) == found.GM
+    assert found.PM_deg == pytest.approx(recomputed["PM"], abs=0.3)
+    assert found.Ms == pytest.approx(recomputed["Ms"], rel=0.005)
+
+
+@pytest.mark.parametrize("row", TABLES["table4"]["rows"], ids=lambda r: f"{r['model']} {r['method']}")
+def test_table_4(row: dict[str, Any]) -> None:
+    gains = row["recomputed"]
+    found = margins(table4_model(row["model"]), Gains(Kp=gains["Kp"], Ti=gains["Ti"]))
+    assert found.stable
+    assert pytest.approx(gains["GM"], rel=0.005) == found.GM
+    assert found.PM_deg == pytest.approx(gains["PM"], abs=0.3)
+    if "Ms" in gains:
+        assert found.Ms == pytest.approx(gains["Ms"], rel=0.005)
+    # the print itself: exact for ZN-2, within the optimum's own tolerance for the optimised PI
+    assert pytest.approx(row["printed"]["GM"], rel=0.005 if row["method"] == "ZN-2" else 0.015) == found.GM
+    assert found.PM_deg == pytest.approx(row["printed"]["PM"], abs=0.4)
+
+
+@pytest.mark.parametrize("entry", MODELS, ids=lambda m: str(m["id"]))
+def test_ultimate_points_of_the_50_models(entry: dict[str, Any]) -> None:
+    model = transfer_function(entry)
+    Ku, Pu = ultimate_point(model)
+    assert pytest.approx(entry["computed"]["Ku"], rel=0.001) == Ku
+    assert pytest.approx(entry["computed"]["Pu"], rel=0.001) == Pu
+    assert margins(model, Gains(Kp=0.99 * Ku)).stable
+    assert not margins(model, Gains(Kp=1.01 * Ku)).stable
+
+
+def test_ultimate_point_of_equal_lags() -> None:
+    # five equal lags meet at 36 degrees each: w = tan 36, Ku = 1/cos^5 36
+    Ku, Pu = ultimate_point(EQUIPOLE5)
+    assert pytest.approx(math.cos(math.radians(36.0)) ** -5, rel=1e-6) == Ku
+    assert pytest.approx(2.0 * math.pi / math.tan(math.radians(36.0)), rel=1e-6) == Pu
+    assert pytest.approx(GOLDEN["equipole5"]["Ku"], rel=0.001) == Ku
+
+
+@pytest.mark.parametrize("row", GOLDEN["formula2_on_exact_fopdt"]["rows"], ids=lambda r: f"d={r[0]}")
+def test_ultimate_points_of_fopdt(row: list[float]) -> None:
+    Ku, Pu = ultimate_point(FOPDT(2.0, 10.0, 10.0 * row[0]))
+    assert 2.0 * Ku == pytest.approx(row[1], rel=0.001)
+    assert Pu / (10.0 * row[0]) == pytest.approx(row[2], rel=0.001)
+
+
+def test_an_integral_loop_with_dead_time_in_closed_form() -> None:
+    # the PI cancels the lag: loop 0.5*exp(-s)/s, so wc = 0.5, PM = 90 deg - 0.5 rad, GM = pi
+    found = margins(FOPDT(1.0, 4.0, 1.0), Gains(Kp=2.0, Ti=4.0))
+    assert found.wc == pytest.approx(0.5, rel=1e-6)
+    assert found.PM_deg == pytest.approx(90.0 - math.degrees(0.5), abs=1e-4)
+    assert pytest.approx(math.pi, rel=1e-6) == found.GM
+    assert found.wpc == pytest.approx(math.pi / 2.0, rel=1e-6)
+
+
+def test_the_sign_of_the_gain_is_the_action_of_the_controller() -> None:
+    gains = Gains(Kp=0.9, Ti=7.5)
+    assert margins(FOPDT(-2.0, 5.0, 2.5), gains) == margins(FOPDT(2.0, 5.0, 2.5), gains)
+
+
+def test_a_plant_without_ultimate_point_is_refused() -> None:
+    with pytest.raises(Refused) as refused:
+        ultimate_point(TransferFunction((1.0,), (2.0, 3.0, 1.0)))
+    assert refused.value.reason is Reason.CANNOT_OSCILLATE
+
+
+def test_against_python_control_without_dead_time() -> None:
+    checked = 0
+    for entry in MODELS:
+        model = TransferFunction(tuple(entry["num"]), tuple(entry["den"]))
+        gains = Gains(Kp=0.8, Ti=4.0, Td=0.5, Tf=0.05)
+        found = margins(model, gains)
+        s = control.tf("s")
+        c = gains.Kp * (1.0 + 1.0 / (gains.Ti * s) + gains.Td * s / (gains.Tf * s + 1.0))
+        loop = control.tf(list(model.num), list(model.den)) * c
+        assert found.stable == bool(np.all(control.feedback(loop, 1).poles().real < 0.0)), entry["id"]
+        if not found.stable:
+            continue
+        gm, pm, sm, *_ = control.stability_margins(loop)
+        assert found.PM_deg == pytest.approx(pm, abs=0.01), entry["id"]
+        # their sm leaves out the ends of the axis, where a bi-proper loop may come nearest
+        nearest = float(np.min(np.abs(1.0 + loop(1j * np.geomspace(1e-4, 1e5, 20_000)))))
+        assert 1.0 / found.Ms == pytest.approx(nearest, rel=0.001), entry["id"]
+        if math.isfinite(sm):
+            assert 1.0 / found.Ms <= sm * 1.001, entry["id"]
+        assert (found.GM is None) == math.isinf(gm), entry["id"]
+        if found.GM is not None:
+            assert pytest.approx(gm, rel=0.001) == found.GM, entry["id"]
+        checked += 1
+    assert checked > 20
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: FOPDT(0.0, 1.0, 1.0),
+        lambda: FOPDT(1.0, -1.0, 1.0),
+        lambda: FOPDT(1.0, 1.0, math.nan),
+        lambda: TransferFunction((1.0, 1.0, 1.0), (1.0, 1.0)),
+        lambda: TransferFunction((1.0,), (1.0, 0.0, 0.0)),
+        lambda: TransferFunction((1.0,), (2.0,)),
+    ],
+)
+def test_what_is_not_a_model(make: Any) -> None:
+    with pytest.raises(ValueError):
+        make()

@@ -1,0 +1,1 @@
+"""What a model and a controller make together: stability, margins, step responses and their figures."""

@@ -1,0 +1,163 @@
+"""Stability margins of a loop and the ultimate point of a plant, with exact dead time.
+
+A dense logarithmic grid finds the crossings and the peak, a local search refines each. Loops are taken with the sign
+that makes them negative feedback (the controller's direct or reverse action), so models of negative gain need no care.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq, minimize_scalar
+
+from loopwright.tuning.analysis.stability import is_stable, open_loop
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import Complexes, Model, Reals
+from loopwright.tuning.reasons import Reason, Refused
+
+POINTS_PER_DECADE = 600
+
+
+@dataclass(frozen=True, slots=True)
+class Margins:
+    """GM: ratio.  PM_deg: degrees.  Ms: peak of |1/(1+L)|.  Mt: peak of |L/(1+L)|.
+
+    GM is the least factor above one that takes a stable loop to its limit. wc: gain crossover, wpc: phase crossover,
+    ws: where Ms is, all rad/s.  bandwidth: where |L/(1+L)| first falls to 1/sqrt(2) of its value at rest, rad/s. A
+    margin without its crossing is None, and so is its frequency. `stable` is exact (see `tuning.analysis.stability`);
+    with stable false the other figures describe the curve, not a margin.
+    """
+
+    GM: float | None
+    PM_deg: float | None
+    Ms: float
+    Mt: float
+    wc: float | None
+    wpc: float | None
+    ws: float
+    bandwidth: float | None
+    stable: bool
+
+    @property
+    def delay_margin_s(self) -> float | None:
+        """The dead time that the loop bears in addition at its gain crossover wc, s."""
+        if self.PM_deg is None or self.wc is None:
+            return None
+        return math.radians(self.PM_deg) / self.wc
+
+
+def margins(model: Model, gains: Gains) -> Margins:
+    """Margins of the loop of this model and these gains; Tf = 0 is the ideal derivative.
+
+    Raises Refused, BAD_INPUT: gains that are none, or an ideal derivative on a bi-proper plant.
+    """
+    N, D = open_loop(model, gains)
+    stable = is_stable(model, gains)
+
+    def loop(w: Reals) -> Complexes:
+        s = 1j * w
+        return np.asarray(np.polyval(N, s) / np.polyval(D, s) * np.exp(-model.L * s))
+
+    def at(w: float) -> complex:
+        return complex(loop(np.array([w]))[0])
+
+    w = _grid(model, N, D)
+    L = loop(w)
+    one_plus = np.abs(1.0 + L)
+    ws, least = _least(lambda x: abs(1.0 + at(x)), w, int(np.argmin(one_plus)))
+    closed = np.abs(L) / one_plus
+    _, mt = _least(lambda x: -abs(at(x) / (1.0 + at(x))), w, int(np.argmax(closed)))
+
+    wpc, inverse_gm = None, 0.0
+    for x in _crossings(lambda v: loop(v).imag, w, L.imag, (L.real < 0.0)):
+        size = abs(at(x))
+        # a stable loop may cross beyond -1 as well (conditional stability): less gain, not more, ends it there
+        if size > inverse_gm and not (stable and size >= 1.0):
+            wpc, inverse_gm = x, size
+
+    wc, pm = None, None
+    for x in _crossings(lambda v: np.log(np.abs(loop(v))), w, np.log(np.abs(L)), np.ones(w.shape, dtype=bool)):
+        here = abs(float(np.degrees(np.angle(-at(x)))))
+        if pm is None or here < pm:
+            wc, pm = x, here
+
+    return Margins(
+        GM=1.0 / inverse_gm if inverse_gm > 0.0 else None,
+        PM_deg=pm,
+        Ms=1.0 / max(least, 1e-12),
+        Mt=-mt,
+        wc=wc,
+        wpc=wpc,
+        ws=ws,
+        bandwidth=_bandwidth(loop, w, closed, N, D),
+        stable=stable,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Ultimate:
+    """Ku: MV units per PV unit.  Pu_s: s. As measured on the loop, or typed in."""
+
+    Ku: float
+    Pu_s: float
+
+
+def ultimate_point(model: Model) -> tuple[float, float]:
+    """(Ku, Pu): the gain, positive, at which a P loop just oscillates, and the period of it in s."""
+    found = margins(model, Gains(Kp=1.0))
+    if found.GM is None or found.wpc is None:
+        raise Refused(Reason.CANNOT_OSCILLATE, "the model's phase never reaches -180 degrees")
+    return found.GM, 2.0 * math.pi / found.wpc
+
+
+def _grid(model: Model, N: Reals, D: Reals) -> Reals:
+    """From well below the slowest to well above the fastest corner of the loop, crossovers included."""
+    corners = [float(x) for x in np.abs(np.concatenate((np.roots(N), np.roots(D)))) if x > 0.0]
+    kept = np.trim_zeros(D, "b")
+    origin = len(D) - len(kept)
+    if origin:
+        # where the integrating part alone would cross
+        corners.append(float(abs(N[-1] / kept[-1]) ** (1.0 / origin)))
+    if model.L > 0.0:
+        corners.append(1.0 / model.L)
+    low, high = 1e-3 * min(corners), 1e2 * max(corners)
+    points = int(POINTS_PER_DECADE * math.log10(high / low)) + 1
+    return np.asarray(np.geomspace(low, high, points))
+
+
+def _bandwidth(loop: Callable[[Reals], Complexes], w: Reals, closed: Reals, N: Reals, D: Reals) -> float | None:
+    level = abs(N[-1] / (N[-1] + D[-1])) / math.sqrt(2.0)
+    below = np.flatnonzero(closed < level)
+    if not len(below) or below[0] == 0:
+        return None
+    i = int(below[0])
+
+    def excess(x: float) -> float:
+        at = complex(loop(np.array([x]))[0])
+        return float(abs(at / (1.0 + at)) - level)
+
+    return float(brentq(excess, w[i - 1], w[i], xtol=1e-12 * float(w[i]), rtol=1e-12))
+
+
+def _crossings(f: Callable[[Reals], Reals], w: Reals, values: Reals, wanted: NDArray[np.bool_]) -> list[float]:
+    """Zeros of f between grid points that are both wanted."""
+    keep = wanted[:-1] & wanted[1:]
+    at = np.flatnonzero((np.sign(values[:-1]) * np.sign(values[1:]) <= 0.0) & keep)
+    # beyond a few dozen turns of the dead time the loop gain has long decayed: the first crossings decide
+    return [
+        float(brentq(lambda x: float(f(np.array([x]))[0]), w[i], w[i + 1], xtol=1e-12 * float(w[i]), rtol=1e-12))
+        for i in at[:40]
+        if values[i] != values[i + 1]
+    ]
+
+
+def _least(f: Callable[[float], float], w: Reals, at: int) -> tuple[float, float]:
+    """The least value of f near the grid point `at`: (where, value)."""
+    if at in (0, len(w) - 1):
+        return float(w[at]), f(float(w[at]))
+    found = minimize_scalar(f, bounds=(w[at - 1], w[at + 1]), method="bounded", options={"xatol": 1e-7 * float(w[at])})
+    return float(found.x), float(found.fun)

@@ -1,0 +1,1 @@
+"""What every procedure moves on a live loop is made of: rest, a set-point step, settling, verification."""

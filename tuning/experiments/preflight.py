@@ -1,0 +1,90 @@
+"""Preflight: is the loop fit to be tested? Listens only; refuses with the numbers.
+
+Noise alone moves a slow loop about, and what has just disturbed one dies away: a loop that is not at rest is given time
+and looked at again.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, record
+from loopwright.tuning.plan import Mode, Note, Plan, StageStarted
+from loopwright.tuning.reasons import Reason, Refused
+
+PREFLIGHT, SETTLE = "preflight", "settle"
+LOOKS = 4
+LEAST_LISTENED_SAMPLES = 60
+MOST_NOISE = 0.10
+"""Noise (standard deviation) as a share of the set-point step, above which no overshoot can be read."""
+MOST_AWAY = 0.05
+"""PV off the set-point, and its drift, as a share of the set-point step, above which the loop is not at rest."""
+LEAST_ROOM = 0.05
+"""Room for MV on both sides, as a share of its permitted range."""
+
+
+def preflight(facts: Facts, after_s: float) -> Plan[OperatingPoint]:
+    """Where the loop rests, see `at_rest`."""
+    point, _ = yield from at_rest(facts, after_s)
+    return point
+
+
+def at_rest(
+    facts: Facts, after_s: float, least_samples: int = LEAST_LISTENED_SAMPLES
+) -> Plan[tuple[OperatingPoint, Trace]]:
+    """Looks at the loop until it is at rest, LOOKS times at most; the last look's samples come with the point.
+
+    after_s: expected of the stages that follow. Each look is a stage of its own, with one of settling before it.
+    Raises Refused: WRONG_MODE, NOT_AT_REST, NOISE_TOO_HIGH, SATURATED.
+    """
+    once_s = facts.T95_s / 2
+    begin = (StageStarted(PREFLIGHT, once_s, after_s),)
+    for _ in range(LOOKS - 1):
+        yield begin
+        try:
+            return (yield from look(facts, least_samples))
+        except Refused as refused:
+            if refused.reason is not Reason.NOT_AT_REST:
+                raise
+            yield from record(once_s, (Note(refused.detail), StageStarted(SETTLE, once_s, once_s + after_s)))
+    yield begin
+    return (yield from look(facts, least_samples))
+
+
+def look(facts: Facts, least_samples: int = LEAST_LISTENED_SAMPLES) -> Plan[tuple[OperatingPoint, Trace]]:
+    """Listens once, for half T95 (at least so many samples) in automatic. Raises Refused as `at_rest`."""
+    trace = yield from record(max(facts.T95_s / 2, least_samples * facts.sample_time_s))
+    sample = yield ()
+    trace.add(sample)
+    if sample.mode != Mode.AUTOMATIC:
+        raise Refused(Reason.WRONG_MODE, f"the controller is in mode {Mode(sample.mode).name.lower()}, not automatic")
+    pv, mv = np.asarray(trace.pv), np.asarray(trace.mv)
+    step = facts.sp_deviation
+    if float(np.ptp(trace.sp)) > 0:
+        raise Refused(Reason.NOT_AT_REST, f"the set-point moved by {np.ptp(trace.sp):.4g} while listening")
+    x = np.linspace(-0.5, 0.5, len(pv))
+    drift = float(np.polyfit(x, pv, 1)[0])
+    noise = float(np.std(np.diff(pv))) / math.sqrt(2)
+    spread = float(np.std(pv - drift * x))
+    away = float(pv.mean()) - sample.sp
+    near = facts.mv_high - facts.mv_low
+    room = min(facts.mv_high - float(mv.mean()), float(mv.mean()) - facts.mv_low)
+    if room < LEAST_ROOM * near:
+        raise Refused(
+            Reason.SATURATED,
+            f"MV {mv.mean():.4g} leaves {room:.3g} of room within {facts.mv_low:.4g} .. {facts.mv_high:.4g}; "
+            f"at least {LEAST_ROOM * near:.3g} is needed",
+        )
+    slack = 4 * noise / math.sqrt(len(pv))
+    if noise > MOST_NOISE * step:
+        raise Refused(Reason.NOISE_TOO_HIGH, f"noise {noise:.3g} is above {MOST_NOISE:.0%} of the step {step:.3g}")
+    near_rest = MOST_AWAY * step
+    if abs(drift) > near_rest + 4 * slack or abs(away) > near_rest + slack or spread > 0.03 * step + 2 * noise:
+        raise Refused(
+            Reason.NOT_AT_REST,
+            f"within {trace.t[-1] - trace.t[0]:.3g} s PV drifted by {drift:+.3g}, is {away:+.3g} off the set-point and "
+            f"varies by {spread:.3g} (noise {noise:.3g}); the step would be {step:.3g}",
+        )
+    return OperatingPoint(sample.sp, float(pv.mean()), float(mv.mean()), noise, room), trace

@@ -1,0 +1,126 @@
+"""A set-point step on the live loop: up, until settled. Baseline, Stage 3 and verification are all made of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopwright.tuning.experiments.primitives import Array, Facts, OperatingPoint, Trace, same, settle
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Plan, SetSetpoint
+from loopwright.tuning.reasons import Reason, Refused
+
+KICK_OF_ROOM = 0.7
+"""Of the room for MV: the largest first kick of a set-point step."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepResult:
+    """Figures of one measured set-point step.
+
+    step: PV units.  overshoot_pct: of the step.  IAE: PV unit * s.  settling_s: into 5 % (or the noise) for good, s.
+    static_gain: PV units per MV unit, signed; nan when the step did not settle, infinite when MV is back where it was.
+    mv_at_limit_s: how long MV was at the end of its permitted range.  settled: within the time allowed.
+    """
+
+    step: float
+    overshoot_pct: float
+    IAE: float
+    settling_s: float
+    static_gain: float
+    mv_span: float
+    mv_at_limit_s: float
+    settled: bool
+    duration_s: float
+
+
+def allowed_step(facts: Facts, point: OperatingPoint, Kp: float, static_gain: float) -> float:
+    """The largest permitted set-point step that keeps the kick and the final value of MV well inside its room."""
+    step = min(facts.sp_deviation, KICK_OF_ROOM * point.room / Kp)
+    if static_gain == static_gain and static_gain != 0:
+        step = min(step, 0.6 * point.room * abs(static_gain))
+    return step
+
+
+def step_test(
+    facts: Facts,
+    point: OperatingPoint,
+    step: float,
+    *,
+    band: float,
+    most_s: float,
+    smooth_s: float,
+    kept: Trace | None = None,
+) -> Plan[StepResult]:
+    """Steps the set-point from rest by `step` and waits until PV stays within band * step for T95/5.
+
+    smooth_s: width of the parabola fitted around the peak (it must be shorter than the peak), s.
+    kept: filled with the samples, the first being that of the step.
+    """
+    target = point.sp + step
+    sample = yield (SetSetpoint(target),)
+    while not same(sample.sp, target):
+        sample = yield ()
+    later, settled = yield from settle(target, band * abs(step), facts.T95_s / 5, most_s, point.noise)
+    trace = Trace([sample.t, *later.t], [sample.sp, *later.sp], [sample.pv, *later.pv], [sample.mv, *later.mv])
+    if kept is not None:
+        kept.t, kept.sp, kept.pv, kept.mv = trace.t, trace.sp, trace.pv, trace.mv
+    t, pv, mv = (np.asarray(column) for column in (trace.t, trace.pv, trace.mv))
+    t = t - t[0]
+    tail = trace.tail(facts.T95_s / 5)
+    change = float(mv[tail].mean()) - point.mv
+    error = (target - pv) / step
+    hair = 1e-6 * (facts.mv_high - facts.mv_low)  # REAL32 on the bus
+    outside = np.flatnonzero(np.abs(error) > 0.05 + 3 * point.noise / abs(step))
+    return StepResult(
+        step=step,
+        overshoot_pct=100 * max(0.0, _peak(t, -error, smooth_s)),
+        IAE=float(np.trapezoid(np.abs(target - pv), t)),
+        settling_s=float(t[outside[-1]]) if len(outside) else 0.0,
+        static_gain=_ratio(float(pv[tail].mean()) - point.pv, change) if settled else math.nan,
+        mv_span=float(np.ptp(mv)),
+        mv_at_limit_s=facts.sample_time_s * int(np.sum((mv <= facts.mv_low + hair) | (mv >= facts.mv_high - hair))),
+        settled=settled,
+        duration_s=float(t[-1]),
+    )
+
+
+def unlimited(facts: Facts, result: StepResult, gains: Gains) -> None:
+    """Raises Refused when the limits of MV had a part in the response: it then says nothing about the loop.
+
+    A clipped kick of a sample or two leaves no mark on it.
+    """
+    if result.mv_at_limit_s > max(2.5 * facts.sample_time_s, 0.02 * gains.Ti):
+        raise Refused(
+            Reason.MV_LIMIT,
+            f"MV was at the end of its permitted range for {result.mv_at_limit_s:.3g} s of a set-point step of "
+            f"{result.step:.4g} with Kp {gains.Kp:.4g}",
+        )
+
+
+def _ratio(pv_change: float, mv_change: float) -> float:
+    return pv_change / mv_change if mv_change else math.inf
+
+
+def _peak(t: Array, y: Array, width: float) -> float:
+    """Height of the highest peak: a parabola by least squares around the highest moving average.
+
+    Reading off the largest sample would add two or three standard deviations of noise to every overshoot.
+    """
+    dt = t[1] - t[0] if len(t) > 1 else 1.0
+    half = int(width / dt / 2)
+    if half < 2:
+        return float(y.max())
+    kernel = np.ones(half) / half
+    middle = (
+        int(np.argmax(np.convolve(y, kernel, mode="same")[half : -half or None])) + half if len(y) > 4 * half else 0
+    )
+    part = slice(max(0, middle - half), middle + half + 1)
+    x = t[part] - t[middle]
+    c = np.polyfit(x, y[part], 2)
+    if c[0] >= 0:
+        return float(np.polyval(c, x).max())
+    top = min(max(-c[1] / (2 * c[0]), float(x[0])), float(x[-1]))
+    return float(np.polyval(c, top))

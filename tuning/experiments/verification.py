@@ -1,0 +1,38 @@
+"""The last stage: a set-point step from rest under the new gains, against what their model predicts."""
+
+from __future__ import annotations
+
+import math
+
+from loopwright.tuning.analysis.comparison import Predicted
+from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, settle
+from loopwright.tuning.experiments.step_test import StepResult, allowed_step, step_test, unlimited
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Mode, Plan, SetGains, SetMode, SetSetpoint
+from loopwright.tuning.reasons import Reason, Refused
+
+
+def verification(
+    facts: Facts, point: OperatingPoint, gains: Gains, predicted: Predicted, static_gain: float, dead_time_s: float
+) -> Plan[StepResult]:
+    """static_gain: of the model, nan where it is not known. The step is the one that the old gains may have been
+    tried with. Raises Refused: NOT_CONFIRMED, MV_LIMIT.
+    """
+    step = min(
+        allowed_step(facts, point, gains.Kp, abs(static_gain)),
+        allowed_step(facts, point, facts.old_gains.Kp, math.nan),
+    )
+    commands = (SetGains(gains), SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp))
+    yield from settle(point.sp, 0.02 * step, facts.T95_s / 5, 3 * facts.T95_s, point.noise, commands)
+    result = yield from step_test(facts, point, step, band=0.05, most_s=5 * facts.T95_s, smooth_s=dead_time_s / 2)
+    unlimited(facts, result, gains)
+    most = max(40.0, predicted.overshoot_pct + 25.0)
+    if not result.settled or result.overshoot_pct > most:
+        raise Refused(
+            Reason.NOT_CONFIRMED,
+            f"under the new gains the loop {'settled' if result.settled else 'did not settle'} with an overshoot of "
+            f"{result.overshoot_pct:.1f} % (predicted {predicted.overshoot_pct:.1f} %, at most {most:.0f} %)",
+        )
+    # home under the new gains, so that the old ones take over a loop at rest
+    yield from settle(point.sp, 0.05 * step, facts.T95_s / 5, 3 * facts.T95_s, point.noise, (SetSetpoint(point.sp),))
+    return result

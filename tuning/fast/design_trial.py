@@ -1,0 +1,91 @@
+"""Gains for another Ms on a model that is known already, tried on the loop: no relay."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+from loopwright.tuning.analysis.comparison import Comparison, predicted
+from loopwright.tuning.experiments.preflight import preflight
+from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.experiments.step_test import StepResult
+from loopwright.tuning.experiments.verification import verification
+from loopwright.tuning.fast.design import Best, Design
+from loopwright.tuning.fast.procedure import FAST, FastOptions
+from loopwright.tuning.fast.proposal import FastProposal, FoundModel, comparison_on, delayed, ultimate
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import Model, TransferFunction, sign, time_constants
+from loopwright.tuning.plan import Plan, StageDone, StageStarted, worked
+from loopwright.tuning.reasons import Reason, Refused
+
+__all__ = ["TRIAL_STAGES", "designed_on", "trial"]
+
+TRIAL_STAGES = ("preflight", "design", "verify")
+
+
+def trial_stages(verify: bool) -> tuple[str, ...]:
+    """The stages of a trial with or without the set-point step, in their order."""
+    return TRIAL_STAGES if verify else TRIAL_STAGES[:2]
+
+
+def designed_on(model: Model, options: FastOptions, sample_time_s: float) -> Best:
+    """The best gains on the model. Raises Refused, NOT_ROBUST."""
+    known = ultimate(model)
+    # without an ultimate point the loop's time is that of its lags and dead time
+    period = known.Pu_s if known else 4.0 * (model.L + float(max(time_constants(model), default=0.0)))
+    return Design(delayed(model, 0.5 * sample_time_s), options.wish(), period).best()
+
+
+def _considered(model: Model, options: FastOptions, facts: Facts) -> tuple[Gains, Comparison]:
+    """The best gains on the model, beside the old ones. Raises Refused, NOT_ROBUST."""
+    best = designed_on(model, options, facts.sample_time_s)
+    sampled = delayed(model, 0.5 * facts.sample_time_s)
+    return best.gains, comparison_on(sampled, best, facts, options.wish(), options.propose_anyway)
+
+
+def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal]:
+    """On a loop in automatic and at rest. Raises Refused; restores nothing (the runner does).
+
+    Gains that bring nothing that was asked for are tried only where `propose_anyway` is among the options.
+    """
+    expected = {"preflight": facts.T95_s / 2, "design": 0.0, "verify": 6 * facts.T95_s}
+    todo = trial_stages(options.verify)
+
+    def started(stage: str) -> tuple[StageStarted]:
+        after = todo[todo.index(stage) + 1 :]
+        return (StageStarted(stage, expected[stage], sum(expected[s] for s in after)),)
+
+    point = yield from preflight(facts, sum(expected[stage] for stage in todo[1:]))
+    yield (StageDone("preflight", point), *started("design"))
+    if (sign(model) > 0.0) != facts.reverse:
+        raise Refused(
+            Reason.WRONG_SIGN,
+            f"the model's gain is {'positive' if sign(model) > 0.0 else 'negative'}; the controller acts "
+            f"{'reverse' if facts.reverse else 'direct'}",
+        )
+    gains, comparison = yield from worked(partial(_considered, model, options, facts))
+    promised = predicted(comparison.after)
+    yield (StageDone("design", gains),)
+    shown: StepResult | None = None
+    if options.verify and (comparison.gain or options.propose_anyway):
+        yield started("verify")
+        gain = model.static_gain if math.isfinite(model.static_gain) else math.nan
+        shown = yield from verification(facts, point, gains, promised, gain, model.L)
+        yield (StageDone("verify", shown),)
+    wish = options.wish()
+    given = TransferFunction(model.num, model.den, model.L)
+    return FastProposal(
+        method=FAST,
+        chosen={"Ms": wish.Ms, **({"N": wish.N} if gains.Td else {})},
+        model=FoundModel("typed in", given.num, given.den, given.L),
+        old_gains=facts.old_gains,
+        gains=gains,
+        predicted=promised,
+        predicted_before=predicted(comparison.before) if comparison.before.stable else None,
+        comparison=comparison,
+        ultimate=ultimate(model),
+        found=None,
+        verified=None,
+        verification=shown,
+        notes=(),
+    )

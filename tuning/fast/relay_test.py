@@ -1,0 +1,276 @@
+"""The biased relay and the set-point step, sample by sample, and the record that they leave."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+
+from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, no_oscillation
+from loopwright.tuning.fast.proposal import Recorded
+from loopwright.tuning.fast.record import LEAST_SWITCHES, Evidence, noise_of, period
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import (
+    Command,
+    Event,
+    Mode,
+    Plan,
+    Sample,
+    SetGains,
+    SetMode,
+    SetOutput,
+    SetRelay,
+    SetSetpoint,
+    Work,
+)
+from loopwright.tuning.reasons import Reason, Refused
+
+T = TypeVar("T")
+BIAS = 0.5
+"""The lower amplitude in higher ones."""
+FIRST = 0.5
+"""The amplitude that the relay begins with, of the largest that MV permits."""
+HYSTERESIS = 2.2  # standard deviations of the noise
+AVERAGED = 3
+LEAST_HYSTERESIS = 1e-3
+"""Of the set-point step permitted, for a PV without noise."""
+STALLED = 2.5
+"""Longest half periods without a switch, after which the present side is raised."""
+RAISED, MOST_RAISED = 1.7, 2.0
+LEAST_SPAN, GOOD_SPAN = 25.0, 60.0
+"""Of PV under the relay, standard deviations of the noise."""
+WIDEST_SPAN = 2.0
+"""Of PV under the relay, permitted set-point steps."""
+MOST_PERIODS = 8.4
+VERIFIED_PERIODS = 3.0
+BACK = 0.5
+"""Of the time of the first step."""
+SHORTEST = 0.5
+"""Of the relay's period: a model's that is shorter is not believed."""
+FAR = 20.0
+"""Spans of PV under the relay, at which the step under the new gains is ended."""
+
+
+def most_amplitude(mv: float, mv_low: float, mv_high: float) -> float:
+    """Of the higher side of a relay around `mv` that stays within the limits, MV units."""
+    return min(mv_high - mv, (mv - mv_low) / BIAS)
+
+
+class Experiment:
+    """One record, grown by its plans. Amplitudes in MV units."""
+
+    def __init__(self, facts: Facts, point: OperatingPoint, listened: Trace, amplitude: float | None) -> None:
+        self.facts, self.point, self.trace = facts, point, listened
+        self.listened = len(listened)
+        self.relayed = 0
+        self.switches: list[int] = []
+        self.noise = noise_of(np.asarray(listened.pv))
+        self._most = most_amplitude(point.mv, facts.mv_low, facts.mv_high)
+        if amplitude is not None and not 0.0 < amplitude <= self._most:
+            raise Refused(
+                Reason.BAD_LIMITS, f"a relay amplitude of {amplitude:g} is asked for; MV permits up to {self._most:.4g}"
+            )
+        self._fixed = amplitude is not None
+        self.amplitude = amplitude or FIRST * self._most
+        self._sides = [BIAS, 1.0]  # low, high, in amplitudes
+        self._high = True
+        self._raise_at = 0
+        self._follow_s = 0.0
+        self._steps: list[int] = []
+        self._commands: tuple[Command, ...] = ()
+        self._step = 0.0
+
+    def recorded(self) -> Recorded:
+        """The relay's record so far, in numbers."""
+        evidence = self.evidence()
+        return Recorded(
+            switches=len(evidence.switches),
+            period_s=evidence.period * evidence.Ts,
+            span=evidence.span,
+            noise=self.noise,
+            amplitude=self.amplitude,
+            samples=len(evidence.y),
+        )
+
+    @property
+    def stepped(self) -> tuple[float, float]:
+        """The set-point step, PV units, and how long ago it was made, s."""
+        return self._step, self.trace.t[-1] - self.trace.t[self.relayed]
+
+    def tell(self, *events: Event) -> Plan[None]:
+        """The sample that an event takes belongs to the record."""
+        self._commands = self._hear((yield (*self._commands, *events)))
+
+    def relay(self, switches: int) -> Plan[bool]:
+        """Goes on until the relay has switched so often; False where the time is over first.
+
+        Raises Refused: NO_RESPONSE, WRONG_SIGN, CANNOT_OSCILLATE up to the second switch, STALLED before the fourth.
+        """
+        if not self.relayed:
+            self.listened = self.relayed = len(self.trace)
+            self._commands = (self._armed(), SetMode(Mode.EXPERIMENT))
+        while len(self.switches) < switches:
+            self._commands = self._hear((yield self._commands))
+            if self._over():
+                if len(self.switches) < LEAST_SWITCHES:
+                    raise self._stalled()
+                return False
+        return True
+
+    def step(self, gains: Gains, model_period: float) -> Plan[None]:
+        """The new gains take over with nothing in the integral, and the set-point steps by up to half the span.
+
+        model_period: s; a load, or hysteresis, makes the relay's longer.
+        """
+        relay_period = period(tuple(self.switches)) * self.facts.sample_time_s
+        self._follow_s = VERIFIED_PERIODS * min(max(model_period, SHORTEST * relay_period), relay_period)
+        facts, point = self.facts, self.point
+        span = self.evidence().span
+        size = min(0.5 * span, self.amplitude / gains.Kp, facts.sp_deviation)
+        self.relayed = len(self.trace)
+        self._commands = ()
+        # bumpless from the relay's side, the integral would begin there, as far away as a load that has been lifted;
+        # from the proportional part alone it begins at rest
+        error = (point.pv - self.trace.pv[-1]) * (1.0 if facts.reverse else -1.0)
+        output = min(max(point.mv + gains.Kp * error, facts.mv_low), facts.mv_high)
+        self._keep((yield (SetMode(Mode.MANUAL), SetOutput(output), SetGains(gains))))
+        self._step = size
+        yield from self._follow((SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp + size)), span)
+
+    def step_back(self) -> Plan[None]:
+        """The set-point steps home, under the same gains, for half as long."""
+        self._follow_s *= BACK
+        yield from self._follow((SetSetpoint(self.point.sp),), self.evidence().span)
+
+    def _follow(self, commands: tuple[Command, ...], span: float) -> Plan[None]:
+        """Raises Refused, DIVERGES."""
+        self._steps.append(len(self.trace))
+        sample = yield commands
+        self._keep(sample)
+        end = sample.t + self._follow_s
+        while sample.t < end:
+            sample = yield ()
+            self._keep(sample)
+            if abs(sample.pv - self.point.pv) > FAR * span:
+                raise Refused(
+                    Reason.DIVERGES,
+                    f"PV is {sample.pv - self.point.pv:+.4g} away; the relay had moved it by {span:.4g}",
+                )
+
+    def computed(self, compute: Callable[[], T]) -> Plan[T]:
+        """Its result; the record goes on meanwhile."""
+        work = Work(compute)
+        self._commands = self._hear((yield (*self._commands, work)))
+        while not work.done:
+            self._commands = self._hear((yield self._commands))
+        return work.result()
+
+    def evidence(self) -> Evidence:
+        """The record as it is."""
+        trace = self.trace
+        rest = slice(0, self.listened)
+        return Evidence(
+            Ts=self.facts.sample_time_s,
+            u=np.asarray(trace.mv) - float(np.mean(trace.mv[rest])),
+            y=np.asarray(trace.pv) - float(np.mean(trace.pv[rest])),
+            direction=1.0 if self.facts.reverse else -1.0,
+            listened=self.listened,
+            relayed=self.relayed if self._stepping else len(trace),
+            switches=tuple(self.switches),
+            steps=tuple(self._steps),
+        )
+
+    def _keep(self, sample: Sample) -> None:
+        """Into the record; samples lost before it are made up: PV in between, MV as it was."""
+        trace, Ts = self.trace, self.facts.sample_time_s
+        lost = round((sample.t - trace.t[-1]) / Ts) - 1
+        t, pv = trace.t[-1], trace.pv[-1]
+        for k in range(1, lost + 1):
+            between = pv + (sample.pv - pv) * k / (lost + 1)
+            trace.add(sample._replace(t=t + k * Ts, pv=between, mv=trace.mv[-1]))
+        trace.add(sample)
+
+    @property
+    def _stepping(self) -> bool:
+        return self.relayed > self.listened
+
+    def _hear(self, sample: Sample) -> tuple[Command, ...]:
+        """One sample under the relay; what is to be commanded for it."""
+        trace = self.trace
+        self._keep(sample)
+        at = len(trace) - 1
+        if sample.mode != Mode.EXPERIMENT or self._stepping:
+            return ()
+        high = sample.mv > self.point.mv
+        if high != self._high:
+            self._high = high
+            self.switches.append(at)
+            if len(self.switches) == 2 and not self._fixed:
+                return self._adapted()
+            if self._sides != [BIAS, 1.0]:
+                self._sides = [BIAS, 1.0]
+                return (self._armed(),)
+        elif len(self.switches) >= 2:
+            longest = max(np.diff([self.listened, *self.switches]))
+            since = at - max(self.switches[-1], self._raise_at)
+            if since > STALLED * longest:
+                self._raise_at = at
+                side = int(high)
+                most = self._most * (1.0 if high else BIAS) / self.amplitude
+                raised = min(RAISED * self._sides[side], MOST_RAISED * (1.0, BIAS)[not high], most)
+                if raised > self._sides[side]:
+                    self._sides[side] = raised
+                    return (self._armed(),)
+        return ()
+
+    def _adapted(self) -> tuple[Command, ...]:
+        """After the first wave: more amplitude above the noise, or less where PV went too far. Raises Refused,
+        NO_RESPONSE: MV has switched, and PV stands still."""
+        seen = float(np.ptp(self.trace.pv[self.listened :]))
+        factor = 1.0
+        if seen == 0.0:
+            raise Refused(
+                Reason.NO_RESPONSE,
+                f"the relay of {self.amplitude:.4g} has switched twice, and PV is exactly {self.trace.pv[-1]:.6g} "
+                f"all the time (noise {self.noise:.3g} before)",
+            )
+        if seen < LEAST_SPAN * self.noise:
+            factor = min(GOOD_SPAN * self.noise / seen, self._most / self.amplitude)
+        elif seen > WIDEST_SPAN * self.facts.sp_deviation:
+            factor = max(WIDEST_SPAN * self.facts.sp_deviation, LEAST_SPAN * self.noise) / seen
+        if 0.8 < factor < 1.25:
+            return ()
+        self.amplitude *= factor
+        return (self._armed(),)
+
+    def _armed(self) -> SetRelay:
+        low, high = (self.amplitude * side for side in self._sides)
+        hysteresis = max(HYSTERESIS * self.noise, LEAST_HYSTERESIS * self.facts.sp_deviation)
+        average = AVERAGED if self.noise > 0.0 else 1
+        return SetRelay(high, hysteresis, self.point.mv, amplitude_low=low, average=average)
+
+    def _over(self) -> bool:
+        """The time is over: before the second switch by T95, after it by the half periods."""
+        passed = len(self.trace) - self.listened
+        if len(self.switches) < 2:
+            if passed * self.facts.sample_time_s > max(3.0 * self.facts.T95_s, 40 * self.facts.sample_time_s):
+                point = replace(self.point, room=self.amplitude)  # what it tells is what the relay moved
+                raise no_oscillation(self.facts, point, self._since(), len(self.switches))
+            return False
+        halves = np.diff(self.switches)
+        known = period(tuple(self.switches)) if len(halves) >= 2 else 2.0 * float(halves[0])
+        return passed > MOST_PERIODS * max(known, 2.0 * float(np.max(halves)) if len(halves) < 3 else 0.0)
+
+    def _since(self) -> Trace:
+        trace, at = self.trace, self.listened
+        return Trace(trace.t[at:], trace.sp[at:], trace.pv[at:], trace.mv[at:])
+
+    def _stalled(self) -> Refused:
+        passed = (len(self.trace) - self.listened) * self.facts.sample_time_s
+        return Refused(
+            Reason.STALLED,
+            f"the relay of {self.amplitude:.4g} switched {len(self.switches)} times in {passed:.4g} s, "
+            f"{LEAST_SWITCHES} are needed; PV is {self.trace.pv[-1] - self.point.pv:+.4g} away",
+        )

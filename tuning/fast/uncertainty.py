@@ -1,0 +1,95 @@
+"""How far Ms of a controller may be off, as the record leaves the model uncertain: the delta method, and the rivals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from loopwright.tuning.fast.design import controller
+from loopwright.tuning.fast.record import Evidence
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.identification.output_error import LOG_STEP, Fit, Fitted
+from loopwright.tuning.identification.sensitivity import sensitivities
+from loopwright.tuning.models import Complexes, Reals, TransferFunction, sign
+
+NEAR_THE_PEAK = 0.7
+"""Of |S|: where it is less, an error of the model costs nothing."""
+STANDARD_DEVIATIONS = 2.0
+UNSEEN = 1e-7
+"""Singular value, of columns of unit length."""
+LEAST_DISTANCE = 0.05
+"""Of the loop from -1; nearer, Ms is anything."""
+
+
+def colour(residual: Reals) -> float:
+    """By how much slow averages of the residual vary more than white noise would, at least 1."""
+    fast = 0.5 * float(np.mean(np.diff(residual) ** 2))
+    return max(1.0, float(np.mean(residual**2)) / fast) if fast > 0.0 else 1.0
+
+
+def fit_covariance(fit: Fit[Evidence], found: Fitted) -> Reals:
+    """Of theta and the linear coefficients, in this order."""
+    variance = found.linear.rss / max(fit.samples - found.parameters, 1) * colour(found.linear.residual)
+    return seen_covariance(sensitivities(fit, found), variance)
+
+
+def seen_covariance(columns: Reals, variance: float) -> Reals:
+    """variance * (A'A)^-1 without the directions that move PV by next to nothing: they move the loop as little."""
+    lengths = np.sqrt(np.einsum("ij,ij->j", columns, columns))
+    lengths = np.where(lengths > 0.0, lengths, 1.0)
+    inverse = np.linalg.pinv(columns / lengths, rcond=UNSEEN)
+    return np.asarray(variance * (inverse @ inverse.T) / np.outer(lengths, lengths))
+
+
+def uncertainty_of_Ms(fit: Fit[Evidence], found: Fitted, gains: Gains, w: Reals, N: float, delay: float) -> float:
+    """Ms that would be met at two standard deviations, less the nominal one. delay: s, of the sampling."""
+    structure, theta, c = found.structure, found.theta, found.linear.coefficients
+    inputs = structure.inputs
+    at = np.concatenate((theta[: structure.searched], c[:inputs]))
+    C = gains.Kp * controller(w, gains.Ti, gains.Td, N) * sign(fit.model(found))
+
+    def loop(at: Reals) -> Complexes:
+        model = fit.transfer(structure, at[: structure.searched], at[structure.searched :])
+        return np.asarray(C * _delayed(model, w, delay))
+
+    nominal = loop(at)
+    slopes = []
+    for i in range(len(at)):
+        if i == structure.lags:
+            slopes.append(-1j * w * fit.evidence.Ts * nominal)
+            continue
+        step = LOG_STEP * (abs(at[i]) + 1e-12 if i >= structure.searched else 1.0)
+        move = np.zeros(len(at))
+        move[i] = step
+        # weak directions are long: their parts must cancel to many digits
+        slopes.append((loop(at + move) - loop(at - move)) / (2.0 * step))
+    distance = np.abs(1.0 + nominal)
+    along = np.real(np.array(slopes) * np.conj(1.0 + nominal) / distance)
+    whole = fit_covariance(fit, found)
+    kept = np.concatenate((np.arange(structure.searched), len(theta) + np.arange(inputs)))
+    sigma = np.sqrt(np.maximum(np.einsum("iw,ij,jw->w", along, whole[np.ix_(kept, kept)], along), 0.0))
+    near = distance < 1.0 / NEAR_THE_PEAK
+    worst = np.maximum(distance - STANDARD_DEVIATIONS * sigma, LEAST_DISTANCE)[near]
+    return float(1.0 / worst.min() - 1.0 / distance.min()) if near.any() else 0.0
+
+
+def difference_of_rivals(
+    fit: Fit[Evidence], best: Fitted, rivals: Sequence[Fitted], gains: Gains, w: Reals, delay: float
+) -> float:
+    """The largest |Ms - nominal Ms| that the same controller has on another model the record supports."""
+    nominal = peak(fit.model(best), gains, w, delay)
+    return max((abs(peak(fit.model(rival), gains, w, delay) - nominal) for rival in rivals), default=0.0)
+
+
+def peak(model: TransferFunction, gains: Gains, w: Reals, delay: float = 0.0) -> float:
+    """Ms of the loop on the grid w."""
+    N = gains.Td / gains.Tf if gains.Tf > 0.0 else 10.0
+    C = gains.Kp * controller(w, gains.Ti, gains.Td, N) * sign(model)
+    least = float(np.abs(1.0 + C * _delayed(model, w, delay)).min())
+    return 1.0 / max(least, 1e-9) if math.isfinite(least) else math.inf
+
+
+def _delayed(model: TransferFunction, w: Reals, delay: float) -> Complexes:
+    return np.asarray(model.frequency_response(w) * np.exp(-1j * w * delay))

@@ -1,0 +1,1 @@
+"""The five-stage procedure: relay, ultimate gain, Ziegler-Nichols PI, FOPDT estimate, robust optimisation."""

@@ -1,0 +1,86 @@
+"""Stage 1: relay test, rough ultimate gain and period.
+
+The relay runs inside the controller, centred on the present output. Ku_a = |U1| / |Y1| from the first harmonics of MV
+and PV over the last cycles: with an ideal relay this is the describing function 4d/(pi a), and it stays right with
+hysteresis and noise (the print's `max(P) - SP` does not). The print's parallel path, Ts/10 * e, is left out: its weight
+depends on the unit of PV, and on top of the relay it leaves the permitted range of MV.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, no_oscillation, to_rest
+from loopwright.tuning.identification.oscillation import harmonic
+from loopwright.tuning.plan import Mode, Plan, SetMode, SetRelay
+from loopwright.tuning.reasons import Reason, Refused
+
+STEADY = 0.10
+LEAST_SAMPLES_PER_PERIOD = 22
+
+
+@dataclass(frozen=True, slots=True)
+class RelayResult:
+    """Ku_a: MV units per PV unit.  Pu_a_s: s.  amplitude: of PV, PV units.  relay: its amplitude, MV units."""
+
+    Ku_a: float
+    Pu_a_s: float
+    amplitude: float
+    relay: float
+    hysteresis: float
+    cycles: int
+
+
+def relay_test(facts: Facts, point: OperatingPoint) -> Plan[RelayResult]:
+    """Raises Refused: WRONG_SIGN, NO_RESPONSE, CANNOT_OSCILLATE."""
+    d = point.room
+    hysteresis = 3 * point.noise
+    sample = yield (SetRelay(d, hysteresis, point.mv), SetMode(Mode.EXPERIMENT))
+    trace = Trace()
+    start = sample.t
+    ups: list[int] = []
+    was_high = True
+    while True:
+        trace.add(sample)
+        if sample.mode == Mode.EXPERIMENT:
+            high = sample.mv > point.mv
+            if high and not was_high:
+                ups.append(len(trace) - 1)
+                if _steady(trace, ups):
+                    break
+            was_high = high
+        last = trace.t[ups[-1]] if ups else start
+        if sample.t - last > max(3 * facts.T95_s, 40 * facts.sample_time_s) or len(ups) > 120:
+            raise no_oscillation(facts, point, trace, len(ups))
+        sample = yield ()
+    first, end = ups[-4], ups[-1]
+    t, pv, mv = (np.asarray(column[first:end]) for column in (trace.t, trace.pv, trace.mv))
+    period = (trace.t[end] - trace.t[first]) / 3
+    if period < LEAST_SAMPLES_PER_PERIOD * facts.sample_time_s:
+        raise Refused(
+            Reason.CANNOT_OSCILLATE,
+            f"under the relay PV swings with a period of {period:.3g} s, {period / facts.sample_time_s:.1f} samples: "
+            "there is no ultimate point slower than the sampling",
+        )
+    amplitude = abs(harmonic(t, pv, period))
+    if amplitude < 2 * point.noise or amplitude == 0:
+        raise Refused(
+            Reason.NO_RESPONSE, f"the relay of {d:.3g} moved PV by {amplitude:.3g} only (noise {point.noise:.3g})"
+        )
+    rough = abs(harmonic(t, mv, period)) / amplitude
+    yield from to_rest(facts, point, 0.02 * facts.sp_deviation)
+    return RelayResult(rough, period, amplitude, d, hysteresis, len(ups))
+
+
+def _steady(trace: Trace, ups: list[int]) -> bool:
+    """Three cycles in a row alike within 10 % in height and period (the third closes the print's 3 L)."""
+    if len(ups) < 5:
+        return False
+    heights = [max(trace.pv[a:b]) - min(trace.pv[a:b]) for a, b in zip(ups[-4:-1], ups[-3:], strict=True)]
+    periods = [trace.t[b] - trace.t[a] for a, b in zip(ups[-4:-1], ups[-3:], strict=True)]
+    dt = trace.t[-1] - trace.t[-2]
+    return max(heights) - min(heights) <= STEADY * max(heights) and max(periods) - min(periods) <= max(
+        STEADY * max(periods), 2 * dt
+    )

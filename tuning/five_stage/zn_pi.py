@@ -1,0 +1,79 @@
+"""Stage 3: Ziegler-Nichols PI, static gain and overshoot, with Kp moved until the overshoot is informative.
+
+(1)  Kp = Ku/2.2, Ti = Pu/1.2.  Outside the window Kp moves by 0.1 (Ku - Kp_zn), or by a factor (the manual mode).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, settle
+from loopwright.tuning.experiments.step_test import StepResult, allowed_step, step_test, unlimited
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Mode, Note, Plan, SetGains, SetMode, SetSetpoint
+from loopwright.tuning.reasons import Reason, Refused
+
+MOST_STEPS = 12
+
+
+@dataclass(frozen=True, slots=True)
+class ZnResult:
+    """Kp, Ti_s: the PI in effect when overshoot_pct was measured.  static_gain: signed, PV per MV units."""
+
+    Kp: float
+    Ti_s: float
+    overshoot_pct: float
+    static_gain: float
+    step: float
+    tests: int
+
+
+def zn_pi(
+    facts: Facts,
+    point: OperatingPoint,
+    Ku: float,
+    Pu: float,
+    static_gain: float,
+    window: tuple[float, float],
+    factor: float | None,
+    kept: Trace,
+) -> Plan[ZnResult]:
+    """static_gain: a first idea (nan when there is none), to keep MV inside.  kept: gets the last step's samples.
+
+    Raises Refused: NO_OVERSHOOT, MV_LIMIT.
+    """
+    Kp, Ti = Ku / 2.2, Pu / 1.2
+    increment = 0.1 * (Ku - Kp)
+    step = allowed_step(facts, point, 1.6 * Kp, static_gain)
+    tests = 0
+    seen: list[StepResult] = []
+    while True:
+        gains = Gains(Kp=Kp, Ti=Ti)
+        commands = (SetGains(gains), SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp))
+        # a remnant of the last movement adds to the overshoot: a whole period of rest, whatever T95 was stated
+        stay_s = max(facts.T95_s / 5, Pu)
+        most_s = max(3 * facts.T95_s, 8 * Pu)
+        yield from settle(point.sp, 0.005 * step, stay_s, most_s, point.noise, commands)
+        found = yield from step_test(
+            facts, point, step, band=0.01, most_s=max(6 * facts.T95_s, 15 * Pu), smooth_s=Pu / 5, kept=kept
+        )
+        unlimited(facts, found, gains)
+        seen.append(found)
+        tests += 1
+        over = found.overshoot_pct
+        yield (Note(f"PI Kp = {Kp:.4g}, Ti = {Ti:.4g} s: overshoot {over:.1f} %"),)
+        if window[0] <= over <= window[1]:
+            return ZnResult(Kp, Ti, over, found.static_gain, step, tests)
+        if len(seen) > 1 and (over - window[1]) * (seen[-2].overshoot_pct - window[1]) < 0:
+            raise Refused(
+                Reason.NO_OVERSHOOT,
+                f"the overshoot jumped across the whole window, from {seen[-2].overshoot_pct:.0f} to {over:.0f} %",
+            )
+        up = over < window[0]
+        Kp = (Kp * factor if up else Kp / factor) if factor else (Kp + increment if up else Kp - increment)
+        if tests >= MOST_STEPS or not 0 < Kp < 0.98 * Ku:
+            raise Refused(
+                Reason.NO_OVERSHOOT,
+                f"overshoot {over:.1f} % before Kp {Kp:.4g} (Ku {Ku:.4g}) after {tests} tests; "
+                f"wanted {window[0]:g} to {window[1]:g} %",
+            )

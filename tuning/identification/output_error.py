@@ -1,0 +1,295 @@
+"""Structures fitted to a whole record, with steps of the load at free times and a drift if need be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+
+from loopwright.tuning.analysis.zero_order_hold import pulses
+from loopwright.tuning.identification.structures import Structure
+from loopwright.tuning.identification.variable_projection import REDUNDANT, Bounded, Linear, descend, solve
+from loopwright.tuning.models import Reals, TransferFunction
+
+FLOOR = 2e-4
+"""Of the residual in spans of PV: data without noise would ask for ever more parameters."""
+LOG_LOW, LOG_HIGH = -8.5, 9.5
+"""Of a rate in 1/period (a product of two: its square)."""
+DEAD_TIMES = (0.01, 0.06, 0.14, 0.23, 0.32, 0.41, 0.49)
+LAGS = (0.02, 0.08, 0.25, 0.8, 4.0, 40.0)
+COMPLEX = ((3.0, 0.5), (6.0, 0.5), (10.0, 0.3))
+MOST_STEPS = 25
+FIRST_STEPS, LONG_SEARCHES = 5, 2
+"""Of many starts, all are followed so far, and so many to the end."""
+RELATIVE_DECREASE = 1e-6
+LOG_STEP = 1e-4
+LOG_REACH = 1.5
+
+
+class Signals(Protocol):
+    """A record as the fit wants it.
+
+    Ts: s.  u, y: MV and PV, shape (N,), as deviations from rest; MV is 0 before the record.  swing: of MV, span: of PV,
+    which measure them.  period: samples, the time scale: about that of an oscillation at the limit of stability.
+    most_dead_time: samples.  block: samples averaged into one.
+    """
+
+    @property
+    def Ts(self) -> float: ...
+    @property
+    def u(self) -> Reals: ...
+    @property
+    def y(self) -> Reals: ...
+    @property
+    def swing(self) -> float: ...
+    @property
+    def span(self) -> float: ...
+    @property
+    def period(self) -> float: ...
+    @property
+    def most_dead_time(self) -> float: ...
+    @property
+    def block(self) -> int: ...
+
+
+S = TypeVar("S", bound=Signals)
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """What moved PV beside MV. loads: steps of the load at times to be found.  drift: PV drifts at a steady rate.
+
+    moving: the plant was not at rest, or under a load, when the record began.
+    """
+
+    loads: int = 0
+    drift: bool = False
+    moving: bool = False
+
+
+QUIET = Hypothesis()
+MOVING = Hypothesis(moving=True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fitted:
+    """theta: the structure's, then the times of the loads, in samples.  columns: regressors there, averaged.
+
+    linear: their coefficients (MV in swings, PV in spans) and the residual in spans.
+    """
+
+    structure: Structure
+    hypothesis: Hypothesis
+    theta: Reals
+    columns: Reals
+    linear: Linear
+    bic: float
+
+    @property
+    def rms(self) -> float:
+        return math.sqrt(self.linear.rss / len(self.linear.residual))
+
+    @property
+    def parameters(self) -> int:
+        return len(self.theta) + int(self.columns.shape[1])
+
+
+def count(fit: Fitted) -> int:
+    """Parameters, as BIC takes them: a load's time was chosen among many and counts twice."""
+    return fit.parameters + fit.hypothesis.loads
+
+
+class Fit(Generic[S]):
+    """Fits one record. Time in samples, MV in swings, PV in spans."""
+
+    def __init__(self, evidence: S) -> None:
+        self.evidence = evidence
+        self.block = evidence.block
+        self.u = evidence.u / evidence.swing
+        self.y = averaged(evidence.y / evidence.span, self.block)
+        self.samples = len(self.y)
+        self.period = evidence.period
+        self._step = np.ones(len(self.u))
+        self._always = averaged(np.column_stack((self._step, np.linspace(-1.0, 1.0, len(self.u)))), self.block)
+        self._rate = math.log(1.0 / self.period)
+
+    # what is fitted
+
+    def regressors(self, structure: Structure, hypothesis: Hypothesis, thetas: Reals) -> Reals:
+        """Columns of everything linear for each theta, shape (thetas, rows, columns)."""
+        many, inputs = len(thetas), structure.zeros + 1
+        # one call for MV and every load: what it costs is mostly the call
+        times = thetas[:, structure.lags :].T
+        if hypothesis.moving:
+            # a step of every state at the start stands for any state there, and for a load
+            times = np.append(times, np.zeros((1, many)), axis=0)
+        steps = len(times) - 1
+        answers = pulses(np.tile(structure.monic(thetas), (1 + steps, 1)), times.ravel(), structure.order)
+        driven, loads = answers.of(slice(many)), answers.of(slice(many, None))
+        always = self._always[:, : 1 + hypothesis.drift]
+        out = np.empty((many, self.samples, structure.inputs + always.shape[1] + structure.order * steps))
+        out[:, :, :inputs] = averaged(driven.drive(self.u, inputs), self.block, 1)
+        if structure.feed_through:
+            delayed = np.zeros((many, len(self.u)))
+            for row, delay in zip(delayed, driven.delay, strict=True):
+                row[delay + 1 :] = self.u[: len(self.u) - delay - 1]
+            out[:, :, inputs] = averaged(delayed, self.block, 1)
+        at = structure.inputs
+        out[:, :, at : at + always.shape[1]] = always
+        at += always.shape[1]
+        moved = averaged(loads.drive(self._step), self.block, 1) if steps else out[:0]
+        for k in range(steps):
+            out[:, :, at : at + structure.order] = moved[k * many : (k + 1) * many]
+            at += structure.order
+        return out
+
+    def fitted(self, structure: Structure, hypothesis: Hypothesis, theta: Reals) -> Fitted:
+        """The best linear part for this theta."""
+        columns = self.regressors(structure, hypothesis, theta[None])[0]
+        linear = solve(columns, self.y)
+        # a load's time was chosen among many: it counts twice
+        parameters = len(theta) + columns.shape[1] + hypothesis.loads
+        bic = self.samples * math.log(linear.rss / self.samples + FLOOR**2) + parameters * math.log(self.samples)
+        return Fitted(structure, hypothesis, theta, columns, linear, bic)
+
+    def search(
+        self, structure: Structure, hypothesis: Hypothesis, starts: Sequence[Reals], most_steps: int = MOST_STEPS
+    ) -> Fitted:
+        """The best local minimum from these starts."""
+        if len(starts) > LONG_SEARCHES:
+            starts = self._descend(structure, hypothesis, starts, FIRST_STEPS)[:LONG_SEARCHES]
+        return self.fitted(structure, hypothesis, self._descend(structure, hypothesis, starts, most_steps)[0])
+
+    def followed(
+        self, structure: Structure, hypothesis: Hypothesis, starts: Sequence[Reals], steps: int
+    ) -> list[Fitted]:
+        """Where so many steps lead from each start, the best first."""
+        return [self.fitted(structure, hypothesis, at) for at in self._descend(structure, hypothesis, starts, steps)]
+
+    def _descend(
+        self, structure: Structure, hypothesis: Hypothesis, starts: Sequence[Reals], most_steps: int
+    ) -> list[Reals]:
+        low, high = self.bounds(structure, hypothesis)
+        times = 1 + hypothesis.loads
+        reach = np.append(np.full(structure.lags, LOG_REACH), np.full(times, 0.25 * self.period))
+        step = np.append(np.full(structure.lags, LOG_STEP), np.full(times, LOG_STEP * self.period))
+
+        def columns(thetas: Reals) -> Reals:
+            return self.regressors(structure, hypothesis, thetas)
+
+        bounded = Bounded(low, high, reach, step)
+        found, rss = descend(columns, self.y, np.array(starts), bounded, most_steps, RELATIVE_DECREASE)
+        return [found[i] for i in np.argsort(rss, kind="stable")]
+
+    def bounds(self, structure: Structure, hypothesis: Hypothesis) -> tuple[Reals, Reals]:
+        powers = np.array([1.0, 2.0, 1.0][: structure.lags])
+        low = np.concatenate((LOG_LOW + powers * self._rate, np.zeros(1 + hypothesis.loads)))
+        high = np.concatenate((LOG_HIGH + powers * self._rate, [self.evidence.most_dead_time]))
+        return low, np.append(high, np.full(hypothesis.loads, len(self.u) - 2.0 * self.block))
+
+    # where to begin
+
+    def denominators(self, structure: Structure) -> list[Reals]:
+        """Logs of the rates to begin with."""
+        unit = self.period
+        if structure.lags == 0:
+            return [np.empty(0)]
+        if structure.lags == 1:
+            return [np.log([1.0 / (T * unit)]) for T in LAGS]
+        if structure.lags == 3:
+            return [
+                np.log([1.0 / T1 + 1.0 / T2, 1.0 / (T1 * T2), 1.0 / T3])
+                for T3, T2, T1 in combinations_with_replacement(np.multiply(LAGS, unit), 3)
+            ]
+        pairs = [(T1 * unit, T2 * unit) for i, T1 in enumerate(LAGS) for T2 in LAGS[: i + 1]]
+        real = [np.log([1.0 / T1 + 1.0 / T2, 1.0 / (T1 * T2)]) for T1, T2 in pairs]
+        return real + [np.log([2.0 * zeta * w / unit, (w / unit) ** 2]) for w, zeta in COMPLEX]
+
+    def grid(
+        self,
+        structure: Structure,
+        keep: int,
+        load_at: float | None = None,
+        dead_times: Sequence[float] = DEAD_TIMES,
+    ) -> list[Reals]:
+        """The `keep` best theta that differ, best first.
+
+        load_at: with one step of the load at this sample.  dead_times: periods.
+        """
+        thetas = [
+            np.append(logs, max(L, 0.0) * self.period) for logs in self.denominators(structure) for L in dead_times
+        ]
+        hypothesis = QUIET
+        if load_at is not None:
+            hypothesis = Hypothesis(loads=1)
+            thetas = [np.append(theta, load_at) for theta in thetas]
+        rss = left_over(self.regressors(structure, hypothesis, np.array(thetas)), self.y)
+        return self.differing([thetas[i] for i in np.argsort(rss)], structure, keep)
+
+    def differing(self, ranked: Sequence[Reals], structure: Structure, keep: int) -> list[Reals]:
+        """The first few that are not near another."""
+        kept: list[Reals] = []
+        for theta in ranked:
+            if all(self._differ(theta, other, structure.lags) for other in kept):
+                kept.append(theta)
+                if len(kept) == keep:
+                    break
+        return kept
+
+    def _differ(self, a: Reals, b: Reals, lags: int) -> bool:
+        apart = np.abs(a - b)
+        return bool(np.any(apart[:lags] > 1.0) or np.any(apart[lags:] > 0.05 * self.period))
+
+    # what it means
+
+    def static_gain(self, fit: Fitted) -> float:
+        """In spans per swing; its sign and per sample where the plant integrates."""
+        structure, c = fit.structure, fit.linear.coefficients
+        gain = float(c[0] / structure.slowest(fit.theta))
+        if structure.feed_through:
+            gain += float(c[structure.zeros + 1])
+        return gain
+
+    def model(self, fit: Fitted) -> TransferFunction:
+        """In s and the units of the record."""
+        return self.transfer(fit.structure, fit.theta, fit.linear.coefficients)
+
+    def transfer(self, structure: Structure, theta: Reals, coefficients: Reals) -> TransferFunction:
+        """The plant of these parameters; coefficients as fitted, those of no input ignored."""
+        evidence = self.evidence
+        Ts, unit = evidence.Ts, evidence.span / evidence.swing
+        order = structure.order
+        monic = structure.monic(theta[: structure.searched])
+        den = np.append(1.0, monic) * Ts ** -np.arange(order + 1.0)
+        b = coefficients[: structure.zeros + 1]
+        num = np.zeros(order + 1)
+        # the i-th state is s^i/den with s counted in samples
+        for i, value in enumerate(b):
+            num[order - i] = unit * value * Ts ** (i - order)
+        if structure.feed_through:
+            num += unit * coefficients[structure.zeros + 1] * den
+        return TransferFunction(tuple(num), tuple(den), max(float(theta[structure.lags]), 0.0) * Ts)
+
+
+def left_over(columns: Reals, y: Reals) -> Reals:
+    """Sum of squares left of y by each set of columns, shape (sets,)."""
+    lengths = np.sqrt(np.einsum("bij,bij->bj", columns, columns))
+    lengths[lengths == 0.0] = 1.0
+    turned = np.swapaxes(columns / lengths[:, None, :], 1, 2)
+    gram = turned @ np.swapaxes(turned, 1, 2) + REDUNDANT * np.eye(columns.shape[2])
+    along = turned @ y
+    weights = np.linalg.solve(gram, along[:, :, None])[:, :, 0]
+    return np.asarray(y @ y - np.einsum("bi,bi->b", weights, along))
+
+
+def averaged(columns: Reals, block: int, axis: int = 0) -> Reals:
+    """Means of `block` rows each, which lie along the axis; rows left over at the end are dropped."""
+    if block == 1:
+        return columns
+    before, rows, after = columns.shape[:axis], columns.shape[axis] // block, columns.shape[axis + 1 :]
+    kept = columns[(slice(None),) * axis + (slice(rows * block),)]
+    return np.asarray(kept.reshape(*before, rows, block, *after).mean(axis=axis + 1))

@@ -1,0 +1,175 @@
+"""FOPDT models of recorded steps: areas, moments and least squares on an open step, a fit on a closed loop.
+
+All take the record as arrays over t, s, that begin at the step. For records of other shapes see identification.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from loopwright.tuning.analysis.step_response import step_response
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import FOPDT, Reals
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.reduction.moments_and_areas import fopdt_of_areas, fopdt_of_moments
+
+LEAST_SAMPLES = 20
+FINE = 4000
+REST = 0.02
+"""How far the ends of the last two twentieths of a record may be apart, as a fraction of the step, to be at rest."""
+
+
+def two_areas_of(t: Reals, y: Reals, step: float, y0: float) -> FOPDT:
+    """FOPDT from a step of MV by `step` (MV units) at t[0] from rest at y0 (PV units), by two areas.
+
+    Equations and source: `tuning.reduction.moments_and_areas`. Raises Refused, BAD_INPUT: a record that is none, or not
+    at rest at its end; NO_RESPONSE.
+    """
+    time, share, K = _normalised(t, y, step, y0)
+    A0 = float(np.trapezoid(1.0 - share, time))
+    areas = np.diff(time) * (share[1:] + share[:-1]) / 2.0
+    below = np.interp(A0, time, np.concatenate(([0.0], np.cumsum(areas))))
+    return fopdt_of_areas(K, A0, float(below))
+
+
+def moments_of(t: Reals, y: Reals, step: float, y0: float) -> FOPDT:
+    """FOPDT from a step of MV by its moments (see `tuning.reduction.moments_and_areas`).
+
+    Arguments and errors are those of `two_areas_of`.
+
+    mean = integral of 1 - y/K, variance = 2 * integral of t*(1 - y/K) - mean^2: noise late in the record weighs most.
+    """
+    time, share, K = _normalised(t, y, step, y0)
+    mean = float(np.trapezoid(1.0 - share, time))
+    return fopdt_of_moments(K, mean, 2.0 * float(np.trapezoid(time * (1.0 - share), time)) - mean * mean)
+
+
+def fit_step(t: Reals, y: Reals, step: float, y0: float, K: float | None = None) -> FOPDT:
+    """FOPDT by least squares over time on a step of MV; the record need not end at rest. Arguments as `two_areas_of`.
+
+    K: gain, PV units per MV unit, to be kept; by default it is fitted too. Raises Refused, BAD_INPUT or NO_RESPONSE.
+    """
+    time, change = _checked(t, y, step, y0)
+    end = float(time[-1])
+    # on a sparse grid the sum of squares has a valley between any two samples that the dead time passes
+    fine = np.linspace(0.0, end, max(len(time), FINE))
+    wanted = np.interp(fine, time, change / step)
+
+    def gain(T: float, L: float) -> tuple[float, Reals]:
+        shape = 1.0 - np.exp(-np.maximum(fine - L, 0.0) / T)
+        size = float(shape @ shape)
+        k = K if K is not None else float(shape @ wanted) / size if size > 0.0 else 0.0
+        return k, np.asarray(k * shape - wanted)
+
+    def cost(start: tuple[float, float]) -> float:
+        return float(np.sum(gain(*start)[1] ** 2))
+
+    def difference(x: Reals) -> Reals:
+        return gain(math.exp(x[0]), float(x[1]))[1]
+
+    # before the step has come to rest many pairs look alike: the best of a coarse grid to begin with
+    T, L = min(((T, L) for T in end * np.geomspace(0.01, 3.0, 12) for L in end * np.linspace(0.0, 0.6, 13)), key=cost)
+    found = least_squares(
+        difference,
+        [math.log(T), max(L, 1e-3 * end)],
+        bounds=([math.log(1e-5 * end), 0.0], [math.log(1e3 * end), end]),
+        x_scale=[0.1, 0.1 * end],
+        xtol=1e-12,
+        ftol=1e-12,
+        gtol=1e-14,
+    )
+    T, L = math.exp(float(found.x[0])), float(found.x[1])
+    k, _ = gain(T, L)
+    if k == 0.0:
+        raise Refused(Reason.NO_RESPONSE, "the fitted gain is zero")
+    return FOPDT(k, T, L)
+
+
+def fit_closed_loop(t: Reals, y: Reals, gains: Gains, step: float, y0: float, K: float | None = None) -> FOPDT:
+    """FOPDT from a set-point step of `step` (PV units) at t[0] from rest at y0, under known gains: a reverse fit.
+
+    The model whose own loop under these gains answers most alike, in the sum of squares over the record. K: gain to be
+    kept, PV units per MV unit; by default it is fitted too. The model's K is positive: the record does not tell the
+    direction of the plant. Raises Refused, BAD_INPUT: a record or gains that are none; NO_RESPONSE.
+
+    Source: Stopakevych et al., automatic re-tuning of PI controllers, Problemele Energeticii Regionale (row 5 of
+    Table 1, which reproduces with the squares, not with the absolute differences that its text names).
+    """
+    time, change = _checked(t, y, step, y0)
+    share = change / step
+    end = float(time[-1])
+
+    def model(logs: Reals) -> FOPDT:
+        return FOPDT(K if K is not None else math.exp(logs[2]), math.exp(logs[0]), math.exp(logs[1]))
+
+    def difference(logs: Reals) -> Reals:
+        each = model(logs)
+        try:
+            found = step_response(each, gains, horizon=end, dt=min(end / 1000.0, each.L / 30.0))
+        except Refused:
+            # an unstable candidate that leaves all bounds
+            return np.full(len(time), 1e3)
+        return np.clip(np.interp(time, found.t, found.y) - share, -1e3, 1e3)
+
+    def cost(logs: Reals) -> float:
+        return float(np.sum(difference(logs) ** 2))
+
+    begun = float(time[int(np.argmax(share > 0.05))])
+    known = [] if K is not None else [_static_gain(time, share, gains)]
+    start = min(
+        (np.log([T, L, *known]) for L in (0.4 * begun, 0.9 * begun) for T in begun * np.array([0.3, 1.0, 3.0, 10.0])),
+        key=cost,
+    )
+
+    def around(x: Reals) -> Reals:
+        # counted from one, so that the relative step of the differences is one of the logarithm
+        return difference(start + x - 1.0)
+
+    found = least_squares(
+        around, np.ones(len(start)), x_scale=0.1, xtol=1e-8, ftol=1e-10, diff_step=[1e-4] * len(start)
+    )
+    return model(start + found.x - 1.0)
+
+
+def _static_gain(time: Reals, share: Reals, gains: Gains) -> float:
+    """A first idea of the gain: with integral action from the error's integral, Ti/(K*Kp); else from the end."""
+    if gains.Ti > 0.0:
+        area = float(np.trapezoid(1.0 - share, time))
+        # from a record that ends too early the area is too small, at worst negative
+        return gains.Ti / (gains.Kp * max(area, 0.05 * float(time[-1])))
+    ends = min(max(float(np.mean(share[-max(len(share) // 20, 1) :])), 0.01), 0.99 * gains.b)
+    return ends / (gains.Kp * (gains.b - ends))
+
+
+def _checked(t: Reals, y: Reals, step: float, y0: float) -> tuple[Reals, Reals]:
+    """(t from 0, change of y). Raises Refused, BAD_INPUT or NO_RESPONSE."""
+    time, change = np.asarray(t, dtype=float), np.asarray(y, dtype=float) - y0
+    if time.ndim != 1 or time.shape != change.shape or len(time) < LEAST_SAMPLES:
+        raise Refused(
+            Reason.BAD_INPUT,
+            f"t has shape {time.shape}, y {change.shape}: equal lengths of {LEAST_SAMPLES} samples at least are needed",
+        )
+    if not (np.isfinite(time).all() and np.isfinite(change).all() and math.isfinite(step) and step != 0.0):
+        raise Refused(Reason.BAD_INPUT, f"t, y, y0 and the step must be finite and the step ({step}) not 0")
+    if not (np.diff(time) > 0.0).all():
+        i = int(np.argmin(np.diff(time)))
+        raise Refused(Reason.BAD_INPUT, f"t must increase: {time[i]:g} s is followed by {time[i + 1]:g} s")
+    if not np.ptp(change) > 0.0:
+        raise Refused(Reason.NO_RESPONSE, "y does not change at all")
+    return time - time[0], change
+
+
+def _normalised(t: Reals, y: Reals, step: float, y0: float) -> tuple[Reals, Reals, float]:
+    """(t from 0, change as a fraction of its end, gain)."""
+    time, change = _checked(t, y, step, y0)
+    part = max(len(time) // 20, 1)
+    last, before = float(np.mean(change[-part:])), float(np.mean(change[-2 * part : -part]))
+    if abs(last - before) > REST * float(np.max(np.abs(change))):
+        raise Refused(
+            Reason.BAD_INPUT,
+            f"y still moves at the end of the record ({before:.4g} to {last:.4g}): record longer or use least squares",
+        )
+    return time, change / last, last / step

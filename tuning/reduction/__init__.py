@@ -1,0 +1,1 @@
+"""From any model to the few parameters that a rule asks for."""

@@ -1,0 +1,149 @@
+"""From a model to gains worth trying on the loop: any rule of `registry`, judged on the model before it is tried.
+
+Nothing that would not be robust on its own model, or that comes near instability at the ultimate point measured on the
+loop, is handed over.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from loopwright.tuning.analysis.comparison import (
+    Asked,
+    Comparison,
+    IAE_over_present,
+    Predicted,
+    compared,
+    predicted,
+    worth,
+)
+from loopwright.tuning.analysis.margins import Ultimate
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import FOPDT, SOPDT
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.rules.registry import METHODS, tune
+from loopwright.tuning.rules.robust_pi import UNSTABLE, Criterion
+from loopwright.tuning.rules.setting import Setting
+
+MOST_Ms, LEAST_GM = 2.0, 2.0
+ROUNDING = 1.002
+"""A method that seeks the bound ends on it."""
+SLOWER = {"lambda_s": "larger", "tau_c_s": "larger", "c": "smaller"}
+"""The options that make a rule more robust."""
+CRITERION_7 = "criterion (7): 10 ITAE + overshoot + 10 Ms, the largest with K, T and L 20 % off"
+OVER_PRESENT = "half of the set-point's and half of the load's IAE, each over that of the present gains"
+ROBUST = "robust"
+LEAST_DISTANCE = 0.45
+"""From the loop's response at the measured ultimate frequency to -1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Designed:
+    """What stage 5 hands on. chosen: the rule's design parameters, by name with unit."""
+
+    method: str
+    gains: Gains
+    predicted: Predicted
+    chosen: Mapping[str, float]
+    notes: tuple[str, ...]
+
+
+def design(
+    method: str, plant: FOPDT | SOPDT, ultimate: Ultimate | None, options: Mapping[str, object] | None = None
+) -> Designed:
+    """The rule's gains for this plant, realisable, with what the model predicts of them.
+
+    The rules made on the ultimate point take the measured one. Refused: as the rule says; NOT_ROBUST.
+    """
+    setting = _setting(method, plant, ultimate, options or {})
+    gains, notes = realisable(setting.gains, METHODS[method].filter)
+    found = worth(plant, gains)
+    robust = found.Ms is not None and found.Ms <= MOST_Ms * ROUNDING and (found.GM is None or found.GM >= LEAST_GM)
+    if not robust:
+        GM = "none" if found.GM is None else f"{found.GM:.2f}"
+        shown = "the loop would be unstable" if found.Ms is None else f"Ms {found.Ms:.2f}, GM {GM}"
+        raise Refused(
+            Reason.NOT_ROBUST,
+            f"{method} gives Kp {gains.Kp:.4g}, Ti {gains.Ti:.4g} s, Td {gains.Td:.4g} s; on the model {shown} "
+            f"(Ms at most {MOST_Ms}, GM at least {LEAST_GM}){_slower(setting)}",
+        )
+    if ultimate is not None:
+        distance = abs(1.0 - _controller(gains, 2.0 * math.pi / ultimate.Pu_s) / ultimate.Ku)
+        if distance < LEAST_DISTANCE:
+            raise Refused(
+                Reason.NOT_ROBUST,
+                f"at the measured ultimate point the loop comes within {distance:.2f} of instability "
+                f"(least {LEAST_DISTANCE})",
+            )
+    return Designed(method, gains, predicted(found), dict(setting.chosen), setting.notes + notes)
+
+
+def comparison_of(
+    designed: Designed,
+    plant: FOPDT | SOPDT,
+    old_gains: Gains,
+    sample_time_s: float,
+    options: Mapping[str, object],
+    anyway: bool,
+) -> Comparison:
+    """The old gains and those of the rule on the model that these were made for.
+
+    The robust PI was asked for the bounds of this module, and for the least of its own criterion. The other rules
+    minimise nothing: their gains are worth having where they are more robust than the old ones, or bring the IAE down.
+    anyway: see `tuning.analysis.comparison.compared`.
+    """
+    before, after = worth(plant, old_gains, sample_time_s), worth(plant, designed.gains)
+    assert after.Ms is not None  # `design` sees to that
+    of_robust = designed.method == ROBUST
+    asked = Asked(MOST_Ms, GM=LEAST_GM) if of_robust else Asked(after.Ms, by=f"by {designed.method}")
+    if of_robust and isinstance(plant, FOPDT) and _plain_pi(old_gains):
+        scale_free = options.get("scale_free")
+        of = Criterion(plant, designed.chosen["horizon_s"], None if scale_free is None else bool(scale_free))
+        now, then = (None if J >= UNSTABLE else J for J in (of(g.Kp, g.Ti) for g in (old_gains, designed.gains)))
+        return compared(before, after, asked, CRITERION_7, (now, then), anyway)
+    return compared(before, after, asked, OVER_PRESENT, IAE_over_present(before, after), anyway)
+
+
+def _plain_pi(gains: Gains) -> bool:
+    """Such as criterion (7) is made for."""
+    return gains.Ti > 0.0 and gains.Td == 0.0 and gains.b == 1.0
+
+
+def _slower(setting: Setting) -> str:
+    """What to ask for instead, where the rule has a number for it."""
+    for name, direction in SLOWER.items():
+        if name in setting.chosen:
+            return f"; ask for a {direction} {name} than {setting.chosen[name]:.4g}"
+    return ""
+
+
+def realisable(gains: Gains, filter: float) -> tuple[Gains, tuple[str, ...]]:
+    """An ideal derivative gets the filter Tf = Td/filter, and acts on PV alone; notes say so.
+
+    It would answer noise without bound, and a set-point step would kick MV.
+    """
+    if gains.Td == 0.0:
+        return gains, ()
+    notes = []
+    if gains.Tf == 0.0:
+        gains = replace(gains, Tf=gains.Td / filter)
+        notes.append(f"The derivative is filtered with Tf = Td/{filter:g} = {gains.Tf:.4g} s.")
+    if gains.c != 0.0:
+        gains = replace(gains, c=0.0)
+        notes.append("The derivative acts on PV alone, not on the set-point.")
+    return gains, tuple(notes)
+
+
+def _controller(gains: Gains, w: float) -> complex:
+    """C(jw) of the feedback path."""
+    s = 1j * w
+    integral = 1.0 / (gains.Ti * s) if gains.Ti > 0.0 else 0.0
+    return gains.Kp * (1.0 + integral + gains.Td * s / (1.0 + gains.Tf * s))
+
+
+def _setting(method: str, plant: FOPDT | SOPDT, ultimate: Ultimate | None, options: Mapping[str, object]) -> Setting:
+    if ultimate is not None and method in METHODS and METHODS[method].measured is not None:
+        return METHODS[method].tune_measured(ultimate.Ku, ultimate.Pu_s, **options)
+    return tune(method, plant, **options)

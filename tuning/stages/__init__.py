@@ -1,1 +1,0 @@
-"""The stages of an experiment on a live loop, each a plan (see tuning.plan)."""
