@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 import httpx
 
 from benchmarks.command import command
-from loopwright.service.processes import Process
+from loopwright.service.cli.child_process import Process
 
 LOOPS = (1, 10, 50)
 RATE_PER_S, ASK_S, CONNECTIONS = 100, 10.0, 16

@@ -21,7 +21,7 @@ from typing import TypeVar
 from benchmarks.command import parser_of, show
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, SYNC_ID, channel_ids
 from loopwright.protocol.tuner import Tuner
-from loopwright.service.bus_loop import BusLoop
+from loopwright.service.loops.bus_loop import BusLoop
 
 T = TypeVar("T")
 INTERFACE = "vcan0"

@@ -12,13 +12,14 @@ from pathlib import Path
 from benchmarks.command import command
 from benchmarks.rehearsed import entry, open_loop
 from loopwright.service.config import LoopConfig, parse_site
-from loopwright.service.engine.durable import DurableEngine
-from loopwright.service.jobs import Jobs
-from loopwright.service.loop import Loop, LoopState
+from loopwright.service.execution.procedures import Hooks, Outcome, rehearse
+from loopwright.service.jobs.active_job import Running
+from loopwright.service.jobs.dbos_engine import DurableEngine
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.loop_state import LoopState
+from loopwright.service.loops.loop import Loop
 from loopwright.service.request import RetuneRequest
-from loopwright.service.running import Running
 from loopwright.service.store.store import Store
-from loopwright.service.work import Hooks, Outcome, rehearse
 from loopwright.tuning.plan import StageDone, StageStarted
 
 STAGES = 500

@@ -22,8 +22,8 @@ from sqlalchemy import Engine, create_engine, text
 
 from benchmarks.answers import processor_s
 from benchmarks.command import Missing, command
-from loopwright.service.processes import Process
-from loopwright.service.states import ACTIVE
+from loopwright.service.cli.child_process import Process
+from loopwright.service.job_states import ACTIVE
 from tests.unit.service.postgres import Server, binaries
 
 LOOPS = 1000

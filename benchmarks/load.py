@@ -28,8 +28,8 @@ from benchmarks.command import command
 from loopwright.plantsim.catalogue import find
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE
 from loopwright.protocol.tuner import Tuner
-from loopwright.service.processes import Process
-from loopwright.service.states import ACTIVE
+from loopwright.service.cli.child_process import Process
+from loopwright.service.job_states import ACTIVE
 
 TS = 0.1
 MANY, PACE = 50, 1.0

@@ -16,11 +16,11 @@ from PIL import Image
 from benchmarks.command import check_names, parser_of
 from loopwright.controller.channel import Channel, Settings
 from loopwright.plantsim.plant import LinearPlant
-from loopwright.service.fast_picture import fast_job
-from loopwright.service.fast_record import kept
-from loopwright.service.plain import plain
-from loopwright.service.rehearsal import RehearsedLoop, _parameters
-from loopwright.service.runner import Watch, run
+from loopwright.service.execution.rehearsal import RehearsedLoop, _parameters
+from loopwright.service.execution.runner import Watch, run
+from loopwright.service.jobs.relay_record import kept
+from loopwright.service.jsonable import plain
+from loopwright.service.plots.fast_job import fast_job
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.procedure import FastOptions, fast
 from loopwright.tuning.fast.proposal import Found

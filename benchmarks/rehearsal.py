@@ -13,7 +13,7 @@ import time
 from importlib.resources import files
 
 from benchmarks.command import command
-from loopwright.service.rehearsal import rehearse
+from loopwright.service.execution.rehearsal import rehearse
 
 TS = 0.1
 

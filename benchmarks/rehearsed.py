@@ -20,8 +20,8 @@ from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.config import LoopConfig
-from loopwright.service.rehearsal import RehearsedLoop
-from loopwright.service.serving import Setup, serve
+from loopwright.service.execution.rehearsal import RehearsedLoop
+from loopwright.service.server.serving import Setup, serve
 from loopwright.tuning.plan import Command, Mode, Sample
 
 TS = 0.1

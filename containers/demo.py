@@ -10,8 +10,8 @@ import sys
 import time
 from typing import Any
 
-from loopwright.service import show
-from loopwright.service.client import ApiError, Client
+from loopwright.service.cli import job_tables
+from loopwright.service.cli.client import ApiError, Client
 
 URL = "http://127.0.0.1:8080"
 
@@ -28,14 +28,14 @@ def _demonstrate(client: Client) -> int:
     started = time.monotonic()
     loop = client.get("/loops")[0]
     if url := loop["active_job"]:
-        show.console.print(f"GET   {url}: a retune is on its way", highlight=False)
+        job_tables.console.print(f"GET   {url}: a retune is on its way", highlight=False)
     else:
         url = client.post(f"/loops/{loop['tag']}/retune", {"requested_by": "demo"})["url"]
-        show.console.print(f"POST  /loops/{loop['tag']}/retune -> {url}", highlight=False)
-    job = show.follow(client, url)
-    show.job_report(job, loop["pv_unit"])
+        job_tables.console.print(f"POST  /loops/{loop['tag']}/retune -> {url}", highlight=False)
+    job = job_tables.follow(client, url)
+    job_tables.job_report(job, loop["pv_unit"])
     proof = _proof(job, client.get(f"/loops/{loop['tag']}"), time.monotonic() - started)
-    show.console.print("\n".join(proof), highlight=False, soft_wrap=True)
+    job_tables.console.print("\n".join(proof), highlight=False, soft_wrap=True)
     return 0 if job["state"] == "proposed" else 3
 
 
@@ -48,15 +48,15 @@ def _proof(job: dict[str, Any], loop: dict[str, Any], seconds: float) -> list[st
         how, names = "predicted", (("overshoot", "overshoot_pct", " %"), ("Ms", "Ms", ""))
         before, after = job["predicted_before"], job["predicted"]
     changes = [
-        f"{label} {show.cell((before or {}).get(name))} -> {show.cell((after or {}).get(name))}{unit}"
+        f"{label} {job_tables.cell((before or {}).get(name))} -> {job_tables.cell((after or {}).get(name))}{unit}"
         for label, name, unit in names
     ]
     if job["verification"]:
         changes.append(f"{job['verification']['fit_pct']:.1f} % of the measured step explained")
-    held = ", ".join(f"{name} {show.cell(live['gains'][name])}" for name in ("Kp", "Ti"))
+    held = ", ".join(f"{name} {job_tables.cell(live['gains'][name])}" for name in ("Kp", "Ti"))
     return [
         f"proof       {how}: {', '.join(changes)}",
-        f"controller  {live['mode']}, {held}, set-point {show.cell(live['sp'])}: its own until a proposal is accepted",
+        f"controller  {live['mode']}, {held}, set-point {job_tables.cell(live['sp'])}: its own until a proposal is accepted",
         f"time        {job['plant_time_s']:.0f} s of plant time in {seconds:.1f} s",
         f"state       {job['state']}",
     ]

@@ -1,5 +1,5 @@
 """python -m loopwright.service: the same as the `loopwright` command."""
 
-from loopwright.service.cli import main
+from loopwright.service.cli.main import main
 
 main()

@@ -14,9 +14,9 @@ import pytest
 _STARTERS = {
     "subprocess",
     "multiprocessing",
-    "loopwright.service.processes",
-    "loopwright.service.serving",
-    "loopwright.service.computing",
+    "loopwright.service.cli.child_process",
+    "loopwright.service.server.serving",
+    "loopwright.service.execution.computing.pool",
 }
 
 _COUNTS = pytest.StashKey[dict[str, Counter[str]]]()

@@ -10,14 +10,13 @@ from typing import Annotated, Literal
 from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from loopwright.service.api import contract, fleet, locks, operations, previews, problems, tunings
-from loopwright.service.api.access import Access
+from loopwright.service.api import fleet, locks, openapi, operations, previews, problems, tunings
 from loopwright.service.api.bodies import JsonRoute
+from loopwright.service.api.events import event_stream, still_permitted
+from loopwright.service.api.gate.access_log import Access
+from loopwright.service.api.gate.gate import Gate, Policy
 from loopwright.service.api.idempotency import Idempotent
-from loopwright.service.api.paging import LARGEST
-from loopwright.service.api.samples import Reading, csv_text, json_text, parts, takes_gzip
-from loopwright.service.api.stream import event_stream, still_permitted
-from loopwright.service.api.views import (
+from loopwright.service.api.job_views import (
     Decision,
     DismissedView,
     JobView,
@@ -28,17 +27,18 @@ from loopwright.service.api.views import (
     live_view,
     loop_view,
 )
-from loopwright.service.computing.pool import Pool
-from loopwright.service.fleet import Fleet
-from loopwright.service.jobs import Jobs
-from loopwright.service.lateness import watched_event_loop
+from loopwright.service.api.paging import LARGEST
+from loopwright.service.api.samples import Reading, csv_text, json_text, parts, takes_gzip
+from loopwright.service.execution.computing.pool import Pool
+from loopwright.service.job_states import ACTIVE, JobState
+from loopwright.service.jobs.fleet import Fleet
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.loops.shared_reading import SharedReading
 from loopwright.service.request import RetuneRequest
-from loopwright.service.security.gate import Gate, Policy
 from loopwright.service.security.principal import current
-from loopwright.service.shared_reading import SharedReading
-from loopwright.service.states import ACTIVE, JobState
 from loopwright.service.store.idempotency import IdempotencyKeys
 from loopwright.service.store.tables import JobRow
+from loopwright.service.telemetry.lateness import watched_event_loop
 from loopwright.tuning.reasons import Ended
 
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
@@ -86,7 +86,7 @@ def create_app(
     app.add_middleware(Gate, policy=policy)
     app.add_middleware(Access)
     problems.install(app)
-    contract.install(app)
+    openapi.install(app)
     operations.install(app, jobs, operations.checks(jobs) if checks is None else checks)
 
     def views(rows: Sequence[JobRow]) -> list[JobView]:

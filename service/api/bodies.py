@@ -1,4 +1,4 @@
-"""Bodies of requests: JSON, of one meaning (see `service.strict_json`), and said to be JSON."""
+"""Bodies of requests: JSON, of one meaning (see `service.api.strict_json`), and said to be JSON."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fastapi import HTTPException, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.routing import APIRoute
 
-from loopwright.service import strict_json
+from loopwright.service.api import strict_json
 
 _SHORT = 16_384
 """Bytes that are read at once; reading a longer body would hold up the event loop."""

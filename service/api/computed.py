@@ -9,9 +9,9 @@ from typing import Any
 
 from fastapi import Request
 
-from loopwright.service.computing.limits import Kind
-from loopwright.service.computing.pool import NotWanted, Pool
 from loopwright.service.errors import Stopping
+from loopwright.service.execution.computing.limits import Kind
+from loopwright.service.execution.computing.pool import NotWanted, Pool
 
 Work = Callable[[], dict[str, Any]]
 

@@ -12,11 +12,11 @@ from pydantic import BaseModel, Field
 
 from loopwright.service.api import problems
 from loopwright.service.api.bodies import JsonRoute
+from loopwright.service.api.job_views import Decision, JobView, LoopView, loop_view
 from loopwright.service.api.paging import LINK, Cursor, Limit, more
-from loopwright.service.api.views import Decision, JobView, LoopView, loop_view
-from loopwright.service.fleet import BadFleet, Fleet, FleetRequest
-from loopwright.service.jobs import Jobs
-from loopwright.service.states import JobState
+from loopwright.service.job_states import JobState
+from loopwright.service.jobs.fleet import BadFleet, Fleet, FleetRequest
+from loopwright.service.jobs.manager import Jobs
 from loopwright.service.store.retunes import NoSuchRetune, Part, RetuneOver, RetuneState, StopReason
 from loopwright.service.store.tables import JobRow, RetuneRow
 from loopwright.tuning.reasons import Reason
@@ -26,7 +26,7 @@ Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 LoopFilter = Literal["busy", "idle"] | JobState
 
 
-class PartView(BaseModel):
+class RetuneLoopView(BaseModel):
     """A loop of the retune."""
 
     loop: str = Field(examples=["TIC-101"])
@@ -60,7 +60,7 @@ class RetuneSummary(BaseModel):
 
 
 class RetuneView(RetuneSummary):
-    loops: list[PartView] = Field(description="In the order in which they are begun")
+    loops: list[RetuneLoopView] = Field(description="In the order in which they are begun")
 
 
 def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[JobRow]], list[JobView]]) -> None:
@@ -212,7 +212,7 @@ def _summary(row: RetuneRow, parts: list[Part]) -> dict[str, Any]:
 def _view(row: RetuneRow, parts: list[Part]) -> RetuneView:
     may_begin = row.stop_reason is None
     loops = [
-        PartView(
+        RetuneLoopView(
             loop=part.loop,
             state=part.state(may_begin),
             job=None if part.job_id is None else f"/jobs/{part.job_id}",

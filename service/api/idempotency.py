@@ -20,8 +20,8 @@ from starlette.responses import Response
 from starlette.routing import compile_path
 
 from loopwright.service.api import problems
-from loopwright.service.security.bodies import begins_with
-from loopwright.service.security.gate import App, AsgiScope, Message, Receive, Send
+from loopwright.service.api.gate.bodies import begins_with
+from loopwright.service.api.gate.gate import App, AsgiScope, Message, Receive, Send
 from loopwright.service.security.principal import LOCAL
 from loopwright.service.security.principal import current as principal
 from loopwright.service.store import claims

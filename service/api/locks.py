@@ -9,8 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from loopwright.service.api import problems
 from loopwright.service.api.bodies import JsonRoute
-from loopwright.service.api.views import Decision, LockView
-from loopwright.service.jobs import Jobs
+from loopwright.service.api.job_views import Decision, LockView
+from loopwright.service.jobs.manager import Jobs
 
 _ONE_LINE = r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$"
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]

@@ -15,15 +15,14 @@ from fastapi import APIRouter, FastAPI, Query, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import BaseModel, Field
 
-from loopwright.service import metrics
-from loopwright.service.aftercare import NotHome
-from loopwright.service.api import problems
-from loopwright.service.api.page import POLICY, page
+from loopwright.service.api import metrics, problems
+from loopwright.service.api.docs_page import POLICY, page
 from loopwright.service.api.paging import LARGEST
-from loopwright.service.bus_watch import BusWatch
-from loopwright.service.jobs import Jobs
-from loopwright.service.security import audit
-from loopwright.service.security.tables import AuditRow
+from loopwright.service.jobs.aftercare import NotHome
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.loops.bus_watch import BusWatch
+from loopwright.service.store import audit
+from loopwright.service.store.tables import AuditRow
 
 Check = Callable[[], str | None]
 """Returns when all is well, with what is worth knowing; raises with the reason when not."""
@@ -37,7 +36,7 @@ class Alive(BaseModel):
     status: str = Field(description="alive", examples=["alive"])
 
 
-class PartView(BaseModel):
+class ReadinessPart(BaseModel):
     """One thing the service cannot do without."""
 
     ready: bool
@@ -51,7 +50,7 @@ class Ready(BaseModel):
     """Whether the service can take work."""
 
     ready: bool = Field(description="All of its parts are")
-    parts: dict[str, PartView] = Field(
+    parts: dict[str, ReadinessPart] = Field(
         description="database, engine, samples (what is deleted when), each bus by its address, and each loop that is "
         "looked after"
     )
@@ -109,14 +108,14 @@ class Readiness:
             return self._last[1]
 
     @staticmethod
-    async def _one(check: Check) -> PartView:
+    async def _one(check: Check) -> ReadinessPart:
         try:
             told = await asyncio.wait_for(asyncio.to_thread(check), CHECK_S)
         except TimeoutError:
-            return PartView(ready=False, detail=f"no answer within {CHECK_S:g} s")
+            return ReadinessPart(ready=False, detail=f"no answer within {CHECK_S:g} s")
         except Exception as error:  # whatever it is, this part is not ready
-            return PartView(ready=False, detail=str(error) or type(error).__name__)
-        return PartView(ready=True, detail=told)
+            return ReadinessPart(ready=False, detail=str(error) or type(error).__name__)
+        return ReadinessPart(ready=True, detail=told)
 
 
 def checks(jobs: Jobs) -> dict[str, Check]:

@@ -8,12 +8,12 @@ from typing import Annotated
 from fastapi import APIRouter, Body, Path
 
 from loopwright.service.api import problems
-from loopwright.service.fleet import Fleet, FleetRequest
-from loopwright.service.jobs import Jobs
-from loopwright.service.obstacles import Now
-from loopwright.service.preview import FleetPreview, LastProposal, Preview, fleet_preview, preview
+from loopwright.service.jobs.fleet import Fleet, FleetRequest
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.loop_state import loop_state
+from loopwright.service.planning.obstacles import Now
+from loopwright.service.planning.preview import FleetPreview, LastProposal, Preview, fleet_preview, preview
 from loopwright.service.request import RetuneRequest
-from loopwright.service.state_json import loop_state
 from loopwright.service.store import loop_locks
 from loopwright.service.store.tables import JobRow
 from loopwright.tuning.reasons import Ended

@@ -13,16 +13,16 @@ from sqlalchemy.exc import DataError, SQLAlchemyError
 from starlette.exceptions import HTTPException
 
 from loopwright.service.api.bodies import BadBody
-from loopwright.service.computing.pool import NotWanted
 from loopwright.service.errors import Conflict, Locked, Stopping, UnknownLoop
-from loopwright.service.journal import temporary
-from loopwright.service.model_forms import BadModel
+from loopwright.service.execution.computing.pool import NotWanted
+from loopwright.service.job_states import IllegalMove
+from loopwright.service.jobs.journal import temporary
+from loopwright.service.offline.model_json import BadModel
+from loopwright.service.offline.tunings import BadTuning
 from loopwright.service.request import BadLimits
-from loopwright.service.states import IllegalMove
 from loopwright.service.store.claims import StillAnswering
 from loopwright.service.store.damage import is_damage
 from loopwright.service.store.store import Busy, FolderInUse, NoSuchJob
-from loopwright.service.tunings import BadTuning
 from loopwright.tuning.reasons import ADVICE, Ended, Reason
 
 MEDIA_TYPE = "application/problem+json"

@@ -13,8 +13,8 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from loopwright.service.fast_record import Columns
-from loopwright.service.store.chunks import COLUMNS, Block
+from loopwright.service.jobs.relay_record import Columns
+from loopwright.service.store.sample_blocks import COLUMNS, Block
 from loopwright.service.store.store import Store
 from loopwright.tuning.models import Reals
 

@@ -8,17 +8,17 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Request
 from fastapi.concurrency import run_in_threadpool
 
-from loopwright.service import tunings
-from loopwright.service.alternatives import alternatives, redesigned
 from loopwright.service.api import problems
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.computed import Work, computed
 from loopwright.service.api.samples import record_columns
 from loopwright.service.api.tuning_views import AlternativesView, MethodView, TuningRequest, TuningsView
-from loopwright.service.computing.pool import Pool
-from loopwright.service.fast_record import kept
-from loopwright.service.jobs import Jobs
-from loopwright.service.model_forms import parse_model
+from loopwright.service.execution.computing.pool import Pool
+from loopwright.service.jobs.alternatives import alternatives, redesigned
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.jobs.relay_record import kept
+from loopwright.service.offline import tunings
+from loopwright.service.offline.model_json import parse_model
 from loopwright.tuning.fast.procedure import FAST
 
 

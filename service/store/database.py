@@ -21,6 +21,8 @@ from sqlalchemy.pool import NullPool
 _log = logging.getLogger(__name__)
 
 FILE = "loopwright.sqlite"
+ENGINE_FILE = "engine.sqlite"
+"""What the durable engine keeps for itself."""
 WAIT_S = 5
 """Wall time for a connection, a lock or a locked file."""
 STATEMENT_S = 10

@@ -6,9 +6,9 @@ from datetime import UTC, datetime
 
 from sqlalchemy import func, select
 
-from loopwright.service.clock_watch import Jump, Seen
-from loopwright.service.security import audit
+from loopwright.service.store import audit
 from loopwright.service.store.clock import stamp
+from loopwright.service.store.clock_watch import Jump, Seen
 from loopwright.service.store.store import Store, of_host
 from loopwright.service.store.tables import HostRow, JobRow
 

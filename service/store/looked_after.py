@@ -11,8 +11,8 @@ from typing import Any
 from sqlalchemy import distinct, func, select
 from sqlalchemy.orm import Session
 
-from loopwright.service.plain import plain
-from loopwright.service.security import audit
+from loopwright.service.jsonable import plain
+from loopwright.service.store import audit
 from loopwright.service.store.store import Store, Write, append, set_columns
 from loopwright.service.store.tables import JobRow
 

@@ -10,7 +10,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from loopwright.service.errors import Locked, LockedOtherwise
-from loopwright.service.security import audit
+from loopwright.service.store import audit
 from loopwright.service.store.clock import now
 from loopwright.service.store.tables import LoopLockRow, LoopRow
 

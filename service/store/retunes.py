@@ -11,9 +11,8 @@ from typing import Any
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
-from loopwright.service.security import audit
-from loopwright.service.states import ACTIVE, JobState, shown
-from loopwright.service.store import claims
+from loopwright.service.job_states import ACTIVE, JobState, shown
+from loopwright.service.store import audit, claims
 from loopwright.service.store.clock import now
 from loopwright.service.store.tables import JobRow, RetuneLoopRow, RetuneRow
 from loopwright.tuning.reasons import Reason

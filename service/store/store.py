@@ -13,12 +13,10 @@ from sqlalchemy import ColumnElement, delete, func, select, update
 from sqlalchemy.exc import IntegrityError, SQLAlchemyError, TimeoutError
 from sqlalchemy.orm import Session
 
-from loopwright.service.loop import same_gains
-from loopwright.service.plain import plain
-from loopwright.service.security import audit
-from loopwright.service.state_json import gains_of
-from loopwright.service.states import ACTIVE, IllegalMove, JobState, check
-from loopwright.service.store import chunks, claims, loop_locks, retunes
+from loopwright.service.job_states import ACTIVE, IllegalMove, JobState, check
+from loopwright.service.jsonable import plain
+from loopwright.service.loop_state import gains_of, same_gains
+from loopwright.service.store import audit, claims, loop_locks, retunes, sample_blocks
 from loopwright.service.store.clock import now
 from loopwright.service.store.damage import Damage
 from loopwright.service.store.database import (
@@ -452,14 +450,14 @@ class Store:
         last = select(ChunkRow).where(ChunkRow.job_id == job_id).order_by(ChunkRow.seq.desc()).limit(1)
         with self._session() as session:
             row = session.scalars(last).one_or_none()
-        return 0.0 if row is None else chunks.unpack(_block(row))[-1].t
+        return 0.0 if row is None else sample_blocks.unpack(_block(row))[-1].t
 
     def last_block(self, job_id: str) -> int:
         """Number of the last block of samples that is kept of a job as yet; 0: there is none."""
         with self._session() as session:
             return session.scalar(select(func.max(ChunkRow.seq)).where(ChunkRow.job_id == job_id)) or 0
 
-    def blocks(self, job_id: str, stage: str | None = None, last: int | None = None) -> Iterator[chunks.Block]:
+    def blocks(self, job_id: str, stage: str | None = None, last: int | None = None) -> Iterator[sample_blocks.Block]:
         """The blocks of samples in order, up to number `last`: a few at a time, each time in a short transaction of its
         own, so that a slow reader holds neither a connection nor the memory."""
         wanted = select(ChunkRow).where(ChunkRow.job_id == job_id).order_by(ChunkRow.seq).limit(_BLOCKS_AT_ONCE)
@@ -478,15 +476,15 @@ class Store:
 
     def samples(self, job_id: str, stage: str | None = None) -> list[tuple[str, list[Sample]]]:
         """The blocks in order, each with the stage it belongs to: all of them in memory."""
-        return [(block.stage, chunks.unpack(block)) for block in self.blocks(job_id, stage)]
+        return [(block.stage, sample_blocks.unpack(block)) for block in self.blocks(job_id, stage)]
 
 
-def _block(row: ChunkRow) -> chunks.Block:
-    return chunks.Block(row.stage, row.first_t_s, row.count, row.data)
+def _block(row: ChunkRow) -> sample_blocks.Block:
+    return sample_blocks.Block(row.stage, row.first_t_s, row.count, row.data)
 
 
 def is_shown_as(state: JobState) -> ColumnElement[bool]:
-    """As `service.states.shown` has it."""
+    """As `service.job_states.shown` has it."""
     stored = JobRow.state == state.value
     if state is JobState.PROPOSED:
         return stored & JobRow.dry_run.is_(False)
@@ -509,7 +507,7 @@ def event_of(job_id: str, kind: str, data: dict[str, Any], plant_time_s: float, 
 
 def block_of(job_id: str, stage: str, samples: Sequence[Sample]) -> Write:
     """A block of samples of one stage, packed now: a database that is away does not fill the memory."""
-    first_t_s, count, data = samples[0].t, len(samples), chunks.pack(samples)
+    first_t_s, count, data = samples[0].t, len(samples), sample_blocks.pack(samples)
 
     def write(session: Session) -> None:
         seq = session.scalar(select(func.max(ChunkRow.seq)).where(ChunkRow.job_id == job_id)) or 0

@@ -79,6 +79,8 @@ class LoopLockRow(Base):
     reason: Mapped[str]
     by: Mapped[str]
     since: Mapped[str]
+
+
 class HostRow(Base):
     """What a host keeps of itself."""
 
@@ -177,3 +179,36 @@ class IdempotencyRow(Base):
     status: Mapped[int | None]
     headers: Mapped[dict[str, Any] | None]
     body: Mapped[bytes | None] = mapped_column(LargeBinary)
+
+
+class KeyRow(Base):
+    """An API key. Never deleted: the audit log names it."""
+
+    __tablename__ = "api_keys"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    name: Mapped[str]
+    scope: Mapped[str]
+    hash: Mapped[str]
+    created_at: Mapped[str]
+    expires_at: Mapped[str | None]
+    revoked_at: Mapped[str | None]
+
+
+class AuditRow(Base):
+    """One change. who: the key's name, `local` or `cli:USER`; said_by: what the request itself claimed."""
+
+    __tablename__ = "audit"
+    __table_args__ = (Index("audit_by_loop", "loop", "number"),)
+
+    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    at: Mapped[str]
+    who: Mapped[str]
+    key_id: Mapped[str | None]
+    address: Mapped[str | None]
+    said_by: Mapped[str | None]
+    what: Mapped[str]
+    subject: Mapped[str]
+    loop: Mapped[str | None]
+    before: Mapped[dict[str, Any] | None]
+    after: Mapped[dict[str, Any] | None]

@@ -16,10 +16,10 @@ import yaml
 
 from loopwright.protocol.profile import FOREVER
 from loopwright.protocol.tuner import Tuner
-from loopwright.service.bus_loop import BusLoop
-from loopwright.service.demo import vcan_usable
-from loopwright.service.loop import LoopState
-from loopwright.service.processes import Process
+from loopwright.service.cli.child_process import Process
+from loopwright.service.cli.demo import vcan_usable
+from loopwright.service.loop_state import LoopState
+from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.tuning.plan import Mode
 
 NEEDS_VCAN = [

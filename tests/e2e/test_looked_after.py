@@ -14,7 +14,7 @@ import pytest
 
 from loopwright.protocol.bus import open_bus
 from loopwright.protocol.profile import NMT_FRAME, NMT_ID, NmtCommand
-from loopwright.service.processes import Process
+from loopwright.service.cli.child_process import Process
 from tests.e2e.plantsite import MODEL_14, STAGES, TAG, Plantsite
 
 pytestmark = pytest.mark.timeout(300)

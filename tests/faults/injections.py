@@ -37,9 +37,9 @@ from loopwright.protocol.profile import (
     sdo_response_id,
 )
 from loopwright.protocol.station import Station
-from loopwright.service.backup import back_up, restore
-from loopwright.service.bus_loop import BusLoop
-from loopwright.service.processes import NotReady
+from loopwright.service.cli.child_process import NotReady
+from loopwright.service.loops.bus_loop import BusLoop
+from loopwright.service.store.backup import back_up, restore
 from loopwright.tuning.reasons import Ended, Reason
 from tests.e2e.plantsite import TAG
 from tests.faults.ending import Home, unsafe

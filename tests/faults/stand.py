@@ -22,7 +22,7 @@ from loopwright.controller.device import Kept
 from loopwright.controller.memory import write
 from loopwright.controller.pid import Parameters
 from loopwright.protocol.profile import Mode
-from loopwright.service.store.chunks import Block, unpack
+from loopwright.service.store.sample_blocks import Block, unpack
 from loopwright.service.store.tables import ChunkRow
 from tests.e2e.plantsite import MODEL_14, Plantsite
 from tests.faults.ending import Eye, Home, Stalls

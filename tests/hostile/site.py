@@ -12,12 +12,12 @@ import yaml
 
 from loopwright.plantsim.catalogue import find
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE
-from loopwright.service.bus_loop import BusLoop
-from loopwright.service.demo import vcan_usable
-from loopwright.service.loop import LoopState
-from loopwright.service.processes import Process
-from loopwright.service.security.keyring import Keyring
+from loopwright.service.cli.child_process import Process
+from loopwright.service.cli.demo import vcan_usable
+from loopwright.service.loop_state import LoopState
+from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.service.security.keys import Scope
+from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Store
 from loopwright.tuning.plan import Mode
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from loopwright.service.rehearsal import rehearse
+from loopwright.service.execution.rehearsal import rehearse
 from loopwright.tuning.models import FOPDT
 from loopwright.tuning.reasons import ADVICE, Reason
 

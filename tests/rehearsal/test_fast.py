@@ -9,7 +9,7 @@ import pytest
 from benchmarks.cases import ASKED, FURTHER
 from benchmarks.plants import plants
 from benchmarks.tuning import fast_run
-from loopwright.service.rehearsal import rehearse
+from loopwright.service.execution.rehearsal import rehearse
 from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction

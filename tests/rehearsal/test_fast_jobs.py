@@ -11,14 +11,14 @@ from benchmarks.rehearsed import MIDDLE, TS, entry
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
+from loopwright.service.api.job_views import job_view
 from loopwright.service.api.samples import record_columns
-from loopwright.service.api.views import job_view
 from loopwright.service.config import LoopConfig, parse_site
-from loopwright.service.jobs import Jobs
-from loopwright.service.rehearsal import RehearsedLoop
+from loopwright.service.execution.procedures import rehearse, tune
+from loopwright.service.execution.rehearsal import RehearsedLoop
+from loopwright.service.jobs.manager import Jobs
 from loopwright.service.request import RetuneRequest
 from loopwright.service.store.store import Store
-from loopwright.service.work import rehearse, tune
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from loopwright.service.rehearsal import rehearse
+from loopwright.service.execution.rehearsal import rehearse
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction

@@ -12,17 +12,17 @@ import pytest
 from benchmarks.rehearsed import MIDDLE, TS, AroundTheMiddle, entry
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
-from loopwright.service.api.views import job_view
+from loopwright.service.api.job_views import job_view
+from loopwright.service.cli.job_tables import job_report, title
 from loopwright.service.config import LoopConfig, parse_site
-from loopwright.service.jobs import Jobs
-from loopwright.service.rehearsal import RehearsedLoop, rehearse
+from loopwright.service.execution.procedures import rehearse as dry_run
+from loopwright.service.execution.procedures import tune
+from loopwright.service.execution.rehearsal import RehearsedLoop, rehearse
+from loopwright.service.job_states import JobState
+from loopwright.service.jobs.manager import Jobs
 from loopwright.service.request import RetuneRequest
-from loopwright.service.show import job_report, title
-from loopwright.service.states import JobState
 from loopwright.service.store.retunes import Part
 from loopwright.service.store.store import Store
-from loopwright.service.work import rehearse as dry_run
-from loopwright.service.work import tune
 from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT

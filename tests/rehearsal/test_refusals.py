@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.refusals import cases, draw, rehearsed
-from loopwright.service.fast_record import kept
+from loopwright.service.jobs.relay_record import kept
 from loopwright.tuning.fast.design import Wish
 from loopwright.tuning.fast.verdict import judge_again
 from loopwright.tuning.reasons import ADVICE, Reason

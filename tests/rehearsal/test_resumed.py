@@ -10,10 +10,10 @@ import pytest
 
 from loopwright.controller.channel import Channel, Settings
 from loopwright.plantsim.plant import LinearPlant
-from loopwright.service.checkpoints import finished
-from loopwright.service.plain import plain_object
-from loopwright.service.rehearsal import RehearsedLoop, _parameters
-from loopwright.service.runner import Watch, run
+from loopwright.service.execution.checkpoints import finished
+from loopwright.service.execution.rehearsal import RehearsedLoop, _parameters
+from loopwright.service.execution.runner import Watch, run
+from loopwright.service.jsonable import plain_object
 from loopwright.tuning.five_stage.procedure import STAGES, Facts, Finished, Options, five_stage
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Event, Mode, StageDone, StageStarted

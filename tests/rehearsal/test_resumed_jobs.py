@@ -11,11 +11,11 @@ import pytest
 
 from benchmarks.rehearsed import entry, open_loop
 from loopwright.service.config import parse_site
-from loopwright.service.jobs import Jobs
-from loopwright.service.rehearsal import RehearsedLoop
+from loopwright.service.execution.procedures import rehearse, tune
+from loopwright.service.execution.rehearsal import RehearsedLoop
+from loopwright.service.jobs.manager import Jobs
 from loopwright.service.request import RetuneRequest
 from loopwright.service.store.store import Store
-from loopwright.service.work import rehearse, tune
 from loopwright.tuning.experiments.preflight import SETTLE
 from loopwright.tuning.fast.procedure import FAST_STAGES
 from loopwright.tuning.five_stage.procedure import STAGES

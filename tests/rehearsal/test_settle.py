@@ -6,11 +6,11 @@ import pytest
 
 from benchmarks.rehearsed import entry, open_loop
 from loopwright.service.config import parse_site
-from loopwright.service.loop import Loop
+from loopwright.service.execution.procedures import plan
+from loopwright.service.execution.runner import RunResult, Watch, run
+from loopwright.service.loops.loop import Loop
 from loopwright.service.request import RetuneRequest
-from loopwright.service.runner import RunResult, Watch, run
 from loopwright.service.store.tables import EventRow
-from loopwright.service.work import plan
 from loopwright.tuning.experiments.preflight import SETTLE
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.settle import LOOKS

@@ -19,16 +19,17 @@ from sqlalchemy import event, text
 
 from loopwright.protocol.station import Station
 from loopwright.protocol.turns import Turns
-from loopwright.service.bus_loop import BusLoop
-from loopwright.service.bus_reading import BusReading
 from loopwright.service.config import LoopConfig
-from loopwright.service.jobs import Jobs
-from loopwright.service.loop import Loop, LoopState, Restored
+from loopwright.service.execution.procedures import Tune
+from loopwright.service.job_states import ACTIVE, JobState
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.loop_state import LoopState
+from loopwright.service.loops.bus_loop import BusLoop
+from loopwright.service.loops.bus_reading import BusReading
+from loopwright.service.loops.loop import Loop, Restored
 from loopwright.service.machine import Machine
-from loopwright.service.states import ACTIVE, JobState
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import Base, JobRow
-from loopwright.service.work import Tune
 from tests.simulation.scheduler import Killed, Process, Simulation, Task
 from tests.simulation.wire import Port, Wire
 

@@ -13,12 +13,11 @@ from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, Mode, NmtState
 from loopwright.service.config import Limits, LoopConfig
-from loopwright.service.loop import LoopState
+from loopwright.service.execution.procedures import Tune
+from loopwright.service.job_states import ACTIVE, JobState
+from loopwright.service.loop_state import LoopState, state_json
 from loopwright.service.request import RetuneRequest
-from loopwright.service.state_json import state_json
-from loopwright.service.states import ACTIVE, JobState
 from loopwright.service.store.tables import JobRow
-from loopwright.service.work import Tune
 from tests.simulation import plans
 from tests.simulation.devices import Controller, PlantNode
 from tests.simulation.gateway import Gateway, ReadLoop, SimStation

@@ -26,8 +26,8 @@ from loopwright.protocol.profile import (
     ParameterCommand,
     channel_ids,
 )
-from loopwright.service.loop import LoopState
-from loopwright.service.states import ACTIVE, JobState
+from loopwright.service.job_states import ACTIVE, JobState
+from loopwright.service.loop_state import LoopState
 from loopwright.service.store.tables import JobRow
 from tests.simulation.devices import Controller, PlantNode
 from tests.simulation.disk import AGAIN_S, SOON_S

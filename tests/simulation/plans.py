@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from random import Random
 from typing import Any
 
-from loopwright.service.computing.limits import Kind
 from loopwright.service.config import LoopConfig
-from loopwright.service.loop import Loop, LoopState
-from loopwright.service.plain import plain_object
+from loopwright.service.execution.computing.limits import Kind
+from loopwright.service.execution.procedures import Hooks, Outcome, Tune, tune
+from loopwright.service.execution.runner import Watch, run
+from loopwright.service.jsonable import plain_object
+from loopwright.service.loop_state import LoopState
+from loopwright.service.loops.loop import Loop
 from loopwright.service.request import RetuneRequest
-from loopwright.service.runner import Watch, run
-from loopwright.service.work import Hooks, Outcome, Tune, tune
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import (
     Mode,

@@ -14,9 +14,9 @@ import pytest
 
 from loopwright.protocol.bus import open_bus
 from loopwright.protocol.profile import COMMAND_FRAME, channel_ids
-from loopwright.service.bus_loop import BusLoop
-from loopwright.service.loop import LoopState
-from loopwright.service.runner import Watch, run
+from loopwright.service.execution.runner import Watch, run
+from loopwright.service.loop_state import LoopState
+from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode, Plan, Sample, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
 from loopwright.tuning.reasons import Ended, Failed, Reason, Refused
@@ -199,7 +199,7 @@ def test_gains_are_accepted_and_stay(loop: BusLoop) -> None:
 
 TRIAL = """
 import sys
-from loopwright.service.bus_loop import BusLoop
+from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode, SetGains, SetMode, SetSetpoint
 loop = BusLoop(sys.argv[1], 0x20, 0x10)

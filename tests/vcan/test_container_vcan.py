@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from loopwright.containers.vcan import NoVcan, make, remove
-from loopwright.service.demo import vcan_usable
+from loopwright.service.cli.demo import vcan_usable
 from tests.e2e.plantsite import NEEDS_VCAN
 
 pytestmark = NEEDS_VCAN

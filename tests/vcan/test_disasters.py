@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from loopwright.protocol.station import Station
-from loopwright.service.bus_loop import BusLoop
+from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.tuning.gains import Gains
 from tests.vcan.test_bus_loop import CONTROLLER, GAINS, PLANT, TRIED, Start, as_configured, on_vcan, start, url  # noqa: F401
 
@@ -22,7 +22,7 @@ HOME_WITHIN_S = 3.0
 GATEWAY = """
 import sys
 from loopwright.protocol.station import Station
-from loopwright.service.bus_loop import BusLoop
+from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.tuning.plan import Mode, SetMode, SetRelay, SetSetpoint
 url, node, channel = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 loop = BusLoop(url, 0x20, 0x10, channel, station=Station(node))

@@ -10,8 +10,8 @@ import pytest
 from benchmarks.cases import ASKED
 from benchmarks.plants import Plant, plants
 from benchmarks.tuning import cost_over_best, loop_of, span_of
-from loopwright.service.bus_loop import BusLoop
-from loopwright.service.runner import Watch, run
+from loopwright.service.execution.runner import Watch, run
+from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.procedure import FastOptions, fast

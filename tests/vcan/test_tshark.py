@@ -28,8 +28,8 @@ from loopwright.protocol.profile import (
     sdo_request_id,
     sdo_response_id,
 )
-from loopwright.service.bus_loop import BusLoop
-from loopwright.service.runner import Watch, run
+from loopwright.service.execution.runner import Watch, run
+from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode, Plan, SetGains, SetMode, SetRelay, SetSetpoint
 

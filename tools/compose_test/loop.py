@@ -12,7 +12,7 @@ TAG = "TIC-101"
 _LOOK = """
 import json, sys, time
 from loopwright.containers import keeper
-from loopwright.service.bus_loop import BusLoop
+from loopwright.service.loops.bus_loop import BusLoop
 url, _ = keeper.join(5.0)
 loop = BusLoop(url, 0x20, 0x10)
 print("looking", flush=True)

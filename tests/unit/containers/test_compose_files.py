@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
-from loopwright.service.demo import TAG, loops_yaml
+from loopwright.service.cli.demo import TAG, loops_yaml
 
 ROOT = Path(__file__).parents[3]
 FILES = ("docker-compose.yml", "docker-compose.can0.yml")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from loopwright.service.demo import loops_yaml
+from loopwright.service.cli.demo import loops_yaml
 from loopwright.service.store.database import FILE, migrate, sqlite
 
 

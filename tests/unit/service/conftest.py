@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from loopwright.service import logs
 from loopwright.service.api.app import create_app
 from loopwright.service.security.principal import SERVICE, current
 from loopwright.service.store.store import Store
+from loopwright.service.telemetry import logs
 from tests.unit.service.fakes import Service
 from tests.unit.service.postgres import Server, binaries
 

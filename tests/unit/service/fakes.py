@@ -13,12 +13,13 @@ from typing import Any
 import pytest
 
 from loopwright.service.config import LoopConfig, parse_site
-from loopwright.service.jobs import Jobs
-from loopwright.service.loop import OPERATIONAL, Loop, LoopState, Restored, differences, same_gains
+from loopwright.service.execution.procedures import Hooks, Outcome, Rehearse
+from loopwright.service.job_states import ACTIVE, JobState
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.loop_state import OPERATIONAL, LoopState, differences, same_gains
+from loopwright.service.loops.loop import Loop, Restored
 from loopwright.service.request import RetuneRequest
-from loopwright.service.states import ACTIVE, JobState
 from loopwright.service.store.store import Store
-from loopwright.service.work import Hooks, Outcome, Rehearse
 from loopwright.tuning.analysis.comparison import Predicted
 from loopwright.tuning.experiments.step_test import StepResult
 from loopwright.tuning.gains import Gains

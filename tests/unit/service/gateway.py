@@ -27,14 +27,14 @@ from typing import Any
 import yaml
 
 from loopwright.protocol.station import Station
+from loopwright.service.api.gate.limits import RequestLimits
 from loopwright.service.config import LoopConfig
-from loopwright.service.loop import Loop, LoopState, Restored, differences
+from loopwright.service.execution.procedures import Hooks, Outcome
+from loopwright.service.loop_state import LoopState, differences, loop_state, state_json
+from loopwright.service.loops.loop import Loop, Restored
 from loopwright.service.request import RetuneRequest
-from loopwright.service.security.limits import RequestLimits
-from loopwright.service.serving import Setup, open_bus_loop, serve
-from loopwright.service.state_json import loop_state, state_json
+from loopwright.service.server.serving import Setup, open_bus_loop, serve
 from loopwright.service.store import store
-from loopwright.service.work import Hooks, Outcome
 from loopwright.tuning.plan import Command, Mode, Sample, SetGains, SetSetpoint, StageDone, StageStarted
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
 from tests.unit.service.fakes import NEW, OLD, RESULT, Found, loop_entry

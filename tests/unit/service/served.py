@@ -14,7 +14,7 @@ from typing import Any
 import uvicorn
 from fastapi import FastAPI
 
-from loopwright.service.serving import Setup, listen, server_config
+from loopwright.service.server.serving import Setup, listen, server_config
 from tests.unit.service.processes import until
 
 SETUP = Setup(Path(), Path(), "127.0.0.1", 0)

@@ -13,15 +13,15 @@ import pytest
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner
 
-from loopwright.service import aftercare, cli
-from loopwright.service.aftercare import EVERY_S, LONGEST_S, Aftercare
 from loopwright.service.api.app import create_app
-from loopwright.service.client import Client
-from loopwright.service.metrics import exposition, registry
+from loopwright.service.api.metrics import exposition, registry
+from loopwright.service.cli import main as cli
+from loopwright.service.cli.client import Client
+from loopwright.service.jobs import aftercare
+from loopwright.service.jobs.aftercare import EVERY_S, LONGEST_S, Aftercare
+from loopwright.service.loop_state import state_json
 from loopwright.service.request import RetuneRequest
-from loopwright.service.security import audit
-from loopwright.service.state_json import state_json
-from loopwright.service.store import looked_after
+from loopwright.service.store import audit, looked_after
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow, LoopRow
 from loopwright.tuning.plan import Mode

@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from loopwright.service.alternatives import alternatives
-from loopwright.service.found_model import DISPROVED
-from loopwright.service.model_forms import parse_model
+from loopwright.service.execution.procedures import rehearse
+from loopwright.service.jobs.alternatives import alternatives
+from loopwright.service.offline.model_json import parse_model
+from loopwright.service.offline.tunings import tunings
+from loopwright.service.planning.found_model import DISPROVED
 from loopwright.service.request import PlantModel, RetuneRequest
-from loopwright.service.tunings import tunings
-from loopwright.service.work import rehearse
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
@@ -127,7 +127,7 @@ def test_the_slow_method_on_request(service: Service, client: TestClient) -> Non
 def test_unstable_gains_are_not_to_be_tried(
     service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from loopwright.service import tunings as module
+    from loopwright.service.offline import tunings as module
     from loopwright.tuning.analysis.assessment import assess
 
     # a hundred times the gains that the method found

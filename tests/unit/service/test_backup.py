@@ -12,12 +12,12 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from loopwright.service import cli
-from loopwright.service.backup import BackupProblem, back_up, restore
+from loopwright.service.cli import main as cli
+from loopwright.service.job_states import JobState
 from loopwright.service.request import RetuneRequest
-from loopwright.service.security.keyring import Keyring
 from loopwright.service.security.keys import Scope
-from loopwright.service.states import JobState
+from loopwright.service.store.backup import BackupProblem, back_up, restore
+from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import FolderInUse, Store
 from loopwright.tuning.plan import Sample
 from tests.unit.service.fakes import TAG, Service
@@ -225,7 +225,7 @@ def test_no_room(data: Path, tmp_path: Path) -> None:
     """A full disk: the command says so, and leaves no half file."""
     filled(data)
     code = (
-        "import resource, sys; from service.cli import main; "
+        "import resource, sys; from loopwright.service.cli.main import main; "
         "resource.setrlimit(resource.RLIMIT_FSIZE, (30000, 30000)); "
         "import signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "
         f"sys.argv = ['loopwright', 'backup', {str(tmp_path / 'b')!r}, '--data', {str(data)!r}]; main()"

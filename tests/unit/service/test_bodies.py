@@ -12,10 +12,10 @@ from fastapi.testclient import TestClient
 
 from loopwright.service.api.app import create_app
 from loopwright.service.api.bodies import JsonRoute
-from loopwright.service.jobs import Jobs
+from loopwright.service.api.gate.bodies import SMALL
+from loopwright.service.api.gate.places import DECIDES, kind_of
+from loopwright.service.jobs.manager import Jobs
 from loopwright.service.request import RetuneRequest
-from loopwright.service.security.bodies import SMALL
-from loopwright.service.security.places import DECIDES, kind_of
 from loopwright.service.store.store import Store
 from tests.unit.service.fakes import TAG, FakeController, FakeLoop, FakeTune, Service, ThreadEngine, fake_rehearse
 from tests.unit.service.postgres import Server

@@ -29,7 +29,7 @@ from loopwright.protocol.profile import (
     heartbeat_id,
 )
 from loopwright.protocol.tuner import RENEWAL_S, TURN_S
-from loopwright.service.bus_loop import CONFIRM_S, LEASE_WALL_S, BusLoop
+from loopwright.service.loops.bus_loop import CONFIRM_S, LEASE_WALL_S, BusLoop
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Mode, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason, Refused

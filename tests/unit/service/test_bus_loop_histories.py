@@ -21,7 +21,7 @@ from loopwright.protocol.profile import (
     heartbeat_id,
     sdo_request_id,
 )
-from loopwright.service.loop import Restored
+from loopwright.service.loops.loop import Restored
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Mode, SetGains, SetMode, SetOutput, SetSetpoint
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason, Refused

@@ -9,7 +9,7 @@ import pytest
 
 from loopwright.protocol.bus import BusError, Frame
 from loopwright.protocol.bus_state import BusState
-from loopwright.service.bus_watch import BusWatch
+from loopwright.service.loops.bus_watch import BusWatch
 
 
 class Interface:

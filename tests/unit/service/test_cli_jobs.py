@@ -13,7 +13,7 @@ import pytest
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner, Result
 
-from loopwright.service import cli
+from loopwright.service.cli import main as cli
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import NoGain, Reason, Refused
 from tests.unit.service.fakes import TAG, FakeLoop, Service
@@ -163,7 +163,7 @@ def test_a_tag_with_a_wildcard_is_a_retune_of_many(service: Service, through: Th
 @pytest.fixture
 def rehearsed(service: Service, through: Through) -> str:
     """The id of a job that has rehearsed."""
-    from loopwright.service.work import rehearse
+    from loopwright.service.execution.procedures import rehearse
 
     jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
     from loopwright.service.request import PlantModel, RetuneRequest

@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from loopwright.plantsim.plant import LinearPlant
-from loopwright.service.cli import app
+from loopwright.service.cli.main import app
 from loopwright.tuning.reasons import Reason
 from loopwright.tuning.rules.registry import METHODS
 
@@ -302,7 +302,7 @@ def test_identify_of_no_file() -> None:
 
 def test_tune_imports_nothing_that_it_does_not_use() -> None:
     code = (
-        "import sys; from service.cli import app\n"
+        "import sys; from loopwright.service.cli.main import app\n"
         "try: app(['tune', '--method', 'simc', '--json', '--model', sys.argv[1]])\n"
         "except SystemExit as end: assert not end.code\n"
         "print(*sys.modules, file=sys.stderr)"

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import httpx
 import pytest
 
-from loopwright.service import client as client_module
-from loopwright.service.client import ApiError, Client
+from loopwright.service.cli import client as client_module
+from loopwright.service.cli.client import ApiError, Client
 
 
 def through(

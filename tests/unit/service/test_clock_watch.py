@@ -4,7 +4,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from loopwright.service.clock_watch import ClockWatch, Seen, after_a_stop, in_operation, longest_stop
+from loopwright.service.store.clock_watch import ClockWatch, Seen, after_a_stop, in_operation, longest_stop
 
 NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)
 DAY = timedelta(days=1)

@@ -19,9 +19,9 @@ import pytest
 
 from loopwright.protocol.bus import open_bus
 from loopwright.protocol.hub import Hub
-from loopwright.service.computing.beside import Computing
-from loopwright.service.computing.limits import ComputingLimits, Kind
-from loopwright.service.computing.pool import NoProcess, NotWanted, Pool
+from loopwright.service.execution.beside import Computing
+from loopwright.service.execution.computing.limits import ComputingLimits, Kind
+from loopwright.service.execution.computing.pool import NoProcess, NotWanted, Pool
 from loopwright.service.store.store import Store
 from loopwright.tuning.plan import Work
 from loopwright.tuning.reasons import Failed, Reason, Refused
@@ -96,9 +96,9 @@ class TestPool:
         wanted = {
             "loopwright.tuning.five_stage.procedure",
             "loopwright.tuning.fast.design_trial",
-            "loopwright.service.tunings",
-            "loopwright.service.alternatives",
-            "loopwright.service.rehearsal",
+            "loopwright.service.offline.tunings",
+            "loopwright.service.jobs.alternatives",
+            "loopwright.service.execution.rehearsal",
         }
         assert wanted <= pool.run(Kind.TUNING, modules)
 
@@ -293,8 +293,8 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
-from loopwright.service.computing.limits import Kind
-from loopwright.service.computing.pool import Pool
+from loopwright.service.execution.computing.limits import Kind
+from loopwright.service.execution.computing.pool import Pool
 from tests.unit.service.computations import burn
 pool = Pool(most=1)
 pool.submit(Kind.DRY_RUN, partial(burn, Path(sys.argv[1])))

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from loopwright.service.cli.demo import loops_yaml
 from loopwright.service.config import ConfigError, load_site, parse_site
-from loopwright.service.demo import loops_yaml
 from tests.unit.service.fakes import loop_entry
 
 

@@ -15,16 +15,17 @@ from typing import Any
 import pytest
 
 from loopwright.service.api.app import create_app
-from loopwright.service.api.connections import Connections, OnceAMinute, Told
-from loopwright.service.loop import Loop, LoopState
-from loopwright.service.metrics import REQUESTS
-from loopwright.service.security import key_checks
-from loopwright.service.security.gate import Policy
-from loopwright.service.security.keyring import Keyring
+from loopwright.service.api.gate import key_checks
+from loopwright.service.api.gate.connections import Connections, OnceAMinute, Told
+from loopwright.service.api.gate.gate import Policy
+from loopwright.service.api.gate.limits import RequestLimits
+from loopwright.service.api.gate.places import Full, Kind, Places, Room, kind_of
+from loopwright.service.loop_state import LoopState
+from loopwright.service.loops.loop import Loop
 from loopwright.service.security.keys import Scope, matches, new_key
-from loopwright.service.security.limits import RequestLimits
-from loopwright.service.security.places import Full, Kind, Places, Room, kind_of
-from loopwright.service.serving import listen
+from loopwright.service.server.serving import listen
+from loopwright.service.store.keyring import Keyring
+from loopwright.service.telemetry.metrics import REQUESTS
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.fakes import TAG, FakeLoop, Service
 from tests.unit.service.processes import until
@@ -233,7 +234,7 @@ def test_guesses_at_a_key_are_counted_as_they_begin_and_keep_nobody_waiting(
         assert over.wait(PATIENCE_S)
         return matches(key, kept)
 
-    monkeypatch.setattr("loopwright.service.security.keyring.matches", hashing)
+    monkeypatch.setattr("loopwright.service.store.keyring.matches", hashing)
     head = "GET /loops HTTP/1.1\nHost: 127.0.0.1\nAuthorization: Bearer {}\n\n"
     guesses = [stack.enter_context(closing(door.begun(head.format(wrong_secret(guessed))))) for _ in range(50)]
     until(lambda: hashed)
@@ -259,7 +260,7 @@ def test_who_comes_from_another_address_waits_behind_one_guess_of_each(
         order.append("right" if guess == key else "wrong")
         return guess == key
 
-    monkeypatch.setattr("loopwright.service.security.keyring.matches", hashing)
+    monkeypatch.setattr("loopwright.service.store.keyring.matches", hashing)
 
     async def tried() -> None:
         checks = key_checks.KeyChecks(keyring, RequestLimits())
@@ -282,7 +283,7 @@ def test_the_id_of_a_key_does_not_refuse_its_owner(service: Service, monkeypatch
     """Whoever guesses from many addresses finds the id's guesses used up; the owner has guessed nothing."""
     keyring = Keyring(service.store.engine)
     _, key = keyring.create("a", Scope.READ)
-    monkeypatch.setattr("loopwright.service.security.keyring.matches", lambda guess, kept: guess == key)
+    monkeypatch.setattr("loopwright.service.store.keyring.matches", lambda guess, kept: guess == key)
 
     async def tried() -> None:
         checks = key_checks.KeyChecks(keyring, RequestLimits(bad_keys_burst=2, bad_keys_per_s=0.001))

@@ -16,15 +16,14 @@ from fastapi.testclient import TestClient
 from sqlalchemy import event, text
 from typer.testing import CliRunner
 
-from loopwright.service import cli
 from loopwright.service.api import operations
 from loopwright.service.api.app import create_app
-from loopwright.service.engine import durable
-from loopwright.service.engine.durable import DurableEngine
+from loopwright.service.cli import main as cli
+from loopwright.service.job_states import JobState
+from loopwright.service.jobs.dbos_engine import DurableEngine
 from loopwright.service.request import RetuneRequest
-from loopwright.service.states import JobState
 from loopwright.service.store.damage import FileCheck, Log, read_log
-from loopwright.service.store.database import FILE, BadDatabase
+from loopwright.service.store.database import ENGINE_FILE, FILE, BadDatabase
 from loopwright.service.store.store import Store, event_of
 from loopwright.tuning.plan import Sample
 from tests.unit.service.fakes import OLD, TAG, Service
@@ -172,9 +171,9 @@ def test_the_engines_file_is_made_anew(tmp_path: Path, caplog: pytest.LogCapture
         engine = DurableEngine(tmp_path, None, "local", 0.02)
         engine.launch(lambda job_id: None, {"q": 1})
         engine.close()
-        overwrite(tmp_path / durable.FILE, PAGE, 4 * PAGE)
+        overwrite(tmp_path / ENGINE_FILE, PAGE, 4 * PAGE)
     (aside,) = tmp_path.glob("damaged-*")
-    assert (aside / durable.FILE).exists() and "is made anew" in caplog.text
+    assert (aside / ENGINE_FILE).exists() and "is made anew" in caplog.text
 
 
 def test_a_job_that_only_the_engine_knows_is_said(service: Service, caplog: pytest.LogCaptureFixture) -> None:

@@ -11,10 +11,10 @@ from fastapi.testclient import TestClient
 from sqlalchemy.exc import OperationalError
 
 from loopwright.service.errors import Conflict
-from loopwright.service.loop import LoopState
+from loopwright.service.job_states import IllegalMove, JobState
+from loopwright.service.loop_state import LoopState
 from loopwright.service.request import RetuneRequest
-from loopwright.service.security import audit
-from loopwright.service.states import IllegalMove, JobState
+from loopwright.service.store import audit
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.fakes import NEW, OLD, TAG, FakeLoop, Service

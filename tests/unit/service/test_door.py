@@ -12,9 +12,9 @@ from typing import Any
 import httpx
 import pytest
 
-from loopwright.service.processes import Process
-from loopwright.service.security.keyring import Keyring
+from loopwright.service.cli.child_process import Process
 from loopwright.service.security.keys import Scope
+from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Store
 from tests.unit.service.fakes import TAG
 from tests.unit.service.gateway import HOME, read_loop

@@ -10,14 +10,14 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import text
 
-from loopwright.service import show
-from loopwright.service.api.views import JobView, job_view
-from loopwright.service.found_model import DISPROVED
-from loopwright.service.ground import GainsSource, Ground, LastModel, PlantSource, rehearsal_spec
-from loopwright.service.metrics import exposition, registry
+from loopwright.service.api.job_views import JobView, job_view
+from loopwright.service.api.metrics import exposition, registry
+from loopwright.service.cli import job_tables
+from loopwright.service.execution.procedures import Hooks, rehearse
+from loopwright.service.job_states import JobState
+from loopwright.service.planning.found_model import DISPROVED
+from loopwright.service.planning.ground import GainsSource, Ground, LastModel, PlantSource, rehearsal_spec
 from loopwright.service.request import PlantModel, RetuneRequest, TransferModel
-from loopwright.service.states import JobState
-from loopwright.service.work import Hooks, rehearse
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT
@@ -109,7 +109,7 @@ def test_a_dry_run_takes_the_model_that_the_last_job_found_and_the_gains_of_the_
     assert on.gains_source == "controller" and view.old_gains is not None and view.old_gains.Kp == OLD.Kp
     assert view.comparison is not None and view.comparison.verdict
     assert any(f"the model that job {job_id} found" in note for note in view.notes)
-    title = show.title(view.model_dump(mode="json"))
+    title = job_tables.title(view.model_dump(mode="json"))
     assert "rehearsed on the model that job" in title and title.endswith("nothing was tested")
     assert "proposed" not in title
 
@@ -124,7 +124,7 @@ def test_neither_a_dry_run_nor_a_model_that_was_disproved_or_typed_in_is_the_las
     service.store.move(typed_in.id, JobState.PROPOSED, result=result)
     view = dry_run(service)
     assert view.rehearsed_on is not None and view.rehearsed_on.plant_source == "guessed"
-    title = show.title(view.model_dump(mode="json"))
+    title = job_tables.title(view.model_dump(mode="json"))
     assert title == (
         f"job {view.id}: {TAG} rehearsed on a guessed plant (from T95 9 s, MV 0 to 100 %, step 2), nothing was tested"
     )
@@ -173,7 +173,7 @@ def test_a_refused_rehearsal_says_what_it_was_on(service: Service) -> None:
     view = dry_run(service, plant=PlantModel(num=[-0.2], den=[2.4, 1.0], dead_time_s=1.8))
     assert (view.state, view.reason) == (JobState.REFUSED, "wrong_sign"), view.detail
     assert view.rehearsed_on is not None and view.rehearsed_on.plant_source == "given"
-    assert show.title(view.model_dump(mode="json")).endswith("refused on the plant given, nothing was tested")
+    assert job_tables.title(view.model_dump(mode="json")).endswith("refused on the plant given, nothing was tested")
 
 
 @pytest.mark.parametrize(
@@ -218,4 +218,4 @@ def test_dry_runs_of_earlier_versions_are_shown_as_rehearsed(service: Service, c
     told = exposition(registry(service.loops, service.store)).decode()
     assert 'loopwright_jobs{reason="",state="rehearsed"} 1.0' in told
     assert 'loopwright_jobs{reason="",state="proposed"} 1.0' in told
-    show.job_report(job)
+    job_tables.job_report(job)

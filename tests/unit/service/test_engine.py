@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import Engine as Database
 
-from loopwright.service.engine.durable import DurableEngine
+from loopwright.service.jobs.dbos_engine import DurableEngine
 from loopwright.service.store.database import open_database
 
 Make = Callable[[str], DurableEngine]

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loopwright.service.fast_record import kept
-from loopwright.service.rehearsal import rehearse
+from loopwright.service.execution.rehearsal import rehearse
+from loopwright.service.jobs.relay_record import kept
 from loopwright.tuning.fast.structure_choice import choose
 from loopwright.tuning.identification.output_error import Fit
 from loopwright.tuning.plan import Event, Mode, Sample, StageStarted

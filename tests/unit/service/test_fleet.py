@@ -12,13 +12,13 @@ from fastapi.testclient import TestClient
 from pydantic import ValidationError
 
 from loopwright.service.api.app import create_app
-from loopwright.service.client import Client
+from loopwright.service.cli.client import Client
 from loopwright.service.config import BusConfig, parse_site
-from loopwright.service.fleet import BadFleet, Fleet, FleetRequest
-from loopwright.service.jobs import Jobs
+from loopwright.service.job_states import JobState
+from loopwright.service.jobs.fleet import BadFleet, Fleet, FleetRequest
+from loopwright.service.jobs.manager import Jobs
 from loopwright.service.request import RetuneRequest
-from loopwright.service.security import audit
-from loopwright.service.states import JobState
+from loopwright.service.store import audit
 from loopwright.service.store.retunes import NoSuchRetune, Part, RetuneOver
 from loopwright.service.store.store import Store
 from loopwright.tuning.reasons import Aborted, Failed, Reason, Refused

@@ -22,11 +22,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from loopwright.service.api.app import create_app
+from loopwright.service.api.gate.gate import Policy
+from loopwright.service.api.gate.limits import RequestLimits
 from loopwright.service.request import RetuneRequest
-from loopwright.service.security.gate import Policy
-from loopwright.service.security.keyring import Keyring
 from loopwright.service.security.keys import Scope
-from loopwright.service.security.limits import RequestLimits
+from loopwright.service.store.keyring import Keyring
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.fakes import TAG, Service
 

@@ -15,16 +15,15 @@ from fastapi.testclient import TestClient
 from sqlalchemy.exc import OperationalError
 
 from loopwright.service.api.app import create_app
-from loopwright.service.jobs import Jobs
+from loopwright.service.api.gate.gate import Policy
+from loopwright.service.api.gate.limits import RequestLimits
+from loopwright.service.jobs.manager import Jobs
 from loopwright.service.request import RetuneRequest
-from loopwright.service.security import audit
-from loopwright.service.security.gate import Policy
-from loopwright.service.security.keyring import Keyring
 from loopwright.service.security.keys import Scope
-from loopwright.service.security.limits import RequestLimits
-from loopwright.service.store import claims
+from loopwright.service.store import audit, claims
 from loopwright.service.store.claims import Claim, StillAnswering
 from loopwright.service.store.idempotency import MOST_BYTES, Answer, IdempotencyKeys, OtherRequest
+from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Store
 from loopwright.tuning.reasons import Reason
 from tests.unit.service.fakes import NEW, TAG, Service, held_acceptances

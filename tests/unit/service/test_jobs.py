@@ -8,18 +8,19 @@ from typing import Any
 import pytest
 from sqlalchemy.exc import OperationalError
 
-from loopwright.service import jobs as jobs_module
-from loopwright.service.api.results import ModelView, TransferModelView
-from loopwright.service.api.views import job_view
-from loopwright.service.bus_loop import RESTORE_PATIENCE_S
-from loopwright.service.loop import LoopState, Restored
-from loopwright.service.progress import Progress
+from loopwright.service.api.job_views import job_view
+from loopwright.service.api.result_views import ModelView, TransferModelView
+from loopwright.service.execution.procedures import rehearse
+from loopwright.service.job_states import IllegalMove, JobState
+from loopwright.service.jobs import manager as jobs_module
+from loopwright.service.jobs.progress import Progress
+from loopwright.service.loop_state import LoopState
+from loopwright.service.loops.bus_loop import RESTORE_PATIENCE_S
+from loopwright.service.loops.loop import Restored
 from loopwright.service.request import RetuneRequest
-from loopwright.service.security import audit
-from loopwright.service.states import IllegalMove, JobState
+from loopwright.service.store import audit
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow
-from loopwright.service.work import rehearse
 from loopwright.tuning.plan import StageStarted
 from loopwright.tuning.reasons import Reason
 from tests.unit.service.fakes import OLD, TAG, FakeLoop, Service

@@ -22,14 +22,15 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from loopwright.service.config import LoopConfig, parse_site
 from loopwright.service.errors import Conflict, Locked
-from loopwright.service.jobs import Jobs
-from loopwright.service.loop import Loop, LoopState
+from loopwright.service.execution.procedures import Hooks, Outcome
+from loopwright.service.job_states import IllegalMove
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.loop_state import LoopState
+from loopwright.service.loops.loop import Loop
 from loopwright.service.request import RetuneRequest
-from loopwright.service.states import IllegalMove
 from loopwright.service.store import database
 from loopwright.service.store.database import FILE
 from loopwright.service.store.store import Busy, Store
-from loopwright.service.work import Hooks, Outcome
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import SetGains, StageStarted
 from loopwright.tuning.reasons import Aborted, Ended, Failed, NoGain, Reason, Refused

@@ -11,8 +11,8 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
-from loopwright.service.journal import Journal
-from loopwright.service.running import Running
+from loopwright.service.jobs.active_job import Running
+from loopwright.service.jobs.journal import Journal
 from loopwright.service.store.store import Store, Write, event_of
 from loopwright.service.store.tables import ChunkRow
 from loopwright.tuning.plan import Sample, StageDone, StageStarted

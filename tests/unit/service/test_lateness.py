@@ -11,7 +11,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from loopwright.service.api.app import create_app
-from loopwright.service.lateness import EVERY_S, Lateness, watched_event_loop
+from loopwright.service.telemetry.lateness import EVERY_S, Lateness, watched_event_loop
 from tests.unit.service.fakes import Service
 
 HELD_S = 0.3

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from loopwright.service.logs import JsonLines, Lines, escaped
+from loopwright.service.telemetry.logs import JsonLines, Lines, escaped
 
 ENDS_A_LINE = "\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029"
 HIDDEN = "\x1b\x08\x00\u202e\u2066\u200b\ufeff\ud800"

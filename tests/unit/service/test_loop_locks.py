@@ -16,23 +16,22 @@ from rich.console import Console
 from sqlalchemy.orm import Session
 from typer.testing import CliRunner
 
-from loopwright.service import cli, show
 from loopwright.service.api.app import create_app
-from loopwright.service.backup import back_up, restore
-from loopwright.service.client import Client
+from loopwright.service.api.gate.gate import Policy
+from loopwright.service.cli import job_tables
+from loopwright.service.cli import main as cli
+from loopwright.service.cli.client import Client
 from loopwright.service.config import parse_site
 from loopwright.service.errors import Locked, UnknownLoop
-from loopwright.service.fleet import Fleet, FleetRequest
-from loopwright.service.jobs import Jobs
-from loopwright.service.loop import LoopState
+from loopwright.service.job_states import JobState
+from loopwright.service.jobs.fleet import Fleet, FleetRequest
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.loop_state import LoopState, state_json
 from loopwright.service.request import RetuneRequest
-from loopwright.service.security import audit
-from loopwright.service.security.gate import Policy
-from loopwright.service.security.keyring import Keyring
 from loopwright.service.security.keys import Scope
-from loopwright.service.state_json import state_json
-from loopwright.service.states import JobState
-from loopwright.service.store import loop_locks
+from loopwright.service.store import audit, loop_locks
+from loopwright.service.store.backup import back_up, restore
+from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Busy, Store
 from loopwright.tuning.reasons import Reason
 from tests.unit.service.fakes import (
@@ -432,7 +431,7 @@ def test_the_commands(run: Any, service: Service) -> None:
 def test_the_table_of_loops_shows_it(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     run("lock", TAG, "--reason", "valve", "--by", "me")
     shown = io.StringIO()
-    monkeypatch.setattr(show, "console", Console(width=200, file=shown))
+    monkeypatch.setattr(job_tables, "console", Console(width=200, file=shown))
     run("loops")
     run("loop", TAG)
     assert shown.getvalue().count("by me: valve") == 2 and "automatic" in shown.getvalue()

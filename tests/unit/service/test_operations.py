@@ -19,10 +19,10 @@ from loopwright.protocol.tuner import Kind, Tuner, TunerError, sdo_retries
 from loopwright.service.api import operations
 from loopwright.service.api.app import create_app
 from loopwright.service.api.operations import Readiness
-from loopwright.service.bus_watch import BusWatch
-from loopwright.service.logs import JsonLines, about
-from loopwright.service.metrics import SAMPLES_LOST
-from loopwright.service.serving import listen, tell_systemd
+from loopwright.service.loops.bus_watch import BusWatch
+from loopwright.service.server.serving import listen, tell_systemd
+from loopwright.service.telemetry.logs import JsonLines, about
+from loopwright.service.telemetry.metrics import SAMPLES_LOST
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.fakes import TAG, Service
 from tests.unit.service.test_api import finished, start
@@ -213,7 +213,9 @@ def test_lines_of_a_job_carry_job_and_loop(
     finally:
         logging.getLogger().removeHandler(keep)
     told = [
-        (x["message"].partition(",")[0], x["job"], x["loop"]) for x in lines if x["logger"] == "loopwright.service.jobs"
+        (x["message"].partition(",")[0], x["job"], x["loop"])
+        for x in lines
+        if x["logger"] == "loopwright.service.jobs.manager"
     ]
     assert told == [
         ("job started", job, TAG), ("job proposes new gains", job, TAG),
@@ -221,7 +223,7 @@ def test_lines_of_a_job_carry_job_and_loop(
     ]  # fmt: skip
     (failure,) = [x for x in lines if "exception" in x]
     assert "ValueError: a defect" in failure["exception"] and failure["level"] == "error"
-    (asked, _) = [x for x in lines if x["logger"] == "loopwright.service.api.access" and x["method"] == "POST"]
+    (asked, _) = [x for x in lines if x["logger"] == "loopwright.service.api.gate.access_log" and x["method"] == "POST"]
     assert (asked["loop"], asked["status"], asked["who"]) == (TAG, 202, "local")
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z", asked["at"])
 

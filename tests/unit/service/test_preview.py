@@ -8,16 +8,16 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from loopwright.service.api.gate.gate import scope_for
 from loopwright.service.config import LoopConfig
-from loopwright.service.loop import LoopState
-from loopwright.service.moves import broken_limits
-from loopwright.service.obstacles import Now
-from loopwright.service.preview import LastProposal, Preview, duration_text, preview
+from loopwright.service.execution.procedures import Hooks, tune
+from loopwright.service.loop_state import LoopState
+from loopwright.service.planning.moves import broken_limits
+from loopwright.service.planning.obstacles import Now
+from loopwright.service.planning.preview import LastProposal, Preview, duration_text, preview
 from loopwright.service.request import RetuneRequest, within
-from loopwright.service.security.gate import scope_for
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.store import Store
-from loopwright.service.work import Hooks, tune
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Failed, Reason, Refused
 from tests.unit.service.fakes import RESULT, TAG, FakeController, FakeLoop, Service, loop_entry

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopwright.service.record import RecordError, load_record, parse_record
+from loopwright.service.offline.csv_record import RecordError, load_record, parse_record
 from loopwright.tuning.identification.identify import identify
 from loopwright.tuning.models import FOPDT
 from tests.unit.tuning.recordings import FIRST_ORDER, open_loop, step

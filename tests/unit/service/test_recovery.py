@@ -13,13 +13,12 @@ from sqlalchemy import inspect, text
 from sqlalchemy.exc import OperationalError
 
 from loopwright.service.config import parse_site
-from loopwright.service.engine import WORKFLOW_VERSION
-from loopwright.service.jobs import Jobs
-from loopwright.service.loop import LoopState
-from loopwright.service.recovery import MOST_ATTEMPTS
+from loopwright.service.job_states import IllegalMove, JobState
+from loopwright.service.jobs.engine import WORKFLOW_VERSION
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.jobs.recovery import MOST_ATTEMPTS
+from loopwright.service.loop_state import LoopState, state_json
 from loopwright.service.request import RetuneRequest
-from loopwright.service.state_json import state_json
-from loopwright.service.states import IllegalMove, JobState
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow
 from loopwright.tuning.gains import Gains

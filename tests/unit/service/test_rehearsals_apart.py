@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from loopwright.service.computing.limits import ComputingLimits
-from loopwright.service.computing.pool import Pool
-from loopwright.service.computing.rehearsals import apart
 from loopwright.service.config import LoopConfig, parse_site
+from loopwright.service.execution.computing.limits import ComputingLimits
+from loopwright.service.execution.computing.pool import Pool
+from loopwright.service.execution.procedures import Hooks, Outcome, rehearse
+from loopwright.service.execution.rehearsals import apart
+from loopwright.service.execution.runner import Watch, run
+from loopwright.service.job_states import JobState
 from loopwright.service.request import RetuneRequest
-from loopwright.service.runner import Watch, run
-from loopwright.service.states import JobState
-from loopwright.service.work import Hooks, Outcome, rehearse
 from loopwright.tuning.plan import Event, Mode, Plan, Sample, StageStarted
 from loopwright.tuning.reasons import Aborted, Failed, Reason
 from tests.unit.service.fakes import TAG, FakeController, FakeLoop, Service, loop_entry

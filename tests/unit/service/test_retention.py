@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 from sqlalchemy import MetaData, Table, func, inspect, select
 
-from loopwright.service.clock_watch import ClockWatch
-from loopwright.service.engine.durable import DurableEngine
-from loopwright.service.metrics import CLOCK_JUMPS
-from loopwright.service.retention import Keep, Retention, forget, tidy
-from loopwright.service.security import audit
-from loopwright.service.states import JobState
+from loopwright.service.job_states import JobState
+from loopwright.service.jobs.dbos_engine import DurableEngine
+from loopwright.service.jobs.retention import Keep, Retention, forget, tidy
+from loopwright.service.store import audit
+from loopwright.service.store.clock_watch import ClockWatch
 from loopwright.service.store.store import Store
+from loopwright.service.telemetry.metrics import CLOCK_JUMPS
 from loopwright.tuning.plan import Sample
 from tests.unit.service.fakes import ThreadEngine
 
@@ -143,7 +143,7 @@ def test_it_is_done_at_the_start_and_again(tmp_path: Path, monkeypatch: pytest.M
             twice.set()
         return 0
 
-    monkeypatch.setattr("loopwright.service.retention.tidy", count)
+    monkeypatch.setattr("loopwright.service.jobs.retention.tidy", count)
     retention = Retention(store, ThreadEngine(), Keep(jobs=1), every_s=0.001, look_s=0.001)
     retention.start()
     assert twice.wait(60)

@@ -13,9 +13,10 @@ import pytest
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
-from loopwright.service.loop import LoopState, Restored, differences
-from loopwright.service.rehearsal import RehearsedLoop
-from loopwright.service.runner import RunResult, Watch, run
+from loopwright.service.execution.rehearsal import RehearsedLoop
+from loopwright.service.execution.runner import RunResult, Watch, run
+from loopwright.service.loop_state import LoopState, differences
+from loopwright.service.loops.loop import Restored
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import (
     Command,

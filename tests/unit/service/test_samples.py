@@ -23,7 +23,7 @@ from sqlalchemy.pool import QueuePool
 
 from loopwright.service.api.app import create_app
 from loopwright.service.api.samples import Gone, Reading, csv_text, json_text, parts, record_columns, takes_gzip
-from loopwright.service.store import chunks
+from loopwright.service.store import sample_blocks
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import ChunkRow
 from loopwright.tuning.plan import Sample
@@ -84,14 +84,14 @@ def test_what_is_no_number_is_null(client: TestClient, service: Service) -> None
 
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False))
 def test_a_decimal_is_the_float32_that_was_stored(value: float) -> None:
-    (text,) = chunks.Block("relay", 0.0, 1, chunks.pack([Sample(0.0, 0.0, value, 0.0, 2)])).texts("pv")
+    (text,) = sample_blocks.Block("relay", 0.0, 1, sample_blocks.pack([Sample(0.0, 0.0, value, 0.0, 2)])).texts("pv")
     assert np.float32(text).tobytes() == np.float32(value).tobytes()
     assert len(text.lstrip("-").partition("e")[0].replace(".", "").strip("0")) <= 9
 
 
 def test_times_are_as_they_were_counted() -> None:
     """Not with the tail of a float32, which at 409.1 s is 0.00001 s."""
-    (times,) = [chunks.Block("relay", 12.3, LONG, chunks.pack(block_of_samples(123, LONG))).texts("t_s")]
+    (times,) = [sample_blocks.Block("relay", 12.3, LONG, sample_blocks.pack(block_of_samples(123, LONG))).texts("t_s")]
     assert times == [repr(sample.t) for sample in block_of_samples(123, LONG)]
 
 
@@ -134,7 +134,7 @@ def test_samples_that_are_deleted_meanwhile_break_the_answer_off(service: Servic
 def many(store: Store, blocks: int) -> str:
     """A job with so many blocks, packed once."""
     job = store.create(TAG, {}, "test", True).id
-    data = chunks.pack(block_of_samples(0, LONG))
+    data = sample_blocks.pack(block_of_samples(0, LONG))
     with store.writing() as session:
         session.add_all(
             ChunkRow(job_id=job, seq=k + 1, stage="relay", first_t_s=k * LONG * TS, count=LONG, data=data)
@@ -161,13 +161,13 @@ def test_nothing_of_a_download_is_done_in_the_event_loop(
     service: Service, monkeypatch: pytest.MonkeyPatch, query: str
 ) -> None:
     job = many(service.store, 3)
-    real, threads = chunks.Block.texts, set[int]()
+    real, threads = sample_blocks.Block.texts, set[int]()
 
-    def watched(block: chunks.Block, column: str) -> list[str]:
+    def watched(block: sample_blocks.Block, column: str) -> list[str]:
         threads.add(threading.get_ident())
         return real(block, column)
 
-    monkeypatch.setattr(chunks.Block, "texts", watched)
+    monkeypatch.setattr(sample_blocks.Block, "texts", watched)
 
     async def download() -> int:
         transport = httpx.ASGITransport(create_app(service.jobs))

@@ -17,18 +17,18 @@ from sqlalchemy import update
 from sqlalchemy.exc import OperationalError
 from typer.testing import CliRunner
 
-from loopwright.service import cli
 from loopwright.service.api.app import create_app
-from loopwright.service.logs import JsonLines, Lines
+from loopwright.service.api.gate.gate import Policy, is_loopback
+from loopwright.service.api.gate.limits import Buckets, RequestLimits
+from loopwright.service.cli import main as cli
 from loopwright.service.request import RetuneRequest
-from loopwright.service.security import audit
-from loopwright.service.security.gate import Policy, is_loopback
-from loopwright.service.security.keyring import REVOKED_WITHIN_S, KeyProblem, Keyring
 from loopwright.service.security.keys import Scope, hash_key, matches, new_key
-from loopwright.service.security.limits import Buckets, RequestLimits
-from loopwright.service.security.tables import KeyRow
-from loopwright.service.serving import NotSafe, Setup, serve
+from loopwright.service.server.serving import NotSafe, Setup, serve
+from loopwright.service.store import audit
+from loopwright.service.store.keyring import REVOKED_WITHIN_S, KeyProblem, Keyring
 from loopwright.service.store.store import Store
+from loopwright.service.store.tables import KeyRow
+from loopwright.service.telemetry.logs import JsonLines, Lines
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
 from tests.unit.service.postgres import Server
@@ -425,7 +425,7 @@ def test_serve_refuses_what_is_not_safe(tmp_path: Path, bind: str, auth: bool | 
 def test_a_stream_ends_with_the_key_that_it_was_opened_with(
     service: Service, open_client: Open, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    monkeypatch.setattr("loopwright.service.api.stream.REVOKED_WITHIN_S", 0.05)
+    monkeypatch.setattr("loopwright.service.api.events.REVOKED_WITHIN_S", 0.05)
     asked = threading.Event()
 
     class Watched(Keyring):

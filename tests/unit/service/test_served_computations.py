@@ -188,7 +188,7 @@ def test_what_costs_too_much_is_refused_by_name(tmp_path: Path, stack: ExitStack
 FAILING = """
 import multiprocessing, socket, sys
 from pathlib import Path
-from loopwright.service.serving import Setup, serve
+from loopwright.service.server.serving import Setup, serve
 from loopwright.service.store.lock import FolderInUse
 from loopwright.service.store.store import Store
 loops, data = Path(sys.argv[1]), Path(sys.argv[2])

@@ -9,9 +9,9 @@ import yaml
 from typer.testing import CliRunner
 
 from loopwright.protocol.profile import TUNER_NODE
-from loopwright.service import serving
-from loopwright.service.cli import app
-from loopwright.service.jobs import Jobs
+from loopwright.service.cli.main import app
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.server import serving
 from loopwright.service.store.store import FolderInUse
 from tests.unit.service.fakes import FakeTune, loop_entry
 

@@ -7,7 +7,7 @@ from contextvars import copy_context
 
 import pytest
 
-from loopwright.service.shared_reading import SharedReading, asked_at
+from loopwright.service.loops.shared_reading import SharedReading, asked_at
 from loopwright.tuning.reasons import Ended, Failed, Reason
 
 PATIENCE_S = 60.0

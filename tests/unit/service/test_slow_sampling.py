@@ -17,9 +17,9 @@ from loopwright.plantsim.device import PlantChannel, PlantDevice
 from loopwright.protocol.bus import open_bus
 from loopwright.protocol.station import Station
 from loopwright.service.api.app import create_app
-from loopwright.service.jobs import Jobs
-from loopwright.service.serving import open_bus_loop
-from loopwright.service.work import tune
+from loopwright.service.execution.procedures import tune
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.server.serving import open_bus_loop
 from tests.unit.service.bus_site import FOUND
 from tests.unit.service.fakes import TAG, Service, ThreadEngine, fake_rehearse
 

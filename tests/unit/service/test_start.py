@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 from sqlalchemy import create_engine, select
 
-from loopwright.service.engine import WORKFLOW_VERSION
-from loopwright.service.state_json import state_json
-from loopwright.service.states import JobState
+from loopwright.service.job_states import JobState
+from loopwright.service.jobs.engine import WORKFLOW_VERSION
+from loopwright.service.loop_state import state_json
 from loopwright.service.store.database import FILE
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow
@@ -30,19 +30,19 @@ ROOT = Path(__file__).parents[3]
 SESSION = 77
 
 BEFORE_IT_WORKS = (
-    "before service.serving:Store.__init__",
-    "after service.serving:Store.__init__",
-    "before service.serving:Signals.tell",
-    "before service.jobs:Store.own_loops",
-    "before service.recovery:Recovery.recover",
-    "before service.engine.durable:DurableEngine.launch",
-    "after service.engine.durable:DurableEngine.launch",
+    "before loopwright.service.server.serving:Store.__init__",
+    "after loopwright.service.server.serving:Store.__init__",
+    "before loopwright.service.server.serving:Signals.tell",
+    "before loopwright.service.jobs.manager:Store.own_loops",
+    "before loopwright.service.jobs.recovery:Recovery.recover",
+    "before loopwright.service.jobs.dbos_engine:DurableEngine.launch",
+    "after loopwright.service.jobs.dbos_engine:DurableEngine.launch",
 )
 AS_IT_WORKS = (
-    "before service.retention:Retention.start",
-    "before service.serving:_Server.serve",
-    "before service.serving:_Server.startup",
-    "before service.fleet:Fleet.boot",
+    "before loopwright.service.jobs.retention:Retention.start",
+    "before loopwright.service.server.serving:_Server.serve",
+    "before loopwright.service.server.serving:_Server.startup",
+    "before loopwright.service.jobs.fleet:Fleet.boot",
 )
 
 
@@ -86,7 +86,7 @@ def test_it_ends_cleanly_at_whatever_moment(tmp_path: Path) -> None:
 def test_what_it_has_left_the_next_start_goes_on_with(tmp_path: Path) -> None:
     """The engine had been given the job, and believes that it was run."""
     job_id = left(tmp_path / "one")
-    first = gateway(tmp_path / "one", "--sigterm=after service.engine.durable:DurableEngine.launch")
+    first = gateway(tmp_path / "one", "--sigterm=after loopwright.service.jobs.dbos_engine:DurableEngine.launch")
     assert first.communicate(timeout=300) and first.returncode == 0
     (tmp_path / "one" / "go").touch()
     second = gateway(tmp_path / "one")

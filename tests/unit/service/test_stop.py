@@ -16,10 +16,9 @@ import pytest
 import yaml
 from sqlalchemy import text
 
-from loopwright.service import serving
-from loopwright.service.engine.durable import FILE as ENGINE_FILE
-from loopwright.service.signals import Signals
-from loopwright.service.store.database import FILE
+from loopwright.service.server import serving
+from loopwright.service.server.signals import Signals
+from loopwright.service.store.database import ENGINE_FILE, FILE
 from loopwright.service.store.lock import FolderLock
 from loopwright.service.store.store import Store
 from tests.unit.service.fakes import NEW, TAG, loop_entry
@@ -134,7 +133,7 @@ def test_further_signals_do_not_cut_the_stop_short(under_test: tuple[Gateway, st
 def test_a_signal_after_everything_has_ended_ends_a_process_that_hangs(tmp_path: Path) -> None:
     hangs = (
         "import os, signal, threading\n"
-        "from service.signals import Signals\n"
+        "from loopwright.service.server.signals import Signals\n"
         "with Signals():\n"
         "    os.kill(os.getpid(), signal.SIGTERM)\n"
         "threading.Thread(target=threading.Event().wait).start()\n"

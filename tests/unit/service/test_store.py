@@ -13,7 +13,7 @@ from alembic.migration import MigrationContext
 from sqlalchemy import Connection, inspect, text
 from sqlalchemy.exc import IntegrityError
 
-from loopwright.service.states import MOVES, IllegalMove, JobState, check
+from loopwright.service.job_states import MOVES, IllegalMove, JobState, check
 from loopwright.service.store import lock
 from loopwright.service.store.database import USUAL, BadDatabase, urgent
 from loopwright.service.store.store import Busy, FolderInUse, ForeignLoop, NoSuchJob, Store

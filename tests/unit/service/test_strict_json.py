@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from loopwright.service.strict_json import DEEPEST, BadJson, loads
+from loopwright.service.api.strict_json import DEEPEST, BadJson, loads
 
 PLAIN = st.recursive(
     st.none()

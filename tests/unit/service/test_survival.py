@@ -16,7 +16,7 @@ import pytest
 from sqlalchemy import create_engine, select
 from sqlalchemy.orm import Session
 
-from loopwright.service.processes import NotReady, Process
+from loopwright.service.cli.child_process import NotReady, Process
 from loopwright.service.store.database import WAIT_S
 from loopwright.service.store.tables import EventRow
 from tests.unit.service.fakes import NEW, OLD, TAG
@@ -345,7 +345,7 @@ def test_two_gateways_on_one_database(stack: ExitStack, tmp_path: Path, postgres
 def test_killed_before_it_has_answered_a_repetition_with_the_key_begins_nothing_twice(
     stack: ExitStack, tmp_path: Path, database: str | None, path: str, body: dict[str, Any]
 ) -> None:
-    cut = "before service.store.idempotency:IdempotencyKeys.keep"
+    cut = "before loopwright.service.store.idempotency:IdempotencyKeys.keep"
     gateway = Gateway(stack, tmp_path, database, first=[f"--sigkill={cut}"])
     key = {"Idempotency-Key": "once"}
     with pytest.raises(httpx.TransportError):

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from sqlalchemy.exc import OperationalError
 
-from loopwright.service import watchdog
-from loopwright.service.processes import Process
-from loopwright.service.watchdog import Watchdog, interval_s
+from loopwright.service.cli.child_process import Process
+from loopwright.service.server import watchdog
+from loopwright.service.server.watchdog import Watchdog, interval_s
 from tests.unit.service.fakes import TAG, Service
 
 

@@ -99,9 +99,12 @@ def test_it_works_in_an_empty_environment(built: Path, tmp_path: Path) -> None:
         (
             "lint-imports",
             ("--no-cache",),
-            {"tuning/models.py": "import loopwright.service.states", "tuning/new.py": "import loopwright.protocol.bus"},
+            {
+                "tuning/models.py": "import loopwright.service.job_states",
+                "tuning/new.py": "import loopwright.protocol.bus",
+            },
             (
-                "loopwright.tuning.models -> loopwright.service.states",
+                "loopwright.tuning.models -> loopwright.service.job_states",
                 "loopwright.tuning.new -> loopwright.protocol.bus",
             ),
         ),

@@ -1,0 +1,91 @@
+"""A job's events as server-sent events. The id of an event is its number in the job, so a client that was cut off
+resumes with Last-Event-ID and misses nothing. `progress` events carry no id: they are not kept.
+
+A stream may outlive the key it was opened with: that is asked now and then, and ends it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Callable
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from loopwright.service.job_states import ACTIVE, JobState
+from loopwright.service.jobs.journal import temporary
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.store.keyring import REVOKED_WITHIN_S, Keyring
+
+_POLL_S = 0.2
+_AWAY_S = 1.0
+_EVENTS_AT_ONCE = 200
+_KEEP_ALIVE_POLLS = 75  # 15 s: proxies close a silent connection after 30 s or more
+
+
+def still_permitted(keyring: Keyring | None, key_id: str | None) -> Callable[[], bool]:
+    """Whether the key of a request is valid as yet; always where no keys are asked for."""
+    if keyring is None or key_id is None:
+        return lambda: True
+    return lambda: keyring.still_valid(key_id)
+
+
+async def event_stream(
+    jobs: Jobs, job_id: str, after: int, permitted: Callable[[], bool] = lambda: True
+) -> AsyncIterator[str]:
+    """Everything after event number `after`, then live until the job is no longer active, or the asker no longer
+    permitted to see it."""
+    told = ""
+    silent = 0
+    asked = time.monotonic()
+    while True:
+        try:
+            if time.monotonic() - asked > REVOKED_WITHIN_S:
+                if not await asyncio.to_thread(permitted):
+                    yield ": the key of this stream was revoked or has expired\n\n"
+                    return
+                asked = time.monotonic()
+            # Asked before the events are read: an event written in between is then seen in the next round.
+            row = await asyncio.to_thread(jobs.store.get, job_id)
+            events = await asyncio.to_thread(jobs.store.events, job_id, after, _EVENTS_AT_ONCE)
+        except SQLAlchemyError as error:
+            if not temporary(error):
+                raise
+            yield ": the database does not answer\n\n"
+            await asyncio.sleep(_AWAY_S)
+            continue
+        more = len(events) == _EVENTS_AT_ONCE
+        over = JobState(row.state) not in ACTIVE and not more
+        for event in events:
+            after, silent = event.seq, 0
+            data = {"at": event.at, "plant_time_s": event.plant_time_s, **event.data}
+            yield f"id: {event.seq}\nevent: {event.kind}\ndata: {json.dumps(data)}\n\n"
+        if over:
+            return
+        if more:
+            continue
+        progress = _progress(jobs, job_id)
+        if progress and progress != told:
+            told, silent = progress, 0
+            yield f"event: progress\ndata: {progress}\n\n"
+        silent += 1
+        if silent % _KEEP_ALIVE_POLLS == 0:
+            yield ": alive\n\n"
+        await asyncio.sleep(_POLL_S)
+
+
+def _progress(jobs: Jobs, job_id: str) -> str:
+    running = jobs.running(job_id)
+    if running is None:
+        return ""
+    running.keep_time()
+    live = running.progress
+    remaining = live.remaining_s
+    return json.dumps(
+        {
+            "stage": live.stage,
+            "progress": round(live.fraction, 4),
+            "remaining_plant_time_s": None if remaining is None else round(remaining, 3),
+            "plant_time_s": round(live.plant_time_s, 3),
+        }
+    )

@@ -1,0 +1,96 @@
+"""One line and one count for each request, as ASGI middleware. Outermost: it sees what the gate refuses, too."""
+
+from __future__ import annotations
+
+import logging
+import random
+import time
+from collections.abc import Callable
+
+from loopwright.service.api.gate.gate import App, AsgiScope, Message, Receive, Send
+from loopwright.service.telemetry.logs import about
+from loopwright.service.telemetry.metrics import IN_FLIGHT, REQUEST_SECONDS, REQUESTS
+
+log = logging.getLogger(__name__)
+
+_NO_ROUTE = "none"
+_REFUSED = frozenset({400, 401, 408, 429, 503})
+"""What somebody who asks too much, or goes away before all is asked, is answered, as often as they ask."""
+_REFUSED_EVERY_S = 1.0
+_REMEMBERED = 1000
+_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+
+
+class Access:
+    """Wraps the application. The query is not logged: who knows what somebody puts there. Of the refusals that somebody
+    brings about as often as they ask there is a line a second for each address."""
+
+    def __init__(self, app: App, wall: Callable[[], float] = time.monotonic) -> None:
+        self._app, self._wall = app, wall
+        self._refused: dict[tuple[int, str | None], float] = {}
+
+    async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        status = 500
+        request = f"{random.getrandbits(32):08x}"  # no secret: one from the system costs a system call
+
+        async def watched(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                message["headers"] = [
+                    *message.get("headers", ()),
+                    (b"x-request-id", request.encode()),
+                    (b"x-content-type-options", b"nosniff"),
+                ]
+            await send(message)
+
+        started = time.perf_counter()
+        try:
+            with about(request=request), IN_FLIGHT.track_inprogress():
+                await self._app(scope, receive, watched)
+        finally:
+            self._tell(scope, status, time.perf_counter() - started, request)
+
+    def _often(self, status: int, address: str | None) -> bool:
+        """Whether a line of such a refusal was written just now; each is counted in the metrics all the same."""
+        if status not in _REFUSED:
+            return False
+        now = self._wall()
+        if now - self._refused.get((status, address), -_REFUSED_EVERY_S) < _REFUSED_EVERY_S:
+            return True
+        if len(self._refused) >= _REMEMBERED:
+            self._refused.clear()
+        self._refused[status, address] = now
+        return False
+
+    def _tell(self, scope: AsgiScope, status: int, seconds: float, request: str) -> None:
+        method = scope["method"] if scope["method"] in _METHODS else "other"
+        # The template, not the path: a label must not have as many values as there are jobs.
+        route = str(getattr(scope.get("route"), "path", _NO_ROUTE))
+        REQUESTS.labels(method, route, str(status)).inc()
+        if not route.endswith("/events"):
+            REQUEST_SECONDS.labels(route).observe(seconds)
+        client = scope.get("client")
+        address = client[0] if client else None
+        if self._often(status, address):
+            return
+        found = scope.get("path_params") or {}
+        level = logging.DEBUG if method in ("GET", "HEAD") and status < 400 else logging.INFO
+        log.log(
+            level if status < 500 else logging.WARNING,
+            "request",
+            extra={
+                "request": request,
+                "method": method,
+                "path": scope["path"],
+                "status": status,
+                "ms": round(seconds * 1e3, 1),
+                "who": scope.get("principal"),
+                "address": address,
+                "job": found.get("job_id"),
+                "loop": found.get("tag"),
+            },
+        )

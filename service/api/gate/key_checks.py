@@ -1,0 +1,93 @@
+"""Keys at the door: those in use are let through without waiting, those not known yet are checked one at a time.
+
+The hash of a key takes some 50 ms and 16 MiB, so an unknown key is a guess until it is found right: its attempt is
+counted as it begins, by address and by the id of the key that is guessed at, before anything is hashed. From an address
+one key is checked at a time: who comes from another one waits behind one guess of each, and not behind them all.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from loopwright.service.api.gate.limits import Buckets, RequestLimits
+from loopwright.service.security.keys import key_id_of
+from loopwright.service.store.keyring import Keyring
+from loopwright.service.store.tables import KeyRow
+
+
+class TooOften(Exception):
+    """Too many wrong keys; the text says of whom. wait_s: until another one is looked at."""
+
+    def __init__(self, why: str, wait_s: float) -> None:
+        super().__init__(why)
+        self.wait_s = wait_s
+
+
+class KeyChecks:
+    """For one event loop. Threads of its own: what goes on behind the door does not keep anybody before it."""
+
+    def __init__(self, keyring: Keyring, limits: RequestLimits, wall: Callable[[], float] = time.monotonic) -> None:
+        self._keyring = keyring
+        self._by_address = Buckets(limits.bad_keys_per_s, limits.bad_keys_burst, wall)
+        self._by_key = Buckets(limits.bad_keys_per_s, limits.bad_keys_burst, wall)
+        self._turns: dict[str, asyncio.Lock] = {}
+        self._waiting: Counter[str] = Counter()
+        self._hashing = ThreadPoolExecutor(1, "key hash")
+        self._looking = ThreadPoolExecutor(2, "key")
+
+    async def row(self, key: str, address: str) -> KeyRow | None:
+        """The row of a valid key, None for a wrong one. Raises TooOften, SQLAlchemyError."""
+        found = self._keyring.known(key)
+        if found is not None:
+            return found
+        if self._keyring.was_right(key):
+            return await self._in(self._looking, key)
+        self._refuse_early(address)
+        async with self._turn(address):
+            return self._keyring.known(key) or await self._guess(key, address)
+
+    async def _guess(self, key: str, address: str) -> KeyRow | None:
+        # The id alone does not refuse an address that has guessed nothing wrong of late: it may be the key's owner.
+        clean = self._by_address.full(address)
+        self._refuse_early(address)
+        self._by_address.take(address)
+        key_id = key_id_of(key)
+        if key_id is None:
+            return None
+        if (wait := self._by_key.take(key_id)) and not clean:
+            raise TooOften(f"too many wrong keys with the id {key_id}", wait)
+        try:
+            found = await self._in(self._hashing, key)
+        except SQLAlchemyError:
+            self._by_address.give_back(address)
+            raise
+        if found is not None:
+            self._by_address.give_back(address)
+            self._by_key.give_back(key_id)
+        return found
+
+    def _refuse_early(self, address: str) -> None:
+        if wait := self._by_address.wait_s(address):
+            raise TooOften("too many wrong keys from this address", wait)
+
+    @asynccontextmanager
+    async def _turn(self, address: str) -> AsyncIterator[None]:
+        turn = self._turns.setdefault(address, asyncio.Lock())
+        self._waiting[address] += 1
+        try:
+            async with turn:
+                yield
+        finally:
+            self._waiting[address] -= 1
+            if not self._waiting[address]:
+                del self._waiting[address], self._turns[address]
+
+    async def _in(self, threads: ThreadPoolExecutor, key: str) -> KeyRow | None:
+        return await asyncio.get_running_loop().run_in_executor(threads, self._keyring.check, key)

@@ -1,0 +1,345 @@
+"""What the API shows. Units are in the descriptions; times without "wall" are plant time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from pydantic import BaseModel, Field
+
+from loopwright.service.api.result_views import (
+    ComparisonView,
+    EvidenceView,
+    ModelView,
+    PredictedView,
+    RehearsedOnView,
+    StepView,
+    TransferModelView,
+    UltimateView,
+    VerificationView,
+    known,
+    model_view,
+    rehearsed_on_view,
+    verification_view,
+)
+from loopwright.service.config import Limits, LoopConfig
+from loopwright.service.job_states import ACTIVE, JobState, shown
+from loopwright.service.jobs.active_job import Running
+from loopwright.service.jobs.aftercare import NotHome
+from loopwright.service.loop_state import LoopState
+from loopwright.service.store.tables import EventRow, JobRow, LoopLockRow
+from loopwright.tuning.five_stage.procedure import PROCEDURE
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.reasons import ADVICE, Reason
+
+
+class GainsView(BaseModel):
+    """ISA (standard) form: u = Kp (b SP - PV + 1/Ti int(SP - PV) + Td d/dt(c SP - PV) / (1 + Tf s))."""
+
+    form: str = Field(default="ISA", description="Form of the controller")
+    Kp: float = Field(description="Proportional gain, MV percent per PV unit", examples=[0.75])
+    Ti: float = Field(description="Integral time, s; 0 means none", examples=[19.17])
+    Td: float = Field(description="Derivative time, s", examples=[0.0])
+    Tf: float = Field(description="Derivative filter time, s", examples=[0.0])
+    b: float = Field(description="Set-point weight of the proportional path", examples=[1.0])
+    c: float = Field(description="Set-point weight of the derivative path", examples=[0.0])
+
+
+class LockView(BaseModel):
+    """Somebody keeps tests and decisions from a loop."""
+
+    reason: str = Field(examples=["valve is being overhauled"])
+    by: str = Field(description="Who has locked it, as they said", examples=["night shift"])
+    since: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
+
+    @classmethod
+    def of(cls, row: LoopLockRow) -> LockView:
+        return cls(reason=row.reason, by=row.by, since=row.since)
+
+
+class LoopView(BaseModel):
+    """A configured loop."""
+
+    tag: str = Field(description="Name of the loop", examples=["TIC-101"])
+    description: str = Field(examples=["Reactor outlet temperature"])
+    bus: str = Field(description="Where the devices are", examples=["socketcan:vcan0"])
+    controller_node: int = Field(description="CANopen node id of the controller", examples=[32])
+    plant_node: int | None = Field(description="CANopen node id of a simulated plant", examples=[16])
+    channel: int = Field(description="Channel of the controller, from 1", examples=[1])
+    pv_unit: str = Field(description="Unit of PV and SP", examples=["degC"])
+    mv_limits: Limits = Field(description="Permitted MV, percent")
+    pv_limits: Limits = Field(description="Permitted PV, PV units")
+    t95_s: float = Field(description="Time in which the plant covers 95 % of a step, s", examples=[9.1])
+    sp_deviation: float = Field(description="Permitted set-point step, PV units", examples=[2.0])
+    area: str | None = Field(description="Part of the site, by its name in loops.yaml", examples=["distillation"])
+    notes: str = Field(description="For the operator")
+    host: str = Field(description="The service that has the loop's bus", examples=["local"])
+    active_job: str | None = Field(description="URL of the job that has the loop", examples=["/jobs/4f0c2a9be113"])
+    last_job_state: JobState | None = Field(description="State of its latest job; dry runs do not count")
+    locked: LockView | None = Field(description="No test and no decision touches it; null: it is not locked")
+
+
+class LiveView(BaseModel):
+    """The present state, read from the controller or from the job that is using it."""
+
+    sp: float = Field(description="Set-point, PV units", examples=[50.0])
+    pv: float | None = Field(description="Process value, PV units", examples=[49.8])
+    mv: float | None = Field(description="Controller output, percent", examples=[41.2])
+    mode: str = Field(description="off, manual, automatic or experiment", examples=["automatic"])
+    gains: GainsView = Field(description="Gains in effect; while another tuner has others on trial, the accepted ones")
+    on_trial: bool = Field(description="True while gains are on trial under the tuner's lease")
+    mv_low: float = Field(description="The controller's own lower output limit, percent", examples=[0.0])
+    mv_high: float = Field(description="The controller's own upper output limit, percent", examples=[100.0])
+    sample_time_s: float = Field(description="Sampling period, s", examples=[0.1])
+    reverse_acting: bool = Field(description="True: MV falls as PV rises")
+    node_state: str = Field(
+        description="operational, or which node of the loop is in which state and controls nothing",
+        examples=["operational", "node 20h is pre-operational"],
+    )
+    when_silent: str = Field(
+        description="What the plant's I/O does with MV when the controller falls silent; empty: not known",
+        examples=["it holds MV where it is"],
+    )
+
+
+class NotHomeView(BaseModel):
+    """A loop that a job has left and that was not read back as home since: it is looked at until it is, or until
+    `POST /loops/TAG/dismiss`."""
+
+    job: str = Field(description="URL of the job", examples=["/jobs/4f0c2a9be113"])
+    reason: str | None = Field(description="From the closed list", examples=["node_not_operational"])
+    detail: str = Field(description="What was found when it was looked at last")
+    advice: str = Field(description="The same, and what to do about it")
+
+    @classmethod
+    def of(cls, found: NotHome) -> NotHomeView:
+        reason = None if found.reason is None else found.reason.value
+        return cls(job=f"/jobs/{found.job_id}", reason=reason, detail=found.detail, advice=found.words)
+
+
+class LoopDetail(LoopView):
+    live: LiveView | None = Field(
+        description="null: the bus is another host's, whose service can tell; or the loop is not reached, and looked "
+        "after"
+    )
+    not_confirmed_home: NotHomeView | None = Field(description="null: it is not looked after")
+
+
+class DismissedView(BaseModel):
+    """What a loop was looked after for."""
+
+    loop: str = Field(examples=["TIC-101"])
+    jobs: list[str] = Field(
+        description="URLs of the jobs it was looked after for; empty: it was not", examples=[["/jobs/4f0c2a9be113"]]
+    )
+
+
+class StageView(BaseModel):
+    stage: str = Field(examples=["relay"])
+    state: str = Field(description="running, done or ended", examples=["done"])
+    result: dict[str, Any] | None = Field(description="What the stage found; times in s, gains in ISA form")
+    plant_time_s: float | None = Field(description="Plant time the stage took, s", examples=[120.5])
+
+
+class JobView(BaseModel):
+    """A job: what was asked, how far it is, what came out."""
+
+    id: str = Field(examples=["4f0c2a9be113"])
+    url: str = Field(examples=["/jobs/4f0c2a9be113"])
+    loop: str = Field(examples=["TIC-101"])
+    state: JobState = Field(
+        description="no_gain: the loop is tuned as well as asked already, a good end; rehearsed: a dry run that came "
+        "to gains, nothing was tested",
+        examples=["running"],
+    )
+    dry_run: bool
+    host: str = Field(description="The service that runs it", examples=["local"])
+    attempts: int = Field(description="How often it was begun: more than once after a crash", examples=[1])
+    request: dict[str, Any] = Field(description="The options asked for")
+    requested_by: str = Field(examples=["night shift"])
+    created_at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
+    started_at: str | None = Field(description="UTC, ISO 8601, wall time")
+    ended_at: str | None = Field(description="UTC, ISO 8601, wall time")
+    stage: str | None = Field(description="The present or last stage", examples=["ultimate"])
+    progress: float = Field(ge=0, le=1, description="0 to 1, in expected plant time", examples=[0.42])
+    remaining_plant_time_s: float | None = Field(description="Expected plant time to the end, s", examples=[310.0])
+    plant_time_s: float = Field(description="Plant time so far, s", examples=[224.0])
+    stages: list[StageView]
+    method: str = Field(description="What gives the gains", examples=["fast"])
+    chosen: dict[str, float] = Field(description="The method's design parameters in effect, by name with unit")
+    ultimate: UltimateView | None
+    model: ModelView | TransferModelView | None = Field(description="As five-stage finds it, or as fast does")
+    old_gains: GainsView | None
+    new_gains: GainsView | None = Field(description="Proposed, rehearsed, or (no_gain) not worth a proposal")
+    comparison: ComparisonView | None = Field(
+        description="Present and new gains side by side on the model, with the verdict; null: no new gains, or a job "
+        "of an earlier version"
+    )
+    rehearsed_on: RehearsedOnView | None = Field(description="Of a dry run: on which plant, under which gains")
+    predicted: PredictedView | None = Field(description="The new gains on the model")
+    predicted_before: PredictedView | None = Field(
+        description="fast: the old gains on the same model, in place of a measured step; null: not stable there. "
+        "`comparison` has more figures, for every method"
+    )
+    evidence: EvidenceView | None = Field(description="fast: what its record says; of a refused job too")
+    verification: VerificationView | None = Field(description="fast: the measured step that proves the model")
+    before: StepView | None = Field(description="Set-point step with the old gains, measured; five-stage only")
+    after: StepView | None = Field(description="The same step with the new gains, from rest, measured")
+    notes: list[str]
+    reason: str | None = Field(description="Why there is no proposal, from the closed list", examples=["not_at_rest"])
+    detail: str | None = Field(description="The reason's numbers")
+    advice: str | None = Field(description="What to do about it")
+    restored: dict[str, Any] | None = Field(description="The loop as read back at the end")
+
+
+class SamplesView(BaseModel):
+    """Columns of equal length. float32 as on the bus."""
+
+    job: str
+    stage: list[str] = Field(description="Stage of each sample")
+    t_s: list[float] = Field(description="Plant time, s")
+    sp: list[float] = Field(description="PV units")
+    pv: list[float] = Field(description="PV units")
+    mv: list[float] = Field(description="Percent")
+    mode: list[int] = Field(description="0 off, 1 manual, 2 automatic, 3 experiment")
+
+
+class Decision(BaseModel):
+    """Who decides, for the record."""
+
+    by: str = Field(default="api", max_length=100, examples=["operator A"])
+
+
+def loop_view(
+    config: LoopConfig, host: str, active: str | None, last: str | None, lock: LoopLockRow | None
+) -> dict[str, Any]:
+    """active: the id of the job that has the loop.  last: the state of its latest one."""
+    fields = config.model_dump(exclude={"noise_std_hint"})
+    return fields | {
+        "host": host,
+        "active_job": None if active is None else f"/jobs/{active}",
+        "last_job_state": last,
+        "locked": None if lock is None else LockView.of(lock),
+    }
+
+
+def live_view(state: LoopState) -> LiveView:
+    return LiveView(
+        sp=state.sp,
+        pv=_finite(state.pv),
+        mv=_finite(state.mv),
+        mode=state.mode.name.lower(),
+        gains=gains_view(state.gains),
+        on_trial=state.on_trial,
+        mv_low=state.mv_low,
+        mv_high=state.mv_high,
+        sample_time_s=state.sample_time_s,
+        reverse_acting=state.reverse_acting,
+        node_state=state.node_state,
+        when_silent=state.when_silent,
+    )
+
+
+def gains_view(gains: Gains) -> GainsView:
+    return GainsView(Kp=gains.Kp, Ti=gains.Ti, Td=gains.Td, Tf=gains.Tf, b=gains.b, c=gains.c)
+
+
+def job_view(row: JobRow, events: Sequence[EventRow], running: Running | None) -> JobView:
+    """The job from the store, and from its live part while it runs."""
+    state = shown(row.state, row.dry_run)
+    result = row.result or {}
+    progress, remaining, plant_time = _progress(state, row, events, running)
+    new = result.get("gains")
+    return JobView(
+        id=row.id,
+        url=f"/jobs/{row.id}",
+        loop=row.loop,
+        state=state,
+        dry_run=row.dry_run,
+        host=row.host,
+        attempts=row.attempt,
+        request=row.request,
+        requested_by=row.requested_by,
+        created_at=row.created_at,
+        started_at=row.started_at,
+        ended_at=row.ended_at,
+        stage=row.stage,
+        progress=progress,
+        remaining_plant_time_s=remaining,
+        plant_time_s=plant_time,
+        stages=_stages(events, row),
+        method=row.request.get("method", PROCEDURE),
+        chosen=result.get("chosen") or {},
+        ultimate=known(UltimateView, result.get("ultimate")),
+        model=model_view(result.get("model")),
+        old_gains=_stored_gains(row.old_gains or result.get("old_gains")),
+        new_gains=_stored_gains(new),
+        comparison=known(ComparisonView, result.get("comparison")),
+        rehearsed_on=rehearsed_on_view(result.get("rehearsed_on")),
+        predicted=known(PredictedView, result.get("predicted")),
+        predicted_before=known(PredictedView, result.get("predicted_before")),
+        evidence=known(EvidenceView, result.get("found") or _told(events, ("redesign", "design"), "cause")),
+        verification=verification_view(result.get("verified") or _told(events, ("verify",), "tested")),
+        before=known(StepView, result.get("baseline")),
+        after=known(StepView, result.get("verification")),
+        notes=[e.data["text"] for e in events if e.kind == "note"] + list(result.get("notes") or ()),
+        reason=row.reason,
+        detail=row.detail,
+        advice=ADVICE[Reason(row.reason)] if row.reason else None,
+        restored=row.restored,
+    )
+
+
+def _progress(
+    state: JobState, row: JobRow, events: Sequence[EventRow], running: Running | None
+) -> tuple[float, float | None, float]:
+    """Fraction, remaining and present plant time; of a job on another host as of its last stage."""
+    if running is not None:
+        running.keep_time()
+        live = running.progress
+        return live.fraction, live.remaining_s, live.plant_time_s
+    if state not in ACTIVE:
+        return 1.0, 0.0, row.plant_time_s
+    told = next((e.data for e in reversed(events) if e.kind == "stage_started"), None)
+    if told is None:
+        return 0.0, None, row.plant_time_s
+    remaining = told["expected_s"] + told["remaining_s"]
+    total = row.plant_time_s + remaining
+    return (min(0.99, row.plant_time_s / total) if total > 0 else 0.0), remaining, row.plant_time_s
+
+
+def _stages(events: Sequence[EventRow], row: JobRow) -> list[StageView]:
+    over = row.ended_at is not None
+    times = row.stage_times_s or {}
+    stages: dict[str, StageView] = {}
+    for event in events:
+        name = event.data.get("stage")
+        if event.kind == "stage_started" and isinstance(name, str):
+            stages[name] = StageView(
+                stage=name, state="ended" if over else "running", result=None, plant_time_s=times.get(name)
+            )
+        elif event.kind == "stage_done" and name in stages:
+            stages[name].state, stages[name].result = "done", event.data.get("result")
+    return list(stages.values())
+
+
+def _told(events: Sequence[EventRow], stages: Sequence[str], sign: str) -> dict[str, Any] | None:
+    """The last result of the first of these stages that has one; `sign` is a field that others' results lack."""
+    for stage in stages:
+        for event in reversed(events):
+            data = event.data.get("result")
+            if event.kind == "stage_done" and event.data.get("stage") == stage and data and sign in data:
+                found: dict[str, Any] = data
+                return found
+    return None
+
+
+def _stored_gains(data: dict[str, Any] | None) -> GainsView | None:
+    if not data:
+        return None
+    known = {name: value for name, value in data.items() if name in Gains.__dataclass_fields__ and value is not None}
+    return gains_view(Gains(**known))
+
+
+def _finite(value: float) -> float | None:
+    return value if value == value and abs(value) != float("inf") else None

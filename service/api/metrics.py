@@ -1,0 +1,83 @@
+"""What Prometheus sees: the counters of this process, and jobs and loops, asked of the store when somebody looks."""
+
+from __future__ import annotations
+
+from collections import Counter as Tally
+from collections.abc import Iterable, Mapping
+
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+from sqlalchemy import func, select
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Session
+
+from loopwright.protocol.tuner import sdo_retries
+from loopwright.service.config import LoopConfig
+from loopwright.service.job_states import ACTIVE, JobState, shown
+from loopwright.service.store import looked_after
+from loopwright.service.store.store import Store
+from loopwright.service.store.tables import JobRow
+from loopwright.service.telemetry.metrics import OF_THIS_PROCESS
+
+MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+
+
+class _OfTheStore(Collector):
+    def __init__(self, loops: Mapping[str, LoopConfig], store: Store) -> None:
+        self._loops, self._store = loops, store
+
+    def collect(self) -> Iterable[Metric]:
+        loops = GaugeMetricFamily("loopwright_loops", "Configured loops", labels=["bus"])
+        for bus, count in sorted(Tally(loop.bus for loop in self._loops.values()).items()):
+            loops.add_metric([bus], count)
+        yield loops
+        retries = CounterMetricFamily(
+            "loopwright_sdo_retries", "SDO requests sent again for want of an answer", labels=["bus"]
+        )
+        for bus, count in sorted(sdo_retries.items()):
+            retries.add_metric([bus], count)
+        yield retries
+        up = GaugeMetricFamily("loopwright_database_up", "1: the database answers")
+        try:
+            jobs, not_home = self._jobs(), self._not_home()
+        except SQLAlchemyError:
+            up.add_metric([], 0)
+        else:
+            up.add_metric([], 1)
+            yield jobs
+            yield not_home
+        yield up
+
+    def _jobs(self) -> Metric:
+        by = JobRow.state, JobRow.dry_run, JobRow.reason
+        with Session(self._store.engine) as session:
+            counts = session.execute(select(*by, func.count()).group_by(*by)).all()
+        jobs = GaugeMetricFamily("loopwright_jobs", "Jobs in the database", labels=["state", "reason"])
+        found: Tally[tuple[str, str]] = Tally()
+        for state, dry_run, reason, count in counts:
+            found[shown(state, dry_run).value, reason or ""] += count
+        # Active states are always there: a gauge that vanishes cannot be alarmed on.
+        for key in sorted(found.keys() | {(state.value, "") for state in ACTIVE | {JobState.PROPOSED}}):
+            jobs.add_metric(list(key), found.get(key, 0))
+        return jobs
+
+    def _not_home(self) -> Metric:
+        with Session(self._store.engine) as session:
+            count = looked_after.count(session, self._store.host)
+        found = GaugeMetricFamily("loopwright_loops_looked_after", "Loops not confirmed home after a job")
+        found.add_metric([], count)
+        return found
+
+
+def registry(loops: Mapping[str, LoopConfig], store: Store) -> CollectorRegistry:
+    """Everything that /metrics shows of a service."""
+    found = CollectorRegistry()
+    for collector in (*OF_THIS_PROCESS, _OfTheStore(loops, store)):
+        found.register(collector)
+    return found
+
+
+def exposition(of: CollectorRegistry) -> bytes:
+    """The text that Prometheus scrapes."""
+    return generate_latest(of)

@@ -1,0 +1,127 @@
+"""`loopwright demo`: a badly tuned loop is retuned over a real bus, by real processes, through HTTP."""
+
+from __future__ import annotations
+
+import socket
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from loopwright.service.cli import job_tables
+from loopwright.service.cli.child_process import NotReady, Process
+from loopwright.service.cli.client import ApiError, Client
+from loopwright.service.plots.job import NoPicture, job_picture
+
+TAG = "TIC-101"
+PV_UNIT = "degC"
+SAMPLE_TIME_S = 0.02
+"""A 150th of model 14's ultimate period, 3.3 s."""
+NOISE = "0.002"
+"""Standard deviation of PV, degC: 1 % of what the relay moves it by."""
+BAD_GAINS = ("80", "1.2")
+"""Kp in % per PV unit, Ti in s: model 14 (Ku 205, Pu 3.3 s) swings for a long time with these."""
+
+
+class DemoFailed(Exception):
+    """What went wrong, in words for who runs the demo."""
+
+
+def vcan_usable(name: str = "vcan0") -> bool:
+    """True when a CAN interface of that name is there and takes a socket."""
+    if not hasattr(socket, "AF_CAN"):
+        return False
+    try:
+        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
+            probe.bind((name,))
+            probe.send(b"\x7f\x07\x00\x00\x01\x00\x00\x00\x05" + bytes(7))  # heartbeat of a node 127: harmless
+    except OSError:
+        return False
+    return True
+
+
+def loops_yaml(bus: str) -> str:
+    """The demo's loop as a configuration to start from."""
+    loop: dict[str, Any] = {
+        "tag": TAG,
+        "description": "Model 14 with gains that swing",
+        "bus": bus,
+        "controller_node": 0x20,
+        "plant_node": 0x10,
+        "channel": 1,
+        "pv_unit": PV_UNIT,
+        "mv_limits": {"low": 0.0, "high": 100.0},
+        "pv_limits": {"low": 49.0, "high": 51.0},
+        "t95_s": 9.1,
+        "sp_deviation": 0.1,
+        "notes": "PV 50 at MV 50 %; 100 % of MV move PV by 2 degC",
+    }
+    return str(yaml.safe_dump({"loops": [loop]}, sort_keys=False))
+
+
+def run_demo(folder: Path | None, speed: str, hub_only: bool) -> None:
+    """Everything from the bus to the picture; leaves nothing running. Raises DemoFailed."""
+    kept = folder or Path(tempfile.mkdtemp(prefix="loopwright-demo-"))
+    kept.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        try:
+            client = _start(stack, kept, speed, hub_only)
+            job, seconds = _retune(client)
+            picture = kept / "before-after.png"
+            job_picture(picture, client.samples_of(job), job, PV_UNIT)
+        except (NotReady, ApiError, NoPicture) as error:
+            raise DemoFailed(f"{error}\n(logs are in {kept})") from error
+    _tell(job, seconds, kept, picture)
+    if job["state"] != "proposed":
+        raise DemoFailed(f"the job ended as {job['state']}, not as a proposal")
+
+
+def _start(stack: ExitStack, folder: Path, speed: str, hub_only: bool) -> Client:
+    def process(name: str, *arguments: str) -> str:
+        started = Process(name, arguments, folder / f"{name}.log")
+        stack.callback(started.stop)
+        line = started.wait_ready()
+        job_tables.console.print(f"{name:<11}{' '.join(arguments)}", highlight=False, soft_wrap=True)
+        return line
+
+    if not hub_only and vcan_usable():
+        bus = "socketcan:vcan0"
+        job_tables.console.print("bus        vcan0")
+    else:
+        bus = process("hub", "loopwright.protocol.hub", "--port", "0").split()[1]
+    ts = str(SAMPLE_TIME_S)
+    plant = ["--bus", bus, "--model", "model-14", "--ts", ts, "--speed", speed, "--noise", NOISE]
+    kp, ti = BAD_GAINS
+    # The plant last: at full speed it waits for nobody, and takes what the processor gives.
+    tuning = ["--kp", kp, "--ti", ti, "--sp", "50", "--ts", ts]
+    process("controller", "loopwright.controller", "--bus", bus, "--channels", "1", *tuning)
+    loops = folder / "loops.yaml"
+    loops.write_text(loops_yaml(bus), encoding="utf-8")
+    serve = ("loopwright.service", "serve", "--loops", str(loops), "--data", str(folder / "data"), "--port", "0")
+    url = process("service", *serve).split()[1]
+    process("plant", "loopwright.plantsim", *plant)
+    return Client(url)
+
+
+def _retune(client: Client) -> tuple[dict[str, Any], float]:
+    job_tables.console.print(f"POST       {client.url}/loops/{TAG}/retune", highlight=False)
+    started = time.monotonic()
+    job = client.post(f"/loops/{TAG}/retune", {"requested_by": "demo"})
+    job = job_tables.follow(client, job["url"])
+    return job, time.monotonic() - started
+
+
+def _tell(job: dict[str, Any], seconds: float, folder: Path, picture: Path) -> None:
+    job_tables.job_report(job, PV_UNIT)
+    plant_s = job["plant_time_s"]
+    lines = [
+        f"{plant_s:.0f} s of plant time in {seconds:.1f} s of wall time: {plant_s / seconds:.0f} times as fast",
+        f"picture          {picture}",
+        f"jobs, samples    {folder / 'data' / 'loopwright.sqlite'}",
+        f"configuration    {folder / 'loops.yaml'}",
+        'next             README.md, "The service and its REST API": the same by hand; docs/one-job.md: how it works',
+    ]
+    job_tables.console.print("\n".join(lines), highlight=False, soft_wrap=True)

@@ -1,0 +1,208 @@
+"""Jobs and loops on a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from loopwright.service.api.result_views import ComparisonView
+from loopwright.service.cli.client import Client
+
+console = Console()
+_MARGINS = (("GM", "GM", ""), ("PM", "PM_deg", "deg"), ("Ms", "Ms", ""))
+_PREDICTED = (
+    ("overshoot", "overshoot_pct", "%"),
+    ("settling", "settling_s", "s"),
+    ("IAE, unit step", "IAE_per_unit", "s"),
+    *_MARGINS,
+)
+"""Of a job of an earlier version, which has no comparison."""
+
+
+def follow(client: Client, job_url: str) -> dict[str, Any]:
+    """Shows a job live until it is over; returns it."""
+    columns = (
+        TextColumn("{task.description:<11}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[left]}"),
+        TimeElapsedColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=console) as bars:
+        task = bars.add_task("queued", total=1.0, left="")
+        for kind, data in client.events(job_url):
+            if kind == "progress":
+                left = data["remaining_plant_time_s"]
+                text = "" if left is None else f"about {left:.0f} s of plant time left"
+                bars.update(task, completed=data["progress"], description=data["stage"] or "", left=text)
+            elif kind == "stage_done":
+                told = f"  {data['stage']:<10} at {data['plant_time_s']:.1f} s  {brief(data['result'])}"
+                bars.console.print(told, soft_wrap=True)
+            elif kind == "note":
+                bars.console.print(f"  note: {data['text']}")
+            elif kind == "state":
+                bars.update(task, description=data["state"], left="")
+        job: dict[str, Any] = client.get(job_url)
+        bars.update(task, completed=job["progress"])
+    return job
+
+
+def brief(result: dict[str, Any] | None) -> str:
+    """The numbers of a stage's result on one line."""
+    return ", ".join(f"{key} {number(value)}" for key, value in _leaves(result or {}))
+
+
+def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, int | float | str]]:
+    if isinstance(value, dict):
+        for name, item in value.items():
+            yield from _leaves(item, name)
+    elif isinstance(value, int | float | str) and value != "":
+        yield key, value
+
+
+def number(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def job_report(job: dict[str, Any], pv_unit: str = "PV unit") -> None:
+    """Everything a decision needs, as a table."""
+    table = Table(title=title(job), show_header=True)
+    of_new = {"no_gain": "designed", "rehearsed": "rehearsed"}.get(job["state"], "after")
+    for heading in ("", "before", of_new, "unit"):
+        table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
+    old, new = job["old_gains"] or {}, job["new_gains"] or {}
+    per = f"% per {pv_unit}"
+    for name, unit in (("Kp", f"{per} (ISA)"), ("Ti", "s"), ("Td", "s")):
+        table.add_row(f"gain {name}", cell(old.get(name)), cell(new.get(name)), unit)
+    before, after = job["before"] or {}, job["after"] or {}
+    if before or after:
+        for label, name, unit in (
+            ("measured IAE", "IAE", f"{pv_unit} s"),
+            ("measured overshoot", "overshoot_pct", "%"),
+            ("measured settling", "settling_s", "s"),
+        ):
+            table.add_row(label, cell(before.get(name)), cell(after.get(name)), unit)
+    for label, was, now, unit in _predicted(job, pv_unit):
+        table.add_row(f"predicted {label}", was, now, unit)
+    for label, value, unit in (*_model(job["model"], pv_unit), *_certainty(job)):
+        table.add_row(label, "", value, unit)
+    ultimate = job["ultimate"] or {}
+    table.add_row("ultimate Ku, Pu", "", ", ".join(cell(ultimate.get(n)) for n in ("Ku", "Pu_s")), f"{per}, s")
+    table.add_row("plant time", "", cell(job["plant_time_s"]), "s")
+    console.print(table)
+    if job["reason"]:
+        console.print(f"[bold]{job['reason']}[/bold]: {job['detail']}\n{job['advice']}", highlight=False)
+    elif job["comparison"]:
+        console.print(job["comparison"]["verdict"], markup=False, highlight=False)
+    if on := job["rehearsed_on"]:
+        text = f"Rehearsed on {on['plant_text']}; {on['gains_text']}. Nothing was tested on the loop."
+        console.print(text, markup=False, highlight=False)
+
+
+def title(job: dict[str, Any]) -> str:
+    """What has become of the job, so that a rehearsal and a loop that stays as it is are not taken for a proposal."""
+    what = f"job {job['id']}: {job['loop']} {job['state']}"
+    if job["state"] == "no_gain":
+        return f"{what}: tuned as well as asked already, the present gains are kept"
+    if job["dry_run"] and (on := job["rehearsed_on"]):
+        done = f"job {job['id']}: {job['loop']} rehearsed"
+        return f"{done if job['state'] == 'rehearsed' else what} on {on['plant_text']}, nothing was tested"
+    return f"{what}, nothing was tested" if job["dry_run"] else what
+
+
+def _predicted(job: dict[str, Any], pv_unit: str) -> Iterator[tuple[str, str, str, str]]:
+    """Lines of the table: label, before, after, unit."""
+    if job["comparison"] is None:
+        predicted, earlier = job["predicted"] or {}, job["predicted_before"] or {}
+        for label, name, unit in _PREDICTED if earlier or not job["after"] else _MARGINS:
+            yield label, cell(earlier[name]) if earlier else "", cell(predicted.get(name)), unit
+        return
+    compared = ComparisonView.model_validate(job["comparison"])
+    for label, part, name, unit in (
+        ("overshoot", None, "overshoot_pct", "%"),
+        ("settling, set-point", "setpoint", "settling_s", "s"),
+        ("IAE, set-point", "setpoint", "IAE", "s"),
+        ("MV travel, set-point", "setpoint", "TV", f"% per {pv_unit}"),
+        ("peak, load", "load", "peak", f"{pv_unit} per %"),
+        ("settling, load", "load", "settling_s", "s"),
+        ("IAE, load", "load", "IAE", f"{pv_unit} s per %"),
+        ("MV travel, load", "load", "TV", "% per %"),
+        *((label, None, name, unit) for label, name, unit in _MARGINS),
+    ):
+        shown = []
+        for each in (compared.before, compared.after):
+            of = getattr(each, part) if part else each
+            shown.append(cell(getattr(of, name)) if each.stable else "unstable")
+        yield label, shown[0], shown[1], unit
+    yield "J, what is made small", cell(compared.J_before), cell(compared.J_after), ""
+
+
+def _model(model: dict[str, Any] | None, pv_unit: str) -> Iterator[tuple[str, str, str]]:
+    """Lines of the table: label, value, unit."""
+    if model is None or "num" not in model:
+        known = model or {}
+        yield "model K, T, L", ", ".join(cell(known.get(n)) for n in ("K", "T_s", "L_s")), f"{pv_unit} per %, s, s"
+        return
+    for label, name, error, unit in (
+        ("model num", "num", "num_errors", f"{pv_unit} per %"),
+        ("model den", "den", "den_errors", ""),
+    ):
+        yield label, " ".join(map(_with_error, model[name], model[error] or [None] * len(model[name]))), unit
+    yield "model dead time", _with_error(model["dead_time_s"], model["dead_time_error_s"]), "s"
+
+
+def _with_error(value: float, error: float | None) -> str:
+    """With its standard error, where that says something."""
+    return cell(value) if not error or error < 1e-4 * abs(value) else f"{cell(value)}±{error:.1g}"
+
+
+def _certainty(job: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+    """What the record of fast says of itself."""
+    found, step = job["evidence"], job["verification"]
+    if found is not None:
+        yield "Ms uncertain by", cell(found["uncertainty"]), "(2 std. dev.)"
+        yield "on rival models by", cell(found["ambiguity"]), ""
+        for load in found["loads"]:
+            yield "load step found", f"{load['size']:+.4g} at {load['t_s']:.4g}", "%, s into the relay"
+    if step is not None:
+        yield "measured step explained", f"{step['fit_pct']:.1f}", "%"
+
+
+def loop_report(loop: dict[str, Any]) -> None:
+    """A loop as it is now."""
+    live = loop["live"] or {}
+    unit, gains = loop["pv_unit"], live.get("gains") or {}
+    job, last = loop["active_job"], loop["last_job_state"]
+    table = Table("", "now", "unit", title=f"loop {loop['tag']}: {loop['description']}")
+    for label, value, of in (
+        ("SP", live.get("sp"), unit),
+        ("PV", live.get("pv"), unit),
+        ("MV", live.get("mv"), "%"),
+        ("mode", live.get("mode"), ""),
+        *((f"gain {name}", gains.get(name), of) for name, of in (("Kp", f"% per {unit}"), ("Ti", "s"), ("Td", "s"))),
+        ("nodes", live.get("node_state"), ""),
+        ("host", loop["host"], ""),
+        ("job", job or (last and f"none; the last one: {last}"), ""),
+        ("locked", lock(loop["locked"]), ""),
+    ):
+        table.add_row(label, cell(value), of)
+    console.print(table)
+    if loop["not_confirmed_home"]:
+        console.print(loop["not_confirmed_home"]["advice"], highlight=False)
+
+
+def lock(locked: dict[str, Any] | None) -> str | None:
+    """Who keeps tests from a loop, and why."""
+    return None if locked is None else f"by {locked['by']}: {locked['reason']}"
+
+
+def cell(value: object) -> str:
+    return "-" if value is None else number(value)
+
+
+def rows(title: str, headings: Iterable[str], lines: Iterable[Iterable[object]]) -> None:
+    table = Table(*headings, title=title)
+    for line in lines:
+        table.add_row(*map(cell, line))
+    console.print(table)

@@ -1,0 +1,51 @@
+"""What a retune would do, on a terminal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from loopwright.service.cli.job_tables import number
+from loopwright.service.planning.preview import duration_text
+
+
+def one(found: dict[str, Any], console: Console) -> None:
+    """The preview of one loop: sentences, a table of its stages, and what stands in the way."""
+    for line in found["summary"]:
+        console.print(line, highlight=False)
+    moving = [each for each in found["stages"] if each["mv_move_pct"] or each["sp_move"]]
+    if moving:
+        table = Table("stage", "MV %", "SP", "plant time", "what is moved")
+        for each in moving:
+            table.add_row(
+                each["stage"],
+                _range(each["mv_low_pct"], each["mv_high_pct"], each["mv_move_pct"]),
+                _range(each["sp_low"], each["sp_high"], each["sp_move"]),
+                duration_text(each["duration_low_s"], each["duration_high_s"]),
+                each["what"],
+            )
+        console.print(table)
+    _obstacles(found, console)
+
+
+def many(found: dict[str, Any], console: Console) -> None:
+    """The preview of a retune of many loops, and what stands in the way of each."""
+    for line in found["summary"]:
+        console.print(line, highlight=False)
+    for each in found["loops"]:
+        _obstacles(each, console)
+
+
+def _obstacles(found: dict[str, Any], console: Console) -> None:
+    if found["obstacles"]:
+        console.print(f"[bold]{found['loop']} would be refused now[/bold]:", highlight=False)
+    for each in found["obstacles"]:
+        console.print(f"  {each['reason']}: {each['detail']}\n    {each['advice']}", highlight=False, markup=False)
+
+
+def _range(low: float | None, high: float | None, move: float) -> str:
+    if not move:
+        return ""
+    return f"by {number(move)}" if low is None or high is None else f"{number(low)} .. {number(high)}"

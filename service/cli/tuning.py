@@ -1,0 +1,135 @@
+"""The commands that need no service: the methods, a model tuned by them, a model from a record."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from loopwright.service.cli.output import AsJson, die, json_object, print_json, read_json_object
+
+PICTURES = (".png", ".svg", ".pdf")
+Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Picture: .png, .svg or .pdf.")]
+
+
+def methods(as_json: AsJson = False) -> None:
+    """The tuning methods, what each is for and its options."""
+    from loopwright.service.offline import tunings
+
+    found = tunings.methods_json()
+    if as_json:
+        print_json(found)
+        return
+    from loopwright.service.cli import tuning_tables
+
+    tuning_tables.methods(found)
+
+
+def tune(
+    model: Annotated[str, typer.Option(metavar="JSON|FILE", help='As {"K": 2, "T": 10, "L": 3}, or a file of it.')],
+    method: Annotated[str, typer.Option(metavar="NAME", help="One of `loopwright methods`, or all.")] = "all",
+    option: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=VALUE", help="Of the method, as lambda_s=5; may be repeated.")
+    ] = None,
+    plot: Plot = None,
+    as_json: AsJson = False,
+) -> None:
+    """Gains for a process model by one method or all, compared on it. Exit 0: gains found, 3: none."""
+    # the matrices are small: threads of the linear algebra cost more than they save
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from loopwright.service.offline import tunings
+    from loopwright.service.offline.model_json import BadModel, parse_model
+
+    check_plot(plot)
+    try:
+        typed = model.lstrip().startswith(("{", "["))
+        given = json_object(model, "--model") if typed else read_json_object(Path(model))
+        plant = parse_model(given)
+        found = tunings.tune_model(plant, method, dict(_option(text) for text in option or ()))
+    except (BadModel, tunings.BadTuning) as error:
+        die(str(error), 2)
+    answer = tunings.answer(plant, found)
+    if plot is not None:
+        from loopwright.service.plots.tunings import responses
+
+        _save(plot, responses, plant, found)
+    if as_json:
+        print_json(answer)
+    else:
+        from loopwright.service.cli import tuning_tables
+
+        tuning_tables.tunings(answer)
+    if all(each["outcome"] == "refused" for each in answer["methods"]):
+        raise typer.Exit(3)
+
+
+def identify(
+    data: Annotated[Path, typer.Argument(metavar="DATA.csv", help="Columns t, u (or mv), y (or pv).")],
+    mv_before: Annotated[
+        float | None, typer.Option(help="MV before the record; needed if it begins with the move.")
+    ] = None,
+    plot: Plot = None,
+    as_json: AsJson = False,
+) -> None:
+    """A process model from a recorded test of any shape. Exit 0: a model found, 3: none."""
+    from loopwright.service.offline.csv_record import RecordError, load_record
+    from loopwright.service.offline.identification import identified, refused
+    from loopwright.tuning.identification.identify import identify as fit
+    from loopwright.tuning.reasons import Reason, Refused
+
+    check_plot(plot)
+    try:
+        record = load_record(data)
+    except RecordError as error:
+        die(str(error), 2)
+    try:
+        found = fit(record.t, record.u, record.y, mv_before)
+    except Refused as refusal:
+        if refusal.reason is Reason.BAD_INPUT:
+            die(f"{data}: {refusal.detail}", 2)
+        answer = refused(refusal)
+    else:
+        answer = identified(found, record)
+        if plot is not None:
+            from loopwright.service.plots.tunings import record_and_model
+
+            _save(plot, record_and_model, record, found)
+    if as_json:
+        print_json(answer)
+    else:
+        from loopwright.service.cli import tuning_tables
+
+        tuning_tables.identified(answer)
+    if answer["outcome"] == "refused":
+        raise typer.Exit(3)
+
+
+def check_plot(plot: Path | None) -> None:
+    """Before the work, not after it."""
+    if plot is not None and plot.suffix.lower() not in PICTURES:
+        die(f"--plot must end in {', '.join(PICTURES)}, not {plot}", 2)
+
+
+def _save(plot: Path, draw: Callable[..., None], *what: object) -> None:
+    try:
+        draw(plot, *what)
+    except OSError as error:
+        die(f"{plot}: {error.strerror}", 2)
+
+
+def _option(text: str) -> tuple[str, object]:
+    """name=value; the value a number, true or false where it reads as one."""
+    name, equals, value = text.partition("=")
+    if not (name and equals):
+        die(f"--option must be NAME=VALUE, not {text!r}", 2)
+    if value in ("true", "false"):
+        return name, value == "true"
+    for number in (int, float):
+        try:
+            return name, number(value)
+        except ValueError:
+            continue
+    return name, value

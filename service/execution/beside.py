@@ -1,0 +1,127 @@
+"""Long computations beside a loop that is pumped meanwhile."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, Protocol
+
+from loopwright.service.execution.computing.limits import Kind
+from loopwright.service.execution.computing.pool import NoProcess, NotWanted
+from loopwright.service.loop_state import LoopState
+from loopwright.service.loops.loop import Loop, Restored
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Command, Sample, Work
+from loopwright.tuning.reasons import Reason
+
+HELD_S = 0.3
+"""Wall time for which a step may be held up: a part of the heartbeat time."""
+
+_SWITCH_S = 0.0005
+"""How long a computation keeps the interpreter from a thread that has an answer of the bus: Python's 5 ms, twice for
+each SDO, are seconds where many loops are under test. Only meanwhile, for threads that wait look as often, and of fifty
+that takes more than it brings."""
+
+_log = logging.getLogger(__name__)
+_turn = threading.Lock()
+
+
+@contextmanager
+def _alone() -> Iterator[None]:
+    """One computation at a time: side by side they would not be ready sooner, and each would keep the interpreter from
+    loops that have a sample or an answer."""
+    with _turn:
+        usual = sys.getswitchinterval()
+        sys.setswitchinterval(_SWITCH_S)
+        try:
+            yield
+        finally:
+            sys.setswitchinterval(usual)
+
+
+class Workers(Protocol):
+    """Who computes in other processes: a `Pool`."""
+
+    def submit(self, kind: Kind, work: Callable[[], Any], unwanted: Callable[[], bool]) -> Future[Any]: ...
+
+
+class Computing:
+    """A loop, and what is being computed for it: steps of the loop go through here, all else to the loop itself.
+
+    A real plant goes on while we compute. One that waits for us, in memory or run in blocks, is held from sample to
+    sample: at full speed a second of arithmetic would be minutes of its time under the relay.
+    workers: who computes; None: a thread of this process.
+    """
+
+    def __init__(self, loop: Loop, workers: Workers | None = None) -> None:
+        self._loop, self._workers = loop, workers
+        self._idle = threading.Event()
+        self._idle.set()
+        self._over = False
+
+    def start(self, work: Work[Any]) -> None:
+        """For `start_work` of the runner."""
+        self._idle.clear()
+        if self._workers is None:
+            self._beside(work)
+            return
+        future = self._workers.submit(Kind.LIVE, work.compute, lambda: self._over)
+        future.add_done_callback(partial(self._came, work))
+
+    def step(self, commands: Sequence[Command]) -> Sample:
+        if not self._idle.is_set() and self._loop.waits:
+            self._idle.wait(HELD_S)
+        return self._loop.step(commands)
+
+    @property
+    def waits(self) -> bool:
+        return self._loop.waits
+
+    def read(self, beside_tests: bool = False) -> LoopState:
+        return self._loop.read(beside_tests)
+
+    def begin(
+        self,
+        stop: Callable[[], Reason | None] = lambda: None,
+        remember: Callable[[int], None] = lambda session: None,
+    ) -> LoopState:
+        return self._loop.begin(stop, remember)
+
+    def restore(self, home: LoopState, session: int | None = None) -> Restored:
+        self._over = True  # what is being computed, or waits for its turn, nobody wants any more
+        return self._loop.restore(home, session)
+
+    def accept(self, gains: Gains, instead_of: Gains) -> LoopState:
+        return self._loop.accept(gains, instead_of)
+
+    def close(self) -> None:
+        self._loop.close()
+
+    def _came(self, work: Work[Any], future: Future[Any]) -> None:
+        """From the workers; called in a thread of theirs."""
+        error = future.exception()
+        if isinstance(error, NoProcess):
+            _log.warning("%s; the service computes by itself", error.detail)
+            self._beside(work)
+            return
+        if error is None:
+            work.finish(future.result())
+        elif not isinstance(error, NotWanted):
+            work.fail(error)
+        self._idle.set()
+
+    def _beside(self, work: Work[Any]) -> None:
+        threading.Thread(target=self._do, args=(work,), daemon=True, name="computation").start()
+
+    def _do(self, work: Work[Any]) -> None:
+        try:
+            with _alone():
+                if not self._over:
+                    work.run()
+        finally:
+            self._idle.set()

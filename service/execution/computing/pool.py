@@ -1,0 +1,280 @@
+"""Whose turn it is to compute, and what becomes of a computation that does not come to its end.
+
+Each computation has a process of its own, forked from a fork server that has everything loaded (about 10 ms; a process
+made by spawn would load for more than a second, one forked from the service would have its sockets and database). What
+is kept elsewhere does not do: concurrent.futures cannot end one computation alone, pebble and loky know no reports on
+the way, no order of precedence, no pause and no limit of memory.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import multiprocessing
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerProcess
+from typing import Any
+
+from loopwright.service.execution.computing.child import GO_ON, PAUSE, Said, compute
+from loopwright.service.execution.computing.limits import MEMORY_OPTION, OPTIONS, WORDS, ComputingLimits, Kind, at_once
+from loopwright.tuning.reasons import Failed, Reason
+
+NICE = {Kind.LIVE: 5, Kind.TUNING: 10, Kind.DRY_RUN: 10}
+_LOOK_S, _LOOK_WAITING_S = 0.1, 0.5
+"""Wall time between two looks whether a computation is still wanted, one that runs and one that waits for its turn:
+fifty loops may wait at once, and each look takes the interpreter."""
+_TRIES = 2
+_AGAIN_S = 0.2
+_CLOSE_S = 30.0
+_KEPT_AWAY = {signal.SIGINT, signal.SIGTERM}
+
+_log = logging.getLogger(__name__)
+_bookkeeping = threading.Lock()
+"""multiprocessing keeps its processes in a set of the module."""
+
+
+class NotWanted(Exception):
+    """Nobody waits for the result any more: the computation was ended, or never begun."""
+
+
+class NoProcess(Failed):
+    """The system gives no process."""
+
+
+class _Died(Exception):
+    """The process ended without a word."""
+
+    def __init__(self, exitcode: int | None) -> None:
+        self.exitcode = exitcode
+
+
+class _Place:
+    """The place of a computation in the order. Everything but `turn` is guarded by the pool."""
+
+    def __init__(self, rank: tuple[Kind, int]) -> None:
+        self.rank = rank
+        self.turn = threading.Event()
+        self.control: Connection | None = None
+
+    def set_turn(self, mine: bool) -> None:
+        if mine == self.turn.is_set():
+            return
+        if mine:
+            self.turn.set()
+        else:
+            self.turn.clear()
+        self.tell()
+
+    def tell(self) -> None:
+        """Lets the process know, if there is one."""
+        if self.control is not None:
+            with suppress(OSError):  # it has just ended
+                self.control.send_bytes(GO_ON if self.turn.is_set() else PAUSE)
+
+
+class Pool:
+    """At most so many computations run at once: the best by kind, then by age. Others wait, or pause until then.
+
+    most: at_once() by default.
+    """
+
+    def __init__(self, limits: ComputingLimits | None = None, most: int | None = None) -> None:
+        self.limits = limits or ComputingLimits()
+        self._most = most or at_once()
+        self._context = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload(["loopwright.service.execution.computing.preload"])
+        self._numbers = itertools.count()
+        self._places: list[_Place] = []
+        self._changed = threading.Condition()
+        self._closed = False
+
+    def run(
+        self,
+        kind: Kind,
+        work: Callable[..., Any],
+        *,
+        hear: Callable[[Any], None] | None = None,
+        unwanted: Callable[[], bool] = lambda: False,
+    ) -> Any:
+        """The result of the work, waited for here; raises what it raises.
+
+        hear: the work is called with a function, and what it gives that is given to this one, here.
+        unwanted: asked some times a second; once true, the computation is ended and NotWanted raised.
+        Raises Failed(COMPUTATION_LIMIT | COMPUTATION_LOST), NoProcess.
+        """
+        with self._place(kind) as place:
+            for last in range(1, _TRIES + 1):
+                while not place.turn.wait(_LOOK_WAITING_S):
+                    self._check(unwanted)
+                self._check(unwanted)
+                heard = _Heard(hear)
+                try:
+                    return self._one(kind, work, place, heard, unwanted)
+                except _Died as died:
+                    if died.exitcode == -signal.SIGXCPU:
+                        cpu_s = self.limits.cpu_s(kind)
+                        text = f"{WORDS[kind]} was ended after {cpu_s:g} s of processor time ({OPTIONS[kind]})"
+                        raise Failed(Reason.COMPUTATION_LIMIT, text) from None
+                    if last == _TRIES or heard.anything:
+                        text = f"the process of {WORDS[kind]} was killed (exit {died.exitcode})"
+                        raise Failed(Reason.COMPUTATION_LOST, text) from None
+                    _log.warning("the process of %s was killed, it is computed once more", WORDS[kind])
+        raise AssertionError("every try returns or raises")
+
+    def submit(self, kind: Kind, work: Callable[[], Any], unwanted: Callable[[], bool] = lambda: False) -> Future[Any]:
+        """The same in a thread of its own, for who does not wait."""
+        future: Future[Any] = Future()
+        future.set_running_or_notify_cancel()  # it is ended by `unwanted` alone
+
+        def wait() -> None:
+            try:
+                future.set_result(self.run(kind, work, unwanted=unwanted))
+            except BaseException as error:
+                future.set_exception(error)
+
+        threading.Thread(target=wait, name="computation", daemon=True).start()
+        return future
+
+    def close(self) -> None:
+        """Ends every computation, and waits until its process has ended."""
+        with self._changed:
+            self._closed = True
+            if not self._changed.wait_for(lambda: not self._places, _CLOSE_S):
+                _log.error("%d computations have not ended in %.0f s", len(self._places), _CLOSE_S)
+
+    # -- whose turn it is
+
+    @contextmanager
+    def _place(self, kind: Kind) -> Iterator[_Place]:
+        place = _Place((kind, next(self._numbers)))
+        with self._changed:
+            self._places.append(place)
+            self._arrange()
+        try:
+            yield place
+        finally:
+            with self._changed:
+                self._places.remove(place)
+                self._arrange()
+                self._changed.notify_all()
+
+    def _arrange(self) -> None:
+        self._places.sort(key=lambda place: place.rank)
+        for n, place in reversed(list(enumerate(self._places))):  # who has to pause is told first
+            place.set_turn(n < self._most)
+
+    def _check(self, unwanted: Callable[[], bool]) -> None:
+        if self._closed or unwanted():
+            raise NotWanted
+
+    # -- one process
+
+    def _one(
+        self, kind: Kind, work: Callable[..., Any], place: _Place, heard: _Heard, unwanted: Callable[[], bool]
+    ) -> Any:
+        with self._process(kind, work, place, heard.wanted) as (process, connection):
+            while True:
+                while not connection.poll(_LOOK_S):
+                    self._check(unwanted)
+                try:
+                    said, value = connection.recv()
+                except (EOFError, OSError):
+                    with _bookkeeping:
+                        process.join()
+                    raise _Died(process.exitcode) from None
+                if said is Said.REPORT:
+                    heard.report(value)
+                    self._check(unwanted)
+                elif said is Said.RESULT:
+                    return value
+                elif said is Said.NO_MEMORY:
+                    memory = self.limits.memory_mb
+                    text = f"{WORDS[kind]} asked for more than {memory} MB of memory ({MEMORY_OPTION})"
+                    raise Failed(Reason.COMPUTATION_LIMIT, text)
+                else:
+                    raise value
+
+    @contextmanager
+    def _process(
+        self, kind: Kind, work: Callable[..., Any], place: _Place, reports: bool
+    ) -> Iterator[tuple[ForkServerProcess, Connection]]:
+        """Whatever ends it in here, the process is gone behind it. Raises NoProcess, and what pickling raises."""
+        limits = self.limits.cpu_s(kind), self.limits.memory_mb, NICE[kind]
+        try:
+            connection, theirs = multiprocessing.Pipe()
+        except OSError as error:
+            raise _no_process(kind, error) from error
+        with connection:
+            with theirs:
+                process = self._context.Process(
+                    target=compute, args=(theirs, work, reports, *limits), name="computation", daemon=True
+                )
+                try:
+                    _start(process)
+                except (OSError, EOFError) as error:
+                    raise _no_process(kind, error) from error
+            try:
+                with self._changed:
+                    place.control = connection
+                    if not place.turn.is_set():  # it was lost while the process was made
+                        place.tell()
+                yield process, connection
+            finally:
+                with self._changed:
+                    place.control = None
+                with _bookkeeping:
+                    if process.is_alive():
+                        process.kill()
+                    process.join()
+                    process.close()
+
+
+class _Heard:
+    """Reports on their way to who hears them. anything: there was one, so that the work cannot begin anew."""
+
+    def __init__(self, hear: Callable[[Any], None] | None) -> None:
+        self.wanted = hear is not None
+        self.anything = False
+        self._hear = hear
+
+    def report(self, value: object) -> None:
+        assert self._hear is not None
+        self.anything = True
+        self._hear(value)
+
+
+def _no_process(kind: Kind, error: Exception) -> NoProcess:
+    text = f"no process can be made for {WORDS[kind]} ({type(error).__name__}: {error})"
+    return NoProcess(Reason.COMPUTATION_LOST, text)
+
+
+def _start(process: ForkServerProcess) -> None:
+    """Raises OSError, and EOFError where the fork server has died: it is made anew with the next process."""
+    for last_try in (False, False, True):
+        try:
+            with _bookkeeping, _signals_kept_away():
+                process.start()
+            return
+        except (OSError, EOFError):
+            if last_try:
+                raise
+        time.sleep(_AGAIN_S)
+
+
+@contextmanager
+def _signals_kept_away() -> Iterator[None]:
+    """The fork server and all that it forks never get a SIGINT or SIGTERM to the whole group: what these end, the
+    service ends. A process that is started has the mask of the thread that starts it."""
+    resource_tracker.ensure_running()  # it would lift the mask
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _KEPT_AWAY)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

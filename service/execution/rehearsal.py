@@ -1,0 +1,387 @@
+"""The whole procedure in memory: the pure plant model and the pure controller algorithm behind the same `Loop`.
+
+This is the one module of the service that knows plantsim and controller, and only their pure parts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from loopwright.controller.channel import Channel, RelaySettings, Settings
+from loopwright.controller.pid import Parameters
+from loopwright.plantsim.plant import LinearPlant, Process
+from loopwright.service.execution.runner import RunResult, Watch, run
+from loopwright.service.jsonable import plain
+from loopwright.service.loop_state import LoopState
+from loopwright.service.loops.loop import Restored
+from loopwright.service.plausible import (
+    Finite,
+    Gain,
+    Implausible,
+    Size,
+    Time,
+    TimeOrNone,
+    Value,
+    check_model,
+    check_sampling,
+)
+from loopwright.tuning.analysis.margins import ultimate_point
+from loopwright.tuning.fast.design_trial import trial
+from loopwright.tuning.fast.procedure import FAST, FAST_STAGES, FastOptions, FastProposal, fast
+from loopwright.tuning.five_stage.procedure import STAGES, Facts, Options, Proposal, five_stage
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import FOPDT, SOPDT, Model, TransferFunction
+from loopwright.tuning.plan import (
+    Command,
+    Event,
+    Mode,
+    Sample,
+    SetGains,
+    SetMode,
+    SetOutput,
+    SetRelay,
+    SetSetpoint,
+    StageDone,
+)
+from loopwright.tuning.reasons import Ended, Failed, NoGain, Reason, Refused
+
+
+class RehearsedLoop:
+    """A `Loop` in memory, as fast as the machine goes. Commands act on the next sample."""
+
+    waits = True
+
+    def __init__(self, plant: Process, channel: Channel, sample_time_s: float) -> None:
+        self._plant = plant
+        self._channel = channel
+        self._dt = sample_time_s
+        self._n = 0
+        self._home = channel.home
+        self._pv = plant.pv
+
+    def read(self, beside_tests: bool = False) -> LoopState:
+        channel = self._channel
+        return LoopState(
+            mode=Mode(channel.mode),
+            sp=channel.setpoint,
+            pv=self._pv,
+            mv=channel.mv,
+            gains=_gains(channel.accepted),
+            on_trial=channel.on_trial,
+            mv_low=channel.settings.mv_low,
+            mv_high=channel.settings.mv_high,
+            sample_time_s=self._dt,
+            reverse_acting=channel.settings.reverse,
+            manual_output=channel.manual_output,
+        )
+
+    def begin(
+        self,
+        stop: Callable[[], Reason | None] = lambda: None,
+        remember: Callable[[int], None] = lambda session: None,
+    ) -> LoopState:
+        self._home = self._channel.home
+        return self.read()
+
+    def step(self, commands: Sequence[Command]) -> Sample:
+        channel = self._channel
+        for command in commands:
+            self._carry_out(command)
+        mv = channel.step(self._pv)
+        sample = Sample(self._n * self._dt, channel.setpoint, self._pv, mv, channel.mode)
+        self._pv = self._plant.step(mv)
+        self._n += 1
+        return sample
+
+    def _carry_out(self, command: Command) -> None:
+        channel = self._channel
+        match command:
+            case SetSetpoint(value):
+                channel.setpoint = value
+            case SetMode(mode):
+                if int(mode) != int(channel.mode):
+                    channel.command_mode(int(mode))
+            case SetGains(gains):
+                channel.try_gains(_parameters(gains))
+            case SetOutput(value):
+                channel.manual_output = value
+            case SetRelay(amplitude, hysteresis, working, amplitude_low, average):
+                low, high = channel.settings.pv_low, channel.settings.pv_high
+                channel.start_relay(
+                    RelaySettings(amplitude, hysteresis, working, 10**9, low, high, amplitude_low or 0.0, average)
+                )
+
+    def restore(self, home: LoopState, session: int | None = None) -> Restored:
+        self._channel.go_home(self._home)
+        return Restored(self.read(), "the test is over")
+
+    def accept(self, gains: Gains, instead_of: Gains) -> LoopState:
+        self._channel.accept(_parameters(gains))
+        return self.read()
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+
+def _parameters(gains: Gains) -> Parameters:
+    return Parameters(gains.Kp, gains.Ti, gains.Td, gains.Tf, gains.b, gains.c)
+
+
+def _gains(p: Parameters) -> Gains:
+    return Gains(p.Kp, p.Ti, p.Td, p.Tf, p.b, p.c)
+
+
+class PresentGains(BaseModel):
+    """Of the loop before the test, in ISA form."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    Kp: Gain
+    Ti: TimeOrNone = Field(default=0.0, description="s; 0: no integral part")
+    Td: TimeOrNone = Field(default=0.0, description="s")
+    Tf: TimeOrNone = Field(default=0.0, description="s, filter of the derivative")
+    b: Finite = Field(default=1.0, description="set-point weight of the proportional path")
+    c: Finite = Field(default=0.0, description="set-point weight of the derivative path")
+
+
+class PlantFile(BaseModel):
+    """A plant for `loopwright rehearse`, in deviation variables; what is left out is chosen and echoed."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    name: str = "plant"
+    num: list[float] = Field(min_length=1, max_length=12, description="numerator, highest power of s first")
+    den: list[float] = Field(min_length=1, max_length=12, description="denominator, highest power of s first")
+    dead_time_s: float = Field(0.0, ge=0)
+    sample_time_s: Time | None = None
+    t95_s: Time | None = None
+    noise_std: Size = Field(0.0, description="standard deviation of the measurement, PV units")
+    seed: int = Field(1, ge=0)
+    mv_limits: tuple[Value, Value] = (-0.5, 0.5)
+    sp_deviation: Annotated[Value, Field(gt=0)] | None = None
+    gains: PresentGains | None = Field(None, description="present gains of the loop")
+    reverse_acting: bool | None = Field(None, description="the controller's action; left out: right for the plant")
+
+    @model_validator(mode="after")
+    def _proper(self) -> PlantFile:
+        if not any(self.den) or self.den[0] == 0:
+            raise ValueError("den must start with a coefficient other than 0")
+        if len(self.num) > len(self.den):
+            raise ValueError(f"num has order {len(self.num) - 1}, more than den's {len(self.den) - 1}: not proper")
+        if not any(self.num):
+            raise ValueError("num is zero: the plant does not answer MV")
+        if self.num[-1] == 0 and self.den[-1] != 0:
+            raise ValueError("num must end with a coefficient other than 0: PV would come back from every move of MV")
+        if not self.mv_limits[0] < 0 < self.mv_limits[1]:
+            raise ValueError(f"mv_limits must be [low < 0, high > 0] around the operating point, not {self.mv_limits}")
+        check_model(self.num, self.den, self.dead_time_s)
+        return self
+
+
+def _nice(x: float) -> float:
+    """The largest 1, 2 or 5 times a power of ten that is not above x."""
+    power = 10.0 ** math.floor(math.log10(x))
+    return next(m * power for m in (5.0, 2.0, 1.0) if m * power <= x * (1 + 1e-9))
+
+
+def _complete(file: PlantFile) -> PlantFile:
+    """Chooses what was left out, from the model: T95, Ts (a 300th of Pu or less), step, present gains."""
+    poles = np.roots(file.den)
+    gain = file.num[-1] / file.den[-1] if file.den[-1] else math.inf
+    t95 = file.t95_s
+    if t95 is None:
+        if len(poles) and float(poles.real.max()) >= -1e-9:
+            slow = max((1 / abs(p) for p in poles if abs(p) > 1e-9), default=1.0)
+            t95 = file.dead_time_s * 4 + 3 * slow
+        else:
+            t95 = _t95(file)
+    ts = file.sample_time_s or _nice(max(_period(file, t95) / 300, t95 / 5000))
+    room = min(-file.mv_limits[0], file.mv_limits[1])
+    step = file.sp_deviation or 0.2 * room * (abs(gain) if math.isfinite(gain) else 1.0)
+    try:
+        check_sampling(file.dead_time_s, t95, ts)
+    except Implausible as error:
+        raise Refused(Reason.BAD_INPUT, str(error)) from None
+    gains = file.gains or PresentGains(Kp=0.3 / abs(gain) if math.isfinite(gain) else 0.1, Ti=t95 / 3)
+    return file.model_copy(update={"sample_time_s": ts, "t95_s": t95, "sp_deviation": step, "gains": gains})
+
+
+def _period(file: PlantFile, t95: float) -> float:
+    """The ultimate period, s; for a plant without one, something short beside T95."""
+    try:
+        period = ultimate_point(TransferFunction(tuple(file.num), tuple(file.den), file.dead_time_s))[1]
+    except (Ended, ValueError, ArithmeticError):
+        return t95 / 2
+    return period if 0 < period < math.inf else t95 / 2
+
+
+def _t95(file: PlantFile) -> float:
+    """When the plant's own step response has come within 5 % of its end for good, s."""
+    slowest = max((1 / abs(p.real) for p in np.roots(file.den)), default=1.0)
+    dt = max(slowest, file.dead_time_s) / 200
+    plant = LinearPlant(file.num, file.den, file.dead_time_s, dt)
+    y = np.array([plant.step(1.0) for _ in range(round((12 * slowest + file.dead_time_s) / dt))])
+    end = file.num[-1] / file.den[-1]
+    away = np.flatnonzero(np.abs(y - end) > 0.05 * abs(end))
+    return float(dt * (away[-1] + 2)) if len(away) else 10 * dt
+
+
+def rehearse(
+    spec: dict[str, Any],
+    method: str = FAST,
+    on_event: Callable[[Event], None] | None = None,
+    on_samples: Callable[[list[Sample]], None] | None = None,
+    model: Model | None = None,
+    **options: Any,
+) -> dict[str, Any]:
+    """Preflight to verification on a model in memory. Returns the JSON object of `loopwright rehearse`.
+
+    spec: the fields of `PlantFile`.  method: "fast", "five-stage", or a rule of `tuning.rules.registry` in place of the
+    fifth stage.  model: what to design for; fast then needs no relay.  options: those of
+    `tuning.fast.procedure.FastOptions`, or of `tuning.five_stage.procedure.Options`.
+    A spec that cannot be used gives outcome "refused", reason "bad_input".
+    """
+    results: dict[str, object] = {}
+
+    def listen(event: Event) -> None:
+        if isinstance(event, StageDone):
+            results[event.stage] = event.result
+        if on_event:
+            on_event(event)
+
+    try:
+        file = _complete(PlantFile.model_validate(spec))
+        loop, facts = _loop(file)
+        outcome: RunResult[Proposal] | RunResult[FastProposal]
+        watch = _watch(facts, _reach(file))
+        hear = on_samples or (lambda samples: None)
+        if method == FAST:
+            wishes = FastOptions(**options)
+            plan = fast(facts, wishes) if model is None else trial(facts, wishes, model)
+            outcome = run(plan, loop, watch=watch, on_event=listen, on_samples=hear)
+        else:
+            entered = Options(method=method, model=_entered(model), **options)
+            outcome = run(five_stage(facts, entered), loop, watch=watch, on_event=listen, on_samples=hear)
+    except ValidationError as error:
+        lines = "; ".join(map(_line, error.errors()))
+        return _answer(None, RunResult(ended=Refused(Reason.BAD_INPUT, lines)), results)
+    except Ended as ended:
+        return _answer(None, RunResult(ended=ended), results)
+    return _answer(file, outcome, results, anyway=bool(options.get("propose_anyway")))
+
+
+def _line(error: Any) -> str:
+    where = ".".join(map(str, error["loc"]))
+    words = str(error["msg"]).removeprefix("Value error, ")
+    return f"{where}: {words}" if where else words
+
+
+def _entered(model: Model | None) -> FOPDT | SOPDT | None:
+    if model is not None and not isinstance(model, FOPDT | SOPDT):
+        raise Refused(Reason.BAD_INPUT, "five-stage takes a model of the form K, T, L, perhaps with zeta")
+    return model
+
+
+def _loop(file: PlantFile) -> tuple[RehearsedLoop, Facts]:
+    ts, t95, step, gains = file.sample_time_s, file.t95_s, file.sp_deviation, file.gains
+    assert ts and t95 and step and gains
+    low, high = file.mv_limits
+    plant = LinearPlant(
+        file.num, file.den, file.dead_time_s, ts, noise_std=file.noise_std, seed=file.seed, mv_low=low, mv_high=high
+    )
+    positive = (file.num[-1] or file.num[0]) / (file.den[-1] or file.den[0]) > 0
+    reverse = positive if file.reverse_acting is None else file.reverse_acting
+    span = 1e9
+    settings = Settings(mv_low=low, mv_high=high, safe_output=0.0, pv_low=-span, pv_high=span, reverse=reverse)
+    present = Gains(**gains.model_dump())
+    channel = Channel(ts, settings, _parameters(present), 0.0, int(Mode.AUTOMATIC), 0.0)
+    facts = Facts(ts, t95, low, high, step, present, reverse)
+    return RehearsedLoop(plant, channel, ts), facts
+
+
+def _watch(facts: Facts, reach: float) -> Watch:
+    """Wide PV limits: an unstable plant must end, but the test takes PV to several steps on purpose."""
+    far = max(100 * facts.sp_deviation, 10 * reach)
+    low, high = facts.mv_low, facts.mv_high
+    return Watch(-far, far, low, high, max_time_s=500 * facts.T95_s, max_frozen_s=3 * facts.T95_s)
+
+
+def _reach(file: PlantFile) -> float:
+    """How far PV goes when MV stays at a limit (0 for an integrating plant), PV units."""
+    return abs(file.num[-1] / file.den[-1]) * max(map(abs, file.mv_limits)) if file.den[-1] else 0.0
+
+
+def _answer(
+    file: PlantFile | None,
+    outcome: RunResult[Proposal] | RunResult[FastProposal],
+    results: dict[str, object],
+    anyway: bool = False,
+) -> dict[str, Any]:
+    """The JSON object; what is not known is null. anyway: a proposal is made also where there is no gain."""
+    proposal, ended = outcome.value, outcome.ended
+    if proposal is not None and not proposal.comparison.gain and not anyway:
+        ended = NoGain(Reason.NO_GAIN, proposal.comparison.verdict)
+    stages = dict.fromkeys((*STAGES, *FAST_STAGES))
+    times = {stage: outcome.plant_time_s[stage] for stage in stages if stage in outcome.plant_time_s}
+    answer: dict[str, Any] = {
+        "name": file.name if file else None,
+        "method": proposal.method if proposal else None,
+        "chosen": dict(proposal.chosen) if proposal else None,
+        "outcome": _outcome(ended),
+        "reason": ended.reason.value if ended else None,
+        "detail": ended.detail if ended else None,
+        "advice": ended.advice if ended else None,
+        "ultimate": None,
+        "model": None,
+        "gains": None,
+        "predicted": None,
+        "comparison": None,
+        "measured": None,
+        "plant_time_s": {**times, "total": sum(times.values())},
+        "stages": results,
+        "input": file.model_dump() if file else None,
+        "form": "ISA: u = Kp*(e + integral(e)/Ti + Td*de/dt); Kp in MV per PV unit, times in s",
+    }
+    ultimate = results.get("ultimate") or (proposal and proposal.ultimate)
+    if ultimate is not None:
+        answer["ultimate"] = {"Ku": ultimate.Ku, "Pu": ultimate.Pu_s}  # type: ignore[attr-defined]
+    if proposal:
+        answer["model"] = _model(proposal)
+        gains = proposal.gains
+        answer["gains"] = {"Kp": gains.Kp, "Ti": gains.Ti, "Td": gains.Td, "Tf": gains.Tf}
+        answer["predicted"] = asdict(proposal.predicted)
+        answer["comparison"] = asdict(proposal.comparison)
+        baseline = proposal.baseline if isinstance(proposal, Proposal) else None
+        answer["measured"] = {"before": baseline, "after": proposal.verification}
+        if isinstance(proposal, FastProposal):
+            answer |= {name: getattr(proposal, name) for name in ("predicted_before", "found", "verified")}
+        answer["notes"] = list(proposal.notes)
+    clean: dict[str, Any] = plain(answer)
+    return clean
+
+
+def _outcome(ended: Ended | None) -> str:
+    if ended is None:
+        return "proposed"
+    return "no_gain" if isinstance(ended, NoGain) else "failed" if isinstance(ended, Failed) else "refused"
+
+
+def _model(proposal: Proposal | FastProposal) -> object:
+    """What the gains were made on."""
+    if isinstance(proposal, FastProposal):
+        return proposal.model
+    model = proposal.model
+    return {
+        "K": model.K,
+        "T": model.T_s,
+        "L": model.L_s,
+        "k_source": model.k_source,
+        "zeta": model.zeta,
+        "fit_pct": model.fit_pct,
+    }

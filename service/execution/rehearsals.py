@@ -1,0 +1,84 @@
+"""Dry runs in processes of their own: what they report on their way comes to the hooks of the job, in order."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from loopwright.service.config import LoopConfig
+from loopwright.service.execution.computing.limits import Kind
+from loopwright.service.execution.computing.pool import NotWanted, Pool
+from loopwright.service.execution.procedures import Hooks, Outcome, Rehearse
+from loopwright.service.planning.ground import Ground
+from loopwright.service.request import RetuneRequest
+from loopwright.tuning.plan import Event, Sample
+from loopwright.tuning.reasons import Aborted, Reason
+
+SAMPLES_AT_ONCE = 1000
+TOLD_AFTER_S = 0.2
+"""Wall time after which what has come together is reported."""
+
+
+def apart(rehearse: Rehearse, pool: Pool) -> Rehearse:
+    """The same rehearsal, computed by the pool. rehearse: what can be pickled."""
+
+    def rehearse_apart(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:
+        def hear(reports: list[Event | list[Sample]]) -> None:
+            for each in reports:
+                if isinstance(each, list):
+                    hooks.on_samples(each)
+                else:
+                    hooks.on_event(each)
+
+        work = partial(_rehearsed, rehearse, config, request, hooks.ground)
+        try:
+            outcome = pool.run(Kind.DRY_RUN, work, hear=hear, unwanted=lambda: hooks.stop() is not None)
+        except NotWanted:
+            reason = hooks.stop() or Reason.SERVICE_STOPPED
+            return Outcome(None, Aborted(reason, "the dry run was stopped"), None, {})
+        assert isinstance(outcome, Outcome)
+        return outcome
+
+    return rehearse_apart
+
+
+def _rehearsed(
+    rehearse: Rehearse, config: LoopConfig, request: RetuneRequest, ground: Ground, report: Callable[[Any], None]
+) -> Outcome:
+    """In the process of the computation."""
+    reports = _Reports(report)
+    outcome = rehearse(config, request, Hooks(reports.event, reports.samples, lambda: None, ground=ground))
+    if outcome.ended is not None and outcome.ended.reason is Reason.COMPUTATION_LIMIT:
+        raise MemoryError  # the runner has named it; the limit is known to the pool
+    reports.hand_on()
+    return outcome
+
+
+class _Reports:
+    """Gathers what a rehearsal reports, which may come sample by sample, into messages."""
+
+    def __init__(self, report: Callable[[Any], None]) -> None:
+        self._report = report
+        self._gathered: list[Event | list[Sample]] = []
+        self._handed_on_at = 0.0
+
+    def event(self, event: Event) -> None:
+        self._gathered.append(event)
+        self.hand_on()
+
+    def samples(self, samples: list[Sample]) -> None:
+        last = self._gathered[-1] if self._gathered else None
+        if isinstance(last, list):
+            last.extend(samples)
+        else:
+            self._gathered.append(last := list(samples))
+        if len(last) >= SAMPLES_AT_ONCE or time.monotonic() - self._handed_on_at > TOLD_AFTER_S:
+            self.hand_on()
+
+    def hand_on(self) -> None:
+        if self._gathered:
+            self._report(self._gathered)
+            self._gathered = []
+        self._handed_on_at = time.monotonic()

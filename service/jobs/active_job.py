@@ -1,0 +1,98 @@
+"""The live part of an active job: how far it is, what it reports, and whether somebody wants it to stop."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from loopwright.service.jobs.journal import Journal
+from loopwright.service.jobs.progress import Progress
+from loopwright.service.jsonable import plain_object
+from loopwright.service.loops.observed_loop import ObservedLoop
+from loopwright.service.store.store import block_of, event_of
+from loopwright.service.telemetry.metrics import STAGE_SECONDS
+from loopwright.tuning.plan import Event, Note, Sample, StageDone, StageStarted
+from loopwright.tuning.reasons import Reason
+
+_BLOCK_SAMPLES = 4096
+_BLOCK_WALL_S = 1.0
+
+
+class Running:
+    """Other threads read it and may set `stop_reason`.
+
+    before_s: plant time that earlier attempts took, s: the samples of this one are counted on from there.
+    """
+
+    def __init__(
+        self,
+        job_id: str,
+        tag: str,
+        journal: Journal,
+        before_s: float = 0.0,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.job_id = job_id
+        self.tag = tag
+        self.progress = Progress(before_s)
+        self.loop: ObservedLoop | None = None
+        self.stop_reason: Reason | None = None
+        self.over = threading.Event()
+        """Set when the loop is given up and the end is written."""
+        self.before_s = before_s
+        self._journal = journal
+        self._buffer: list[Sample] = []
+        self._stage = "preflight"
+        self._boundaries: list[tuple[float, str]] = []
+        self._last_t = -math.inf
+        self._monotonic = monotonic
+        self._flushed = monotonic()
+
+    def on_event(self, event: Event) -> None:
+        self.keep_time()
+        if isinstance(event, StageStarted):
+            self.progress.stage_started(event)
+            self._boundaries.append((self._last_t, event.stage))
+            data: dict[str, Any] = {
+                "stage": event.stage, "expected_s": event.expected_s, "remaining_s": event.remaining_s,
+            }  # fmt: skip
+            self.tell("stage_started", data, stage=event.stage)
+        elif isinstance(event, StageDone):
+            self.flush()  # what is done never runs again: its samples are stored before that is
+            if self.loop is not None:  # a rehearsal has no plant whose time it takes
+                STAGE_SECONDS.labels(event.stage).observe(self.progress.stage_time_s)
+            took = {"stage_time_s": self.progress.stage_time_s}
+            self.tell("stage_done", {"stage": event.stage, "result": plain_object(event.result), **took})
+        elif isinstance(event, Note):
+            self.tell("note", {"stage": self.progress.stage, "text": event.text})
+
+    def on_samples(self, samples: list[Sample]) -> None:
+        """Samples come in the runner's blocks, which do not end where a stage does: split by the stages' times."""
+        self.keep_time()
+        for sample in samples:
+            while self._boundaries and sample.t > self._boundaries[0][0]:
+                self.flush()
+                self._stage = self._boundaries.pop(0)[1]
+            self._buffer.append(sample._replace(t=sample.t + self.before_s) if self.before_s else sample)
+        if len(self._buffer) >= _BLOCK_SAMPLES or self._monotonic() - self._flushed > _BLOCK_WALL_S:
+            self.flush()
+
+    def flush(self) -> None:
+        """Hands the gathered samples on as one block of their stage."""
+        if self._buffer:
+            self._journal.put(block_of(self.job_id, self._stage, self._buffer))
+            self._buffer = []
+        self._flushed = self._monotonic()
+
+    def keep_time(self) -> None:
+        """Brings the progress up to the latest sample."""
+        t = self.loop.t_s if self.loop else None
+        if t is not None:
+            self._last_t = t
+            self.progress.at(t)
+
+    def tell(self, kind: str, data: dict[str, Any], **columns: Any) -> None:
+        self._journal.put(event_of(self.job_id, kind, data, self.progress.plant_time_s, **columns))

@@ -1,0 +1,168 @@
+"""Loops looked after: what a job could not bring home is looked at again, until it is home or a person answers for it.
+
+A thread of its own: a loop whose node is away takes seconds to say so, and aborts must be heard meanwhile.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from loopwright.service.config import LoopConfig
+from loopwright.service.loop_state import state_json
+from loopwright.service.loops.loop import Loop
+from loopwright.service.loops.restoration import Safe, look
+from loopwright.service.machine import Machine
+from loopwright.service.store import looked_after
+from loopwright.service.store.store import Store
+from loopwright.service.store.tables import JobRow
+from loopwright.service.telemetry.logs import about
+from loopwright.tuning.reasons import ADVICE, Reason
+
+log = logging.getLogger(__name__)
+
+EVERY_S = 2.0
+LONGEST_S = 30.0
+"""Between two looks at a loop that stays away: twice as long each time, up to this."""
+_AT_ONCE = 8
+_STOP_S = 10.0
+_UNREACHED = (Reason.NODE_LOST, Reason.BUS_LOST, Reason.NODE_NOT_OPERATIONAL)
+
+
+@dataclass(frozen=True)
+class NotHome:
+    """A loop that is not confirmed home: since which job, and why, as last looked."""
+
+    loop: str
+    job_id: str
+    reason: Reason | None
+    detail: str
+
+    @property
+    def words(self) -> str:
+        """What is the matter, and what to do."""
+        if self.reason in _UNREACHED:
+            advice = ADVICE[self.reason]
+        else:
+            advice = "Look at the controller; it is looked at again by itself."
+        return (
+            f"not confirmed home after job {self.job_id}: {self.detail.removeprefix('not confirmed: ')}. {advice} "
+            f"If it is as it should be: loopwright dismiss {self.loop}"
+        )
+
+
+@dataclass
+class _Again:
+    """When a job's loop is looked at again, and what was found last."""
+
+    at: float
+    wait_s: float
+    found: Safe
+
+
+class Aftercare:
+    """Looks after the loops of one host.
+
+    hands: by loop, who is about to begin a job on it or to decide one; taken for each look.
+    machine: its clock and threads.
+    """
+
+    def __init__(
+        self,
+        loops: Mapping[str, LoopConfig],
+        store: Store,
+        open_loop: Callable[[LoopConfig], Loop],
+        hands: Mapping[str, AbstractContextManager[Any]],
+        machine: Machine | None = None,
+    ) -> None:
+        self._loops, self._store, self._open_loop, self._hands = loops, store, open_loop, hands
+        self._machine = machine or Machine()
+        self._clock = self._machine.monotonic
+        self._again: dict[str, _Again] = {}
+        # Apart from the event: a signal handler sets it.
+        self._stopping = False
+        self._over = self._machine.event()
+        self._thread = self._machine.thread(self._run, "aftercare")
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def request_stop(self) -> None:
+        """Looks at nothing more; what is not home is looked at after the next start. Returns at once."""
+        self._stopping = True
+
+    def close(self) -> None:
+        """The same, and waits for the look in progress."""
+        self._stopping = True
+        self._over.set()
+        if self._thread.is_alive():
+            self._thread.join(_STOP_S)
+            if self._thread.is_alive():
+                log.error("a loop that is looked after has not answered in %.0f s, the service ends", _STOP_S)
+
+    def not_home(self, loop: str | None = None) -> list[NotHome]:
+        """This host's loops that are looked after, or whether one is, on whatever host; a loop once."""
+        found: dict[str, NotHome] = {}
+        for row in looked_after.rows(self._store, loop):
+            found.setdefault(row.loop, self._not_home(row))
+        return list(found.values())
+
+    def _not_home(self, row: JobRow) -> NotHome:
+        again = self._again.get(row.id)
+        if again is not None:
+            return NotHome(row.loop, row.id, again.found.reason, again.found.text)
+        reason = Reason(row.reason) if row.reason else None
+        return NotHome(row.loop, row.id, reason, row.detail or "it was not read back")
+
+    def look(self) -> None:
+        """Looks at every loop whose time has come."""
+        rows = looked_after.rows(self._store)
+        for gone in self._again.keys() - {row.id for row in rows}:
+            del self._again[gone]
+        now = self._clock()
+        due = [row for row in rows if row.id not in self._again or self._again[row.id].at <= now]
+        if len(due) < 2:
+            for row in due:
+                self._one(row)
+            return
+        self._machine.side_by_side(self._one, due, _AT_ONCE)
+
+    def _one(self, row: JobRow) -> None:
+        with about(job=row.id, loop=row.loop):
+            try:
+                self._look_at(row)
+            except Exception:  # one loop must not keep the others from being looked at
+                log.exception("looking after loop %s", row.loop)
+
+    def _look_at(self, row: JobRow) -> None:
+        with self._hands[row.loop]:
+            # The job that has it answers for it: the row may be older than its beginning.
+            if self._stopping or self._store.active(row.loop) is not None:
+                return
+            found = look(row, self._loops, self._open_loop)
+        if found.state is None:
+            self._not_yet(row, found)
+        elif looked_after.home_again(self._store, row.id, state_json(found.state), found.text):
+            log.info("looked after no more: %s", found.text)
+
+    def _not_yet(self, row: JobRow, found: Safe) -> None:
+        before = self._again.get(row.id)
+        wait_s = EVERY_S if before is None else min(LONGEST_S, 2.0 * before.wait_s)
+        if before is None or before.found.reason is not found.reason:
+            log.warning("%s; it is looked at again", found.text)
+        self._again[row.id] = _Again(self._clock() + wait_s, wait_s, found)
+
+    def _run(self) -> None:
+        while not self._stopping:
+            try:
+                self.look()
+            except SQLAlchemyError as error:
+                log.warning("the database does not say which loops are to be looked after: %s", error)
+            except Exception:
+                log.exception("looking after loops")
+            self._over.wait(EVERY_S)

@@ -1,0 +1,140 @@
+"""DBOS as the engine: one workflow per job, its id that of the job, its one argument too.
+
+It has no steps: a workflow cut off is started anew, and what its stages had found is in our own tables.
+DBOS is one per process.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Collection, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+
+from dbos import DBOS, DBOSConfig, SetWorkflowID
+from sqlalchemy import Engine as Database
+
+from loopwright.service.jobs.engine import WORKFLOW_VERSION
+from loopwright.service.store.damage import Damage
+from loopwright.service.store.database import ENGINE_FILE, checkpoint, sqlite
+from loopwright.service.store.lock import FolderInUse
+
+log = logging.getLogger(__name__)
+
+"""Nothing in it that our own tables would not restore: it may be deleted while the service is stopped."""
+POLL_S = 0.5
+_ALIVE = ("PENDING", "ENQUEUED", "DELAYED")
+_OVER = ("SUCCESS", "ERROR", "CANCELLED", "MAX_RECOVERY_ATTEMPTS_EXCEEDED")
+
+_run: Callable[[str], None] | None = None
+
+
+class _Left(BaseException):
+    """A workflow that is another's by now ends with it. After a result, or an Exception, DBOS would wait in this thread
+    until the other one's is recorded, and so would the end of the process."""
+
+
+@DBOS.workflow(name="job", max_recovery_attempts=None)
+def _job(job_id: str) -> None:
+    if _run is not None:
+        try:
+            _run(job_id)
+        except FolderInUse as error:
+            raise _Left from error
+
+
+class DurableEngine:
+    """database: the PostgreSQL engine shared with the other hosts, or None for a file of its own in the folder.
+
+    poll_s: how often each queue is looked at, s of wall time.
+    """
+
+    def __init__(self, folder: Path, database: Database | None, host: str, poll_s: float = POLL_S) -> None:
+        self._host = host
+        self._poll_s = poll_s
+        self._damage = Damage(folder / ENGINE_FILE if database is None else None)
+        if self._damage.look() is not None:
+            _set_aside(folder)
+            self._damage = Damage(folder / ENGINE_FILE)
+        self._own = sqlite(folder / ENGINE_FILE) if database is None else None
+        if self._own is not None:
+            self._damage.watch(self._own)
+        self.database = self._own if database is None else database
+        self._queues: frozenset[str] = frozenset()
+        self._launched = False
+
+    def launch(self, run: Callable[[str], None], queues: Mapping[str, int]) -> None:
+        global _run
+        _run = run
+        # Said here, so that no variable of the environment sends anything anywhere.
+        for name in ("DBOS__CLOUD", "DBOS__APPVERSION", "DBOS__VMID"):
+            os.environ.pop(name, None)
+        config: DBOSConfig = {
+            "name": "loopwright",
+            "system_database_engine": self.database,
+            "application_version": WORKFLOW_VERSION,
+            "executor_id": self._host,
+            "log_level": "WARNING",
+            "enable_otlp": False,
+            "use_listen_notify": False,
+            "notification_listener_polling_interval_sec": self._poll_s,
+        }
+        DBOS(config=config)
+        logging.getLogger("dbos").setLevel(logging.WARNING)
+        DBOS.listen_queues(list(queues))
+        DBOS.launch()
+        for name, at_once in queues.items():
+            DBOS.register_queue(
+                name, worker_concurrency=at_once, polling_interval_sec=self._poll_s, on_conflict="always_update"
+            )
+        self._queues = frozenset(queues)
+        self._launched = True
+
+    def enqueue(self, job_id: str, queue: str) -> None:
+        with SetWorkflowID(job_id):
+            DBOS.enqueue_workflow(queue, _job, job_id)
+
+    def known(self, job_ids: Collection[str]) -> set[str]:
+        if not job_ids:
+            return set()
+        found = DBOS.list_workflows(
+            workflow_ids=list(job_ids), status=list(_ALIVE), load_input=False, load_output=False
+        )
+        return {one.workflow_id for one in found if one.queue_name in self._queues}
+
+    def over(self, most: int) -> list[str]:
+        # A file has one host, whatever it was called before.
+        host = None if self._own is not None else self._host
+        found = DBOS.list_workflows(
+            status=list(_OVER), executor_id=host, limit=most, load_input=False, load_output=False
+        )
+        return [one.workflow_id for one in found]
+
+    def forget(self, job_ids: Collection[str]) -> None:
+        if job_ids:
+            DBOS.delete_workflows(list(job_ids))
+
+    def alive(self) -> bool:
+        return self._launched and self._damage.words is None
+
+    def close(self) -> None:
+        global _run
+        if self._launched:
+            self._launched = False
+            DBOS.destroy()
+            if self._own is not None:
+                checkpoint(self._own)
+        _run = None
+        self._damage.close()
+        if self._own is not None:
+            self._own.dispose()
+
+
+def _set_aside(folder: Path) -> None:
+    """The start finds the jobs that are not over in our own tables, and makes the file anew."""
+    aside = folder / f"damaged-{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}"
+    aside.mkdir(mode=0o700)
+    for path in folder.glob(f"{ENGINE_FILE}*"):
+        path.rename(aside / path.name)
+    log.warning("%s was damaged and is made anew: nothing is lost; the old one is in %s", folder / ENGINE_FILE, aside)

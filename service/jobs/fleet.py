@@ -1,0 +1,269 @@
+"""Retunes of many loops: begins their jobs, so many at once per bus and per area, and stops when too many fail.
+
+What is asked and what has become of it is in the store: a service that is started again goes on where it was.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+import threading
+from collections import Counter
+from collections.abc import Collection, Sequence
+from fnmatch import fnmatchcase
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+from sqlalchemy.exc import SQLAlchemyError
+
+from loopwright.service.config import BusConfig, LoopConfig
+from loopwright.service.errors import Locked, Stopping, UnknownLoop
+from loopwright.service.job_states import IllegalMove
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.request import BadLimits, RetuneRequest, within
+from loopwright.service.store import retunes
+from loopwright.service.store.retunes import Part, RetuneOver, StopReason
+from loopwright.service.store.store import Busy, FolderInUse
+from loopwright.service.store.tables import RetuneRow
+from loopwright.tuning.reasons import Reason
+
+log = logging.getLogger(__name__)
+
+LOOK_S = 0.5
+"""Wall time between two looks at what runs."""
+_OWN = ("loops", "pattern", "at_once_per_bus", "at_once_per_area", "stop_after_failures")
+AtOnce = Annotated[int, Field(ge=1, le=1000)]
+
+
+class FleetRequest(RetuneRequest):
+    """Which loops, how many of them at once, and the options of the retune of each."""
+
+    loops: list[Annotated[str, Field(max_length=64)]] | None = Field(
+        default=None, min_length=1, max_length=10_000, description="Tags, in the order in which they are to be begun",
+        examples=[["TIC-101", "TIC-102"]],
+    )  # fmt: skip
+    pattern: str | None = Field(
+        default=None, min_length=1, max_length=200, examples=["TIC-*"],
+        description="Every loop whose tag is so, by tag: * stands for anything, ? for one character; instead of loops",
+    )  # fmt: skip
+    at_once_per_bus: AtOnce | None = Field(
+        default=None,
+        description="Most loops of one bus under test at once; at most, and by default, what the bus allows",
+    )
+    at_once_per_area: AtOnce | None = Field(
+        default=None, description="Most loops of one area under test at once; loops without an area do not count"
+    )
+    stop_after_failures: AtOnce | None = Field(
+        default=None,
+        description="Begin no more loops once so many ended without a proposal; those under test go on. "
+        "What an operator aborts does not count, and no_gain is a good end",
+    )
+
+    @model_validator(mode="after")
+    def _which(self) -> Self:
+        if (self.loops is None) == (self.pattern is None):
+            raise ValueError("either loops or pattern must be given, and not both")
+        return self
+
+    def options(self) -> RetuneRequest:
+        """What is asked of each loop."""
+        return RetuneRequest.model_validate(self.model_dump(exclude=set(_OWN), exclude_none=True))
+
+
+class BadFleet(ValueError):
+    """What is asked cannot be begun on all of its loops; the text names them."""
+
+
+class Fleet:
+    """Drives the retunes that were asked of this host."""
+
+    def __init__(self, jobs: Jobs) -> None:
+        self._jobs = jobs
+        self._store = jobs.store
+        self._wake = threading.Event()
+        self._over = threading.Event()
+        self._looking = threading.Lock()
+        self._thread = threading.Thread(target=self._run, name="fleet", daemon=True)
+
+    # life
+    def boot(self) -> None:
+        """Goes on with what a service before has left, in a thread, unless jobs are not to be resumed."""
+        if not self._jobs.resumes:
+            self._end_all("the service was started with --no-resume")
+        self._thread.start()
+
+    def close(self) -> None:
+        """Begins no more; what is not begun waits for the next start."""
+        self._over.set()
+        self._wake.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _end_all(self, why: str) -> None:
+        with self._store.writing() as session:
+            for row in retunes.unfinished(session, self._store.host):
+                retunes.stop(session, row.id, StopReason.SERVICE_STOPPED, why)
+
+    def _run(self) -> None:
+        while not self._over.is_set():
+            try:
+                self.look()
+            except FolderInUse as error:
+                log.error("retunes of many loops are another's to drive: %s", error)
+                return
+            except SQLAlchemyError as error:
+                log.warning("retunes of many loops wait for the database: %s", error)
+            except Exception:
+                log.exception("a defect in a retune of many loops")
+            self._wake.wait(LOOK_S)
+            self._wake.clear()
+
+    # wishes
+    def start(self, request: FleetRequest) -> RetuneRow:
+        """Begins it. Raises BadFleet when one of the loops is unknown or does not permit what is asked, Stopping."""
+        if self._jobs.stopping:
+            raise Stopping(self._jobs.why_stopping)
+        known = self._known()
+        tags, options, wrong = _tags(request, known), request.options(), []
+        for tag in tags:
+            try:
+                if tag not in known:
+                    raise UnknownLoop(tag)
+                within(known[tag][0], options)
+            except (BadLimits, UnknownLoop) as error:
+                wrong.append(str(error) if tag not in known else f"{tag}: {error}")
+        if wrong:
+            raise BadFleet("; ".join(wrong))
+        asked = {name: value for name, value in request.asked().items() if name != "loops"}
+        with self._store.writing() as session:
+            row = retunes.add(session, self._store.host, asked, tags, request.requested_by)
+        self._wake.set()
+        return row
+
+    def asked(self, request: FleetRequest) -> list[LoopConfig]:
+        """The loops that it would begin, in their order. Raises BadFleet when one of them is unknown."""
+        known = self._known()
+        tags = _tags(request, known)
+        wrong = [str(UnknownLoop(tag)) for tag in tags if tag not in known]
+        if wrong:
+            raise BadFleet("; ".join(wrong))
+        return [known[tag][0] for tag in tags]
+
+    def abort(self, retune_id: str, by: str) -> RetuneRow:
+        """Begins no more, and asks the jobs that run to stop. Raises NoSuchRetune, RetuneOver."""
+        with self._store.writing() as session:
+            retunes.stop(session, retune_id, StopReason.OPERATOR, f"aborted by {by}", by)
+        row, parts = self.get(retune_id)
+        self._abort(row, parts)
+        self._wake.set()
+        return row
+
+    # what there is
+    def get(self, retune_id: str) -> tuple[RetuneRow, list[Part]]:
+        """Raises NoSuchRetune."""
+        with self._store.reading() as session:
+            return retunes.find(session, retune_id), retunes.parts(session, retune_id)
+
+    def recent(self, limit: int, before: int | None = None) -> list[tuple[RetuneRow, list[Part]]]:
+        with self._store.reading() as session:
+            return [(row, retunes.parts(session, row.id)) for row in retunes.recent(session, limit, before)]
+
+    # the work
+    def look(self) -> None:
+        """One look at every retune of this host: begins what may begin, and ends what is over."""
+        with self._looking:
+            with self._store.reading() as session:
+                rows = retunes.unfinished(session, self._store.host)
+            for row in rows:
+                self._one(*self.get(row.id))
+
+    def _one(self, row: RetuneRow, parts: list[Part]) -> None:
+        request = FleetRequest.model_validate(row.request | {"loops": [part.loop for part in parts]} | _NO_PATTERN)
+        failures = sum(part.failed for part in parts)
+        if row.stop_reason is None and request.stop_after_failures and failures >= request.stop_after_failures:
+            named = ", ".join(part.loop for part in parts if part.failed)
+            with self._store.writing() as session:
+                retunes.stop(session, row.id, StopReason.FAILURES, f"{failures} ended without a proposal: {named}")
+        elif row.stop_reason is None:
+            self._begin(row, request, parts)
+        elif row.stop_reason == StopReason.OPERATOR:
+            self._abort(row, parts)
+        row, parts = self.get(row.id)
+        waits = row.stop_reason is None and any(part.waiting for part in parts)
+        if not waits and not any(part.active for part in parts):
+            with self._store.writing() as session:
+                retunes.end(session, row.id)
+
+    def _begin(self, row: RetuneRow, request: FleetRequest, parts: Sequence[Part]) -> None:
+        """Begins the loops that wait, in order, as far as bus and area have room for more under test, by whomever."""
+        known, options = self._known(), request.options()
+        under_test = {part.loop for part in parts if part.active}
+        if not request.dry_run:
+            under_test |= self._store.busy().keys()
+        taken = Counter(place for tag in under_test if tag in known for place in _places(*known[tag]))
+        for part in parts:
+            if not part.waiting or part.loop in under_test:
+                continue
+            if part.loop not in known:
+                self._give_up(row, part, str(UnknownLoop(part.loop)))
+                continue
+            places = _places(*known[part.loop])
+            if any(taken[place] >= self._most(place, request) for place in places):
+                continue
+            try:
+                self._jobs.start(part.loop, options, retunes.begins(row.id, part.position))
+            except Busy:
+                continue  # somebody was faster
+            except (BadLimits, UnknownLoop) as error:
+                self._give_up(row, part, str(error))
+                continue
+            except Locked as error:
+                self._give_up(row, part, error.detail, error.reason)
+                continue
+            except (Stopping, RetuneOver):
+                return
+            taken.update(places)
+
+    def _give_up(self, row: RetuneRow, part: Part, detail: str, reason: Reason | None = None) -> None:
+        with self._store.writing() as session:
+            retunes.give_up(session, row.id, part.position, detail, reason)
+
+    def _abort(self, row: RetuneRow, parts: Sequence[Part]) -> None:
+        active = [part.job_id for part in parts if part.active and part.job_id is not None]
+        for job_id in active:  # all of them, before the first is written down
+            self._jobs.tell_to_stop(job_id)
+        for job_id in active:
+            try:
+                self._jobs.abort(job_id, f"retune {row.id}")
+            except IllegalMove:
+                continue  # it has just ended
+
+    def _known(self) -> dict[str, tuple[LoopConfig, str]]:
+        return {config.tag: (config, host) for config, host in self._jobs.everywhere()}
+
+    def _most(self, place: tuple[str, ...], request: FleetRequest) -> int:
+        if place[0] == _AREA:
+            return request.at_once_per_area or sys.maxsize
+        _, host, bus = place
+        allows = self._jobs.at_once(bus) if host == self._store.host else BusConfig().at_once
+        return min(allows, request.at_once_per_bus or allows)
+
+
+def _tags(request: FleetRequest, known: Collection[str]) -> list[str]:
+    """Raises BadFleet where no loop is like the pattern."""
+    if request.pattern is None:
+        return list(dict.fromkeys(request.loops or ()))
+    tags = sorted(tag for tag in known if fnmatchcase(tag, request.pattern))
+    if not tags:
+        raise BadFleet(f"no loop has a tag like {request.pattern!r}")
+    return tags
+
+
+_NO_PATTERN = {"pattern": None}
+_AREA, _BUS = "area", "bus"
+
+
+def _places(config: LoopConfig, host: str) -> list[tuple[str, ...]]:
+    """Where room is limited: the loop's bus and, if it has one, its area. An area may span hosts."""
+    bus: tuple[str, ...] = (_BUS, host, config.bus)
+    return [bus] if config.area is None else [bus, (_AREA, config.area)]

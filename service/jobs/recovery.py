@@ -1,0 +1,95 @@
+"""A job that a dead service left: its loop made safe, and whether the job may go on."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from loopwright.service.config import LoopConfig
+from loopwright.service.errors import Locked
+from loopwright.service.job_states import JobState
+from loopwright.service.jobs.engine import WORKFLOW_VERSION
+from loopwright.service.loop_state import state_json
+from loopwright.service.loops.loop import Loop
+from loopwright.service.loops.restoration import Safe, look
+from loopwright.service.request import RetuneRequest, within
+from loopwright.service.store import loop_locks
+from loopwright.service.store.store import Store
+from loopwright.service.store.tables import JobRow
+from loopwright.tuning.reasons import Reason
+
+log = logging.getLogger(__name__)
+
+MOST_ATTEMPTS = 10
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """resumes: whether such jobs go on.  stopping: whether this service is to end before it has begun: what it has not
+    looked at yet is left to the next start."""
+
+    loops: Mapping[str, LoopConfig]
+    store: Store
+    open_loop: Callable[[LoopConfig], Loop]
+    resumes: bool
+    stopping: Callable[[], bool] = lambda: False
+
+    def recover(self, row: JobRow) -> None:
+        """Makes the loop of the job safe, and ends the job if it is not to go on."""
+        if self.stopping():
+            return
+        safe: Safe | None = None
+        # A job of the code before has no session, and may have touched its loop all the same.
+        if row.found is not None and (row.session is not None or row.version != WORKFLOW_VERSION):
+            safe = look(row, self.loops, self.open_loop)
+            self.store.append(row.id, "loop_found", {"text": safe.text}, row.plant_time_s)
+        restored: dict[str, Any] = {}
+        if safe is not None and safe.state is not None:
+            restored = {"restored": state_json(safe.state)}
+        elif safe is not None:
+            restored = {"look_after": True}
+        if row.stop_reason is not None:
+            detail = "asked to stop before the service ended; " + _loop_words(safe)
+            self.store.move(row.id, JobState.ABORTED, reason=row.stop_reason, detail=detail, **restored)
+            return
+        why = self._why_not(row, safe)
+        if why is not None:
+            reason, text = why
+            detail = f"cut off by the end of the service, and not resumed: {text}; {_loop_words(safe)}"
+            self.store.move(row.id, JobState.INTERRUPTED, reason=reason.value, detail=detail, **restored)
+
+    def _why_not(self, row: JobRow, safe: Safe | None) -> tuple[Reason, str] | None:
+        """Why a job is not to be resumed, if so."""
+        config = self.loops.get(row.loop)
+        if row.version != WORKFLOW_VERSION:
+            return Reason.SERVICE_STOPPED, "it was begun by another version of Loopwright"
+        if config is None:
+            return Reason.SERVICE_STOPPED, "its loop is no longer configured here"
+        if not self.resumes:
+            return Reason.SERVICE_STOPPED, "the service was started with --no-resume"
+        if row.found is not None and (locked := self._locked(row.loop)) is not None:
+            return Reason.LOCKED, locked
+        if safe is not None and safe.reason is not None:
+            return safe.reason, "the loop is not as the job had found it" if safe.state else "the loop is not reached"
+        if row.attempt >= MOST_ATTEMPTS:
+            return Reason.SERVICE_STOPPED, f"that was attempt {row.attempt} of at most {MOST_ATTEMPTS}"
+        try:
+            within(config, RetuneRequest.model_validate(row.request))
+        except ValueError as error:  # BadLimits too
+            return Reason.BAD_LIMITS, f"the loop's configuration has changed: {error}"
+        return None
+
+    def _locked(self, loop: str) -> str | None:
+        """Who has locked the loop, in words. A job that has not begun yet is refused at its turn."""
+        try:
+            with self.store.reading() as session:
+                loop_locks.check(session, loop)
+        except Locked as locked:
+            return locked.detail
+        return None
+
+
+def _loop_words(safe: Safe | None) -> str:
+    return "the loop had not been touched" if safe is None else f"the loop: {safe.text}"

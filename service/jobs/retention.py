@@ -1,0 +1,186 @@
+"""What need not be kept is deleted, at the start of the service and once an hour: the samples of old jobs, as it is
+told, and what the engine still knows of jobs that are over, always.
+
+Jobs, their events and results stay. Which samples are deleted is in the audit log, and each job has an event of it.
+A clock that has jumped deletes nothing: service/store/clock_watch.py.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+from sqlalchemy import ColumnElement, delete, func, select
+from sqlalchemy.exc import SQLAlchemyError
+
+from loopwright.service.job_states import ACTIVE, JobState
+from loopwright.service.jobs.engine import Engine
+from loopwright.service.store import audit, hosts
+from loopwright.service.store.clock import stamp
+from loopwright.service.store.clock_watch import ClockWatch, longest_stop
+from loopwright.service.store.store import FolderInUse, Store, append
+from loopwright.service.store.tables import ChunkRow, JobRow
+from loopwright.service.telemetry.metrics import CLOCK_JUMPS
+
+log = logging.getLogger(__name__)
+
+EVERY_S = 3600.0
+LOOK_S = 60.0
+"""Wall time between two looks at the clock."""
+_AT_ONCE = 50
+_FORGOTTEN_AT_ONCE = 500
+_STOP_S = 5.0
+_KEPT = [state.value for state in (*ACTIVE, JobState.PROPOSED)]
+
+
+@dataclass(frozen=True)
+class Keep:
+    """Which jobs keep their samples: the newest `jobs` of each loop, and those that ended in the last `days`; None:
+    that is no reason. Where both are None, all. Active and proposed jobs always do."""
+
+    jobs: int | None = None
+    days: float | None = None
+
+    def __bool__(self) -> bool:
+        return self.jobs is not None or self.days is not None
+
+
+def tidy(store: Store, keep: Keep, at: datetime | None = None, ages_from: datetime | None = None) -> int:
+    """Deletes what need not be kept of this host's jobs. Returns of how many jobs. at: the present.  ages_from: nothing
+    counts as older than this."""
+    at = at or datetime.now(UTC)
+    if keep.days is not None and ages_from is not None and ages_from > at - timedelta(days=keep.days):
+        return 0  # each job has a reason to be kept: as far as was seen, it is not old enough
+    count = 0
+    while keep and (jobs := _some(store, keep, at)):
+        count += len(jobs)
+    return count
+
+
+def forget(store: Store, engine: Engine) -> int:
+    """Has the engine forget the jobs that are over: our own tables have all of them. Returns how many."""
+    count = 0
+    while ids := engine.over(_FORGOTTEN_AT_ONCE):
+        # What it takes for over while we do not is given to it anew (Jobs.reconcile), under the same id.
+        active = store.active_among(ids)
+        over = [job_id for job_id in ids if job_id not in active]
+        if not over:
+            break
+        engine.forget(over)
+        count += len(over)
+    if count:
+        log.info("the engine has forgotten %d jobs that are over", count)
+    return count
+
+
+def _some(store: Store, keep: Keep, at: datetime) -> list[JobRow]:
+    """The first few: a transaction is short, others want to write, too."""
+    with store.writing() as session:
+        old = select(JobRow).where(*_old(store.host, keep, at)).order_by(JobRow.number).limit(_AT_ONCE)
+        rows = list(session.scalars(old))
+        ids = [row.id for row in rows]
+        if rows:
+            of_them = ChunkRow.job_id.in_(ids)
+            samples = session.scalar(select(func.sum(ChunkRow.count)).where(of_them))
+            session.execute(delete(ChunkRow).where(of_them))
+            for row in rows:
+                append(session, row.id, "samples_deleted", {"text": _why(keep)}, row.plant_time_s)
+            before = {"jobs": ids, "samples": samples}
+            audit.record(session, "samples_delete", "retention", before=before, after={"kept": _why(keep)})
+    if ids:
+        log.info("samples of %d old jobs deleted: %s", len(ids), ", ".join(ids))
+    return rows
+
+
+def _old(host: str, keep: Keep, at: datetime) -> list[ColumnElement[bool]]:
+    with_samples = select(ChunkRow.job_id).where(ChunkRow.job_id == JobRow.id).exists()
+    found = [JobRow.host == host, JobRow.state.not_in(_KEPT), with_samples]
+    if keep.jobs is not None:
+        # Rehearsals are counted apart: they must not push the experiments out.
+        of_loop = (JobRow.loop, JobRow.dry_run)
+        number = func.row_number().over(partition_by=of_loop, order_by=JobRow.number.desc())
+        rank = select(JobRow.id, number).subquery()
+        found.append(JobRow.id.in_(select(rank.c[0]).where(rank.c[1] > keep.jobs)))
+    if keep.days is not None:
+        found.append(JobRow.ended_at < stamp(at - timedelta(days=keep.days)))
+    return found
+
+
+def _why(keep: Keep) -> str:
+    parts = [] if keep.jobs is None else [f"of the newest {keep.jobs} jobs of each loop"]
+    parts += [] if keep.days is None else [f"of the last {keep.days:g} days"]
+    return "samples are kept " + " and ".join(parts)
+
+
+class Retention:
+    """Tidies now and then, in a thread, by a clock that it looks at more often."""
+
+    def __init__(
+        self,
+        store: Store,
+        engine: Engine,
+        keep: Keep,
+        every_s: float = EVERY_S,
+        look_s: float = LOOK_S,
+        watch: ClockWatch | None = None,
+    ) -> None:
+        self._store, self._engine, self._keep, self._every_s, self._look_s = store, engine, keep, every_s, look_s
+        self._watch = watch or ClockWatch()
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="retention", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def close(self) -> None:
+        self._over.set()
+        if self._thread.is_alive():
+            self._thread.join(_STOP_S)  # the engine waits for a database that is away
+
+    def note(self) -> str | None:
+        """Why no samples are deleted for their age at present; None: nothing keeps them."""
+        seen, days = self._watch.seen, self._keep.days
+        if seen is None or seen.ages_from is None or days is None:
+            return None
+        until = seen.ages_from + timedelta(days=days)
+        if until <= seen.at:
+            return None
+        return (
+            f"the wall clock has jumped, the ages of samples count from {stamp(seen.ages_from)}: "
+            f"none are deleted for their age before {stamp(until)}"
+        )
+
+    def look(self) -> None:
+        """Looks at the clock, and writes down what it says."""
+        before = None if self._watch.seen is not None else hosts.last_seen(self._store)
+        jump = self._watch.look(before, longest_stop(self._keep.days))
+        if jump is not None:
+            CLOCK_JUMPS.inc()
+            log.warning("%s", jump.text)
+        if self._watch.seen is not None:
+            hosts.keep_seen(self._store, self._watch.seen, jump)
+
+    def _run(self) -> None:
+        tidied: float | None = None
+        while not self._over.is_set():
+            try:
+                self.look()
+                if tidied is None or time.monotonic() - tidied >= self._every_s:
+                    self._tidy()
+                    tidied = time.monotonic()
+            except FolderInUse:  # another service has our name, and looks after what is to be kept
+                return
+            except SQLAlchemyError as error:
+                log.warning("what need not be kept could not be deleted, it will be later: %s", error)
+            except Exception:  # whatever it is, it must be tried again
+                log.exception("what need not be kept could not be deleted")
+            self._over.wait(self._look_s)
+
+    def _tidy(self) -> None:
+        seen = self._watch.seen
+        if seen is not None:
+            tidy(self._store, self._keep, seen.at, seen.ages_from)
+        forget(self._store, self._engine)

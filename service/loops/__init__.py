@@ -1,0 +1,1 @@
+"""A loop as a plan sees it, on the bus or in memory, and how it comes home."""

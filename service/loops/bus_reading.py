@@ -1,0 +1,154 @@
+"""What controller and plant of a loop say of themselves over the bus: who they are, what they control, and home."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from loopwright.protocol.objects import Device, default_of, lookup
+from loopwright.protocol.profile import REVISION, NmtState, OnMissingAnswer
+from loopwright.protocol.session import GAINS
+from loopwright.protocol.tuner import Tuner, TunerError
+from loopwright.service.loop_state import OPERATIONAL, LoopState
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Mode
+from loopwright.tuning.reasons import Failed, Reason, Refused
+
+SILENT = "silent"
+_WHEN_SILENT: dict[int, str] = {
+    OnMissingAnswer.HOLD_OUTPUT: "holds MV where it is",
+    OnMissingAnswer.STOP_RUN: "stops its run, and MV stays",
+    OnMissingAnswer.SAFE_OUTPUT: "goes to the safe output",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class BusReading:
+    """What can be read of one channel. controller, plant: node-IDs; plant None: a plant that offers nothing to ask.
+
+    Every method raises TunerError beside what it names.
+    """
+
+    tuner: Tuner
+    controller: int
+    plant: int | None
+    channel: int
+
+    def identify(self) -> None:
+        """Raises Refused(DEVICE_MISMATCH), Failed(NODE_NOT_OPERATIONAL)."""
+        self.identify_controller()
+        if self.plant is not None:
+            self._identify(self.plant, Device.PLANT)
+
+    def identify_controller(self) -> None:
+        self._identify(self.controller, Device.CONTROLLER)
+
+    def _identify(self, node: int, device: Device) -> None:
+        found = int(self.tuner.number("device_type", node=node))
+        expected = int(default_of(lookup("device_type"), 0, device))
+        if found != expected:
+            text = f"node {node:02X}h is of type {found:08X}h, not a {device.value} ({expected:08X}h)"
+            raise Refused(Reason.DEVICE_MISMATCH, text)
+        revision = int(self.tuner.number("identity", 3, node=node))
+        if revision >> 16 != REVISION >> 16:
+            raise Refused(
+                Reason.DEVICE_MISMATCH,
+                f"{device.value} node {node:02X}h speaks revision {revision >> 16}.{revision & 0xFFFF} of the profile, "
+                f"this service {REVISION >> 16}.{REVISION & 0xFFFF}: bring both to the same version",
+            )
+        self._check_operational(node)
+
+    def compare_times(self) -> None:
+        """A controller that reckons with another sample time than the plant's has other gains than it shows."""
+        if self.plant is None:
+            return
+        ours, theirs = (self.tuner.number("sample_time", node=node) / 1e6 for node in (self.controller, self.plant))
+        if ours != theirs:
+            text = f"controller node {self.controller:02X}h has a sample time of {ours:g} s"
+            raise Refused(Reason.DEVICE_MISMATCH, f"{text}, plant node {self.plant:02X}h one of {theirs:g} s")
+
+    def check_controller_operational(self) -> None:
+        """Raises Failed(NODE_NOT_OPERATIONAL)."""
+        self._check_operational(self.controller)
+
+    def check_plant_operational(self) -> None:
+        """The same of a plant that can be asked."""
+        if self.plant is not None:
+            self._check_operational(self.plant)
+
+    def _check_operational(self, node: int) -> None:
+        state = int(self.tuner.number("node_state", node=node))
+        if state != NmtState.OPERATIONAL:
+            raise not_operational(node, state)
+
+    def state(self) -> LoopState:
+        """The gains are the accepted ones, in or out of a trial: those that it ends with."""
+        number = self.tuner.number
+        plant_state, when_silent = self._plant_state()
+        own = int(number("node_state", node=self.controller))
+        away = [] if own == NmtState.OPERATIONAL else [f"node {self.controller:02X}h is {_state_name(own)}"]
+        if plant_state != OPERATIONAL:
+            away.append(self._plant_is(plant_state))
+        return LoopState(
+            mode=Mode(int(number("controller_mode"))),
+            sp=number("controller_setpoint"),
+            pv=number("controller_received_pv"),
+            mv=number("controller_mv"),
+            gains=self._gains("accepted"),
+            on_trial=bool(number("controller_on_trial")),
+            mv_low=number("controller_mv_low"),
+            mv_high=number("controller_mv_high"),
+            sample_time_s=number("sample_time", node=self.controller) / 1e6,
+            reverse_acting=number("controller_action") == 0,
+            manual_output=number("controller_manual_output"),
+            node_state="; ".join(away) or OPERATIONAL,
+            when_silent=when_silent,
+        )
+
+    def beside_the_test(self) -> LoopState:
+        """The present state, but for what an open session comes back to."""
+        return replace(
+            self.state(),
+            on_trial=False,
+            mode=Mode(int(self.tuner.number("controller_home_mode"))),
+            sp=self.tuner.number("controller_home_setpoint"),
+            manual_output=self.tuner.number("controller_home_manual_output"),
+            mv=self.tuner.number("controller_home_mv"),
+        )
+
+    def home(self) -> LoopState:
+        """The same, with the gains that were the accepted ones at the opening."""
+        return replace(self.beside_the_test(), gains=self._gains("home"))
+
+    def controls(self, state: LoopState) -> bool:
+        """A plant that is away keeps the controller from nothing; one that is there must be operational."""
+        return state.node_state in (OPERATIONAL, self._plant_is(SILENT))
+
+    def _gains(self, which: str) -> Gains:
+        return Gains(*(self.tuner.number(f"controller_{which}_{name}") for name in GAINS))
+
+    def _plant_is(self, state: str) -> str:
+        return f"node {self.plant or 0:02X}h is {state}"
+
+    def _plant_state(self) -> tuple[str, str]:
+        """Its NMT state, and what it does when the controller is silent. A plant that is away keeps nobody from reading
+        the controller."""
+        if self.plant is None:
+            return OPERATIONAL, ""
+        try:
+            state = _state_name(int(self.tuner.number("node_state", node=self.plant)))
+            reaction = int(self.tuner.number("plant_on_missing_answer"))
+            words = _WHEN_SILENT.get(reaction, "")
+            if reaction == OnMissingAnswer.SAFE_OUTPUT:
+                words += f" of {self.tuner.number('plant_safe_output', self.channel):.6g} %"
+            return state, words
+        except TunerError:
+            return SILENT, ""
+
+
+def not_operational(node: int, state: int) -> Failed:
+    text = f"node {node:02X}h is {_state_name(state)}: it controls nothing, MV stays where it is"
+    return Failed(Reason.NODE_NOT_OPERATIONAL, text)
+
+
+def _state_name(state: int) -> str:
+    return NmtState(state).name.lower().replace("_", "-") if state in list(NmtState) else f"in NMT state {state}"

@@ -1,0 +1,69 @@
+"""A loop that a job has left unconfirmed: its session closed, and compared with how the job had found it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from loopwright.service.config import LoopConfig
+from loopwright.service.loop_state import LoopState, loop_state
+from loopwright.service.loops.loop import Loop
+from loopwright.service.store.tables import JobRow
+from loopwright.tuning.reasons import Ended, Reason
+
+log = logging.getLogger(__name__)
+
+_REASONS = {
+    "session": Reason.LOOP_IN_USE,
+    "mode": Reason.MODE_CHANGED,
+    "set-point": Reason.SETPOINT_CHANGED,
+    "output": Reason.OUTPUT_CHANGED,
+    "gains": Reason.GAINS_CHANGED,
+    "trial": Reason.GAINS_CHANGED,
+}
+
+
+@dataclass(frozen=True)
+class Safe:
+    """The loop as read at the end, and what was done and found about it, in words.
+
+    state: None when it could not be read, or is not confirmed to be home.  reason: why a job on it should not go on.
+    """
+
+    state: LoopState | None
+    text: str
+    reason: Reason | None = None
+
+
+def make_safe(loop: Loop, home: LoopState, session: int | None) -> Safe:
+    """Closes the session of the job if it is still open, and reads the loop back. Raises nothing of the loop's.
+
+    session: its number; None where none was opened, and the job has touched nothing.
+    What another's hand has moved since stays so, and is told.
+    """
+    try:
+        restored = loop.restore(home, session or 0)
+    except Ended as ended:
+        return Safe(None, f"not confirmed: {ended.detail}; the controller brings it home by itself", ended.reason)
+    if not restored.changed:
+        return Safe(restored.state, f"{restored.how}: mode, set-point and gains as before the job, read back")
+    reason = next((reason for name, reason in _REASONS.items() if name in restored.changed), Reason.SERVICE_STOPPED)
+    text = f"{restored.how}; not as before the job, left so: {'; '.join(restored.changed.values())}"
+    return Safe(restored.state, text, reason)
+
+
+def look(row: JobRow, loops: Mapping[str, LoopConfig], open_loop: Callable[[LoopConfig], Loop]) -> Safe:
+    """The loop of a job, opened and made safe. Raises nothing: one loop must not keep others from being looked at."""
+    config = loops.get(row.loop)
+    if config is None:
+        return Safe(None, "the loop is no longer configured here", Reason.SERVICE_STOPPED)
+    try:
+        loop = open_loop(config)
+        try:
+            return make_safe(loop, loop_state(row.found or {}), row.session)
+        finally:
+            loop.close()
+    except Exception as error:
+        log.exception("loop %s", row.loop)
+        return Safe(None, f"not reached: {error}; the controller brings it home by itself", Reason.BUS_LOST)

@@ -1,0 +1,1 @@
+"""What needs neither a loop nor a service: models, tunings, recorded tests."""

@@ -1,0 +1,203 @@
+"""A model tuned by one method or by all: the one call behind `loopwright tune` and POST /tunings.
+
+The gains are those a controller can carry out (see `tuning.rules.design.realisable`), and margins and step figures are
+of just these, on the model as given with its exact dead time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from loopwright.service.jsonable import plain
+from loopwright.service.offline.model_json import dump_model
+from loopwright.service.plausible import Implausible, check_option
+from loopwright.tuning.analysis.assessment import Assessment, assess
+from loopwright.tuning.analysis.step_figures import StepFigures
+from loopwright.tuning.gain_forms import to_parallel
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import Model
+from loopwright.tuning.reasons import Ended, Failed, Reason, Refused
+from loopwright.tuning.rules.design import realisable
+from loopwright.tuning.rules.registry import METHODS, Method, Option
+
+ALL = "all"
+FORM = "ISA: u = Kp*(b*SP - PV + integral(SP - PV)/Ti + Td*d/dt(c*SP - PV)/(1 + Tf*s)); Ti = 0: no integral"
+OF_WHAT = (
+    "Margins and figures are of these gains on the model as given, with its exact dead time; an ideal derivative has "
+    "been given a filter first. setpoint: unit step of the set-point; load: unit step at the plant's input."
+)
+UNITS = {
+    "Kp": "MV per PV unit",
+    "Ti, Td, Tf": "s",
+    "Ki": "MV per PV unit and s",
+    "Kd": "MV s per PV unit",
+    "PM_deg": "degrees",
+    "bandwidth_rad_s": "rad/s",
+    "*_s": "s",
+    "IAE, ITAE": "PV units times s, s^2",
+    "ISE, ITSE": "PV units^2 times s, s^2",
+    "MIE, peak, settling_band": "PV units",
+    "MIC, TV, peak_u": "MV units",
+    "effort": "MV units^2 s",
+}
+
+
+class BadTuning(ValueError):
+    """What was asked for cannot be: an unknown method or option, or a value that the option does not take."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tuned:
+    """What one method says of a model: gains and how they do, or the refusal."""
+
+    method: Method
+    gains: Gains | None = None
+    chosen: Mapping[str, float] | None = None
+    notes: tuple[str, ...] = ()
+    assessment: Assessment | None = None
+    refusal: Ended | None = None
+
+
+def tune_model(model: Model, method: str = ALL, options: Mapping[str, object] | None = None) -> list[Tuned]:
+    """By the method named, or by all in the order of the registry; each option goes to the methods that have it.
+
+    Raises BadTuning. A method that refuses the model is in the list with its refusal.
+    """
+    return tune_each(model, list(METHODS) if method == ALL else [method], options)
+
+
+def tune_each(model: Model, names: Sequence[str], options: Mapping[str, object] | None = None) -> list[Tuned]:
+    """By the methods named, in this order; as `tune_model`."""
+    for name in names:
+        if name not in METHODS:
+            raise BadTuning(f"method must be one of {', '.join(METHODS)}, not {name!r}")
+    methods = [METHODS[name] for name in names]
+    asked = options or {}
+    for name, value in asked.items():
+        _check(methods, name, value)
+    return [_tuned(each, model, {k: v for k, v in asked.items() if k in each.options}) for each in methods]
+
+
+def tunings(model: Model, method: str = ALL, options: Mapping[str, object] | None = None) -> dict[str, Any]:
+    """As `tune_model`, as the JSON object of `loopwright tune --json` and POST /tunings; raises BadTuning."""
+    return answer(model, tune_model(model, method, options))
+
+
+def answer(model: Model, found: Iterable[Tuned]) -> dict[str, Any]:
+    """The JSON object; what is not known is null."""
+    return {
+        "model": dump_model(model),
+        "methods": [as_json(each) for each in found],
+        "form": FORM,
+        "figures_are": OF_WHAT,
+        "units": UNITS,
+    }
+
+
+def as_json(found: Tuned) -> dict[str, Any]:
+    """One method's part of the JSON object."""
+    gains, assessed, refusal = found.gains, found.assessment, found.refusal
+    parallel = to_parallel(gains) if gains else None
+    told: dict[str, Any] = {
+        "method": found.method.name,
+        "title": found.method.title,
+        "outcome": "refused" if refusal else "tuned",
+        "reason": refusal.reason.value if refusal else None,
+        "detail": refusal.detail if refusal else None,
+        "advice": refusal.advice if refusal else None,
+        "gains": {"form": "ISA", **asdict(gains)} if gains else None,
+        "parallel": {"Kp": parallel.Kp, "Ki": parallel.Ki, "Kd": parallel.Kd, "Tf": parallel.Tf} if parallel else None,
+        "chosen": dict(found.chosen) if found.chosen is not None else None,
+        "notes": list(found.notes),
+        "margins": _margins(assessed) if assessed else None,
+        "setpoint": _figures(assessed.setpoint) if assessed else None,
+        "load": _figures(assessed.load) if assessed else None,
+    }
+    clean: dict[str, Any] = plain(told)
+    return clean
+
+
+def methods_json() -> list[dict[str, Any]]:
+    """The registry, as GET /methods and `loopwright methods --json` show it."""
+    return [
+        {
+            "method": method.name,
+            "title": method.title,
+            "source": method.source,
+            "for_what": method.for_what,
+            "needs": method.needs,
+            "options": {name: _option(option) for name, option in method.options.items()},
+        }
+        for method in METHODS.values()
+    ]
+
+
+def _check(methods: list[Method], name: str, value: object) -> None:
+    """The option must be known to one of the methods and its value accepted by one that knows it."""
+    knowing = [method for method in methods if name in method.options]
+    if not knowing:
+        who = methods[0].name if len(methods) == 1 else "no method"
+        known = sorted({option for method in methods for option in method.options})
+        verb = "has no option" if len(methods) == 1 else "has an option"
+        raise BadTuning(f"{who} {verb} {name!r}; there are: {', '.join(known) or 'none'}")
+    refusals = []
+    for method in knowing:
+        try:
+            method.checked({name: value})
+            check_option(name, method.options[name].unit, value)
+        except Refused as refusal:
+            refusals.append(refusal.detail)
+        except Implausible as refusal:
+            refusals.append(str(refusal))
+    if len(refusals) == len(knowing):
+        raise BadTuning("; ".join(dict.fromkeys(refusals)))
+
+
+def _tuned(method: Method, model: Model, options: Mapping[str, object]) -> Tuned:
+    try:
+        setting = method.tune(model, **options)
+        gains, notes = realisable(setting.gains, method.filter)
+        assessed = assess(model, gains)
+    except Ended as refusal:
+        return Tuned(method, refusal=refusal)
+    except (ArithmeticError, ValueError) as error:
+        # one method's defect must not take the other methods' answers with it
+        return Tuned(method, refusal=Failed(Reason.INTERNAL, f"{type(error).__name__}: {error}"))
+    if not assessed.stable:
+        notes += ("With these gains the loop is unstable on this model.",)
+    return Tuned(method, gains, setting.chosen, setting.notes + notes, assessed)
+
+
+def _margins(found: Assessment) -> dict[str, Any]:
+    m = found.margins
+    margins = {
+        "Ms": m.Ms,
+        "Mt": m.Mt,
+        "GM": m.GM,
+        "PM_deg": m.PM_deg,
+        "delay_margin_s": m.delay_margin_s,
+        "bandwidth_rad_s": m.bandwidth,
+    }
+    # an unstable loop has a curve, but no margins
+    return {"stable": m.stable} | (margins if m.stable else dict.fromkeys(margins))
+
+
+def _figures(found: StepFigures | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    figures = asdict(found)
+    return {"settling_band": figures.pop("band")} | figures
+
+
+def _option(option: Option) -> dict[str, Any]:
+    return {
+        "kind": option.kind,
+        "unit": option.unit,
+        "default": option.default,
+        "meaning": option.meaning,
+        "choices": list(option.choices),
+        "least": option.range[0],
+        "most": option.range[1],
+    }

@@ -1,0 +1,35 @@
+"""What a procedure is told of its loop, and how long it may take."""
+
+from __future__ import annotations
+
+from loopwright.service.config import LoopConfig
+from loopwright.service.loop_state import LoopState
+from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.fast.procedure import FAST
+
+TIME_BUDGET_T95 = {FAST: 100.0}
+OTHER_BUDGET_T95 = 500.0
+LEAST_BUDGET_SAMPLES = 1000
+"""Of a loop whose T95 is a few samples: the time at rest alone is counted in samples."""
+
+
+def facts_of(config: LoopConfig, state: LoopState) -> Facts:
+    """What the procedures know of a loop; the limits of MV are the narrower of the job's and the controller's own.
+
+    Raises Refused: BAD_LIMITS, SAMPLING_TOO_SLOW.
+    """
+    return Facts(
+        sample_time_s=state.sample_time_s,
+        T95_s=config.t95_s,
+        mv_low=max(config.mv_limits.low, state.mv_low),
+        mv_high=min(config.mv_limits.high, state.mv_high),
+        sp_deviation=config.sp_deviation,
+        old_gains=state.gains,
+        reverse=state.reverse_acting,
+    )
+
+
+def time_budget_s(method: str, t95_s: float, sample_time_s: float) -> float:
+    """Plant time, s: several times what a loop of this T95 takes."""
+    budget = TIME_BUDGET_T95.get(method, OTHER_BUDGET_T95) * t95_s
+    return max(budget, LEAST_BUDGET_SAMPLES * sample_time_s)

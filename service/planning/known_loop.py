@@ -1,0 +1,43 @@
+"""What is known of a loop before a dry run: asked of its controller, and of the jobs that it has had."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from loopwright.service.job_states import JobState
+from loopwright.service.loop_state import LoopState, gains_of, loop_state
+from loopwright.service.planning.found_model import DISPROVED, found_model
+from loopwright.service.planning.ground import Ground, LastModel
+from loopwright.service.store.store import Store
+from loopwright.service.store.tables import JobRow
+from loopwright.tuning.reasons import Ended
+
+LOOKED_AT = 50
+"""Latest jobs of the loop among which a model, and the controller's last state, are looked for."""
+
+
+def known(store: Store, tag: str, read: Callable[[], LoopState]) -> Ground:
+    """read: the present state of the loop; what it raises is told, not raised."""
+    rows = store.tests_of(tag, LOOKED_AT)
+    last = _last_model(store, rows)
+    try:
+        return Ground(last, read(), silence="")
+    except (Ended, OSError) as silent:
+        words = f"{silent.reason.value}: {silent.detail}" if isinstance(silent, Ended) else str(silent)
+    row = next((row for row in rows if row.found), None)
+    if row is None or row.found is None:
+        return Ground(last, silence=words)
+    accepted = JobState(row.state) is JobState.ACCEPTED and row.result
+    gains = gains_of(row.result["gains"] if accepted and row.result else row.old_gains or row.found["gains"])
+    return Ground(last, replace(loop_state(row.found), gains=gains), row.id, words)
+
+
+def _last_model(store: Store, rows: Sequence[JobRow]) -> LastModel | None:
+    for row in rows:
+        if row.ended_at is None or row.reason in DISPROVED:
+            continue
+        model = found_model(row, store.events(row.id))
+        if model is not None:
+            return LastModel(model, row.id, row.ended_at)
+    return None

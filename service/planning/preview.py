@@ -1,0 +1,333 @@
+"""What a retune would do to a loop, told before it starts: pure, from configuration, request and what is known now."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel, Field
+
+from loopwright.service.config import Limits, LoopConfig
+from loopwright.service.loop_state import LoopState
+from loopwright.service.planning.durations import Span, durations
+from loopwright.service.planning.facts import time_budget_s
+from loopwright.service.planning.moves import Before, Moves, moves
+from loopwright.service.planning.obstacles import Now, Obstacle, Occupied, obstacles
+from loopwright.service.request import RetuneRequest, narrow
+from loopwright.tuning.gains import Gains
+
+
+@dataclass(frozen=True, slots=True)
+class LastProposal:
+    """The last retune of this loop that ended in a proposal. Ku, Pu_s: None where its model has none.
+
+    ended_at: UTC, ISO 8601, of the job.  plant_time_s: what it took.
+    """
+
+    job_id: str
+    ended_at: str | None
+    method: str
+    structure: str
+    Ku: float | None
+    Pu_s: float | None
+    plant_time_s: float
+
+    @classmethod
+    def of(cls, job_id: str, ended_at: str | None, plant_time_s: float, result: Mapping[str, Any]) -> LastProposal:
+        """From the result of a job that ended in a proposal."""
+        ultimate, model = result.get("ultimate") or {}, result.get("model") or {}
+        order = "sopdt" if model.get("zeta") is not None else "fopdt"
+        return cls(
+            job_id, ended_at, str(result.get("method")), str(model.get("structure") or order),
+            ultimate.get("Ku"), ultimate.get("Pu_s"), plant_time_s,
+        )  # fmt: skip
+
+
+class ObstacleView(BaseModel):
+    """Something for which a retune would not start, or would end before anything is moved."""
+
+    reason: str = Field(description="From the closed list of reasons, or busy", examples=["wrong_mode"])
+    detail: str = Field(description="The numbers", examples=["the controller is in mode manual, not automatic"])
+    advice: str = Field(description="What to do about it")
+    job: str | None = Field(
+        default=None, description="URL of the job that has the loop", examples=["/jobs/4f0c2a9be113"]
+    )
+
+
+class StagePreview(BaseModel):
+    """What one stage would move. Absolute values are null where the present ones are not known."""
+
+    stage: str = Field(examples=["relay"])
+    what: str = Field(description="What is moved, in a sentence")
+    mv_low_pct: float | None = Field(description="The test moves MV down to this at most, percent", examples=[25.0])
+    mv_high_pct: float | None = Field(description="The test moves MV up to this at most, percent", examples=[100.0])
+    mv_move_pct: float = Field(description="The largest move of MV away from where it is, percent", examples=[50.0])
+    sp_low: float | None = Field(description="Set-point at least, PV units", examples=[50.0])
+    sp_high: float | None = Field(description="Set-point at most, PV units", examples=[52.0])
+    sp_move: float = Field(description="The largest step of the set-point, PV units", examples=[2.0])
+    pv_move: float | None = Field(
+        description="How far PV is expected to go from the present set-point, PV units; null: not known before",
+        examples=[2.8],
+    )
+    duration_low_s: float = Field(description="Expected at least, plant time, s", examples=[7.0])
+    duration_high_s: float = Field(description="Expected at most, plant time, s", examples=[30.0])
+
+
+class WatchedLimits(BaseModel):
+    """What ends the test at once when it is left; the gains and the set-point are then put back."""
+
+    pv: Limits = Field(description="PV units; watched in the controller under the relay, and here at every sample")
+    mv: Limits = Field(description="Percent; the narrower of the job's and the controller's own")
+    max_time_s: float | None = Field(description="Plant time, s; null: depends on a sample time not known now")
+
+
+class KnownPlant(BaseModel):
+    """What is known of the loop before the test."""
+
+    t95_s: float = Field(description="Time in which the plant covers 95 % of a step, s, from the configuration")
+    noise_std: float | None = Field(description="Of PV, PV units, from the configuration; null: not told")
+    model: str | None = Field(description="Structure of the last model found on this loop", examples=["sopdt"])
+    model_job: str | None = Field(description="URL of the job that found it", examples=["/jobs/4f0c2a9be113"])
+    model_at: str | None = Field(description="When, UTC, ISO 8601, wall time")
+    Ku: float | None = Field(description="Its ultimate gain, MV percent per PV unit", examples=[9.3])
+    Pu_s: float | None = Field(description="Its ultimate period, s", examples=[14.4])
+    last_plant_time_s: float | None = Field(description="Plant time that the job took, s", examples=[86.0])
+
+
+class Preview(BaseModel):
+    """What a retune with these options would do now. Nothing was moved to find it out."""
+
+    loop: str = Field(examples=["TIC-101"])
+    method: str = Field(examples=["fast"])
+    dry_run: bool = Field(description="A rehearsal in memory, which moves nothing on the loop")
+    would_start: bool = Field(description="Nothing stands in the way, as far as is known now")
+    obstacles: list[ObstacleView] = Field(description="Everything for which it would be refused, all at once")
+    summary: list[str] = Field(description="The same in sentences")
+    stages: list[StagePreview] = Field(description="In their order")
+    sp: float | None = Field(description="Set-point now, PV units; null: not known", examples=[50.0])
+    pv: float | None = Field(description="Process value now, PV units; null: not known", examples=[49.9])
+    mv: float | None = Field(description="Controller output now, percent; null: not known", examples=[50.0])
+    first_mv_move_pct: float | None = Field(
+        description="What the relay begins with, percent of MV; null: there is no relay", examples=[12.5]
+    )
+    largest_mv_move_pct: float = Field(description="Of any stage, percent", examples=[50.0])
+    largest_sp_move: float = Field(description="Of any stage, PV units", examples=[2.0])
+    largest_pv_move: float | None = Field(
+        description="How far PV is expected to go from the present set-point, PV units; null: not known before",
+        examples=[2.8],
+    )
+    duration_low_s: float = Field(description="Of all stages, plant time, s", examples=[40.0])
+    duration_high_s: float = Field(description="Of all stages, plant time, s", examples=[160.0])
+    duration_basis: str = Field(description="What the estimate is made from")
+    watched: WatchedLimits
+    at_the_end: str = Field(description="What the loop is after the test")
+    on_abort: str = Field(description="What the loop is after an abort, a limit or a failure")
+    known: KnownPlant
+
+
+def preview(config: LoopConfig, request: RetuneRequest, now: Now, last: LastProposal | None) -> Preview:
+    """Of one loop. now: without a state the figures are the largest that the configured limits leave room for."""
+    narrowed, _ = narrow(config, request)
+    state = None if request.dry_run else now.state
+    permitted = _permitted(narrowed, state)
+    limited = narrowed.model_copy(update={"mv_limits": permitted})
+    pu_s = request.Pu_s or (last.Pu_s if last else None)
+    times = durations(request, config.t95_s, state.sample_time_s if state else None, pu_s)
+    mv, sp = (_finite(state.mv), _finite(state.sp)) if state else (None, None)
+    before = Before(state.gains if state else None, mv, request.Ku or (last.Ku if last else None))
+    moved = [] if request.dry_run else moves(limited, request, before)
+    stages = [_stage(each, times[each.stage], permitted, mv, sp) for each in moved]
+    in_the_way = obstacles(config, request, now)
+    found = Preview(
+        loop=config.tag,
+        method=request.method,
+        dry_run=request.dry_run,
+        would_start=not in_the_way,
+        obstacles=[_obstacle(each, now) for each in in_the_way],
+        summary=[],
+        stages=stages,
+        sp=sp,
+        pv=_finite(state.pv) if state else None,
+        mv=mv,
+        first_mv_move_pct=next((_told(each.first_mv) for each in moved if each.first_mv is not None), None),
+        largest_mv_move_pct=max((each.mv_move_pct for each in stages), default=0.0),
+        largest_sp_move=max((each.sp_move for each in stages), default=0.0),
+        largest_pv_move=_largest_pv(stages),
+        duration_low_s=_told(sum(each.duration_low_s for each in stages)),
+        duration_high_s=_told(sum(each.duration_high_s for each in stages)),
+        duration_basis=_basis(request, config, last),
+        watched=WatchedLimits(pv=narrowed.pv_limits, mv=permitted, max_time_s=_budget_s(request, limited, state)),
+        at_the_end=_at_the_end(request),
+        on_abort=_on_abort(request, state, config.pv_unit),
+        known=_known(config, last),
+    )
+    return found.model_copy(update={"summary": _summary(found, config.pv_unit)})
+
+
+def _permitted(config: LoopConfig, state: LoopState | None) -> Limits:
+    """MV limits that hold: the job's and the controller's own; the job's where the two leave nothing."""
+    limits = config.mv_limits
+    if state is None:
+        return limits
+    low, high = max(limits.low, state.mv_low), min(limits.high, state.mv_high)
+    return limits.model_copy(update={"low": low, "high": high}) if low < high else limits
+
+
+def _stage(each: Moves, time: Span, mv_limits: Limits, mv: float | None, sp: float | None) -> StagePreview:
+    moves_mv, moves_sp = max(each.mv_down, each.mv_up) > 0.0, each.sp_up > 0.0
+    low, high = time
+    return StagePreview(
+        stage=each.stage,
+        what=each.what,
+        mv_low_pct=_told(max(mv_limits.low, mv - each.mv_down)) if mv is not None and moves_mv else None,
+        mv_high_pct=_told(min(mv_limits.high, mv + each.mv_up)) if mv is not None and moves_mv else None,
+        mv_move_pct=_told(max(each.mv_down, each.mv_up)),
+        sp_low=sp if moves_sp else None,
+        sp_high=_told(sp + each.sp_up) if sp is not None and moves_sp else None,
+        sp_move=_told(each.sp_up),
+        pv_move=None if each.pv is None else _told(each.pv),
+        duration_low_s=_told(low),
+        duration_high_s=_told(high),
+    )
+
+
+def _largest_pv(stages: Sequence[StagePreview]) -> float | None:
+    known = [each.pv_move for each in stages if each.pv_move is not None]
+    return max(known, default=0.0) if len(known) == len(stages) else None
+
+
+def _obstacle(found: Obstacle, now: Now) -> ObstacleView:
+    job = f"/jobs/{now.active_job}" if found.reason is Occupied.BUSY else None
+    return ObstacleView(reason=found.reason.value, detail=found.detail, advice=found.advice, job=job)
+
+
+def _budget_s(request: RetuneRequest, config: LoopConfig, state: LoopState | None) -> float | None:
+    if request.max_time_s is not None or state is None:
+        return request.max_time_s
+    return time_budget_s(request.method, config.t95_s, state.sample_time_s)
+
+
+def _basis(request: RetuneRequest, config: LoopConfig, last: LastProposal | None) -> str:
+    if request.dry_run:
+        return "a dry run takes no time of the plant"
+    if request.Pu_s:
+        return f"Pu {request.Pu_s:g} s as typed in, and T95 {config.t95_s:g} s of the configuration"
+    if last is not None and last.Pu_s:
+        return f"Pu {last.Pu_s:.4g} s of the model that job {last.job_id} found, and T95 {config.t95_s:g} s"
+    return f"T95 {config.t95_s:g} s of the configuration alone, which leaves the loop's period open by a factor of ten"
+
+
+def _at_the_end(request: RetuneRequest) -> str:
+    if request.dry_run:
+        return "Nothing on the loop has changed."
+    return "The loop is as after an abort; the new gains are a proposal, which takes effect when somebody accepts it."
+
+
+def _on_abort(request: RetuneRequest, state: LoopState | None, unit: str) -> str:
+    if request.dry_run:
+        return "Nothing on the loop has changed."
+    silent = ""
+    if state is not None and state.when_silent:
+        silent = f" If the controller itself falls silent, the plant's I/O {state.when_silent}."
+    return f"{_home(state, unit)} The controller does that by itself when the service or the bus fails too.{silent}"
+
+
+def _home(state: LoopState | None, unit: str) -> str:
+    if state is None:
+        return "The controller has its mode, set-point and gains back as they were before."
+    gains = _gains_text(state.gains)
+    return f"The controller is in {state.mode.name.lower()} again, set-point {state.sp:.6g} {unit}, with {gains}."
+
+
+def _gains_text(gains: Gains) -> str:
+    return f"the gains it has now (Kp {gains.Kp:.4g}, Ti {gains.Ti:.4g} s)"
+
+
+def _known(config: LoopConfig, last: LastProposal | None) -> KnownPlant:
+    return KnownPlant(
+        t95_s=config.t95_s,
+        noise_std=config.noise_std_hint,
+        model=last.structure if last else None,
+        model_job=f"/jobs/{last.job_id}" if last else None,
+        model_at=last.ended_at if last else None,
+        Ku=last.Ku if last else None,
+        Pu_s=last.Pu_s if last else None,
+        last_plant_time_s=last.plant_time_s if last else None,
+    )
+
+
+def _summary(found: Preview, unit: str) -> list[str]:
+    if found.dry_run:
+        return [f"A dry run of {found.loop} is computed in memory; nothing on the loop is moved."]
+    first = "" if found.first_mv_move_pct is None else f"by {found.first_mv_move_pct:.3g} % at first and "
+    limits = f"{found.watched.mv.low:g} .. {found.watched.mv.high:g} %"
+    goes = "How far PV goes under the relay is not known beforehand."
+    if found.largest_pv_move is not None:
+        goes = f"PV is expected to go up to {found.largest_pv_move:.3g} {unit} from the set-point as it is now."
+    time, pv = duration_text(found.duration_low_s, found.duration_high_s), found.watched.pv
+    lines = [
+        f"A retune of {found.loop} by {found.method} moves MV {first}by at most {found.largest_mv_move_pct:.3g} %, "
+        f"within {limits}, and the set-point by at most {found.largest_sp_move:.4g} {unit}.",
+        f"It takes {time} of plant time; that is estimated from {found.duration_basis}.",
+        f"{goes} It is watched within {pv.low:g} .. {pv.high:g} {unit}: beyond that the test ends.",
+        f"After an abort, a limit or a failure: {found.on_abort}",
+        f"At the end: {found.at_the_end}",
+    ]
+    if found.mv is None:
+        lines.insert(1, "The loop could not be read: these are the largest moves that the configured limits permit.")
+    return lines
+
+
+def duration_text(low_s: float, high_s: float) -> str:
+    """Two times in a unit that suits them, the first left out where it is 0."""
+    unit, name = next(((u, n) for u, n in ((3600.0, "h"), (60.0, "min")) if high_s >= 3.0 * u), (1.0, "s"))
+    low, high = (f"{time / unit:.{0 if time >= 10.0 * unit else 1}f}" for time in (low_s, high_s))
+    return f"{low} to {high} {name}" if low_s else f"up to {high} {name}"
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _told(value: float) -> float:
+    """As many digits as an estimate has."""
+    return float(f"{value:.6g}")
+
+
+class FleetPreview(BaseModel):
+    """What a retune of many loops would do, from configuration and earlier jobs: no controller is asked."""
+
+    count: int = Field(description="Loops it is for", examples=[40])
+    would_start: int = Field(
+        description="Of these, those in whose way nothing stands as far as is known", examples=[38]
+    )
+    largest_mv_move_pct: float = Field(description="Of any of the loops, percent; at most", examples=[66.7])
+    largest_mv_move_loop: str = Field(description="The loop that it is of", examples=["TIC-101"])
+    longest_s: float = Field(description="Longest time of one loop, plant time, s; at most", examples=[600.0])
+    longest_loop: str = Field(description="The loop that it is of", examples=["LIC-7"])
+    summary: list[str] = Field(description="The same in sentences")
+    loops: list[Preview] = Field(description="Each loop, in the order in which they are begun")
+
+
+def fleet_preview(loops: Sequence[Preview]) -> FleetPreview:
+    """loops: at least one."""
+    boldest, longest = max(loops, key=lambda p: p.largest_mv_move_pct), max(loops, key=lambda p: p.duration_high_s)
+    able = sum(each.would_start for each in loops)
+    summary = [
+        f"{len(loops)} loops are retuned by {loops[0].method}; {len(loops) - able} of them would be refused as it is.",
+        f"MV is moved by at most {boldest.largest_mv_move_pct:.3g} % ({boldest.loop}).",
+        f"One loop takes at most {duration_text(0.0, longest.duration_high_s)} of plant time ({longest.loop}).",
+        "The controllers have not been asked; look at one loop by its own preview.",
+    ]
+    return FleetPreview(
+        count=len(loops),
+        would_start=able,
+        largest_mv_move_pct=boldest.largest_mv_move_pct,
+        largest_mv_move_loop=boldest.loop,
+        longest_s=longest.duration_high_s,
+        longest_loop=longest.loop,
+        summary=summary,
+        loops=list(loops),
+    )

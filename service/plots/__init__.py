@@ -1,0 +1,1 @@
+"""Pictures in files, without a display."""

@@ -1,0 +1,1 @@
+"""The live service as a process: put together, started and ended."""

@@ -1,0 +1,260 @@
+"""The live service put together: configuration, store, jobs on the bus, HTTP server."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import logging
+import os
+import socket
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass, field
+from functools import partial
+from ipaddress import IPv4Network, IPv6Network, ip_address
+from pathlib import Path
+from typing import cast
+
+import uvicorn
+from fastapi import FastAPI
+
+from loopwright.protocol.profile import TUNER_NODE
+from loopwright.protocol.station import Station
+from loopwright.service.api import operations
+from loopwright.service.api.app import create_app
+from loopwright.service.api.gate.connections import (
+    Connection,
+    Connections,
+    Listener,
+    OnceAMinute,
+    raise_descriptor_limit,
+)
+from loopwright.service.api.gate.gate import Policy, is_loopback
+from loopwright.service.api.gate.limits import RequestLimits
+from loopwright.service.config import LoopConfig, load_site
+from loopwright.service.execution.computing.limits import ComputingLimits, Kind
+from loopwright.service.execution.computing.pool import Pool
+from loopwright.service.execution.procedures import Tune, rehearse
+from loopwright.service.execution.procedures import tune as live
+from loopwright.service.execution.rehearsals import apart
+from loopwright.service.jobs.dbos_engine import POLL_S, DurableEngine
+from loopwright.service.jobs.manager import Jobs, LoopFactory
+from loopwright.service.jobs.retention import Keep, Retention
+from loopwright.service.loops.loop import Loop
+from loopwright.service.server.signals import Signals
+from loopwright.service.server.watchdog import Watchdog, interval_s
+from loopwright.service.store.database import BadDatabase
+from loopwright.service.store.keyring import Keyring
+from loopwright.service.store.store import LOCAL, Store
+from loopwright.service.telemetry import logs
+from loopwright.service.telemetry.logs import LogFormat
+
+_GRACE_S = 10
+_ONCE_A_MINUTE = OnceAMinute()
+_log = logging.getLogger(__name__)
+
+
+class _Server(uvicorn.Server):
+    """Says when it is ready. Signals are not its own: it would raise each of them again after its shutdown, and take a
+    second SIGINT for leave to break off."""
+
+    def __init__(self, config: uvicorn.Config, jobs: Jobs) -> None:
+        super().__init__(config)
+        self._jobs = jobs
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        if self.started and sockets:
+            host, port = sockets[0].getsockname()[:2]
+            print(f"ready http://{f'[{host}]' if ':' in host else host}:{port}", flush=True)
+            tell_systemd("READY=1")
+            if (every_s := interval_s()) is not None:
+                watchdog = Watchdog(self._jobs.unwatched_s, self._jobs.store.ping, tell_systemd)
+                self._watchdog = asyncio.create_task(watchdog.run(every_s))
+
+
+def tell_systemd(state: str) -> None:
+    """sd_notify: says where we are to a unit of Type=notify; nothing where there is none."""
+    address = os.environ.get("NOTIFY_SOCKET")
+    if address:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify, suppress(OSError):
+            notify.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
+
+
+def _load() -> None:
+    """Has the jobs find everything there: one that imports what it needs, and a full collection of all that is loaded,
+    which lets no thread run, hold up the loops of the others (seconds, and 0.1 s of processor each time)."""
+    import loopwright.service.loops.bus_loop
+    import loopwright.tuning.fast.design_trial
+    import loopwright.tuning.five_stage.procedure  # noqa: F401
+
+    gc.collect()
+    gc.freeze()
+
+
+def open_bus_loop(station: Station, config: LoopConfig) -> Loop:
+    """The live loop of a configuration."""
+    from loopwright.service.loops.bus_loop import BusLoop
+
+    return BusLoop(
+        config.bus,
+        config.controller_node,
+        config.plant_node,
+        channel=config.channel,
+        station=station,
+        pv_limits=(config.pv_limits.low, config.pv_limits.high),
+    )
+
+
+class NotSafe(Exception):
+    """What was asked for would open the plant to the network; the text says what to do instead."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """How the service is run. database: a PostgreSQL URL, or None for a file in the data folder.
+
+    bind: the address to listen on.  host: this host's name among those that share the database.
+    resume: jobs that a dead service left go on.  poll_s: how often the engine looks for jobs, s of wall time.
+    keep: whose samples are kept.  computing: what one computation may take.
+    node: our node-ID on every bus, another one than any other gateway's.
+    auth: whether keys are asked for; None: unless the address is this machine's own.
+    trusted_proxies: addresses and networks whose word on whom they ask for is taken (X-Forwarded-For, -Proto).
+    """
+
+    loops_file: Path
+    data: Path
+    bind: str
+    port: int
+    database: str | None = None
+    host: str | None = None
+    resume: bool = True
+    poll_s: float = POLL_S
+    node: int = TUNER_NODE
+    auth: bool | None = None
+    limits: RequestLimits = field(default_factory=RequestLimits)
+    log_format: LogFormat = "text"
+    keep: Keep = field(default_factory=Keep)
+    computing: ComputingLimits = field(default_factory=ComputingLimits)
+    trusted_proxies: tuple[IPv4Network | IPv6Network, ...] = ()
+
+
+def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None = None) -> None:
+    """Serves until SIGTERM or SIGINT; every loop is restored before it returns. tune: by default computed by a pool.
+
+    Raises ConfigError, FolderInUse, ForeignLoop, BadDatabase, NotSafe, OSError (the address cannot be had),
+    SQLAlchemyError (the database cannot be reached).
+    """
+    logs.configure(setup.log_format)
+    # python-can's socketcand client warns of every frame that TCP splits, which is what TCP does.
+    logging.getLogger("can").setLevel(logging.ERROR)
+    site = load_site(setup.loops_file)
+    site.check_own_node(setup.node, str(setup.loops_file))
+    if setup.database is not None and setup.host is None:
+        raise BadDatabase("a shared database needs --host NAME: what this host is called among the others, for ever")
+    local = is_loopback(setup.bind)
+    if setup.auth is False and not local:
+        raise NotSafe(f"without keys only this machine is served: leave out --no-auth, or --bind {setup.bind}")
+    descriptors = raise_descriptor_limit()
+    with ExitStack() as stack:
+        signals = stack.enter_context(Signals())
+        # Bound before anything is started or opened: a port that is taken is one sentence and not half a service.
+        listener = stack.enter_context(listen(setup.bind, setup.port))
+        pool = stack.enter_context(closing(Pool(setup.computing)))
+        if tune is None:
+            pool.submit(Kind.LIVE, os.getpid)  # loads the fork server: the first computation of a loop is not to wait
+        store = stack.enter_context(closing(Store(setup.data, setup.database, setup.host or LOCAL)))
+        keyring = Keyring(store.engine) if setup.auth or not local else None
+        if keyring is not None and not keyring.any_valid():
+            where = f"--data {setup.data}" if setup.database is None else "with LOOPWRIGHT_DATABASE set"
+            raise NotSafe(
+                f"keys are asked for on {setup.bind} and there is none; make one with: "
+                f"loopwright key create NAME --scope admin {where}"
+            )
+        policy = Policy(keyring, setup.limits, local_only=True)
+        engine = DurableEngine(setup.data, store.engine if store.shared else None, store.host, setup.poll_s)
+        jobs = Jobs(
+            site.loops,
+            store,
+            open_loop or partial(open_bus_loop, Station(setup.node)),
+            tune or partial(live, workers=pool),
+            apart(rehearse, pool),
+            engine=engine,
+            buses=site.buses,
+            resume=setup.resume,
+        )
+        stack.callback(jobs.stop)
+        retention = stack.enter_context(closing(Retention(store, engine, setup.keep)))
+        checks = {**operations.checks(jobs), "samples": retention.note}
+        app = create_app(jobs, policy, checks, pool)
+        server = _Server(server_config(app, setup, listener, descriptors), jobs)
+
+        def end() -> None:
+            """Open event streams end with their jobs: the server, which waits for its connections, waits for them."""
+            tell_systemd("STOPPING=1")
+            jobs.request_stop()
+            server.should_exit = True
+
+        signals.tell(end, partial(_awaited, jobs))
+        _load()
+        jobs.boot()
+        if not jobs.stopping:
+            retention.start()
+            server.run(sockets=[listener])
+
+
+def _awaited(jobs: Jobs) -> str:
+    """What the end of the service waits for."""
+    under_test = [f"{tag} (job {job_id})" for job_id, tag in jobs.under_test().items()]
+    if not under_test:
+        return "no loop is under test, connections and the database are being closed"
+    return f"it waits until these loops are restored and the ends of their jobs written: {', '.join(under_test)}"
+
+
+def server_config(app: FastAPI, setup: Setup, listener: Listener, descriptors: int) -> uvicorn.Config:
+    """The HTTP server: whose word it takes on whom it serves, and how many connections of which kind it keeps.
+
+    descriptors: file descriptors of this process.
+    """
+    logging.getLogger("uvicorn.error").addFilter(_ONCE_A_MINUTE)
+    connections = Connections(setup.limits, descriptors, partial(_is_of, setup.trusted_proxies))
+    listener.wanted = connections.wanted
+    return uvicorn.Config(
+        app,
+        loop="asyncio",
+        http=cast(type[asyncio.Protocol], partial(Connection, connections)),
+        ws="none",
+        log_config=None,
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        proxy_headers=bool(setup.trusted_proxies),
+        forwarded_allow_ips=[str(network) for network in setup.trusted_proxies],
+        timeout_graceful_shutdown=_GRACE_S,
+    )
+
+
+def _is_of(networks: Sequence[IPv4Network | IPv6Network], address: str) -> bool:
+    if not networks:
+        return False
+    try:
+        found = ip_address(address)
+    except ValueError:
+        return False
+    return any(found in network for network in networks)
+
+
+def listen(bind: str, port: int) -> Listener:
+    """The listening socket. Raises OSError."""
+    family = socket.AF_INET6 if ":" in bind else socket.AF_INET
+    listener = Listener(socket.create_server((bind, port), family=family, reuse_port=False).detach())
+    # asyncio sets it only where a socket names its protocol; without it an answer waits 40 ms for the client's ACK.
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    # The kernel hands a connection over with what its client says, or after a second in silence: those that say nothing
+    # can be told from those that are about to.
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, 1)
+    return listener

@@ -1,0 +1,73 @@
+"""How late the event loop is: whatever it is busy with, every other request and stream waits for.
+
+A task asks to be woken every 10 ms and sees when it is. Nothing that a request does should hold the loop for 50 ms.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+
+from loopwright.service.telemetry.metrics import LATE_SECONDS, LATEST_SECONDS
+
+log = logging.getLogger(__name__)
+
+EVERY_S = 0.01
+MOST_S = 0.05
+"""Later than this is told, once a minute at most."""
+_MINUTE_S = 60.0
+
+
+class Lateness:
+    """The worst of the last minute, and when it is time to tell of it. Times are monotonic seconds."""
+
+    def __init__(self) -> None:
+        # Second by second: a minute has sixty entries, whatever happens in it.
+        self._worst: dict[int, float] = {}
+        self._told: float | None = None
+
+    def note(self, late_s: float, at_s: float) -> float | None:
+        """Takes a measurement. What is to be told now, s: the worst of the last minute, or None."""
+        second = int(at_s)
+        if second not in self._worst:
+            for past in [past for past in self._worst if past <= at_s - _MINUTE_S]:
+                del self._worst[past]
+        if late_s > self._worst.get(second, -1.0):
+            self._worst[second] = late_s
+        if late_s <= MOST_S or (self._told is not None and at_s - self._told < _MINUTE_S):
+            return None
+        self._told = at_s
+        return self.worst_s(at_s)
+
+    def worst_s(self, at_s: float) -> float:
+        """The worst of the last minute, s. For any thread: the numbers are copied first."""
+        recent = [late for second, late in list(self._worst.items()) if second > at_s - _MINUTE_S]
+        return max(recent, default=0.0)
+
+
+@asynccontextmanager
+async def watched_event_loop() -> AsyncIterator[None]:
+    """Measures the running event loop, for /metrics and the log, as long as it is open."""
+    watch = asyncio.create_task(_watch(Lateness()), name="event loop watch")
+    try:
+        yield
+    finally:
+        watch.cancel()
+        with suppress(asyncio.CancelledError):
+            await watch
+
+
+async def _watch(lateness: Lateness) -> None:
+    LATEST_SECONDS.set_function(lambda: lateness.worst_s(time.monotonic()))
+    while True:
+        due = time.monotonic() + EVERY_S
+        await asyncio.sleep(EVERY_S)
+        now = time.monotonic()
+        late = max(0.0, now - due)
+        LATE_SECONDS.observe(late)
+        told = lateness.note(late, now)
+        if told is not None:
+            log.warning("the event loop was held up for %.0f ms: every request and stream waited for that", 1e3 * told)

@@ -1,0 +1,43 @@
+"""What is counted in this process. `api.metrics` shows it, with what the store knows."""
+
+from __future__ import annotations
+
+from prometheus_client import Counter, Gauge, Histogram, disable_created_metrics
+
+disable_created_metrics()  # type: ignore[no-untyped-call]
+
+SAMPLES_LOST = Counter("loopwright_samples_lost", "Samples that did not arrive during a test", ["bus"], registry=None)
+STAGE_SECONDS = Histogram(
+    "loopwright_stage_plant_seconds",
+    "Plant time of a finished stage, s",
+    ["stage"],
+    buckets=(1, 3, 10, 30, 100, 300, 1000, 3000, 10_000, 30_000),
+    registry=None,
+)
+REQUESTS = Counter("loopwright_http_requests", "Answered requests", ["method", "route", "status"], registry=None)
+REQUEST_SECONDS = Histogram(
+    "loopwright_http_request_seconds",
+    "Wall time to the end of an answer, s; event streams left out",
+    ["route"],
+    buckets=(0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1, 3, 10),
+    registry=None,
+)
+IN_FLIGHT = Gauge("loopwright_http_requests_in_flight", "Requests being answered", registry=None)
+LATE_SECONDS = Histogram(
+    "loopwright_event_loop_late_seconds",
+    "How late the event loop came back to who had asked it to, s",
+    buckets=(0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 3),
+    registry=None,
+)
+LATEST_SECONDS = Gauge(
+    "loopwright_event_loop_late_worst_seconds", "The worst of that in the last minute, s", registry=None
+)
+
+CLOCK_JUMPS = Counter(
+    "loopwright_clock_jumps", "Jumps of the wall clock that were seen; the ages of samples count from the last one",
+    registry=None,
+)  # fmt: skip
+
+OF_THIS_PROCESS = (
+    SAMPLES_LOST, STAGE_SECONDS, REQUESTS, REQUEST_SECONDS, IN_FLIGHT, LATE_SECONDS, LATEST_SECONDS, CLOCK_JUMPS,
+)  # fmt: skip
