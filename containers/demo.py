@@ -54,9 +54,10 @@ def _proof(job: dict[str, Any], loop: dict[str, Any], seconds: float) -> list[st
     if job["verification"]:
         changes.append(f"{job['verification']['fit_pct']:.1f} % of the measured step explained")
     held = ", ".join(f"{name} {job_tables.cell(live['gains'][name])}" for name in ("Kp", "Ti"))
+    held = f"{held}, set-point {job_tables.cell(live['sp'])}"
     return [
         f"proof       {how}: {', '.join(changes)}",
-        f"controller  {live['mode']}, {held}, set-point {job_tables.cell(live['sp'])}: its own until a proposal is accepted",
+        f"controller  {live['mode']}, {held}: its own until a proposal is accepted",
         f"time        {job['plant_time_s']:.0f} s of plant time in {seconds:.1f} s",
         f"state       {job['state']}",
     ]

@@ -1,1 +1,76 @@
-"""Control mathematics: models, experiment plans, estimation, robust optimisation. Pure: no clock, no I/O."""
+"""Control mathematics for PI and PID loops: models, rules, margins, responses, identification, procedures.
+
+    from loopwright import tuning
+
+    plant = tuning.FOPDT(K=2.0, T=10.0, L=1.0)
+    found = tuning.tune(plant, "simc")
+    print(found)                                    # gains, Ms, overshoot
+    found.plot().savefig("simc.png")                # a notebook shows it by itself
+
+Models        FOPDT, SOPDT, Integrating, TransferFunction, as_model (from control or scipy.signal)
+Tuning        tune, METHODS (every rule: what it is for, its source, its options), Tuned, Gains
+Analysis      margins, ultimate_point, assess, step_response, step_figures
+Reduction     half_rule, moments, two_areas
+From a record identify, fopdt_from_overshoot
+Other forms   to_parallel, of_parallel, to_series, of_series
+Errors        Refused (with a Reason, and what to do about it)
+
+Times are in s, gains in ISA form: u = Kp (b SP - PV + integral(SP - PV)/Ti + Td d/dt(c SP - PV)/(1 + Tf s)).
+The library is pure: no clock, no input or output. The procedures that tune live loops are `tuning.fast` and
+`tuning.five_stage`.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from loopwright.tuning.analysis.assessment import Assessment, assess
+    from loopwright.tuning.analysis.margins import Margins, margins, ultimate_point
+    from loopwright.tuning.analysis.step_figures import StepFigures
+    from loopwright.tuning.analysis.step_response import Response, step_figures, step_response
+    from loopwright.tuning.gain_forms import Parallel, Series, of_parallel, of_series, to_parallel, to_series
+    from loopwright.tuning.gains import Gains
+    from loopwright.tuning.identification.identify import Identified, identify
+    from loopwright.tuning.identification.overshoot import fopdt_from_overshoot
+    from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction, as_model
+    from loopwright.tuning.reasons import Reason, Refused
+    from loopwright.tuning.reduction.half_rule import half_rule
+    from loopwright.tuning.reduction.moments_and_areas import moments, two_areas
+    from loopwright.tuning.rules.registry import METHODS, Method
+    from loopwright.tuning.rules.tuned import Tuned, tune
+
+_WHERE = {
+    "analysis.assessment": ("Assessment", "assess"),
+    "analysis.margins": ("Margins", "margins", "ultimate_point"),
+    "analysis.step_figures": ("StepFigures",),
+    "analysis.step_response": ("Response", "step_figures", "step_response"),
+    "gain_forms": ("Parallel", "Series", "of_parallel", "of_series", "to_parallel", "to_series"),
+    "gains": ("Gains",),
+    "identification.identify": ("Identified", "identify"),
+    "identification.overshoot": ("fopdt_from_overshoot",),
+    "models": ("FOPDT", "SOPDT", "Integrating", "Model", "TransferFunction", "as_model"),
+    "reasons": ("Reason", "Refused"),
+    "reduction.half_rule": ("half_rule",),
+    "reduction.moments_and_areas": ("moments", "two_areas"),
+    "rules.registry": ("METHODS", "Method"),
+    "rules.tuned": ("Tuned", "tune"),
+}
+_HOME = {name: module for module, names in _WHERE.items() for name in names}
+
+__all__ = [
+    "FOPDT", "METHODS", "SOPDT", "Assessment", "Gains", "Identified", "Integrating", "Margins", "Method", "Model",
+    "Parallel", "Reason", "Refused", "Response", "Series", "StepFigures", "TransferFunction", "Tuned", "as_model",
+    "assess", "fopdt_from_overshoot", "half_rule", "identify", "margins", "moments", "of_parallel", "of_series",
+    "step_figures", "step_response", "to_parallel", "to_series", "tune", "two_areas", "ultimate_point",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    """Loads what is asked for when it is asked for: who wants a model need not wait for every rule."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

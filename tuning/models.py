@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -171,6 +172,40 @@ class TransferFunction:
 
 
 Model = FOPDT | SOPDT | Integrating | TransferFunction
+
+
+class LinearSystem(Protocol):
+    """A transfer function of another library: control.TransferFunction, scipy.signal.TransferFunction.
+
+    num, den: coefficients from the highest power down, nested or not.  dt: None or 0 for continuous time.
+    """
+
+    @property
+    def num(self) -> Any: ...
+    @property
+    def den(self) -> Any: ...
+    @property
+    def dt(self) -> Any: ...
+
+
+def as_model(system: Model | LinearSystem, dead_time_s: float = 0.0) -> Model:
+    """A model of this library from one of another, which has no dead time of its own; a model of ours is returned.
+
+    dead_time_s: s, of a system of another library.  Raises ValueError: more than one input or output, discrete time, a
+    dead time given twice, coefficients that make no model.
+    """
+    if isinstance(system, Model):
+        if dead_time_s:
+            raise ValueError(
+                f"the model has a dead time of its own ({system.L:g} s): dead_time_s={dead_time_s:g} is one too many"
+            )
+        return system
+    if system.dt:
+        raise ValueError(f"the transfer function is in discrete time (dt={system.dt}): a model here is continuous")
+    num, den = (np.squeeze(np.asarray(each, dtype=float)) for each in (system.num, system.den))
+    if num.ndim > 1 or den.ndim > 1:
+        raise ValueError("the transfer function has more than one input or output")
+    return TransferFunction(tuple(np.atleast_1d(num).tolist()), tuple(np.atleast_1d(den).tolist()), dead_time_s)
 
 
 def time_constants(model: Model) -> Reals:

@@ -8,7 +8,7 @@ from typing import Any
 from loopwright.service.errors import Conflict
 from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.relay_record import Kept
-from loopwright.service.offline.tunings import Tuned, answer, tune_each
+from loopwright.service.offline.tunings import MethodResult, answer, tune_each
 from loopwright.service.planning.found_model import DISPROVED, FoundModel, found_model, model_of
 from loopwright.service.request import ProcessModel
 from loopwright.service.store.tables import EventRow, JobRow
@@ -84,7 +84,7 @@ def redesigned(
             gains = designed_on(model, FastOptions(Ms=ms, derivative=derivative), Ts).gains
         found = _tuned(gains, ms, assess(sampled, gains))
     except Ended as refusal:
-        found = Tuned(FAST_DESIGN, refusal=refusal)
+        found = MethodResult(FAST_DESIGN, refusal=refusal)
     told = answer(model, [found])
     retune = None
     if found.gains is not None:
@@ -94,9 +94,9 @@ def redesigned(
     return {"job": row.id, "loop": row.loop, **told}
 
 
-def _tuned(gains: Gains, ms: float, assessed: Assessment) -> Tuned:
+def _tuned(gains: Gains, ms: float, assessed: Assessment) -> MethodResult:
     notes = ("Margins and figures are of the model and half a sample's delay.",)
-    return Tuned(FAST_DESIGN, gains, {"Ms": ms}, notes, assessed)
+    return MethodResult(FAST_DESIGN, gains, {"Ms": ms}, notes, assessed)
 
 
 def job_model(row: JobRow, events: Sequence[EventRow]) -> FoundModel:
@@ -115,7 +115,7 @@ def _not_disproved(row: JobRow, reasons: Sequence[Reason]) -> None:
         raise Conflict(f"{text}: retune instead")
 
 
-def _retune(found: Tuned, model: FoundModel) -> dict[str, Any] | None:
+def _retune(found: MethodResult, model: FoundModel) -> dict[str, Any] | None:
     """None for gains that the service would not try on a loop (see `tuning.rules.design`), and for those of a rule on a
     model that the five stages do not take."""
     if found.assessment is None or isinstance(model, TransferFunction):

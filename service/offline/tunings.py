@@ -13,14 +13,14 @@ from typing import Any
 from loopwright.service.jsonable import plain
 from loopwright.service.offline.model_json import dump_model
 from loopwright.service.plausible import Implausible, check_option
-from loopwright.tuning.analysis.assessment import Assessment, assess
+from loopwright.tuning.analysis.assessment import Assessment
 from loopwright.tuning.analysis.step_figures import StepFigures
 from loopwright.tuning.gain_forms import to_parallel
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Model
 from loopwright.tuning.reasons import Ended, Failed, Reason, Refused
-from loopwright.tuning.rules.design import realisable
 from loopwright.tuning.rules.registry import METHODS, Method, Option
+from loopwright.tuning.rules.tuned import tune
 
 ALL = "all"
 FORM = "ISA: u = Kp*(b*SP - PV + integral(SP - PV)/Ti + Td*d/dt(c*SP - PV)/(1 + Tf*s)); Ti = 0: no integral"
@@ -49,7 +49,7 @@ class BadTuning(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Tuned:
+class MethodResult:
     """What one method says of a model: gains and how they do, or the refusal."""
 
     method: Method
@@ -60,7 +60,7 @@ class Tuned:
     refusal: Ended | None = None
 
 
-def tune_model(model: Model, method: str = ALL, options: Mapping[str, object] | None = None) -> list[Tuned]:
+def tune_model(model: Model, method: str = ALL, options: Mapping[str, object] | None = None) -> list[MethodResult]:
     """By the method named, or by all in the order of the registry; each option goes to the methods that have it.
 
     Raises BadTuning. A method that refuses the model is in the list with its refusal.
@@ -68,7 +68,7 @@ def tune_model(model: Model, method: str = ALL, options: Mapping[str, object] | 
     return tune_each(model, list(METHODS) if method == ALL else [method], options)
 
 
-def tune_each(model: Model, names: Sequence[str], options: Mapping[str, object] | None = None) -> list[Tuned]:
+def tune_each(model: Model, names: Sequence[str], options: Mapping[str, object] | None = None) -> list[MethodResult]:
     """By the methods named, in this order; as `tune_model`."""
     for name in names:
         if name not in METHODS:
@@ -85,7 +85,7 @@ def tunings(model: Model, method: str = ALL, options: Mapping[str, object] | Non
     return answer(model, tune_model(model, method, options))
 
 
-def answer(model: Model, found: Iterable[Tuned]) -> dict[str, Any]:
+def answer(model: Model, found: Iterable[MethodResult]) -> dict[str, Any]:
     """The JSON object; what is not known is null."""
     return {
         "model": dump_model(model),
@@ -96,7 +96,7 @@ def answer(model: Model, found: Iterable[Tuned]) -> dict[str, Any]:
     }
 
 
-def as_json(found: Tuned) -> dict[str, Any]:
+def as_json(found: MethodResult) -> dict[str, Any]:
     """One method's part of the JSON object."""
     gains, assessed, refusal = found.gains, found.assessment, found.refusal
     parallel = to_parallel(gains) if gains else None
@@ -155,19 +155,15 @@ def _check(methods: list[Method], name: str, value: object) -> None:
         raise BadTuning("; ".join(dict.fromkeys(refusals)))
 
 
-def _tuned(method: Method, model: Model, options: Mapping[str, object]) -> Tuned:
+def _tuned(method: Method, model: Model, options: Mapping[str, object]) -> MethodResult:
     try:
-        setting = method.tune(model, **options)
-        gains, notes = realisable(setting.gains, method.filter)
-        assessed = assess(model, gains)
+        found = tune(model, method.name, 0.0, **options)
     except Ended as refusal:
-        return Tuned(method, refusal=refusal)
+        return MethodResult(method, refusal=refusal)
     except (ArithmeticError, ValueError) as error:
         # one method's defect must not take the other methods' answers with it
-        return Tuned(method, refusal=Failed(Reason.INTERNAL, f"{type(error).__name__}: {error}"))
-    if not assessed.stable:
-        notes += ("With these gains the loop is unstable on this model.",)
-    return Tuned(method, gains, setting.chosen, setting.notes + notes, assessed)
+        return MethodResult(method, refusal=Failed(Reason.INTERNAL, f"{type(error).__name__}: {error}"))
+    return MethodResult(method, found.gains, found.chosen, found.notes, found.assessment)
 
 
 def _margins(found: Assessment) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from loopwright.service.offline.csv_record import Record
 from loopwright.service.offline.model_json import describe, dump_model
-from loopwright.service.offline.tunings import Tuned
+from loopwright.service.offline.tunings import MethodResult
 from loopwright.tuning.analysis.step_response import Response, step_response
 from loopwright.tuning.identification.identify import Identified
 from loopwright.tuning.models import Model
@@ -27,7 +27,7 @@ OUTLIER = 3.0
 """A curve may reach so many times the others' median range before the axis stops following it."""
 
 
-def responses(path: Path, model: Model, found: Sequence[Tuned]) -> None:
+def responses(path: Path, model: Model, found: Sequence[MethodResult]) -> None:
     """Unit steps of the set-point (left) and of the load (right), PV over MV; unstable loops are left out."""
     stable = [each for each in found if each.gains and each.assessment and each.assessment.stable]
     figure = Figure(figsize=(13, 7.5), layout="constrained")
@@ -91,7 +91,7 @@ def _curves(axes: Axes, drawn: Sequence[Response], names: Sequence[str], of_mv: 
         axes.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
 
 
-def _horizon(stable: Sequence[Tuned], load: bool) -> float:
+def _horizon(stable: Sequence[MethodResult], load: bool) -> float:
     """s: enough for the median loop to come to rest, and no more than for the slowest."""
     times = []
     for each in stable:

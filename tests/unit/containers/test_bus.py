@@ -87,11 +87,13 @@ def test_where_nothing_but_vcan_will_do_it_ends_with_that_line(answer: int, word
 
 
 def test_the_door_leads_to_the_service_once_there_is_one() -> None:
-    ports = (free_port(), free_port(), free_port())
-    with running(NO_MODULE, "hub", ports):
-        with socket.create_connection(("127.0.0.1", ports[1]), timeout=120) as early:
-            assert early.recv(1) == b""
-        with socket.create_server(("127.0.0.1", ports[2])) as service:
+    with socket.socket() as service:
+        service.bind(("127.0.0.1", 0))  # ours from now on, and nobody answers there yet
+        ports = (free_port(), free_port(), int(service.getsockname()[1]))
+        with running(NO_MODULE, "hub", ports):
+            with socket.create_connection(("127.0.0.1", ports[1]), timeout=120) as early:
+                assert early.recv(1) == b""
+            service.listen()
 
             def serve() -> None:
                 inner, _ = service.accept()

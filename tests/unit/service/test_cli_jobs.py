@@ -14,6 +14,7 @@ from fastapi.testclient import TestClient
 from typer.testing import CliRunner, Result
 
 from loopwright.service.cli import main as cli
+from loopwright.service.cli.client import Client
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import NoGain, Reason, Refused
 from tests.unit.service.fakes import TAG, FakeLoop, Service
@@ -31,6 +32,8 @@ class Through:
 
     def get(self, path: str, **query: Any) -> Any:
         return self._checked(self._client.get(path, params={k: v for k, v in query.items() if v is not None}))
+
+    samples_of = Client.samples_of
 
     def post(self, path: str, body: dict[str, Any] | None = None) -> Any:
         self.posted.append(body or {})

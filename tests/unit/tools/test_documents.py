@@ -61,3 +61,18 @@ def test_commands_that_it_names_are_there(document: str) -> None:
     assert set(re.findall(r"`make ([\w-]+)", text(document))) <= TARGETS
     commands = re.findall(r"(?:`|^    |/bin/)loopwright ([a-z][\w-]*)", text(document), re.MULTILINE)
     assert set(commands) <= COMMANDS
+
+
+EXAMPLES = [
+    pytest.param(code, printed, id=f"{document}-{number}")
+    for document in DOCUMENTS
+    for number, (code, printed) in enumerate(
+        re.findall(r"^```python\n(.*?)^```\n\n```\n(.*?)^```$", text(document), re.MULTILINE | re.DOTALL)
+    )
+]
+
+
+@pytest.mark.parametrize(("code", "printed"), EXAMPLES)
+def test_examples_print_what_is_printed_below_them(code: str, printed: str, capsys: pytest.CaptureFixture[str]) -> None:
+    exec(compile(code, "example", "exec"), {})
+    assert capsys.readouterr().out == printed

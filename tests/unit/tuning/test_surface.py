@@ -1,0 +1,90 @@
+"""`loopwright.tuning` as a notebook uses it."""
+
+from __future__ import annotations
+
+import pydoc
+import subprocess
+import sys
+from dataclasses import replace
+
+import control
+import numpy as np
+import pytest
+from scipy import signal
+
+from loopwright import tuning
+
+PLANT = tuning.FOPDT(K=2.0, T=10.0, L=1.0)
+
+
+def test_every_name_is_there_and_in_the_help() -> None:
+    assert all(getattr(tuning, name) is not None for name in tuning.__all__)
+    told = pydoc.plain(pydoc.render_doc(tuning))
+    assert all(name in told for name in tuning.__all__)
+    assert all(name in (tuning.__doc__ or "") for name in ("tune", "METHODS", "identify", "margins", "as_model"))
+    with pytest.raises(AttributeError, match="no attribute 'tuned_by_magic'"):
+        tuning.tuned_by_magic  # noqa: B018
+
+
+def test_a_model_loads_no_rule() -> None:
+    code = "import sys; from loopwright.tuning import FOPDT; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert "loopwright.tuning.models" in loaded and "loopwright.tuning.rules.registry" not in loaded
+
+
+def test_tune_says_gains_and_margins() -> None:
+    found = tuning.tune(PLANT, "simc")
+    # Skogestad 2003, eq. 23 and 24, tau_c = L
+    assert (found.gains.Kp, found.gains.Ti) == (pytest.approx(2.5), pytest.approx(8.0))
+    assert found.assessment.margins.Ms == tuning.margins(PLANT, found.gains).Ms
+    assert str(found).startswith("SIMC: Kp 2.5, Ti 8 s; Ms 1.61")
+
+
+@pytest.mark.parametrize(
+    "system",
+    [
+        control.TransferFunction([2.0], [10.0, 1.0]),
+        control.tf([2.0], [10.0, 1.0]),
+        signal.TransferFunction([2.0], [10.0, 1.0]),
+    ],
+)
+def test_models_of_other_libraries_are_tuned(system: tuning.Model) -> None:
+    found = tuning.tune(system, "simc", dead_time_s=1.0)
+    assert (found.gains.Kp, found.gains.Ti) == (pytest.approx(2.5), pytest.approx(8.0))
+    w = np.array([0.01, 0.3])
+    assert np.allclose(found.model.frequency_response(w), PLANT.frequency_response(w))
+
+
+@pytest.mark.parametrize(
+    ("system", "dead_time_s", "why"),
+    [
+        (control.tf([1.0], [1.0, 0.5], 0.1), 0.0, "discrete time"),
+        (control.tf([[[1.0], [1.0]]], [[[1.0, 1.0], [2.0, 1.0]]]), 0.0, "more than one"),
+        (PLANT, 2.0, "one too many"),
+    ],
+)
+def test_what_is_no_model_is_refused(system: tuning.Model, dead_time_s: float, why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        tuning.as_model(system, dead_time_s)
+
+
+def test_an_unknown_method_is_refused_with_those_that_are() -> None:
+    with pytest.raises(tuning.Refused, match=r"method must be one of .*simc"):
+        tuning.tune(PLANT, "magic")
+
+
+def test_it_draws_itself() -> None:
+    found = tuning.tune(PLANT, "simc")
+    pv, load = (axes.lines[0] for axes in found.plot().axes[:2])
+    response = tuning.step_response(PLANT, found.gains)
+    assert np.array_equal(pv.get_ydata(), response.y) and len(load.get_ydata())
+    assert (found._repr_png_() or b"").startswith(b"\x89PNG")
+
+
+def test_a_loop_that_is_not_stable_has_no_picture() -> None:
+    too_much = tuning.Gains(Kp=100.0, Ti=1.0)
+    found = replace(tuning.tune(PLANT), gains=too_much, assessment=tuning.assess(PLANT, too_much))
+    assert not found.assessment.stable and "unstable" in str(found)
+    with pytest.raises(tuning.Refused, match="no response to draw"):
+        found.plot()
+    assert found._repr_png_() is None

@@ -1,0 +1,93 @@
+"""A model tuned by hand: gains that a controller can carry out, what they do to the loop, and a picture of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from loopwright.tuning.analysis.assessment import Assessment, assess
+from loopwright.tuning.analysis.step_response import step_response
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import LinearSystem, Model, as_model
+from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.rules.design import realisable
+from loopwright.tuning.rules.registry import METHODS, Method
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, slots=True)
+class Tuned:
+    """What a method makes of a model.
+
+    gains: in ISA form; an ideal derivative has been given a filter.  chosen: the design parameters of the rule, by name
+    with unit.  notes: what the rule, and the filter, have to say.  assessment: margins and step figures of these gains
+    on this model, with its exact dead time.
+    """
+
+    method: Method
+    model: Model
+    gains: Gains
+    chosen: Mapping[str, float]
+    notes: tuple[str, ...]
+    assessment: Assessment
+
+    def __str__(self) -> str:
+        g, found = self.gains, self.assessment
+        derivative = f", Td {g.Td:.4g} s, Tf {g.Tf:.4g} s" if g.Td else ""
+        gains = f"{self.method.title}: Kp {g.Kp:.4g}, Ti {g.Ti:.4g} s{derivative}"
+        if not found.stable or found.setpoint is None:
+            return f"{gains}; the loop would be unstable"
+        return f"{gains}; Ms {found.margins.Ms:.3g}, overshoot {found.setpoint.overshoot_pct:.1f} %"
+
+    def plot(self) -> Figure:
+        """PV and MV after a unit step of the set-point, and of the load. Needs matplotlib; raises Refused, NOT_ROBUST,
+        for a loop that is not stable."""
+        from matplotlib.figure import Figure
+
+        if not self.assessment.stable:
+            raise Refused(Reason.NOT_ROBUST, f"{self}: there is no response to draw")
+        figure = Figure(figsize=(10, 5), layout="constrained")
+        axes = figure.subplots(2, 2, sharex="col")
+        for column, of in enumerate(("set-point", "load")):
+            response = step_response(self.model, self.gains, load=of == "load")
+            axes[0, column].plot(response.t, response.y)
+            axes[1, column].plot(response.t, response.u)
+            axes[0, column].axhline(1.0 - column, color="black", linewidth=0.8, linestyle=":")
+            axes[0, column].set_title(f"unit step of the {of}")
+            axes[1, column].set_xlabel("time since the step, s")
+        axes[0, 0].set_ylabel("change of PV")
+        axes[1, 0].set_ylabel("change of MV")
+        figure.suptitle(str(self))
+        return figure
+
+    def _repr_png_(self) -> bytes | None:
+        """What a notebook shows."""
+        from io import BytesIO
+
+        if not self.assessment.stable:
+            return None
+        found = BytesIO()
+        self.plot().savefig(found, format="png", dpi=100)
+        return found.getvalue()
+
+
+def tune(model: Model | LinearSystem, method: str = "simc", dead_time_s: float = 0.0, **options: object) -> Tuned:
+    """The gains that a method gives a model, and what they do to the loop.
+
+    model: one of this library, or a transfer function of another (control, scipy.signal) with its dead time, s.
+    method, options: a name of `METHODS`, and options that it has.
+    Raises Refused: BAD_INPUT (method, option), or as the rule says: NOT_SELF_REGULATING, OUTSIDE_RANGE,
+    CANNOT_OSCILLATE; ValueError: a model that is none.
+    """
+    if method not in METHODS:
+        raise Refused(Reason.BAD_INPUT, f"method must be one of {', '.join(METHODS)}, not {method!r}")
+    plant, by = as_model(model, dead_time_s), METHODS[method]
+    setting = by.tune(plant, **options)
+    gains, notes = realisable(setting.gains, by.filter)
+    found = assess(plant, gains)
+    if not found.stable:
+        notes += ("With these gains the loop is unstable on this model.",)
+    return Tuned(by, plant, gains, setting.chosen, setting.notes + notes, found)
