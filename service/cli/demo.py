@@ -122,6 +122,6 @@ def _tell(job: dict[str, Any], seconds: float, folder: Path, picture: Path) -> N
         f"picture          {picture}",
         f"jobs, samples    {folder / 'data' / 'loopwright.sqlite'}",
         f"configuration    {folder / 'loops.yaml'}",
-        'next             README.md, "The service and its REST API": the same by hand; docs/one-job.md: how it works',
+        'next             docs/rest.md: the same by hand; docs/one-job.md: how it works',
     ]
     job_tables.console.print("\n".join(lines), highlight=False, soft_wrap=True)
