@@ -68,7 +68,7 @@ def start() -> Iterator[Start]:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         running.append(process)
         assert process.stdout is not None
-        assert process.stdout.readline().startswith(f"ready {module}")
+        assert process.stdout.readline().startswith(f"ready {module.removeprefix('loopwright.')}")
         return process
 
     yield go
