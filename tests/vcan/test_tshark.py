@@ -29,7 +29,7 @@ from loopwright.protocol.profile import (
     sdo_response_id,
 )
 from loopwright.service.execution.runner import Watch, run
-from loopwright.service.loops.bus_loop import BusLoop
+from loopwright.service.loops.bus_loop import WATCH_S, BusLoop
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode, Plan, SetGains, SetMode, SetRelay, SetSetpoint
 
@@ -107,7 +107,7 @@ def session() -> None:
     assert result.ended is None, result.ended
     loop.begin()
     loop.close()  # its heartbeat ends while its lease runs
-    time.sleep(1.5)
+    time.sleep(WATCH_S + 1.0)
     bus = open_bus(URL)
     for command in (NmtCommand.STOP, NmtCommand.START, NmtCommand.RESET_NODE):
         bus.send(NMT_ID, NMT_FRAME.pack(command, CONTROLLER))
