@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 from benchmarks.disturbances import Disturbance
 from benchmarks.plants import SAMPLES_PER_PERIOD, Plant
-from loopwright.tuning.fast.design import Wish
+from loopwright.tuning.fast.design import DesignSpec
 
 ASKED = 1.6
-PI = Wish(ASKED)
+PI = DesignSpec(ASKED)
 UNDISTURBED = Disturbance()
 
 
@@ -37,9 +37,9 @@ class Case:
     noise_gain: float | None = None
     tail: float = 0.0
 
-    def wish(self, plant: Plant) -> Wish:
+    def spec(self, plant: Plant) -> DesignSpec:
         bound = None if self.noise_gain is None else self.noise_gain * plant.Ku
-        return Wish(ASKED, self.derivative, self.Mt, bound)
+        return DesignSpec(ASKED, self.derivative, self.Mt, bound)
 
 
 PLAIN = Case("", 0.0)

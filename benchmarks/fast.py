@@ -26,9 +26,9 @@ from loopwright.controller.channel import Channel, RelaySettings, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.tuning.analysis.margins import margins
-from loopwright.tuning.fast.design import Wish
+from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.record import Evidence
-from loopwright.tuning.fast.verdict import judge
+from loopwright.tuning.fast.verdict import evaluate
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.disturbances import STRUCTURES
 from loopwright.tuning.identification.output_error import Fit
@@ -149,12 +149,12 @@ def plain_design(model: TransferFunction, period: float) -> Gains:
 def run(records: int = MANY) -> dict[str, float]:
     """Times in s of processor; memory in MB of the whole process."""
     evidence = record()
-    wish = Wish(1.6)
-    judge(evidence, wish)
+    spec = DesignSpec(1.6)
+    evaluate(evidence, spec)
     times = []
     for _ in range(REPEATS):
         start = time.process_time()
-        ours = judge(evidence, wish)
+        ours = evaluate(evidence, spec)
         times.append(time.process_time() - start)
     start = time.process_time()
     model = plain_fit(evidence)
@@ -164,7 +164,7 @@ def run(records: int = MANY) -> dict[str, float]:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     start = time.process_time()
     for seed in range(records):
-        judge(record(seed + 1), wish)
+        evaluate(record(seed + 1), spec)
     each_s = (time.process_time() - start) / records
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     true = TransferFunction(NUM, DEN, L + 0.5 * TS)

@@ -91,18 +91,18 @@ class Site:
 
     def until_over(self, urls: list[str], patience_s: float) -> tuple[list[dict[str, Any]], float]:
         """The jobs as they ended, and the largest memory seen meanwhile. It looks seldom: it is not to be the load."""
-        give_up, most, ended = time.monotonic() + patience_s, 0.0, []
+        give_up, maximum, ended = time.monotonic() + patience_s, 0.0, []
         while urls:
             job = self.http.get(urls[0]).json()
             if job["state"] not in tuple(ACTIVE):
                 ended.append(job)
                 urls = urls[1:]
                 continue
-            most = max(most, memory_MB(self.service.pid))
+            maximum = max(maximum, memory_MB(self.service.pid))
             if time.monotonic() > give_up:
                 raise RuntimeError(f"{len(urls)} jobs have not ended in {patience_s:g} s")
             time.sleep(0.5)
-        return ended, most
+        return ended, maximum
 
 
 def retuned(folder: Path, loops: int, pace: float, method: str = "five-stage") -> dict[str, Any]:
@@ -110,7 +110,7 @@ def retuned(folder: Path, loops: int, pace: float, method: str = "five-stage") -
     with ExitStack() as stack:
         site = Site(stack, folder, loops, pace)
         began, before = time.monotonic(), processor_s(site.service.pid)
-        jobs, most = site.until_over(site.retune_all(method), 600.0)
+        jobs, maximum = site.until_over(site.retune_all(method), 600.0)
         wall, processor = time.monotonic() - began, processor_s(site.service.pid) - before
     ends = Counter(job["reason"] or job["state"] for job in jobs)
     longest = max(job["plant_time_s"] for job in jobs)
@@ -127,7 +127,7 @@ def retuned(folder: Path, loops: int, pace: float, method: str = "five-stage") -
         "of_plant_time": wall * pace / longest,
         "proposed": ends["proposed"],
         "ends": dict(ends),
-        "memory_MB": most,
+        "memory_MB": maximum,
     }
 
 

@@ -28,7 +28,7 @@ from benchmarks.tuning import (
     T95_PERIODS,
     WRONG,
     Ran,
-    judged,
+    evaluated,
     kept,
     loads,
     loop_of,
@@ -133,7 +133,7 @@ def measure(method: str, plant: Plant, case: Case, seed: int) -> Ran:
     ran = Ran(method, plant.name, seed, passed / plant.Pu, time.process_time() - start)
     if isinstance(found, Ended):
         return replace(ran, reason=found.reason.value, detail=found.detail)
-    return judged(ran, plant, found)
+    return evaluated(ran, plant, found)
 
 
 def line(name: str, runs: Sequence[Ran]) -> str:

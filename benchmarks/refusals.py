@@ -18,8 +18,8 @@ from loopwright.controller.channel import Channel, Settings
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.execution.rehearsal import RehearsedLoop, _parameters
 from loopwright.service.execution.runner import Watch, run
-from loopwright.service.jobs.relay_record import kept
-from loopwright.service.jsonable import plain
+from loopwright.service.jobs.relay_record import relay_record
+from loopwright.service.jsonable import to_jsonable
 from loopwright.service.plots.fast_job import fast_job
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.procedure import FastOptions, fast
@@ -134,7 +134,7 @@ def rehearsed(cause: str, case: Case) -> dict[str, Any]:
             if event.stage == case.of:
                 plant.t = 0.0
         elif isinstance(event, StageDone) and isinstance(event.result, Found):
-            found = plain(event.result)
+            found = to_jsonable(event.result)
 
     class Heard:
         def __getattr__(self, name: str) -> Any:
@@ -154,10 +154,10 @@ def rehearsed(cause: str, case: Case) -> dict[str, Any]:
         "reason": ended.reason.value if ended else None,
         "detail": ended.detail if ended else None,
         "advice": ended.advice if ended else None,
-        "new_gains": plain(ran.value.gains) if ran.value else None,
-        "old_gains": plain(case.gains),
+        "new_gains": to_jsonable(ran.value.gains) if ran.value else None,
+        "old_gains": to_jsonable(case.gains),
         "evidence": found,
-        "model": plain(ran.value.model) if ran.value else None,
+        "model": to_jsonable(ran.value.model) if ran.value else None,
         "verification": None,
         "samples": {
             "stage": names,
@@ -168,7 +168,7 @@ def rehearsed(cause: str, case: Case) -> dict[str, Any]:
 
 
 def draw(folder: Path, cause: str, job: dict[str, Any]) -> Path:
-    record = kept(job["samples"])
+    record = relay_record(job["samples"])
     assert record is not None
     path = folder / f"{cause.replace('_', '-')}.png"
     fast_job(path, job, record, "degC")

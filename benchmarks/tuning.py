@@ -38,15 +38,15 @@ from loopwright.plantsim.plant import Plant as Simulated
 from loopwright.plantsim.reactor import Reactor
 from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.execution.runner import RunResult, Watch, run
-from loopwright.service.jobs.relay_record import kept as recorded
+from loopwright.service.jobs.relay_record import relay_record
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.experiments.preflight import PREFLIGHT, SETTLE, at_rest
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.design import Design, Wish
-from loopwright.tuning.fast.procedure import LEAST_SAMPLES, FastOptions, FastProposal, fast
+from loopwright.tuning.fast.design import Design, DesignSpec
+from loopwright.tuning.fast.procedure import MIN_SAMPLES, FastOptions, FastProposal, fast
 from loopwright.tuning.fast.record import Evidence
 from loopwright.tuning.fast.relay_test import Experiment
-from loopwright.tuning.fast.verdict import judge_again
+from loopwright.tuning.fast.verdict import evaluate_again
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import sign
 from loopwright.tuning.plan import Command, Event, Mode, Plan, Sample, StageStarted
@@ -87,7 +87,7 @@ class Troubled(RehearsedLoop):
         """Of what was taken, without the last so many samples."""
         columns = zip(*self.taken[: len(self.taken) - tail], strict=True)
         named = dict(zip(("t_s", "sp", "pv", "mv", "mode"), columns, strict=True))
-        record = recorded({"stage": len(named["t_s"]) * [PREFLIGHT], **named})
+        record = relay_record({"stage": len(named["t_s"]) * [PREFLIGHT], **named})
         return record.evidence() if record else None
 
 
@@ -128,7 +128,7 @@ def relay_span(plant: Plant) -> float:
     """Of PV under four switches of a relay of amplitude 1, without noise."""
 
     def plan(facts: Facts) -> Plan[float]:
-        point, listened = yield from at_rest(facts, 0.0, LEAST_SAMPLES)
+        point, listened = yield from at_rest(facts, 0.0, MIN_SAMPLES)
         experiment = Experiment(facts, point, listened, 1.0)
         yield from experiment.relay(4)
         return experiment.evidence().span
@@ -165,12 +165,12 @@ class Ran:
 
 
 @cache
-def optimum(plant: Plant, wish: Wish) -> tuple[Design, float, tuple[float, float]]:
+def optimum(plant: Plant, spec: DesignSpec) -> tuple[Design, float, tuple[float, float]]:
     """The design on the true plant, its J, and the least integrals that J is counted in."""
-    design = Design(plant.model(), wish, plant.Pu)
+    design = Design(plant.model(), spec, plant.Pu)
     best = design.best()
-    assert design.least is not None
-    return design, best.J, (design.least.setpoint, design.least.load)
+    assert design.minimum is not None
+    return design, best.J, (design.minimum.setpoint, design.minimum.load)
 
 
 @cache
@@ -189,10 +189,10 @@ def _run(plant: Plant, case: Case, seed: int) -> tuple[RunResult[FastProposal], 
     # a step that the preflight can tell from the noise
     deviation = span * max(0.5, 12.0 * case.noise)
     loop, facts = loop_of(plant, case.amplitude, deviation, case.noise * span, seed, case)
-    wish = case.wish(plant)
+    spec = case.spec(plant)
     amplitude = None if case.adapted else case.amplitude
     # what is judged is the design, whatever it is worth beside the gains that the loop has to begin with
-    options = FastOptions(wish.Ms, wish.derivative, wish.Mt, wish.noise_gain, amplitude, propose_anyway=True)
+    options = FastOptions(spec.Ms, spec.derivative, spec.Mt, spec.noise_gain, amplitude, propose_anyway=True)
     result = run(fast(facts, options), loop, watch=Watch(max_time_s=100.0 * plant.Pu), on_event=loop.hear)
     passed = sum(value for stage, value in result.plant_time_s.items() if stage not in (PREFLIGHT, SETTLE))
     return result, passed / plant.Pu, loop
@@ -211,33 +211,33 @@ def measure(case: Case, plant: Plant, seed: int) -> Ran:
     if case.tail:
         evidence = loop.record(round(case.tail * case.samples))
         assert evidence is not None
-        again = judge_again(evidence, case.wish(plant))
+        again = evaluate_again(evidence, case.spec(plant))
         if again.cause is not None:
             return replace(ran, reason=again.cause, detail=again.detail)
         gains = again.best.gains
     # a plant that has changed is judged as it is now
     now = replace(plant, num=tuple(case.how.gain * c for c in plant.num), L=plant.L + case.how.later * plant.Pu)
-    return judged(ran, now, gains, case.wish(plant))
+    return evaluated(ran, now, gains, case.spec(plant))
 
 
-def judged(ran: Ran, plant: Plant, gains: Gains, wish: Wish = PI) -> Ran:
+def evaluated(ran: Ran, plant: Plant, gains: Gains, spec: DesignSpec = PI) -> Ran:
     """With what the gains are worth on the true plant."""
     true = margins(plant.model(), gains)
     if not true.stable:
         return ran
-    over = true.Ms - wish.Ms
-    if wish.Mt is not None:
-        over = max(over, true.Mt - wish.Mt)
-    if wish.noise_gain is not None:
-        over = max(over, gains.Kp * (1.0 + wish.N if gains.Td else 1.0) / wish.noise_gain - 1.0)
-    return replace(ran, Ms=true.Ms, over=over, ratio=cost_over_best(plant, gains, wish))
+    over = true.Ms - spec.Ms
+    if spec.Mt is not None:
+        over = max(over, true.Mt - spec.Mt)
+    if spec.noise_gain is not None:
+        over = max(over, gains.Kp * (1.0 + spec.N if gains.Td else 1.0) / spec.noise_gain - 1.0)
+    return replace(ran, Ms=true.Ms, over=over, ratio=cost_over_best(plant, gains, spec))
 
 
-def cost_over_best(plant: Plant, gains: Gains, wish: Wish = PI) -> float:
+def cost_over_best(plant: Plant, gains: Gains, spec: DesignSpec = PI) -> float:
     """J of gains that are stable on the true plant, over that of the best PI (or PID) for it."""
-    design, best, least = optimum(plant, wish)
-    cost = design.cost(gains.Kp, gains.Ti, gains.Td, design.wish.N)
-    return (0.5 * cost.setpoint / least[0] + 0.5 * cost.load / least[1]) / best
+    design, best, minimum = optimum(plant, spec)
+    cost = design.cost(gains.Kp, gains.Ti, gains.Td, design.spec.N)
+    return (0.5 * cost.setpoint / minimum[0] + 0.5 * cost.load / minimum[1]) / best
 
 
 def line(name: str, runs: Sequence[Ran]) -> str:

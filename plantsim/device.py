@@ -30,7 +30,7 @@ from loopwright.protocol.profile import (
 from loopwright.protocol.runtime import Runtime
 from loopwright.protocol.sdo import SdoAbort
 
-_MOST_CATCH_UP = 5
+_MAX_CATCH_UP = 5
 """Periods the pace may lag behind the wall clock before it gives the lost time up."""
 
 
@@ -162,7 +162,7 @@ class PlantDevice:
         else:
             period = self._sample_time_s / self._pace
             self._next_at += period
-            if self._next_at < now - _MOST_CATCH_UP * period:
+            if self._next_at < now - _MAX_CATCH_UP * period:
                 self._next_at = now
         self.runtime.due = self._next_at
 

@@ -47,7 +47,7 @@ STEADY_STATE = (
 )
 """CA, CB, CC in mol/m3, h in m, T in K at 50 %."""
 
-_MOST_SUBSTEP_S = 0.25  # RK4 is exact to 1e-6 mol/m3 here, and stable down to the leak (fastest rate 7 1/s)
+_MAX_SUBSTEP_S = 0.25  # RK4 is exact to 1e-6 mol/m3 here, and stable down to the leak (fastest rate 7 1/s)
 
 State = tuple[float, float, float, float, float]
 
@@ -136,7 +136,7 @@ class Reactor:
 
     def _run(self, command: float, inlet_K: float, duration: float) -> None:
         """Constant input for `duration` s: the actuator's lag in closed form, the vessel by Runge-Kutta 4."""
-        substeps = math.ceil(duration / _MOST_SUBSTEP_S)
+        substeps = math.ceil(duration / _MAX_SUBSTEP_S)
         dt = duration / substeps
         half_decay = math.exp(-0.5 * dt / ACTUATOR_LAG_S)
         state = self.state

@@ -9,7 +9,7 @@ from loopwright.protocol.objects import Value, lookup
 from loopwright.protocol.profile import EMCY_FRAME, EMCY_REGISTER, Abort, Emcy
 from loopwright.protocol.sdo import SdoAbort
 
-_MOST_REMEMBERED = len(lookup("error_field").names)
+_MAX_REMEMBERED = len(lookup("error_field").names)
 
 
 class Emergencies:
@@ -34,7 +34,7 @@ class Emergencies:
         if error in self._errors:
             return
         self._errors.append(error)
-        self._history = [int(code), *self._history][:_MOST_REMEMBERED]
+        self._history = [int(code), *self._history][:_MAX_REMEMBERED]
         self._send(EMCY_FRAME.pack(code, EMCY_REGISTER[code], detail[:5]))
 
     def clear_error(self, code: Emcy, source: bytes | None = None) -> None:

@@ -10,7 +10,7 @@ import math
 import struct
 
 _REAL32 = struct.Struct("<f")
-_LEAST_NORMAL = 2.0**-126
+_MIN_NORMAL = 2.0**-126
 
 
 def shortest(value: float) -> float:
@@ -19,7 +19,7 @@ def shortest(value: float) -> float:
         return value
     packed = _REAL32.pack(value)
     # A float32 has six digits at least, unless it is next to nothing, and with nine it is told from every other.
-    for digits in range(6 if abs(value) >= _LEAST_NORMAL else 1, 9):
+    for digits in range(6 if abs(value) >= _MIN_NORMAL else 1, 9):
         decimal = float(f"{value:.{digits}g}")
         if _packs_to(decimal, packed):
             return decimal

@@ -35,7 +35,7 @@ from loopwright.protocol.sdo import SdoServer
 Handler = Callable[[bytes], None]
 
 _IDLE_S = 0.02
-_MOST_FRAMES_BETWEEN_TICKS = 64  # reading the clock is a system call in some virtual machines
+_MAX_FRAMES_BETWEEN_TICKS = 64  # reading the clock is a system call in some virtual machines
 _PAUSE_AFTER_BUS_ERROR_S = 0.05
 _TOLD_AGAIN_AFTER_S = 5.0  # without an error: then it is another one
 _COMMUNICATION = (0x1000, 0x1FFF)
@@ -160,7 +160,7 @@ class Runtime:
         now = self.clock()
         slow = now - self._last_tick > _IDLE_S
         between = self._between_ticks // 2 if slow else self._between_ticks * 2
-        self._countdown = self._between_ticks = min(max(between, 1), _MOST_FRAMES_BETWEEN_TICKS)
+        self._countdown = self._between_ticks = min(max(between, 1), _MAX_FRAMES_BETWEEN_TICKS)
         self._last_tick = now
         self._produce_heartbeat(now)
         self._consume_heartbeats(now)

@@ -8,19 +8,19 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 
-def plain(value: object) -> Any:
+def to_jsonable(value: object) -> Any:
     """Dataclasses and mappings as dict, sequences as list, numpy scalars as numbers; NaN and infinity as null."""
     if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
+        return {field.name: to_jsonable(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_jsonable(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [to_jsonable(item) for item in value]
     value = value.item() if hasattr(value, "item") else value
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def plain_object(value: object) -> dict[str, Any] | None:
+def to_json_object(value: object) -> dict[str, Any] | None:
     """The same of a stage's result, which is stored as an object: what is none becomes {"value": ...}."""
-    found = plain(value)
+    found = to_jsonable(value)
     return found if found is None or isinstance(found, dict) else {"value": found}

@@ -36,8 +36,8 @@ class Machine:
         """Not started yet; it ends with the process at the latest."""
         return threading.Thread(target=run, name=name, daemon=True)
 
-    def side_by_side(self, call: Callable[[T], None], items: Iterable[T], most: int) -> None:
+    def side_by_side(self, call: Callable[[T], None], items: Iterable[T], max_workers: int) -> None:
         """Returns when the call has been made for each item, so many at a time."""
-        with ThreadPoolExecutor(most) as pool:
+        with ThreadPoolExecutor(max_workers) as pool:
             for _ in pool.map(call, items):
                 pass

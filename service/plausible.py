@@ -15,22 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
-LEAST_TIME_S, MOST_TIME_S = 1e-6, 1e8
+MIN_TIME_S, MAX_TIME_S = 1e-6, 1e8
 """From a microsecond, the unit of a controller's sample time, to three years."""
-LEAST_GAIN, MOST_GAIN = 1e-9, 1e9
+MIN_GAIN, MAX_GAIN = 1e-9, 1e9
 """PV units over MV units, or the other way round: from flows in m3/s to pressures in Pa."""
-MOST_VALUE = 1e12
+MAX_VALUE = 1e12
 """Of PV, in its units."""
 SPREAD = 1e5
 """Of a plant's time constants. The stiffest plant of the benchmarks has 1e3."""
-LEAST_DEAD_TIME, MOST_DEAD_TIME = 1e-5, 1e3
+MIN_DEAD_TIME, MAX_DEAD_TIME = 1e-5, 1e3
 """Over the longest time constant. The benchmarks have 1e-3 to 50; a shorter one is none."""
 SPREAD_OF_ZEROS = 1e9
 """Of a zero that is faster than every lag: fits leave such, and they do no harm."""
-LEAST_DAMPING = 1e-3
-MOST_SAMPLES = 200_000
+MIN_DAMPING = 1e-3
+MAX_SAMPLES = 200_000
 """In T95 or in the dead time: of more, a rehearsal takes minutes."""
-LEAST_STEP = 1e-6
+MIN_STEP = 1e-6
 """Of a set-point step, over the largest PV: values travel as REAL32, which has 7 digits."""
 _LARGEST_COEFFICIENT = 1e100
 
@@ -74,18 +74,18 @@ def _check_gain(num: Reals, den: Reals, lags: Reals, dead_time_s: float) -> None
     gain = abs(float(num[-1] / at_the_end[-1]))  # 0: PV comes back, which others refuse
     if len(at_the_end) < len(den):  # integrating: what PV moves in the plant's own time
         gain *= max([dead_time_s, *lags]) or 1.0
-    if gain and not LEAST_GAIN <= gain <= MOST_GAIN:
+    if gain and not MIN_GAIN <= gain <= MAX_GAIN:
         raise Implausible(
-            f"a gain of {gain:.3g} PV units per MV unit is no plant's; permitted are {LEAST_GAIN:g} to {MOST_GAIN:g}: "
+            f"a gain of {gain:.3g} PV units per MV unit is no plant's; permitted are {MIN_GAIN:g} to {MAX_GAIN:g}: "
             "look whether K is given per percent of MV, or choose another unit of PV"
         )
 
 
 def _check_times(lags: Reals, leads: Reals, dead_time_s: float) -> None:
     for name, value in (*(("time constant", lag) for lag in lags), ("dead time", dead_time_s)):
-        if value and not LEAST_TIME_S <= value <= MOST_TIME_S:
+        if value and not MIN_TIME_S <= value <= MAX_TIME_S:
             raise Implausible(
-                f"a {name} of {value:.3g} s is no plant's; permitted are {LEAST_TIME_S:g} to {MOST_TIME_S:g} s: "
+                f"a {name} of {value:.3g} s is no plant's; permitted are {MIN_TIME_S:g} to {MAX_TIME_S:g} s: "
                 "look whether times are in seconds"
             )
     if not len(lags):
@@ -102,12 +102,12 @@ def _check_times(lags: Reals, leads: Reals, dead_time_s: float) -> None:
                 f"a zero of {lead:.3g} s beside a time constant of {longest:.3g} s; permitted are "
                 f"{longest / SPREAD_OF_ZEROS:.3g} to {longest * SPREAD:.3g} s: leave it out, or correct num"
             )
-    least, most = LEAST_DEAD_TIME * longest, MOST_DEAD_TIME * longest
-    if dead_time_s and not least <= dead_time_s <= most:
-        what = "give 0" if dead_time_s < least else "correct it, or the time constants"
+    minimum, maximum = MIN_DEAD_TIME * longest, MAX_DEAD_TIME * longest
+    if dead_time_s and not minimum <= dead_time_s <= maximum:
+        what = "give 0" if dead_time_s < minimum else "correct it, or the time constants"
         raise Implausible(
             f"a dead time of {dead_time_s:.3g} s beside a time constant of {longest:.3g} s; permitted are 0, and "
-            f"{least:.3g} to {most:.3g} s: {what}"
+            f"{minimum:.3g} to {maximum:.3g} s: {what}"
         )
 
 
@@ -115,34 +115,34 @@ def check_option(name: str, unit: str, value: object) -> None:
     """Of a method. Raises Implausible."""
     if isinstance(value, bool) or not isinstance(value, int | float) or value == 0:
         return
-    low, high = (LEAST_TIME_S, MOST_TIME_S) if unit == "s" else (LEAST_GAIN, MOST_GAIN)
+    low, high = (MIN_TIME_S, MAX_TIME_S) if unit == "s" else (MIN_GAIN, MAX_GAIN)
     if not low <= abs(value) <= high:
         raise Implausible(f"{name} {value:.4g} is out of all bounds; permitted are 0, and {low:g} to {high:g} {unit}")
 
 
 def check_damping(zeta: float) -> None:
     """Raises Implausible."""
-    if zeta < LEAST_DAMPING:
+    if zeta < MIN_DAMPING:
         raise Implausible(
-            f"zeta {zeta:.3g} is no plant's: it hardly ever comes to rest; permitted are {LEAST_DAMPING:g} and more"
+            f"zeta {zeta:.3g} is no plant's: it hardly ever comes to rest; permitted are {MIN_DAMPING:g} and more"
         )
 
 
 def check_sampling(dead_time_s: float, t95_s: float, sample_time_s: float) -> None:
     """Of a plant to rehearse on. Raises Implausible."""
-    if not LEAST_TIME_S <= t95_s <= MOST_TIME_S:
-        raise Implausible(f"t95_s {t95_s:.3g}; permitted are {LEAST_TIME_S:g} to {MOST_TIME_S:g} s: correct t95_s")
+    if not MIN_TIME_S <= t95_s <= MAX_TIME_S:
+        raise Implausible(f"t95_s {t95_s:.3g}; permitted are {MIN_TIME_S:g} to {MAX_TIME_S:g} s: correct t95_s")
     check_dead_time(dead_time_s, t95_s)
-    if not LEAST_TIME_S <= sample_time_s <= t95_s:
+    if not MIN_TIME_S <= sample_time_s <= t95_s:
         raise Implausible(
-            f"sample_time_s {sample_time_s:.3g} with a T95 of {t95_s:.3g} s; permitted are {LEAST_TIME_S:g} s to T95: "
+            f"sample_time_s {sample_time_s:.3g} with a T95 of {t95_s:.3g} s; permitted are {MIN_TIME_S:g} s to T95: "
             "a loop is controlled at a hundredth of T95 or faster"
         )
     for name, time_s in (("T95", t95_s), ("the dead time", dead_time_s)):
-        if time_s > MOST_SAMPLES * sample_time_s:
+        if time_s > MAX_SAMPLES * sample_time_s:
             raise Implausible(
                 f"sample_time_s {sample_time_s:g} is {time_s / sample_time_s:.3g} times in {name} ({time_s:.4g} s); "
-                f"at most {MOST_SAMPLES:,} are allowed: sample more slowly, or correct that time"
+                f"at most {MAX_SAMPLES:,} are allowed: sample more slowly, or correct that time"
             )
 
 
@@ -158,10 +158,10 @@ def check_dead_time(dead_time_s: float, t95_s: float) -> None:
 def check_step(sp_deviation: float, pv_low: float, pv_high: float) -> None:
     """Raises Implausible."""
     largest = max(abs(pv_low), abs(pv_high))
-    if sp_deviation < LEAST_STEP * largest:
+    if sp_deviation < MIN_STEP * largest:
         raise Implausible(
             f"sp_deviation {sp_deviation:.3g} is lost beside PV limits of {largest:.3g}: PV has 7 digits on the bus; "
-            f"at least {LEAST_STEP * largest:.3g} is needed: correct it or the limits"
+            f"at least {MIN_STEP * largest:.3g} is needed: correct it or the limits"
         )
 
 
@@ -177,8 +177,8 @@ def _within(low: float, high: float, unit: str) -> AfterValidator:
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Time = Annotated[Positive, _within(LEAST_TIME_S, MOST_TIME_S, "s")]
-TimeOrNone = Annotated[NotNegative, _within(LEAST_TIME_S, MOST_TIME_S, "s, or 0")]
-Gain = Annotated[Positive, _within(LEAST_GAIN, MOST_GAIN, "PV and MV units over each other")]
-Value = Annotated[Finite, _within(0.0, MOST_VALUE, "in units of PV")]
-Size = Annotated[NotNegative, _within(0.0, MOST_VALUE, "in units of PV")]
+Time = Annotated[Positive, _within(MIN_TIME_S, MAX_TIME_S, "s")]
+TimeOrNone = Annotated[NotNegative, _within(MIN_TIME_S, MAX_TIME_S, "s, or 0")]
+Gain = Annotated[Positive, _within(MIN_GAIN, MAX_GAIN, "PV and MV units over each other")]
+Value = Annotated[Finite, _within(0.0, MAX_VALUE, "in units of PV")]
+Size = Annotated[NotNegative, _within(0.0, MAX_VALUE, "in units of PV")]

@@ -28,7 +28,7 @@ from loopwright.tuning.reasons import Refused
 from loopwright.tuning.rules.registry import METHODS
 
 Percent = Annotated[float, Field(gt=0, lt=74, allow_inf_nan=False)]
-LEAST_AMPLITUDE_PCT = 1e-3
+MIN_AMPLITUDE_PCT = 1e-3
 """Of the relay: less is not to be told from nothing by a REAL32 of some ten percent."""
 
 
@@ -316,8 +316,8 @@ def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[s
             f"a relay of amplitude_pct {amplitude:g} needs {1.5 * amplitude:g} % of MV between its limits, "
             f"there are {mv.high - mv.low:g} %"
         )
-    if amplitude is not None and amplitude < LEAST_AMPLITUDE_PCT:
-        problems.append(f"a relay of amplitude_pct {amplitude:g} moves nothing; at least {LEAST_AMPLITUDE_PCT:g} %")
+    if amplitude is not None and amplitude < MIN_AMPLITUDE_PCT:
+        problems.append(f"a relay of amplitude_pct {amplitude:g} moves nothing; at least {MIN_AMPLITUDE_PCT:g} %")
     deviation = request.sp_deviation or loop.sp_deviation
     if deviation > loop.sp_deviation:
         problems.append(f"sp_deviation {deviation:g} is more than the configured {loop.sp_deviation:g} {loop.pv_unit}")

@@ -1,6 +1,6 @@
 """Controller settings in the ISA (standard) form, the only form used inside Loopwright.
 
-    u = Kp * ( b*SP - PV  +  1/Ti * integral(SP - PV)  +  Td * d/dt(c*SP - PV) / (1 + Tf*s) )
+u = Kp * ( b*SP - PV  +  1/Ti * integral(SP - PV)  +  Td * d/dt(c*SP - PV) / (1 + Tf*s) )
 """
 
 from __future__ import annotations

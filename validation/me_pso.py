@@ -195,11 +195,11 @@ def _search(references: References, name: str, weighting: Weighting, optimiser: 
     paper = references.search["paper_b"]
     domain = paper["printed"]["domains"][name]
     model = plant(paper["plants"][name])
-    return _least(model, weighting, optimiser, HORIZON_S[name], float(domain["Kp"][1]), float(domain["Ti"][1]))
+    return _min(model, weighting, optimiser, HORIZON_S[name], float(domain["Kp"][1]), float(domain["Ti"][1]))
 
 
 @cache
-def _least(
+def _min(
     model: TransferFunction, weighting: Weighting, optimiser: str, horizon_s: float, Kp_max: float, Ti_max: float
 ) -> float:
     found = me_pso(
@@ -233,8 +233,8 @@ def _optima(references: References) -> Table:
         for weighting in Weighting:
             best = _best_known(references, name, weighting)
             at_printed = Cell(best["criterion_at_printed_ME_PSO"], _at_printed(references, name, weighting))
-            least = Cell(best["criterion"], _search(references, name, weighting, "nelder-mead"))
-            rows.append(Row(f"{name} {weighting}", (at_printed, least)))
+            minimum = Cell(best["criterion"], _search(references, name, weighting, "nelder-mead"))
+            rows.append(Row(f"{name} {weighting}", (at_printed, minimum)))
     return Table(
         "The criterion at the printed ME-PSO settings and at its least",
         (Column("at the printed setting", 0, tol.CRITERION), Column("least", 0, tol.BEST_FOUND)),

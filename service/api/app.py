@@ -42,7 +42,7 @@ from loopwright.service.telemetry.lateness import watched_event_loop
 from loopwright.tuning.reasons import Ended
 
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
-MOST_EVENTS = 2000
+MAX_EVENTS = 2000
 """Of a job, for its view: those of its stages come first. After them decisions that fail may be added without end."""
 JobId = Annotated[str, Path(description="Id of the job", examples=["4f0c2a9be113"])]
 
@@ -90,7 +90,7 @@ def create_app(
     operations.install(app, jobs, operations.checks(jobs) if checks is None else checks)
 
     def views(rows: Sequence[JobRow]) -> list[JobView]:
-        events = jobs.store.events_by_job([row.id for row in rows], limit=MOST_EVENTS)
+        events = jobs.store.events_by_job([row.id for row in rows], limit=MAX_EVENTS)
         return [job_view(row, events[row.id], jobs.running(row.id)) for row in rows]
 
     def view(row: JobRow) -> JobView:

@@ -32,12 +32,12 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 HEADER = "Idempotency-Key"
-MOST_CHARACTERS = 128
-_CHARACTERS = rf"[A-Za-z0-9._~:+/=-]{{1,{MOST_CHARACTERS}}}"
+MAX_CHARACTERS = 128
+_CHARACTERS = rf"[A-Za-z0-9._~:+/=-]{{1,{MAX_CHARACTERS}}}"
 PATTERN = rf'^(?:{_CHARACTERS}|"{_CHARACTERS}")$'
 _AT_ONCE = 4
 """Threads of its own: requests that wait for a silent node do not keep an abort from claiming its key."""
-_WORDS = f"letters, digits and . _ ~ : + / = -, 1 to {MOST_CHARACTERS} of them, with or without quotes around"
+_WORDS = f"letters, digits and . _ ~ : + / = -, 1 to {MAX_CHARACTERS} of them, with or without quotes around"
 
 
 class Idempotent:

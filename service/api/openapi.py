@@ -9,7 +9,7 @@ from fastapi import FastAPI
 
 from loopwright.service.api import problems
 from loopwright.service.api.gate.gate import ALWAYS, scope_for
-from loopwright.service.api.idempotency import HEADER, MOST_CHARACTERS, PATTERN
+from loopwright.service.api.idempotency import HEADER, MAX_CHARACTERS, PATTERN
 from loopwright.service.store.idempotency import KEPT_H
 
 _KEY = "key"
@@ -21,7 +21,7 @@ _IDEMPOTENCY_KEY = {
     "description": "Any text that the client gives to no other request, a UUID say. Repeated with the same key within "
     f"{KEPT_H} h, the request does nothing again and is answered as it was the first time. With another path or body: "
     "422; while the first is still being answered: 409 with Retry-After",
-    "schema": {"type": "string", "pattern": PATTERN, "maxLength": MOST_CHARACTERS + 2},
+    "schema": {"type": "string", "pattern": PATTERN, "maxLength": MAX_CHARACTERS + 2},
     "example": "7f1c4f5e-2b8f-4a36-9f3a-5d0b3c1e8a77",
 }
 

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from loopwright.service.api.job_views import GainsView
 from loopwright.tuning.reasons import Reason
-from loopwright.tuning.rules.design import LEAST_GM, MOST_Ms
+from loopwright.tuning.rules.design import MIN_GM, MAX_Ms
 
 
 class OptionView(BaseModel):
@@ -19,8 +19,8 @@ class OptionView(BaseModel):
     default: float | str | bool | None = Field(description="null: the method decides from the model", examples=[None])
     meaning: str = Field(examples=["time constant of the closed loop; none: the dead time"])
     choices: list[str | float] = Field(description="The only values, for kind choice", examples=[["pi", "pid"]])
-    least: float | None = Field(examples=[0.0])
-    most: float | None = Field(examples=[None])
+    minimum: float | None = Field(examples=[0.0])
+    maximum: float | None = Field(examples=[None])
 
 
 class MethodView(BaseModel):
@@ -123,7 +123,7 @@ class TuningsView(BaseModel):
 class AlternativeView(TunedView):
     retune: dict[str, Any] | None = Field(
         description="Body for POST /loops/{tag}/retune, which tries these gains on the loop without another "
-        f"experiment; null without gains, where Ms is above {MOST_Ms:g} or GM below {LEAST_GM:g}, and for a rule on a "
+        f"experiment; null without gains, where Ms is above {MAX_Ms:g} or GM below {MIN_GM:g}, and for a rule on a "
         "model that is not K, T, L",
         examples=[
             {

@@ -16,7 +16,7 @@ from loopwright.service.api.tuning_views import AlternativesView, MethodView, Tu
 from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.jobs.alternatives import alternatives, redesigned
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.jobs.relay_record import kept
+from loopwright.service.jobs.relay_record import relay_record
 from loopwright.service.offline import tunings
 from loopwright.service.offline.model_json import parse_model
 from loopwright.tuning.fast.procedure import FAST
@@ -77,7 +77,7 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
             return partial(alternatives, row, events, method)
         wanted = bool(row.request.get("derivative")) if derivative is None else derivative
         fast = row.request.get("method") == FAST  # of others the model they found is designed on
-        record = kept(record_columns(jobs.store.blocks(job_id))) if fast else None
+        record = relay_record(record_columns(jobs.store.blocks(job_id))) if fast else None
         return partial(redesigned, row, events, record, ms, wanted)
 
     return routes

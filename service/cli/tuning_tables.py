@@ -14,7 +14,7 @@ from loopwright.service.offline.model_json import describe
 
 console = Console(highlight=False)
 
-MOST_CANDIDATES = 8
+MAX_CANDIDATES = 8
 _COLUMNS = (
     ("", "Kp", "gains"),
     ("", "Ti", "gains"),
@@ -108,13 +108,13 @@ def identified(answer: dict[str, Any]) -> None:
         "structure", "BIC", "rms", "parameters", "from rest", "beside MV", "", box=box.SIMPLE_HEAD, pad_edge=False
     )
     for i, each in enumerate(answer["candidates"]):
-        if i < MOST_CANDIDATES or each["chosen"]:
+        if i < MAX_CANDIDATES or each["chosen"]:
             table.add_row(
                 each["structure"], f"{each['bic']:.1f}", number(each["rms"]), str(each["parameters"]),
                 "yes" if each["at_rest"] else "no", _beside(each), "chosen" if each["chosen"] else "",
             )  # fmt: skip
     console.print(table)
-    if len(answer["candidates"]) > MOST_CANDIDATES:
+    if len(answer["candidates"]) > MAX_CANDIDATES:
         console.print(f"{len(answer['candidates'])} were tried; --json has them all.")
     console.print("For `loopwright tune --model`: " + json.dumps(answer["model"]), markup=False, soft_wrap=True)
     for note in answer["notes"]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from loopwright.service.config import LoopConfig
-from loopwright.service.jsonable import plain_object
+from loopwright.service.jsonable import to_json_object
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.service.planning.facts import facts_of, time_budget_s
@@ -111,7 +111,7 @@ def tune(
     ended = ran.ended
     if ran.value is not None and not ran.value.comparison.gain and not request.propose_anyway:
         ended = NoGain(Reason.NO_GAIN, ran.value.comparison.verdict)
-    return Outcome(plain_object(ran.value), ended, ran.restored, dict(ran.plant_time_s))
+    return Outcome(to_json_object(ran.value), ended, ran.restored, dict(ran.plant_time_s))
 
 
 def plan(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow] = ()) -> Plan[Any]:
@@ -143,7 +143,7 @@ def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcom
     from loopwright.service.execution.rehearsal import rehearse as rehearse_spec
 
     spec, on = rehearsal_spec(config, request, hooks.ground)
-    told = plain_object(on)
+    told = to_json_object(on)
     hooks.on_event(Note(f"rehearsed on {on.plant_text}; {on.gains_text}; nothing is tested on the loop"))
     options = _options(request)
     if request.fast:

@@ -17,7 +17,7 @@ from loopwright.controller.channel import Channel, RelaySettings, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant, Process
 from loopwright.service.execution.runner import RunResult, Watch, run
-from loopwright.service.jsonable import plain
+from loopwright.service.jsonable import to_jsonable
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Restored
 from loopwright.service.plausible import (
@@ -362,7 +362,7 @@ def _answer(
         if isinstance(proposal, FastProposal):
             answer |= {name: getattr(proposal, name) for name in ("predicted_before", "found", "verified")}
         answer["notes"] = list(proposal.notes)
-    clean: dict[str, Any] = plain(answer)
+    clean: dict[str, Any] = to_jsonable(answer)
     return clean
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from loopwright.service.jobs.journal import Journal
 from loopwright.service.jobs.progress import Progress
-from loopwright.service.jsonable import plain_object
+from loopwright.service.jsonable import to_json_object
 from loopwright.service.loops.observed_loop import ObservedLoop
 from loopwright.service.store.store import block_of, event_of
 from loopwright.service.telemetry.metrics import STAGE_SECONDS
@@ -65,7 +65,7 @@ class Running:
             if self.loop is not None:  # a rehearsal has no plant whose time it takes
                 STAGE_SECONDS.labels(event.stage).observe(self.progress.stage_time_s)
             took = {"stage_time_s": self.progress.stage_time_s}
-            self.tell("stage_done", {"stage": event.stage, "result": plain_object(event.result), **took})
+            self.tell("stage_done", {"stage": event.stage, "result": to_json_object(event.result), **took})
         elif isinstance(event, Note):
             self.tell("note", {"stage": self.progress.stage, "text": event.text})
 

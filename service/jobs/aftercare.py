@@ -16,7 +16,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from loopwright.service.config import LoopConfig
 from loopwright.service.loop_state import state_json
 from loopwright.service.loops.loop import Loop
-from loopwright.service.loops.restoration import Safe, look
+from loopwright.service.loops.restoration import Restoration, look
 from loopwright.service.machine import Machine
 from loopwright.service.store import looked_after
 from loopwright.service.store.store import Store
@@ -62,7 +62,7 @@ class _Again:
 
     at: float
     wait_s: float
-    found: Safe
+    found: Restoration
 
 
 class Aftercare:
@@ -150,7 +150,7 @@ class Aftercare:
         elif looked_after.home_again(self._store, row.id, state_json(found.state), found.text):
             log.info("looked after no more: %s", found.text)
 
-    def _not_yet(self, row: JobRow, found: Safe) -> None:
+    def _not_yet(self, row: JobRow, found: Restoration) -> None:
         before = self._again.get(row.id)
         wait_s = EVERY_S if before is None else min(LONGEST_S, 2.0 * before.wait_s)
         if before is None or before.found.reason is not found.reason:

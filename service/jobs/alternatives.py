@@ -7,21 +7,21 @@ from typing import Any
 
 from loopwright.service.errors import Conflict
 from loopwright.service.job_states import ACTIVE, JobState
-from loopwright.service.jobs.relay_record import Kept
+from loopwright.service.jobs.relay_record import RelayRecord
 from loopwright.service.offline.tunings import MethodResult, answer, tune_each
 from loopwright.service.planning.found_model import DISPROVED, FoundModel, found_model, model_of
 from loopwright.service.request import ProcessModel
 from loopwright.service.store.tables import EventRow, JobRow
 from loopwright.tuning.analysis.assessment import Assessment, assess
-from loopwright.tuning.fast.design import Wish
+from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.design_trial import designed_on
 from loopwright.tuning.fast.procedure import FAST, FastOptions
 from loopwright.tuning.fast.proposal import delayed
-from loopwright.tuning.fast.verdict import judge_again
+from loopwright.tuning.fast.verdict import evaluate_again
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 from loopwright.tuning.reasons import Ended, Reason, Refused
-from loopwright.tuning.rules.design import LEAST_GM, MOST_Ms
+from loopwright.tuning.rules.design import MIN_GM, MAX_Ms
 from loopwright.tuning.rules.registry import METHODS, Method
 from loopwright.tuning.rules.setting import Setting
 
@@ -59,7 +59,7 @@ def alternatives(row: JobRow, events: Sequence[EventRow], method: str | None = N
 
 
 def redesigned(
-    row: JobRow, events: Sequence[EventRow], record: Kept | None, ms: float, derivative: bool
+    row: JobRow, events: Sequence[EventRow], record: RelayRecord | None, ms: float, derivative: bool
 ) -> dict[str, Any]:
     """The same object with the gains of fast for another Ms: no new experiment.
 
@@ -72,12 +72,12 @@ def redesigned(
     _not_disproved(row, (Reason.WRONG_SIGN,) if evidence else DISPROVED)
     try:
         if evidence is not None:
-            judged = judge_again(evidence, Wish(ms, derivative))
-            model, gains = judged.model, judged.best.gains
-            doubt = {"uncertainty": judged.uncertainty, "ambiguity": judged.ambiguity}
-            if judged.cause is not None:
-                raise Refused(Reason(judged.cause), judged.detail)
-            sampled: Model = delayed(model, judged.design_delay)
+            evaluation = evaluate_again(evidence, DesignSpec(ms, derivative))
+            model, gains = evaluation.model, evaluation.best.gains
+            doubt = {"uncertainty": evaluation.uncertainty, "ambiguity": evaluation.ambiguity}
+            if evaluation.cause is not None:
+                raise Refused(Reason(evaluation.cause), evaluation.detail)
+            sampled: Model = delayed(model, evaluation.design_delay)
         else:
             Ts = (row.found or {}).get("sample_time_s") or 0.0
             sampled = delayed(model, 0.5 * Ts)
@@ -121,7 +121,7 @@ def _retune(found: MethodResult, model: FoundModel) -> dict[str, Any] | None:
     if found.assessment is None or isinstance(model, TransferFunction):
         return None
     m = found.assessment.margins
-    if not (m.stable and m.Ms <= MOST_Ms and (m.GM is None or m.GM >= LEAST_GM)):
+    if not (m.stable and m.Ms <= MAX_Ms and (m.GM is None or m.GM >= MIN_GM)):
         return None
     asked = ProcessModel(K=model.K, T_s=model.T, L_s=model.L, zeta=model.zeta if isinstance(model, SOPDT) else None)
     return {"start": "optimise", "method": found.method.name, "model": asked.model_dump(exclude_none=True)} | ANYWAY

@@ -103,11 +103,11 @@ class DurableEngine:
         )
         return {one.workflow_id for one in found if one.queue_name in self._queues}
 
-    def over(self, most: int) -> list[str]:
+    def over(self, limit: int) -> list[str]:
         # A file has one host, whatever it was called before.
         host = None if self._own is not None else self._host
         found = DBOS.list_workflows(
-            status=list(_OVER), executor_id=host, limit=most, load_input=False, load_output=False
+            status=list(_OVER), executor_id=host, limit=limit, load_input=False, load_output=False
         )
         return [one.workflow_id for one in found]
 

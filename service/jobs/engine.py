@@ -25,7 +25,7 @@ class Engine(Protocol):
         """Those of the jobs that it is running, or will run on a queue of this host."""
         ...
 
-    def over(self, most: int) -> list[str]:
+    def over(self, limit: int) -> list[str]:
         """Jobs of this host that it has run to their end and still remembers, the oldest first, so many of them."""
         ...
 

@@ -208,7 +208,7 @@ class Fleet:
                 self._give_up(row, part, str(UnknownLoop(part.loop)))
                 continue
             places = _places(*known[part.loop])
-            if any(taken[place] >= self._most(place, request) for place in places):
+            if any(taken[place] >= self._max(place, request) for place in places):
                 continue
             try:
                 self._jobs.start(part.loop, options, retunes.begins(row.id, part.position))
@@ -241,7 +241,7 @@ class Fleet:
     def _known(self) -> dict[str, tuple[LoopConfig, str]]:
         return {config.tag: (config, host) for config, host in self._jobs.everywhere()}
 
-    def _most(self, place: tuple[str, ...], request: FleetRequest) -> int:
+    def _max(self, place: tuple[str, ...], request: FleetRequest) -> int:
         if place[0] == _AREA:
             return request.at_once_per_area or sys.maxsize
         _, host, bus = place

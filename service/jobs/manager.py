@@ -26,10 +26,10 @@ from loopwright.service.jobs.engine import WORKFLOW_VERSION, Engine
 from loopwright.service.jobs.journal import Journal, temporary
 from loopwright.service.jobs.recovery import Recovery
 from loopwright.service.loop_state import LoopState, differences, gains_of, loop_state, same_gains, state_json
-from loopwright.service.loops.gain_change import ForeignGains, exchange
+from loopwright.service.loops.gain_change import ForeignGains, replace_accepted
 from loopwright.service.loops.loop import Loop
 from loopwright.service.loops.observed_loop import ObservedLoop
-from loopwright.service.loops.restoration import make_safe
+from loopwright.service.loops.restoration import restore_abandoned
 from loopwright.service.machine import Machine
 from loopwright.service.planning.known_loop import known
 from loopwright.service.request import BadLimits, RetuneRequest, within
@@ -447,7 +447,7 @@ class Jobs:
             try:
                 loop = self._open_loop(config)
                 try:
-                    state = exchange(loop, before, after, begun, begin)
+                    state = replace_accepted(loop, before, after, begun, begin)
                 finally:
                     loop.close()
             except ForeignGains as foreign:
@@ -572,7 +572,7 @@ class Jobs:
                 self._lasting(lambda: self.store.note(row.id, **columns))
                 self._resumed(row, "the loop had not been touched")
             return state
-        safe = make_safe(loop, loop_state(row.found), row.session)
+        safe = restore_abandoned(loop, loop_state(row.found), row.session)
         if safe.state is None:
             raise Failed(safe.reason or Reason.NODE_LOST, safe.text)
         if safe.reason is not None:

@@ -13,7 +13,7 @@ from loopwright.service.job_states import JobState
 from loopwright.service.jobs.engine import WORKFLOW_VERSION
 from loopwright.service.loop_state import state_json
 from loopwright.service.loops.loop import Loop
-from loopwright.service.loops.restoration import Safe, look
+from loopwright.service.loops.restoration import Restoration, look
 from loopwright.service.request import RetuneRequest, within
 from loopwright.service.store import loop_locks
 from loopwright.service.store.store import Store
@@ -22,7 +22,7 @@ from loopwright.tuning.reasons import Reason
 
 log = logging.getLogger(__name__)
 
-MOST_ATTEMPTS = 10
+MAX_ATTEMPTS = 10
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Recovery:
         """Makes the loop of the job safe, and ends the job if it is not to go on."""
         if self.stopping():
             return
-        safe: Safe | None = None
+        safe: Restoration | None = None
         # A job of the code before has no session, and may have touched its loop all the same.
         if row.found is not None and (row.session is not None or row.version != WORKFLOW_VERSION):
             safe = look(row, self.loops, self.open_loop)
@@ -60,7 +60,7 @@ class Recovery:
             detail = f"cut off by the end of the service, and not resumed: {text}; {_loop_words(safe)}"
             self.store.move(row.id, JobState.INTERRUPTED, reason=reason.value, detail=detail, **restored)
 
-    def _why_not(self, row: JobRow, safe: Safe | None) -> tuple[Reason, str] | None:
+    def _why_not(self, row: JobRow, safe: Restoration | None) -> tuple[Reason, str] | None:
         """Why a job is not to be resumed, if so."""
         config = self.loops.get(row.loop)
         if row.version != WORKFLOW_VERSION:
@@ -73,8 +73,8 @@ class Recovery:
             return Reason.LOCKED, locked
         if safe is not None and safe.reason is not None:
             return safe.reason, "the loop is not as the job had found it" if safe.state else "the loop is not reached"
-        if row.attempt >= MOST_ATTEMPTS:
-            return Reason.SERVICE_STOPPED, f"that was attempt {row.attempt} of at most {MOST_ATTEMPTS}"
+        if row.attempt >= MAX_ATTEMPTS:
+            return Reason.SERVICE_STOPPED, f"that was attempt {row.attempt} of at most {MAX_ATTEMPTS}"
         try:
             within(config, RetuneRequest.model_validate(row.request))
         except ValueError as error:  # BadLimits too
@@ -91,5 +91,5 @@ class Recovery:
         return None
 
 
-def _loop_words(safe: Safe | None) -> str:
+def _loop_words(safe: Restoration | None) -> str:
     return "the loop had not been touched" if safe is None else f"the loop: {safe.text}"

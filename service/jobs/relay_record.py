@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from loopwright.tuning.fast.record import LEAST_LISTENED, LEAST_SWITCHES, Evidence
+from loopwright.tuning.fast.record import MIN_LISTENED, MIN_SWITCHES, Evidence
 from loopwright.tuning.models import Reals
 from loopwright.tuning.plan import Mode
 
@@ -17,7 +17,7 @@ Columns = Mapping[str, Sequence[Any] | Reals]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Kept:
+class RelayRecord:
     """Columns of the last attempt of a job. t: s since the relay began.  sp, pv, mv: as they were.
 
     listened: samples before the relay.  relayed: up to its end.  switches: samples at which it switched.
@@ -39,7 +39,7 @@ class Kept:
 
     def evidence(self) -> Evidence | None:
         """None where the relay did not come far enough for a fit."""
-        if len(self.switches) < LEAST_SWITCHES or self.listened < LEAST_LISTENED:
+        if len(self.switches) < MIN_SWITCHES or self.listened < MIN_LISTENED:
             return None
         mv, pv = self.rest
         y = self.pv - pv
@@ -56,7 +56,7 @@ class Kept:
         )
 
 
-def kept(columns: Columns) -> Kept | None:
+def relay_record(columns: Columns) -> RelayRecord | None:
     """None where no relay was run."""
     stage = columns["stage"]
     first = max((i for i, name in enumerate(stage) if name == "preflight" and stage[max(i - 1, 0)] != name), default=0)
@@ -76,4 +76,4 @@ def kept(columns: Columns) -> Kept | None:
     # the relay begins high
     high = np.append(True, mv[listened:relayed] > np.mean(mv[: max(listened, 1)]))
     switches = tuple(int(i) + listened for i in np.flatnonzero(high[1:] != high[:-1]))
-    return Kept(Ts, (whole - listened) * Ts, sp, pv, mv, listened, relayed, switches)
+    return RelayRecord(Ts, (whole - listened) * Ts, sp, pv, mv, listened, relayed, switches)

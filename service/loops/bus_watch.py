@@ -11,7 +11,7 @@ from loopwright.protocol.bus_state import BusState
 
 _LISTENED_TO = "socketcan:"
 """Its error frames reach who is open when they are sent; a hub has none."""
-_MOST_FRAMES = 1000
+_MAX_FRAMES = 1000
 
 
 class BusWatch:
@@ -45,7 +45,7 @@ class BusWatch:
         if self._ear is None:
             self._ear = self._open(self._url)
             self._ear.set_filters(())
-        for _ in range(_MOST_FRAMES):
+        for _ in range(_MAX_FRAMES):
             before = self._ear.state
             if self._ear.recv(0.0) is None and self._ear.state is before:
                 return

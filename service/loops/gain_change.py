@@ -22,7 +22,7 @@ class ForeignGains(Conflict):
         self.found = found
 
 
-def exchange(loop: Loop, before: Gains, after: Gains, begun: bool, begin: Callable[[], None]) -> LoopState:
+def replace_accepted(loop: Loop, before: Gains, after: Gains, begun: bool, begin: Callable[[], None]) -> LoopState:
     """The loop's state, read back with the new gains. Raises ForeignGains, and Failed or Refused as the loop does.
 
     begun: a decision on the same gains was cut off. A controller that holds the new ones then has them from it, and

@@ -25,7 +25,7 @@ _REASONS = {
 
 
 @dataclass(frozen=True)
-class Safe:
+class Restoration:
     """The loop as read at the end, and what was done and found about it, in words.
 
     state: None when it could not be read, or is not confirmed to be home.  reason: why a job on it should not go on.
@@ -36,7 +36,7 @@ class Safe:
     reason: Reason | None = None
 
 
-def make_safe(loop: Loop, home: LoopState, session: int | None) -> Safe:
+def restore_abandoned(loop: Loop, home: LoopState, session: int | None) -> Restoration:
     """Closes the session of the job if it is still open, and reads the loop back. Raises nothing of the loop's.
 
     session: its number; None where none was opened, and the job has touched nothing.
@@ -45,25 +45,27 @@ def make_safe(loop: Loop, home: LoopState, session: int | None) -> Safe:
     try:
         restored = loop.restore(home, session or 0)
     except Ended as ended:
-        return Safe(None, f"not confirmed: {ended.detail}; the controller brings it home by itself", ended.reason)
+        return Restoration(
+            None, f"not confirmed: {ended.detail}; the controller brings it home by itself", ended.reason
+        )
     if not restored.changed:
-        return Safe(restored.state, f"{restored.how}: mode, set-point and gains as before the job, read back")
+        return Restoration(restored.state, f"{restored.how}: mode, set-point and gains as before the job, read back")
     reason = next((reason for name, reason in _REASONS.items() if name in restored.changed), Reason.SERVICE_STOPPED)
     text = f"{restored.how}; not as before the job, left so: {'; '.join(restored.changed.values())}"
-    return Safe(restored.state, text, reason)
+    return Restoration(restored.state, text, reason)
 
 
-def look(row: JobRow, loops: Mapping[str, LoopConfig], open_loop: Callable[[LoopConfig], Loop]) -> Safe:
+def look(row: JobRow, loops: Mapping[str, LoopConfig], open_loop: Callable[[LoopConfig], Loop]) -> Restoration:
     """The loop of a job, opened and made safe. Raises nothing: one loop must not keep others from being looked at."""
     config = loops.get(row.loop)
     if config is None:
-        return Safe(None, "the loop is no longer configured here", Reason.SERVICE_STOPPED)
+        return Restoration(None, "the loop is no longer configured here", Reason.SERVICE_STOPPED)
     try:
         loop = open_loop(config)
         try:
-            return make_safe(loop, loop_state(row.found or {}), row.session)
+            return restore_abandoned(loop, loop_state(row.found or {}), row.session)
         finally:
             loop.close()
     except Exception as error:
         log.exception("loop %s", row.loop)
-        return Safe(None, f"not reached: {error}; the controller brings it home by itself", Reason.BUS_LOST)
+        return Restoration(None, f"not reached: {error}; the controller brings it home by itself", Reason.BUS_LOST)

@@ -24,16 +24,16 @@ Reals = NDArray[np.float64]
 _NAMES = {"t": ("t", "time", "t_s"), "u": ("u", "mv"), "y": ("y", "pv"), "sp": ("sp",)}
 _OPTIONAL = frozenset({"sp"})
 _DELIMITERS = ",;\t"
-_MOST_PROBLEMS = 20
+_MAX_PROBLEMS = 20
 
 
 class RecordError(Exception):
     """The file cannot be used; `problems` holds what was found, one line each (the first 20)."""
 
     def __init__(self, source: str, problems: Sequence[str]) -> None:
-        shown = list(problems[:_MOST_PROBLEMS])
-        if len(problems) > _MOST_PROBLEMS:
-            shown.append(f"and {len(problems) - _MOST_PROBLEMS} more")
+        shown = list(problems[:_MAX_PROBLEMS])
+        if len(problems) > _MAX_PROBLEMS:
+            shown.append(f"and {len(problems) - _MAX_PROBLEMS} more")
         super().__init__("\n".join([f"{source}: {len(problems)} error(s)", *(f"  {p}" for p in shown)]))
         self.problems = shown
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from loopwright.service.jsonable import plain
+from loopwright.service.jsonable import to_jsonable
 from loopwright.service.offline.csv_record import Record
 from loopwright.service.offline.model_json import dump_model
 from loopwright.tuning.identification.identify import Identified
@@ -18,7 +18,7 @@ def identified(found: Identified, record: Record) -> dict[str, Any]:
     parameters: of the model by name; covariance: of the same, row by row in their order. loads: t_s, when each entered
     if at the plant's input; seen_s, when PV began to answer; size in MV units.
     """
-    answer: dict[str, Any] = plain(
+    answer: dict[str, Any] = to_jsonable(
         {
             "outcome": "identified",
             "reason": None,

@@ -20,7 +20,7 @@ from typing import Any
 from loopwright.service.plausible import Implausible, check_damping, check_model
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 
-MOST_COEFFICIENTS = 12
+MAX_COEFFICIENTS = 12
 _BESIDE = frozenset(
     {"name", "sample_time_s", "t95_s", "noise_std", "seed", "mv_limits", "sp_deviation", "gains", "reverse_acting"}
 )
@@ -144,8 +144,8 @@ def _transfer_function(data: Mapping[str, object]) -> TransferFunction:
 
 def _coefficients(data: Mapping[str, object], name: str) -> tuple[float, ...]:
     given = data[name]
-    if not isinstance(given, list | tuple) or not 1 <= len(given) <= MOST_COEFFICIENTS:
-        raise BadModel(f"{name} must be a list of 1 to {MOST_COEFFICIENTS} numbers, not {_shown(given)}")
+    if not isinstance(given, list | tuple) or not 1 <= len(given) <= MAX_COEFFICIENTS:
+        raise BadModel(f"{name} must be a list of 1 to {MAX_COEFFICIENTS} numbers, not {_shown(given)}")
     return tuple(_finite(value, f"{name}[{i}]") for i, value in enumerate(given))
 
 

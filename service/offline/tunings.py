@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from loopwright.service.jsonable import plain
+from loopwright.service.jsonable import to_jsonable
 from loopwright.service.offline.model_json import dump_model
 from loopwright.service.plausible import Implausible, check_option
 from loopwright.tuning.analysis.assessment import Assessment
@@ -115,7 +115,7 @@ def as_json(found: MethodResult) -> dict[str, Any]:
         "setpoint": _figures(assessed.setpoint) if assessed else None,
         "load": _figures(assessed.load) if assessed else None,
     }
-    clean: dict[str, Any] = plain(told)
+    clean: dict[str, Any] = to_jsonable(told)
     return clean
 
 
@@ -194,6 +194,6 @@ def _option(option: Option) -> dict[str, Any]:
         "default": option.default,
         "meaning": option.meaning,
         "choices": list(option.choices),
-        "least": option.range[0],
-        "most": option.range[1],
+        "minimum": option.range[0],
+        "maximum": option.range[1],
     }

@@ -9,7 +9,7 @@ from loopwright.tuning.fast.procedure import FAST
 
 TIME_BUDGET_T95 = {FAST: 100.0}
 OTHER_BUDGET_T95 = 500.0
-LEAST_BUDGET_SAMPLES = 1000
+MIN_BUDGET_SAMPLES = 1000
 """Of a loop whose T95 is a few samples: the time at rest alone is counted in samples."""
 
 
@@ -32,4 +32,4 @@ def facts_of(config: LoopConfig, state: LoopState) -> Facts:
 def time_budget_s(method: str, t95_s: float, sample_time_s: float) -> float:
     """Plant time, s: several times what a loop of this T95 takes."""
     budget = TIME_BUDGET_T95.get(method, OTHER_BUDGET_T95) * t95_s
-    return max(budget, LEAST_BUDGET_SAMPLES * sample_time_s)
+    return max(budget, MIN_BUDGET_SAMPLES * sample_time_s)

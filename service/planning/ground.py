@@ -19,7 +19,7 @@ from loopwright.tuning.reasons import Ended
 
 TAMEST_Ms = 2.5
 """Of the present gains on a plant that is guessed: they work, so that a plant on which they would not is no guess."""
-LOWER, MOST_LOWERED = 0.5, 20
+LOWER, MAX_LOWERED = 0.5, 20
 """The gain of a guess is lowered by so much, so often at most."""
 MOST_IN_T95 = 20_000
 """Samples: of more, a rehearsal takes long, and shows nothing else."""
@@ -163,7 +163,7 @@ def _guess(config: LoopConfig, state: LoopState | None) -> tuple[FOPDT, bool]:
     plant = FOPDT(gain, (config.t95_s - dead_time) / 3.0, dead_time)
     if state is None:
         return plant, False
-    steps = (n for n in range(MOST_LOWERED) if _works(replace(plant, K=LOWER**n * plant.K), state.gains))
+    steps = (n for n in range(MAX_LOWERED) if _works(replace(plant, K=LOWER**n * plant.K), state.gains))
     lowered = next(steps, 0)  # of gains that work on none the rehearsal says what is wrong with them
     K = LOWER**lowered * plant.K
     return replace(plant, K=K if state.reverse_acting else -K), lowered > 0

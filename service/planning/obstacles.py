@@ -11,8 +11,8 @@ from loopwright.service.loop_state import OPERATIONAL, LoopState
 from loopwright.service.planning.facts import facts_of
 from loopwright.service.planning.moves import broken_limits, stages_asked
 from loopwright.service.request import RetuneRequest, narrow
-from loopwright.tuning.experiments.preflight import LEAST_ROOM, LOOKS, MOST_AWAY, MOST_NOISE
-from loopwright.tuning.fast.relay_test import BIAS, most_amplitude
+from loopwright.tuning.experiments.preflight import LOOKS, MAX_AWAY, MAX_NOISE, MIN_ROOM
+from loopwright.tuning.fast.relay_test import BIAS, max_amplitude
 from loopwright.tuning.models import sign
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import ADVICE, Ended, Reason, Refused
@@ -74,10 +74,8 @@ def obstacles(config: LoopConfig, request: RetuneRequest, now: Now) -> list[Obst
     if now.state is not None:
         found += _of_the_loop(narrowed, request, now.state)
     noise, step = config.noise_std_hint or 0.0, narrowed.sp_deviation
-    if noise > MOST_NOISE * step:
-        text = (
-            f"the noise of {noise:g} {config.pv_unit} (noise_std_hint) is above {MOST_NOISE:.0%} of the step {step:g}"
-        )
+    if noise > MAX_NOISE * step:
+        text = f"the noise of {noise:g} {config.pv_unit} (noise_std_hint) is above {MAX_NOISE:.0%} of the step {step:g}"
         found.append(Obstacle(Reason.NOISE_TOO_HIGH, text))
     return found
 
@@ -104,16 +102,16 @@ def _of_the_loop(config: LoopConfig, request: RetuneRequest, state: LoopState) -
 
 
 def _of_mv(request: RetuneRequest, mv: float, low: float, high: float) -> list[Obstacle]:
-    room, least = min(high - mv, mv - low), LEAST_ROOM * (high - low)
-    if room < least:
-        text = f"MV {mv:.4g} leaves {room:.3g} of room within {low:.4g} .. {high:.4g}; at least {least:.3g} is needed"
+    room, minimum = min(high - mv, mv - low), MIN_ROOM * (high - low)
+    if room < minimum:
+        text = f"MV {mv:.4g} leaves {room:.3g} of room within {low:.4g} .. {high:.4g}; at least {minimum:.3g} is needed"
         return [Obstacle(Reason.SATURATED, text)]
-    most, asked = most_amplitude(mv, low, high), request.amplitude_pct
+    maximum, asked = max_amplitude(mv, low, high), request.amplitude_pct
     fits_nowhere = asked is not None and (1.0 + BIAS) * asked > high - low  # `narrow` has told that
-    if asked is not None and asked > most and not fits_nowhere and "relay" in stages_asked(request):
+    if asked is not None and asked > maximum and not fits_nowhere and "relay" in stages_asked(request):
         text = (
             f"a relay of amplitude_pct {asked:g} moves MV from {mv:.4g} to {mv - BIAS * asked:.4g} and "
-            f"{mv + asked:.4g} %, which is not within {low:.4g} .. {high:.4g}: at most {most:.4g} fits"
+            f"{mv + asked:.4g} %, which is not within {low:.4g} .. {high:.4g}: at most {maximum:.4g} fits"
         )
         return [Obstacle(Reason.BAD_LIMITS, text)]
     return []
@@ -123,15 +121,15 @@ def _of_pv(config: LoopConfig, request: RetuneRequest, state: LoopState) -> list
     found: list[Obstacle] = []
     step, noise = config.sp_deviation, config.noise_std_hint
     # one reading is not the mean of many: a noise that nobody has told may be as large as is permitted
-    most = MOST_AWAY * step + 4.0 * (MOST_NOISE * step if noise is None else noise)
+    maximum = MAX_AWAY * step + 4.0 * (MAX_NOISE * step if noise is None else noise)
     away = state.pv - state.sp
     limits, unit = config.pv_limits, config.pv_unit
     if not limits.low <= state.pv <= limits.high:
         text = f"PV {state.pv:.5g} {unit} is outside {limits.low:g} .. {limits.high:g}"
         found.append(Obstacle(Reason.PV_LIMIT, text))
-    if abs(away) > most:
+    if abs(away) > maximum:
         text = (
-            f"PV is {away:+.3g} {unit} off the set-point in this moment, and at most {most:.3g} would be at rest; a "
+            f"PV is {away:+.3g} {unit} off the set-point in this moment, and at most {maximum:.3g} would be at rest; a "
             f"retune looks {LOOKS} times, half a T95 each, before it gives up"
         )
         found.append(Obstacle(Reason.NOT_AT_REST, text))

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from loopwright.service.jobs.relay_record import Kept
+from loopwright.service.jobs.relay_record import RelayRecord
 from loopwright.tuning.analysis.assessment import assess
 from loopwright.tuning.analysis.step_response import step_response
 from loopwright.tuning.fast.structure_choice import choose
@@ -23,7 +23,7 @@ GREY, RED, BLUE, GREEN = "0.55", "tab:red", "tab:blue", "tab:green"
 SHOWN_SETTLINGS = 2.5
 
 
-def fast_job(path: Path, job: dict[str, Any], record: Kept, pv_unit: str) -> None:
+def fast_job(path: Path, job: dict[str, Any], record: RelayRecord, pv_unit: str) -> None:
     """job: as of GET /jobs/{id}, of whatever end."""
     proposed = job["new_gains"] is not None
     figure = Figure(figsize=(12 if proposed else 9, 6.5), layout="constrained")
@@ -42,7 +42,7 @@ def fast_job(path: Path, job: dict[str, Any], record: Kept, pv_unit: str) -> Non
     canvas.print_figure(path, dpi=80)
 
 
-def _record(pv: Axes, rest: Axes, mv: Axes, record: Kept, found: dict[str, Any] | None, pv_unit: str) -> None:
+def _record(pv: Axes, rest: Axes, mv: Axes, record: RelayRecord, found: dict[str, Any] | None, pv_unit: str) -> None:
     t = record.t
     pv.plot(t, record.pv, color=GREY, linewidth=1.0, label="PV measured")
     pv.step(t, record.sp, where="post", color="black", linestyle=":", linewidth=1.0, label="set-point")

@@ -9,7 +9,7 @@ from typing import Any
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from loopwright.service.jobs.relay_record import kept
+from loopwright.service.jobs.relay_record import relay_record
 
 LEAD_IN = 20
 """Samples shown before the step."""
@@ -27,7 +27,7 @@ def job_picture(path: Path, samples: Samples, job: dict[str, Any], pv_unit: str)
     """A picture of a fast job shows its record, fit and residual, and the loop before and after; a picture of any other
     job shows the set-point step before and after. job: the answer to GET /jobs/{id}.  Raises NoPicture.
     """
-    if job["method"] == "fast" and (record := kept(samples(None))) is not None:
+    if job["method"] == "fast" and (record := relay_record(samples(None))) is not None:
         from loopwright.service.plots.fast_job import fast_job
 
         fast_job(path, job, record, pv_unit)

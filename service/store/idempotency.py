@@ -23,9 +23,9 @@ from loopwright.service.store.store import Store
 from loopwright.service.store.tables import IdempotencyRow
 
 KEPT_H = 24
-MOST_KEYS = 5000
+MAX_KEYS = 5000
 """Of one principal: the oldest answers beyond that are forgotten."""
-MOST_BYTES = 16_384
+MAX_BYTES = 16_384
 """Of one answer, compressed. A longer one is not kept: only computations have such, and they may be repeated."""
 
 
@@ -45,9 +45,9 @@ class Answer:
 class IdempotencyKeys:
     """The keys in the database, as one process sees them. most: keys of one principal."""
 
-    def __init__(self, store: Store, most: int = MOST_KEYS) -> None:
+    def __init__(self, store: Store, maximum: int = MAX_KEYS) -> None:
         self._store = store
-        self._most = most
+        self._max = maximum
         # Tokens of the requests that this process is answering.
         self._answering: set[str] = set()
 
@@ -95,14 +95,14 @@ class IdempotencyKeys:
         unanswered = keys.status.is_(None) & keys.effect.is_(None)
         session.execute(delete(keys).where(here, unanswered, keys.token.not_in(list(self._answering))))
         newest = select(keys.at).where(keys.principal == principal).order_by(keys.at.desc())
-        last = session.scalar(newest.offset(self._most - 1).limit(1))
+        last = session.scalar(newest.offset(self._max - 1).limit(1))
         if last is not None:
             session.execute(delete(keys).where(keys.principal == principal, keys.at <= last, ~unanswered))
 
     def keep(self, claim: Claim, answer: Answer) -> None:
         """Repetitions get this answer, unless another request has taken over."""
         body = zlib.compress(answer.body)
-        if len(body) > MOST_BYTES:
+        if len(body) > MAX_BYTES:
             self.let_go(claim)
             return
         values = {"status": answer.status, "headers": answer.headers, "body": body}

@@ -11,7 +11,7 @@ from typing import Any
 from sqlalchemy import distinct, func, select
 from sqlalchemy.orm import Session
 
-from loopwright.service.jsonable import plain
+from loopwright.service.jsonable import to_jsonable
 from loopwright.service.store import audit
 from loopwright.service.store.store import Store, Write, append, set_columns
 from loopwright.service.store.tables import JobRow
@@ -39,7 +39,7 @@ def home_again(store: Store, job_id: str, restored: dict[str, Any], text: str) -
         row = session.scalars(wanted).one_or_none()
         if row is None:
             return False
-        row.look_after, row.restored = False, plain(restored)
+        row.look_after, row.restored = False, to_jsonable(restored)
         append(session, row.id, "loop_found", {"text": text}, row.plant_time_s)
         return True
 

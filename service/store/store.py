@@ -14,7 +14,7 @@ from sqlalchemy.exc import IntegrityError, SQLAlchemyError, TimeoutError
 from sqlalchemy.orm import Session
 
 from loopwright.service.job_states import ACTIVE, IllegalMove, JobState, check
-from loopwright.service.jsonable import plain
+from loopwright.service.jsonable import to_jsonable
 from loopwright.service.loop_state import gains_of, same_gains
 from loopwright.service.store import audit, claims, loop_locks, retunes, sample_blocks
 from loopwright.service.store.clock import now
@@ -229,7 +229,7 @@ class Store:
             loop=loop,
             state=JobState.QUEUED.value,
             dry_run=dry_run,
-            request=plain(request),
+            request=to_jsonable(request),
             requested_by=requested_by,
             created_at=now(),
             host=host or self.host,
@@ -495,7 +495,7 @@ def is_shown_as(state: JobState) -> ColumnElement[bool]:
 
 def event_of(job_id: str, kind: str, data: dict[str, Any], plant_time_s: float, **columns: Any) -> Write:
     """An event, at the time it happened, and what it changes in the job's row."""
-    at, told = now(), plain(data)
+    at, told = now(), to_jsonable(data)
 
     def write(session: Session) -> None:
         row = _find(session, job_id, lock=True)
@@ -537,7 +537,7 @@ def of_host(session: Session, host: str) -> HostRow:
 
 def set_columns(row: JobRow, columns: dict[str, Any]) -> None:
     for name, value in columns.items():
-        setattr(row, name, plain(value))
+        setattr(row, name, to_jsonable(value))
 
 
 def _may_begin(session: Session, row: JobRow) -> None:
@@ -600,6 +600,8 @@ def append(
     """The next event of a job whose row this transaction has locked."""
     seq = session.scalar(select(func.max(EventRow.seq)).where(EventRow.job_id == job_id)) or 0
     session.add(
-        EventRow(job_id=job_id, seq=seq + 1, at=at or now(), plant_time_s=plant_time_s, kind=kind, data=plain(data))
+        EventRow(
+            job_id=job_id, seq=seq + 1, at=at or now(), plant_time_s=plant_time_s, kind=kind, data=to_jsonable(data)
+        )
     )
     session.flush()

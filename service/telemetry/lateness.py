@@ -16,7 +16,7 @@ from loopwright.service.telemetry.metrics import LATE_SECONDS, LATEST_SECONDS
 log = logging.getLogger(__name__)
 
 EVERY_S = 0.01
-MOST_S = 0.05
+MAX_S = 0.05
 """Later than this is told, once a minute at most."""
 _MINUTE_S = 60.0
 
@@ -37,7 +37,7 @@ class Lateness:
                 del self._worst[past]
         if late_s > self._worst.get(second, -1.0):
             self._worst[second] = late_s
-        if late_s <= MOST_S or (self._told is not None and at_s - self._told < _MINUTE_S):
+        if late_s <= MAX_S or (self._told is not None and at_s - self._told < _MINUTE_S):
             return None
         self._told = at_s
         return self.worst_s(at_s)

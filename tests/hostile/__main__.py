@@ -21,7 +21,7 @@ from tests.hostile.site import Site
 ABORT_P99_S, LATE_S = 0.5, 0.05
 GROWTH = 1.3
 """Memory at the end, of what it was when everything had begun."""
-MOST_MB = 600.0
+MAX_MB = 600.0
 MEMORY_EVERY_S = 5.0
 
 
@@ -81,7 +81,7 @@ def judged(found: Found, unsafe: dict[str, str]) -> list[tuple[str, str, str, bo
         ),
         ("a process that only sleeps is woken late, p99", f"{1e3 * p99(found.machine_late_s):.0f} ms", "", True),
         ("the same, at most", f"{1e3 * max(found.machine_late_s, default=0.0):.0f} ms", "", True),
-        ("memory at most", f"{max(memory):.0f} MB", f"{MOST_MB:.0f} MB", max(memory) <= MOST_MB),
+        ("memory at most", f"{max(memory):.0f} MB", f"{MAX_MB:.0f} MB", max(memory) <= MAX_MB),
         ("memory, end to beginning", f"{growth:.2f}", f"{GROWTH}", growth <= GROWTH),
         ("loops not as they were", str(unsafe or 0), "0", not unsafe),
         ("tests that came to their end", str(sum(found.ends.values())), "", True),

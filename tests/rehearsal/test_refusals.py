@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from benchmarks.refusals import cases, draw, rehearsed
-from loopwright.service.jobs.relay_record import kept
-from loopwright.tuning.fast.design import Wish
-from loopwright.tuning.fast.verdict import judge_again
+from loopwright.service.jobs.relay_record import relay_record
+from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.verdict import evaluate_again
 from loopwright.tuning.reasons import ADVICE, Reason
 
 PAGE = (Path(__file__).parents[2] / "docs" / "refusals.md").read_text(encoding="utf-8")
@@ -35,8 +35,8 @@ def test_a_fault_is_refused_with_its_cause_and_shown(cause: str, tmp_path: Path)
 @pytest.mark.parametrize("Ms", [1.4, 1.6])
 def test_what_the_step_has_refuted_is_no_alternative_either(Ms: float) -> None:
     """The record as a whole fits well, with a story of loads: only its parts tell."""
-    record = kept(rehearsed("surprise", cases()["surprise"])["samples"])
+    record = relay_record(rehearsed("surprise", cases()["surprise"])["samples"])
     assert record is not None
     evidence = record.evidence()
     assert evidence is not None and len(evidence.steps) == 2
-    assert judge_again(evidence, Wish(Ms)).cause == "surprise"
+    assert evaluate_again(evidence, DesignSpec(Ms)).cause == "surprise"

@@ -13,7 +13,7 @@ from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.execution.checkpoints import finished
 from loopwright.service.execution.rehearsal import RehearsedLoop, _parameters
 from loopwright.service.execution.runner import Watch, run
-from loopwright.service.jsonable import plain_object
+from loopwright.service.jsonable import to_json_object
 from loopwright.tuning.five_stage.procedure import STAGES, Facts, Finished, Options, five_stage
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Event, Mode, StageDone, StageStarted
@@ -40,7 +40,7 @@ def stored(events: list[Event]) -> list[tuple[str, Any]]:
             return [null(v) for v in value]
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
-    done = [(event.stage, null(plain_object(event.result))) for event in events if isinstance(event, StageDone)]
+    done = [(event.stage, null(to_json_object(event.result))) for event in events if isinstance(event, StageDone)]
     result: list[tuple[str, Any]] = json.loads(json.dumps(done))
     return result
 

@@ -177,7 +177,7 @@ class SimMachine(Machine):
     def event(self) -> Any:
         return SimEvent(self._process.simulation)
 
-    def side_by_side(self, call: Callable[[T], None], items: Iterable[T], most: int) -> None:
+    def side_by_side(self, call: Callable[[T], None], items: Iterable[T], max_workers: int) -> None:
         for item in items:
             call(item)
 
@@ -218,8 +218,8 @@ class SimEngine:
     def known(self, job_ids: Collection[str]) -> set[str]:
         return {job_id for job_id in job_ids if self._given.get(job_id) is False}
 
-    def over(self, most: int) -> list[str]:
-        return [job_id for job_id, over in self._given.items() if over][:most]
+    def over(self, limit: int) -> list[str]:
+        return [job_id for job_id, over in self._given.items() if over][:limit]
 
     def forget(self, job_ids: Collection[str]) -> None:
         for job_id in job_ids:

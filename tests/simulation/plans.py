@@ -12,7 +12,7 @@ from loopwright.service.config import LoopConfig
 from loopwright.service.execution.computing.limits import Kind
 from loopwright.service.execution.procedures import Hooks, Outcome, Tune, tune
 from loopwright.service.execution.runner import Watch, run
-from loopwright.service.jsonable import plain_object
+from loopwright.service.jsonable import to_json_object
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.service.request import RetuneRequest
@@ -127,7 +127,7 @@ def tunes(actions: tuple[Action, ...]) -> Tune:
             made_up(actions, state), loop, watch=watch, on_event=hooks.on_event, on_samples=hooks.on_samples,
             stop=hooks.stop, remember=hooks.remember, on_home=hooks.on_home,
         )  # fmt: skip
-        return Outcome(plain_object(ran.value), ran.ended, ran.restored, dict(ran.plant_time_s))
+        return Outcome(to_json_object(ran.value), ran.ended, ran.restored, dict(ran.plant_time_s))
 
     return work
 

@@ -16,7 +16,7 @@ from typing import Any
 from greenlet import getcurrent, greenlet
 
 START = 1000.0
-MOST_EVENTS = 500_000
+MAX_EVENTS = 500_000
 
 
 class Killed(BaseException):
@@ -78,8 +78,8 @@ class Simulation:
             if time > self.now:
                 self.now = time
             self.events += 1
-            if self.events > MOST_EVENTS:
-                raise Runaway(f"more than {MOST_EVENTS} events")
+            if self.events > MAX_EVENTS:
+                raise Runaway(f"more than {MAX_EVENTS} events")
             call(*timer.args)
             if over():
                 return

@@ -146,8 +146,8 @@ def test_wireshark_reads_a_session_as_canopen(tmp_path: Path) -> None:
     for can_id in (SYNC_ID, IDS.pv, IDS.mv):
         assert count[can_id] >= SAMPLES, hex(can_id)
     assert count[IDS.status] >= 3
-    for node, least in ((CONTROLLER, 50), (PLANT, 5)):
-        assert count[sdo_request_id(node)] >= least
+    for node, minimum in ((CONTROLLER, 50), (PLANT, 5)):
+        assert count[sdo_request_id(node)] >= minimum
         assert count[sdo_response_id(node)] == count[sdo_request_id(node)]
         assert count[heartbeat_id(node)] >= 5
     assert count[heartbeat_id(TUNER)] >= 10

@@ -15,7 +15,7 @@ _MODULES = (
     "net/bridge/bridge", "drivers/block/loop",
 )  # fmt: skip
 _CGROUPS = ("cpu", "cpuacct", "memory", "devices", "pids", "freezer")
-_MOST_S = 2400
+_MAX_S = 2400
 
 
 def vcan_in_guest(folder: Path, own: "subprocess.Popen[bytes]") -> None:
@@ -26,7 +26,7 @@ def vcan_in_guest(folder: Path, own: "subprocess.Popen[bytes]") -> None:
     output("mkfs.ext4", "-q", "-d", str(folder / "data"), str(disk), "4G")
     shutil.rmtree(folder / "data")
     tool = [sys.executable, "tools/compose-test", "--guest", str(disk)]
-    if subprocess.run(["tools/with-vcan", "--timeout", str(_MOST_S), "--", *tool], check=False).returncode != 0:
+    if subprocess.run(["tools/with-vcan", "--timeout", str(_MAX_S), "--", *tool], check=False).returncode != 0:
         raise Wrong("on vcan, inside user-mode Linux: see above")
 
 

@@ -2,7 +2,7 @@
 
 Asked for are bounds of robustness (Ms, and what else there is) and, under these, the least J: the criterion that the
 procedure minimises. New gains are worth having where they restore a bound that the old ones pass, or bring J down, by
-more than `LEAST_GAIN` each; and never where no figure shown is better.
+more than `MIN_GAIN` each; and never where no figure shown is better.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Model, integrators
 from loopwright.tuning.reasons import Ended
 
-LEAST_GAIN = 0.05
+MIN_GAIN = 0.05
 """Of a bound or of J, as a fraction: less is not worth a change of a loop that works."""
 BAND = 0.05
 """Of settling, a fraction of the final change (load: of the peak)."""
@@ -78,13 +78,13 @@ class Asked:
         return max(self._each(found))
 
     def _each(self, found: Worth) -> Iterator[tuple[float, str]]:
-        for name, value, most in (
+        for name, value, maximum in (
             ("Ms", found.Ms, self.Ms),
             ("Mt", found.Mt, self.Mt),
             ("noise gain", found.noise_gain, self.noise_gain),
         ):
-            if value is not None and most is not None:
-                yield value / most, f"{name} {value:.2f} ({self.by}: at most {most:.2f})"
+            if value is not None and maximum is not None:
+                yield value / maximum, f"{name} {value:.2f} ({self.by}: at most {maximum:.2f})"
         if found.GM is not None and self.GM is not None:
             yield self.GM / found.GM, f"GM {found.GM:.2f} ({self.by}: at least {self.GM:.2f})"
 
@@ -187,7 +187,7 @@ def compared(
     gain, words = _verdict(before, after, asked, J)
     if not gain:
         end = "the new gains are proposed because that was asked for" if anyway else "the present gains are kept"
-        words = f"Nothing asked for gets better by more than {100.0 * LEAST_GAIN:.0f} %: {end}; {words}."
+        words = f"Nothing asked for gets better by more than {100.0 * MIN_GAIN:.0f} %: {end}; {words}."
     return Comparison(before, after, asked.Ms, criterion, *J, gain, words)
 
 
@@ -199,10 +199,10 @@ def _verdict(before: Worth, after: Worth, asked: Asked, J: tuple[float | None, f
     past, words = asked.worst(before)
     rest = f"{_errors(before, after)}; Ms {before.Ms:.2f} now, {Ms:.2f} with the new gains ({wanted})"
     better = _better(before, after)
-    if better and past > 1.0 + LEAST_GAIN and asked.worst(after)[0] * (1.0 + LEAST_GAIN) < past:
+    if better and past > 1.0 + MIN_GAIN and asked.worst(after)[0] * (1.0 + MIN_GAIN) < past:
         return True, f"The present gains have {words}, the new ones {asked.worst(after)[1]}; {_errors(before, after)}."
     now, then = J
-    if better and then is not None and (now is None or then * (1.0 + LEAST_GAIN) < now):
+    if better and then is not None and (now is None or then * (1.0 + MIN_GAIN) < now):
         falls = "" if now is None else f"; J falls by {100.0 * (1.0 - then / now):.0f} %"
         return True, f"{rest[0].upper()}{rest[1:]}{falls}."
     return False, rest

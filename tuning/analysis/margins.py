@@ -68,9 +68,9 @@ def margins(model: Model, gains: Gains) -> Margins:
     w = _grid(model, N, D)
     L = loop(w)
     one_plus = np.abs(1.0 + L)
-    ws, least = _least(lambda x: abs(1.0 + at(x)), w, int(np.argmin(one_plus)))
+    ws, minimum = _min(lambda x: abs(1.0 + at(x)), w, int(np.argmin(one_plus)))
     closed = np.abs(L) / one_plus
-    _, mt = _least(lambda x: -abs(at(x) / (1.0 + at(x))), w, int(np.argmax(closed)))
+    _, mt = _min(lambda x: -abs(at(x) / (1.0 + at(x))), w, int(np.argmax(closed)))
 
     wpc, inverse_gm = None, 0.0
     for x in _crossings(lambda v: loop(v).imag, w, L.imag, (L.real < 0.0)):
@@ -88,7 +88,7 @@ def margins(model: Model, gains: Gains) -> Margins:
     return Margins(
         GM=1.0 / inverse_gm if inverse_gm > 0.0 else None,
         PM_deg=pm,
-        Ms=1.0 / max(least, 1e-12),
+        Ms=1.0 / max(minimum, 1e-12),
         Mt=-mt,
         wc=wc,
         wpc=wpc,
@@ -155,7 +155,7 @@ def _crossings(f: Callable[[Reals], Reals], w: Reals, values: Reals, wanted: NDA
     ]
 
 
-def _least(f: Callable[[float], float], w: Reals, at: int) -> tuple[float, float]:
+def _min(f: Callable[[float], float], w: Reals, at: int) -> tuple[float, float]:
     """The least value of f near the grid point `at`: (where, value)."""
     if at in (0, len(w) - 1):
         return float(w[at]), f(float(w[at]))

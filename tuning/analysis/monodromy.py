@@ -17,7 +17,7 @@ from scipy.linalg import expm
 from loopwright.tuning.analysis.state_space import state_space
 from loopwright.tuning.models import Complexes, Model, Reals, sign
 
-MOST_NODES = 64
+MAX_NODES = 64
 LOCAL = 6
 
 
@@ -35,7 +35,7 @@ class DeadTimeLoop:
         self.L, self.direction = model.L, sign(model)
         fastest = float(np.abs(np.linalg.eigvals(plant.a)).max()) * model.L
         # Chebyshev points crowd at the ends as their square: the root of the fastest lag's rate is enough
-        count = min(MOST_NODES, 10 + math.ceil(4.0 * math.sqrt(fastest)))
+        count = min(MAX_NODES, 10 + math.ceil(4.0 * math.sqrt(fastest)))
         n = len(plant.b)
         self.order, self.nodes, self.size = n, count, n + count + 1
         self.errors = slice(n, n + count)

@@ -53,14 +53,14 @@ def step_figures(
     _require_stable(model, gains)
     response = step_response(model, gains, horizon, dt, load)
     final = final_value(model, gains, load)
-    most = float(np.max(np.abs(response.y))) if load else final
+    maximum = float(np.max(np.abs(response.y))) if load else final
     return response_figures(
         response.t,
         response.y,
         response.u,
         final=0.0 if load else final,
         reference=0.0 if load else 1.0,
-        band=band * most,
+        band=band * maximum,
         final_u=_final_control(model, gains, load),
     )
 

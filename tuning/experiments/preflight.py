@@ -16,12 +16,12 @@ from loopwright.tuning.reasons import Reason, Refused
 
 PREFLIGHT, SETTLE = "preflight", "settle"
 LOOKS = 4
-LEAST_LISTENED_SAMPLES = 60
-MOST_NOISE = 0.10
+MIN_LISTENED_SAMPLES = 60
+MAX_NOISE = 0.10
 """Noise (standard deviation) as a share of the set-point step, above which no overshoot can be read."""
-MOST_AWAY = 0.05
+MAX_AWAY = 0.05
 """PV off the set-point, and its drift, as a share of the set-point step, above which the loop is not at rest."""
-LEAST_ROOM = 0.05
+MIN_ROOM = 0.05
 """Room for MV on both sides, as a share of its permitted range."""
 
 
@@ -32,7 +32,7 @@ def preflight(facts: Facts, after_s: float) -> Plan[OperatingPoint]:
 
 
 def at_rest(
-    facts: Facts, after_s: float, least_samples: int = LEAST_LISTENED_SAMPLES
+    facts: Facts, after_s: float, min_samples: int = MIN_LISTENED_SAMPLES
 ) -> Plan[tuple[OperatingPoint, Trace]]:
     """Looks at the loop until it is at rest, LOOKS times at most; the last look's samples come with the point.
 
@@ -44,18 +44,18 @@ def at_rest(
     for _ in range(LOOKS - 1):
         yield begin
         try:
-            return (yield from look(facts, least_samples))
+            return (yield from look(facts, min_samples))
         except Refused as refused:
             if refused.reason is not Reason.NOT_AT_REST:
                 raise
             yield from record(once_s, (Note(refused.detail), StageStarted(SETTLE, once_s, once_s + after_s)))
     yield begin
-    return (yield from look(facts, least_samples))
+    return (yield from look(facts, min_samples))
 
 
-def look(facts: Facts, least_samples: int = LEAST_LISTENED_SAMPLES) -> Plan[tuple[OperatingPoint, Trace]]:
+def look(facts: Facts, min_samples: int = MIN_LISTENED_SAMPLES) -> Plan[tuple[OperatingPoint, Trace]]:
     """Listens once, for half T95 (at least so many samples) in automatic. Raises Refused as `at_rest`."""
-    trace = yield from record(max(facts.T95_s / 2, least_samples * facts.sample_time_s))
+    trace = yield from record(max(facts.T95_s / 2, min_samples * facts.sample_time_s))
     sample = yield ()
     trace.add(sample)
     if sample.mode != Mode.AUTOMATIC:
@@ -71,16 +71,16 @@ def look(facts: Facts, least_samples: int = LEAST_LISTENED_SAMPLES) -> Plan[tupl
     away = float(pv.mean()) - sample.sp
     near = facts.mv_high - facts.mv_low
     room = min(facts.mv_high - float(mv.mean()), float(mv.mean()) - facts.mv_low)
-    if room < LEAST_ROOM * near:
+    if room < MIN_ROOM * near:
         raise Refused(
             Reason.SATURATED,
             f"MV {mv.mean():.4g} leaves {room:.3g} of room within {facts.mv_low:.4g} .. {facts.mv_high:.4g}; "
-            f"at least {LEAST_ROOM * near:.3g} is needed",
+            f"at least {MIN_ROOM * near:.3g} is needed",
         )
     slack = 4 * noise / math.sqrt(len(pv))
-    if noise > MOST_NOISE * step:
-        raise Refused(Reason.NOISE_TOO_HIGH, f"noise {noise:.3g} is above {MOST_NOISE:.0%} of the step {step:.3g}")
-    near_rest = MOST_AWAY * step
+    if noise > MAX_NOISE * step:
+        raise Refused(Reason.NOISE_TOO_HIGH, f"noise {noise:.3g} is above {MAX_NOISE:.0%} of the step {step:.3g}")
+    near_rest = MAX_AWAY * step
     if abs(drift) > near_rest + 4 * slack or abs(away) > near_rest + slack or spread > 0.03 * step + 2 * noise:
         raise Refused(
             Reason.NOT_AT_REST,

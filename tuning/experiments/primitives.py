@@ -99,7 +99,7 @@ def record(seconds: float, commands: Sequence[Command | Event] = (), *, into: Tr
 
 
 def until(
-    done: Callable[[Trace], bool], every_s: float, most_s: float, commands: Sequence[Command | Event] = ()
+    done: Callable[[Trace], bool], every_s: float, max_s: float, commands: Sequence[Command | Event] = ()
 ) -> Plan[tuple[Trace, bool]]:
     """Listens until `done` (asked every so many seconds) or the time is over; tells which."""
     trace = Trace()
@@ -114,12 +114,12 @@ def until(
             ask = sample.t + every_s
             if done(trace):
                 return trace, True
-        if sample.t - start >= most_s:
+        if sample.t - start >= max_s:
             return trace, False
 
 
 def settle(
-    target: float, band: float, stay_s: float, most_s: float, noise: float, commands: Sequence[Command | Event] = ()
+    target: float, band: float, stay_s: float, max_s: float, noise: float, commands: Sequence[Command | Event] = ()
 ) -> Plan[tuple[Trace, bool]]:
     """Listens until PV has stayed around target for stay_s: its mean over each third of that time within the band."""
 
@@ -129,7 +129,7 @@ def settle(
         thirds = np.array_split(np.asarray(trace.pv[trace.tail(stay_s)]) - target, 3)
         return all(abs(float(part.mean())) <= band + 3 * noise / math.sqrt(len(part)) for part in thirds)
 
-    return (yield from until(done, stay_s / 8, most_s, commands))
+    return (yield from until(done, stay_s / 8, max_s, commands))
 
 
 def to_rest(facts: Facts, point: OperatingPoint, band: float) -> Plan[None]:

@@ -50,7 +50,7 @@ def step_test(
     step: float,
     *,
     band: float,
-    most_s: float,
+    max_s: float,
     smooth_s: float,
     kept: Trace | None = None,
 ) -> Plan[StepResult]:
@@ -63,7 +63,7 @@ def step_test(
     sample = yield (SetSetpoint(target),)
     while not same(sample.sp, target):
         sample = yield ()
-    later, settled = yield from settle(target, band * abs(step), facts.T95_s / 5, most_s, point.noise)
+    later, settled = yield from settle(target, band * abs(step), facts.T95_s / 5, max_s, point.noise)
     trace = Trace([sample.t, *later.t], [sample.sp, *later.sp], [sample.pv, *later.pv], [sample.mv, *later.mv])
     if kept is not None:
         kept.t, kept.sp, kept.pv, kept.mv = trace.t, trace.sp, trace.pv, trace.mv

@@ -24,14 +24,14 @@ def verification(
     )
     commands = (SetGains(gains), SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp))
     yield from settle(point.sp, 0.02 * step, facts.T95_s / 5, 3 * facts.T95_s, point.noise, commands)
-    result = yield from step_test(facts, point, step, band=0.05, most_s=5 * facts.T95_s, smooth_s=dead_time_s / 2)
+    result = yield from step_test(facts, point, step, band=0.05, max_s=5 * facts.T95_s, smooth_s=dead_time_s / 2)
     unlimited(facts, result, gains)
-    most = max(40.0, predicted.overshoot_pct + 25.0)
-    if not result.settled or result.overshoot_pct > most:
+    maximum = max(40.0, predicted.overshoot_pct + 25.0)
+    if not result.settled or result.overshoot_pct > maximum:
         raise Refused(
             Reason.NOT_CONFIRMED,
             f"under the new gains the loop {'settled' if result.settled else 'did not settle'} with an overshoot of "
-            f"{result.overshoot_pct:.1f} % (predicted {predicted.overshoot_pct:.1f} %, at most {most:.0f} %)",
+            f"{result.overshoot_pct:.1f} % (predicted {predicted.overshoot_pct:.1f} %, at most {maximum:.0f} %)",
         )
     # home under the new gains, so that the old ones take over a loop at rest
     yield from settle(point.sp, 0.05 * step, facts.T95_s / 5, 3 * facts.T95_s, point.noise, (SetSetpoint(point.sp),))

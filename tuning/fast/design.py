@@ -36,15 +36,15 @@ TI = np.geomspace(0.04, 30.0, 30)  # periods
 HALVINGS = 5
 PID_TI = np.geomspace(0.1, 8.0, 11)
 PID_TD = (0.03, 0.06, 0.15, 0.25, 0.4, 0.65)  # of Ti
-LEAST_TD, LEAST_TI = 0.045, 0.08  # periods
-MOST_TD = 2.0  # of Ti
+MIN_TD, MIN_TI = 0.045, 0.08  # periods
+MAX_TD = 2.0  # of Ti
 PID_STEPS = 45
 WORTH = 0.97
 """A derivative must bring J below this part of the PI's."""
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class DesignSpec:
     """What the user asks for. Ms: 1.2 robust, 1.6, 2.0 fast.  Mt: largest peak of the closed loop, None for no bound.
 
     derivative: a PID where it pays.  N: its filter is Td/N.  noise_gain: the most that MV may answer to a jump of PV,
@@ -76,15 +76,15 @@ class Best:
     gains: Gains
     J: float
     cost: Cost
-    least: Cost
+    minimum: Cost
 
 
 class Design:
     """The criterion on one model, its dead time including what the sampling adds; relay_period: s."""
 
-    def __init__(self, model: Model, wish: Wish, relay_period: float) -> None:
+    def __init__(self, model: Model, spec: DesignSpec, relay_period: float) -> None:
         positive = TransferFunction(tuple(sign(model) * c for c in model.num), model.den, model.L)
-        self.model, self.wish = positive, wish
+        self.model, self.spec = positive, spec
         self.period = own_period(positive, relay_period)
         self.w = frequencies(self.period)
         self.G = positive.frequency_response(self.w)
@@ -94,38 +94,38 @@ class Design:
         start = min(TURNED / positive.L, end) if positive.L > 0.0 else end
         self.tail = np.geomspace(start, BEYOND * end, POINTS)
         self.G_tail = positive.frequency_response(self.tail)
-        self.least: Cost | None = None
+        self.minimum: Cost | None = None
 
     def best(self) -> Best:
         """Raises Refused, NOT_ROBUST: no gain meets the bounds."""
         pi = self._pi()
-        if not self.wish.derivative:
+        if not self.spec.derivative:
             return pi
         pid = self._pid()
         return pid if pid is not None and pid.J < WORTH * pi.J else pi
 
     def candidates(self, Ti: float, Td: float = 0.0) -> list[tuple[Gains, Cost]]:
         """The largest gains of these times that are stable, with their cost."""
-        wish = self.wish
-        g = self.G * controller(self.w, Ti, Td, wish.N)
+        spec = self.spec
+        g = self.G * controller(self.w, Ti, Td, spec.N)
         cap = math.inf
-        if wish.noise_gain is not None:
-            cap = wish.noise_gain / (1.0 + wish.N if Td > 0.0 else 1.0)
-        size = float(np.max(np.abs(self.G_tail * controller(self.tail, Ti, Td, wish.N))))
-        cap = min(cap, (TRUSTED if Td > 0.0 else 1.0) * (1.0 - 1.0 / wish.Ms) / size)
+        if spec.noise_gain is not None:
+            cap = spec.noise_gain / (1.0 + spec.N if Td > 0.0 else 1.0)
+        size = float(np.max(np.abs(self.G_tail * controller(self.tail, Ti, Td, spec.N))))
+        cap = min(cap, (TRUSTED if Td > 0.0 else 1.0) * (1.0 - 1.0 / spec.Ms) / size)
         found = []
-        for end in largest_gains(g, wish.Ms, wish.Mt, cap):
+        for end in largest_gains(g, spec.Ms, spec.Mt, cap):
             if encircles_not(end * g):
-                cost = self.cost(end, Ti, Td, wish.N)
-                found.append((Gains(float(end), float(Ti), float(Td), float(Td) / wish.N), cost))
+                cost = self.cost(end, Ti, Td, spec.N)
+                found.append((Gains(float(end), float(Ti), float(Td), float(Td) / spec.N), cost))
         return found
 
     def _pi(self) -> Best:
         scanned = [self.candidates(Ti * self.period) for Ti in TI]
         everything = [each for candidates in scanned for each in candidates]
         if not everything:
-            raise Refused(Reason.NOT_ROBUST, f"no PI on the model has an Ms of at most {self.wish.Ms:g}")
-        self.least = Cost(min(cost.setpoint for _, cost in everything), min(cost.load for _, cost in everything))
+            raise Refused(Reason.NOT_ROBUST, f"no PI on the model has an Ms of at most {self.spec.Ms:g}")
+        self.minimum = Cost(min(cost.setpoint for _, cost in everything), min(cost.load for _, cost in everything))
         best = min((self._judged(each) for each in everything), key=_value)
         step = math.log(TI[1] / TI[0])
         for _ in range(HALVINGS):
@@ -173,15 +173,15 @@ class Design:
 
     def _at(self, Ti: float, Td: float) -> Best | None:
         """The best gain of these times, None where they are not permitted or have none."""
-        if Td < LEAST_TD * self.period or Ti < LEAST_TI * self.period or Td > MOST_TD * Ti or Ti > 40.0 * self.period:
+        if Td < MIN_TD * self.period or Ti < MIN_TI * self.period or Td > MAX_TD * Ti or Ti > 40.0 * self.period:
             return None
         return min(map(self._judged, self.candidates(Ti, Td)), key=_value, default=None)
 
     def _judged(self, each: tuple[Gains, Cost]) -> Best:
         gains, cost = each
-        assert self.least is not None  # the PI comes first
-        J = 0.5 * cost.setpoint / self.least.setpoint + 0.5 * cost.load / self.least.load
-        return Best(gains, J, cost, self.least)
+        assert self.minimum is not None  # the PI comes first
+        J = 0.5 * cost.setpoint / self.minimum.setpoint + 0.5 * cost.load / self.minimum.load
+        return Best(gains, J, cost, self.minimum)
 
     def _require_stable(self, best: Best) -> None:
         if not is_stable(self.model, best.gains):

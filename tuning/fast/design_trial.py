@@ -33,14 +33,14 @@ def designed_on(model: Model, options: FastOptions, sample_time_s: float) -> Bes
     known = ultimate(model)
     # without an ultimate point the loop's time is that of its lags and dead time
     period = known.Pu_s if known else 4.0 * (model.L + float(max(time_constants(model), default=0.0)))
-    return Design(delayed(model, 0.5 * sample_time_s), options.wish(), period).best()
+    return Design(delayed(model, 0.5 * sample_time_s), options.spec(), period).best()
 
 
 def _considered(model: Model, options: FastOptions, facts: Facts) -> tuple[Gains, Comparison]:
     """The best gains on the model, beside the old ones. Raises Refused, NOT_ROBUST."""
     best = designed_on(model, options, facts.sample_time_s)
     sampled = delayed(model, 0.5 * facts.sample_time_s)
-    return best.gains, comparison_on(sampled, best, facts, options.wish(), options.propose_anyway)
+    return best.gains, comparison_on(sampled, best, facts, options.spec(), options.propose_anyway)
 
 
 def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal]:
@@ -72,11 +72,11 @@ def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal
         gain = model.static_gain if math.isfinite(model.static_gain) else math.nan
         shown = yield from verification(facts, point, gains, promised, gain, model.L)
         yield (StageDone("verify", shown),)
-    wish = options.wish()
+    spec = options.spec()
     given = TransferFunction(model.num, model.den, model.L)
     return FastProposal(
         method=FAST,
-        chosen={"Ms": wish.Ms, **({"N": wish.N} if gains.Td else {})},
+        chosen={"Ms": spec.Ms, **({"N": spec.N} if gains.Td else {})},
         model=FoundModel("typed in", given.num, given.den, given.L),
         old_gains=facts.old_gains,
         gains=gains,

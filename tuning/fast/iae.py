@@ -22,7 +22,7 @@ from loopwright.tuning.models import Model, Reals
 
 STEPS_PER_PERIOD = 80
 PERIODS, INTEGRAL_TIMES = 20.0, 15.0
-MOST_STEPS = 40_000
+MAX_STEPS = 40_000
 _DIFFERENCE = np.array([1.0, -1.0])
 
 
@@ -63,7 +63,7 @@ class LoopCost:
         forward = Kp * _sum(np.convolve(proportional, filtered), derived)
         AF = np.convolve(self._A, filtered)
         D = _sum(np.convolve(AF, _DIFFERENCE), np.convolve(self._B, forward))
-        steps = min(MOST_STEPS, int((PERIODS * self.period + INTEGRAL_TIMES * Ti) / h))
+        steps = min(MAX_STEPS, int((PERIODS * self.period + INTEGRAL_TIMES * Ti) / h))
         pulse = np.zeros(steps)
         pulse[0] = 1.0
         common = recursive(D, pulse)

@@ -16,11 +16,11 @@ from functools import partial
 from loopwright.tuning.analysis.comparison import Comparison
 from loopwright.tuning.experiments.preflight import at_rest
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.design import Wish
+from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.proposal import FastProposal, Verified, comparison_of, found_of, proposed, verified
-from loopwright.tuning.fast.record import LEAST_LISTENED, Evidence
+from loopwright.tuning.fast.record import MIN_LISTENED, Evidence
 from loopwright.tuning.fast.relay_test import Experiment
-from loopwright.tuning.fast.verdict import Judged, judge
+from loopwright.tuning.fast.verdict import Evaluation, evaluate
 from loopwright.tuning.models import sign
 from loopwright.tuning.plan import Note, Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
@@ -32,13 +32,13 @@ FAST_STAGES = ("preflight", "relay", "design", "verify", "redesign")
 SWITCHES = (4, 6, 8, 10)
 NOT_YET = (Reason.UNCERTAIN, Reason.AMBIGUOUS)
 """What more of the same record may mend."""
-LEAST_SAMPLES = 2 * LEAST_LISTENED
+MIN_SAMPLES = 2 * MIN_LISTENED
 """At rest, for the noise and the offset."""
 
 
 @dataclass(frozen=True, slots=True)
 class FastOptions:
-    """What to design for, see `tuning.fast.design.Wish`; how to test.
+    """What to design for, see `tuning.fast.design.DesignSpec`; how to test.
 
     amplitude: of the relay's higher side, MV units; by default half of what MV permits, adapted after the first wave.
     verify: the set-point step under the new gains; without it the relay switches six times at least, as with careful.
@@ -54,12 +54,12 @@ class FastOptions:
     verify: bool = True
     propose_anyway: bool = False
 
-    def wish(self) -> Wish:
+    def spec(self) -> DesignSpec:
         """Raises Refused, BAD_INPUT."""
-        return Wish(self.Ms, self.derivative, self.Mt, self.noise_gain)
+        return DesignSpec(self.Ms, self.derivative, self.Mt, self.noise_gain)
 
     def __post_init__(self) -> None:
-        self.wish()
+        self.spec()
         if self.amplitude is not None and not (math.isfinite(self.amplitude) and self.amplitude > 0.0):
             raise Refused(Reason.BAD_INPUT, f"amplitude must be a positive number, not {self.amplitude!r}")
 
@@ -71,7 +71,7 @@ def fast_stages(verify: bool) -> tuple[str, ...]:
 
 def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
     """The whole procedure on a loop in automatic and at rest. Raises Refused; restores nothing (the runner does)."""
-    T95, wish = facts.T95_s, options.wish()
+    T95, spec = facts.T95_s, options.spec()
     expected = {"preflight": T95 / 2, "relay": T95, "design": 0.0, "verify": 1.5 * T95, "redesign": 0.0}
     todo = fast_stages(options.verify)
 
@@ -80,20 +80,20 @@ def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
         return (StageStarted(stage, expected[stage], sum(expected[s] for s in after)),)
 
     after_s = sum(expected[stage] for stage in todo[1:])
-    point, listened = yield from at_rest(facts, after_s, LEAST_SAMPLES)
+    point, listened = yield from at_rest(facts, after_s, MIN_SAMPLES)
     experiment = Experiment(facts, point, listened, options.amplitude)
     yield from experiment.tell(StageDone("preflight", point))
 
     yield from experiment.tell(*started("relay"))
-    judged: Judged | None = None
+    evaluation: Evaluation | None = None
     came: Refused | Comparison = Refused(Reason.STALLED, "the relay came to nothing")
     careful = options.careful or not options.verify
     for switches in SWITCHES[careful:]:
         in_time = yield from experiment.relay(switches)
-        judged = None
+        evaluation = None
         try:
             evidence = experiment.evidence()
-            judged, came = yield from experiment.computed(partial(_looked_at, facts, options, evidence))
+            evaluation, came = yield from experiment.computed(partial(_looked_at, facts, options, evidence))
         except Refused as refused:
             came = refused
         if isinstance(came, Comparison) or not in_time:
@@ -101,52 +101,54 @@ def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
         yield from experiment.tell(Note(f"after {switches} switches: {came.detail}"))
     # refused or not, what the record came to is told: it says why
     yield from experiment.tell(StageDone("relay", experiment.recorded()), *started("design"))
-    if judged is not None:
-        yield from experiment.tell(StageDone("design", found_of(judged)))
+    if evaluation is not None:
+        yield from experiment.tell(StageDone("design", found_of(evaluation)))
     if isinstance(came, Refused):
         raise came
-    assert judged is not None
+    assert evaluation is not None
 
     shown: Verified | None = None
     if options.verify and (came.gain or options.propose_anyway):
         yield from experiment.tell(*started("verify"))
-        first = judged
+        first = evaluation
         tested = first.best.gains
         yield from experiment.step(tested, first.period)
         looked = partial(_looked_at, facts, options, experiment.evidence(), first)
-        judged, came = yield from experiment.computed(looked)
-        shown = verified(judged, tested, *experiment.stepped)
+        evaluation, came = yield from experiment.computed(looked)
+        shown = verified(evaluation, tested, *experiment.stepped)
         if isinstance(came, Refused) and came.reason in NOT_YET:
             yield from experiment.tell(Note(f"after the set-point step: {came.detail}; it is stepped back"))
             yield from experiment.step_back()
             looked = partial(_looked_at, facts, options, experiment.evidence(), first)
-            judged, came = yield from experiment.computed(looked)
-            shown = verified(judged, tested, *experiment.stepped)
-        yield (StageDone("verify", shown), *started("redesign"), StageDone("redesign", found_of(judged)))
+            evaluation, came = yield from experiment.computed(looked)
+            shown = verified(evaluation, tested, *experiment.stepped)
+        yield (StageDone("verify", shown), *started("redesign"), StageDone("redesign", found_of(evaluation)))
         if isinstance(came, Refused):
             raise came
     relay_at_s = experiment.trace.t[experiment.listened]
-    return (yield from experiment.computed(partial(proposed, facts, wish, judged, came, shown, relay_at_s)))
+    return (yield from experiment.computed(partial(proposed, facts, spec, evaluation, came, shown, relay_at_s)))
 
 
 def _looked_at(
-    facts: Facts, options: FastOptions, evidence: Evidence, first: Judged | None = None
-) -> tuple[Judged, Refused | Comparison]:
+    facts: Facts, options: FastOptions, evidence: Evidence, first: Evaluation | None = None
+) -> tuple[Evaluation, Refused | Comparison]:
     """The verdict on the record, and why nothing is to be proposed on it, or else what the new gains are worth.
 
-    first: as `earlier` of `judge`. Raises Refused, NOT_ROBUST.
+    first: as `earlier` of `evaluate`. Raises Refused, NOT_ROBUST.
     """
-    judged = judge(evidence, options.wish(), first)
-    return judged, _wrong(facts, judged) or comparison_of(judged, facts, options.wish(), options.propose_anyway)
+    evaluation = evaluate(evidence, options.spec(), first)
+    return evaluation, _wrong(facts, evaluation) or comparison_of(
+        evaluation, facts, options.spec(), options.propose_anyway
+    )
 
 
-def _wrong(facts: Facts, judged: Judged) -> Refused | None:
+def _wrong(facts: Facts, evaluation: Evaluation) -> Refused | None:
     """Why this is not to be proposed."""
-    model = judged.model
+    model = evaluation.model
     if (sign(model) > 0.0) != facts.reverse:
         return Refused(
             Reason.WRONG_SIGN,
             f"the record fits a plant of {'positive' if sign(model) > 0.0 else 'negative'} gain; the controller acts "
             f"{'reverse' if facts.reverse else 'direct'}",
         )
-    return None if judged.cause is None else Refused(Reason(judged.cause), judged.detail)
+    return None if evaluation.cause is None else Refused(Reason(evaluation.cause), evaluation.detail)

@@ -11,10 +11,10 @@ from loopwright.tuning.analysis.comparison import Asked, Comparison, Predicted, 
 from loopwright.tuning.analysis.margins import Ultimate, margins, ultimate_point
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.step_test import StepResult
-from loopwright.tuning.fast.design import Best, Wish
+from loopwright.tuning.fast.design import Best, DesignSpec
 from loopwright.tuning.fast.record import Evidence
 from loopwright.tuning.fast.uncertainty import fit_covariance
-from loopwright.tuning.fast.verdict import Judged
+from loopwright.tuning.fast.verdict import Evaluation
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.output_error import Fit, Fitted
 from loopwright.tuning.identification.sensitivity import slopes_of
@@ -127,8 +127,8 @@ class FastProposal:
     notes: tuple[str, ...]
 
 
-def found_of(judged: Judged) -> Found:
-    fit, best = judged.fit, judged.chosen.best
+def found_of(evaluation: Evaluation) -> Found:
+    fit, best = evaluation.fit, evaluation.chosen.best
     evidence, structure, theta, c = fit.evidence, best.structure, best.theta, best.linear.coefficients
     order, count = structure.order, best.hypothesis.loads
     first = len(c) - order * count
@@ -141,20 +141,20 @@ def found_of(judged: Judged) -> Found:
     )
     return Found(
         structure=structure.name,
-        num=judged.model.num,
-        den=judged.model.den,
-        L_s=judged.model.L,
-        gains=judged.best.gains,
-        Ms=judged.Ms,
-        uncertainty=judged.uncertainty,
-        ambiguity=judged.ambiguity,
-        residual=judged.residual,
+        num=evaluation.model.num,
+        den=evaluation.model.den,
+        L_s=evaluation.model.L,
+        gains=evaluation.best.gains,
+        Ms=evaluation.Ms,
+        uncertainty=evaluation.uncertainty,
+        ambiguity=evaluation.ambiguity,
+        residual=evaluation.residual,
         loads=loads,
         drift=best.hypothesis.drift,
         switches=len(evidence.switches),
         period_s=evidence.period * evidence.Ts,
-        cause=judged.cause,
-        detail=judged.detail,
+        cause=evaluation.cause,
+        detail=evaluation.detail,
     )
 
 
@@ -187,15 +187,15 @@ def model_of(fit: Fit[Evidence], found: Fitted) -> FoundModel:
     )
 
 
-def verified(judged: Judged, tested: Gains, size: float, duration_s: float) -> Verified:
+def verified(evaluation: Evaluation, tested: Gains, size: float, duration_s: float) -> Verified:
     """size: of the set-point step under the tested gains, PV units; duration_s: since it was made."""
-    fit, residual = judged.fit, judged.chosen.best.linear.residual
+    fit, residual = evaluation.fit, evaluation.chosen.best.linear.residual
     first = fit.evidence.relayed // fit.block
     rest, shown = residual[first:], fit.y[first:]
     spread = float(np.linalg.norm(shown - shown.mean()))
     return Verified(
         tested=tested,
-        Ms=margins(delayed(judged.model, judged.design_delay), tested).Ms,
+        Ms=margins(delayed(evaluation.model, evaluation.design_delay), tested).Ms,
         step=size,
         duration_s=duration_s,
         fit_pct=100.0 * (1.0 - float(np.linalg.norm(rest)) / spread) if spread > 0.0 else 0.0,
@@ -203,32 +203,37 @@ def verified(judged: Judged, tested: Gains, size: float, duration_s: float) -> V
     )
 
 
-def comparison_of(judged: Judged, facts: Facts, wish: Wish, anyway: bool) -> Comparison:
+def comparison_of(evaluation: Evaluation, facts: Facts, spec: DesignSpec, anyway: bool) -> Comparison:
     """Of the old gains and those designed on the record. Raises as `comparison_on`."""
-    return comparison_on(delayed(judged.model, judged.design_delay), judged.best, facts, wish, anyway)
+    return comparison_on(delayed(evaluation.model, evaluation.design_delay), evaluation.best, facts, spec, anyway)
 
 
-def comparison_on(sampled: Model, best: Best, facts: Facts, wish: Wish, anyway: bool) -> Comparison:
+def comparison_on(sampled: Model, best: Best, facts: Facts, spec: DesignSpec, anyway: bool) -> Comparison:
     """sampled: the model with the delay of the sampling.  anyway: see `compared`. Raises Refused, NOT_ROBUST."""
     before, after = (worth(sampled, gains, facts.sample_time_s) for gains in (facts.old_gains, best.gains))
     if not after.stable:
         raise Refused(Reason.NOT_ROBUST, "the gains designed are not stable on their own model")
-    asked = Asked(wish.Ms, Mt=wish.Mt, noise_gain=wish.noise_gain)
-    J = tuple(weighted_IAE(each, best.least.setpoint, best.least.load) for each in (before, after))
+    asked = Asked(spec.Ms, Mt=spec.Mt, noise_gain=spec.noise_gain)
+    J = tuple(weighted_IAE(each, best.minimum.setpoint, best.minimum.load) for each in (before, after))
     return compared(before, after, asked, CRITERION, (J[0], J[1]), anyway)
 
 
 def proposed(
-    facts: Facts, wish: Wish, judged: Judged, comparison: Comparison, verified: Verified | None, relay_at_s: float
+    facts: Facts,
+    spec: DesignSpec,
+    evaluation: Evaluation,
+    comparison: Comparison,
+    verified: Verified | None,
+    relay_at_s: float,
 ) -> FastProposal:
     """relay_at_s: plant time at which the relay began."""
-    found, gains = found_of(judged), judged.best.gains
+    found, gains = found_of(evaluation), evaluation.best.gains
     notes = [
         f"A step of the load of {load.size:+.3g} at the plant's input was found {load.t_s:.4g} s after the start of "
         f"the relay (at {relay_at_s + load.t_s:.4g} s), and allowed for."
         for load in found.loads
     ]
-    swing = judged.fit.evidence.swing
+    swing = evaluation.fit.evidence.swing
     if any(abs(load.size) > swing for load in found.loads):
         notes.append(
             f"Such a load is larger than what the relay moved MV by ({swing:.3g}): a change of the plant would look so "
@@ -238,14 +243,14 @@ def proposed(
         notes.append("PV drifted at a steady rate during the test; this was allowed for.")
     return FastProposal(
         method="fast",
-        chosen={"Ms": wish.Ms, **({"N": wish.N} if gains.Td else {})},
-        model=model_of(judged.fit, judged.chosen.best),
+        chosen={"Ms": spec.Ms, **({"N": spec.N} if gains.Td else {})},
+        model=model_of(evaluation.fit, evaluation.chosen.best),
         old_gains=facts.old_gains,
         gains=gains,
         predicted=predicted(comparison.after),
         predicted_before=predicted(comparison.before) if comparison.before.stable else None,
         comparison=comparison,
-        ultimate=ultimate(judged.model),
+        ultimate=ultimate(evaluation.model),
         found=found,
         verified=verified,
         verification=None,

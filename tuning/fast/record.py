@@ -11,11 +11,11 @@ from loopwright.tuning.identification.output_error import averaged
 from loopwright.tuning.models import Reals
 from loopwright.tuning.reasons import Reason, Refused
 
-LEAST_LISTENED = 60
+MIN_LISTENED = 60
 """Averages in which the time at rest must still be told, for noise and offset."""
 AVERAGES_PER_PERIOD = 80
 LONGEST_DEAD_TIME = 0.75  # periods
-LEAST_SWITCHES = 4
+MIN_SWITCHES = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,12 +38,12 @@ class Evidence:
     steps: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        if len(self.switches) < LEAST_SWITCHES:
+        if len(self.switches) < MIN_SWITCHES:
             raise Refused(
-                Reason.CANNOT_OSCILLATE, f"the relay switched {len(self.switches)} times; {LEAST_SWITCHES} are needed"
+                Reason.CANNOT_OSCILLATE, f"the relay switched {len(self.switches)} times; {MIN_SWITCHES} are needed"
             )
-        if self.listened < LEAST_LISTENED:
-            raise Refused(Reason.BAD_INPUT, f"{self.listened} samples at rest; at least {LEAST_LISTENED} are needed")
+        if self.listened < MIN_LISTENED:
+            raise Refused(Reason.BAD_INPUT, f"{self.listened} samples at rest; at least {MIN_LISTENED} are needed")
         if not self.span > 0.0:
             raise Refused(Reason.NO_RESPONSE, "PV did not move at all under the relay")
 
@@ -70,7 +70,7 @@ class Evidence:
     @property
     def block(self) -> int:
         """Samples averaged into one for the fit: sampling faster than this tells nothing more."""
-        return max(1, min(int(self.period / AVERAGES_PER_PERIOD), self.listened // LEAST_LISTENED))
+        return max(1, min(int(self.period / AVERAGES_PER_PERIOD), self.listened // MIN_LISTENED))
 
     @property
     def noise(self) -> float:

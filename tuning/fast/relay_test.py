@@ -10,7 +10,7 @@ import numpy as np
 
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, no_oscillation
 from loopwright.tuning.fast.proposal import Recorded
-from loopwright.tuning.fast.record import LEAST_SWITCHES, Evidence, noise_of, period
+from loopwright.tuning.fast.record import MIN_SWITCHES, Evidence, noise_of, period
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import (
     Command,
@@ -34,16 +34,16 @@ FIRST = 0.5
 """The amplitude that the relay begins with, of the largest that MV permits."""
 HYSTERESIS = 2.2  # standard deviations of the noise
 AVERAGED = 3
-LEAST_HYSTERESIS = 1e-3
+MIN_HYSTERESIS = 1e-3
 """Of the set-point step permitted, for a PV without noise."""
 STALLED = 2.5
 """Longest half periods without a switch, after which the present side is raised."""
-RAISED, MOST_RAISED = 1.7, 2.0
-LEAST_SPAN, GOOD_SPAN = 25.0, 60.0
+RAISED, MAX_RAISED = 1.7, 2.0
+MIN_SPAN, GOOD_SPAN = 25.0, 60.0
 """Of PV under the relay, standard deviations of the noise."""
 WIDEST_SPAN = 2.0
 """Of PV under the relay, permitted set-point steps."""
-MOST_PERIODS = 8.4
+MAX_PERIODS = 8.4
 VERIFIED_PERIODS = 3.0
 BACK = 0.5
 """Of the time of the first step."""
@@ -53,7 +53,7 @@ FAR = 20.0
 """Spans of PV under the relay, at which the step under the new gains is ended."""
 
 
-def most_amplitude(mv: float, mv_low: float, mv_high: float) -> float:
+def max_amplitude(mv: float, mv_low: float, mv_high: float) -> float:
     """Of the higher side of a relay around `mv` that stays within the limits, MV units."""
     return min(mv_high - mv, (mv - mv_low) / BIAS)
 
@@ -67,13 +67,13 @@ class Experiment:
         self.relayed = 0
         self.switches: list[int] = []
         self.noise = noise_of(np.asarray(listened.pv))
-        self._most = most_amplitude(point.mv, facts.mv_low, facts.mv_high)
-        if amplitude is not None and not 0.0 < amplitude <= self._most:
+        self._max = max_amplitude(point.mv, facts.mv_low, facts.mv_high)
+        if amplitude is not None and not 0.0 < amplitude <= self._max:
             raise Refused(
-                Reason.BAD_LIMITS, f"a relay amplitude of {amplitude:g} is asked for; MV permits up to {self._most:.4g}"
+                Reason.BAD_LIMITS, f"a relay amplitude of {amplitude:g} is asked for; MV permits up to {self._max:.4g}"
             )
         self._fixed = amplitude is not None
-        self.amplitude = amplitude or FIRST * self._most
+        self.amplitude = amplitude or FIRST * self._max
         self._sides = [BIAS, 1.0]  # low, high, in amplitudes
         self._high = True
         self._raise_at = 0
@@ -114,7 +114,7 @@ class Experiment:
         while len(self.switches) < switches:
             self._commands = self._hear((yield self._commands))
             if self._over():
-                if len(self.switches) < LEAST_SWITCHES:
+                if len(self.switches) < MIN_SWITCHES:
                     raise self._stalled()
                 return False
         return True
@@ -218,8 +218,8 @@ class Experiment:
             if since > STALLED * longest:
                 self._raise_at = at
                 side = int(high)
-                most = self._most * (1.0 if high else BIAS) / self.amplitude
-                raised = min(RAISED * self._sides[side], MOST_RAISED * (1.0, BIAS)[not high], most)
+                maximum = self._max * (1.0 if high else BIAS) / self.amplitude
+                raised = min(RAISED * self._sides[side], MAX_RAISED * (1.0, BIAS)[not high], maximum)
                 if raised > self._sides[side]:
                     self._sides[side] = raised
                     return (self._armed(),)
@@ -236,10 +236,10 @@ class Experiment:
                 f"the relay of {self.amplitude:.4g} has switched twice, and PV is exactly {self.trace.pv[-1]:.6g} "
                 f"all the time (noise {self.noise:.3g} before)",
             )
-        if seen < LEAST_SPAN * self.noise:
-            factor = min(GOOD_SPAN * self.noise / seen, self._most / self.amplitude)
+        if seen < MIN_SPAN * self.noise:
+            factor = min(GOOD_SPAN * self.noise / seen, self._max / self.amplitude)
         elif seen > WIDEST_SPAN * self.facts.sp_deviation:
-            factor = max(WIDEST_SPAN * self.facts.sp_deviation, LEAST_SPAN * self.noise) / seen
+            factor = max(WIDEST_SPAN * self.facts.sp_deviation, MIN_SPAN * self.noise) / seen
         if 0.8 < factor < 1.25:
             return ()
         self.amplitude *= factor
@@ -247,7 +247,7 @@ class Experiment:
 
     def _armed(self) -> SetRelay:
         low, high = (self.amplitude * side for side in self._sides)
-        hysteresis = max(HYSTERESIS * self.noise, LEAST_HYSTERESIS * self.facts.sp_deviation)
+        hysteresis = max(HYSTERESIS * self.noise, MIN_HYSTERESIS * self.facts.sp_deviation)
         average = AVERAGED if self.noise > 0.0 else 1
         return SetRelay(high, hysteresis, self.point.mv, amplitude_low=low, average=average)
 
@@ -261,7 +261,7 @@ class Experiment:
             return False
         halves = np.diff(self.switches)
         known = period(tuple(self.switches)) if len(halves) >= 2 else 2.0 * float(halves[0])
-        return passed > MOST_PERIODS * max(known, 2.0 * float(np.max(halves)) if len(halves) < 3 else 0.0)
+        return passed > MAX_PERIODS * max(known, 2.0 * float(np.max(halves)) if len(halves) < 3 else 0.0)
 
     def _since(self) -> Trace:
         trace, at = self.trace, self.listened
@@ -272,5 +272,5 @@ class Experiment:
         return Refused(
             Reason.STALLED,
             f"the relay of {self.amplitude:.4g} switched {len(self.switches)} times in {passed:.4g} s, "
-            f"{LEAST_SWITCHES} are needed; PV is {self.trace.pv[-1] - self.point.pv:+.4g} away",
+            f"{MIN_SWITCHES} are needed; PV is {self.trace.pv[-1] - self.point.pv:+.4g} away",
         )

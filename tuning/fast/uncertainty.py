@@ -19,7 +19,7 @@ NEAR_THE_PEAK = 0.7
 STANDARD_DEVIATIONS = 2.0
 UNSEEN = 1e-7
 """Singular value, of columns of unit length."""
-LEAST_DISTANCE = 0.05
+MIN_DISTANCE = 0.05
 """Of the loop from -1; nearer, Ms is anything."""
 
 
@@ -71,7 +71,7 @@ def uncertainty_of_Ms(fit: Fit[Evidence], found: Fitted, gains: Gains, w: Reals,
     kept = np.concatenate((np.arange(structure.searched), len(theta) + np.arange(inputs)))
     sigma = np.sqrt(np.maximum(np.einsum("iw,ij,jw->w", along, whole[np.ix_(kept, kept)], along), 0.0))
     near = distance < 1.0 / NEAR_THE_PEAK
-    worst = np.maximum(distance - STANDARD_DEVIATIONS * sigma, LEAST_DISTANCE)[near]
+    worst = np.maximum(distance - STANDARD_DEVIATIONS * sigma, MIN_DISTANCE)[near]
     return float(1.0 / worst.min() - 1.0 / distance.min()) if near.any() else 0.0
 
 
@@ -87,8 +87,8 @@ def peak(model: TransferFunction, gains: Gains, w: Reals, delay: float = 0.0) ->
     """Ms of the loop on the grid w."""
     N = gains.Td / gains.Tf if gains.Tf > 0.0 else 10.0
     C = gains.Kp * controller(w, gains.Ti, gains.Td, N) * sign(model)
-    least = float(np.abs(1.0 + C * _delayed(model, w, delay)).min())
-    return 1.0 / max(least, 1e-9) if math.isfinite(least) else math.inf
+    minimum = float(np.abs(1.0 + C * _delayed(model, w, delay)).min())
+    return 1.0 / max(minimum, 1e-9) if math.isfinite(minimum) else math.inf
 
 
 def _delayed(model: TransferFunction, w: Reals, delay: float) -> Complexes:

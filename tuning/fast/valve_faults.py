@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopwright.tuning.fast.record import Evidence
-from loopwright.tuning.identification.disturbances import EARNED
+from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN
 from loopwright.tuning.identification.output_error import Fit, Fitted, Hypothesis
 from loopwright.tuning.models import Reals
 
 SIZES = (0.03, 0.06, 0.11, 0.19, 0.31)  # of MV's largest move
-LEAST_STICK = 0.04
+MIN_STICK = 0.04
 """Of MV's largest move: less is not told from a plant that is none of the structures, and does not move Ms."""
 ENDS, WIDEST_END = (0.55, 0.7, 0.85), 0.96
 FIRST_STEPS, STEPS = 4, 10
@@ -83,14 +83,14 @@ def suspect(fit: Fit[Evidence], best: Fitted) -> Suspicion | None:
         sizes = [each for each in (size / factor, size * factor) if fault is not end or each <= WIDEST_END]
         near = [(under(fault, each, found.theta, FIRST_STEPS), fault, each) for each in sizes]
         found, fault, size = min([(found, fault, size), *near], key=_bic)
-    if fault is stick and size < LEAST_STICK:
+    if fault is stick and size < MIN_STICK:
         return None
     found = under(fault, size, found.theta, STEPS)
     # that freedom alone may explain as much: MV at rest is known only as well as the noise lets it be. Or the way that
     # the search has gone: the best fit may be a local minimum
     sound = fit.search(structure, slack, [start, found.theta], FIRST_STEPS + STEPS)
     gain = min(best.bic, sound.bic) - found.bic
-    return Suspicion(FAULTS[fault][1].format(size * evidence.swing), gain) if gain > EARNED else None
+    return Suspicion(FAULTS[fault][1].format(size * evidence.swing), gain) if gain > MIN_BIC_GAIN else None
 
 
 def _bic(each: tuple[Fitted, object, float]) -> float:

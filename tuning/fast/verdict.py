@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from loopwright.tuning.fast.design import Best, Design, Wish
+from loopwright.tuning.fast.design import Best, Design, DesignSpec
 from loopwright.tuning.fast.record import Evidence
 from loopwright.tuning.fast.structure_choice import Chosen, choose
 from loopwright.tuning.fast.uncertainty import colour, difference_of_rivals, peak, uncertainty_of_Ms
@@ -14,12 +14,12 @@ from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.output_error import Fit, Fitted
 from loopwright.tuning.models import TransferFunction
 
-MOST_RESIDUAL, UNIMPORTANT = 1.35, 0.004
+MAX_RESIDUAL, UNIMPORTANT = 1.35, 0.004
 """Of the residual: in noises at rest; in spans of PV, below which it does not matter."""
-MOST_COLOUR = 1.35
-MOST_ROUNDED = 1.25
+MAX_COLOUR = 1.35
+MAX_ROUNDED = 1.25
 """Of what rounding leaves on average, which is not quite random and not white."""
-MOST_UNCERTAINTY = 0.10
+MAX_UNCERTAINTY = 0.10
 """Of Ms, by the delta method and among the rivals."""
 SURPRISE, SURPRISE_OF_A_STORY = 0.5, 0.2
 """Of Ms from what was asked, of the tested controller on the new model and the new one on the earlier model; where the
@@ -34,7 +34,7 @@ REDRAWN = 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judged:
+class Evaluation:
     """cause: the value of the reason why the result is not to be trusted, None if it is.
 
     model: without the delay of the sampling, which is in `design_delay` (s).  Ms: on the model.
@@ -56,7 +56,7 @@ class Judged:
     period: float
 
 
-def judge(evidence: Evidence, wish: Wish, earlier: Judged | None = None) -> Judged:
+def evaluate(evidence: Evidence, spec: DesignSpec, earlier: Evaluation | None = None) -> Evaluation:
     """earlier: of a first part of the record, whose gains were tested in the rest of it.
 
     Raises Refused, NOT_ROBUST, where the model allows no such controller.
@@ -66,34 +66,34 @@ def judge(evidence: Evidence, wish: Wish, earlier: Judged | None = None) -> Judg
     found = chosen.best
     model = fit.model(found)
     delay = 0.5 * evidence.Ts
-    design = Design(replace(model, L=model.L + delay), wish, evidence.period * evidence.Ts)
+    design = Design(replace(model, L=model.L + delay), spec, evidence.period * evidence.Ts)
     best = design.best()
-    spread = uncertainty_of_Ms(fit, found, best.gains, design.w, wish.N, delay)
+    spread = uncertainty_of_Ms(fit, found, best.gains, design.w, spec.N, delay)
     rivals = difference_of_rivals(fit, found, chosen.rivals, best.gains, design.w, delay)
     noise, rounding = evidence.noise / evidence.span, evidence.rounding / evidence.span
     whiteness = colour(found.linear.residual)
     cause, detail = None, ""
-    if found.rms > max(MOST_RESIDUAL * noise, UNIMPORTANT):
+    if found.rms > max(MAX_RESIDUAL * noise, UNIMPORTANT):
         cause = "unexplained"
         rms = 100.0 * found.rms
         detail = f"the model leaves {rms:.2g} % of PV's span unexplained, the noise is {100.0 * noise:.2g} %"
-    elif found.rms > max(UNIMPORTANT, MOST_ROUNDED * rounding) and whiteness > MOST_COLOUR * max(evidence.colour, 1.0):
+    elif found.rms > max(UNIMPORTANT, MAX_ROUNDED * rounding) and whiteness > MAX_COLOUR * max(evidence.colour, 1.0):
         cause = "disturbed"
         at_rest = f"{evidence.colour:.2f} at rest"
         detail = f"what the model leaves varies slowly: {whiteness:.2f} times white noise, {at_rest}"
-    elif spread > MOST_UNCERTAINTY:
+    elif spread > MAX_UNCERTAINTY:
         cause = "uncertain"
         detail = f"Ms is known to +{spread:.2g} only"
-    elif rivals > MOST_UNCERTAINTY:
+    elif rivals > MAX_UNCERTAINTY:
         cause = "ambiguous"
         detail = f"another model that explains the record as well gives an Ms off by {rivals:.2g}"
     elif earlier is not None:
-        cause, detail = _surprise(earlier, model, best.gains, wish, design, found.hypothesis.loads)
+        cause, detail = _surprise(earlier, model, best.gains, spec, design, found.hypothesis.loads)
         if cause is None and (suspicion := suspect(fit, found)) is not None:
             cause, detail = "unexplained", f"{suspicion.fault} explains the record better, or the plant is not linear"
         if cause is None:
             cause, detail = _excused(fit, found, earlier, best.gains)
-    return Judged(
+    return Evaluation(
         cause=cause,
         detail=detail,
         model=model,
@@ -110,18 +110,20 @@ def judge(evidence: Evidence, wish: Wish, earlier: Judged | None = None) -> Judg
     )
 
 
-def judge_again(evidence: Evidence, wish: Wish) -> Judged:
+def evaluate_again(evidence: Evidence, spec: DesignSpec) -> Evaluation:
     """The verdict on a whole record as the procedure comes to it, which judges the relay's part first.
 
     Raises Refused, NOT_ROBUST.
     """
     if not evidence.steps:
-        return judge(evidence, wish)
+        return evaluate(evidence, spec)
     until = slice(evidence.relayed)
-    return judge(evidence, wish, judge(replace(evidence, u=evidence.u[until], y=evidence.y[until], steps=()), wish))
+    return evaluate(
+        evidence, spec, evaluate(replace(evidence, u=evidence.u[until], y=evidence.y[until], steps=()), spec)
+    )
 
 
-def _excused(fit: Fit[Evidence], found: Fitted, earlier: Judged, gains: Gains) -> tuple[str | None, str]:
+def _excused(fit: Fit[Evidence], found: Fitted, earlier: Evaluation, gains: Gains) -> tuple[str | None, str]:
     """Loads that came with the new gains explain away what was to be tested: a plant that has changed looks the same.
 
     One may be true, if the step back is explained without another, by about the gains that were tested: relay and steps
@@ -159,16 +161,16 @@ def _loads(found: Fitted) -> list[float]:
 
 
 def _surprise(
-    earlier: Judged, model: TransferFunction, gains: Gains, wish: Wish, design: Design, loads: int
+    earlier: Evaluation, model: TransferFunction, gains: Gains, spec: DesignSpec, design: Design, loads: int
 ) -> tuple[str | None, str]:
     """Both models must agree roughly on both controllers: one of them may be a story told of a disturbance."""
-    most = SURPRISE_OF_A_STORY if loads > 1 else SURPRISE
+    maximum = SURPRISE_OF_A_STORY if loads > 1 else SURPRISE
     tested = peak(model, earlier.best.gains, design.w, earlier.design_delay)
     again = peak(earlier.model, gains, design.w, earlier.design_delay)
-    if abs(tested - wish.Ms) > most:
-        text = f"the controller that was tested has Ms {tested:.2f} on the model of the whole record, not {wish.Ms:g}"
+    if abs(tested - spec.Ms) > maximum:
+        text = f"the controller that was tested has Ms {tested:.2f} on the model of the whole record, not {spec.Ms:g}"
         return "surprise", text
-    if abs(again - wish.Ms) > most:
-        text = f"the controller designed on the whole record has Ms {again:.2f} on the relay's model, not {wish.Ms:g}"
+    if abs(again - spec.Ms) > maximum:
+        text = f"the controller designed on the whole record has Ms {again:.2f} on the relay's model, not {spec.Ms:g}"
         return "surprise", text
     return None, ""

@@ -39,7 +39,7 @@ __all__ = ["STAGES", "Facts", "Options", "Proposal", "five_stage"]
 STAGES = ("preflight", "baseline", "relay", "ultimate", "zn_pi", "estimate", "optimise", "verify")
 R = TypeVar("R")
 PROCEDURE = "five-stage"
-MOST_GAIN = 60.0
+MAX_GAIN = 60.0
 """Ku * K of a FOPDT plant with L/T = 0.026, half the least that formula (2) was checked for."""
 Entry = Literal["relay", "zn_pi", "estimate", "optimise"]
 
@@ -213,10 +213,10 @@ def five_stage(facts: Facts, options: Options, finished: Finished = Finished()) 
     ultimate: Ultimate | None = None
     if options.start == "relay":
         rough = yield from stage("relay", finished.relay, lambda: relay_test(facts, point))
-        if gain == gain and abs(gain) * rough.Ku_a > MOST_GAIN:
+        if gain == gain and abs(gain) * rough.Ku_a > MAX_GAIN:
             raise Refused(
                 Reason.CANNOT_OSCILLATE,
-                f"Ku * K is about {abs(gain) * rough.Ku_a:.0f} (at most {MOST_GAIN:g}): next to no dead time",
+                f"Ku * K is about {abs(gain) * rough.Ku_a:.0f} (at most {MAX_GAIN:g}): next to no dead time",
             )
         expected["ultimate"] = 5 * (5 * rough.Pu_a_s + T95)
         found = yield from stage("ultimate", finished.ultimate, lambda: ultimate_gain(facts, point, rough))
@@ -280,8 +280,8 @@ def _typed(value: float | None) -> float:
 def _baseline(facts: Facts, point: OperatingPoint) -> Plan[StepResult]:
     """The set-point step under the accepted gains, for the comparison, and a first look at gain and sign."""
     step = allowed_step(facts, point, facts.old_gains.Kp, math.nan)
-    result = yield from step_test(facts, point, step, band=0.05, most_s=5 * facts.T95_s, smooth_s=facts.T95_s / 12)
-    if abs(result.static_gain) * facts.old_gains.Kp > MOST_GAIN:
+    result = yield from step_test(facts, point, step, band=0.05, max_s=5 * facts.T95_s, smooth_s=facts.T95_s / 12)
+    if abs(result.static_gain) * facts.old_gains.Kp > MAX_GAIN:
         raise Refused(
             Reason.NOT_SELF_REGULATING,
             f"PV went {step:.4g} up and MV came back to where it was: that is a gain of {result.static_gain:.3g}",

@@ -18,7 +18,7 @@ from loopwright.tuning.plan import Mode, Plan, SetMode, SetRelay
 from loopwright.tuning.reasons import Reason, Refused
 
 STEADY = 0.10
-LEAST_SAMPLES_PER_PERIOD = 22
+MIN_SAMPLES_PER_PERIOD = 22
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ def relay_test(facts: Facts, point: OperatingPoint) -> Plan[RelayResult]:
     first, end = ups[-4], ups[-1]
     t, pv, mv = (np.asarray(column[first:end]) for column in (trace.t, trace.pv, trace.mv))
     period = (trace.t[end] - trace.t[first]) / 3
-    if period < LEAST_SAMPLES_PER_PERIOD * facts.sample_time_s:
+    if period < MIN_SAMPLES_PER_PERIOD * facts.sample_time_s:
         raise Refused(
             Reason.CANNOT_OSCILLATE,
             f"under the relay PV swings with a period of {period:.3g} s, {period / facts.sample_time_s:.1f} samples: "

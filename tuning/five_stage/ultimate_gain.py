@@ -25,7 +25,7 @@ EQUAL = 0.002
 """Growth per period that counts as equal swings: 0.1 % of Ku on a plant of this class."""
 SLOPE = 2.5
 """d ln(growth per period) / d ln K near Ku for a FOPDT plant with L/T = 0.5; a start value only."""
-MOST_RUNS = 16
+MAX_RUNS = 16
 KICK, NOISY_KICK = 0.25, 0.45
 """The step's first kick as a share of the room for MV: gains stay near Ku, so swings stay inside. Noise buys more."""
 RUN_MV_LIMIT = 0.98
@@ -88,7 +88,7 @@ def ultimate_gain(facts: Facts, point: OperatingPoint, rough: RelayResult) -> Pl
         equal = abs(run.growth) <= max(EQUAL, 2 * run.error) and run.error < 0.02 and run.ended != "mv limit"
         if equal or (low and high and (high.K - low.K) / low.K < GAP):
             break
-        if len(runs) == MOST_RUNS or not rough.Ku_a / 8 < K < rough.Ku_a * 8:
+        if len(runs) == MAX_RUNS or not rough.Ku_a / 8 < K < rough.Ku_a * 8:
             tried = ", ".join(f"{r.K:.3g}: {r.growth:+.1%}" for r in runs)
             raise Refused(Reason.NO_BRACKET, f"after {len(runs)} runs (gain: growth per period) {tried}")
         K = _next_gain(runs, low, high)

@@ -13,7 +13,7 @@ from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode, Note, Plan, SetGains, SetMode, SetSetpoint
 from loopwright.tuning.reasons import Reason, Refused
 
-MOST_STEPS = 12
+MAX_STEPS = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,10 +52,10 @@ def zn_pi(
         commands = (SetGains(gains), SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp))
         # a remnant of the last movement adds to the overshoot: a whole period of rest, whatever T95 was stated
         stay_s = max(facts.T95_s / 5, Pu)
-        most_s = max(3 * facts.T95_s, 8 * Pu)
-        yield from settle(point.sp, 0.005 * step, stay_s, most_s, point.noise, commands)
+        max_s = max(3 * facts.T95_s, 8 * Pu)
+        yield from settle(point.sp, 0.005 * step, stay_s, max_s, point.noise, commands)
         found = yield from step_test(
-            facts, point, step, band=0.01, most_s=max(6 * facts.T95_s, 15 * Pu), smooth_s=Pu / 5, kept=kept
+            facts, point, step, band=0.01, max_s=max(6 * facts.T95_s, 15 * Pu), smooth_s=Pu / 5, kept=kept
         )
         unlimited(facts, found, gains)
         seen.append(found)
@@ -71,7 +71,7 @@ def zn_pi(
             )
         up = over < window[0]
         Kp = (Kp * factor if up else Kp / factor) if factor else (Kp + increment if up else Kp - increment)
-        if tests >= MOST_STEPS or not 0 < Kp < 0.98 * Ku:
+        if tests >= MAX_STEPS or not 0 < Kp < 0.98 * Ku:
             raise Refused(
                 Reason.NO_OVERSHOOT,
                 f"overshoot {over:.1f} % before Kp {Kp:.4g} (Ku {Ku:.4g}) after {tests} tests; "

@@ -32,7 +32,7 @@ from loopwright.tuning.models import Reals
 STRUCTURES = (FIRST, FIRST_FED, SECOND, SECOND_WITH_ZERO, SECOND_FED, THIRD_WITH_ZERO, THIRD_WITH_ZEROS)
 PLAIN = (FIRST, SECOND, INTEGRATOR, LAGGED_INTEGRATOR)
 """Of each denominator the one without a zero: fitted from a grid, and the others begin where it has come to."""
-EARNED = 15.0
+MIN_BIC_GAIN = 15.0
 """Of BIC: what a story beside MV must gain."""
 STARTS = 2
 THIRD_RATES = (1.0, 40.0)  # 1/period
@@ -66,7 +66,7 @@ def stories(
 
 def better(simple: list[Fitted], story: list[Fitted]) -> list[Fitted]:
     """The story, if it has earned its parameters."""
-    return story if min(map(by_bic, story)) < min(map(by_bic, simple)) - EARNED else simple
+    return story if min(map(by_bic, story)) < min(map(by_bic, simple)) - MIN_BIC_GAIN else simple
 
 
 def by_bic(fitted: Fitted) -> float:

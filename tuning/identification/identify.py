@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopwright.tuning.identification.disturbances import EARNED, by_bic
+from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN, by_bic
 from loopwright.tuning.identification.feedback_test import follows_from_pv
 from loopwright.tuning.identification.output_error import MOVING, QUIET, Fitted, count
 from loopwright.tuning.identification.problem import WHITE_ABOVE, Problem
@@ -164,7 +164,7 @@ def _chosen(problem: Problem, lags_only: bool) -> tuple[Fitted, list[Fitted]]:
             best = of_moving
     if lags_only:
         return best, tried
-    if best is lags and richer is not lags and problem.gain(richer, best) > EARNED:
+    if best is lags and richer is not lags and problem.gain(richer, best) > MIN_BIC_GAIN:
         best = richer
     # where more than lags explain the record, only lags and one load can be simpler
     explained = best is richer and problem.explains(best, SURELY_WHITE)
@@ -172,7 +172,7 @@ def _chosen(problem: Problem, lags_only: bool) -> tuple[Fitted, list[Fitted]]:
         tried += told
         story = min((best, *told), key=by_bic)
         # one that is told of fewer parameters needs no more than to be likelier, if anything beside lags is needed
-        earned = 0.0 if best is not lags and count(story) <= count(best) else EARNED
+        earned = 0.0 if best is not lags and count(story) <= count(best) else MIN_BIC_GAIN
         if story is not best and problem.gain(story, best) > earned:
             best = story
     if best is not lags and not best.hypothesis.moving:

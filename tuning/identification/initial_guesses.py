@@ -61,25 +61,25 @@ def _denominators(structure: Structure, samples: int) -> list[Reals]:
     return real + [np.log([2.0 * zeta / T, 1.0 / T**2]) for T in within for zeta in DAMPING_RATIOS]
 
 
-def _of_all_shifts(responses: Reals, y: Reals, others: Reals, most: int) -> Reals:
-    """Sum of squares left of y by a fit of the columns, shifted by 0, 1, ... `most` samples, and of the others."""
+def _of_all_shifts(responses: Reals, y: Reals, others: Reals, maximum: int) -> Reals:
+    """Sum of squares left of y by a fit of the columns, shifted by 0, 1, ... `maximum` samples, and of the others."""
     columns = responses / np.maximum(np.sqrt(np.sum(responses**2, axis=0)), 1e-300)
     basis = np.linalg.qr(others)[0]
     rest = y - basis @ (basis.T @ y)
-    products = _shifted_products(np.column_stack((rest, basis)), columns, most)
+    products = _shifted_products(np.column_stack((rest, basis)), columns, maximum)
     with_y, with_basis = products[:, 0], products[:, 1:]
     count = columns.shape[1]
     gram = 1e-9 * np.eye(count) - np.einsum("mqi,mqj->mij", with_basis, with_basis)
     for i in range(count):
         for j in range(count):
             # what is shifted out at the end is lost
-            gram[:, i, j] += np.cumsum(columns[:, i] * columns[:, j])[::-1][: most + 1]
+            gram[:, i, j] += np.cumsum(columns[:, i] * columns[:, j])[::-1][: maximum + 1]
     weights = np.linalg.solve(gram, with_y[:, :, None])[:, :, 0]
     return np.asarray(rest @ rest - np.sum(weights * with_y, axis=1))
 
 
-def _shifted_products(fixed: Reals, shifted: Reals, most: int) -> Reals:
+def _shifted_products(fixed: Reals, shifted: Reals, maximum: int) -> Reals:
     """Sum over k of fixed[k, q]*shifted[k-m, i] for m = 0 ... most, shape (most + 1, columns of each)."""
     size = next_fast_len(2 * len(fixed), real=True)
     spectrum = np.fft.rfft(fixed, size, axis=0)[:, :, None] * np.fft.rfft(shifted, size, axis=0).conj()[:, None, :]
-    return np.asarray(np.fft.irfft(spectrum, size, axis=0)[: most + 1])
+    return np.asarray(np.fft.irfft(spectrum, size, axis=0)[: maximum + 1])

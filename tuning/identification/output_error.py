@@ -22,7 +22,7 @@ LOG_LOW, LOG_HIGH = -8.5, 9.5
 DEAD_TIMES = (0.01, 0.06, 0.14, 0.23, 0.32, 0.41, 0.49)
 LAGS = (0.02, 0.08, 0.25, 0.8, 4.0, 40.0)
 COMPLEX = ((3.0, 0.5), (6.0, 0.5), (10.0, 0.3))
-MOST_STEPS = 25
+MAX_STEPS = 25
 FIRST_STEPS, LONG_SEARCHES = 5, 2
 """Of many starts, all are followed so far, and so many to the end."""
 RELATIVE_DECREASE = 1e-6
@@ -157,7 +157,7 @@ class Fit(Generic[S]):
         return Fitted(structure, hypothesis, theta, columns, linear, bic)
 
     def search(
-        self, structure: Structure, hypothesis: Hypothesis, starts: Sequence[Reals], most_steps: int = MOST_STEPS
+        self, structure: Structure, hypothesis: Hypothesis, starts: Sequence[Reals], most_steps: int = MAX_STEPS
     ) -> Fitted:
         """The best local minimum from these starts."""
         if len(starts) > LONG_SEARCHES:

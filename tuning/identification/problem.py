@@ -28,16 +28,16 @@ VISIBLE = 10.0
 # noise, as a part of the response's span, beyond which what is found may be a shape of the noise
 NOISIEST = 0.5
 STARTS = 3
-MOST_STEPS = 60
+MAX_STEPS = 60
 RELATIVE_DECREASE = 1e-7
 LONGEST_LAG = 30.0  # in records
 SHORTEST_LAG = 0.1  # in samples
 # of a wider search: periods that a record has at most, averages in it, and averages in a period at least
-MOST_PERIODS = 50.0
-MOST_AVERAGES = 1000
+MAX_PERIODS = 50.0
+MAX_AVERAGES = 1000
 AVERAGES_PER_PERIOD = 80.0
-LEAST_AVERAGES_PER_PERIOD = 30.0
-LEAST_PERIOD = 8.0  # samples
+MIN_AVERAGES_PER_PERIOD = 30.0
+MIN_PERIOD = 8.0  # samples
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,9 +76,9 @@ class Problem:
 
     def wide(self, period: float, block: int | None = None) -> Fit[Scaled]:
         """For a search around a time scale, in samples, on averages of so many samples; by default what it needs."""
-        period = min(max(period, self.samples / MOST_PERIODS, LEAST_PERIOD), float(self.samples))
-        wanted = max(period / AVERAGES_PER_PERIOD, self.samples / MOST_AVERAGES)
-        block = block or max(1, int(min(wanted, period / LEAST_AVERAGES_PER_PERIOD)))
+        period = min(max(period, self.samples / MAX_PERIODS, MIN_PERIOD), float(self.samples))
+        wanted = max(period / AVERAGES_PER_PERIOD, self.samples / MAX_AVERAGES)
+        block = block or max(1, int(min(wanted, period / MIN_AVERAGES_PER_PERIOD)))
         record = self.record
         signals = Scaled(
             record.Ts, self.mv_unit * self.u, self.pv_unit * self.y, self.mv_unit, self.pv_unit,
@@ -103,7 +103,7 @@ class Problem:
             return self.whole.regressors(structure, hypothesis, thetas)
 
         bounded = Bounded(low, high, reach, step)
-        found, rss = descend(columns, self.y, np.array(begun), bounded, MOST_STEPS, RELATIVE_DECREASE)
+        found, rss = descend(columns, self.y, np.array(begun), bounded, MAX_STEPS, RELATIVE_DECREASE)
         return self.fitted(structure, hypothesis, found[np.argmin(rss)])
 
     def fitted(self, structure: Structure, hypothesis: Hypothesis, theta: Reals) -> Fitted:

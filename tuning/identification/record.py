@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from loopwright.tuning.models import Reals
 from loopwright.tuning.reasons import Reason, Refused
 
-LEAST_SAMPLES = 20
-LEAST_AFTER_THE_FIRST_MOVE = 10
+MIN_SAMPLES = 20
+MIN_AFTER_THE_FIRST_MOVE = 10
 # of the sample time, between one sample and the next
 UNEVEN = 0.2
 GAP = 1.5
@@ -40,8 +40,8 @@ def recorded(t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | None = 
     time, mv, pv = (_column(name, values) for name, values in (("t", t), ("u", u), ("y", y)))
     if not len(time) == len(mv) == len(pv):
         raise _bad(f"t, u and y must be equally long; they have {len(time)}, {len(mv)} and {len(pv)} samples")
-    if len(time) < LEAST_SAMPLES:
-        raise _bad(f"too few samples: {len(time)}; at least {LEAST_SAMPLES} are needed")
+    if len(time) < MIN_SAMPLES:
+        raise _bad(f"too few samples: {len(time)}; at least {MIN_SAMPLES} are needed")
     Ts = _sample_time(time)
     before = float(mv[0]) if u_before is None else float(u_before)
     if not np.isfinite(before):
@@ -53,10 +53,10 @@ def recorded(t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | None = 
             "once (if it moved when the record began, say from where: u_before)"
         )
     first = int(moved[0])
-    if len(time) - first - 1 < LEAST_AFTER_THE_FIRST_MOVE:
+    if len(time) - first - 1 < MIN_AFTER_THE_FIRST_MOVE:
         raise _bad(
             f"only {len(time) - first - 1} samples follow the first move of the input (sample {first}); "
-            f"at least {LEAST_AFTER_THE_FIRST_MOVE} are needed"
+            f"at least {MIN_AFTER_THE_FIRST_MOVE} are needed"
         )
     if float(np.ptp(pv)) == 0.0:
         raise Refused(Reason.NO_RESPONSE, f"PV is constant at {pv[0]:g} while MV moves")

@@ -16,7 +16,7 @@ from loopwright.tuning.models import FOPDT, Reals
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.reduction.moments_and_areas import fopdt_of_areas, fopdt_of_moments
 
-LEAST_SAMPLES = 20
+MIN_SAMPLES = 20
 FINE = 4000
 REST = 0.02
 """How far the ends of the last two twentieths of a record may be apart, as a fraction of the step, to be at rest."""
@@ -147,10 +147,10 @@ def _static_gain(time: Reals, share: Reals, gains: Gains) -> float:
 def _checked(t: Reals, y: Reals, step: float, y0: float) -> tuple[Reals, Reals]:
     """(t from 0, change of y). Raises Refused, BAD_INPUT or NO_RESPONSE."""
     time, change = np.asarray(t, dtype=float), np.asarray(y, dtype=float) - y0
-    if time.ndim != 1 or time.shape != change.shape or len(time) < LEAST_SAMPLES:
+    if time.ndim != 1 or time.shape != change.shape or len(time) < MIN_SAMPLES:
         raise Refused(
             Reason.BAD_INPUT,
-            f"t has shape {time.shape}, y {change.shape}: equal lengths of {LEAST_SAMPLES} samples at least are needed",
+            f"t has shape {time.shape}, y {change.shape}: equal lengths of {MIN_SAMPLES} samples at least are needed",
         )
     if not (np.isfinite(time).all() and np.isfinite(change).all() and math.isfinite(step) and step != 0.0):
         raise Refused(Reason.BAD_INPUT, f"t, y, y0 and the step must be finite and the step ({step}) not 0")

@@ -91,11 +91,11 @@ class Search:
 
         Around its own and around the dead time of the best fit.
         """
-        at, most = fit.structure.lags, float(self.problem.most_dead_time)
+        at, maximum = fit.structure.lags, float(self.problem.most_dead_time)
         thetas = [fit.theta]
         if fit.structure.feed_through:
             for whole in np.floor([fit.theta[at], dead_time])[:, None] + np.array(NEAR):
-                thetas += [np.insert(np.delete(fit.theta, at), at, np.clip(L + 0.5, 0.0, most)) for L in whole]
+                thetas += [np.insert(np.delete(fit.theta, at), at, np.clip(L + 0.5, 0.0, maximum)) for L in whole]
         tried = sorted((self.problem.fitted(fit.structure, fit.hypothesis, theta) for theta in thetas), key=by_bic)
         if len(tried) == 1:
             return tried[0]

@@ -19,7 +19,7 @@ from loopwright.tuning.models import Reals
 Rows = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 TRIES = 12
-FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-12
+FIRST_DAMPING, MIN_DAMPING = 1e-3, 1e-12
 WORTH_TRYING = 0.1
 """Of the decrease at which a search ends: a step that promises less is not tried."""
 UNFELT = 1e-9
@@ -27,7 +27,7 @@ UNFELT = 1e-9
 REDUNDANT = 1e-10
 """Of a direction, in columns of unit length, that the others have left nothing of."""
 # directions weaker than this, in columns of unit length, are not seen in the data
-LEAST_SINGULAR = 1e-9
+MIN_SINGULAR = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +146,7 @@ def descend(
             won = mine[better]
             at[won], cost[won] = new[better], there.rss[better]
             here.replaced(won, there, better)
-            damping[won] = np.maximum(0.2 * damping[won], LEAST_DAMPING)
+            damping[won] = np.maximum(0.2 * damping[won], MIN_DAMPING)
             damping[mine[~better]] *= 4.0
             trying = trying[~better]
         going = going[before - cost[going] > relative_decrease * before]
@@ -185,5 +185,5 @@ def covariance(columns: Reals, variance: float) -> Reals:
     lengths = np.sqrt(np.einsum("ij,ij->j", columns, columns))
     lengths = np.where(lengths > 0.0, lengths, 1.0)
     _, singular, turned = np.linalg.svd(columns / lengths, full_matrices=False)
-    weighted = turned.T / np.maximum(singular, LEAST_SINGULAR * singular[0])
+    weighted = turned.T / np.maximum(singular, MIN_SINGULAR * singular[0])
     return np.asarray(variance * (weighted @ weighted.T) / np.outer(lengths, lengths))

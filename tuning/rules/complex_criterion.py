@@ -31,7 +31,7 @@ BAND = 0.05
 DIVERGED = 1e9
 SAMPLES = 6000
 HORIZON_IN_TIME_SUMS = 20.0
-LEAST_HORIZON = 0.5
+MIN_HORIZON = 0.5
 BLOCK = 64
 
 
@@ -97,8 +97,8 @@ class ComplexCriterion:
         self.Ms_max = Ms_max
         plant = normalised(model, self.time_unit_s)
         horizon = (HORIZON_IN_TIME_SUMS * total if horizon_s is None else horizon_s) / self.time_unit_s
-        if horizon < LEAST_HORIZON:
-            shown = f"at least {LEAST_HORIZON * self.time_unit_s:.3g} s is accepted"
+        if horizon < MIN_HORIZON:
+            shown = f"at least {MIN_HORIZON * self.time_unit_s:.3g} s is accepted"
             raise Refused(Reason.BAD_INPUT, f"horizon_s {horizon_s}: {shown} for this model")
         self._loops = (_Delayed if plant.L > 0.0 else _Immediate)(plant, horizon, samples)
         self.horizon = self._loops.dt * self._loops.steps

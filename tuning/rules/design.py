@@ -27,7 +27,7 @@ from loopwright.tuning.rules.registry import METHODS, tune
 from loopwright.tuning.rules.robust_pi import UNSTABLE, Criterion
 from loopwright.tuning.rules.setting import Setting
 
-MOST_Ms, LEAST_GM = 2.0, 2.0
+MAX_Ms, MIN_GM = 2.0, 2.0
 ROUNDING = 1.002
 """A method that seeks the bound ends on it."""
 SLOWER = {"lambda_s": "larger", "tau_c_s": "larger", "c": "smaller"}
@@ -35,7 +35,7 @@ SLOWER = {"lambda_s": "larger", "tau_c_s": "larger", "c": "smaller"}
 CRITERION_7 = "criterion (7): 10 ITAE + overshoot + 10 Ms, the largest with K, T and L 20 % off"
 OVER_PRESENT = "half of the set-point's and half of the load's IAE, each over that of the present gains"
 ROBUST = "robust"
-LEAST_DISTANCE = 0.45
+MIN_DISTANCE = 0.45
 """From the loop's response at the measured ultimate frequency to -1."""
 
 
@@ -60,22 +60,22 @@ def design(
     setting = _setting(method, plant, ultimate, options or {})
     gains, notes = realisable(setting.gains, METHODS[method].filter)
     found = worth(plant, gains)
-    robust = found.Ms is not None and found.Ms <= MOST_Ms * ROUNDING and (found.GM is None or found.GM >= LEAST_GM)
+    robust = found.Ms is not None and found.Ms <= MAX_Ms * ROUNDING and (found.GM is None or found.GM >= MIN_GM)
     if not robust:
         GM = "none" if found.GM is None else f"{found.GM:.2f}"
         shown = "the loop would be unstable" if found.Ms is None else f"Ms {found.Ms:.2f}, GM {GM}"
         raise Refused(
             Reason.NOT_ROBUST,
             f"{method} gives Kp {gains.Kp:.4g}, Ti {gains.Ti:.4g} s, Td {gains.Td:.4g} s; on the model {shown} "
-            f"(Ms at most {MOST_Ms}, GM at least {LEAST_GM}){_slower(setting)}",
+            f"(Ms at most {MAX_Ms}, GM at least {MIN_GM}){_slower(setting)}",
         )
     if ultimate is not None:
         distance = abs(1.0 - _controller(gains, 2.0 * math.pi / ultimate.Pu_s) / ultimate.Ku)
-        if distance < LEAST_DISTANCE:
+        if distance < MIN_DISTANCE:
             raise Refused(
                 Reason.NOT_ROBUST,
                 f"at the measured ultimate point the loop comes within {distance:.2f} of instability "
-                f"(least {LEAST_DISTANCE})",
+                f"(least {MIN_DISTANCE})",
             )
     return Designed(method, gains, predicted(found), dict(setting.chosen), setting.notes + notes)
 
@@ -97,7 +97,7 @@ def comparison_of(
     before, after = worth(plant, old_gains, sample_time_s), worth(plant, designed.gains)
     assert after.Ms is not None  # `design` sees to that
     of_robust = designed.method == ROBUST
-    asked = Asked(MOST_Ms, GM=LEAST_GM) if of_robust else Asked(after.Ms, by=f"by {designed.method}")
+    asked = Asked(MAX_Ms, GM=MIN_GM) if of_robust else Asked(after.Ms, by=f"by {designed.method}")
     if of_robust and isinstance(plant, FOPDT) and _plain_pi(old_gains):
         scale_free = options.get("scale_free")
         of = Criterion(plant, designed.chosen["horizon_s"], None if scale_free is None else bool(scale_free))

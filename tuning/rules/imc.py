@@ -35,7 +35,7 @@ FORMS = ("zero", "all-pass")
 SAFE = {"taylor": 0.5, "all-pass": 0.25, "zero": 0.8, "integrating": 2.0}
 UNSTABLE_ZERO = 0.1445307
 """Form "zero": GM = (lambda/L + 1/2)/0.6445307; x - atan(x/2) = pi/2 is its crossover."""
-LEAST_PSI = {"pi": 10.0, "pid": 2.5}
+MIN_PSI = {"pi": 10.0, "pid": 2.5}
 """Least psi/L: below it the integral time gets so short that Ms is well above 2 at the least safe lambda."""
 
 
@@ -129,9 +129,9 @@ def _as_fopdt(model: FOPDT | Integrating, psi_s: float | None, controller: str) 
         return model, {}
     no_lag(model, "IMC")
     psi = positive("psi_s", psi_s if psi_s is not None else math.nan, "s")
-    least = LEAST_PSI[controller] * model.L
-    if psi < least:
-        raise Refused(Reason.OUTSIDE_RANGE, f"psi_s = {psi:g} s is too short; from {least:g} s up is accepted")
+    minimum = MIN_PSI[controller] * model.L
+    if psi < minimum:
+        raise Refused(Reason.OUTSIDE_RANGE, f"psi_s = {psi:g} s is too short; from {minimum:g} s up is accepted")
     return FOPDT(model.K * psi, psi, model.L), {"psi_s": psi}
 
 

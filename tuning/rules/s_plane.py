@@ -127,8 +127,8 @@ def s_plane(
     if not dominant:
         slowest = -best.left_over[0].real
         notes.append(f"A root of {slowest:.3g} 1/s is slower than the prescribed ones: the answer creeps.")
-    elif (least := min(found.minima, key=lambda each: each.J)) is not best:
-        notes.append(f"J is lower at alpha = {least.alpha:.3g} 1/s, but there a slower root rules; not taken.")
+    elif (minimum := min(found.minima, key=lambda each: each.J)) is not best:
+        notes.append(f"J is lower at alpha = {minimum.alpha:.3g} 1/s, but there a slower root rules; not taken.")
     chosen = {"alpha_per_s": best.alpha, "mu": mu, "tau_s": tau_s, "J_s": best.J, "J0_s": best.J0, "J1_per_s": best.J1}
     if controller == "pid":
         chosen["k1"] = k1
@@ -221,7 +221,7 @@ class _Search:
                 low = middle
         return high if rising else low
 
-    def least(self, low: float, high: float) -> list[float]:
+    def local_minima(self, low: float, high: float) -> list[float]:
         """Every local minimum of J inside an interval."""
         grid = np.geomspace(low, high, INSIDE)[1:-1]
         grid = np.concatenate(([low], grid, [high]))
@@ -229,10 +229,10 @@ class _Search:
         J = J0 + self.tau**2 * J1
         found = []
         for i in np.flatnonzero((J[1:-1] < J[:-2]) & (J[1:-1] <= J[2:])) + 1:
-            least = minimize_scalar(
+            minimum = minimize_scalar(
                 self._J, bounds=(grid[i - 1], grid[i + 1]), method="bounded", options={"xatol": 1e-9 * float(grid[i])}
             )
-            found.append(float(least.x))
+            found.append(float(minimum.x))
         return found
 
     def _J(self, alpha: float) -> float:
@@ -243,7 +243,7 @@ class _Search:
         intervals = self.admissible()
         return Design(
             admissible=tuple((low / self.unit, high / self.unit) for low, high in intervals),
-            minima=tuple(self.minimum(alpha) for low, high in intervals for alpha in self.least(low, high)),
+            minima=tuple(self.minimum(alpha) for low, high in intervals for alpha in self.local_minima(low, high)),
         )
 
     def minimum(self, alpha: float) -> Minimum:

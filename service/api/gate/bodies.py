@@ -37,9 +37,9 @@ class Bodies:
         """The body; None where there is none. small: it is that of a decision. Raises BodyRefused."""
         headers = Headers(scope=scope)
         length = headers.get("content-length", "0")
-        most = min(SMALL, self._limits.body_bytes) if small else self._limits.body_bytes
-        too_long = BodyRefused(413, f"the body is longer than the {most} bytes permitted")
-        if not length.isdigit() or int(length) > most:
+        maximum = min(SMALL, self._limits.body_bytes) if small else self._limits.body_bytes
+        too_long = BodyRefused(413, f"the body is longer than the {maximum} bytes permitted")
+        if not length.isdigit() or int(length) > maximum:
             raise too_long
         if not int(length) and "transfer-encoding" not in headers:
             return None
@@ -52,7 +52,7 @@ class Bodies:
                     if message["type"] == "http.disconnect":
                         raise BodyRefused(400, "the connection ended before the body did")
                     body += message.get("body", b"")
-                    if len(body) > most:  # sent in chunks, without saying how much it will be
+                    if len(body) > maximum:  # sent in chunks, without saying how much it will be
                         raise too_long
                     if len(body) > SMALL:
                         self._hold(client, len(body) - held)

@@ -90,8 +90,8 @@ class Connections:
     ) -> None:
         self.limits = limits
         # The other half is for buses, database and files.
-        self._most = min(limits.connections, descriptors // 2)
-        self._most_of_address = min(limits.connections_of_address, self._most)
+        self._max = min(limits.connections, descriptors // 2)
+        self._max_of_address = min(limits.connections_of_address, self._max)
         self._exempt = exempt
         self._open: Counter[str] = Counter()
         self._idle: dict[str, OrderedDict[Connection, None]] = {}
@@ -99,7 +99,7 @@ class Connections:
 
     def wanted(self, new: socket.socket, address: str) -> bool:
         """Whether it may go before the event loop at all."""
-        if not self._address_is_full(address) and self._open.total() < self._most:
+        if not self._address_is_full(address) and self._open.total() < self._max:
             return True
         try:
             if new.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT):
@@ -110,14 +110,14 @@ class Connections:
         return False
 
     def _address_is_full(self, address: str) -> bool:
-        return self._open[address] >= self._most_of_address and not self._exempt(address)
+        return self._open[address] >= self._max_of_address and not self._exempt(address)
 
     def admit(self, new: Connection) -> bool:
         """Makes room if there is none. False: there is no connection that could give way."""
         if self._address_is_full(new.address):
             found = self._give_way(new.address)
         else:
-            found = self._open.total() < self._most or any(map(self._give_way, self._by_number()))
+            found = self._open.total() < self._max or any(map(self._give_way, self._by_number()))
         if found:
             self._open[new.address] += 1
             self.idle(new)
@@ -157,7 +157,7 @@ class Connections:
 
     def _tell(self, what: str) -> None:
         self._told.happened(
-            f"{what}: {self._open.total()} are open, {self._most} may be, {self._most_of_address} of one address"
+            f"{what}: {self._open.total()} are open, {self._max} may be, {self._max_of_address} of one address"
         )
 
 

@@ -45,9 +45,9 @@ class Buckets:
     """A token bucket for each caller. Not for use by two threads."""
 
     def __init__(
-        self, rate_per_s: float, burst: int, wall: Callable[[], float] = time.monotonic, most: int = 10_000
+        self, rate_per_s: float, burst: int, wall: Callable[[], float] = time.monotonic, maximum: int = 10_000
     ) -> None:
-        self._rate, self._burst, self._wall, self._most = rate_per_s, burst, wall, most
+        self._rate, self._burst, self._wall, self._max = rate_per_s, burst, wall, maximum
         self._levels: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def wait_s(self, caller: str) -> float:
@@ -72,7 +72,7 @@ class Buckets:
     def _put(self, caller: str, level: float) -> None:
         self._levels[caller] = (level, self._wall())
         self._levels.move_to_end(caller)
-        if len(self._levels) > self._most:  # who was not seen for longest has a full bucket, most likely
+        if len(self._levels) > self._max:  # who was not seen for longest has a full bucket, most likely
             self._levels.popitem(last=False)
 
     def _level(self, caller: str) -> float:

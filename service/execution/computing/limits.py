@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from enum import IntEnum
 
-MOST_AT_ONCE = 4
+MAX_AT_ONCE = 4
 MB = 1 << 20
 
 
@@ -47,4 +47,4 @@ class ComputingLimits:
 def at_once() -> int:
     """How many computations this machine does at once: one processor is left for the bus and the requests."""
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(MOST_AT_ONCE, usable - 1))
+    return max(1, min(MAX_AT_ONCE, usable - 1))

@@ -82,12 +82,12 @@ class _Place:
 class Pool:
     """At most so many computations run at once: the best by kind, then by age. Others wait, or pause until then.
 
-    most: at_once() by default.
+    max_workers: at_once() by default.
     """
 
-    def __init__(self, limits: ComputingLimits | None = None, most: int | None = None) -> None:
+    def __init__(self, limits: ComputingLimits | None = None, max_workers: int | None = None) -> None:
         self.limits = limits or ComputingLimits()
-        self._most = most or at_once()
+        self._max_workers = max_workers or at_once()
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(["loopwright.service.execution.computing.preload"])
         self._numbers = itertools.count()
@@ -168,7 +168,7 @@ class Pool:
     def _arrange(self) -> None:
         self._places.sort(key=lambda place: place.rank)
         for n, place in reversed(list(enumerate(self._places))):  # who has to pause is told first
-            place.set_turn(n < self._most)
+            place.set_turn(n < self._max_workers)
 
     def _check(self, unwanted: Callable[[], bool]) -> None:
         if self._closed or unwanted():

@@ -246,8 +246,8 @@ class ThreadEngine:
     def known(self, job_ids: Collection[str]) -> set[str]:
         return {job_id for job_id in job_ids if job_id in self._threads and self._threads[job_id].is_alive()}
 
-    def over(self, most: int) -> list[str]:
-        return [job_id for job_id, thread in self._threads.items() if not thread.is_alive()][:most]
+    def over(self, limit: int) -> list[str]:
+        return [job_id for job_id, thread in self._threads.items() if not thread.is_alive()][:limit]
 
     def forget(self, job_ids: Collection[str]) -> None:
         for job_id in job_ids:
@@ -279,9 +279,9 @@ class Service:
         jobs.boot()
         return jobs
 
-    def wait(self, job_id: str, most_s: float = 60.0) -> None:
+    def wait(self, job_id: str, max_s: float = 60.0) -> None:
         """Until the job is over."""
-        deadline = time.monotonic() + most_s
+        deadline = time.monotonic() + max_s
         while JobState(self.store.get(job_id).state) in ACTIVE and time.monotonic() < deadline:
             time.sleep(0.005)
 

@@ -43,7 +43,9 @@ from tests.unit.service.processes import gone, until
 
 @pytest.fixture(scope="module")
 def pool() -> Iterator[Pool]:
-    with closing(Pool(ComputingLimits(live_cpu_s=60, tuning_cpu_s=1, dry_run_cpu_s=60, memory_mb=100), most=1)) as pool:
+    with closing(
+        Pool(ComputingLimits(live_cpu_s=60, tuning_cpu_s=1, dry_run_cpu_s=60, memory_mb=100), max_workers=1)
+    ) as pool:
         yield pool
 
 
@@ -135,7 +137,7 @@ class TestLimits:
         assert over.value.reason is Reason.COMPUTATION_LIMIT and "--tuning-cpu-s" in over.value.detail
 
     def test_those_of_a_live_loop_end_its_plan_by_name(self) -> None:
-        with closing(Pool(ComputingLimits(live_cpu_s=1), most=1)) as pool:
+        with closing(Pool(ComputingLimits(live_cpu_s=1), max_workers=1)) as pool:
             with pytest.raises(Failed, match="--live-cpu-s") as over:
                 done(Work(burn), pool)
             assert over.value.reason is Reason.COMPUTATION_LIMIT
@@ -235,7 +237,7 @@ class TestOrder:
 class TestEnd:
     def test_closing_ends_and_waits(self, tmp_path: Path) -> None:
         mark = tmp_path / "mark"
-        ends, pool = [], Pool(most=1)
+        ends, pool = [], Pool(max_workers=1)
         ends.append(pool.submit(Kind.LIVE, partial(burn, mark)))
         ends.append(pool.submit(Kind.DRY_RUN, os.getpid))
         until(lambda: mark.exists() and mark.read_text() != "")

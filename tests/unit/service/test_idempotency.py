@@ -22,7 +22,7 @@ from loopwright.service.request import RetuneRequest
 from loopwright.service.security.keys import Scope
 from loopwright.service.store import audit, claims
 from loopwright.service.store.claims import Claim, StillAnswering
-from loopwright.service.store.idempotency import MOST_BYTES, Answer, IdempotencyKeys, OtherRequest
+from loopwright.service.store.idempotency import MAX_BYTES, Answer, IdempotencyKeys, OtherRequest
 from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Store
 from loopwright.tuning.reasons import Reason
@@ -395,7 +395,7 @@ def test_answers_outlive_the_service(tmp_path: Path) -> None:
 
 @pytest.fixture
 def keys(store: Store) -> IdempotencyKeys:
-    return IdempotencyKeys(store, most=3)
+    return IdempotencyKeys(store, maximum=3)
 
 
 def claim(keys: IdempotencyKeys, key: str, print_: str = "f", at: datetime = AT, who: str = "me") -> Claim:
@@ -433,7 +433,7 @@ def test_what_is_being_answered_is_not_forgotten_for_want_of_room(keys: Idempote
 def test_a_long_answer_is_not_kept(keys: IdempotencyKeys) -> None:
     import random
 
-    long = random.Random(1).randbytes(2 * MOST_BYTES)
+    long = random.Random(1).randbytes(2 * MAX_BYTES)
     keys.keep(claim(keys, "a"), Answer(200, {}, long))
     claim(keys, "a", "g")
 

@@ -45,7 +45,7 @@ ENDS: dict[str, Ended | None] = {
     "aborted": Aborted(Reason.MODE_CHANGED, "manual"),
     "no_gain": NoGain(Reason.NO_GAIN, "as good as asked"),
 }
-MOST_ATTEMPTS = 10
+MAX_ATTEMPTS = 10
 WHICH = st.integers(0, 15)
 OPTIONS: tuple[dict[str, Any], ...] = (
     {},
@@ -121,7 +121,7 @@ class HandEngine:
     def known(self, job_ids: Collection[str]) -> set[str]:
         return set(job_ids) & (set(self.queued) | self.threads.keys())
 
-    def over(self, most: int) -> list[str]:
+    def over(self, limit: int) -> list[str]:
         return []
 
     def forget(self, job_ids: Collection[str]) -> None:
@@ -392,7 +392,7 @@ class JobsMachine(RuleBasedStateMachine):
             job.act.killed = False
             job.act.told.clear()
             job.act.inside.clear()
-            if job.attempts >= MOST_ATTEMPTS or (job.loop in self.locked and job.old is not None):
+            if job.attempts >= MAX_ATTEMPTS or (job.loop in self.locked and job.old is not None):
                 job.state = "interrupted"
         assert sorted(self.engine.queued) == sorted(job.id for job in self.jobs if job.active)
         self.said("crash", "gone back" if goes_back else "on trial")

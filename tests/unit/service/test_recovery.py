@@ -16,7 +16,7 @@ from loopwright.service.config import parse_site
 from loopwright.service.job_states import IllegalMove, JobState
 from loopwright.service.jobs.engine import WORKFLOW_VERSION
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.jobs.recovery import MOST_ATTEMPTS
+from loopwright.service.jobs.recovery import MAX_ATTEMPTS
 from loopwright.service.loop_state import LoopState, state_json
 from loopwright.service.request import RetuneRequest
 from loopwright.service.store.store import Store
@@ -194,7 +194,7 @@ def test_what_somebody_changed_meanwhile_stays_and_the_job_does_not_go_on(
     [
         ({"version": "0"}, {}, "another version"),
         ({}, {"resume": False}, "--no-resume"),
-        ({"attempt": MOST_ATTEMPTS}, {}, f"attempt {MOST_ATTEMPTS}"),
+        ({"attempt": MAX_ATTEMPTS}, {}, f"attempt {MAX_ATTEMPTS}"),
         ({"request": {"sp_deviation": 2.5}}, {}, "configuration has changed"),
     ],
 )

@@ -29,7 +29,7 @@ ASKED = RetuneRequest(dry_run=True)
 
 @pytest.fixture(scope="module")
 def pool() -> Iterator[Pool]:
-    with closing(Pool(ComputingLimits(dry_run_cpu_s=60, memory_mb=64), most=1)) as pool:
+    with closing(Pool(ComputingLimits(dry_run_cpu_s=60, memory_mb=64), max_workers=1)) as pool:
         yield pool
 
 
@@ -114,7 +114,7 @@ def test_a_job_that_asks_for_too_much_fails_by_name(tmp_path: Path, pool: Pool) 
 
 
 def test_the_end_of_the_pool_ends_it(tmp_path: Path) -> None:
-    pool, told, found = Pool(most=1), Told(), []
+    pool, told, found = Pool(max_workers=1), Told(), []
     thread = threading.Thread(target=lambda: found.append(apart(endless, pool)(CONFIG, ASKED, told.hooks)))
     thread.start()
     until(lambda: told.all)

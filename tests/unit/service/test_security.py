@@ -245,7 +245,7 @@ def test_too_many_at_once(open_client: Open) -> None:
 
 def test_a_bucket_fills_again() -> None:
     now = [0.0]
-    buckets = Buckets(2.0, 3, lambda: now[0], most=2)
+    buckets = Buckets(2.0, 3, lambda: now[0], maximum=2)
     assert [buckets.take("a") for _ in range(3)] == [0.0, 0.0, 0.0]
     assert buckets.take("a") == pytest.approx(0.5)
     now[0] = 0.5

@@ -10,7 +10,7 @@ import pytest
 from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.analysis.stability import is_stable
 from loopwright.tuning.analysis.step_response import step_figures
-from loopwright.tuning.fast.design import Design, Wish, controller, frequencies
+from loopwright.tuning.fast.design import Design, DesignSpec, controller, frequencies
 from loopwright.tuning.fast.gain_bounds import encircles_not, largest_gains
 from loopwright.tuning.fast.iae import LoopCost
 from loopwright.tuning.gains import Gains
@@ -97,23 +97,23 @@ def test_what_the_encirclements_say_is_what_the_poles_say() -> None:
 def test_no_other_integral_time_is_better(name: str) -> None:
     bench = BENCHES[name]
     model = TransferFunction(tuple(sign(bench.model) * c for c in bench.num), bench.den, bench.L)
-    design = Design(model, Wish(1.6), period(model))
+    design = Design(model, DesignSpec(1.6), period(model))
     best = design.best()
     assert margins(model, best.gains).Ms == pytest.approx(1.6, abs=2e-3)
-    assert design.least is not None
+    assert design.minimum is not None
     for Ti in best.gains.Ti * np.geomspace(0.7, 1.4, 25):
         for _, cost in design.candidates(float(Ti)):
-            J = 0.5 * cost.setpoint / design.least.setpoint + 0.5 * cost.load / design.least.load
+            J = 0.5 * cost.setpoint / design.minimum.setpoint + 0.5 * cost.load / design.minimum.load
             assert J >= best.J * (1.0 - 1e-4)
 
 
 def test_a_derivative_pays_on_lags_and_is_left_out_where_it_does_not() -> None:
     lags, delay = THREE_LAGS.model, TransferFunction((1.0,), (0.05, 1.0), 1.0)
-    pi = Design(lags, Wish(1.6), period(lags)).best()
-    pid = Design(lags, Wish(1.6, derivative=True), period(lags)).best()
+    pi = Design(lags, DesignSpec(1.6), period(lags)).best()
+    pid = Design(lags, DesignSpec(1.6, derivative=True), period(lags)).best()
     assert pid.gains.Td > 0.0 and pid.J < 0.97 * pi.J
     assert margins(lags, pid.gains).Ms == pytest.approx(1.6, abs=2e-3)
-    assert Design(delay, Wish(1.6, derivative=True), period(delay)).best().gains.Td == 0.0
+    assert Design(delay, DesignSpec(1.6, derivative=True), period(delay)).best().gains.Td == 0.0
 
 
 @pytest.mark.parametrize("name", BENCHES)
@@ -122,24 +122,24 @@ def test_a_gain_held_below_the_largest_keeps_Ms(name: str, part: float) -> None:
     """With a short integral time a smaller gain may be the less robust one."""
     bench = BENCHES[name]
     model = TransferFunction(tuple(sign(bench.model) * c for c in bench.num), bench.den, bench.L)
-    most = part * Design(model, Wish(1.6), period(model)).best().gains.Kp
-    held = Design(model, Wish(1.6, noise_gain=most), period(model)).best().gains
-    assert held.Kp <= most * (1.0 + 1e-9)
+    maximum = part * Design(model, DesignSpec(1.6), period(model)).best().gains.Kp
+    held = Design(model, DesignSpec(1.6, noise_gain=maximum), period(model)).best().gains
+    assert held.Kp <= maximum * (1.0 + 1e-9)
     assert margins(model, held).Ms <= 1.602
 
 
 def test_a_bound_on_the_noise_gain_holds() -> None:
     model = THREE_LAGS.model
-    free = Design(model, Wish(1.6, derivative=True), period(model)).best().gains
-    most = 0.5 * free.Kp * 11.0
-    held = Design(model, Wish(1.6, derivative=True, noise_gain=most), period(model)).best().gains
-    assert held.Kp * (11.0 if held.Td else 1.0) <= most * (1.0 + 1e-9)
+    free = Design(model, DesignSpec(1.6, derivative=True), period(model)).best().gains
+    maximum = 0.5 * free.Kp * 11.0
+    held = Design(model, DesignSpec(1.6, derivative=True, noise_gain=maximum), period(model)).best().gains
+    assert held.Kp * (11.0 if held.Td else 1.0) <= maximum * (1.0 + 1e-9)
     assert margins(model, held).Ms <= 1.602
 
 
 @pytest.mark.parametrize("bad", [{"Ms": 1.0}, {"Ms": math.nan}, {"Mt": 0.9}, {"noise_gain": 0.0}, {"N": 1.0}])
 def test_wishes_that_cannot_be_are_refused(bad: dict[str, float]) -> None:
     with pytest.raises(Refused) as refused:
-        Wish(**bad)  # type: ignore[arg-type]
+        DesignSpec(**bad)  # type: ignore[arg-type]
     assert refused.value.reason is Reason.BAD_INPUT
     assert next(iter(bad)) in refused.value.detail

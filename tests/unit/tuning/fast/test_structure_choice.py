@@ -27,8 +27,8 @@ def test_without_noise_the_plant_is_found(name: str) -> None:
     chosen = choose(fit)
     assert chosen.best.hypothesis == QUIET
     # five lags are not among the structures: their phase at 1.5 times the crossover is 1 degree off
-    most = 0.02 if name == "five lags" else 1e-4
-    assert error_near_the_crossover(BENCHES[name], fit.model(chosen.best)) < most
+    maximum = 0.02 if name == "five lags" else 1e-4
+    assert error_near_the_crossover(BENCHES[name], fit.model(chosen.best)) < maximum
 
 
 @pytest.mark.parametrize("name", BENCHES)

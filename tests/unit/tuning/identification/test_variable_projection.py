@@ -64,9 +64,9 @@ def test_a_parameter_that_does_nothing_stays() -> None:
 
     bounded = Bounded(np.full(3, -6.0), np.full(3, 6.0), np.full(3, 1.5), np.full(3, 1e-6))
     found, rss = descend(columns, y, np.array([[-1.5, 2.0, 0.7]]), bounded, 60, 1e-7)
-    expected, least = descended(y, [[-1.5, 2.0]], 6.0)
+    expected, minimum = descended(y, [[-1.5, 2.0]], 6.0)
     assert found[0, 2] == 0.7
-    assert found[0, :2] == pytest.approx(expected[0], abs=1e-6) and rss == pytest.approx(least, rel=1e-9)
+    assert found[0, :2] == pytest.approx(expected[0], abs=1e-6) and rss == pytest.approx(minimum, rel=1e-9)
 
 
 def test_linear_fit_and_covariance_are_those_of_regression() -> None:

@@ -112,10 +112,10 @@ def test_reverse_fit_of_table_1() -> None:
         other = step_response(FOPDT(1.0, T, L), PLANTS_PI, horizon=40.0, dt=0.02)
         return float(np.sum((np.interp(loop.t, other.t, other.y) - loop.y) ** 2))
 
-    least = cost(found.T, found.L)
+    minimum = cost(found.T, found.L)
     for T, L in ((1.01, 1.0), (0.99, 1.0), (1.0, 1.01), (1.0, 0.99), (1.01, 0.99), (0.99, 1.01)):
-        assert least < cost(T * found.T, L * found.L)
-    assert least < cost(fifth["printed"]["T"], fifth["printed"]["tau"])
+        assert minimum < cost(T * found.T, L * found.L)
+    assert minimum < cost(fifth["printed"]["T"], fifth["printed"]["tau"])
 
 
 @pytest.mark.parametrize("gains", [Gains(0.9, 7.5), Gains(0.5, 5.0, b=0.4), Gains(0.8), Gains(1.0, 6.0, 0.8, 0.1)])

@@ -32,14 +32,14 @@ class Watched:
     """Counts what it is asked and keeps the least it has answered."""
 
     def __init__(self, cost: Cost) -> None:
-        self.cost, self.asked, self.least = cost, 0, np.inf
+        self.cost, self.asked, self.minimum = cost, 0, np.inf
 
     def __call__(self, x: Reals) -> Reals:
         assert x.ndim == 2
         assert ((x >= 0.0) & (x <= 1.0)).all()
         value = self.cost(x)
         self.asked += len(x)
-        self.least = min(self.least, float(value.min()))
+        self.minimum = min(self.minimum, float(value.min()))
         return value
 
 
@@ -52,7 +52,7 @@ def test_finds_the_least_within_the_budget(
     watched = Watched(cost)
     found = search(watched, 2, seed)
     assert found.point == pytest.approx(point, abs=0.02 if search is multi_epoch_swarm else 1e-3)
-    assert found.value == watched.least == cost(found.point[None, :])[0]
+    assert found.value == watched.minimum == cost(found.point[None, :])[0]
     assert found.evaluations == watched.asked <= 2500
 
 

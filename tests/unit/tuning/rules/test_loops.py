@@ -116,11 +116,11 @@ def test_end_of_stability_of_form_zero() -> None:
     ],
 )
 def test_Ms_at_the_end_of_the_safe_range_of_imc(loop: str, name: str, model: Model, options: dict[str, Any]) -> None:
-    least = SAFE[loop] * model.L
-    assert 1.9 < peak_sensitivity(model, tune(name, model, lambda_s=least, **options).gains) < 2.2
+    minimum = SAFE[loop] * model.L
+    assert 1.9 < peak_sensitivity(model, tune(name, model, lambda_s=minimum, **options).gains) < 2.2
     with pytest.raises(Refused, match=f"below {SAFE[loop]:g} L"):
-        tune(name, model, lambda_s=0.99 * least, **options)
-    beyond = tune(name, model, lambda_s=0.99 * least, extrapolate=True, **options)
+        tune(name, model, lambda_s=0.99 * minimum, **options)
+    beyond = tune(name, model, lambda_s=0.99 * minimum, extrapolate=True, **options)
     assert "below" in beyond.notes[0]
 
 

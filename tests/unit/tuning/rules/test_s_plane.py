@@ -95,8 +95,8 @@ def test_table_2_is_pole_placement_but_not_the_least_J(i: int) -> None:
         pytest.approx(printed["overshoot_pct"], abs=5e-4),
         pytest.approx(printed["tc"]),
     )
-    least = s_plane(model, mu=mu, tau_s=TAU_S)
-    assert placed.chosen["J_s"] > 1.005 * least.chosen["J_s"]
+    minimum = s_plane(model, mu=mu, tau_s=TAU_S)
+    assert placed.chosen["J_s"] > 1.005 * minimum.chosen["J_s"]
     with pytest.raises(Refused, match="is accepted"):
         s_plane(OBJECTS["second_as_printed"], mu=mu, alpha_per_s=row["printed_C"]["alpha_implied"])
 
