@@ -21,7 +21,7 @@ TAMEST_Ms = 2.5
 """Of the present gains on a plant that is guessed: they work, so that a plant on which they would not is no guess."""
 LOWER, MAX_LOWERED = 0.5, 20
 """The gain of a guess is lowered by so much, so often at most."""
-MOST_IN_T95 = 20_000
+MAX_SAMPLES_IN_T95 = 20_000
 """Samples: of more, a rehearsal takes long, and shows nothing else."""
 
 
@@ -103,7 +103,7 @@ def rehearsal_spec(config: LoopConfig, request: RetuneRequest, ground: Ground) -
     if state is not None:
         low, high = max(low, state.mv_low), min(high, state.mv_high)
         spec |= {"gains": _fields(state.gains), "reverse_acting": state.reverse_acting}
-        if config.t95_s / MOST_IN_T95 <= state.sample_time_s:
+        if config.t95_s / MAX_SAMPLES_IN_T95 <= state.sample_time_s:
             spec["sample_time_s"] = state.sample_time_s
     middle = 0.5 * (low + high)
     spec["mv_limits"] = [low - middle, high - middle]

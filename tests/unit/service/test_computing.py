@@ -298,7 +298,7 @@ from pathlib import Path
 from loopwright.service.execution.computing.limits import Kind
 from loopwright.service.execution.computing.pool import Pool
 from tests.unit.service.computations import burn
-pool = Pool(most=1)
+pool = Pool(max_workers=1)
 pool.submit(Kind.DRY_RUN, partial(burn, Path(sys.argv[1])))
 while not (Path(sys.argv[1]).exists() and Path(sys.argv[1]).read_text()):
     time.sleep(0.01)

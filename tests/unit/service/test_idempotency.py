@@ -324,7 +324,7 @@ def test_a_database_that_is_away(service: Service, client: TestClient, monkeypat
 
 
 def test_a_long_answer_is_computed_again(service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("loopwright.service.store.idempotency.MOST_BYTES", 10)
+    monkeypatch.setattr("loopwright.service.store.idempotency.MAX_BYTES", 10)
     first, again = post(client, "/tunings", MODEL), post(client, "/tunings", MODEL)
     assert first.status_code == again.status_code == 200 and first.json() == again.json()
     assert post(client, "/tunings", MODEL | {"method": "amigo"}).status_code == 200  # nothing is kept
