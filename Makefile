@@ -13,7 +13,6 @@ UML := user-mode-linux iproute2 $(shell grep -qs amx_tile /proc/cpuinfo && echo 
 DEBIAN := $(UML) tshark can-utils postgresql systemd
 ENGINE := docker.io docker-compose
 BESIDE := $(UML) debootstrap e2fsprogs
-PARALLEL := --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 .PHONY: setup demo test compose-test check bench bench-tuning validate faults simulate hostile system clean
 
@@ -32,13 +31,8 @@ demo: setup
 system:
 	@sh tools/system-packages $(DEBIAN)
 
-# The quick tests run natively, on two cores, in their order, a file on one of them; the faults, whose loops run by the
-# clock, one after the other; those on a CAN bus where there is a CAN bus. All run even if one fails.
 test: setup system check
-	quick=0; \
-	$(BIN)/python -m pytest $(PARALLEL) --ignore=tests/vcan --ignore=tests/e2e --ignore=tests/faults || quick=$$?; \
-	$(BIN)/python -m pytest tests/faults || quick=$$?; \
-	LOOPWRIGHT_REQUIRE_VCAN=1 tools/with-vcan --again --timeout 3600 -- $(BIN)/python -m pytest $(wildcard tests/vcan tests/e2e) && exit $$quick
+	tools/run-tests $(BIN)/python
 
 # Where there is no container engine, one is installed as the packages above are, and runs for this test alone.
 compose-test:

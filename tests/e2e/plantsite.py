@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -17,17 +16,11 @@ import yaml
 from loopwright.protocol.profile import FOREVER
 from loopwright.protocol.tuner import Tuner
 from loopwright.service.cli.child_process import Process
-from loopwright.service.cli.demo import vcan_usable
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.tuning.plan import Mode
 
-NEEDS_VCAN = [
-    pytest.mark.skipif(
-        not vcan_usable() and not os.environ.get("LOOPWRIGHT_REQUIRE_VCAN"), reason="there is no vcan0 here"
-    ),
-    pytest.mark.timeout(300),
-]
+NEEDS_VCAN = [pytest.mark.vcan, pytest.mark.timeout(300)]
 BUS = "socketcan:vcan0"
 TAG = "LOOP"
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -27,15 +25,6 @@ TRIED = Gains(Kp=80.0, Ti=6.0)
 WATCH = Watch()
 
 Start = Callable[..., "subprocess.Popen[str]"]
-
-
-def has_vcan() -> bool:
-    try:
-        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as can:
-            can.bind(("vcan0",))
-        return True
-    except (AttributeError, OSError):
-        return False
 
 
 @pytest.fixture
@@ -64,18 +53,17 @@ def start() -> Iterator[Start]:
                 process.kill()
 
 
-@pytest.fixture(params=["vcan", "hub"])
+VCAN = pytest.param("vcan", marks=pytest.mark.vcan)
+
+
+@pytest.fixture(params=[VCAN, "hub"])
 def url(request: pytest.FixtureRequest, start: Start) -> str:
     if request.param == "hub":
         return str(start("loopwright.protocol.hub", "--port", "0").ready)  # type: ignore[attr-defined]
-    if not has_vcan():
-        if os.environ.get("LOOPWRIGHT_REQUIRE_VCAN"):
-            pytest.fail("no vcan0")
-        pytest.skip("no vcan0: run under tools/with-vcan")
     return "socketcan:vcan0"
 
 
-on_vcan = pytest.mark.parametrize("url", ["vcan"], indirect=True)
+on_vcan = pytest.mark.parametrize("url", [VCAN], indirect=True)
 
 
 def start_loop(start: Start, url: str, speed: str = "max") -> dict[str, subprocess.Popen[str]]:

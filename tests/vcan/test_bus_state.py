@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import socket
 import struct
 from collections.abc import Iterator
@@ -15,17 +14,7 @@ from loopwright.protocol.bus_state import BusState
 INTERFACE = "vcan0"
 
 
-def has_vcan() -> bool:
-    try:
-        socket.if_nametoindex(INTERFACE)
-    except OSError:
-        return False
-    return True
-
-
-pytestmark = pytest.mark.skipif(
-    not has_vcan() and not os.environ.get("LOOPWRIGHT_REQUIRE_VCAN"), reason=f"no {INTERFACE}; see tools/with-vcan"
-)
+pytestmark = pytest.mark.vcan
 
 
 @pytest.fixture

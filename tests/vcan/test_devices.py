@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import socket
 import struct
 import subprocess
 import sys
@@ -45,17 +43,7 @@ PATIENCE_S = 10.0
 Start = Callable[..., "subprocess.Popen[str]"]
 
 
-def has_vcan() -> bool:
-    try:
-        socket.if_nametoindex(INTERFACE)
-    except OSError:
-        return False
-    return True
-
-
-pytestmark = pytest.mark.skipif(
-    not has_vcan() and not os.environ.get("LOOPWRIGHT_REQUIRE_VCAN"), reason=f"no {INTERFACE}; see tools/with-vcan"
-)
+pytestmark = pytest.mark.vcan
 
 
 @pytest.fixture

@@ -19,9 +19,9 @@ from canopen.sdo.client import BlockUploadStream
 from loopwright.protocol.eds import FILES, FOLDER
 from loopwright.protocol.objects import Device
 from loopwright.protocol.profile import TUNER_NODE, Abort, Emcy, NmtState
-from tests.vcan.test_devices import INTERFACE, PATIENCE_S, Start, has_vcan, pytestmark, start
+from tests.vcan.test_devices import INTERFACE, PATIENCE_S, Start, pytestmark, start
 
-__all__ = ["has_vcan", "pytestmark", "start"]
+__all__ = ["pytestmark", "start"]
 
 PLANT, CONTROLLER = 0x10, 0x20
 EDS = {PLANT: FOLDER / FILES[Device.PLANT], CONTROLLER: FOLDER / FILES[Device.CONTROLLER]}

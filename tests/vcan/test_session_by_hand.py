@@ -5,8 +5,6 @@ Everything is written as somebody would who has the EDS and docs/canopen-profile
 
 from __future__ import annotations
 
-import os
-import socket
 import struct
 import subprocess
 import sys
@@ -20,6 +18,7 @@ import canopen
 import pytest
 
 INTERFACE = "vcan0"
+pytestmark = pytest.mark.vcan
 TUNER, CONTROLLER = 0x55, 0x20
 EDS = Path(__file__).parents[2] / "protocol" / "eds_files" / "loopwright_controller.eds"
 OPEN, CLOSE, SETPOINT, MODE, OUTPUT, RELAY, TRY, ACCEPT = range(8)
@@ -36,16 +35,6 @@ FORMATS = {
     ACCEPT: ("<ffffff", tuple(range(0x2160, 0x2166))),
 }
 """By order: how its values are packed for the check, and the objects that they are staged in."""
-
-
-@pytest.fixture(autouse=True)
-def vcan() -> None:
-    try:
-        socket.if_nametoindex(INTERFACE)
-    except OSError:
-        if os.environ.get("LOOPWRIGHT_REQUIRE_VCAN"):
-            pytest.fail(f"no {INTERFACE}")
-        pytest.skip(f"no {INTERFACE}; see tools/with-vcan")
 
 
 @pytest.fixture

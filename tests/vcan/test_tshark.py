@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -34,6 +33,7 @@ from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode, Plan, SetGains, SetMode, SetRelay, SetSetpoint
 
 INTERFACE = "vcan0"
+pytestmark = pytest.mark.vcan
 URL = f"socketcan:{INTERFACE}"
 PLANT, CONTROLLER, TUNER = 0x10, 0x20, 0x7D
 IDS = channel_ids(1)
@@ -45,10 +45,6 @@ BROKEN_ID = sdo_request_id(0x7F)
 @pytest.fixture(scope="module", autouse=True)
 def what_it_needs() -> None:
     missing = [tool for tool in ("dumpcap", "tshark") if shutil.which(tool) is None]
-    try:
-        socket.if_nametoindex(INTERFACE)
-    except OSError:
-        missing.append(f"{INTERFACE} (tools/with-vcan)")
     if missing:
         text = f"not there: {', '.join(missing)}"
         if os.environ.get("LOOPWRIGHT_REQUIRE_VCAN"):
