@@ -135,7 +135,7 @@ class Tuner:
         self.session = 0
         """The number of the session whose lease is renewed in every wait in here; 0: none."""
         self._renewed_at = 0.0
-        self._heed_stop: Callable[[], None] = lambda: None
+        self._check_stop_request: Callable[[], None] = lambda: None
         self.mode, self.on_trial, self.sp = 0, False, 0.0
         self.session_is_open = False
         self.node_states: dict[int, int] = {}
@@ -154,12 +154,12 @@ class Tuner:
         self.beating = True
         self.station.beat(self._url, self._bus, self.station.monotonic())
 
-    def keep(self, session: int, heed_stop: Callable[[], None] = lambda: None) -> None:
+    def keep(self, session: int, check_stop_request: Callable[[], None] = lambda: None) -> None:
         """The lease of that session, just paid for, is renewed from now on; 0: no lease is any more.
 
-        heed_stop: called while the loop waits for its turn with a node; raises where somebody wants an end.
+        check_stop_request: called while the loop waits for its turn with a node; raises where somebody wants an end.
         """
-        self.session, self._renewed_at, self._heed_stop = session, self.station.monotonic(), heed_stop
+        self.session, self._renewed_at, self._check_stop_request = session, self.station.monotonic(), check_stop_request
 
     def heartbeat(self) -> float:
         """Sends our heartbeat when it is due and no other loop on this bus has sent it, and the renewal of our session.
@@ -271,7 +271,7 @@ class Tuner:
         waits_since = self.station.monotonic()
 
         def meanwhile() -> None:
-            self._heed_stop()
+            self._check_stop_request()
             if self.station.monotonic() - waits_since < TURN_S:
                 self.heartbeat()
 

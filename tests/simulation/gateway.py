@@ -24,9 +24,8 @@ from loopwright.service.execution.procedures import Tune
 from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.loop_state import LoopState
-from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.service.loops.bus_reading import BusReading
-from loopwright.service.loops.loop import Loop, Restored
+from loopwright.service.loops.loop import Loop
 from loopwright.service.machine import Machine
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import Base, JobRow
@@ -285,32 +284,17 @@ def store(number: int) -> SimStore:
     return found
 
 
-class _Reading(BusReading):
-    told: Callable[[LoopState, float], None]
-    now: Callable[[], float]
+def noted_reading(now: Callable[[], float], note: Callable[[LoopState, float], None]) -> type[BusReading]:
+    """Readings of a bus loop that say when they were begun, and what they have found."""
 
-    def state(self) -> LoopState:
-        began = self.now()
-        found = BusReading.state(self)
-        self.told(found, began)
-        return found
+    class Reading(BusReading):
+        def state(self) -> LoopState:
+            began = now()
+            found = BusReading.state(self)
+            note(found, began)
+            return found
 
-
-class ReadLoop(BusLoop):
-    """A bus loop that says when it read what it says."""
-
-    on_state: Callable[[LoopState, float], None] = staticmethod(lambda state, began: None)
-    on_restore: Callable[[], None] = staticmethod(lambda: None)
-
-    def _reading(self, tuner: Any) -> BusReading:
-        reading = _Reading(tuner, self._node, self._plant, self._channel)
-        object.__setattr__(reading, "told", self.on_state)
-        object.__setattr__(reading, "now", self._station.monotonic)
-        return reading
-
-    def restore(self, home: LoopState, session: int | None = None) -> Restored:
-        self.on_restore()
-        return super().restore(home, session)
+    return Reading
 
 
 class Gateway:

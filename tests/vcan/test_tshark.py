@@ -30,7 +30,8 @@ from loopwright.protocol.profile import (
 )
 from loopwright.service.execution.guard import Watch
 from loopwright.service.execution.runner import run
-from loopwright.service.loops.bus_loop import WATCH_S, BusLoop
+from loopwright.service.loops.bus_loop import BusLoop
+from loopwright.service.loops.bus_session import WATCH_S
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode, Plan, SetGains, SetMode, SetRelay, SetSetpoint
 

@@ -29,7 +29,8 @@ from loopwright.protocol.profile import (
     heartbeat_id,
 )
 from loopwright.protocol.tuner import RENEWAL_S, TURN_S
-from loopwright.service.loops.bus_loop import CONFIRM_S, LEASE_WALL_S, BusLoop
+from loopwright.service.loops.bus_loop import BusLoop
+from loopwright.service.loops.bus_session import CONFIRM_S, LEASE_WALL_S
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Mode, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason, Refused
@@ -142,7 +143,7 @@ class TestLease:
         for _ in range(100):
             loop.step(())
         assert in_blocks.names() == [], "renewals wait for no answer"
-        loop._confirmed_at -= CONFIRM_S
+        loop.session.confirmed_at -= CONFIRM_S
         loop.step((SetSetpoint(50.1),))
         assert in_blocks.names() == [RENEWAL, "controller_session_setpoint", "controller_order_setpoint"]
 
@@ -229,7 +230,7 @@ class TestLease:
         _, number = site.begun()
         assert site.wire.clock.now - began_at > 2 * LEASE_WALL_S
         site.loop.step(())
-        assert site.controller.sessions[0].is_open and site.loop._number == number
+        assert site.controller.sessions[0].is_open and site.loop.session.number == number
 
     def test_of_a_session_that_has_ended_is_not_paid(self, in_blocks: Site) -> None:
         in_blocks.loop.begin()

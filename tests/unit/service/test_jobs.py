@@ -15,7 +15,7 @@ from loopwright.service.job_states import IllegalMove, JobState
 from loopwright.service.jobs import manager as jobs_module
 from loopwright.service.jobs.progress import Progress
 from loopwright.service.loop_state import LoopState
-from loopwright.service.loops.bus_loop import RESTORE_PATIENCE_S
+from loopwright.service.loops.bus_restore import RESTORE_PATIENCE_S
 from loopwright.service.loops.loop import Restored
 from loopwright.service.request import RetuneRequest
 from loopwright.service.store import audit
