@@ -61,7 +61,7 @@ def create_app(
     policy = policy or Policy()
     keyring = policy.keyring
     many = Fleet(jobs)
-    readings = SharedReading(jobs.live)
+    readings = SharedReading(jobs.directory.live)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -102,7 +102,7 @@ def create_app(
         "/loops/{tag}", tags=["loops"], summary="A loop and its present state", responses=problems.responses(404, 503)
     )
     def loop(tag: Tag) -> LoopDetail:
-        config, host = jobs.owner(tag)
+        config, host = jobs.directory.owner(tag)
         not_home = next(iter(jobs.aftercare.not_home(tag)), None)
         try:
             state = readings.of(tag)
@@ -110,7 +110,7 @@ def create_app(
             if not_home is None:
                 raise
             state = None
-        of_it = jobs.store.busy().get(tag), jobs.store.last_states(tag).get(tag), jobs.locks().get(tag)
+        of_it = jobs.store.busy().get(tag), jobs.store.last_states(tag).get(tag), jobs.locking.locks().get(tag)
         shown = loop_view(config, host, *of_it)
         return LoopDetail(
             **shown,
@@ -125,7 +125,7 @@ def create_app(
         responses=problems.responses(404, 409, 422),
     )
     def dismiss(tag: Tag, decision: Annotated[Decision | None, Body()] = None) -> DismissedView:
-        found = jobs.dismiss(tag, (decision or Decision()).by)
+        found = jobs.aftercare.dismiss(tag, (decision or Decision()).by)
         return DismissedView(loop=tag, jobs=[f"/jobs/{job_id}" for job_id in found])
 
     @app.post(
@@ -215,7 +215,7 @@ def create_app(
         responses=problems.responses(404, 409, 422, 503),
     )
     def accept(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
-        return view(jobs.accept(job_id, (decision or Decision()).by))
+        return view(jobs.decisions.accept(job_id, (decision or Decision()).by))
 
     @app.post(
         "/jobs/{job_id}/rollback",
@@ -224,9 +224,9 @@ def create_app(
         responses=problems.responses(404, 409, 422, 503),
     )
     def rollback(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
-        return view(jobs.rollback(job_id, (decision or Decision()).by))
+        return view(jobs.decisions.rollback(job_id, (decision or Decision()).by))
 
-    app.include_router(locks.router(jobs))
+    app.include_router(locks.router(jobs.locking))
     app.include_router(previews.router(jobs, many))
     app.include_router(tunings.router(jobs, pool or Pool()))
     return app

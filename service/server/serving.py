@@ -38,9 +38,11 @@ from loopwright.service.execution.procedures import Tune, rehearse
 from loopwright.service.execution.procedures import tune as live
 from loopwright.service.execution.rehearsals import apart
 from loopwright.service.jobs.dbos_engine import POLL_S, DurableEngine
-from loopwright.service.jobs.manager import Jobs, LoopFactory
+from loopwright.service.jobs.loop_directory import LoopFactory
+from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.retention import Keep, Retention
 from loopwright.service.loops.loop import Loop
+from loopwright.service.server.assembly import make_jobs
 from loopwright.service.server.signals import Signals
 from loopwright.service.server.watchdog import Watchdog, interval_s
 from loopwright.service.store.database import BadDatabase
@@ -177,7 +179,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
             )
         policy = Policy(keyring, setup.limits, local_only=True)
         engine = DurableEngine(setup.data, store.engine if store.shared else None, store.host, setup.poll_s)
-        jobs = Jobs(
+        jobs = make_jobs(
             site.loops,
             store,
             open_loop or partial(open_bus_loop, Station(setup.node)),

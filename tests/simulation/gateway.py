@@ -27,6 +27,7 @@ from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_reading import BusReading
 from loopwright.service.loops.loop import Loop
 from loopwright.service.machine import Machine
+from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import Base, JobRow
 from tests.simulation.scheduler import Killed, Process, Simulation, Task
@@ -341,7 +342,7 @@ class Gateway:
         self.store.on_statement = lambda what: self._statement(what)
 
         def boot() -> None:
-            jobs = Jobs(
+            jobs = make_jobs(
                 self._loops, self.store, lambda config: self._open_loop(station, config), self._tune, _no_rehearsal,
                 engine=SimEngine(self._given, process), machine=SimMachine(station, process),
             )  # fmt: skip

@@ -140,7 +140,7 @@ def test_a_controller_that_is_not_there_is_said_so_and_hinders_nothing(service: 
 
 def test_then_the_gains_are_those_that_the_last_job_left(service: Service) -> None:
     job_id = proposed(service)
-    service.jobs.accept(job_id, "me")
+    service.jobs.decisions.accept(job_id, "me")
     service.controller.absent = Reason.NODE_LOST
     view = dry_run(service)
     on = view.rehearsed_on

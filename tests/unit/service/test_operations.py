@@ -215,7 +215,7 @@ def test_lines_of_a_job_carry_job_and_loop(
     told = [
         (x["message"].partition(",")[0], x["job"], x["loop"])
         for x in lines
-        if x["logger"] == "loopwright.service.jobs.manager"
+        if x["logger"] == "loopwright.service.jobs.worker"
     ]
     assert told == [
         ("job started", job, TAG), ("job proposes new gains", job, TAG),
