@@ -106,6 +106,31 @@ def test_progress_never_falls_and_ends_below_one() -> None:
     assert progress.remaining_s == pytest.approx(1.0)
 
 
+def test_who_reads_the_progress_changes_nothing() -> None:
+    progress = Progress()
+    progress.stage_started(StageStarted("a", 10.0, 90.0))
+    progress.at(100.0)
+    before = vars(progress).copy()
+    seen = progress.seen_at(105.0)
+    assert (seen.plant_time_s, seen.remaining_s) == (5.0, 95.0) and seen.fraction == pytest.approx(0.05)
+    assert progress.seen_at(99.0).plant_time_s == progress.seen_at(None).plant_time_s == 0.0
+    assert vars(progress) == before and progress.fraction == 0.0
+
+
+def test_a_job_that_is_looked_at_is_as_before(service: Service) -> None:
+    service.tune.hold.clear()
+    row = service.jobs.start(TAG, RetuneRequest())
+    assert service.tune.inside.wait(60)
+    running = service.jobs.running(row.id)
+    assert running is not None and running.loop is not None
+    before = vars(running.progress).copy()
+    at_first = running.loop.t_s or 0.0
+    while (running.loop.t_s or 0.0) < at_first + 1.0:
+        time.sleep(0.005)
+    views = [job_view(service.store.get(row.id), service.store.events(row.id), running) for _ in range(2)]
+    assert views[0].plant_time_s > 0.5 and vars(running.progress) == before
+
+
 @pytest.mark.parametrize("method", ["fast", "five-stage"])
 def test_a_real_rehearsal_through_a_job(service: Service, method: str) -> None:
     jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
