@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -38,6 +39,8 @@ class Station:
     monotonic: Callable[[], float] = time.monotonic
     sleep: Callable[[float], None] = time.sleep
     open_bus: Callable[[str], Bus] = open_bus
+    sdo_retries: Counter[str] = field(default_factory=Counter)
+    """By bus: SDO requests that were sent again because no answer came."""
     _beats: dict[str, float] = field(default_factory=dict)
     """For each bus when we have last sent our heartbeat. One beat speaks for all loops of the process: it says that the
     process lives. That a loop's own thread works, only its lease says."""

@@ -7,7 +7,7 @@ falls silent. What arrives while an SDO waits is taken in order and handed out l
 from __future__ import annotations
 
 import struct
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
@@ -90,10 +90,6 @@ class BusSample(NamedTuple):
     mode: int
     on_trial: bool
     sp: float
-
-
-sdo_retries: Counter[str] = Counter()
-"""By bus: SDO requests that this process sent again because no answer came."""
 
 
 class Tuner:
@@ -291,7 +287,7 @@ class Tuner:
         self._answers.clear()
         for attempt in range(self._sdo_tries):
             if attempt:
-                sdo_retries[self._url] += 1
+                self.station.sdo_retries[self._url] += 1
             self._bus.send(sdo_request_id(node), request)
             give_up = self.station.monotonic() + self._sdo_timeout_s
             while (answer := self._answer(node, give_up)) is not None:

@@ -52,10 +52,11 @@ def create_app(
     policy: Policy | None = None,
     checks: Mapping[str, operations.Check] | None = None,
     pool: Pool | None = None,
+    sdo_retries: Mapping[str, int] | None = None,
 ) -> FastAPI:
     """The API over these jobs; ends them when the server shuts down. checks: what must be well to be ready.
 
-    pool: who computes tunings; None: one of its own.
+    pool: who computes tunings; None: one of its own.  sdo_retries: by bus, as the station of this process counts them.
     """
 
     policy = policy or Policy()
@@ -87,7 +88,8 @@ def create_app(
     app.add_middleware(Access)
     problems.install(app)
     openapi.install(app)
-    operations.install(app, jobs, operations.checks(jobs) if checks is None else checks)
+    checks = operations.checks(jobs) if checks is None else checks
+    operations.install(app, jobs, checks, {} if sdo_retries is None else sdo_retries)
 
     def views(rows: Sequence[JobRow]) -> list[JobView]:
         events = jobs.store.events_by_job([row.id for row in rows], limit=MAX_EVENTS)

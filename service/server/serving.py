@@ -179,10 +179,11 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
             )
         policy = Policy(keyring, setup.limits, local_only=True)
         engine = DurableEngine(setup.data, store.engine if store.shared else None, store.host, setup.poll_s)
+        station = Station(setup.node)
         jobs = make_jobs(
             site.loops,
             store,
-            open_loop or partial(open_bus_loop, Station(setup.node)),
+            open_loop or partial(open_bus_loop, station),
             tune or partial(live, workers=pool),
             apart(rehearse, pool),
             engine=engine,
@@ -192,7 +193,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         stack.callback(jobs.stop)
         retention = stack.enter_context(closing(Retention(store, engine, setup.keep)))
         checks = {**operations.checks(jobs), "samples": retention.note}
-        app = create_app(jobs, policy, checks, pool)
+        app = create_app(jobs, policy, checks, pool, station.sdo_retries)
         server = _Server(server_config(app, setup, listener, descriptors), jobs)
 
         def end() -> None:

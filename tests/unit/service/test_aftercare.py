@@ -246,7 +246,7 @@ def test_who_asks_is_told(service: Service, clock: Clock, client: TestClient) ->
     assert ready.status_code == 503 and not part["ready"]
     for words in (row.id, STOPPED, "start it (NMT)", f"loopwright dismiss {TAG}"):
         assert words in part["detail"]
-    assert b"loopwright_loops_looked_after 1.0" in exposition(registry(service.loops, service.store))
+    assert b"loopwright_loops_looked_after 1.0" in exposition(registry(service.loops, service.store, {}))
 
 
 def test_a_loop_that_is_away_is_shown_with_what_is_known(service: Service, clock: Clock, client: TestClient) -> None:
@@ -265,7 +265,7 @@ def test_ready_again_once_it_is_home(service: Service, clock: Clock, client: Tes
     service.jobs.aftercare.look()
     ready = client.get("/readyz")
     assert ready.status_code == 200 and ready.json()["parts"] == {}
-    assert b"loopwright_loops_looked_after 0.0" in exposition(registry(service.loops, service.store))
+    assert b"loopwright_loops_looked_after 0.0" in exposition(registry(service.loops, service.store, {}))
 
 
 def test_a_person_answers_for_it(service: Service, clock: Clock, client: TestClient) -> None:

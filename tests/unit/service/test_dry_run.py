@@ -215,7 +215,7 @@ def test_dry_runs_of_earlier_versions_are_shown_as_rehearsed(service: Service, c
     for decision in ("accept", "rollback"):
         assert client.post(f"/jobs/{row.id}/{decision}").status_code == 409
     assert service.controller.state.gains == OLD
-    told = exposition(registry(service.loops, service.store)).decode()
+    told = exposition(registry(service.loops, service.store, {})).decode()
     assert 'loopwright_jobs{reason="",state="rehearsed"} 1.0' in told
     assert 'loopwright_jobs{reason="",state="proposed"} 1.0' in told
     job_tables.job_report(job)
