@@ -14,8 +14,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from loopwright.protocol.bus import Bus, open_bus
+from loopwright.protocol.fair_lock import FairLock
 from loopwright.protocol.profile import HEARTBEAT_FRAME, TUNER_NODE, NmtState, heartbeat_id
-from loopwright.protocol.turns import Turns
 
 HEARTBEAT_S = 0.1
 LISTEN_S = 2.0
@@ -44,20 +44,20 @@ class Station:
     _beats: dict[str, float] = field(default_factory=dict)
     """For each bus when we have last sent our heartbeat. One beat speaks for all loops of the process: it says that the
     process lives. That a loop's own thread works, only its lease says."""
-    _turns: dict[tuple[str, int], Turns] = field(default_factory=dict)
-    _plants: dict[tuple[str, int], threading.Lock] = field(default_factory=dict)
+    _sdo_locks: dict[tuple[str, int], FairLock] = field(default_factory=dict)
+    _plant_locks: dict[tuple[str, int], threading.Lock] = field(default_factory=dict)
     _guard: threading.Lock = field(default_factory=threading.Lock)
     _listening: threading.Lock = field(default_factory=threading.Lock)
 
-    def turns(self, url: str, node: int) -> Turns:
+    def sdo_lock(self, url: str, node: int) -> FairLock:
         """An SDO server answers one request at a time, whoever asks: loops of one process on one node take turns."""
         with self._guard:
-            return self._turns.setdefault((url, node), Turns())
+            return self._sdo_locks.setdefault((url, node), FairLock())
 
-    def plant(self, url: str, node: int) -> threading.Lock:
+    def plant_lock(self, url: str, node: int) -> threading.Lock:
         """A plant that is run in blocks belongs to one job at a time, whatever its number of channels."""
         with self._guard:
-            return self._plants.setdefault((url, node), threading.Lock())
+            return self._plant_locks.setdefault((url, node), threading.Lock())
 
     # -- heartbeat
 

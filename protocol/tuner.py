@@ -271,7 +271,7 @@ class Tuner:
             if self.station.monotonic() - waits_since < TURN_S:
                 self.heartbeat()
 
-        with self.station.turns(self._url, node).take(name in _URGENT, meanwhile):
+        with self.station.sdo_lock(self._url, node).take(name in _URGENT, meanwhile):
             self._bus.set_filters(self._heard | {sdo_response_id(node)})
             try:
                 yield

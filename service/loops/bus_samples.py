@@ -76,7 +76,7 @@ class BusSamples:
         plant = self._connection.plant
         if not self.in_blocks or plant is None:
             return
-        lock = self._station.plant(self._connection.url, plant)
+        lock = self._station.plant_lock(self._connection.url, plant)
         while not lock.acquire(timeout=0.1):
             self._check_stop_request(f"while another test was using plant node {plant:02X}h")
         self._plant_lock = lock

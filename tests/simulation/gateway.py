@@ -17,8 +17,8 @@ from typing import Any, TypeVar
 
 from sqlalchemy import event, text
 
+from loopwright.protocol.fair_lock import FairLock
 from loopwright.protocol.station import Station
-from loopwright.protocol.turns import Turns
 from loopwright.service.config import LoopConfig
 from loopwright.service.execution.procedures import Tune
 from loopwright.service.job_states import ACTIVE, JobState
@@ -63,7 +63,7 @@ class Lock:
         self.release()
 
 
-class SimTurns(Turns):
+class SimFairLock(FairLock):
     def __init__(self, simulation: Simulation) -> None:
         self._lock = Lock(simulation)
 
@@ -95,11 +95,11 @@ class SimStation(Station):
         self._guard = Lock(simulation)  # type: ignore[assignment]
         self._listening = Lock(simulation)  # type: ignore[assignment]
 
-    def turns(self, url: str, node: int) -> Turns:
-        return self._turns.setdefault((url, node), SimTurns(self._simulation))
+    def sdo_lock(self, url: str, node: int) -> FairLock:
+        return self._sdo_locks.setdefault((url, node), SimFairLock(self._simulation))
 
-    def plant(self, url: str, node: int) -> Any:
-        return self._plants.setdefault((url, node), Lock(self._simulation))  # type: ignore[arg-type]
+    def plant_lock(self, url: str, node: int) -> Any:
+        return self._plant_locks.setdefault((url, node), Lock(self._simulation))  # type: ignore[arg-type]
 
 
 class SimEvent:

@@ -164,7 +164,7 @@ class TestLease:
     def test_is_paid_while_others_have_their_turn_with_the_node(self, site: Site) -> None:
         """An SDO server answers one at a time, and who waits for it is alive."""
         site.begun()
-        turn = site.gateway.turns("wire", CONTROLLER_NODE).take()
+        turn = site.gateway.sdo_lock("wire", CONTROLLER_NODE).take()
         turn.__enter__()
         began_at = site.wire.clock.now
 
@@ -182,7 +182,7 @@ class TestLease:
 
     def test_is_paid_no_longer_where_whoever_has_the_turn_hangs(self, site: Site) -> None:
         site.begun()
-        turn = site.gateway.turns("wire", CONTROLLER_NODE).take()
+        turn = site.gateway.sdo_lock("wire", CONTROLLER_NODE).take()
         turn.__enter__()
         began_at = site.wire.clock.now
 
@@ -203,7 +203,7 @@ class TestLease:
         wanted: list[Reason] = []
         site.let_run()
         home = site.loop.begin(lambda: wanted[0] if wanted else None)
-        turn = site.gateway.turns("wire", CONTROLLER_NODE).take()
+        turn = site.gateway.sdo_lock("wire", CONTROLLER_NODE).take()
         turn.__enter__()
         wanted.append(Reason.OPERATOR)
         with pytest.raises(Aborted, match="had their turn"):
@@ -269,7 +269,7 @@ class TestWaiting:
     def test_a_plant_that_another_test_runs_in_blocks_is_waited_for_until_somebody_asks_to_stop(
         self, in_blocks: Site
     ) -> None:
-        held, asked = in_blocks.gateway.plant("wire", PLANT_NODE), 0
+        held, asked = in_blocks.gateway.plant_lock("wire", PLANT_NODE), 0
 
         def stop() -> Reason | None:
             nonlocal asked
@@ -298,7 +298,7 @@ class TestWaiting:
         gateway.before = samples
         with pytest.raises(Aborted, match="brought to a halt"):
             in_blocks.loop.begin(lambda: Reason.OPERATOR if number > 100 else None)
-        assert not gateway.plant("wire", PLANT_NODE).locked(), "the plant was given back"
+        assert not gateway.plant_lock("wire", PLANT_NODE).locked(), "the plant was given back"
 
     def test_a_plant_that_runs_again_while_it_is_halted_is_told_once_more(self, in_blocks: Site) -> None:
         gateway, number, told = in_blocks.gateway, 0, 0

@@ -1,4 +1,4 @@
-"""Turns: a lock that is had in the order in which it was asked for, what is urgent first.
+"""A lock that is had in the order in which it was asked for, what is urgent first.
 
 Python's locks are not fair: who gives one back and asks again at once has it again. Of fifty loops that begin together
 some would not be heard for seconds, and lose their lease for it.
@@ -15,8 +15,8 @@ _SLICE_S = 0.05
 """Of a wait: short enough to beat in time."""
 
 
-class Turns:
-    """`with turns.take(): ...`; not to be taken again by who is inside."""
+class FairLock:
+    """`with lock.take(): ...`; not to be taken again by who is inside."""
 
     def __init__(self) -> None:
         self._guard = threading.Lock()
