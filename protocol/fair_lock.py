@@ -16,7 +16,7 @@ _SLICE_S = 0.05
 
 
 class FairLock:
-    """`with lock.take(): ...`; not to be taken again by who is inside."""
+    """Is held by `with lock.take(): ...`; whoever holds it must not take it again."""
 
     def __init__(self) -> None:
         self._guard = threading.Lock()
@@ -26,7 +26,10 @@ class FairLock:
 
     @contextmanager
     def take(self, urgent: bool = False, meanwhile: Callable[[], object] = lambda: None) -> Iterator[None]:
-        """meanwhile: called again and again while others have their turn."""
+        """Waits for the lock and holds it.
+
+        meanwhile: called again and again while others have their turn.
+        """
         self._enter(self._urgent if urgent else self._waiting, meanwhile)
         try:
             yield

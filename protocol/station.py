@@ -50,20 +50,22 @@ class Station:
     _listening: threading.Lock = field(default_factory=threading.Lock)
 
     def sdo_lock(self, url: str, node: int) -> FairLock:
-        """An SDO server answers one request at a time, whoever asks: loops of one process on one node take turns."""
+        """Returns the lock of an SDO server, which answers one request at a time, whoever asks: loops of one process on
+        one node take turns."""
         with self._guard:
             return self._sdo_locks.setdefault((url, node), FairLock())
 
     def plant_lock(self, url: str, node: int) -> threading.Lock:
-        """A plant that is run in blocks belongs to one job at a time, whatever its number of channels."""
+        """Returns the lock of a plant that is run in blocks: it belongs to one job at a time, whatever its number of
+        channels."""
         with self._guard:
             return self._plant_locks.setdefault((url, node), threading.Lock())
 
     # -- heartbeat
 
     def beat_if_due(self, url: str, bus: Bus) -> float:
-        """Sends our heartbeat unless a loop of this process has just done so. The time on the clock, which it takes a
-        system call to read in some virtual machines."""
+        """Sends our heartbeat unless a loop of this process has just done so. Returns the time on the clock, which it
+        takes a system call to read in some virtual machines."""
         now = self.monotonic()
         if now - self._beats.get(url, -math.inf) >= HEARTBEAT_S:
             self.beat(url, bus, now)
@@ -74,8 +76,8 @@ class Station:
         bus.send(heartbeat_id(self.node), HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL))
 
     def join(self, url: str) -> None:
-        """To be called before a loop beats. Where we have not beaten for a while it listens first, for a gateway with
-        our ID would keep our sessions alive. Raises NodeTaken, BusError."""
+        """Listens before a loop beats, where we have not beaten for a while: a gateway with our ID would keep our
+        sessions alive. Raises NodeTaken, BusError."""
         with self._listening:
             beaten_at = self._beats.get(url)
             if beaten_at is None or self.monotonic() - beaten_at >= self.listen_s:

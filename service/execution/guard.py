@@ -12,9 +12,9 @@ from loopwright.tuning.reasons import Failed, Reason
 
 @dataclass(frozen=True, slots=True)
 class Watch:
-    """PV limits (PV units), permitted MV (MV units, held from the first command on), time budget (plant s), how many
-    samples in a row may be missing, and for how long PV may stay exactly the same while MV is away from where it was
-    (plant s; longer than any dead time)."""
+    """Holds the limits of a run: PV limits (PV units), permitted MV (MV units, held from the first command on), time
+    budget (plant s), how many samples in a row may be missing, and for how long PV may stay exactly the same while MV
+    is away from where it was (plant s; longer than any dead time)."""
 
     pv_low: float = -math.inf
     pv_high: float = math.inf
@@ -41,7 +41,7 @@ class Guard:
         self._notable = 1e-3 * abs(state.mv_high - state.mv_low)
 
     def commanded(self) -> None:
-        """The plan acts on the loop from now on."""
+        """Notes that the plan acts on the loop from now on."""
         self._acting = True
 
     def check(self, sample: Sample) -> None:

@@ -71,7 +71,7 @@ def run(
 
 
 class _Run(Generic[T]):
-    """One run of a plan on a loop; the arguments are those of `run`."""
+    """Carries out one run of a plan on a loop; the arguments are those of `run`."""
 
     def __init__(
         self,
@@ -127,7 +127,7 @@ class _Run(Generic[T]):
         return home
 
     def _pump(self, home: LoopState) -> None:
-        """Sample by sample until the plan, the guard, the loop or somebody ends it, each by an exception."""
+        """Goes from sample to sample until the plan, the guard, the loop or somebody ends it, each by an exception."""
         guard = Guard(self._watch, home)
         chunk = min(CHUNK, max(1, round(CHUNK_S / home.sample_time_s)))
         answer = next(self._plan)
@@ -165,7 +165,10 @@ class _Run(Generic[T]):
         return commands
 
     def _enter(self, stage: str) -> None:
-        """Adds the plant time of the stage that ends here; "": there is no stage after it."""
+        """Enters a stage and adds the plant time of the one that ends here.
+
+        stage: "" where there is none after it.
+        """
         if self._stage:
             times = self._result.plant_time_s
             times[self._stage] = times.get(self._stage, 0.0) + self._now - self._since
@@ -180,7 +183,7 @@ class _Run(Generic[T]):
         return f"at {self._now:.3f} s of plant time, in stage {self._stage or 'start'}"
 
     def _restore(self, home: LoopState) -> None:
-        """The one way out. A loop that is not confirmed home leaves no proposal."""
+        """Restores the loop, the one way out. A loop that is not confirmed home leaves no proposal."""
         result = self._result
         try:
             restored = self._loop.restore(home)

@@ -22,7 +22,8 @@ _BLOCK_WALL_S = 1.0
 
 
 class Running:
-    """The thread of the job feeds it; other threads read `progress_now` and may set `stop_reason`.
+    """Holds the live part of one job. The thread of the job feeds it; other threads read `progress_now` and may set
+    `stop_reason`.
 
     before_s: plant time that earlier attempts took, s: the samples of this one are counted on from there.
     """
@@ -70,7 +71,7 @@ class Running:
             self.tell("note", {"stage": self.progress.stage, "text": event.text})
 
     def on_samples(self, samples: list[Sample]) -> None:
-        """Samples come in the runner's blocks, which do not end where a stage does: split by the stages' times."""
+        """Splits samples by the times of the stages: the runner's blocks do not end where a stage does."""
         self._keep_time()
         for sample in samples:
             while self._boundaries and sample.t > self._boundaries[0][0]:
@@ -88,7 +89,7 @@ class Running:
         self._flushed = self._monotonic()
 
     def progress_now(self) -> Progress:
-        """The progress at the latest sample; reading it changes nothing here."""
+        """Returns the progress at the latest sample; reading it changes nothing here."""
         return self.progress.seen_at(self.loop.t_s if self.loop else None)
 
     def _keep_time(self) -> None:

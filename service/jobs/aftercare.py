@@ -41,7 +41,7 @@ class NotHome:
 
     @property
     def words(self) -> str:
-        """What is the matter, and what to do."""
+        """Says what is the matter, and what to do."""
         if self.reason in _UNREACHED:
             advice = ADVICE[self.reason]
         else:
@@ -85,7 +85,7 @@ class Aftercare:
         self._stopping = True
 
     def close(self) -> None:
-        """The same, and waits for the look in progress."""
+        """Looks at nothing more, and waits for the look in progress."""
         self._stopping = True
         self._over.set()
         if self._thread.is_alive():
@@ -94,7 +94,7 @@ class Aftercare:
                 log.error("a loop that is looked after has not answered in %.0f s, the service ends", _STOP_S)
 
     def not_home(self, loop: str | None = None) -> list[NotHome]:
-        """This host's loops that are looked after, or whether one is, on whatever host; a loop once."""
+        """Returns this host's loops that are looked after, or whether one is, on whatever host; a loop once."""
         found: dict[str, NotHome] = {}
         for row in looked_after.rows(self._store, loop):
             found.setdefault(row.loop, self._not_home(row))
@@ -108,8 +108,8 @@ class Aftercare:
         return NotHome(row.loop, row.id, reason, row.detail or "it was not read back")
 
     def dismiss(self, tag: str, by: str) -> list[str]:
-        """A person answers for a loop that is looked after: it is not looked at any more. The jobs it was for; none
-        when it was not looked after. Raises UnknownLoop, Busy."""
+        """Lets a person answer for a loop that is looked after: it is not looked at any more. Returns the jobs it was
+        looked after for, none when it was not. Raises UnknownLoop, Busy."""
         if not looked_after.rows(self._store, tag):
             self._directory.owner(tag)
             return []

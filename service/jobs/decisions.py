@@ -33,7 +33,7 @@ class Decisions:
     def accept(self, job_id: str, by: str) -> JobRow:
         """Makes the proposed gains the accepted ones of the controller, and reads them back.
 
-        After an error it is asked again, which finishes what was begun, or rolled back.
+        After an error the decision can be asked for again, which finishes what was begun, or be rolled back.
         """
         return self._decide(job_id, JobState.ACCEPTED, by)
 
@@ -94,6 +94,7 @@ class Decisions:
             return self.store.move(job_id, wanted, by=by, restored=state_json(state))
 
     def wait_for_writes(self, tag: str) -> bool:
-        """Until a decision that has begun to write to the loop has ended; False where it has not in WRITES_S."""
+        """Waits until a decision that has begun to write to the loop has ended; returns False where it has not in
+        WRITES_S."""
         writes = self._writes.get(tag)
         return writes is None or writes.wait(WRITES_S)

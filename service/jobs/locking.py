@@ -12,7 +12,10 @@ from loopwright.service.store.tables import JobRow, LoopLockRow
 
 
 class Locking:
-    """Locks and unlocks loops, of whatever host. decisions: what may be writing to a loop of ours."""
+    """Locks and unlocks loops, of whatever host.
+
+    decisions: what may be writing to a loop of ours.
+    """
 
     def __init__(self, store: Store, directory: LoopDirectory, decisions: Decisions) -> None:
         self.store = store
@@ -20,8 +23,8 @@ class Locking:
         self._decisions = decisions
 
     def lock(self, tag: str, reason: str, by: str) -> tuple[LoopLockRow, JobRow | None]:
-        """From now on no test begins on the loop, whatever host it is on, and no decision writes to it. Returns the
-        lock, and the job whose test was running already and goes on. Raises UnknownLoop, LockedOtherwise."""
+        """Locks a loop: from now on no test begins on it, whatever host it is on, and no decision writes to it. Returns
+        the lock, and the job whose test was running already and goes on. Raises UnknownLoop, LockedOtherwise."""
         self._directory.owner(tag)
         with self.store.writing() as session:
             row = loop_locks.lock(session, tag, reason, by)
@@ -34,12 +37,12 @@ class Locking:
         return row, active if active is not None and active.state == JobState.RUNNING else None
 
     def unlock(self, tag: str, by: str) -> LoopLockRow | None:
-        """What the loop was locked for; None: it was not. Raises UnknownLoop."""
+        """Unlocks a loop. Returns what it was locked for, or None where it was not locked. Raises UnknownLoop."""
         self._directory.owner(tag)
         with self.store.writing() as session:
             return loop_locks.unlock(session, tag, by)
 
     def locks(self) -> dict[str, LoopLockRow]:
-        """The locks by loop, of every host."""
+        """Returns the locks by loop, of every host."""
         with self.store.reading() as session:
             return loop_locks.every(session)

@@ -20,7 +20,11 @@ LoopFactory = Callable[[LoopConfig], Loop]
 
 
 class LoopDirectory:
-    """loops: those of this host.  buses: what is configured for their buses.  open_loop: opens one of our loops."""
+    """Knows the loops of every host, and opens those of this one.
+
+    loops: those of this host.  open_loop: opens one of them.  buses: what is configured for their buses.
+    machine: makes the locks of the loops.
+    """
 
     def __init__(
         self,
@@ -40,18 +44,18 @@ class LoopDirectory:
         self._loop_locks: defaultdict[str, AbstractContextManager[Any]] = defaultdict(machine.lock)
 
     def alone_with(self, tag: str) -> AbstractContextManager[Any]:
-        """To be held while a job on the loop begins, is decided, or the loop is looked after."""
+        """Returns the lock that is held while a job on the loop begins or is decided, or the loop is looked after."""
         return self._loop_locks[tag]
 
     def at_once(self, bus: str) -> int:
-        """How many loops of one of our buses may be under test at the same time."""
+        """Returns how many loops of one of our buses may be under test at the same time."""
         return self._buses.get(bus, BusConfig()).at_once
 
     def config(self, tag: str) -> LoopConfig:
         return self.owner(tag)[0]
 
     def owner(self, tag: str) -> tuple[LoopConfig, str]:
-        """The loop's configuration, and the host that has it. Raises UnknownLoop."""
+        """Returns the loop's configuration, and the host that has it. Raises UnknownLoop."""
         if tag in self.loops:
             return self.loops[tag], self.store.host
         row = self.store.foreign_loop(tag)
@@ -60,12 +64,12 @@ class LoopDirectory:
         return LoopConfig.model_validate(row.config), row.host
 
     def everywhere(self) -> list[tuple[LoopConfig, str]]:
-        """Every loop of every host: ours first."""
+        """Returns every loop of every host: ours first."""
         ours = [(config, self.store.host) for config in self.loops.values()]
         return ours + [(LoopConfig.model_validate(row.config), row.host) for row in self.store.foreign_loops()]
 
     def live(self, tag: str) -> LoopState | None:
-        """The present state of a loop: from the job if one runs, else read from the bus; None on another host."""
+        """Returns the present state of a loop: from the job if one runs, else from the bus; None on another host."""
         if tag not in self.loops:
             self.owner(tag)
             return None
@@ -77,7 +81,7 @@ class LoopDirectory:
         return self.read(tag)
 
     def read(self, tag: str) -> LoopState:
-        """A loop of ours, read from the bus. Raises Ended."""
+        """Reads a loop of ours from the bus. Raises Ended."""
         loop = self.open_loop(self.loops[tag])
         try:
             return loop.read()
@@ -85,7 +89,7 @@ class LoopDirectory:
             loop.close()
 
     def present(self, tag: str) -> LoopState:
-        """The loop as its controller has it, or as the job that has the loop now found it. Raises Ended."""
+        """Returns the loop as its controller has it, or as the job that has the loop now found it. Raises Ended."""
         active = self.store.active(tag)
         if active is not None and active.found is not None:
             return replace(loop_state(active.found), gains=gains_of(active.old_gains))

@@ -90,12 +90,12 @@ class Jobs:
 
     @property
     def why_stopping(self) -> str:
-        """As readiness says it."""
+        """Says why no more jobs are taken, as readiness shows it."""
         return self.registry.why_stopping
 
     @property
     def resumes(self) -> bool:
-        """Whether jobs that a dead service left go on at the next start."""
+        """Says whether jobs that a dead service left go on at the next start."""
         return self._recovery.resumes
 
     # at the start of the service
@@ -137,7 +137,7 @@ class Jobs:
         return self._rehearsals(row.host) if row.dry_run else self._queue(self.directory.loops[row.loop])
 
     def _queue(self, config: LoopConfig, host: str | None = None) -> str:
-        """A bus has its name from its host: two hosts may both have a vcan0."""
+        """Returns the queue of the loop's bus. A bus has its name from its host: two hosts may both have a vcan0."""
         return f"{host or self.store.host}:{config.bus}"
 
     @staticmethod
@@ -149,7 +149,7 @@ class Jobs:
         return self.registry.running.get(job_id)
 
     def under_test(self) -> dict[str, str]:
-        """The tags of the loops that a job works on, by job."""
+        """Returns the tags of the loops that a job works on, by job."""
         return self.registry.under_test()
 
     # start and stop
@@ -194,7 +194,7 @@ class Jobs:
     def abort(self, job_id: str, by: str) -> JobRow:
         """Asks an active job to stop; it ends as aborted once the loop is restored. Raises IllegalMove.
 
-        One that runs here hears of it before it is written down: the loop does not wait for the database.
+        A job that runs here hears of it before it is written down: the loop does not wait for the database.
         """
         heard = self.tell_to_stop(job_id)
         row = self.store.request_stop(job_id, Reason.OPERATOR.value, by, heard)
@@ -203,8 +203,8 @@ class Jobs:
         return self.store.get(job_id)
 
     def tell_to_stop(self, job_id: str) -> bool:
-        """A job that runs here hears that an operator wants it to end; returns at once, and writes nothing down. False
-        where no job hears of it."""
+        """Lets a job that runs here hear that an operator wants it to end; returns at once, and writes nothing down.
+        Returns False where no job hears of it."""
         running = self.registry.running.get(job_id)
         if running is None:
             return False
@@ -218,8 +218,8 @@ class Jobs:
         state: JobState = JobState.ABORTED,
         detail: str = "stopped while it waited for its turn",
     ) -> None:
-        """A job that runs hears of it at its next sample; one that waits for its turn has nothing to restore, and
-        ends in that state."""
+        """Asks one job to stop. A job that runs hears of it at its next sample; one that waits for its turn has nothing
+        to restore, and ends in that state."""
         with self.registry.lock:
             running = self.registry.running.get(job_id)
             if running is not None:
@@ -275,13 +275,14 @@ class Jobs:
         self.journal.close(STOP_PATIENCE_S)
 
     def stop_watching(self) -> None:
-        """Hears of nothing more, and leaves jobs and loops as they are; a `stop` after it does nothing."""
+        """Ends the thread that hears of jobs to stop, and leaves jobs and loops as they are; a `stop` after it does
+        nothing."""
         self._ended.set()
         if self._watcher.ident is not None:
             self._watcher.join()
 
     def _watch(self) -> None:
-        """Hears of jobs to stop, from whatever host; finds what the engine has lost."""
+        """Hears of jobs to stop, from whatever host, and finds what the engine has lost."""
         reconciled = self._machine.monotonic()
         while not self._ended.wait(_WATCH_S):
             self._watched = self._machine.monotonic()
@@ -302,7 +303,7 @@ class Jobs:
                 log.exception("watching the jobs")
 
     def unwatched_s(self) -> float:
-        """For how long nobody has heard of jobs to stop, s of wall time."""
+        """Returns for how long nobody has heard of jobs to stop, s of wall time."""
         return self._machine.monotonic() - self._watched
 
     def _hold_name(self) -> None:

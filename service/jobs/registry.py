@@ -9,7 +9,10 @@ from loopwright.service.store.tables import JobRow
 
 
 class Registry:
-    """stopping: set once, when the service is to end.  why_stopping: as readiness says it."""
+    """Holds the jobs that run, by id, and whether the service is to end.
+
+    stopping: set once, when the service is to end.  why_stopping: as readiness says it.
+    """
 
     def __init__(self) -> None:
         self.stopping = False
@@ -21,7 +24,8 @@ class Registry:
         self.lock = threading.Lock()
 
     def enter(self, running: Running) -> bool:
-        """False where the job is not to begin: it runs already, was given up, or the service is to end."""
+        """Adds a job that begins. Returns False where it is not to begin: it runs already, was given up, or the service
+        is to end."""
         with self.lock:
             if self.stopping or running.job_id in self.running or running.job_id in self.unqueued:
                 return False
@@ -29,11 +33,11 @@ class Registry:
             return True
 
     def leave(self, running: Running) -> None:
-        """The job's loop is given up and its end is written."""
+        """Removes a job whose loop is given up and whose end is written."""
         with self.lock:
             self.running.pop(running.job_id, None)
         running.over.set()
 
     def under_test(self) -> dict[str, str]:
-        """The tags of the loops that a job works on, by job."""
+        """Returns the tags of the loops that a job works on, by job."""
         return {job_id: running.tag for job_id, running in self.running.copy().items()}

@@ -18,7 +18,7 @@ _AGAIN_S = 0.5
 
 
 class UntilAnswered:
-    """Calls of the database, each repeated until there is an answer; while the service stops, for a while only."""
+    """Repeats a call of the database until there is an answer; while the service stops, for a while only."""
 
     def __init__(self, machine: Machine, registry: Registry) -> None:
         self._machine = machine

@@ -135,9 +135,9 @@ class Worker:
             loop.close()
 
     def _note_home(self, job_id: str, read: LoopState, home: LoopState) -> None:
-        """What the controller noted as it opened the session counts, where a hand was faster than our reading.
+        """Notes home as the controller has it since it opened the session, where a hand was faster than our reading.
 
-        Through the journal: the session is open, and waits for no database.
+        The note goes through the journal: the session is open, and waits for no database.
         """
         columns: dict[str, Any] = {}
         if differences(home, read):
@@ -147,7 +147,7 @@ class Worker:
             raise Aborted(Reason.GAINS_CHANGED, "other gains were accepted as the test was about to begin")
 
     def _begun(self, loop: Loop, row: JobRow) -> LoopState:
-        """The state of the loop as an attempt begins, written down before anything is touched."""
+        """Returns the state of the loop as an attempt begins, written down before anything is touched."""
         if row.found is None or row.session is None:
             # No attempt has touched it. What an earlier one had read may have been another tuner's test.
             state = loop.read(beside_tests=True)
@@ -217,6 +217,6 @@ class Worker:
             log.log(level, "job %s, %s: %s", state.value, outcome.ended.reason.value, outcome.ended.detail)
 
     def _earlier_times(self, job_id: str) -> dict[str, float]:
-        """Plant time of the stages that any attempt has finished, s."""
+        """Returns the plant time of the stages that any attempt has finished, s."""
         events = self._lasting(lambda: self.store.events(job_id))
         return {e.data["stage"]: e.data["stage_time_s"] for e in events if e.kind == "stage_done"}

@@ -21,9 +21,10 @@ Read = Callable[[Tuner, int, int | None, int], BusReading]
 
 
 class BusConnection:
-    """One channel of a controller node. plant: the plant I/O, if it offers one to ask.
+    """Reaches one channel of a controller node.
 
-    station: this process on the bus.  read: makes the readings; a simulation notes them.
+    plant: the plant I/O, if it offers one to ask.  station: this process on the bus.
+    read: makes the readings; a simulation notes them.
     """
 
     def __init__(
@@ -39,7 +40,7 @@ class BusConnection:
 
     @contextmanager
     def tuner(self) -> Iterator[Tuner]:
-        """The tuner, opened when needed; what goes wrong on the bus becomes a reason of the closed list."""
+        """Opens the tuner when it is needed; what goes wrong on the bus becomes a reason of the closed list."""
         try:
             if self._tuner is None:
                 self._tuner = Tuner(self.url, self.controller, self.plant, self.channel, station=self.station)
@@ -64,7 +65,7 @@ class BusConnection:
         return self._read(tuner, self.controller, self.plant, self.channel)
 
     def stop_beating(self) -> None:
-        """Our heartbeat ends, and no lease is renewed any more."""
+        """Ends our heartbeat and the renewals of the lease."""
         if self._tuner is not None:
             self._tuner.beating = False
             self._tuner.keep(0)
@@ -76,7 +77,7 @@ class BusConnection:
             self._tuner = None
 
     def _no_answer(self, error: TunerError) -> Failed:
-        """A node that is stopped beats, and answers no SDO."""
+        """Tells a node that is stopped, which beats and answers no SDO, from one that is gone."""
         states = self._tuner.node_states if self._tuner is not None else {}
         for node in (self.controller, self.plant):
             if node is not None and states.get(node) == NmtState.STOPPED:

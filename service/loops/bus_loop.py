@@ -112,7 +112,7 @@ class BusLoop:
             self._release()
 
     def accept(self, gains: Gains, instead_of: Gains) -> LoopState:
-        """In a short session of its own, so that an acceptance that is cut off leaves one set or the other."""
+        """Accepts in a short session of its own, so that an acceptance that is cut off leaves one set or the other."""
         why: Ended | None = None
         self.session.number = 0
         try:
@@ -142,7 +142,8 @@ class BusLoop:
         self._connection.close()
 
     def _carry_out(self, tuner: Tuner, command: Command) -> None:
-        """What an order has brought about is known from its answer: a status frame may be lost."""
+        """Gives the orders of a command. What an order has brought about is known from its answer: a status frame may
+        be lost."""
         order = self.session.order
         match command:
             case SetSetpoint(value):
@@ -167,12 +168,15 @@ class BusLoop:
                 tuner.mode = Mode.EXPERIMENT
 
     def _check_stop_request(self, when: str) -> None:
-        """Raises Aborted where somebody wants an end. when: what is waited for, in words."""
+        """Raises Aborted where somebody wants an end.
+
+        when: what is waited for, in words.
+        """
         reason = self._stop()
         if reason is not None:
             raise Aborted(reason, when)
 
     def _release(self) -> None:
-        """Our heartbeat ends, and the plant is given back."""
+        """Ends our heartbeat, and gives the plant back."""
         self._connection.stop_beating()
         self._samples.release()

@@ -17,8 +17,9 @@ RESTORE_PATIENCE_S = 4.0
 
 
 def restore(connection: BusConnection, home: LoopState, number: int) -> Restored:
-    """Closes the session of that number, if it is still open, and reads the loop back. number 0: none was opened.
+    """Closes the session of that number, if it is still open, and reads the loop back.
 
+    number: 0 where no session was opened.
     Raises Failed(RESTORE_UNCONFIRMED | NODE_NOT_OPERATIONAL).
     """
     station = connection.station
@@ -37,8 +38,11 @@ def restore(connection: BusConnection, home: LoopState, number: int) -> Restored
 
 
 def end_acceptance(connection: BusConnection, number: int, why: Ended | None) -> LoopState:
-    """Closes the session of an acceptance and reads what is accepted now. why: the error that has cut it off, if one
-    has; where the end of the session is not confirmed, that is raised with what it means added."""
+    """Closes the session of an acceptance and reads what is accepted now.
+
+    why: the error that has cut the acceptance off, if one has; where the end of the session is not confirmed, it is
+    raised with what that means added.
+    """
     station = connection.station
     give_up = station.monotonic() + RESTORE_PATIENCE_S
     while True:
@@ -55,7 +59,7 @@ def end_acceptance(connection: BusConnection, number: int, why: Ended | None) ->
 
 
 def close_session(tuner: Tuner, number: int) -> str:
-    """How the session of that number has ended, in words."""
+    """Closes the session of that number where it is still open, and says how it has ended."""
     tuner.keep(0)
     if int(tuner.number("controller_session")) == number:
         session = TunerSession(tuner)

@@ -30,7 +30,7 @@ _HALTED_S = 0.03  # without a sample: the plant has halted
 
 
 class BusSamples:
-    """The samples of the channel of a connection, counted from the beginning of a test.
+    """Counts the samples of the channel of a connection from the beginning of a test.
 
     check_stop_request: as for the session.  block: samples per block of a plant at pace 0.
     max_gap: samples in a row that may be missing.
@@ -82,8 +82,8 @@ class BusSamples:
         self._plant_lock = lock
 
     def begin(self, tuner: Tuner) -> None:
-        """Settles who drives the samples, the plant by its clock or we in blocks, and counts them from now on. To be
-        called when nobody else's test is on the plant any more."""
+        """Settles who drives the samples, the plant by its clock or we in blocks, and counts them from now on. Nobody
+        else's test may be on the plant any more."""
         self._silence_s = max(SILENCE_S, 3.0 * self.sample_time_s / (self.pace or math.inf))
         if self.in_blocks:
             self._halted = True
@@ -94,7 +94,7 @@ class BusSamples:
         self._first_n, self._left, self._passed = None, 0, 0
 
     def _halt(self, tuner: Tuner) -> None:
-        """Tells the plant more than once: one that is reset meanwhile runs again as it was started."""
+        """Halts the plant. It is told more than once: one that is reset meanwhile runs again as it was started."""
         give_up = self._station.monotonic() + HALT_S
         again_at = 0.0
         while True:
@@ -111,7 +111,7 @@ class BusSamples:
                 raise Failed(Reason.SAMPLES_LOST, text)
 
     def release(self) -> None:
-        """A plant that we ran in blocks runs on by itself, and others may take it."""
+        """Lets a plant that we ran in blocks run on by itself, and others take it."""
         if self._halted:
             with suppress(Ended), self._connection.tuner() as tuner:
                 tuner.write("plant_samples_to_run", FOREVER)
@@ -124,7 +124,7 @@ class BusSamples:
 
     @property
     def block_is_over(self) -> bool:
-        """Commands act now; always so where the plant drives the samples by its clock."""
+        """Says whether commands act now; they always do where the plant drives the samples by its clock."""
         return self._left <= 0
 
     def start_block(self, tuner: Tuner) -> None:
@@ -133,7 +133,8 @@ class BusSamples:
             self._left = self._block
 
     def next(self, tuner: Tuner) -> Sample:
-        """Raises Failed(SAMPLES_LOST | NODE_NOT_OPERATIONAL), why the session is over, and what a stop request does."""
+        """Waits for the next sample and counts it. Raises Failed(SAMPLES_LOST | NODE_NOT_OPERATIONAL), why the session
+        is over, and what a stop request raises."""
         return self._count(self._wait_for_next(tuner))
 
     def _wait_for_next(self, tuner: Tuner) -> BusSample:
@@ -151,7 +152,7 @@ class BusSamples:
             self._check_stop_request("while waiting for a sample")
 
     def _silent(self, tuner: Tuner) -> Ended:
-        """No samples: who is it? A node that is gone raises by its time-out."""
+        """Finds out who is silent. A node that is gone raises by its time-out."""
         reading = self._connection.reading(tuner)
         reading.check_controller_operational()
         reading.check_plant_operational()

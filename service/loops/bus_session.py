@@ -32,7 +32,7 @@ SHORTEST_LEASE = 20
 
 
 def terms(pace: float, sample_time_s: float) -> Lease:
-    """What we pay for at a time. At pace 0 samples say nothing of time."""
+    """Returns what we pay for at a time. At pace 0 samples say nothing of time."""
     if not pace:
         samples, lease_s, silence_s = FOREVER, LEASE_IN_BLOCKS_S, PV_SILENCE_IN_BLOCKS_S
     else:
@@ -43,7 +43,7 @@ def terms(pace: float, sample_time_s: float) -> Lease:
 
 
 class BusSession:
-    """The session that this service has on the channel of a connection.
+    """Opens and keeps the session that this service has on the channel of a connection.
 
     check_stop_request: called in every wait with what is waited for; raises where somebody wants an end.
     """
@@ -150,10 +150,10 @@ class BusSession:
                 raise self.why_over(tuner)
 
     def is_open(self, tuner: Tuner) -> bool:
-        """Asked of the controller."""
+        """Asks the controller whether our session is open."""
         return int(tuner.number("controller_session")) == self.number
 
     def why_over(self, tuner: Tuner) -> Ended:
-        """Why our session has ended without us."""
+        """Returns why our session has ended without us."""
         tuner.keep(0)
         return why_over(self._connection.reading(tuner), self.number, self._lease.pv_silence_ms / 1000.0)

@@ -32,7 +32,7 @@ def make_jobs(
     resume: bool = True,
     machine: Machine | None = None,
 ) -> Jobs:
-    """The jobs of this host's loops, not started yet.
+    """Makes the jobs of this host's loops, not started yet.
 
     buses: what is configured for them.  resume: whether jobs that a dead service left go on at the next start.
     machine: clock and threads.

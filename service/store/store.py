@@ -495,12 +495,12 @@ def is_shown_as(state: JobState) -> ColumnElement[bool]:
 
 def event_of(job_id: str, kind: str, data: dict[str, Any], plant_time_s: float, **columns: Any) -> Write:
     """An event, at the time it happened, and what it changes in the job's row."""
-    at, told = now(), to_jsonable(data)
+    at, details = now(), to_jsonable(data)
 
     def write(session: Session) -> None:
         row = _find(session, job_id, lock=True)
         set_columns(row, {"plant_time_s": plant_time_s, **columns})
-        append(session, job_id, kind, told, plant_time_s, at)
+        append(session, job_id, kind, details, plant_time_s, at)
 
     return write
 
@@ -557,9 +557,9 @@ def _move(session: Session, row: JobRow, wanted: JobState, by: str, columns: dic
         row.started_at = now()
     elif previous in ACTIVE:
         row.ended_at = now()
-    told = {"state": wanted.value, "from": previous.value, "by": by}
-    told |= {key: columns[key] for key in ("reason", "detail") if columns.get(key)}
-    append(session, row.id, "state", told, row.plant_time_s)
+    details = {"state": wanted.value, "from": previous.value, "by": by}
+    details |= {key: columns[key] for key in ("reason", "detail") if columns.get(key)}
+    append(session, row.id, "state", details, row.plant_time_s)
     if wanted in DECISIONS:
         claims.changed(session, f"/jobs/{row.id}")
         _audit_decision(session, row, previous, wanted, by, (columns.get("restored") or {}).get("gains"))
