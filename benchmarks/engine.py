@@ -15,10 +15,10 @@ from loopwright.service.config import LoopConfig, parse_site
 from loopwright.service.execution.procedures import Hooks, Outcome, rehearse
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.dbos_engine import DurableEngine
-from loopwright.service.jobs.manager import Jobs
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.service.request import RetuneRequest
+from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.tuning.plan import StageDone, StageStarted
 
@@ -37,7 +37,7 @@ def cost(folder: Path) -> dict[str, float]:
     """Wall time on SQLite. Per job: from asking to the written end, many at once. Per stage: its two events."""
     loops = parse_site({"loops": [entry(f"T-{n}", channel=n + 1) for n in range(NO_WORK)]}, "benchmark").loops
     store = Store(folder)
-    jobs = Jobs(loops, store, open_loop, empty, rehearse, engine=DurableEngine(folder, None, "local", 0.1))
+    jobs = make_jobs(loops, store, open_loop, empty, rehearse, engine=DurableEngine(folder, None, "local", 0.1))
     jobs.boot()
     try:
         time.sleep(1.5)  # the engine has found its queues

@@ -40,7 +40,8 @@ from benchmarks.tuning import (
     spread,
 )
 from loopwright.plantsim.plant import LinearPlant
-from loopwright.service.execution.runner import Watch, run
+from loopwright.service.execution.guard import Watch
+from loopwright.service.execution.runner import run
 from loopwright.tuning.experiments.preflight import PREFLIGHT, SETTLE, preflight
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.five_stage.procedure import Options, five_stage

@@ -16,8 +16,9 @@ from PIL import Image
 from benchmarks.command import check_names, parser_of
 from loopwright.controller.channel import Channel, Settings
 from loopwright.plantsim.plant import LinearPlant
+from loopwright.service.execution.guard import Watch
 from loopwright.service.execution.rehearsal import RehearsedLoop, _parameters
-from loopwright.service.execution.runner import Watch, run
+from loopwright.service.execution.runner import run
 from loopwright.service.jobs.relay_record import relay_record
 from loopwright.service.jsonable import to_jsonable
 from loopwright.service.plots.fast_job import fast_job

@@ -36,8 +36,9 @@ from loopwright.plantsim import reactor
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.plantsim.plant import Plant as Simulated
 from loopwright.plantsim.reactor import Reactor
+from loopwright.service.execution.guard import Watch
 from loopwright.service.execution.rehearsal import RehearsedLoop
-from loopwright.service.execution.runner import RunResult, Watch, run
+from loopwright.service.execution.runner import RunResult, run
 from loopwright.service.jobs.relay_record import relay_record
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.experiments.preflight import PREFLIGHT, SETTLE, at_rest

@@ -10,9 +10,9 @@ from typing import Any
 
 from loopwright.controller.channel import Settings
 from loopwright.controller.device import ControllerChannel, ControllerDevice
-from loopwright.controller.memory import FileKeeper, KeptError, remembered
 from loopwright.controller.pid import Parameters
-from loopwright.protocol.process import ConfigError, node_id, read_channels, run_device
+from loopwright.controller.retained_state import FileKeeper, KeptError, remembered
+from loopwright.protocol.device_process import ConfigError, node_id, read_channels, run_device
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, Mode
 
 _MODES = {"off": Mode.OFF, "manual": Mode.MANUAL, "automatic": Mode.AUTOMATIC}

@@ -17,7 +17,8 @@ from loopwright.controller.channel import Channel, Home, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.controller.session import Session
 from loopwright.protocol.bus import Bus
-from loopwright.protocol.dictionary import Dictionary, Writer
+from loopwright.protocol.device_runtime import Runtime
+from loopwright.protocol.object_dictionary import Dictionary, Writer
 from loopwright.protocol.objects import Device, Value
 from loopwright.protocol.profile import (
     COMMAND_FRAME,
@@ -39,7 +40,6 @@ from loopwright.protocol.profile import (
     channel_ids,
     renewal_id,
 )
-from loopwright.protocol.runtime import Runtime
 from loopwright.protocol.sdo import SdoAbort
 from loopwright.protocol.session import GAINS, STAGED, object_of
 

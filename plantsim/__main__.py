@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from loopwright.plantsim.catalogue import find
 from loopwright.plantsim.device import PlantChannel, PlantDevice
-from loopwright.protocol.process import ConfigError, node_id, read_channels, run_device
+from loopwright.protocol.device_process import ConfigError, node_id, read_channels, run_device
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE
 
 

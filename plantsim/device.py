@@ -9,7 +9,8 @@ from functools import partial
 
 from loopwright.plantsim.plant import Plant
 from loopwright.protocol.bus import Bus
-from loopwright.protocol.dictionary import Dictionary
+from loopwright.protocol.device_runtime import Runtime
+from loopwright.protocol.object_dictionary import Dictionary
 from loopwright.protocol.objects import Device, Value
 from loopwright.protocol.profile import (
     CONTROLLER_NODE,
@@ -27,7 +28,6 @@ from loopwright.protocol.profile import (
     OnMissingAnswer,
     channel_ids,
 )
-from loopwright.protocol.runtime import Runtime
 from loopwright.protocol.sdo import SdoAbort
 
 _MAX_CATCH_UP = 5

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from loopwright.protocol.dictionary import Dictionary
+from loopwright.protocol.object_dictionary import Dictionary
 from loopwright.protocol.objects import Value, lookup
 from loopwright.protocol.profile import EMCY_FRAME, EMCY_REGISTER, Abort, Emcy
 from loopwright.protocol.sdo import SdoAbort

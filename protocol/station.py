@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from loopwright.protocol.bus import Bus, open_bus
+from loopwright.protocol.fair_lock import FairLock
 from loopwright.protocol.profile import HEARTBEAT_FRAME, TUNER_NODE, NmtState, heartbeat_id
-from loopwright.protocol.turns import Turns
 
 HEARTBEAT_S = 0.1
 LISTEN_S = 2.0
@@ -38,29 +39,33 @@ class Station:
     monotonic: Callable[[], float] = time.monotonic
     sleep: Callable[[float], None] = time.sleep
     open_bus: Callable[[str], Bus] = open_bus
+    sdo_retries: Counter[str] = field(default_factory=Counter)
+    """By bus: SDO requests that were sent again because no answer came."""
     _beats: dict[str, float] = field(default_factory=dict)
     """For each bus when we have last sent our heartbeat. One beat speaks for all loops of the process: it says that the
     process lives. That a loop's own thread works, only its lease says."""
-    _turns: dict[tuple[str, int], Turns] = field(default_factory=dict)
-    _plants: dict[tuple[str, int], threading.Lock] = field(default_factory=dict)
+    _sdo_locks: dict[tuple[str, int], FairLock] = field(default_factory=dict)
+    _plant_locks: dict[tuple[str, int], threading.Lock] = field(default_factory=dict)
     _guard: threading.Lock = field(default_factory=threading.Lock)
     _listening: threading.Lock = field(default_factory=threading.Lock)
 
-    def turns(self, url: str, node: int) -> Turns:
-        """An SDO server answers one request at a time, whoever asks: loops of one process on one node take turns."""
+    def sdo_lock(self, url: str, node: int) -> FairLock:
+        """Returns the lock of an SDO server, which answers one request at a time, whoever asks: loops of one process on
+        one node take turns."""
         with self._guard:
-            return self._turns.setdefault((url, node), Turns())
+            return self._sdo_locks.setdefault((url, node), FairLock())
 
-    def plant(self, url: str, node: int) -> threading.Lock:
-        """A plant that is run in blocks belongs to one job at a time, whatever its number of channels."""
+    def plant_lock(self, url: str, node: int) -> threading.Lock:
+        """Returns the lock of a plant that is run in blocks: it belongs to one job at a time, whatever its number of
+        channels."""
         with self._guard:
-            return self._plants.setdefault((url, node), threading.Lock())
+            return self._plant_locks.setdefault((url, node), threading.Lock())
 
     # -- heartbeat
 
     def beat_if_due(self, url: str, bus: Bus) -> float:
-        """Sends our heartbeat unless a loop of this process has just done so. The time on the clock, which it takes a
-        system call to read in some virtual machines."""
+        """Sends our heartbeat unless a loop of this process has just done so. Returns the time on the clock, which it
+        takes a system call to read in some virtual machines."""
         now = self.monotonic()
         if now - self._beats.get(url, -math.inf) >= HEARTBEAT_S:
             self.beat(url, bus, now)
@@ -71,8 +76,8 @@ class Station:
         bus.send(heartbeat_id(self.node), HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL))
 
     def join(self, url: str) -> None:
-        """To be called before a loop beats. Where we have not beaten for a while it listens first, for a gateway with
-        our ID would keep our sessions alive. Raises NodeTaken, BusError."""
+        """Listens before a loop beats, where we have not beaten for a while: a gateway with our ID would keep our
+        sessions alive. Raises NodeTaken, BusError."""
         with self._listening:
             beaten_at = self._beats.get(url)
             if beaten_at is None or self.monotonic() - beaten_at >= self.listen_s:

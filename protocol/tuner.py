@@ -7,7 +7,7 @@ falls silent. What arrives while an SDO waits is taken in order and handed out l
 from __future__ import annotations
 
 import struct
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
@@ -92,10 +92,6 @@ class BusSample(NamedTuple):
     sp: float
 
 
-sdo_retries: Counter[str] = Counter()
-"""By bus: SDO requests that this process sent again because no answer came."""
-
-
 class Tuner:
     """The client of one loop: one channel of a controller and of the plant I/O that feeds it."""
 
@@ -135,7 +131,7 @@ class Tuner:
         self.session = 0
         """The number of the session whose lease is renewed in every wait in here; 0: none."""
         self._renewed_at = 0.0
-        self._heed_stop: Callable[[], None] = lambda: None
+        self._check_stop_request: Callable[[], None] = lambda: None
         self.mode, self.on_trial, self.sp = 0, False, 0.0
         self.session_is_open = False
         self.node_states: dict[int, int] = {}
@@ -154,12 +150,12 @@ class Tuner:
         self.beating = True
         self.station.beat(self._url, self._bus, self.station.monotonic())
 
-    def keep(self, session: int, heed_stop: Callable[[], None] = lambda: None) -> None:
+    def keep(self, session: int, check_stop_request: Callable[[], None] = lambda: None) -> None:
         """The lease of that session, just paid for, is renewed from now on; 0: no lease is any more.
 
-        heed_stop: called while the loop waits for its turn with a node; raises where somebody wants an end.
+        check_stop_request: called while the loop waits for its turn with a node; raises where somebody wants an end.
         """
-        self.session, self._renewed_at, self._heed_stop = session, self.station.monotonic(), heed_stop
+        self.session, self._renewed_at, self._check_stop_request = session, self.station.monotonic(), check_stop_request
 
     def heartbeat(self) -> float:
         """Sends our heartbeat when it is due and no other loop on this bus has sent it, and the renewal of our session.
@@ -271,11 +267,11 @@ class Tuner:
         waits_since = self.station.monotonic()
 
         def meanwhile() -> None:
-            self._heed_stop()
+            self._check_stop_request()
             if self.station.monotonic() - waits_since < TURN_S:
                 self.heartbeat()
 
-        with self.station.turns(self._url, node).take(name in _URGENT, meanwhile):
+        with self.station.sdo_lock(self._url, node).take(name in _URGENT, meanwhile):
             self._bus.set_filters(self._heard | {sdo_response_id(node)})
             try:
                 yield
@@ -291,7 +287,7 @@ class Tuner:
         self._answers.clear()
         for attempt in range(self._sdo_tries):
             if attempt:
-                sdo_retries[self._url] += 1
+                self.station.sdo_retries[self._url] += 1
             self._bus.send(sdo_request_id(node), request)
             give_up = self.station.monotonic() + self._sdo_timeout_s
             while (answer := self._answer(node, give_up)) is not None:

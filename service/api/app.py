@@ -52,16 +52,17 @@ def create_app(
     policy: Policy | None = None,
     checks: Mapping[str, operations.Check] | None = None,
     pool: Pool | None = None,
+    sdo_retries: Mapping[str, int] | None = None,
 ) -> FastAPI:
     """The API over these jobs; ends them when the server shuts down. checks: what must be well to be ready.
 
-    pool: who computes tunings; None: one of its own.
+    pool: who computes tunings; None: one of its own.  sdo_retries: by bus, as the station of this process counts them.
     """
 
     policy = policy or Policy()
     keyring = policy.keyring
     many = Fleet(jobs)
-    readings = SharedReading(jobs.live)
+    readings = SharedReading(jobs.directory.live)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -87,7 +88,8 @@ def create_app(
     app.add_middleware(Access)
     problems.install(app)
     openapi.install(app)
-    operations.install(app, jobs, operations.checks(jobs) if checks is None else checks)
+    checks = operations.checks(jobs) if checks is None else checks
+    operations.install(app, jobs, checks, {} if sdo_retries is None else sdo_retries)
 
     def views(rows: Sequence[JobRow]) -> list[JobView]:
         events = jobs.store.events_by_job([row.id for row in rows], limit=MAX_EVENTS)
@@ -102,7 +104,7 @@ def create_app(
         "/loops/{tag}", tags=["loops"], summary="A loop and its present state", responses=problems.responses(404, 503)
     )
     def loop(tag: Tag) -> LoopDetail:
-        config, host = jobs.owner(tag)
+        config, host = jobs.directory.owner(tag)
         not_home = next(iter(jobs.aftercare.not_home(tag)), None)
         try:
             state = readings.of(tag)
@@ -110,7 +112,7 @@ def create_app(
             if not_home is None:
                 raise
             state = None
-        of_it = jobs.store.busy().get(tag), jobs.store.last_states(tag).get(tag), jobs.locks().get(tag)
+        of_it = jobs.store.busy().get(tag), jobs.store.last_states(tag).get(tag), jobs.locking.locks().get(tag)
         shown = loop_view(config, host, *of_it)
         return LoopDetail(
             **shown,
@@ -125,7 +127,7 @@ def create_app(
         responses=problems.responses(404, 409, 422),
     )
     def dismiss(tag: Tag, decision: Annotated[Decision | None, Body()] = None) -> DismissedView:
-        found = jobs.dismiss(tag, (decision or Decision()).by)
+        found = jobs.aftercare.dismiss(tag, (decision or Decision()).by)
         return DismissedView(loop=tag, jobs=[f"/jobs/{job_id}" for job_id in found])
 
     @app.post(
@@ -215,7 +217,7 @@ def create_app(
         responses=problems.responses(404, 409, 422, 503),
     )
     def accept(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
-        return view(jobs.accept(job_id, (decision or Decision()).by))
+        return view(jobs.decisions.accept(job_id, (decision or Decision()).by))
 
     @app.post(
         "/jobs/{job_id}/rollback",
@@ -224,9 +226,9 @@ def create_app(
         responses=problems.responses(404, 409, 422, 503),
     )
     def rollback(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
-        return view(jobs.rollback(job_id, (decision or Decision()).by))
+        return view(jobs.decisions.rollback(job_id, (decision or Decision()).by))
 
-    app.include_router(locks.router(jobs))
+    app.include_router(locks.router(jobs.locking))
     app.include_router(previews.router(jobs, many))
     app.include_router(tunings.router(jobs, pool or Pool()))
     return app

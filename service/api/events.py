@@ -78,8 +78,7 @@ def _progress(jobs: Jobs, job_id: str) -> str:
     running = jobs.running(job_id)
     if running is None:
         return ""
-    running.keep_time()
-    live = running.progress
+    live = running.progress_now()
     remaining = live.remaining_s
     return json.dumps(
         {

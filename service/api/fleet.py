@@ -84,9 +84,9 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Jo
             str | None, Query(max_length=64, description="From the URL of the next page, as it came")
         ] = None,
     ) -> list[LoopView]:
-        busy, last, locks = jobs.store.busy(), jobs.store.last_states(), jobs.locks()
+        busy, last, locks = jobs.store.busy(), jobs.store.last_states(), jobs.locking.locks()
         found: list[LoopView] = []
-        for config, host in sorted(jobs.everywhere(), key=lambda one: one[0].tag):
+        for config, host in sorted(jobs.directory.everywhere(), key=lambda one: one[0].tag):
             if cursor is not None and config.tag <= cursor:
                 continue
             if not _is(state, config.tag in busy, last.get(config.tag)):
@@ -105,7 +105,7 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Jo
         responses={**LINK, **problems.responses(404, 422)},
     )
     def history(tag: Tag, response: Response, limit: Limit = 50, cursor: Cursor = None) -> list[JobView]:
-        jobs.owner(tag)
+        jobs.directory.owner(tag)
         rows = jobs.store.recent(tag, None, limit + 1, cursor)
         if len(rows) > limit:
             more(response, f"/loops/{tag}/jobs", rows[limit - 1].number, limit=limit)

@@ -295,8 +295,7 @@ def _progress(
 ) -> tuple[float, float | None, float]:
     """Fraction, remaining and present plant time; of a job on another host as of its last stage."""
     if running is not None:
-        running.keep_time()
-        live = running.progress
+        live = running.progress_now()
         return live.fraction, live.remaining_s, live.plant_time_s
     if state not in ACTIVE:
         return 1.0, 0.0, row.plant_time_s

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from loopwright.service.api import problems
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.job_views import Decision, LockView
-from loopwright.service.jobs.manager import Jobs
+from loopwright.service.jobs.locking import Locking
 
 _ONE_LINE = r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$"
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
@@ -49,7 +49,7 @@ class UnlockedView(BaseModel):
     was_locked: LockView | None = Field(description="null: it was not locked")
 
 
-def router(jobs: Jobs) -> APIRouter:
+def router(locking: Locking) -> APIRouter:
     """POST /loops/{tag}/lock and /loops/{tag}/unlock."""
     routes = APIRouter(tags=["loops"], route_class=JsonRoute)
 
@@ -59,7 +59,7 @@ def router(jobs: Jobs) -> APIRouter:
         responses=problems.responses(404, 409, 422),
     )
     def lock(tag: Tag, wish: Annotated[LockWish, Body()]) -> LockedView:
-        row, running = jobs.lock(tag, wish.reason, wish.by)
+        row, running = locking.lock(tag, wish.reason, wish.by)
         url = note = None
         if running is not None:
             url = f"/jobs/{running.id}"
@@ -73,7 +73,7 @@ def router(jobs: Jobs) -> APIRouter:
         responses=problems.responses(404, 422),
     )
     def unlock(tag: Tag, decision: Annotated[Decision | None, Body()] = None) -> UnlockedView:
-        row = jobs.unlock(tag, (decision or Decision()).by)
+        row = locking.unlock(tag, (decision or Decision()).by)
         return UnlockedView(loop=tag, was_locked=None if row is None else LockView.of(row))
 
     return routes

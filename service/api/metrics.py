@@ -12,7 +12,6 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
-from loopwright.protocol.tuner import sdo_retries
 from loopwright.service.config import LoopConfig
 from loopwright.service.job_states import ACTIVE, JobState, shown
 from loopwright.service.store import looked_after
@@ -24,8 +23,8 @@ MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
 
 class _OfTheStore(Collector):
-    def __init__(self, loops: Mapping[str, LoopConfig], store: Store) -> None:
-        self._loops, self._store = loops, store
+    def __init__(self, loops: Mapping[str, LoopConfig], store: Store, sdo_retries: Mapping[str, int]) -> None:
+        self._loops, self._store, self._sdo_retries = loops, store, sdo_retries
 
     def collect(self) -> Iterable[Metric]:
         loops = GaugeMetricFamily("loopwright_loops", "Configured loops", labels=["bus"])
@@ -35,7 +34,7 @@ class _OfTheStore(Collector):
         retries = CounterMetricFamily(
             "loopwright_sdo_retries", "SDO requests sent again for want of an answer", labels=["bus"]
         )
-        for bus, count in sorted(sdo_retries.items()):
+        for bus, count in sorted(self._sdo_retries.items()):
             retries.add_metric([bus], count)
         yield retries
         up = GaugeMetricFamily("loopwright_database_up", "1: the database answers")
@@ -70,10 +69,10 @@ class _OfTheStore(Collector):
         return found
 
 
-def registry(loops: Mapping[str, LoopConfig], store: Store) -> CollectorRegistry:
-    """Everything that /metrics shows of a service."""
+def registry(loops: Mapping[str, LoopConfig], store: Store, sdo_retries: Mapping[str, int]) -> CollectorRegistry:
+    """Everything that /metrics shows of a service. sdo_retries: by bus, as the station of this process counts them."""
     found = CollectorRegistry()
-    for collector in (*OF_THIS_PROCESS, _OfTheStore(loops, store)):
+    for collector in (*OF_THIS_PROCESS, _OfTheStore(loops, store, sdo_retries)):
         found.register(collector)
     return found
 

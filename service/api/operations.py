@@ -132,7 +132,7 @@ def checks(jobs: Jobs) -> dict[str, Check]:
         if not jobs.engine.alive():
             raise RuntimeError("the engine does not run: the log says why; restart the service")
 
-    urls = sorted({loop.bus for loop in jobs.loops.values()})
+    urls = sorted({loop.bus for loop in jobs.directory.loops.values()})
     return {"database": database, "engine": engine, **{f"bus {url}": BusWatch(url).check for url in urls}}
 
 
@@ -148,11 +148,11 @@ def loops_looked_after(jobs: Jobs) -> dict[str, Check]:
     return {f"loop {found.loop}": part(found) for found in jobs.aftercare.not_home()}
 
 
-def install(app: FastAPI, jobs: Jobs, parts: Mapping[str, Check]) -> None:
+def install(app: FastAPI, jobs: Jobs, parts: Mapping[str, Check], sdo_retries: Mapping[str, int]) -> None:
     """Adds the routes."""
     router = APIRouter(tags=["operations"])
     readiness = Readiness(parts, lambda: loops_looked_after(jobs))
-    counted = metrics.registry(jobs.loops, jobs.store)
+    counted = metrics.registry(jobs.directory.loops, jobs.store, sdo_retries)
 
     @router.get("/healthz", summary="Is the process alive")
     async def healthz() -> Alive:

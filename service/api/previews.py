@@ -32,7 +32,7 @@ def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
     )
     def one(tag: Tag, options: Annotated[RetuneRequest | None, Body()] = None) -> Preview:
         request = options or RetuneRequest()
-        config, _ = jobs.owner(tag)
+        config, _ = jobs.directory.owner(tag)
         return preview(config, request, _now(jobs, tag, request), _last(jobs.store.last_models(tag).get(tag)))
 
     @routes.post(
@@ -67,14 +67,14 @@ def _now(jobs: Jobs, tag: str, request: RetuneRequest) -> Now:
         return Now(state, active_job=active.id, locked=locked, stopping=jobs.stopping)
     found = Now(active_job=None if active is None else active.id, locked=_locked(jobs).get(tag), stopping=jobs.stopping)
     try:
-        return replace(found, state=jobs.live(tag))
+        return replace(found, state=jobs.directory.live(tag))
     except Ended as silent:
         return replace(found, silent=silent)
 
 
 def _locked(jobs: Jobs) -> dict[str, str]:
     """Of each loop that is locked, by whom, since when and why."""
-    return {tag: loop_locks.words(row) for tag, row in jobs.locks().items()}
+    return {tag: loop_locks.words(row) for tag, row in jobs.locking.locks().items()}
 
 
 def _last(row: JobRow | None) -> LastProposal | None:

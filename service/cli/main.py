@@ -135,7 +135,7 @@ def serve(
 
     from sqlalchemy.exc import SQLAlchemyError
 
-    from loopwright.protocol.process import node_id
+    from loopwright.protocol.device_process import node_id
     from loopwright.service.api.gate.limits import RequestLimits
     from loopwright.service.config import ConfigError
     from loopwright.service.execution.computing.limits import ComputingLimits

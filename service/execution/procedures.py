@@ -82,7 +82,8 @@ def tune(
 ) -> Outcome:
     """The procedure asked for on the live loop. workers: who computes, by default a thread."""
     from loopwright.service.execution.beside import Computing
-    from loopwright.service.execution.runner import Watch, run
+    from loopwright.service.execution.guard import Watch
+    from loopwright.service.execution.runner import run
 
     facts = facts_of(config, state)
     broken = broken_limits(config, request, state.sp)

@@ -16,7 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from loopwright.controller.channel import Channel, RelaySettings, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant, Process
-from loopwright.service.execution.runner import RunResult, Watch, run
+from loopwright.service.execution.guard import Watch
+from loopwright.service.execution.runner import RunResult, run
 from loopwright.service.jsonable import to_jsonable
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Restored

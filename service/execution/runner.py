@@ -6,11 +6,11 @@ the session is closed, the controller brings the loop home, and what it came to 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
+from loopwright.service.execution.guard import Guard, Watch
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.tuning.plan import (
@@ -36,21 +36,6 @@ CHUNK_S = 1.0
 """Samples are handed on by so many, or by so much plant time: what a service that dies takes with it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Watch:
-    """PV limits (PV units), permitted MV (MV units, held from the first command on), time budget (plant s), how many
-    samples in a row may be missing, and for how long PV may stay exactly the same while MV is away from where it was
-    (plant s; longer than any dead time)."""
-
-    pv_low: float = -math.inf
-    pv_high: float = math.inf
-    mv_low: float = -math.inf
-    mv_high: float = math.inf
-    max_time_s: float = math.inf
-    max_gap_samples: int = 5
-    max_frozen_s: float = math.inf
-
-
 @dataclass(slots=True)
 class RunResult(Generic[T]):
     """value: the plan's result, or ended: why there is none.  restored: the loop as read back, None if it could not
@@ -61,49 +46,6 @@ class RunResult(Generic[T]):
     ended: Ended | None = None
     restored: LoopState | None = None
     plant_time_s: dict[str, float] = field(default_factory=dict)
-
-
-class Guard:
-    """Checks each sample against the watch. Another's hand on the loop is the controller's to see."""
-
-    def __init__(self, watch: Watch, state: LoopState) -> None:
-        self._watch = watch
-        self._dt = state.sample_time_s
-        self._start: float | None = None
-        self._last = 0.0
-        self._acting = False
-        self._slack = 0.01 * min(watch.mv_high - watch.mv_low, 1e300)
-        self._pv = math.nan
-        self._mv = math.nan
-        self._frozen_at = 0.0
-        self._notable = 1e-3 * abs(state.mv_high - state.mv_low)
-
-    def commanded(self) -> None:
-        """The plan acts on the loop from now on."""
-        self._acting = True
-
-    def check(self, sample: Sample) -> None:
-        t, _, pv, mv, _ = sample
-        watch = self._watch
-        if not (math.isfinite(pv) and math.isfinite(mv)):
-            raise Failed(Reason.BAD_SAMPLE, f"at {t:.3f} s PV is {pv}, MV is {mv}")
-        if self._start is None:
-            self._start = t
-        elif t - self._last > (watch.max_gap_samples + 1.5) * self._dt:
-            raise Failed(Reason.SAMPLES_LOST, f"{(t - self._last) / self._dt - 1:.0f} samples missing before {t:.3f} s")
-        self._last = t
-        if not watch.pv_low <= pv <= watch.pv_high:
-            raise Failed(Reason.PV_LIMIT, f"PV {pv:.5g} left {watch.pv_low:.5g} .. {watch.pv_high:.5g} at {t:.3f} s")
-        if self._acting and not watch.mv_low - self._slack <= mv <= watch.mv_high + self._slack:
-            raise Failed(Reason.MV_LIMIT, f"MV {mv:.5g} left {watch.mv_low:.5g} .. {watch.mv_high:.5g} at {t:.3f} s")
-        if t - self._start > watch.max_time_s:
-            raise Failed(Reason.TIME_BUDGET, f"{t - self._start:.0f} s of plant time are over the budget")
-        if pv != self._pv:
-            self._frozen_at, self._pv, self._mv = t, pv, mv
-        elif abs(mv - self._mv) < self._notable:
-            self._frozen_at = t
-        elif t - self._frozen_at > watch.max_frozen_s:
-            raise Failed(Reason.PV_FROZEN, f"PV is exactly {pv:.6g} for {t - self._frozen_at:.3g} s while MV moved")
 
 
 def run(
@@ -125,86 +67,131 @@ def run(
     once, as here, where nobody waits.
     remember: told the number of the session before it is opened.  on_home: told what the loop must come back to.
     """
-    result: RunResult[T] = RunResult()
-    samples: list[Sample] = []
-    state: LoopState | None = None
-    guard: Guard | None = None
-    stage, since, now = "", 0.0, 0.0
+    return _Run(plan, loop, watch, on_event, on_samples, stop, start_work, remember, on_home).to_the_end()
 
-    def hand_on() -> None:
-        nonlocal samples
-        if samples:
-            on_samples(samples)
-            samples = []
 
-    def clock(next_stage: str) -> None:
-        nonlocal stage, since
-        if stage:
-            result.plant_time_s[stage] = result.plant_time_s.get(stage, 0.0) + now - since
-        stage, since = next_stage, now
+class _Run(Generic[T]):
+    """Carries out one run of a plan on a loop; the arguments are those of `run`."""
 
-    try:
-        state = loop.begin(stop, remember)
-        on_home(state)
-        if state.when_silent:
-            on_event(Note(f"if the controller falls silent, the plant's I/O {state.when_silent}"))
-        guard = Guard(watch, state)
-        chunk = min(CHUNK, max(1, round(CHUNK_S / state.sample_time_s)))
-        answer = next(plan)
-        commands: list[Command] = []
-        while True:
-            if answer:
-                commands = []
-                for item in answer:
-                    if isinstance(item, SetMode | SetGains | SetSetpoint | SetOutput | SetRelay):
-                        commands.append(item)
-                    elif isinstance(item, Work):
-                        start_work(item)
-                    else:
-                        if isinstance(item, StageStarted):
-                            clock(item.stage)
-                        elif isinstance(item, StageDone):
-                            hand_on()  # a stage that is done never runs again: its samples go before the word
-                        on_event(item)
-                if commands:
-                    guard.commanded()
-            elif commands:
-                commands = []
-            sample = loop.step(commands)
-            if not now:
-                since = sample.t - state.sample_time_s
-            now = sample.t
-            samples.append(sample)
-            if len(samples) >= chunk:
-                hand_on()
-            guard.check(sample)
-            reason = stop()
-            if reason is not None:
-                raise Aborted(reason, f"at {now:.3f} s of plant time, in stage {stage or 'start'}")
-            answer = plan.send(sample)
-    except StopIteration as end:
-        result.value = end.value
-    except Ended as ended:
-        result.ended = ended
-    except MemoryError:
-        text = f"no memory was left at {now:.3f} s of plant time, in stage {stage or 'start'}"
-        result.ended = Failed(Reason.COMPUTATION_LIMIT, text)
-    except Exception as defect:
-        result.ended = Failed(Reason.INTERNAL, f"{type(defect).__name__}: {defect}")
-        on_event(Note(f"defect in stage {stage}: {defect!r}"))
-    finally:
-        plan.close()
-    clock("")
-    if state is not None:
+    def __init__(
+        self,
+        plan: Plan[T],
+        loop: Loop,
+        watch: Watch,
+        on_event: Callable[[Event], None],
+        on_samples: Callable[[list[Sample]], None],
+        stop: Callable[[], Reason | None],
+        start_work: Callable[[Work[Any]], None],
+        remember: Callable[[int], None],
+        on_home: Callable[[LoopState], None],
+    ) -> None:
+        self._plan, self._loop, self._watch = plan, loop, watch
+        self._on_event, self._on_samples, self._on_home = on_event, on_samples, on_home
+        self._stop, self._start_work, self._remember = stop, start_work, remember
+        self._result: RunResult[T] = RunResult()
+        self._samples: list[Sample] = []
+        self._home: LoopState | None = None
+        self._stage, self._since, self._now = "", 0.0, 0.0
+
+    def to_the_end(self) -> RunResult[T]:
+        self._until_something_ends_it()
+        self._enter("")
+        if self._home is not None:
+            self._restore(self._home)
+        self._hand_on()
+        return self._result
+
+    def _until_something_ends_it(self) -> None:
+        """Notes in the result what has ended the plan; only what is no Exception passes through."""
+        result = self._result
         try:
-            restored = loop.restore(state)
+            self._pump(self._begin())
+        except StopIteration as end:
+            result.value = end.value
         except Ended as ended:
-            on_event(Note(f"restore: {ended}"))
+            result.ended = ended
+        except MemoryError:
+            result.ended = Failed(Reason.COMPUTATION_LIMIT, f"no memory was left {self._when()}")
+        except Exception as defect:
+            result.ended = Failed(Reason.INTERNAL, f"{type(defect).__name__}: {defect}")
+            self._on_event(Note(f"defect in stage {self._stage}: {defect!r}"))
+        finally:
+            self._plan.close()
+
+    def _begin(self) -> LoopState:
+        """Opens the session. From here on the loop has to be restored."""
+        home = self._home = self._loop.begin(self._stop, self._remember)
+        self._on_home(home)
+        if home.when_silent:
+            self._on_event(Note(f"if the controller falls silent, the plant's I/O {home.when_silent}"))
+        return home
+
+    def _pump(self, home: LoopState) -> None:
+        """Goes from sample to sample until the plan, the guard, the loop or somebody ends it, each by an exception."""
+        guard = Guard(self._watch, home)
+        chunk = min(CHUNK, max(1, round(CHUNK_S / home.sample_time_s)))
+        answer = next(self._plan)
+        while True:
+            commands = self._take(answer) if answer else []
+            if commands:
+                guard.commanded()
+            sample = self._loop.step(commands)
+            if not self._now:
+                self._since = sample.t - home.sample_time_s
+            self._now = sample.t
+            self._samples.append(sample)
+            if len(self._samples) >= chunk:
+                self._hand_on()
+            guard.check(sample)
+            reason = self._stop()
+            if reason is not None:
+                raise Aborted(reason, self._when())
+            answer = self._plan.send(sample)
+
+    def _take(self, answer: Sequence[Command | Event | Work[Any]]) -> list[Command]:
+        """Starts the work and passes on the events of the plan's answer; its commands are for the next step."""
+        commands: list[Command] = []
+        for item in answer:
+            if isinstance(item, SetMode | SetGains | SetSetpoint | SetOutput | SetRelay):
+                commands.append(item)
+            elif isinstance(item, Work):
+                self._start_work(item)
+            else:
+                if isinstance(item, StageStarted):
+                    self._enter(item.stage)
+                elif isinstance(item, StageDone):
+                    self._hand_on()  # a stage that is done never runs again: its samples go before the word
+                self._on_event(item)
+        return commands
+
+    def _enter(self, stage: str) -> None:
+        """Enters a stage and adds the plant time of the one that ends here.
+
+        stage: "" where there is none after it.
+        """
+        if self._stage:
+            times = self._result.plant_time_s
+            times[self._stage] = times.get(self._stage, 0.0) + self._now - self._since
+        self._stage, self._since = stage, self._now
+
+    def _hand_on(self) -> None:
+        if self._samples:
+            self._on_samples(self._samples)
+            self._samples = []
+
+    def _when(self) -> str:
+        return f"at {self._now:.3f} s of plant time, in stage {self._stage or 'start'}"
+
+    def _restore(self, home: LoopState) -> None:
+        """Restores the loop, the one way out. A loop that is not confirmed home leaves no proposal."""
+        result = self._result
+        try:
+            restored = self._loop.restore(home)
+        except Ended as ended:
+            self._on_event(Note(f"restore: {ended}"))
             if result.ended is None or result.ended.reason not in (Reason.NODE_LOST, Reason.BUS_LOST):
                 result.value, result.ended = None, ended
         else:
             result.restored = restored.state
             if restored.changed:
-                on_event(Note(f"not as before the test, and left so: {'; '.join(restored.changed.values())}"))
-    hand_on()
-    return result
+                self._on_event(Note(f"not as before the test, and left so: {'; '.join(restored.changed.values())}"))

@@ -22,7 +22,8 @@ _BLOCK_WALL_S = 1.0
 
 
 class Running:
-    """Other threads read it and may set `stop_reason`.
+    """Holds the live part of one job. The thread of the job feeds it; other threads read `progress_now` and may set
+    `stop_reason`.
 
     before_s: plant time that earlier attempts took, s: the samples of this one are counted on from there.
     """
@@ -52,7 +53,7 @@ class Running:
         self._flushed = monotonic()
 
     def on_event(self, event: Event) -> None:
-        self.keep_time()
+        self._keep_time()
         if isinstance(event, StageStarted):
             self.progress.stage_started(event)
             self._boundaries.append((self._last_t, event.stage))
@@ -70,8 +71,8 @@ class Running:
             self.tell("note", {"stage": self.progress.stage, "text": event.text})
 
     def on_samples(self, samples: list[Sample]) -> None:
-        """Samples come in the runner's blocks, which do not end where a stage does: split by the stages' times."""
-        self.keep_time()
+        """Splits samples by the times of the stages: the runner's blocks do not end where a stage does."""
+        self._keep_time()
         for sample in samples:
             while self._boundaries and sample.t > self._boundaries[0][0]:
                 self.flush()
@@ -87,7 +88,11 @@ class Running:
             self._buffer = []
         self._flushed = self._monotonic()
 
-    def keep_time(self) -> None:
+    def progress_now(self) -> Progress:
+        """Returns the progress at the latest sample; reading it changes nothing here."""
+        return self.progress.seen_at(self.loop.t_s if self.loop else None)
+
+    def _keep_time(self) -> None:
         """Brings the progress up to the latest sample."""
         t = self.loop.t_s if self.loop else None
         if t is not None:

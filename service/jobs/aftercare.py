@@ -6,20 +6,16 @@ A thread of its own: a loop whose node is away takes seconds to say so, and abor
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from loopwright.service.config import LoopConfig
+from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.loop_state import state_json
-from loopwright.service.loops.loop import Loop
 from loopwright.service.loops.restoration import Restoration, look
 from loopwright.service.machine import Machine
 from loopwright.service.store import looked_after
-from loopwright.service.store.store import Store
+from loopwright.service.store.store import Busy, Store
 from loopwright.service.store.tables import JobRow
 from loopwright.service.telemetry.logs import about
 from loopwright.tuning.reasons import ADVICE, Reason
@@ -45,7 +41,7 @@ class NotHome:
 
     @property
     def words(self) -> str:
-        """What is the matter, and what to do."""
+        """Says what is the matter, and what to do."""
         if self.reason in _UNREACHED:
             advice = ADVICE[self.reason]
         else:
@@ -68,20 +64,12 @@ class _Again:
 class Aftercare:
     """Looks after the loops of one host.
 
-    hands: by loop, who is about to begin a job on it or to decide one; taken for each look.
-    machine: its clock and threads.
+    directory: its loops; each look at one is made alone with it.  machine: its clock and threads.
     """
 
-    def __init__(
-        self,
-        loops: Mapping[str, LoopConfig],
-        store: Store,
-        open_loop: Callable[[LoopConfig], Loop],
-        hands: Mapping[str, AbstractContextManager[Any]],
-        machine: Machine | None = None,
-    ) -> None:
-        self._loops, self._store, self._open_loop, self._hands = loops, store, open_loop, hands
-        self._machine = machine or Machine()
+    def __init__(self, directory: LoopDirectory, store: Store, machine: Machine) -> None:
+        self._directory, self._store = directory, store
+        self._machine = machine
         self._clock = self._machine.monotonic
         self._again: dict[str, _Again] = {}
         # Apart from the event: a signal handler sets it.
@@ -97,7 +85,7 @@ class Aftercare:
         self._stopping = True
 
     def close(self) -> None:
-        """The same, and waits for the look in progress."""
+        """Looks at nothing more, and waits for the look in progress."""
         self._stopping = True
         self._over.set()
         if self._thread.is_alive():
@@ -106,7 +94,7 @@ class Aftercare:
                 log.error("a loop that is looked after has not answered in %.0f s, the service ends", _STOP_S)
 
     def not_home(self, loop: str | None = None) -> list[NotHome]:
-        """This host's loops that are looked after, or whether one is, on whatever host; a loop once."""
+        """Returns this host's loops that are looked after, or whether one is, on whatever host; a loop once."""
         found: dict[str, NotHome] = {}
         for row in looked_after.rows(self._store, loop):
             found.setdefault(row.loop, self._not_home(row))
@@ -118,6 +106,17 @@ class Aftercare:
             return NotHome(row.loop, row.id, again.found.reason, again.found.text)
         reason = Reason(row.reason) if row.reason else None
         return NotHome(row.loop, row.id, reason, row.detail or "it was not read back")
+
+    def dismiss(self, tag: str, by: str) -> list[str]:
+        """Lets a person answer for a loop that is looked after: it is not looked at any more. Returns the jobs it was
+        looked after for, none when it was not. Raises UnknownLoop, Busy."""
+        if not looked_after.rows(self._store, tag):
+            self._directory.owner(tag)
+            return []
+        active = self._store.active(tag)
+        if active is not None:
+            raise Busy(tag, active.id)
+        return looked_after.dismissed(self._store, tag, by)
 
     def look(self) -> None:
         """Looks at every loop whose time has come."""
@@ -140,11 +139,11 @@ class Aftercare:
                 log.exception("looking after loop %s", row.loop)
 
     def _look_at(self, row: JobRow) -> None:
-        with self._hands[row.loop]:
+        with self._directory.alone_with(row.loop):
             # The job that has it answers for it: the row may be older than its beginning.
             if self._stopping or self._store.active(row.loop) is not None:
                 return
-            found = look(row, self._loops, self._open_loop)
+            found = look(row, self._directory.loops, self._directory.open_loop)
         if found.state is None:
             self._not_yet(row, found)
         elif looked_after.home_again(self._store, row.id, state_json(found.state), found.text):

@@ -79,6 +79,7 @@ class Fleet:
 
     def __init__(self, jobs: Jobs) -> None:
         self._jobs = jobs
+        self._directory = jobs.directory
         self._store = jobs.store
         self._wake = threading.Event()
         self._over = threading.Event()
@@ -239,13 +240,13 @@ class Fleet:
                 continue  # it has just ended
 
     def _known(self) -> dict[str, tuple[LoopConfig, str]]:
-        return {config.tag: (config, host) for config, host in self._jobs.everywhere()}
+        return {config.tag: (config, host) for config, host in self._directory.everywhere()}
 
     def _max(self, place: tuple[str, ...], request: FleetRequest) -> int:
         if place[0] == _AREA:
             return request.at_once_per_area or sys.maxsize
         _, host, bus = place
-        allows = self._jobs.at_once(bus) if host == self._store.host else BusConfig().at_once
+        allows = self._directory.at_once(bus) if host == self._store.host else BusConfig().at_once
         return min(allows, request.at_once_per_bus or allows)
 
 

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 from loopwright.tuning.plan import StageStarted
 
 
 class Progress:
-    """Fed with stages and with plant time; answers a fraction that never falls, and the remaining plant seconds."""
+    """Fed with stages and with plant time; answers a fraction that never falls, and the remaining plant seconds.
+
+    Answering changes nothing: whoever only reads asks a copy (`seen_at`) that is brought up to the latest sample.
+    """
 
     def __init__(self, before_s: float = 0.0) -> None:
         """before_s: plant time that earlier attempts of the job took, s."""
         self.stage: str | None = None
         self._before_s = before_s
-        self._fraction = 0.0
+        self._reached = 0.0  # the fraction at the end of the stage before
         self._start_s: float | None = None
         self._now_s = 0.0
         self._stage_start_s = 0.0
@@ -21,6 +26,7 @@ class Progress:
         self._known = False
 
     def stage_started(self, event: StageStarted) -> None:
+        self._reached = self.fraction
         self.stage = event.stage
         self._stage_start_s = self._now_s
         self._expected_s, self._after_s = event.expected_s, event.remaining_s
@@ -31,6 +37,13 @@ class Progress:
         if self._start_s is None:
             self._start_s = self._now_s = self._stage_start_s = t_s
         self._now_s = t_s
+
+    def seen_at(self, t_s: float | None) -> Progress:
+        """A copy at that plant time, or as it is where it is later already; None: as it is."""
+        found = copy(self)
+        if t_s is not None:
+            found.at(max(t_s, found._now_s))
+        return found
 
     @property
     def plant_time_s(self) -> float:
@@ -55,7 +68,7 @@ class Progress:
     def fraction(self) -> float:
         """0 to 1; stays below 1 until the job has ended."""
         remaining = self.remaining_s
-        if remaining is not None:
-            total = self.plant_time_s + remaining
-            self._fraction = max(self._fraction, min(0.99, self.plant_time_s / total if total > 0 else 0.0))
-        return self._fraction
+        if remaining is None:
+            return self._reached
+        total = self.plant_time_s + remaining
+        return max(self._reached, min(0.99, self.plant_time_s / total if total > 0 else 0.0))

@@ -27,8 +27,11 @@ MAX_ATTEMPTS = 10
 
 @dataclass(frozen=True)
 class Recovery:
-    """resumes: whether such jobs go on.  stopping: whether this service is to end before it has begun: what it has not
-    looked at yet is left to the next start."""
+    """Recovers the jobs that a dead service left.
+
+    resumes: whether such jobs go on.  stopping: whether this service is to end before it has begun: what it has not
+    looked at yet is left to the next start.
+    """
 
     loops: Mapping[str, LoopConfig]
     store: Store
@@ -61,7 +64,7 @@ class Recovery:
             self.store.move(row.id, JobState.INTERRUPTED, reason=reason.value, detail=detail, **restored)
 
     def _why_not(self, row: JobRow, safe: Restoration | None) -> tuple[Reason, str] | None:
-        """Why a job is not to be resumed, if so."""
+        """Returns why a job is not to be resumed, None where it is."""
         config = self.loops.get(row.loop)
         if row.version != WORKFLOW_VERSION:
             return Reason.SERVICE_STOPPED, "it was begun by another version of Loopwright"
@@ -82,7 +85,7 @@ class Recovery:
         return None
 
     def _locked(self, loop: str) -> str | None:
-        """Who has locked the loop, in words. A job that has not begun yet is refused at its turn."""
+        """Says who has locked the loop, None where nobody has. A job that has not begun yet is refused at its turn."""
         try:
             with self.store.reading() as session:
                 loop_locks.check(session, loop)

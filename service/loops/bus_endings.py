@@ -42,7 +42,7 @@ def why_over(reading: BusReading, number: int, pv_silence_s: float) -> Ended:
     match cause:
         case Cause.HAND:
             hand = hand_of(tuner)
-            moved = [told for bit, told in _HANDS.items() if bit in hand]
+            moved = [entry for bit, entry in _HANDS.items() if bit in hand]
             reason = moved[0][0] if moved else Reason.MODE_CHANGED
             return Aborted(reason, f"another hand on the loop: {', '.join(name for _, name, _ in moved)}")
         case Cause.PV_LIMIT:

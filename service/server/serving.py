@@ -38,9 +38,11 @@ from loopwright.service.execution.procedures import Tune, rehearse
 from loopwright.service.execution.procedures import tune as live
 from loopwright.service.execution.rehearsals import apart
 from loopwright.service.jobs.dbos_engine import POLL_S, DurableEngine
-from loopwright.service.jobs.manager import Jobs, LoopFactory
+from loopwright.service.jobs.loop_directory import LoopFactory
+from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.retention import Keep, Retention
 from loopwright.service.loops.loop import Loop
+from loopwright.service.server.assembly import make_jobs
 from loopwright.service.server.signals import Signals
 from loopwright.service.server.watchdog import Watchdog, interval_s
 from loopwright.service.store.database import BadDatabase
@@ -177,10 +179,11 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
             )
         policy = Policy(keyring, setup.limits, local_only=True)
         engine = DurableEngine(setup.data, store.engine if store.shared else None, store.host, setup.poll_s)
-        jobs = Jobs(
+        station = Station(setup.node)
+        jobs = make_jobs(
             site.loops,
             store,
-            open_loop or partial(open_bus_loop, Station(setup.node)),
+            open_loop or partial(open_bus_loop, station),
             tune or partial(live, workers=pool),
             apart(rehearse, pool),
             engine=engine,
@@ -190,7 +193,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         stack.callback(jobs.stop)
         retention = stack.enter_context(closing(Retention(store, engine, setup.keep)))
         checks = {**operations.checks(jobs), "samples": retention.note}
-        app = create_app(jobs, policy, checks, pool)
+        app = create_app(jobs, policy, checks, pool, station.sdo_retries)
         server = _Server(server_config(app, setup, listener, descriptors), jobs)
 
         def end() -> None:

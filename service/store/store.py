@@ -280,7 +280,7 @@ class Store:
             loop_locks.check(session, row.loop)
             append(session, job_id, _BEGUN, {"decision": DECISIONS[wanted], "by": by}, row.plant_time_s)
 
-    def resumed(self, job_id: str, told: dict[str, Any], **columns: Any) -> None:
+    def resumed(self, job_id: str, details: dict[str, Any], **columns: Any) -> None:
         """Notes that an active job has begun another attempt. Raises IllegalMove when it is over, Locked."""
         with self.writing() as session:
             row = _find(session, job_id, lock=True)
@@ -289,7 +289,7 @@ class Store:
                 raise IllegalMove(state, JobState.RUNNING)
             _may_begin(session, row)
             set_columns(row, columns)
-            append(session, job_id, "resumed", told, row.plant_time_s)
+            append(session, job_id, "resumed", details, row.plant_time_s)
 
     def note(self, job_id: str, **columns: Any) -> None:
         """Sets columns of an active job."""
@@ -327,17 +327,17 @@ class Store:
         with self._session() as session:
             return set(session.scalars(select(JobRow.id).where(JobRow.id.in_(job_ids), JobRow.state.in_(_ACTIVE))))
 
-    def wishes_to_stop(self) -> dict[str, str]:
+    def stop_requests(self) -> dict[str, str]:
         """The reason by job, for the active jobs of this host that somebody wants to stop."""
         mine = (JobRow.host == self.host, JobRow.state.in_(_ACTIVE), JobRow.stop_reason.is_not(None))
         with self._session() as session:
             rows = session.execute(select(JobRow.id, JobRow.stop_reason).where(*mine))
             return {row.id: row.stop_reason for row in rows}
 
-    def wish_to_stop(self, job_id: str, reason: str, by: str, heard: bool = False) -> JobRow:
+    def request_stop(self, job_id: str, reason: str, by: str, heard: bool = False) -> JobRow:
         """Notes that the job is to stop, once. Raises IllegalMove when it is over.
 
-        heard: the job knows of this wish already, and may have ended for it by now.
+        heard: the job knows of this request already, and may have ended for it by now.
         """
         with self.writing() as session:
             row = _find(session, job_id, lock=True)
@@ -495,12 +495,12 @@ def is_shown_as(state: JobState) -> ColumnElement[bool]:
 
 def event_of(job_id: str, kind: str, data: dict[str, Any], plant_time_s: float, **columns: Any) -> Write:
     """An event, at the time it happened, and what it changes in the job's row."""
-    at, told = now(), to_jsonable(data)
+    at, details = now(), to_jsonable(data)
 
     def write(session: Session) -> None:
         row = _find(session, job_id, lock=True)
         set_columns(row, {"plant_time_s": plant_time_s, **columns})
-        append(session, job_id, kind, told, plant_time_s, at)
+        append(session, job_id, kind, details, plant_time_s, at)
 
     return write
 
@@ -557,9 +557,9 @@ def _move(session: Session, row: JobRow, wanted: JobState, by: str, columns: dic
         row.started_at = now()
     elif previous in ACTIVE:
         row.ended_at = now()
-    told = {"state": wanted.value, "from": previous.value, "by": by}
-    told |= {key: columns[key] for key in ("reason", "detail") if columns.get(key)}
-    append(session, row.id, "state", told, row.plant_time_s)
+    details = {"state": wanted.value, "from": previous.value, "by": by}
+    details |= {key: columns[key] for key in ("reason", "detail") if columns.get(key)}
+    append(session, row.id, "state", details, row.plant_time_s)
     if wanted in DECISIONS:
         claims.changed(session, f"/jobs/{row.id}")
         _audit_decision(session, row, previous, wanted, by, (columns.get("restored") or {}).get("gains"))

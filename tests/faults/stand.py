@@ -19,8 +19,8 @@ from sqlalchemy import create_engine, select
 from sqlalchemy.orm import Session
 
 from loopwright.controller.device import Kept
-from loopwright.controller.memory import write
 from loopwright.controller.pid import Parameters
+from loopwright.controller.retained_state import write
 from loopwright.protocol.profile import Mode
 from loopwright.service.store.sample_blocks import Block, unpack
 from loopwright.service.store.tables import ChunkRow

@@ -16,8 +16,8 @@ from loopwright.service.api.samples import record_columns
 from loopwright.service.config import LoopConfig, parse_site
 from loopwright.service.execution.procedures import rehearse, tune
 from loopwright.service.execution.rehearsal import RehearsedLoop
-from loopwright.service.jobs.manager import Jobs
 from loopwright.service.request import RetuneRequest
+from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
@@ -57,7 +57,7 @@ def proposal(folder: Path, size: float, at_s: float, **options: Any) -> tuple[di
 
     loops = parse_site({"loops": [entry(TAG) | {"sp_deviation": 5.0}]}, "test").loops
     store, engine = Store(folder), ThreadEngine()
-    jobs = Jobs(loops, store, open_loop, tune, rehearse, engine=engine)
+    jobs = make_jobs(loops, store, open_loop, tune, rehearse, engine=engine)
     jobs.boot()
     row = jobs.start(TAG, RetuneRequest(**{"amplitude_pct": AMPLITUDE, **options}))
     for thread in list(engine._threads.values()):

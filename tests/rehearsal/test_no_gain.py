@@ -19,8 +19,8 @@ from loopwright.service.execution.procedures import rehearse as dry_run
 from loopwright.service.execution.procedures import tune
 from loopwright.service.execution.rehearsal import RehearsedLoop, rehearse
 from loopwright.service.job_states import JobState
-from loopwright.service.jobs.manager import Jobs
 from loopwright.service.request import RetuneRequest
+from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.retunes import Part
 from loopwright.service.store.store import Store
 from loopwright.tuning.analysis.margins import ultimate_point
@@ -45,7 +45,7 @@ def retuned(folder: Path, present: Gains, **options: Any) -> dict[str, Any]:
 
     loops = parse_site({"loops": [entry(TAG)]}, "test").loops
     store, engine = Store(folder), ThreadEngine()
-    jobs = Jobs(loops, store, open_loop, tune, dry_run, engine=engine)
+    jobs = make_jobs(loops, store, open_loop, tune, dry_run, engine=engine)
     jobs.boot()
     row = jobs.start(TAG, RetuneRequest(**options))
     for thread in list(engine._threads.values()):

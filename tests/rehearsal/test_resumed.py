@@ -11,8 +11,9 @@ import pytest
 from loopwright.controller.channel import Channel, Settings
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.execution.checkpoints import finished
+from loopwright.service.execution.guard import Watch
 from loopwright.service.execution.rehearsal import RehearsedLoop, _parameters
-from loopwright.service.execution.runner import Watch, run
+from loopwright.service.execution.runner import run
 from loopwright.service.jsonable import to_json_object
 from loopwright.tuning.five_stage.procedure import STAGES, Facts, Finished, Options, five_stage
 from loopwright.tuning.gains import Gains

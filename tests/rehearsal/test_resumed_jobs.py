@@ -15,6 +15,7 @@ from loopwright.service.execution.procedures import rehearse, tune
 from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.request import RetuneRequest
+from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.tuning.experiments.preflight import SETTLE
 from loopwright.tuning.fast.procedure import FAST_STAGES
@@ -68,11 +69,11 @@ def test_a_job_cut_off_in_a_stage_ends_as_one_that_was_not(tmp_path: Path, metho
         samples = [0]
 
         def dies() -> bool:
-            running = list(jobs._running.values())
+            running = list(jobs.registry.running.values())
             samples[0] += bool(running and running[0].progress.stage == dies_in)
             return samples[0] > 20
 
-        jobs = Jobs(loops, store, lambda config: Mortal(open_loop(config), dies), tune, rehearse, engine=engine)
+        jobs = make_jobs(loops, store, lambda config: Mortal(open_loop(config), dies), tune, rehearse, engine=engine)
         jobs.boot()
         return store, jobs, engine
 
@@ -95,7 +96,7 @@ def test_a_job_cut_off_in_a_stage_ends_as_one_that_was_not(tmp_path: Path, metho
     jobs.start(TAG, RetuneRequest(method=method))
     assert engine.dead.wait(60)
     assert jobs.journal.flush(10)
-    jobs._ended.set()
+    jobs.stop_watching()
     store.close()
     store, jobs, _ = service(tmp_path / "cut", None)
     row = finish(store, jobs)

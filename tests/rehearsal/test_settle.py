@@ -6,8 +6,9 @@ import pytest
 
 from benchmarks.rehearsed import entry, open_loop
 from loopwright.service.config import parse_site
+from loopwright.service.execution.guard import Watch
 from loopwright.service.execution.procedures import plan
-from loopwright.service.execution.runner import RunResult, Watch, run
+from loopwright.service.execution.runner import RunResult, run
 from loopwright.service.loops.loop import Loop
 from loopwright.service.request import RetuneRequest
 from loopwright.service.store.tables import EventRow

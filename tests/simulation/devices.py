@@ -15,8 +15,8 @@ from loopwright.controller.device import ControllerChannel, ControllerDevice
 from loopwright.plantsim.device import PlantChannel, PlantDevice
 from loopwright.plantsim.plant import LinearPlant, Plant
 from loopwright.protocol.bus import BusError
+from loopwright.protocol.device_runtime import Runtime
 from loopwright.protocol.objects import Value
-from loopwright.protocol.runtime import Runtime
 from tests.simulation.disk import Disk, PowerCut
 from tests.simulation.scheduler import Process, Simulation, Timer
 from tests.simulation.wire import Port, Wire

@@ -78,7 +78,7 @@ def told_to_end(world: World, gateway: Gateway, at_s: float) -> None:
         process, jobs = gateway.process, gateway.jobs
         if process is None or jobs is None or not process.alive:
             return
-        if jobs._running:
+        if jobs.under_test():
             simulation.after(0.1, over)
         else:
             gateway.restart_after = lambda: 1.0

@@ -17,17 +17,17 @@ from typing import Any, TypeVar
 
 from sqlalchemy import event, text
 
+from loopwright.protocol.fair_lock import FairLock
 from loopwright.protocol.station import Station
-from loopwright.protocol.turns import Turns
 from loopwright.service.config import LoopConfig
 from loopwright.service.execution.procedures import Tune
 from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.loop_state import LoopState
-from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.service.loops.bus_reading import BusReading
-from loopwright.service.loops.loop import Loop, Restored
+from loopwright.service.loops.loop import Loop
 from loopwright.service.machine import Machine
+from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import Base, JobRow
 from tests.simulation.scheduler import Killed, Process, Simulation, Task
@@ -63,7 +63,7 @@ class Lock:
         self.release()
 
 
-class SimTurns(Turns):
+class SimFairLock(FairLock):
     def __init__(self, simulation: Simulation) -> None:
         self._lock = Lock(simulation)
 
@@ -95,11 +95,11 @@ class SimStation(Station):
         self._guard = Lock(simulation)  # type: ignore[assignment]
         self._listening = Lock(simulation)  # type: ignore[assignment]
 
-    def turns(self, url: str, node: int) -> Turns:
-        return self._turns.setdefault((url, node), SimTurns(self._simulation))
+    def sdo_lock(self, url: str, node: int) -> FairLock:
+        return self._sdo_locks.setdefault((url, node), SimFairLock(self._simulation))
 
-    def plant(self, url: str, node: int) -> Any:
-        return self._plants.setdefault((url, node), Lock(self._simulation))  # type: ignore[arg-type]
+    def plant_lock(self, url: str, node: int) -> Any:
+        return self._plant_locks.setdefault((url, node), Lock(self._simulation))  # type: ignore[arg-type]
 
 
 class SimEvent:
@@ -285,32 +285,17 @@ def store(number: int) -> SimStore:
     return found
 
 
-class _Reading(BusReading):
-    told: Callable[[LoopState, float], None]
-    now: Callable[[], float]
+def noted_reading(now: Callable[[], float], note: Callable[[LoopState, float], None]) -> type[BusReading]:
+    """Readings of a bus loop that say when they were begun, and what they have found."""
 
-    def state(self) -> LoopState:
-        began = self.now()
-        found = BusReading.state(self)
-        self.told(found, began)
-        return found
+    class Reading(BusReading):
+        def state(self) -> LoopState:
+            began = now()
+            found = BusReading.state(self)
+            note(found, began)
+            return found
 
-
-class ReadLoop(BusLoop):
-    """A bus loop that says when it read what it says."""
-
-    on_state: Callable[[LoopState, float], None] = staticmethod(lambda state, began: None)
-    on_restore: Callable[[], None] = staticmethod(lambda: None)
-
-    def _reading(self, tuner: Any) -> BusReading:
-        reading = _Reading(tuner, self._node, self._plant, self._channel)
-        object.__setattr__(reading, "told", self.on_state)
-        object.__setattr__(reading, "now", self._station.monotonic)
-        return reading
-
-    def restore(self, home: LoopState, session: int | None = None) -> Restored:
-        self.on_restore()
-        return super().restore(home, session)
+    return Reading
 
 
 class Gateway:
@@ -357,7 +342,7 @@ class Gateway:
         self.store.on_statement = lambda what: self._statement(what)
 
         def boot() -> None:
-            jobs = Jobs(
+            jobs = make_jobs(
                 self._loops, self.store, lambda config: self._open_loop(station, config), self._tune, _no_rehearsal,
                 engine=SimEngine(self._given, process), machine=SimMachine(station, process),
             )  # fmt: skip

@@ -16,11 +16,12 @@ from loopwright.service.config import Limits, LoopConfig
 from loopwright.service.execution.procedures import Tune
 from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.loop_state import LoopState, state_json
+from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.service.request import RetuneRequest
 from loopwright.service.store.tables import JobRow
 from tests.simulation import plans
 from tests.simulation.devices import Controller, PlantNode
-from tests.simulation.gateway import Gateway, ReadLoop, SimStation
+from tests.simulation.gateway import Gateway, SimStation, noted_reading
 from tests.simulation.invariants import Bad, Invariants, real32
 from tests.simulation.people import Person
 from tests.simulation.scheduler import START, Runaway, Simulation
@@ -164,18 +165,15 @@ class World:
         readings: deque[tuple[dict[str, Any], float]] = deque(maxlen=20)
         self.readings[name] = readings
 
-        def open_loop(station: SimStation, config: LoopConfig) -> ReadLoop:
+        def note(state: LoopState, began: float) -> None:
+            readings.append((state_json(state), began))
+
+        def open_loop(station: SimStation, config: LoopConfig) -> BusLoop:
             station.listen_s = self.listen_s
-            loop = ReadLoop(
+            return BusLoop(
                 config.bus, config.controller_node, config.plant_node, config.channel, station=station,
-                pv_limits=(config.pv_limits.low, config.pv_limits.high),
+                pv_limits=(config.pv_limits.low, config.pv_limits.high), read=noted_reading(station.monotonic, note),
             )  # fmt: skip
-
-            def read(state: LoopState, began: float) -> None:
-                readings.append((state_json(state), began))
-
-            loop.on_state = read  # type: ignore[method-assign]
-            return loop
 
         config = self.config()
         gateway = Gateway(self.wire, name, number, node, {TAG: config}, self.tune_of, open_loop)

@@ -116,7 +116,7 @@ class Person:
             if not self.gateway.wait_until_up():
                 return False
             self.world.permit(self.gateway.store.get(job_id))
-            _, error, died = self._ask(decision, lambda jobs: getattr(jobs, decision)(job_id, "person"))
+            _, error, died = self._ask(decision, lambda jobs: getattr(jobs.decisions, decision)(job_id, "person"))
             if not died and error is None:
                 return True
             if self.gateway.store.get(job_id).state == wanted:

@@ -10,8 +10,9 @@ from typing import Any
 
 from loopwright.service.config import LoopConfig
 from loopwright.service.execution.computing.limits import Kind
+from loopwright.service.execution.guard import Watch
 from loopwright.service.execution.procedures import Hooks, Outcome, Tune, tune
-from loopwright.service.execution.runner import Watch, run
+from loopwright.service.execution.runner import run
 from loopwright.service.jsonable import to_json_object
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop

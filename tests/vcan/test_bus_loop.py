@@ -12,7 +12,8 @@ import pytest
 
 from loopwright.protocol.bus import open_bus
 from loopwright.protocol.profile import COMMAND_FRAME, channel_ids
-from loopwright.service.execution.runner import Watch, run
+from loopwright.service.execution.guard import Watch
+from loopwright.service.execution.runner import run
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.tuning.gains import Gains

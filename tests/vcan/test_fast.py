@@ -10,7 +10,8 @@ import pytest
 from benchmarks.cases import ASKED
 from benchmarks.plants import Plant, plants
 from benchmarks.tuning import cost_over_best, loop_of, span_of
-from loopwright.service.execution.runner import Watch, run
+from loopwright.service.execution.guard import Watch
+from loopwright.service.execution.runner import run
 from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.experiments.primitives import Facts

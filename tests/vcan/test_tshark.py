@@ -27,8 +27,10 @@ from loopwright.protocol.profile import (
     sdo_request_id,
     sdo_response_id,
 )
-from loopwright.service.execution.runner import Watch, run
-from loopwright.service.loops.bus_loop import WATCH_S, BusLoop
+from loopwright.service.execution.guard import Watch
+from loopwright.service.execution.runner import run
+from loopwright.service.loops.bus_loop import BusLoop
+from loopwright.service.loops.bus_session import WATCH_S
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode, Plan, SetGains, SetMode, SetRelay, SetSetpoint
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import canopen
 import pytest
 
-from loopwright.protocol.dictionary import Dictionary
 from loopwright.protocol.eds import FILES, FOLDER, eds
+from loopwright.protocol.object_dictionary import Dictionary
 from loopwright.protocol.objects import OBJECTS, Device, Shape, Type, default_of, lookup, objects_of
 from loopwright.protocol.pdos import pdo_objects
 from loopwright.protocol.profile import CONTROLLER_NODE, MAX_CHANNELS, PLANT_NODE, REVISION, channel_ids

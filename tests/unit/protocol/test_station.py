@@ -149,7 +149,7 @@ def test_a_station_beats_with_its_own_node_id() -> None:
 
 def test_turns_and_plants_are_of_the_bus_and_the_node() -> None:
     station = Station()
-    assert station.turns("a", 1) is station.turns("a", 1)
-    assert station.turns("a", 1) is not station.turns("a", 2)
-    assert station.plant("a", 1) is station.plant("a", 1)
-    assert station.plant("a", 1) is not station.plant("b", 1)
+    assert station.sdo_lock("a", 1) is station.sdo_lock("a", 1)
+    assert station.sdo_lock("a", 1) is not station.sdo_lock("a", 2)
+    assert station.plant_lock("a", 1) is station.plant_lock("a", 1)
+    assert station.plant_lock("a", 1) is not station.plant_lock("b", 1)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection
 import pytest
 
 from loopwright.protocol.bus import Bus
-from loopwright.protocol.dictionary import Dictionary
+from loopwright.protocol.object_dictionary import Dictionary
 from loopwright.protocol.objects import Device
 from loopwright.protocol.profile import (
     MV_FRAME,

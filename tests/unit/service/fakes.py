@@ -19,6 +19,7 @@ from loopwright.service.jobs.manager import Jobs
 from loopwright.service.loop_state import OPERATIONAL, LoopState, differences, same_gains
 from loopwright.service.loops.loop import Loop, Restored
 from loopwright.service.request import RetuneRequest
+from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.tuning.analysis.comparison import Predicted
 from loopwright.tuning.experiments.step_test import StepResult
@@ -275,7 +276,7 @@ class Service:
     ) -> Jobs:
         """Jobs on the same store, started."""
         settings = {"engine": ThreadEngine()} | options
-        jobs = Jobs(self.loops, self.store, open_loop, self.tune, rehearse, **settings)
+        jobs = make_jobs(self.loops, self.store, open_loop, self.tune, rehearse, **settings)
         jobs.boot()
         return jobs
 

@@ -209,7 +209,7 @@ def test_a_loop_that_is_configured_no_more_is_kept_and_can_be_dismissed(service:
     service.jobs.aftercare.look()
     (found,) = service.jobs.aftercare.not_home()
     assert "no longer configured here" in found.words
-    assert service.jobs.dismiss("GONE", "me") == [row.id] and service.jobs.aftercare.not_home() == []
+    assert service.jobs.aftercare.dismiss("GONE", "me") == [row.id] and service.jobs.aftercare.not_home() == []
 
 
 def test_it_moves_with_its_loop_to_another_host(tmp_path: Path, postgres: Server) -> None:
@@ -246,7 +246,7 @@ def test_who_asks_is_told(service: Service, clock: Clock, client: TestClient) ->
     assert ready.status_code == 503 and not part["ready"]
     for words in (row.id, STOPPED, "start it (NMT)", f"loopwright dismiss {TAG}"):
         assert words in part["detail"]
-    assert b"loopwright_loops_looked_after 1.0" in exposition(registry(service.loops, service.store))
+    assert b"loopwright_loops_looked_after 1.0" in exposition(registry(service.loops, service.store, {}))
 
 
 def test_a_loop_that_is_away_is_shown_with_what_is_known(service: Service, clock: Clock, client: TestClient) -> None:
@@ -255,7 +255,7 @@ def test_a_loop_that_is_away_is_shown_with_what_is_known(service: Service, clock
     answer = client.get(f"/loops/{TAG}")
     assert answer.status_code == 200 and answer.json()["live"] is None
     assert answer.json()["not_confirmed_home"]["reason"] == "node_lost"
-    service.jobs.dismiss(TAG, "me")
+    service.jobs.aftercare.dismiss(TAG, "me")
     assert client.get(f"/loops/{TAG}").status_code == 503
 
 
@@ -265,7 +265,7 @@ def test_ready_again_once_it_is_home(service: Service, clock: Clock, client: Tes
     service.jobs.aftercare.look()
     ready = client.get("/readyz")
     assert ready.status_code == 200 and ready.json()["parts"] == {}
-    assert b"loopwright_loops_looked_after 0.0" in exposition(registry(service.loops, service.store))
+    assert b"loopwright_loops_looked_after 0.0" in exposition(registry(service.loops, service.store, {}))
 
 
 def test_a_person_answers_for_it(service: Service, clock: Clock, client: TestClient) -> None:

@@ -14,8 +14,8 @@ from loopwright.service.api.app import create_app
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.gate.bodies import SMALL
 from loopwright.service.api.gate.places import DECIDES, kind_of
-from loopwright.service.jobs.manager import Jobs
 from loopwright.service.request import RetuneRequest
+from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from tests.unit.service.fakes import TAG, FakeController, FakeLoop, FakeTune, Service, ThreadEngine, fake_rehearse
 from tests.unit.service.postgres import Server
@@ -104,7 +104,7 @@ def test_text_that_no_database_keeps(path: str, tmp_path: Path, postgres: Server
     store = Store(tmp_path, postgres.database())
     try:
         open_loop = lambda config: FakeLoop(FakeController())  # noqa: E731
-        jobs = Jobs({}, store, open_loop, FakeTune(), fake_rehearse, engine=ThreadEngine())
+        jobs = make_jobs({}, store, open_loop, FakeTune(), fake_rehearse, engine=ThreadEngine())
         client = TestClient(create_app(jobs, checks={}), raise_server_exceptions=False)
         answer = client.get(path)
         assert answer.status_code == 422 and "NUL" in answer.json()["detail"], answer.text

@@ -29,7 +29,8 @@ from loopwright.protocol.profile import (
     heartbeat_id,
 )
 from loopwright.protocol.tuner import RENEWAL_S, TURN_S
-from loopwright.service.loops.bus_loop import CONFIRM_S, LEASE_WALL_S, BusLoop
+from loopwright.service.loops.bus_loop import BusLoop
+from loopwright.service.loops.bus_session import CONFIRM_S, LEASE_WALL_S
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Mode, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason, Refused
@@ -142,7 +143,7 @@ class TestLease:
         for _ in range(100):
             loop.step(())
         assert in_blocks.names() == [], "renewals wait for no answer"
-        loop._confirmed_at -= CONFIRM_S
+        loop.session.confirmed_at -= CONFIRM_S
         loop.step((SetSetpoint(50.1),))
         assert in_blocks.names() == [RENEWAL, "controller_session_setpoint", "controller_order_setpoint"]
 
@@ -163,7 +164,7 @@ class TestLease:
     def test_is_paid_while_others_have_their_turn_with_the_node(self, site: Site) -> None:
         """An SDO server answers one at a time, and who waits for it is alive."""
         site.begun()
-        turn = site.gateway.turns("wire", CONTROLLER_NODE).take()
+        turn = site.gateway.sdo_lock("wire", CONTROLLER_NODE).take()
         turn.__enter__()
         began_at = site.wire.clock.now
 
@@ -181,7 +182,7 @@ class TestLease:
 
     def test_is_paid_no_longer_where_whoever_has_the_turn_hangs(self, site: Site) -> None:
         site.begun()
-        turn = site.gateway.turns("wire", CONTROLLER_NODE).take()
+        turn = site.gateway.sdo_lock("wire", CONTROLLER_NODE).take()
         turn.__enter__()
         began_at = site.wire.clock.now
 
@@ -202,7 +203,7 @@ class TestLease:
         wanted: list[Reason] = []
         site.let_run()
         home = site.loop.begin(lambda: wanted[0] if wanted else None)
-        turn = site.gateway.turns("wire", CONTROLLER_NODE).take()
+        turn = site.gateway.sdo_lock("wire", CONTROLLER_NODE).take()
         turn.__enter__()
         wanted.append(Reason.OPERATOR)
         with pytest.raises(Aborted, match="had their turn"):
@@ -229,7 +230,7 @@ class TestLease:
         _, number = site.begun()
         assert site.wire.clock.now - began_at > 2 * LEASE_WALL_S
         site.loop.step(())
-        assert site.controller.sessions[0].is_open and site.loop._number == number
+        assert site.controller.sessions[0].is_open and site.loop.session.number == number
 
     def test_of_a_session_that_has_ended_is_not_paid(self, in_blocks: Site) -> None:
         in_blocks.loop.begin()
@@ -268,7 +269,7 @@ class TestWaiting:
     def test_a_plant_that_another_test_runs_in_blocks_is_waited_for_until_somebody_asks_to_stop(
         self, in_blocks: Site
     ) -> None:
-        held, asked = in_blocks.gateway.plant("wire", PLANT_NODE), 0
+        held, asked = in_blocks.gateway.plant_lock("wire", PLANT_NODE), 0
 
         def stop() -> Reason | None:
             nonlocal asked
@@ -297,7 +298,7 @@ class TestWaiting:
         gateway.before = samples
         with pytest.raises(Aborted, match="brought to a halt"):
             in_blocks.loop.begin(lambda: Reason.OPERATOR if number > 100 else None)
-        assert not gateway.plant("wire", PLANT_NODE).locked(), "the plant was given back"
+        assert not gateway.plant_lock("wire", PLANT_NODE).locked(), "the plant was given back"
 
     def test_a_plant_that_runs_again_while_it_is_halted_is_told_once_more(self, in_blocks: Site) -> None:
         gateway, number, told = in_blocks.gateway, 0, 0

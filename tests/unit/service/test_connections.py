@@ -80,7 +80,7 @@ def test_readers_of_a_silent_node_keep_nobody_waiting(service: Service, stack: E
     def open_loop(config: Any) -> Loop:
         return FakeLoop(service.controller) if config.tag == TAG else SilentLoop(service, asked, over)
 
-    service.jobs._open_loop = open_loop
+    service.jobs.directory.open_loop = open_loop
     door = open_door(stack, service)
     job = running(service, door)
     ask = "GET /loops/FIC-2 HTTP/1.1\nHost: 127.0.0.1\n\n"

@@ -178,7 +178,7 @@ def test_the_engines_file_is_made_anew(tmp_path: Path, caplog: pytest.LogCapture
 
 def test_a_job_that_only_the_engine_knows_is_said(service: Service, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.ERROR)
-    service.jobs.work("0123456789ab")
+    service.jobs.worker.work("0123456789ab")
     assert "job 0123456789ab was begun and is not in the database" in caplog.text
 
 
@@ -231,7 +231,7 @@ def test_damage_under_the_running_service(service: Service, client: TestClient) 
     part = answer.json()["parts"]["database"]
     assert answer.status_code == 503 and "loopwright check-data" in part["detail"]
     until(lambda: service.jobs.stopping and service.controller.session == 0)
-    until(lambda: not service.jobs._running)
+    until(lambda: not service.jobs.under_test())
     assert service.controller.state.gains == OLD and not service.controller.state.on_trial
     refused = client.post("/loops/FIC-2/retune", json={})
     assert refused.status_code == 503 and "damaged" in refused.json()["detail"]

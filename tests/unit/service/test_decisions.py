@@ -62,7 +62,7 @@ def half_accepted(service: Service, request: pytest.FixtureRequest) -> str:
     with pytest.MonkeyPatch.context() as patch:
         error = half_way(service, patch)
         with pytest.raises(error):
-            service.jobs.accept(job_id, "me")
+            service.jobs.decisions.accept(job_id, "me")
     assert (service.store.get(job_id).state, service.controller.state.gains) == ("proposed", NEW)
     return job_id
 
@@ -73,13 +73,13 @@ def holds(service: Service, gains: Gains) -> bool:
 
 
 def test_a_second_click_finishes_the_first(service: Service, half_accepted: str) -> None:
-    row = service.jobs.accept(half_accepted, "me")
+    row = service.jobs.decisions.accept(half_accepted, "me")
     assert row.state == "accepted" and holds(service, NEW)
     assert row.restored is not None and row.restored["gains"]["Kp"] == NEW.Kp
 
 
 def test_what_was_half_accepted_is_taken_back_on_the_controller(service: Service, half_accepted: str) -> None:
-    row = service.jobs.rollback(half_accepted, "me")
+    row = service.jobs.decisions.rollback(half_accepted, "me")
     assert row.state == "rolled_back" and holds(service, OLD)
     last = audit.trail(service.store.engine, 1)[0]
     assert last.before is not None and last.after is not None
@@ -89,7 +89,7 @@ def test_what_was_half_accepted_is_taken_back_on_the_controller(service: Service
 def test_a_loop_that_is_not_reached_is_not_said_to_have_its_old_gains(service: Service, half_accepted: str) -> None:
     service.controller.absent = Reason.NODE_LOST
     with pytest.raises(Failed):
-        service.jobs.rollback(half_accepted, "me")
+        service.jobs.decisions.rollback(half_accepted, "me")
     assert service.store.get(half_accepted).state == "proposed"
 
 
@@ -98,9 +98,9 @@ def test_gains_put_in_by_hand_after_a_half_acceptance_stay_and_the_job_can_be_de
 ) -> None:
     service.controller.by_hand(gains=BY_HAND)
     with pytest.raises(Conflict, match="somebody changed the gains"):
-        service.jobs.accept(half_accepted, "me")
+        service.jobs.decisions.accept(half_accepted, "me")
     assert service.store.get(half_accepted).state == "proposed"
-    row = service.jobs.rollback(half_accepted, "me")
+    row = service.jobs.decisions.rollback(half_accepted, "me")
     assert row.state == "rolled_back" and holds(service, BY_HAND)
     assert row.restored is not None and row.restored["gains"]["Kp"] == BY_HAND.Kp
     assert row.detail is not None and "somebody else's, left as they are" in row.detail
@@ -111,10 +111,10 @@ def test_gains_put_in_by_hand_after_a_half_acceptance_stay_and_the_job_can_be_de
 
 def test_gains_put_in_by_hand_after_an_acceptance_stay_and_it_is_not_taken_back(service: Service) -> None:
     job_id = proposed(service)
-    service.jobs.accept(job_id, "me")
+    service.jobs.decisions.accept(job_id, "me")
     service.controller.by_hand(gains=BY_HAND)
     with pytest.raises(Conflict, match="somebody changed the gains in between; retune instead"):
-        service.jobs.rollback(job_id, "me")
+        service.jobs.decisions.rollback(job_id, "me")
     assert holds(service, BY_HAND) and service.store.get(job_id).state == "accepted"
 
 
@@ -148,20 +148,20 @@ def test_an_acceptance_that_wrote_nothing_is_rolled_back_without_writing(service
 
     monkeypatch.setattr(FakeLoop, "accept", lost)
     with pytest.raises(Failed):
-        service.jobs.accept(job_id, "me")
-    assert service.jobs.rollback(job_id, "me").state == "rolled_back" and holds(service, OLD)
+        service.jobs.decisions.accept(job_id, "me")
+    assert service.jobs.decisions.rollback(job_id, "me").state == "rolled_back" and holds(service, OLD)
     assert begun(service, job_id) == ["accept"]
 
 
 def test_a_half_rollback_is_finished_by_the_next(service: Service) -> None:
     job_id = proposed(service)
-    service.jobs.accept(job_id, "me")
+    service.jobs.decisions.accept(job_id, "me")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(service.store, "move", full)
         with pytest.raises(OperationalError):
-            service.jobs.rollback(job_id, "me")
+            service.jobs.decisions.rollback(job_id, "me")
     assert holds(service, OLD) and service.store.get(job_id).state == "accepted"
-    assert service.jobs.rollback(job_id, "me").state == "rolled_back"
+    assert service.jobs.decisions.rollback(job_id, "me").state == "rolled_back"
     assert begun(service, job_id) == ["accept", "rollback"]
 
 
@@ -170,19 +170,19 @@ def test_a_decision_that_cannot_be_written_down_does_not_touch_the_loop(service:
     with monkeypatch.context() as patch:
         patch.setattr(service.store, "begin_decision", full)
         with pytest.raises(OperationalError):
-            service.jobs.accept(job_id, "me")
+            service.jobs.decisions.accept(job_id, "me")
     assert holds(service, OLD) and service.controller.open == 0
     service.controller.absent = Reason.NODE_LOST
-    assert service.jobs.rollback(job_id, "me").state == "rolled_back"  # nothing was begun: no need of the bus
+    assert service.jobs.decisions.rollback(job_id, "me").state == "rolled_back"  # nothing was begun: no need of the bus
 
 
 def test_a_conflict_begins_nothing(service: Service) -> None:
     job_id = proposed(service)
     service.controller.state = replace(service.controller.state, gains=BY_HAND)
     with pytest.raises(Conflict):
-        service.jobs.accept(job_id, "me")
+        service.jobs.decisions.accept(job_id, "me")
     assert begun(service, job_id) == []
-    assert service.jobs.rollback(job_id, "me").state == "rolled_back" and holds(service, BY_HAND)
+    assert service.jobs.decisions.rollback(job_id, "me").state == "rolled_back" and holds(service, BY_HAND)
 
 
 def test_what_another_host_has_declined_meanwhile_is_not_written(service: Service, monkeypatch: Patch) -> None:
@@ -196,5 +196,5 @@ def test_what_another_host_has_declined_meanwhile_is_not_written(service: Servic
 
     monkeypatch.setattr(FakeLoop, "read", slow)
     with pytest.raises(IllegalMove):
-        service.jobs.accept(job_id, "me")
+        service.jobs.decisions.accept(job_id, "me")
     assert service.store.get(job_id).state == JobState.ROLLED_BACK and holds(service, OLD)

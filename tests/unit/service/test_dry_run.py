@@ -140,7 +140,7 @@ def test_a_controller_that_is_not_there_is_said_so_and_hinders_nothing(service: 
 
 def test_then_the_gains_are_those_that_the_last_job_left(service: Service) -> None:
     job_id = proposed(service)
-    service.jobs.accept(job_id, "me")
+    service.jobs.decisions.accept(job_id, "me")
     service.controller.absent = Reason.NODE_LOST
     view = dry_run(service)
     on = view.rehearsed_on
@@ -215,7 +215,7 @@ def test_dry_runs_of_earlier_versions_are_shown_as_rehearsed(service: Service, c
     for decision in ("accept", "rollback"):
         assert client.post(f"/jobs/{row.id}/{decision}").status_code == 409
     assert service.controller.state.gains == OLD
-    told = exposition(registry(service.loops, service.store)).decode()
+    told = exposition(registry(service.loops, service.store, {})).decode()
     assert 'loopwright_jobs{reason="",state="rehearsed"} 1.0' in told
     assert 'loopwright_jobs{reason="",state="proposed"} 1.0' in told
     job_tables.job_report(job)

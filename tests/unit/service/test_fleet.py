@@ -18,6 +18,7 @@ from loopwright.service.job_states import JobState
 from loopwright.service.jobs.fleet import BadFleet, Fleet, FleetRequest
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.request import RetuneRequest
+from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store import audit
 from loopwright.service.store.retunes import NoSuchRetune, Part, RetuneOver
 from loopwright.service.store.store import Store
@@ -216,7 +217,7 @@ def test_a_service_killed_in_between_goes_on_with_the_same_jobs(tmp_path: Path) 
     retune = first.fleet.start(asked(pattern="A-*", at_once_per_bus=2)).id
     first.fleet.look()
     begun = [row.id for row in first.store.unfinished()]
-    first.jobs._ended.set()
+    first.jobs.stop_watching()
     first.store.close()
     again = Plant(tmp_path)
     for _ in range(5):
@@ -321,7 +322,7 @@ def idle_jobs(store: Store, entries: list[dict[str, Any]], engine: ThreadEngine)
     loops = parse_site({"loops": entries}, "test").loops
     store.own_loops({tag: config.model_dump(mode="json") for tag, config in loops.items()})
     engine.launch(lambda job_id: None, {})
-    return Jobs(loops, store, lambda config: FakeLoop(FakeController()), FakeTune(), fake_rehearse, engine=engine)
+    return make_jobs(loops, store, lambda config: FakeLoop(FakeController()), FakeTune(), fake_rehearse, engine=engine)
 
 
 def test_loops_of_another_host_are_begun_there_and_any_host_may_abort(tmp_path: Path, postgres: Server) -> None:
@@ -336,7 +337,7 @@ def test_loops_of_another_host_are_begun_there_and_any_host_may_abort(tmp_path: 
     there = Fleet(b)
     there.look()  # not its own: nothing more is begun
     assert there.abort(retune, "gateway B").state == "stopping" and len(engine.enqueued) == 4
-    assert len(stores["a"].wishes_to_stop()) == 3 and stores["b"].unfinished() == []
+    assert len(stores["a"].stop_requests()) == 3 and stores["b"].unfinished() == []
     for jobs in (a, b):
         jobs.stop()
     fleet.look()

@@ -158,7 +158,7 @@ def test_what_the_document_allows(label: str, site: Site) -> None:
         body=BODIES.get(label, st.none()),
     )
     def run(case: Any, known: bool, pick: int, body: Any) -> None:
-        site.service.jobs.unlock(TAG, "nobody")  # what an example before may have locked
+        site.service.jobs.locking.unlock(TAG, "nobody")  # what an example before may have locked
         if known:  # else nearly every answer would be a 404
             retune = site.retune(label == ABORT_MANY) if "retune_id" in case.path_parameters else ""
             names = {"tag": TAG, "job_id": site.running() if label == ABORT else site.jobs[pick], "retune_id": retune}

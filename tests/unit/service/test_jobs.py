@@ -14,8 +14,9 @@ from loopwright.service.execution.procedures import rehearse
 from loopwright.service.job_states import IllegalMove, JobState
 from loopwright.service.jobs import manager as jobs_module
 from loopwright.service.jobs.progress import Progress
+from loopwright.service.jobs.until_answered import STOP_PATIENCE_S
 from loopwright.service.loop_state import LoopState
-from loopwright.service.loops.bus_loop import RESTORE_PATIENCE_S
+from loopwright.service.loops.bus_restore import RESTORE_PATIENCE_S
 from loopwright.service.loops.loop import Restored
 from loopwright.service.request import RetuneRequest
 from loopwright.service.store import audit
@@ -39,7 +40,7 @@ def test_stopping_ends_the_jobs_and_waits_for_their_loops(service: Service) -> N
 def test_a_job_that_does_not_end_holds_the_stop_up_for_a_while_only(
     service: Service, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(jobs_module, "_ENDS_S", 0.2)
+    monkeypatch.setattr(jobs_module, "ENDS_S", 0.2)
     inside, free = threading.Event(), threading.Event()
 
     def hangs(loop: FakeLoop, home: LoopState, session: int | None = None) -> Restored:
@@ -64,7 +65,7 @@ def test_a_job_that_does_not_end_holds_the_stop_up_for_a_while_only(
 
 
 def test_the_stop_waits_longer_than_any_restore() -> None:
-    assert jobs_module._ENDS_S > RESTORE_PATIENCE_S + 3 * jobs_module._STOP_PATIENCE_S
+    assert jobs_module.ENDS_S > RESTORE_PATIENCE_S + 3 * STOP_PATIENCE_S
 
 
 def test_what_a_dead_service_left_is_marked_at_the_next_start(tmp_path: Path) -> None:
@@ -103,6 +104,31 @@ def test_progress_never_falls_and_ends_below_one() -> None:
             seen.append(progress.fraction)
     assert seen == sorted(seen) and 0.9 < seen[-1] < 1.0
     assert progress.remaining_s == pytest.approx(1.0)
+
+
+def test_who_reads_the_progress_changes_nothing() -> None:
+    progress = Progress()
+    progress.stage_started(StageStarted("a", 10.0, 90.0))
+    progress.at(100.0)
+    before = vars(progress).copy()
+    seen = progress.seen_at(105.0)
+    assert (seen.plant_time_s, seen.remaining_s) == (5.0, 95.0) and seen.fraction == pytest.approx(0.05)
+    assert progress.seen_at(99.0).plant_time_s == progress.seen_at(None).plant_time_s == 0.0
+    assert vars(progress) == before and progress.fraction == 0.0
+
+
+def test_a_job_that_is_looked_at_is_as_before(service: Service) -> None:
+    service.tune.hold.clear()
+    row = service.jobs.start(TAG, RetuneRequest())
+    assert service.tune.inside.wait(60)
+    running = service.jobs.running(row.id)
+    assert running is not None and running.loop is not None
+    before = vars(running.progress).copy()
+    at_first = running.loop.t_s or 0.0
+    while (running.loop.t_s or 0.0) < at_first + 1.0:
+        time.sleep(0.005)
+    views = [job_view(service.store.get(row.id), service.store.events(row.id), running) for _ in range(2)]
+    assert views[0].plant_time_s > 0.5 and vars(running.progress) == before
 
 
 @pytest.mark.parametrize("method", ["fast", "five-stage"])
@@ -154,7 +180,7 @@ def test_a_running_job_hears_of_an_abort_that_the_database_does_not_take(
     service.tune.hold.clear()
     row = service.jobs.start(TAG, RetuneRequest())
     assert service.tune.inside.wait(60)
-    monkeypatch.setattr(service.store, "wish_to_stop", gone)
+    monkeypatch.setattr(service.store, "request_stop", gone)
     with pytest.raises(OperationalError):
         service.jobs.abort(row.id, "me")
     service.wait(row.id, 60)
@@ -166,7 +192,7 @@ def test_a_running_job_hears_of_an_abort_that_the_database_does_not_take(
 def test_a_job_that_ends_for_an_abort_before_it_is_written_down_was_aborted_by_it(
     service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write = service.store.wish_to_stop
+    write = service.store.request_stop
 
     def slow(job_id: str, *more: Any) -> JobRow:
         service.wait(job_id, 60)
@@ -175,7 +201,7 @@ def test_a_job_that_ends_for_an_abort_before_it_is_written_down_was_aborted_by_i
     service.tune.hold.clear()
     row = service.jobs.start(TAG, RetuneRequest())
     assert service.tune.inside.wait(60)
-    monkeypatch.setattr(service.store, "wish_to_stop", slow)
+    monkeypatch.setattr(service.store, "request_stop", slow)
     assert service.jobs.abort(row.id, "me").state == "aborted"
     (told,) = [each for each in audit.trail(service.store.engine, 10) if each.what == "abort"]
     assert (told.subject, told.said_by) == (row.id, "me")

@@ -24,10 +24,10 @@ from loopwright.service.config import LoopConfig, parse_site
 from loopwright.service.errors import Conflict, Locked
 from loopwright.service.execution.procedures import Hooks, Outcome
 from loopwright.service.job_states import IllegalMove
-from loopwright.service.jobs.manager import Jobs
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.service.request import RetuneRequest
+from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store import database
 from loopwright.service.store.database import FILE
 from loopwright.service.store.store import Busy, Store
@@ -170,7 +170,7 @@ class JobsMachine(RuleBasedStateMachine):
     # the service
     def boot(self) -> None:
         self.store, self.engine = Store(self.folder), HandEngine()
-        self.service = Jobs(
+        self.service = make_jobs(
             parse_site({"loops": ENTRIES}, "test").loops, self.store, self.open, self.tune, self.rehearse,
             engine=self.engine,
         )  # fmt: skip
@@ -318,7 +318,7 @@ class JobsMachine(RuleBasedStateMachine):
     @rule(which=WHICH)
     def accept(self, which: int) -> None:
         job = self.one(which, lambda job: job.state == "proposed")
-        if self.decide(job, "accept", self.service.accept, ("proposed",)):
+        if self.decide(job, "accept", self.service.decisions.accept, ("proposed",)):
             job.state, self.gains[job.loop] = "accepted", job.act.new
             self.said("accept", "accepted")
 
@@ -326,7 +326,7 @@ class JobsMachine(RuleBasedStateMachine):
     @rule(which=WHICH)
     def rollback(self, which: int) -> None:
         job = self.one(which, lambda job: job.state in ("proposed", "accepted"))
-        if self.decide(job, "rollback", self.service.rollback, ("proposed", "accepted")):
+        if self.decide(job, "rollback", self.service.decisions.rollback, ("proposed", "accepted")):
             if job.state == "accepted":
                 assert job.old is not None
                 self.gains[job.loop] = job.old
@@ -346,7 +346,7 @@ class JobsMachine(RuleBasedStateMachine):
     @rule(loop=st.sampled_from(TAGS))
     def lock(self, loop: str) -> None:
         """What runs goes on, and is named."""
-        _, found = self.service.lock(loop, "valve", "me")
+        _, found = self.service.locking.lock(loop, "valve", "me")
         self.locked.add(loop)
         job = self.having(loop)
         runs = job is not None and job.state == "running"
@@ -359,20 +359,19 @@ class JobsMachine(RuleBasedStateMachine):
         """And try to take it back: by chance alone that takes thousands of steps."""
         job = next(job for job in reversed(self.jobs) if job.state == "accepted")
         self.lock(job.loop)
-        assert not self.decide(job, "rollback", self.service.rollback, ("proposed", "accepted"))
+        assert not self.decide(job, "rollback", self.service.decisions.rollback, ("proposed", "accepted"))
 
     @precondition(lambda self: self.locked)
     @rule()
     def unlock(self) -> None:
-        assert self.service.unlock(self.locked.pop(), "me") is not None
+        assert self.service.locking.unlock(self.locked.pop(), "me") is not None
         self.said("unlock", "done")
 
     @precondition(lambda self: any(job.begun for job in self.jobs))
     @rule(goes_back=st.booleans())
     def crash(self, goes_back: bool) -> None:
         """kill -9 and the next start; the controllers have ended their sessions meanwhile, or not yet."""
-        self.service._ended.set()
-        self.service._watcher.join()
+        self.service.stop_watching()
         self.service.aftercare.close()
         for job in self.jobs:
             if job.begun:

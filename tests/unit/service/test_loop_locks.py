@@ -29,6 +29,7 @@ from loopwright.service.jobs.manager import Jobs
 from loopwright.service.loop_state import LoopState, state_json
 from loopwright.service.request import RetuneRequest
 from loopwright.service.security.keys import Scope
+from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store import audit, loop_locks
 from loopwright.service.store.backup import back_up, restore
 from loopwright.service.store.keyring import Keyring
@@ -100,7 +101,7 @@ def test_a_loop_that_is_not_there(service: Service, client: TestClient) -> None:
     assert_problem(locked(client, tag="NONE"), 404)
     assert_problem(client.post("/loops/NONE/unlock"), 404)
     with pytest.raises(UnknownLoop):
-        service.jobs.lock("NONE", WHY, "me")
+        service.jobs.locking.lock("NONE", WHY, "me")
 
 
 def test_no_test_begins_but_a_rehearsal_may(service: Service, client: TestClient) -> None:
@@ -145,7 +146,7 @@ def test_a_lock_that_comes_as_a_decision_reads_the_loop(
     read = FakeLoop.read
 
     def slow(loop: FakeLoop, beside_tests: bool = False) -> LoopState:
-        service.jobs.lock(TAG, WHY, "me")
+        service.jobs.locking.lock(TAG, WHY, "me")
         return read(loop)
 
     with monkeypatch.context() as patch:
@@ -159,10 +160,10 @@ def test_a_lock_waits_for_a_decision_that_writes(service: Service) -> None:
     """When it is answered, nothing writes any more."""
     job = proposed(service)
     with held_acceptances() as (inside, free), ThreadPoolExecutor(2) as pool:
-        decision = pool.submit(service.jobs.accept, job, "me")
+        decision = pool.submit(service.jobs.decisions.accept, job, "me")
         assert inside.wait(10)
-        lock = pool.submit(service.jobs.lock, TAG, WHY, "me")
-        while not service.jobs.locks():
+        lock = pool.submit(service.jobs.locking.lock, TAG, WHY, "me")
+        while not service.jobs.locking.locks():
             assert not lock.done()
         free.set()
         assert decision.result(10).state == "accepted" and lock.result(10)[1] is None
@@ -195,7 +196,7 @@ def test_a_job_that_waited_is_refused_at_its_turn(tmp_path: Path) -> None:
     engine = HandEngine()
     service = Service(tmp_path, engine=engine)
     job = service.jobs.start(TAG, RetuneRequest()).id
-    assert service.jobs.lock(TAG, WHY, "me")[1] is None  # nothing runs
+    assert service.jobs.locking.lock(TAG, WHY, "me")[1] is None  # nothing runs
     engine.begin(job)
     service.wait(job)
     row = service.store.get(job)
@@ -210,11 +211,11 @@ def test_killed_during_its_test_a_locked_loop_is_made_safe_and_not_tested_again(
     rows = {}
     for tag in first.loops:
         rows[tag] = first.jobs.start(tag, RetuneRequest()).id
-    first.jobs._ended.set()
+    first.jobs.stop_watching()
     state = state_json(first.controller.state)
     for job in rows.values():
         first.store.move(job, JobState.RUNNING, attempt=1, found=state, old_gains=state["gains"], session=7)
-    first.jobs.lock(TAG, WHY, "me")
+    first.jobs.locking.lock(TAG, WHY, "me")
     controller = first.controller
     controller.begin_session(7)
     controller.session_last = 7
@@ -263,7 +264,7 @@ def test_a_job_of_many_refused_at_its_turn_is_no_failure(tmp_path: Path) -> None
     fleet = Fleet(service.jobs)
     retune = fleet.start(FleetRequest(loops=[TAG], stop_after_failures=1)).id
     fleet.look()
-    service.jobs.lock(TAG, WHY, "me")
+    service.jobs.locking.lock(TAG, WHY, "me")
     engine.begin(engine.queued[0])
     service.wait(service.store.recent()[0].id)
     fleet.look()
@@ -274,13 +275,13 @@ def test_a_job_of_many_refused_at_its_turn_is_no_failure(tmp_path: Path) -> None
 
 def test_a_lock_outlives_the_service_and_a_back_up(tmp_path: Path) -> None:
     service = Service(tmp_path / "data")
-    service.jobs.lock(TAG, WHY, "me")
+    service.jobs.locking.lock(TAG, WHY, "me")
     service.close()
     back_up(tmp_path / "data", tmp_path / "b")
     restore(tmp_path / "b", tmp_path / "new")
     for folder in ("data", "new"):
         service = Service(tmp_path / folder)
-        assert service.jobs.locks()[TAG].reason == WHY
+        assert service.jobs.locking.locks()[TAG].reason == WHY
         with pytest.raises(Locked, match=WHY):
             service.jobs.start(TAG, RetuneRequest())
         service.close()
@@ -293,7 +294,7 @@ def test_from_another_gateway(tmp_path: Path, postgres: Server) -> None:
     engine = Deaf()
     here = idle_jobs(stores["a"], [loop_entry()], engine)
     there = idle_jobs(stores["b"], [loop_entry(tag="FIC-2")], Deaf())
-    there.lock(TAG, WHY, "gateway B")
+    there.locking.lock(TAG, WHY, "gateway B")
     with pytest.raises(Locked, match="gateway B"):
         here.start(TAG, RetuneRequest())
     for jobs in (here, there):
@@ -301,7 +302,7 @@ def test_from_another_gateway(tmp_path: Path, postgres: Server) -> None:
         assert {x["tag"]: x["locked"] and x["locked"]["by"] for x in client.get("/loops").json()} == {
             TAG: "gateway B", "FIC-2": None,
         }  # fmt: skip
-    assert here.unlock(TAG, "gateway A") is not None and there.locks() == {}
+    assert here.locking.unlock(TAG, "gateway A") is not None and there.locking.locks() == {}
     for jobs in (here, there):
         jobs.stop()
     for store in stores.values():
@@ -314,7 +315,7 @@ def racing(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[tuple[Job
     store, tune = Store(tmp_path, database), FakeTune()
     loops = parse_site({"loops": [loop_entry()]}, "test").loops
     controller = FakeController()
-    jobs = Jobs(loops, store, lambda config: FakeLoop(controller), tune, fake_rehearse, engine=ThreadEngine())
+    jobs = make_jobs(loops, store, lambda config: FakeLoop(controller), tune, fake_rehearse, engine=ThreadEngine())
     jobs.boot()
     yield jobs, tune
     tune.hold.set()
@@ -347,8 +348,8 @@ def test_locked_and_retuned_at_the_same_time(racing: tuple[Jobs, FakeTune]) -> N
             if n == 0:
                 assert tune.inside.wait(20)
             for _ in range(n % 8):  # later in each round, so that the lock comes at every point of the way
-                jobs.locks()
-            _, running = jobs.lock(TAG, WHY, "me")
+                jobs.locking.locks()
+            _, running = jobs.locking.lock(TAG, WHY, "me")
             job = asked.result(20)
             if running is not None:
                 assert running.id == job
@@ -363,7 +364,7 @@ def test_locked_and_retuned_at_the_same_time(racing: tuple[Jobs, FakeTune]) -> N
                     assert (row.state, row.reason) == ("refused", "locked"), row.detail
             if running is None:
                 assert not tune.inside.is_set(), "a test began after the lock was answered"
-            jobs.unlock(TAG, "me")
+            jobs.locking.unlock(TAG, "me")
     assert named, "no test was running in any round, not even in the first"
 
 
@@ -425,7 +426,7 @@ def test_the_commands(run: Any, service: Service) -> None:
     assert f"{TAG} was not locked" in run("unlock", TAG)
     assert json.loads(run("lock", TAG, "--reason", WHY, "--json"))["locked"]["by"].startswith("cli:")
     assert entries(service)[1][2] == entries(service)[2][2] != "night shift"
-    service.jobs.unlock(TAG, "me")
+    service.jobs.locking.unlock(TAG, "me")
 
 
 def test_the_table_of_loops_shows_it(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,8 @@ from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
 from sqlalchemy.exc import OperationalError
 
-from loopwright.protocol.tuner import Kind, Tuner, TunerError, sdo_retries
+from loopwright.protocol.station import Station
+from loopwright.protocol.tuner import Kind, Tuner, TunerError
 from loopwright.service.api import operations
 from loopwright.service.api.app import create_app
 from loopwright.service.api.operations import Readiness
@@ -141,7 +142,7 @@ def test_loops_and_jobs_are_counted(service: Service, client: TestClient) -> Non
     assert jobs == {("", "proposed"): 1, ("node_lost", "failed"): 1, ("", "running"): 1, ("", "queued"): 0}
 
 
-def test_stages_requests_samples_and_retries_are_counted(service: Service, client: TestClient) -> None:
+def test_stages_requests_and_samples_are_counted(service: Service, client: TestClient) -> None:
     before = samples(client)
     finished(service, client)
     finished(service, client, dry_run=True)
@@ -149,7 +150,6 @@ def test_stages_requests_samples_and_retries_are_counted(service: Service, clien
     client.get("/jobs/nothing")
     client.get("/nowhere/at/all")
     SAMPLES_LOST.labels("virtual:test").inc(3)
-    sdo_retries["virtual:test"] += 2
     after = samples(client)
 
     def grown(name: str, **labels: str) -> float:
@@ -165,7 +165,15 @@ def test_stages_requests_samples_and_retries_are_counted(service: Service, clien
     assert grown("loopwright_http_requests_total", method="GET", route="none", status="404") == 1
     assert grown("loopwright_http_request_seconds_count", route="/jobs/{job_id}") == 4
     assert grown("loopwright_samples_lost_total", bus="virtual:test") == 3
-    assert grown("loopwright_sdo_retries_total", bus="virtual:test") == 2
+
+
+def test_the_retries_of_the_station_are_shown(service: Service) -> None:
+    station = Station()
+    client = TestClient(create_app(service.jobs, checks={}, sdo_retries=station.sdo_retries))
+    shown = ("loopwright_sdo_retries_total", (("bus", "virtual:test"),))
+    assert shown not in samples(client)
+    station.sdo_retries["virtual:test"] += 2
+    assert samples(client)[shown] == 2
 
 
 def test_a_scrape_goes_on_without_the_database(
@@ -183,12 +191,12 @@ def test_a_scrape_goes_on_without_the_database(
 
 
 def test_an_sdo_without_answer_counts_its_retries() -> None:
-    tuner = Tuner("virtual:nobody", 0x20, None, sdo_timeout_s=0.0, sdo_tries=3)
-    before = sdo_retries["virtual:nobody"]
+    station = Station()
+    tuner = Tuner("virtual:nobody", 0x20, None, station=station, sdo_timeout_s=0.0, sdo_tries=3)
     with pytest.raises(TunerError) as caught:
         tuner.read("controller_mode")
     tuner.close()
-    assert caught.value.kind is Kind.TIMEOUT and sdo_retries["virtual:nobody"] - before == 2
+    assert caught.value.kind is Kind.TIMEOUT and station.sdo_retries == {"virtual:nobody": 2}
 
 
 # logs
@@ -215,7 +223,7 @@ def test_lines_of_a_job_carry_job_and_loop(
     told = [
         (x["message"].partition(",")[0], x["job"], x["loop"])
         for x in lines
-        if x["logger"] == "loopwright.service.jobs.manager"
+        if x["logger"] == "loopwright.service.jobs.worker"
     ]
     assert told == [
         ("job started", job, TAG), ("job proposes new gains", job, TAG),

@@ -19,6 +19,7 @@ from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.recovery import MAX_ATTEMPTS
 from loopwright.service.loop_state import LoopState, state_json
 from loopwright.service.request import RetuneRequest
+from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow
 from loopwright.tuning.gains import Gains
@@ -338,7 +339,7 @@ def test_what_could_neither_be_queued_nor_ended_does_not_begin_later(
         patch.setattr(jobs.engine, "enqueue", ThreadEngine.enqueue.__get__(jobs.engine))
         for _ in range(3):
             jobs.reconcile()
-        jobs.work(row.id)  # an engine that had taken it after all
+        jobs.worker.work(row.id)  # an engine that had taken it after all
         assert service.store.get(row.id).state == "queued" and not service.tune.inside.is_set()
     jobs.reconcile()
     row = service.store.get(row.id)
@@ -368,7 +369,7 @@ def test_what_could_not_be_queued_but_has_begun_is_stopped(service: Service, mon
 
 def test_what_could_not_be_queued_elsewhere_is_stopped_there(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its own host may have begun it by now: a job under test must not be called over."""
-    monkeypatch.setattr(service.jobs, "owner", lambda tag: (service.loops[TAG], "gateway B"))
+    monkeypatch.setattr(service.jobs.directory, "owner", lambda tag: (service.loops[TAG], "gateway B"))
     monkeypatch.setattr(service.jobs.engine, "enqueue", Broken().enqueue)
     with pytest.raises(OperationalError):
         service.jobs.start(TAG, RetuneRequest())
@@ -386,7 +387,7 @@ def test_a_service_that_does_not_come_to_its_start_leaves_the_jobs(tmp_path: Pat
 
     loops = parse_site({"loops": [loop_entry()]}, "test").loops
     controller = FakeController()
-    jobs = Jobs(loops, store, lambda config: FakeLoop(controller), FakeTune(), fake_rehearse, engine=NoStart())
+    jobs = make_jobs(loops, store, lambda config: FakeLoop(controller), FakeTune(), fake_rehearse, engine=NoStart())
     with pytest.raises(OSError, match="no engine"):
         jobs.boot()
     jobs.stop()
@@ -400,7 +401,7 @@ def test_a_service_told_to_end_before_it_has_begun_leaves_the_jobs(tmp_path: Pat
     loops = parse_site({"loops": [loop_entry()]}, "test").loops
     controller, engine = FakeController(), ThreadEngine()
     in_the_session(controller)
-    jobs = Jobs(loops, store, lambda config: FakeLoop(controller), FakeTune(), fake_rehearse, engine=engine)
+    jobs = make_jobs(loops, store, lambda config: FakeLoop(controller), FakeTune(), fake_rehearse, engine=engine)
     jobs.request_stop()
     jobs.boot()
     jobs.stop()
@@ -436,20 +437,20 @@ def test_an_abort_just_as_the_job_gets_its_turn_is_kept(
     answers: list[str] = []
     service = again(started, tmp_path, engine=Forgetful())  # has the job, and does not begin it
     as_it_gets_its_turn(monkeypatch, lambda: answers.append(service.jobs.abort(job_id, "me").state))
-    service.jobs.work(job_id)
+    service.jobs.worker.work(job_id)
     assert answers == ["aborted"] and service.jobs.running(job_id) is None
     assert not service.tune.inside.is_set() and not texts(service, job_id, "resumed")
     assert service.store.get(job_id).state == "aborted"
 
 
-def test_a_wish_to_stop_written_just_as_the_job_gets_its_turn_is_heard(
+def test_a_stop_request_written_just_as_the_job_gets_its_turn_is_heard(
     started: list[Service], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job_id = left(tmp_path)
     service = again(started, tmp_path, engine=Forgetful())
-    monkeypatch.setattr(service.jobs, "_heed", lambda *_: None)  # the watcher comes later
-    as_it_gets_its_turn(monkeypatch, lambda: service.store.wish_to_stop(job_id, Reason.OPERATOR.value, "gateway B"))
-    service.jobs.work(job_id)
+    monkeypatch.setattr(service.store, "stop_requests", dict)  # the watcher comes later
+    as_it_gets_its_turn(monkeypatch, lambda: service.store.request_stop(job_id, Reason.OPERATOR.value, "gateway B"))
+    service.jobs.worker.work(job_id)
     row = service.store.get(job_id)
     assert (row.state, row.reason) == ("aborted", "operator") and not service.tune.inside.is_set()
     monkeypatch.undo()
@@ -474,7 +475,7 @@ def test_an_abort_written_by_another_host_is_heard(service: Service) -> None:
     service.tune.hold.clear()
     row = service.jobs.start(TAG, RetuneRequest())
     service.tune.inside.wait(60)
-    service.store.wish_to_stop(row.id, Reason.OPERATOR.value, "gateway B")
+    service.store.request_stop(row.id, Reason.OPERATOR.value, "gateway B")
     service.wait(row.id)
     assert (service.store.get(row.id).state, service.controller.state) == ("aborted", HOME)
 
@@ -494,7 +495,7 @@ def test_no_loop_is_read_while_a_decision_is_carried_out(service: Service) -> No
             return super().accept(gains, instead_of)
 
     service.tune.inside.clear()
-    service.jobs._open_loop = lambda config: Slow(service.controller)
-    service.jobs.accept(first.id, "me")
+    service.jobs.directory.open_loop = lambda config: Slow(service.controller)
+    service.jobs.decisions.accept(first.id, "me")
     service.wait(seen[0])
     assert service.store.get(seen[0]).old_gains == {**state_json(HOME)["gains"], "Kp": NEW.Kp, "Ti": NEW.Ti}

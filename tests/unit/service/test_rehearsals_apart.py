@@ -13,9 +13,10 @@ import pytest
 from loopwright.service.config import LoopConfig, parse_site
 from loopwright.service.execution.computing.limits import ComputingLimits
 from loopwright.service.execution.computing.pool import Pool
+from loopwright.service.execution.guard import Watch
 from loopwright.service.execution.procedures import Hooks, Outcome, rehearse
 from loopwright.service.execution.rehearsals import apart
-from loopwright.service.execution.runner import Watch, run
+from loopwright.service.execution.runner import run
 from loopwright.service.job_states import JobState
 from loopwright.service.request import RetuneRequest
 from loopwright.tuning.plan import Event, Mode, Plan, Sample, StageStarted

@@ -13,8 +13,9 @@ import pytest
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
+from loopwright.service.execution.guard import Watch
 from loopwright.service.execution.rehearsal import RehearsedLoop
-from loopwright.service.execution.runner import RunResult, Watch, run
+from loopwright.service.execution.runner import RunResult, run
 from loopwright.service.loop_state import LoopState, differences
 from loopwright.service.loops.loop import Restored
 from loopwright.tuning.gains import Gains

@@ -18,7 +18,7 @@ from loopwright.protocol.bus import open_bus
 from loopwright.protocol.station import Station
 from loopwright.service.api.app import create_app
 from loopwright.service.execution.procedures import tune
-from loopwright.service.jobs.manager import Jobs
+from loopwright.service.server.assembly import make_jobs
 from loopwright.service.server.serving import open_bus_loop
 from tests.unit.service.bus_site import FOUND
 from tests.unit.service.fakes import TAG, Service, ThreadEngine, fake_rehearse
@@ -66,7 +66,8 @@ def test_an_abort_does_not_wait_for_the_next_sample(service: Service) -> None:
     service.jobs.stop()  # one of them at a time hears what is wanted of this host's jobs
     loops = {TAG: service.loops[TAG].model_copy(update={"t95_s": 30 * TS_S})}
     with devices("virtual:test") as controller, ExitStack() as stack:
-        jobs = Jobs(loops, service.store, partial(open_bus_loop, station), tune, fake_rehearse, engine=ThreadEngine())
+        open_loop = partial(open_bus_loop, station)
+        jobs = make_jobs(loops, service.store, open_loop, tune, fake_rehearse, engine=ThreadEngine())
         stack.callback(jobs.stop)
         jobs.boot()
         client = TestClient(create_app(jobs, checks={}), base_url="http://127.0.0.1")

@@ -156,7 +156,7 @@ def test_a_taken_port_is_found_before_anything_is_begun(tmp_path: Path, monkeypa
     def begun(*_: Any, **__: Any) -> None:
         pytest.fail("something was begun")
 
-    for name in ("Pool", "Store", "DurableEngine", "Jobs"):
+    for name in ("Pool", "Store", "DurableEngine", "make_jobs"):
         monkeypatch.setattr(serving, name, begun)
     with socket.create_server(("127.0.0.1", 0)) as other, pytest.raises(OSError):
         serving.serve(serving.Setup(loops_in(tmp_path), tmp_path / "data", "127.0.0.1", other.getsockname()[1]))

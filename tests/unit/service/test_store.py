@@ -330,7 +330,7 @@ def test_what_is_urgent_has_connections_of_its_own(store: Store) -> None:
             stack.enter_context(store.engine.connect())
         token = urgent.set(True)
         try:
-            assert store.wish_to_stop(job.id, "operator", "me").stop_reason == "operator"
+            assert store.request_stop(job.id, "operator", "me").stop_reason == "operator"
             assert store.get(job.id).stop_reason == "operator"
         finally:
             urgent.reset(token)

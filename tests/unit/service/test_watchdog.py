@@ -58,7 +58,7 @@ def test_a_watcher_that_hangs_is_told_by_silence(service: Service, monkeypatch: 
     hangs = threading.Event()
     dog = Watchdog(service.jobs.unwatched_s, service.store.ping, told.append)
     assert asyncio.run(dog.well())
-    monkeypatch.setattr(service.store, "wishes_to_stop", lambda: hangs.wait(60) and {})
+    monkeypatch.setattr(service.store, "stop_requests", lambda: hangs.wait(60) and {})
     deadline = time.monotonic() + 30
     while asyncio.run(dog.well()) and time.monotonic() < deadline:
         time.sleep(0.05)

@@ -8,7 +8,7 @@ from binascii import crc_hqx
 
 import pytest
 
-from loopwright.protocol.dictionary import Dictionary
+from loopwright.protocol.object_dictionary import Dictionary
 from loopwright.protocol.objects import Device, Value, lookup
 from loopwright.protocol.profile import Abort
 from loopwright.protocol.sdo import SdoAbort, SdoServer

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import yaml
 
 from loopwright.protocol.bus import Bus, BusError, open_bus
-from loopwright.protocol.runtime import Runtime
+from loopwright.protocol.device_runtime import Runtime
 
 
 class ConfigError(Exception):

@@ -9,7 +9,8 @@ import pytest
 from loopwright.plantsim.catalogue import find
 from loopwright.plantsim.device import PlantChannel, PlantDevice
 from loopwright.protocol.bus import BusError
-from loopwright.protocol.dictionary import Dictionary
+from loopwright.protocol.device_runtime import Runtime
+from loopwright.protocol.object_dictionary import Dictionary
 from loopwright.protocol.objects import Device, lookup
 from loopwright.protocol.profile import (
     FOREVER,
@@ -27,7 +28,6 @@ from loopwright.protocol.profile import (
     sdo_request_id,
     sdo_response_id,
 )
-from loopwright.protocol.runtime import Runtime
 from tests.unit.protocol.memory_bus import Wire
 
 NODE = 0x20
@@ -341,7 +341,7 @@ def test_trouble_with_the_bus_is_said_once(
             rig.runtime.stop()
         raise BusError(troubles.pop(0))
 
-    monkeypatch.setattr("loopwright.protocol.runtime._PAUSE_AFTER_BUS_ERROR_S", 0.0)
+    monkeypatch.setattr("loopwright.protocol.device_runtime._PAUSE_AFTER_BUS_ERROR_S", 0.0)
     monkeypatch.setattr(rig.runtime, "poll", poll)
     rig.runtime.run()
     assert capsys.readouterr().err.splitlines() == ["node 20h: bus-off", "node 20h: it is down"]

@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterable
 from functools import partial
 
 from loopwright.protocol.bus import Bus, BusError
-from loopwright.protocol.dictionary import Dictionary
 from loopwright.protocol.emergencies import Emergencies
 from loopwright.protocol.heartbeats import Consumer, Producer
+from loopwright.protocol.object_dictionary import Dictionary
 from loopwright.protocol.objects import Value
 from loopwright.protocol.profile import (
     HEARTBEAT_FRAME,

@@ -15,8 +15,8 @@ import pytest
 from loopwright.controller.__main__ import main
 from loopwright.controller.channel import Mode
 from loopwright.controller.device import Kept
-from loopwright.controller.memory import FORM, FORM_1, FileKeeper, KeptError, remembered, write
 from loopwright.controller.pid import Parameters
+from loopwright.controller.retained_state import FORM, FORM_1, FileKeeper, KeptError, remembered, write
 
 KEPT = [
     Kept(Parameters(2.5, 10.0, 1.0, 0.1, 0.8, 0.0), Mode.MANUAL, 51.5, 40.0),

@@ -1,4 +1,4 @@
-"""Turns: a lock that is had in the order in which it was asked for, what is urgent first.
+"""A lock that is had in the order in which it was asked for, what is urgent first.
 
 Python's locks are not fair: who gives one back and asks again at once has it again. Of fifty loops that begin together
 some would not be heard for seconds, and lose their lease for it.
@@ -15,8 +15,8 @@ _SLICE_S = 0.05
 """Of a wait: short enough to beat in time."""
 
 
-class Turns:
-    """`with turns.take(): ...`; not to be taken again by who is inside."""
+class FairLock:
+    """Is held by `with lock.take(): ...`; whoever holds it must not take it again."""
 
     def __init__(self) -> None:
         self._guard = threading.Lock()
@@ -26,7 +26,10 @@ class Turns:
 
     @contextmanager
     def take(self, urgent: bool = False, meanwhile: Callable[[], object] = lambda: None) -> Iterator[None]:
-        """meanwhile: called again and again while others have their turn."""
+        """Waits for the lock and holds it.
+
+        meanwhile: called again and again while others have their turn.
+        """
         self._enter(self._urgent if urgent else self._waiting, meanwhile)
         try:
             yield

@@ -1,0 +1,68 @@
+"""The limits of a run, and the guard that checks every sample against them: the second net of docs/safety.md."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from loopwright.service.loop_state import LoopState
+from loopwright.tuning.plan import Sample
+from loopwright.tuning.reasons import Failed, Reason
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """Holds the limits of a run: PV limits (PV units), permitted MV (MV units, held from the first command on), time
+    budget (plant s), how many samples in a row may be missing, and for how long PV may stay exactly the same while MV
+    is away from where it was (plant s; longer than any dead time)."""
+
+    pv_low: float = -math.inf
+    pv_high: float = math.inf
+    mv_low: float = -math.inf
+    mv_high: float = math.inf
+    max_time_s: float = math.inf
+    max_gap_samples: int = 5
+    max_frozen_s: float = math.inf
+
+
+class Guard:
+    """Checks each sample against the watch. Another's hand on the loop is the controller's to see."""
+
+    def __init__(self, watch: Watch, state: LoopState) -> None:
+        self._watch = watch
+        self._dt = state.sample_time_s
+        self._start: float | None = None
+        self._last = 0.0
+        self._acting = False
+        self._slack = 0.01 * min(watch.mv_high - watch.mv_low, 1e300)
+        self._pv = math.nan
+        self._mv = math.nan
+        self._frozen_at = 0.0
+        self._notable = 1e-3 * abs(state.mv_high - state.mv_low)
+
+    def commanded(self) -> None:
+        """Notes that the plan acts on the loop from now on."""
+        self._acting = True
+
+    def check(self, sample: Sample) -> None:
+        t, _, pv, mv, _ = sample
+        watch = self._watch
+        if not (math.isfinite(pv) and math.isfinite(mv)):
+            raise Failed(Reason.BAD_SAMPLE, f"at {t:.3f} s PV is {pv}, MV is {mv}")
+        if self._start is None:
+            self._start = t
+        elif t - self._last > (watch.max_gap_samples + 1.5) * self._dt:
+            raise Failed(Reason.SAMPLES_LOST, f"{(t - self._last) / self._dt - 1:.0f} samples missing before {t:.3f} s")
+        self._last = t
+        if not watch.pv_low <= pv <= watch.pv_high:
+            raise Failed(Reason.PV_LIMIT, f"PV {pv:.5g} left {watch.pv_low:.5g} .. {watch.pv_high:.5g} at {t:.3f} s")
+        if self._acting and not watch.mv_low - self._slack <= mv <= watch.mv_high + self._slack:
+            raise Failed(Reason.MV_LIMIT, f"MV {mv:.5g} left {watch.mv_low:.5g} .. {watch.mv_high:.5g} at {t:.3f} s")
+        if t - self._start > watch.max_time_s:
+            raise Failed(Reason.TIME_BUDGET, f"{t - self._start:.0f} s of plant time are over the budget")
+        if pv != self._pv:
+            self._frozen_at, self._pv, self._mv = t, pv, mv
+        elif abs(mv - self._mv) < self._notable:
+            self._frozen_at = t
+        elif t - self._frozen_at > watch.max_frozen_s:
+            raise Failed(Reason.PV_FROZEN, f"PV is exactly {pv:.6g} for {t - self._frozen_at:.3g} s while MV moved")

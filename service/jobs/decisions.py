@@ -1,0 +1,100 @@
+"""What becomes of a proposal: accepted, declined or taken back, and the writes to the controller that this takes."""
+
+from __future__ import annotations
+
+import threading
+
+from loopwright.service.errors import Conflict, Locked
+from loopwright.service.job_states import IllegalMove, JobState, shown
+from loopwright.service.jobs.loop_directory import LoopDirectory
+from loopwright.service.loop_state import gains_of, state_json
+from loopwright.service.loops.gain_change import ForeignGains, replace_accepted
+from loopwright.service.machine import Machine
+from loopwright.service.store import loop_locks
+from loopwright.service.store.store import Busy, Store
+from loopwright.service.store.tables import JobRow
+from loopwright.tuning.reasons import Ended, Reason
+
+WRITES_S = 10.0
+"""Wall time for which a lock waits for a decision that has begun to write to the loop: each of its few answers comes
+within a second or two."""
+
+
+class Decisions:
+    """Decides the jobs of the loops of the directory, as far as they are this host's."""
+
+    def __init__(self, store: Store, directory: LoopDirectory, machine: Machine) -> None:
+        self.store = store
+        self._directory = directory
+        self._machine = machine
+        # By loop: set once a decision that writes to its controller has ended.
+        self._writes: dict[str, threading.Event] = {}
+
+    def accept(self, job_id: str, by: str) -> JobRow:
+        """Makes the proposed gains the accepted ones of the controller, and reads them back.
+
+        After an error the decision can be asked for again, which finishes what was begun, or be rolled back.
+        """
+        return self._decide(job_id, JobState.ACCEPTED, by)
+
+    def rollback(self, job_id: str, by: str) -> JobRow:
+        """Declines a proposal (the loop has its old gains already), or takes back a change that is accepted or was
+        begun to be. Gains that somebody else has put in since stay: a proposal is declined, an accepted change is not
+        taken back (Conflict)."""
+        return self._decide(job_id, JobState.ROLLED_BACK, by)
+
+    def _decide(self, job_id: str, wanted: JobState, by: str) -> JobRow:
+        row = self.store.get(job_id)
+        with self._directory.alone_with(row.loop):
+            row = self.store.get(job_id)
+            now = shown(row.state, row.dry_run)
+            if now not in (JobState.PROPOSED, JobState.ACCEPTED) or now is wanted:
+                raise IllegalMove(now, wanted)
+            active = self.store.active(row.loop)
+            if active is not None:
+                raise Busy(row.loop, active.id)
+            if wanted is JobState.ROLLED_BACK and (declined := self.store.decline(job_id, by)) is not None:
+                return declined
+            with self.store.reading() as session:
+                loop_locks.check(session, row.loop)
+            config, host = self._directory.owner(row.loop)
+            if host != self.store.host:
+                raise Conflict(f"loop {row.loop} is on the bus of host {host}: only the service there can write to it")
+            old, new = gains_of(row.old_gains), gains_of((row.result or {}).get("gains"))
+            before, after = (old, new) if wanted is JobState.ACCEPTED else (new, old)
+            begun = self.store.decision_begun(job_id)
+            over = self._machine.event()
+
+            def begin() -> None:
+                self._writes[row.loop] = over  # a lock that finds the decision begun waits for its end
+                self.store.begin_decision(job_id, wanted, by)
+
+            try:
+                loop = self._directory.open_loop(config)
+                try:
+                    state = replace_accepted(loop, before, after, begun, begin)
+                finally:
+                    loop.close()
+            except ForeignGains as foreign:
+                # An acceptance that broke off, and then other gains by hand: there is nothing left to take back.
+                if not (begun and now is JobState.PROPOSED and wanted is JobState.ROLLED_BACK):
+                    raise
+                detail = f"declined; the controller holds {foreign.found.gains}: somebody else's, left as they are"
+                return self.store.move(job_id, wanted, by=by, restored=state_json(foreign.found), detail=detail)
+            except Locked:  # before anything was written
+                raise
+            except Ended as ended:
+                self.store.decision_failed(job_id, wanted, by, f"{ended.reason.value}: {ended.detail}")
+                if ended.reason is Reason.GAINS_CHANGED:
+                    raise Conflict(ended.detail) from ended
+                raise
+            finally:
+                self._writes.pop(row.loop, None)
+                over.set()
+            return self.store.move(job_id, wanted, by=by, restored=state_json(state))
+
+    def wait_for_writes(self, tag: str) -> bool:
+        """Waits until a decision that has begun to write to the loop has ended; returns False where it has not in
+        WRITES_S."""
+        writes = self._writes.get(tag)
+        return writes is None or writes.wait(WRITES_S)

@@ -1,0 +1,96 @@
+"""The loops that there are: their configuration, the host that has them, their present state, and who acts on one."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from typing import Any
+
+from loopwright.service.config import BusConfig, LoopConfig
+from loopwright.service.errors import UnknownLoop
+from loopwright.service.jobs.registry import Registry
+from loopwright.service.loop_state import LoopState, gains_of, loop_state
+from loopwright.service.loops.loop import Loop
+from loopwright.service.machine import Machine
+from loopwright.service.store.store import Store
+
+LoopFactory = Callable[[LoopConfig], Loop]
+
+
+class LoopDirectory:
+    """Knows the loops of every host, and opens those of this one.
+
+    loops: those of this host.  open_loop: opens one of them.  buses: what is configured for their buses.
+    machine: makes the locks of the loops.
+    """
+
+    def __init__(
+        self,
+        loops: Mapping[str, LoopConfig],
+        store: Store,
+        open_loop: LoopFactory,
+        registry: Registry,
+        machine: Machine,
+        buses: Mapping[str, BusConfig] | None = None,
+    ) -> None:
+        self.loops = loops
+        self.store = store
+        self.open_loop = open_loop
+        self._registry = registry
+        self._buses = buses or {}
+        # By loop: who is about to begin a job on it, to decide one, or to look after it.
+        self._loop_locks: defaultdict[str, AbstractContextManager[Any]] = defaultdict(machine.lock)
+
+    def alone_with(self, tag: str) -> AbstractContextManager[Any]:
+        """Returns the lock that is held while a job on the loop begins or is decided, or the loop is looked after."""
+        return self._loop_locks[tag]
+
+    def at_once(self, bus: str) -> int:
+        """Returns how many loops of one of our buses may be under test at the same time."""
+        return self._buses.get(bus, BusConfig()).at_once
+
+    def config(self, tag: str) -> LoopConfig:
+        return self.owner(tag)[0]
+
+    def owner(self, tag: str) -> tuple[LoopConfig, str]:
+        """Returns the loop's configuration, and the host that has it. Raises UnknownLoop."""
+        if tag in self.loops:
+            return self.loops[tag], self.store.host
+        row = self.store.foreign_loop(tag)
+        if row is None:
+            raise UnknownLoop(tag)
+        return LoopConfig.model_validate(row.config), row.host
+
+    def everywhere(self) -> list[tuple[LoopConfig, str]]:
+        """Returns every loop of every host: ours first."""
+        ours = [(config, self.store.host) for config in self.loops.values()]
+        return ours + [(LoopConfig.model_validate(row.config), row.host) for row in self.store.foreign_loops()]
+
+    def live(self, tag: str) -> LoopState | None:
+        """Returns the present state of a loop: from the job if one runs, else from the bus; None on another host."""
+        if tag not in self.loops:
+            self.owner(tag)
+            return None
+        active = self.store.active(tag)
+        running = self._registry.running.get(active.id) if active else None
+        state = running.loop.latest if running and running.loop else None
+        if state:
+            return state
+        return self.read(tag)
+
+    def read(self, tag: str) -> LoopState:
+        """Reads a loop of ours from the bus. Raises Ended."""
+        loop = self.open_loop(self.loops[tag])
+        try:
+            return loop.read()
+        finally:
+            loop.close()
+
+    def present(self, tag: str) -> LoopState:
+        """Returns the loop as its controller has it, or as the job that has the loop now found it. Raises Ended."""
+        active = self.store.active(tag)
+        if active is not None and active.found is not None:
+            return replace(loop_state(active.found), gains=gains_of(active.old_gains))
+        return self.read(tag)

@@ -1,0 +1,43 @@
+"""The jobs that run in this service, and whether it is to end: what manager, worker and loop directory share."""
+
+from __future__ import annotations
+
+import threading
+
+from loopwright.service.jobs.active_job import Running
+from loopwright.service.store.tables import JobRow
+
+
+class Registry:
+    """Holds the jobs that run, by id, and whether the service is to end.
+
+    stopping: set once, when the service is to end.  why_stopping: as readiness says it.
+    """
+
+    def __init__(self) -> None:
+        self.stopping = False
+        self.why_stopping = "the service is shutting down"
+        self.running: dict[str, Running] = {}
+        # By id: jobs whose asker was told that they could not be queued, and whose end could not be written either.
+        self.unqueued: dict[str, JobRow] = {}
+        # Guards the registry of running jobs and `stopping`.
+        self.lock = threading.Lock()
+
+    def enter(self, running: Running) -> bool:
+        """Adds a job that begins. Returns False where it is not to begin: it runs already, was given up, or the service
+        is to end."""
+        with self.lock:
+            if self.stopping or running.job_id in self.running or running.job_id in self.unqueued:
+                return False
+            self.running[running.job_id] = running
+            return True
+
+    def leave(self, running: Running) -> None:
+        """Removes a job whose loop is given up and whose end is written."""
+        with self.lock:
+            self.running.pop(running.job_id, None)
+        running.over.set()
+
+    def under_test(self) -> dict[str, str]:
+        """Returns the tags of the loops that a job works on, by job."""
+        return {job_id: running.tag for job_id, running in self.running.copy().items()}

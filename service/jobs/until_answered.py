@@ -1,0 +1,36 @@
+"""Asking a database that may be away for a while."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from loopwright.service.jobs.journal import temporary
+from loopwright.service.jobs.registry import Registry
+from loopwright.service.machine import Machine
+
+T = TypeVar("T")
+
+STOP_PATIENCE_S = 20.0
+_AGAIN_S = 0.5
+
+
+class UntilAnswered:
+    """Repeats a call of the database until there is an answer; while the service stops, for a while only."""
+
+    def __init__(self, machine: Machine, registry: Registry) -> None:
+        self._machine = machine
+        self._registry = registry
+
+    def __call__(self, ask: Callable[[], T]) -> T:
+        since = self._machine.monotonic()
+        while True:
+            try:
+                return ask()
+            except SQLAlchemyError as error:
+                stopping = self._registry.stopping
+                if not temporary(error) or (stopping and self._machine.monotonic() - since > STOP_PATIENCE_S):
+                    raise
+                self._machine.sleep(_AGAIN_S)

@@ -1,0 +1,222 @@
+"""The thread of a job: it runs one to its end, and writes down what came of it.
+
+It is the thread that pumps the loop (heartbeat and lease go out from `step`), so what it does between two samples is
+kept short: what it has to tell goes into the journal, which another thread writes.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import asdict
+from typing import Any
+
+from loopwright.service.config import LoopConfig
+from loopwright.service.errors import Locked
+from loopwright.service.execution.procedures import Hooks, Outcome, Rehearse, Tune
+from loopwright.service.job_states import ACTIVE, GOOD, JobState, state_after
+from loopwright.service.jobs.active_job import Running
+from loopwright.service.jobs.journal import Journal
+from loopwright.service.jobs.loop_directory import LoopDirectory
+from loopwright.service.jobs.registry import Registry
+from loopwright.service.jobs.until_answered import STOP_PATIENCE_S, UntilAnswered
+from loopwright.service.loop_state import LoopState, differences, loop_state, same_gains, state_json
+from loopwright.service.loops.loop import Loop
+from loopwright.service.loops.observed_loop import ObservedLoop
+from loopwright.service.loops.restoration import restore_abandoned
+from loopwright.service.machine import Machine
+from loopwright.service.planning.known_loop import known
+from loopwright.service.request import BadLimits, RetuneRequest, within
+from loopwright.service.store import looked_after
+from loopwright.service.store.lock import FolderInUse
+from loopwright.service.store.store import NoSuchJob, Store
+from loopwright.service.store.tables import JobRow
+from loopwright.service.telemetry.logs import about
+from loopwright.tuning.plan import Event
+from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
+
+log = logging.getLogger(__name__)
+
+
+class Worker:
+    """Runs jobs on the loops of the directory: `tune` on the loop itself, `rehearse` for a dry run."""
+
+    def __init__(
+        self,
+        store: Store,
+        journal: Journal,
+        directory: LoopDirectory,
+        registry: Registry,
+        tune: Tune,
+        rehearse: Rehearse,
+        machine: Machine,
+    ) -> None:
+        self.store = store
+        self.journal = journal
+        self._directory = directory
+        self._registry = registry
+        self._tune = tune
+        self._rehearse = rehearse
+        self._machine = machine
+        self._lasting = UntilAnswered(machine, registry)
+
+    def work(self, job_id: str) -> None:
+        """Runs a job to its end, or its rest after a crash. Called by the engine; a job that is over is left alone.
+
+        Raises FolderInUse: the job is another's by now.
+        """
+        try:
+            row = self._lasting(lambda: self.store.get(job_id))
+            before_s = self._lasting(lambda: self.store.last_sample_s(job_id)) if row.attempt else 0.0
+        except NoSuchJob:
+            log.error(
+                "job %s was begun and is not in the database: it is lost, the database is older than the engine's file "
+                "or was damaged; look at the loops, and at `loopwright check-data`",
+                job_id,
+            )
+            return
+        before_s = max(row.plant_time_s, before_s)
+        running = Running(job_id, row.loop, self.journal, before_s, self._machine.monotonic)
+        if not self._registry.enter(running):
+            return
+        try:
+            # Read anew: until it was among those that run, an abort ended it as one that waits for its turn.
+            row = self._lasting(lambda: self.store.get(job_id))
+            if JobState(row.state) not in ACTIVE:
+                return
+            if row.stop_reason is not None:
+                running.stop_reason = running.stop_reason or Reason(row.stop_reason)
+            with about(job=job_id, loop=row.loop):
+                self._to_the_end(running, row)
+        finally:
+            self._registry.leave(running)
+
+    def _to_the_end(self, running: Running, row: JobRow) -> None:
+        log.info("job started, attempt %d", row.attempt + 1)
+        try:
+            self._finish(running, self._run(running, row), row.dry_run)
+        except FolderInUse as error:
+            log.error("the end of the job is another's to write: %s", error)
+            raise
+        except Exception:
+            log.exception("the end of the job could not be written")
+
+    def _run(self, running: Running, row: JobRow) -> Outcome:
+        try:
+            request = RetuneRequest.model_validate(row.request)
+            config = within(self._directory.config(row.loop), request)
+            run = self._dry if row.dry_run else self._live
+            return run(running, row, config, request)
+        except Ended as ended:
+            return Outcome(None, ended, None, {})
+        except BadLimits as error:
+            return Outcome(None, Failed(Reason.BAD_LIMITS, str(error)), None, {})
+        except Exception as error:
+            log.exception("a defect in the job")
+            return Outcome(None, Failed(Reason.INTERNAL, f"{type(error).__name__}: {error}"), None, {})
+
+    def _live(self, running: Running, row: JobRow, config: LoopConfig, request: RetuneRequest) -> Outcome:
+        self._check_stop_request(running)
+        loop = ObservedLoop(self._directory.open_loop(config))
+        try:
+            running.loop = loop
+            with self._directory.alone_with(row.loop):
+                try:
+                    state = self._begun(loop, row)
+                except Locked as locked:  # what an attempt before has left is home already
+                    return Outcome(None, locked, None if row.session is None else loop.read(), {})
+            earlier = self.store.events(row.id) if row.found is not None else ()
+            hooks = Hooks(
+                running.on_event, running.on_samples, lambda: running.stop_reason, earlier,
+                lambda session: self._lasting(lambda: self.store.note_session(row.id, session)),
+                lambda home: self._note_home(row.id, state, home),
+            )  # fmt: skip
+            return self._tune(config, request, loop, state, hooks)
+        finally:
+            loop.close()
+
+    def _note_home(self, job_id: str, read: LoopState, home: LoopState) -> None:
+        """Notes home as the controller has it since it opened the session, where a hand was faster than our reading.
+
+        The note goes through the journal: the session is open, and waits for no database.
+        """
+        columns: dict[str, Any] = {}
+        if differences(home, read):
+            columns = {"found": state_json(home), "old_gains": asdict(home.gains)}
+        self.journal.put(looked_after.opened(job_id, columns))
+        if not same_gains(home.gains, read.gains):  # the plan reckons with those that were read
+            raise Aborted(Reason.GAINS_CHANGED, "other gains were accepted as the test was about to begin")
+
+    def _begun(self, loop: Loop, row: JobRow) -> LoopState:
+        """Returns the state of the loop as an attempt begins, written down before anything is touched."""
+        if row.found is None or row.session is None:
+            # No attempt has touched it. What an earlier one had read may have been another tuner's test.
+            state = loop.read(beside_tests=True)
+            columns: dict[str, Any] = {"old_gains": asdict(state.gains), "found": state_json(state)}
+            if row.found is None:
+                self._lasting(lambda: self.store.move(row.id, JobState.RUNNING, attempt=1, **columns))
+            else:
+                self._lasting(lambda: self.store.note(row.id, **columns))
+                self._resumed(row, "the loop had not been touched")
+            return state
+        safe = restore_abandoned(loop, loop_state(row.found), row.session)
+        if safe.state is None:
+            raise Failed(safe.reason or Reason.NODE_LOST, safe.text)
+        if safe.reason is not None:
+            raise Aborted(safe.reason, safe.text)
+        self._resumed(row, safe.text)
+        return safe.state
+
+    def _dry(self, running: Running, row: JobRow, config: LoopConfig, request: RetuneRequest) -> Outcome:
+        if JobState(row.state) is JobState.QUEUED:
+            self._lasting(lambda: self.store.move(row.id, JobState.RUNNING, attempt=1))
+        else:
+            self._resumed(row, "a rehearsal begins anew")
+
+        def on_event(event: Event) -> None:
+            self._check_stop_request(running)
+            running.on_event(event)
+
+        ground = self._lasting(lambda: known(self.store, row.loop, lambda: self._directory.present(row.loop)))
+        hooks = Hooks(on_event, running.on_samples, lambda: running.stop_reason, ground=ground)
+        return self._rehearse(config, request, hooks)
+
+    def _resumed(self, row: JobRow, text: str) -> None:
+        details = {"attempt": row.attempt + 1, "text": text}
+        self._lasting(lambda: self.store.resumed(row.id, details, attempt=row.attempt + 1))
+
+    @staticmethod
+    def _check_stop_request(running: Running) -> None:
+        if running.stop_reason is not None:
+            raise Aborted(running.stop_reason, "stopped before the next stage")
+
+    def _finish(self, running: Running, outcome: Outcome, dry_run: bool) -> None:
+        running.flush()
+        while not self.journal.flush(1.0):
+            if self._registry.stopping and self.journal.behind_s > STOP_PATIENCE_S:
+                log.error("the database takes nothing, the last reports of the job are lost")
+                break
+        times = self._earlier_times(running.job_id) | outcome.plant_time_s
+        columns: dict[str, Any] = {
+            "result": outcome.result,
+            "stage_times_s": times,
+            "plant_time_s": max(running.progress.plant_time_s, running.before_s + sum(outcome.plant_time_s.values())),
+        }
+        if outcome.restored is not None:
+            columns["restored"] = state_json(outcome.restored)
+        elif self._lasting(lambda: self.store.get(running.job_id)).session is not None:
+            columns["look_after"] = True
+        state = JobState.REHEARSED if dry_run else JobState.PROPOSED
+        if outcome.ended is not None:
+            state = state_after(outcome.ended)
+            columns |= {"reason": outcome.ended.reason.value, "detail": outcome.ended.detail}
+        self._lasting(lambda: self.store.move(running.job_id, state, **columns))
+        if outcome.ended is None:
+            log.info("job is rehearsed" if dry_run else "job proposes new gains")
+        else:
+            level = logging.INFO if state in GOOD else logging.WARNING
+            log.log(level, "job %s, %s: %s", state.value, outcome.ended.reason.value, outcome.ended.detail)
+
+    def _earlier_times(self, job_id: str) -> dict[str, float]:
+        """Returns the plant time of the stages that any attempt has finished, s."""
+        events = self._lasting(lambda: self.store.events(job_id))
+        return {e.data["stage"]: e.data["stage_time_s"] for e in events if e.kind == "stage_done"}

@@ -1,0 +1,85 @@
+"""The way to one loop on a bus: its tuner, opened when it is needed, and what goes wrong there as a reason."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from loopwright.protocol.bus import BusError
+from loopwright.protocol.profile import Abort, NmtState
+from loopwright.protocol.station import NodeTaken, Station
+from loopwright.protocol.tuner import Kind, Tuner, TunerError
+from loopwright.service.loops.bus_reading import BusReading, not_operational
+from loopwright.tuning.reasons import Failed, Reason, Refused
+
+AGAIN_S = 0.05
+"""Wall time between two tries of what a controller does not do at once."""
+
+_NOT_OURS = (Abort.NO_OBJECT, Abort.NO_SUBINDEX, Abort.LENGTH, Abort.READ_ONLY, Abort.WRITE_ONLY)
+
+Read = Callable[[Tuner, int, int | None, int], BusReading]
+
+
+class BusConnection:
+    """Reaches one channel of a controller node.
+
+    plant: the plant I/O, if it offers one to ask.  station: this process on the bus.
+    read: makes the readings; a simulation notes them.
+    """
+
+    def __init__(
+        self, url: str, controller: int, plant: int | None, channel: int, station: Station, read: Read = BusReading
+    ) -> None:
+        self.url = url
+        self.controller = controller
+        self.plant = plant
+        self.channel = channel
+        self.station = station
+        self._read = read
+        self._tuner: Tuner | None = None
+
+    @contextmanager
+    def tuner(self) -> Iterator[Tuner]:
+        """Opens the tuner when it is needed; what goes wrong on the bus becomes a reason of the closed list."""
+        try:
+            if self._tuner is None:
+                self._tuner = Tuner(self.url, self.controller, self.plant, self.channel, station=self.station)
+            yield self._tuner
+        except NodeTaken as error:
+            raise Refused(Reason.LOOP_IN_USE, str(error)) from error
+        except BusError as error:
+            self.close()
+            raise Failed(Reason.BUS_LOST, str(error)) from error
+        except OSError as error:  # an interface that disappears between two calls
+            self.close()
+            text = f"bus {self.url!r} is lost ({error.strerror or error}): see that its interface is there and up"
+            raise Failed(Reason.BUS_LOST, text) from error
+        except TunerError as error:
+            if error.kind is Kind.TIMEOUT:
+                raise self._no_answer(error) from error
+            if error.code in _NOT_OURS:
+                raise Refused(Reason.DEVICE_MISMATCH, str(error)) from error
+            raise Refused(Reason.BAD_INPUT, f"the controller refused: {error}") from error
+
+    def reading(self, tuner: Tuner) -> BusReading:
+        return self._read(tuner, self.controller, self.plant, self.channel)
+
+    def stop_beating(self) -> None:
+        """Ends our heartbeat and the renewals of the lease."""
+        if self._tuner is not None:
+            self._tuner.beating = False
+            self._tuner.keep(0)
+
+    def close(self) -> None:
+        """Gives the tuner up; it is opened anew when it is needed again."""
+        if self._tuner is not None:
+            self._tuner.close()
+            self._tuner = None
+
+    def _no_answer(self, error: TunerError) -> Failed:
+        """Tells a node that is stopped, which beats and answers no SDO, from one that is gone."""
+        states = self._tuner.node_states if self._tuner is not None else {}
+        for node in (self.controller, self.plant):
+            if node is not None and states.get(node) == NmtState.STOPPED:
+                return not_operational(node, NmtState.STOPPED)
+        return Failed(Reason.NODE_LOST, str(error))

@@ -1,0 +1,74 @@
+"""The way out of a test, and of an acceptance: the session is closed, and what the controller came to is read back."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+from loopwright.protocol.tuner import Tuner, TunerError
+from loopwright.protocol.tuner_session import TunerSession
+from loopwright.service.loop_state import LoopState
+from loopwright.service.loops.bus_connection import AGAIN_S, BusConnection
+from loopwright.service.loops.bus_endings import cause_of, read_back, words_of
+from loopwright.service.loops.loop import Restored
+from loopwright.tuning.reasons import Ended, Failed, Reason
+
+RESTORE_PATIENCE_S = 4.0
+"""Wall time for which the way out is tried again."""
+
+
+def restore(connection: BusConnection, home: LoopState, number: int) -> Restored:
+    """Closes the session of that number, if it is still open, and reads the loop back.
+
+    number: 0 where no session was opened.
+    Raises Failed(RESTORE_UNCONFIRMED | NODE_NOT_OPERATIONAL).
+    """
+    station = connection.station
+    give_up = station.monotonic() + RESTORE_PATIENCE_S
+    while True:
+        try:
+            with connection.tuner() as tuner:
+                how = close_session(tuner, number) if number else "no session was opened"
+                return read_back(connection.reading(tuner), home, number, how)
+        except Ended as ended:
+            if station.monotonic() > give_up:
+                if ended.reason is Reason.NODE_NOT_OPERATIONAL:
+                    raise
+                raise Failed(Reason.RESTORE_UNCONFIRMED, ended.detail) from ended
+            station.sleep(AGAIN_S)
+
+
+def end_acceptance(connection: BusConnection, number: int, why: Ended | None) -> LoopState:
+    """Closes the session of an acceptance and reads what is accepted now.
+
+    why: the error that has cut the acceptance off, if one has; where the end of the session is not confirmed, it is
+    raised with what that means added.
+    """
+    station = connection.station
+    give_up = station.monotonic() + RESTORE_PATIENCE_S
+    while True:
+        try:
+            with connection.tuner() as tuner:
+                close_session(tuner, number)
+                return connection.reading(tuner).state()
+        except Ended as ended:
+            if station.monotonic() > give_up:
+                why = why or ended
+                text = "the end of the session is not confirmed, the controller ends it by itself within seconds"
+                raise type(why)(why.reason, f"{why.detail}; {text}: read the loop before going on") from ended
+            station.sleep(AGAIN_S)
+
+
+def close_session(tuner: Tuner, number: int) -> str:
+    """Closes the session of that number where it is still open, and says how it has ended."""
+    tuner.keep(0)
+    if int(tuner.number("controller_session")) == number:
+        session = TunerSession(tuner)
+        session.take_up(number)
+        with suppress(TunerError):  # a hand may be faster; what is read next counts
+            session.close()
+        if int(tuner.number("controller_session")) == number:
+            raise Failed(Reason.RESTORE_UNCONFIRMED, f"session {number:08X}h could not be closed")
+        return "the session was closed"
+    if int(tuner.number("controller_session_last")) == number:
+        return f"the controller had ended the session ({words_of(cause_of(tuner))})"
+    return "the controller knows nothing of the session: it has been restarted, or others have been on it since"

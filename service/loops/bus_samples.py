@@ -1,0 +1,177 @@
+"""The samples of a loop on the bus: who drives them, which of them have come, and what time that makes.
+
+A simulated plant that runs as fast as the answers come (pace 0) is run in blocks of samples: no sample is lost however
+slow we are, and commands act between two blocks, so that equal seeds give equal runs.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+
+from loopwright.protocol.profile import FOREVER, samples_between
+from loopwright.protocol.tuner import BusSample, Tuner
+from loopwright.service.loops.bus_connection import BusConnection
+from loopwright.service.loops.bus_session import BusSession
+from loopwright.service.telemetry.metrics import SAMPLES_LOST
+from loopwright.tuning.plan import Sample
+from loopwright.tuning.reasons import Ended, Failed, Reason
+
+HALT_S, HALT_AGAIN_S = 5.0, 0.5
+"""How long a plant that is run in blocks may take to halt, and when it is told once more."""
+SILENCE_S = 1.0
+"""Wall time without a sample (at least three sampling periods) after which the nodes are asked whether they live."""
+MAX_GAP = 5
+BLOCK = 10
+_SLICE_S = 0.05  # of a wait: after each, lease and stop are looked at
+_HALTED_S = 0.03  # without a sample: the plant has halted
+
+
+class BusSamples:
+    """Counts the samples of the channel of a connection from the beginning of a test.
+
+    check_stop_request: as for the session.  block: samples per block of a plant at pace 0.
+    max_gap: samples in a row that may be missing.
+    """
+
+    def __init__(
+        self,
+        connection: BusConnection,
+        session: BusSession,
+        check_stop_request: Callable[[str], None],
+        block: int,
+        max_gap: int,
+    ) -> None:
+        self.in_blocks = False
+        self.pace = 1.0
+        self.sample_time_s = 0.0
+        self._connection, self._session = connection, session
+        self._station = connection.station
+        self._check_stop_request = check_stop_request
+        self._block = block
+        self._max_gap = max_gap
+        self._plant_lock: threading.Lock | None = None
+        self._halted = False
+        self._silence_s = SILENCE_S
+        self._left = 0  # samples of the present block still to come
+        self._first_n: int | None = None
+        self._last_n = 0
+        self._passed = 0
+
+    # -- who drives the samples
+
+    def read_pace(self, tuner: Tuner) -> None:
+        self.pace = tuner.number("plant_pace") if self._connection.plant is not None else 1.0
+
+    def read_sample_time(self, tuner: Tuner) -> None:
+        self.sample_time_s = tuner.number("sample_time", node=self._connection.controller) / 1e6
+
+    def take_plant(self, tuner: Tuner) -> None:
+        """Waits for its turn on a plant that is run in blocks; before anything of ours is armed in the controller."""
+        self.read_sample_time(tuner)
+        self.read_pace(tuner)
+        self.in_blocks = self.pace == 0.0
+        plant = self._connection.plant
+        if not self.in_blocks or plant is None:
+            return
+        lock = self._station.plant_lock(self._connection.url, plant)
+        while not lock.acquire(timeout=0.1):
+            self._check_stop_request(f"while another test was using plant node {plant:02X}h")
+        self._plant_lock = lock
+
+    def begin(self, tuner: Tuner) -> None:
+        """Settles who drives the samples, the plant by its clock or we in blocks, and counts them from now on. Nobody
+        else's test may be on the plant any more."""
+        self._silence_s = max(SILENCE_S, 3.0 * self.sample_time_s / (self.pace or math.inf))
+        if self.in_blocks:
+            self._halted = True
+            self._halt(tuner)
+        elif self._connection.plant is not None and not tuner.number("plant_samples_to_run"):
+            tuner.write("plant_samples_to_run", FOREVER)
+        tuner.drain()
+        self._first_n, self._left, self._passed = None, 0, 0
+
+    def _halt(self, tuner: Tuner) -> None:
+        """Halts the plant. It is told more than once: one that is reset meanwhile runs again as it was started."""
+        give_up = self._station.monotonic() + HALT_S
+        again_at = 0.0
+        while True:
+            now = self._station.monotonic()
+            if now >= again_at:
+                tuner.write("plant_samples_to_run", 0)
+                again_at = now + HALT_AGAIN_S
+            if tuner.sample(_HALTED_S) is None:
+                return
+            self._check_stop_request("while the plant was brought to a halt")
+            self._session.confirm_if_due(tuner)
+            if now > give_up:
+                text = f"plant node {self._connection.plant:02X}h runs on although it has been told to halt (2011h)"
+                raise Failed(Reason.SAMPLES_LOST, text)
+
+    def release(self) -> None:
+        """Lets a plant that we ran in blocks run on by itself, and others take it."""
+        if self._halted:
+            with suppress(Ended), self._connection.tuner() as tuner:
+                tuner.write("plant_samples_to_run", FOREVER)
+            self._halted = False
+        if self._plant_lock is not None:
+            self._plant_lock.release()
+            self._plant_lock = None
+
+    # -- sample by sample
+
+    @property
+    def block_is_over(self) -> bool:
+        """Says whether commands act now; they always do where the plant drives the samples by its clock."""
+        return self._left <= 0
+
+    def start_block(self, tuner: Tuner) -> None:
+        if self.in_blocks:
+            tuner.write("plant_samples_to_run", self._block)
+            self._left = self._block
+
+    def next(self, tuner: Tuner) -> Sample:
+        """Waits for the next sample and counts it. Raises Failed(SAMPLES_LOST | NODE_NOT_OPERATIONAL), why the session
+        is over, and what a stop request raises."""
+        return self._count(self._wait_for_next(tuner))
+
+    def _wait_for_next(self, tuner: Tuner) -> BusSample:
+        give_up: float | None = None
+        while True:
+            found = tuner.sample(_SLICE_S)
+            self._session.check_status(tuner)
+            if found is not None and (self._first_n is None or found.n != self._last_n):  # a frame may come twice
+                return found
+            now = self._station.monotonic()
+            give_up = give_up or now + self._silence_s
+            if now > give_up:
+                raise self._silent(tuner)
+            self._session.confirm_if_due(tuner)
+            self._check_stop_request("while waiting for a sample")
+
+    def _silent(self, tuner: Tuner) -> Ended:
+        """Finds out who is silent. A node that is gone raises by its time-out."""
+        reading = self._connection.reading(tuner)
+        reading.check_controller_operational()
+        reading.check_plant_operational()
+        if not self._session.is_open(tuner):
+            return self._session.why_over(tuner)
+        return Failed(Reason.SAMPLES_LOST, f"no sample for {self._silence_s:g} s although the nodes answer")
+
+    def _count(self, found: BusSample) -> Sample:
+        first = self._first_n is None
+        if first:
+            self._first_n = found.n
+        passed = 1 if first else samples_between(self._last_n, found.n)
+        self._last_n = found.n
+        if passed < 1:
+            raise Failed(Reason.SAMPLES_LOST, f"the plant started anew: sample {found.n} after {found.n - passed}")
+        if passed > 1:
+            SAMPLES_LOST.labels(self._connection.url).inc(passed - 1)
+        if passed > self._max_gap + 1:
+            raise Failed(Reason.SAMPLES_LOST, f"{passed - 1} samples missing before sample {found.n}")
+        self._left -= passed if self.in_blocks else 0
+        self._passed += passed
+        return Sample((self._passed - 1) * self.sample_time_s, found.sp, found.pv, found.mv, found.mode)

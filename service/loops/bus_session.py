@@ -1,0 +1,159 @@
+"""Our session on a channel: the way in, its terms, and how it is kept; `bus_restore` is the way out.
+
+The session belongs to the controller (`controller.session`, decision 8). A service that hangs or dies keeps nothing:
+the session ends, and the controller brings the loop home by itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from loopwright.protocol.profile import FOREVER, Abort, Order
+from loopwright.protocol.tuner import Kind, Tuner, TunerError
+from loopwright.protocol.tuner_session import Lease, TunerSession
+from loopwright.service.loop_state import LoopState
+from loopwright.service.loops.bus_connection import AGAIN_S, BusConnection
+from loopwright.service.loops.bus_endings import why_over
+from loopwright.tuning.reasons import Ended, Reason, Refused
+
+WATCH_S = 1.5
+"""Time of the controller's clock without our heartbeat, or without PV (at least three sampling periods), after which it
+ends the session. Virtual machines were seen to stand still for 1.3 s."""
+LEASE_WALL_S = 3.0
+LEASE_IN_BLOCKS_S = 30.0
+CONFIRM_S = 10.0
+"""How often the controller is asked whether the session is still open: an SDO, which waits for its turn with others."""
+PV_SILENCE_IN_BLOCKS_S = 60.0
+"""A plant that we hold sends no PV, and a block may wait for a computation."""
+OTHERS_S = LEASE_WALL_S + 1.0
+"""How long a session of another tuner may take to end before we begin."""
+SHORTEST_LEASE = 20
+
+
+def terms(pace: float, sample_time_s: float) -> Lease:
+    """Returns what we pay for at a time. At pace 0 samples say nothing of time."""
+    if not pace:
+        samples, lease_s, silence_s = FOREVER, LEASE_IN_BLOCKS_S, PV_SILENCE_IN_BLOCKS_S
+    else:
+        samples, lease_s = math.ceil(LEASE_WALL_S * pace / sample_time_s), LEASE_WALL_S
+        silence_s = max(WATCH_S, 3.0 * sample_time_s / pace)
+    ms = (math.ceil(1000.0 * wait_s) for wait_s in (lease_s, silence_s, WATCH_S))
+    return Lease(min(max(samples, SHORTEST_LEASE), FOREVER), *ms)
+
+
+class BusSession:
+    """Opens and keeps the session that this service has on the channel of a connection.
+
+    check_stop_request: called in every wait with what is waited for; raises where somebody wants an end.
+    """
+
+    def __init__(self, connection: BusConnection, check_stop_request: Callable[[str], None]) -> None:
+        self.number = 0
+        """The number of the session that we have opened last; 0: there is none."""
+        self.confirmed_at = 0.0
+        """When the controller has last said that the session is open, on the station's clock."""
+        self._connection = connection
+        self._station = connection.station
+        self._check_stop_request = check_stop_request
+        self._session: TunerSession | None = None
+        self._lease = Lease(SHORTEST_LEASE, 1, 1, 1)
+
+    # -- the way in
+
+    def open(
+        self,
+        tuner: Tuner,
+        pace: float,
+        sample_time_s: float,
+        remember: Callable[[int], None] = lambda session: None,
+    ) -> LoopState:
+        """Opens our session and returns home."""
+
+        def note(number: int) -> None:
+            remember(number)
+            self.number = number
+
+        self._wait_for_others(tuner)
+        tuner.hold()  # not before: a process before us may have had our node-ID, and its session would hear our beats
+        self._session = TunerSession(tuner)
+        self._lease = terms(pace, sample_time_s)
+        try:
+            self._session.open(self._lease, note)
+        except TunerError as error:
+            if error.kind is Kind.ABORT:  # there is no session: nothing to close, nothing to look after
+                note(0)
+            if error.code == Abort.LOCAL_CONTROL:
+                text = "an RPDO has just moved the set-point: an outer loop, a ramp or a recipe drives it"
+                raise Refused(Reason.SETPOINT_IS_DRIVEN, text) from error
+            if error.code == Abort.DEVICE_STATE:
+                raise self._in_use(tuner) from error
+            raise
+        self.confirmed_at = self._station.monotonic()
+        tuner.keep(self.number, lambda: self._check_stop_request("while other loops had their turn with the node"))
+        tuner.restarted, tuner.session_is_open = False, True
+        home = self._connection.reading(tuner).home()
+        if tuner.session_is_open:  # else a hand was on the loop meanwhile, and the status has said so
+            tuner.mode, tuner.on_trial, tuner.sp = home.mode, False, home.sp
+        return home
+
+    def _wait_for_others(self, tuner: Tuner) -> None:
+        """The session of a tuner that has died ends within its lease; that of one that lives is not ours to end."""
+        give_up = self._station.monotonic() + OTHERS_S
+        while tuner.number("controller_session"):
+            if self._station.monotonic() > give_up:
+                raise self._in_use(tuner)
+            self._check_stop_request("while another tuner held the loop")
+            self._station.sleep(AGAIN_S)
+
+    def _in_use(self, tuner: Tuner) -> Refused:
+        self._connection.reading(tuner).check_controller_operational()
+        holder = int(tuner.number("controller_session_holder"))
+        if holder:
+            return Refused(Reason.LOOP_IN_USE, f"the tuner with node-ID {holder:02X}h holds a session on this loop")
+        if tuner.number("controller_on_trial"):
+            text = "somebody tries other gains by hand: accept them or take them back (2120h), then repeat"
+            return Refused(Reason.GAINS_CHANGED, text)
+        return Refused(Reason.LOOP_IN_USE, "another tuner had this loop in the moment of the opening")
+
+    # -- on the way
+
+    def order(self, tuner: Tuner, order: Order, *values: float) -> None:
+        assert self._session is not None
+        try:
+            self._session.give(order, values)
+        except TunerError as error:
+            if error.code in (Abort.DEVICE_STATE, Abort.INVALID_VALUE) and not self._session.is_open:
+                raise self.why_over(tuner) from error
+            raise
+
+    def confirm_if_due(self, tuner: Tuner) -> None:
+        """Asks whether the session is still ours: the tuner renews its lease by frames without an answer, and a status
+        frame that tells of its end may be lost."""
+        if self._station.monotonic() - self.confirmed_at < CONFIRM_S:
+            return
+        assert self._session is not None
+        try:
+            self._session.renew()
+        except TunerError as error:
+            if error.code == Abort.DEVICE_STATE:
+                raise self.why_over(tuner) from error
+            raise
+        self.confirmed_at = self._station.monotonic()
+
+    def check_status(self, tuner: Tuner) -> None:
+        """Raises why the session is over, where the tuner has heard so and the controller says so: a status frame from
+        before the opening may come late."""
+        if tuner.restarted or not tuner.session_is_open:
+            tuner.restarted, tuner.session_is_open = False, True
+            if not self.is_open(tuner):
+                raise self.why_over(tuner)
+
+    def is_open(self, tuner: Tuner) -> bool:
+        """Asks the controller whether our session is open."""
+        return int(tuner.number("controller_session")) == self.number
+
+    def why_over(self, tuner: Tuner) -> Ended:
+        """Returns why our session has ended without us."""
+        tuner.keep(0)
+        return why_over(self._connection.reading(tuner), self.number, self._lease.pv_silence_ms / 1000.0)

@@ -1,0 +1,57 @@
+"""The composition root of the jobs: every part is made here, once, and is given what it needs of the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from loopwright.service.config import BusConfig, LoopConfig
+from loopwright.service.execution.procedures import Rehearse, Tune
+from loopwright.service.jobs.aftercare import Aftercare
+from loopwright.service.jobs.decisions import Decisions
+from loopwright.service.jobs.engine import Engine
+from loopwright.service.jobs.journal import Journal
+from loopwright.service.jobs.locking import Locking
+from loopwright.service.jobs.loop_directory import LoopDirectory, LoopFactory
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.jobs.recovery import Recovery
+from loopwright.service.jobs.registry import Registry
+from loopwright.service.jobs.worker import Worker
+from loopwright.service.machine import Machine
+from loopwright.service.store.store import Store
+
+
+def make_jobs(
+    loops: Mapping[str, LoopConfig],
+    store: Store,
+    open_loop: LoopFactory,
+    tune: Tune,
+    rehearse: Rehearse,
+    *,
+    engine: Engine,
+    buses: Mapping[str, BusConfig] | None = None,
+    resume: bool = True,
+    machine: Machine | None = None,
+) -> Jobs:
+    """Makes the jobs of this host's loops, not started yet.
+
+    buses: what is configured for them.  resume: whether jobs that a dead service left go on at the next start.
+    machine: clock and threads.
+    """
+    machine = machine or Machine()
+    registry = Registry()
+    journal = Journal(store, beside=machine.writes_beside)
+    directory = LoopDirectory(loops, store, open_loop, registry, machine, buses)
+    decisions = Decisions(store, directory, machine)
+    return Jobs(
+        store=store,
+        engine=engine,
+        journal=journal,
+        registry=registry,
+        directory=directory,
+        worker=Worker(store, journal, directory, registry, tune, rehearse, machine),
+        decisions=decisions,
+        locking=Locking(store, directory, decisions),
+        aftercare=Aftercare(directory, store, machine),
+        recovery=Recovery(loops, store, open_loop, resume, lambda: registry.stopping),
+        machine=machine,
+    )
