@@ -42,7 +42,7 @@ class Reason(StrEnum):
     DISTURBED = "disturbed"
     UNCERTAIN = "uncertain"
     AMBIGUOUS = "ambiguous"
-    SURPRISE = "surprise"
+    MODEL_MISMATCH = "model_mismatch"
     DIVERGES = "diverges"
     LOCKED = "locked"
     # no gain
@@ -105,7 +105,7 @@ ADVICE: dict[Reason, str] = {
     Reason.UNCERTAIN: "The record does not tell enough for this robustness: permit more MV, filter the measurement, or "
     "ask for a lower Ms.",
     Reason.AMBIGUOUS: "Several models explain the record and disagree: permit more MV, or retune in a steady time.",
-    Reason.SURPRISE: "The loop behaved differently under the new gains than under the relay: look for changes of the "
+    Reason.MODEL_MISMATCH: "The loop behaved differently under the new gains than under the relay: look for changes of the "
     "load or of the plant, then retune.",
     Reason.DIVERGES: "PV ran away under the new gains, which were taken back: keep the present gains, and repeat.",
     Reason.LOCKED: "Somebody has locked the loop: ask them, or unlock it (loopwright unlock TAG), then ask again.",

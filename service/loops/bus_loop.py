@@ -25,7 +25,7 @@ from loopwright.protocol.profile import (
     samples_between,
 )
 from loopwright.protocol.station import NodeTaken, Station
-from loopwright.protocol.tuner import BusSample, Kind, Tuner, TunerError
+from loopwright.protocol.tuner import BusSample, FailureKind, Tuner, TunerError
 from loopwright.protocol.tuner_session import Lease, TunerSession
 from loopwright.service.loop_state import LoopState, same_gains
 from loopwright.service.loops.bus_endings import cause_of, read_back, why_over, words_of
@@ -265,7 +265,7 @@ class BusLoop:
         try:
             self._session.open(self._lease, note)
         except TunerError as error:
-            if error.kind is Kind.ABORT:  # there is no session: nothing to close, nothing to look after
+            if error.kind is FailureKind.ABORT:  # there is no session: nothing to close, nothing to look after
                 note(0)
             if error.code == Abort.LOCAL_CONTROL:
                 text = "an RPDO has just moved the set-point: an outer loop, a ramp or a recipe drives it"
@@ -484,7 +484,7 @@ class BusLoop:
             text = f"bus {self._url!r} is lost ({error.strerror or error}): see that its interface is there and up"
             raise Failed(Reason.BUS_LOST, text) from error
         except TunerError as error:
-            if error.kind is Kind.TIMEOUT:
+            if error.kind is FailureKind.TIMEOUT:
                 raise self._no_answer(error) from error
             if error.code in _NOT_OURS:
                 raise Refused(Reason.DEVICE_MISMATCH, str(error)) from error

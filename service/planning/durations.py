@@ -9,7 +9,7 @@ from __future__ import annotations
 from loopwright.service.request import RetuneRequest
 from loopwright.tuning.experiments.preflight import LOOKS, MIN_LISTENED_SAMPLES
 from loopwright.tuning.fast.procedure import MIN_SAMPLES
-from loopwright.tuning.fast.relay_test import BACK, MAX_PERIODS, VERIFIED_PERIODS
+from loopwright.tuning.fast.relay_test import MAX_PERIODS, STEP_BACK_FRACTION, VERIFICATION_PERIODS
 
 PU_OF_T95 = (0.07, 0.95)
 """The ultimate period in T95, of eight in ten of 116 self-regulating plants."""
@@ -32,7 +32,7 @@ def durations(request: RetuneRequest, t95_s: float, sample_time_s: float | None,
             "preflight": listening,
             "relay": (1.8 * low, MAX_PERIODS * high),
             "design": nothing,
-            "verify": (VERIFIED_PERIODS * low, (1.0 + BACK) * VERIFIED_PERIODS * high),
+            "verify": (VERIFICATION_PERIODS * low, (1.0 + STEP_BACK_FRACTION) * VERIFICATION_PERIODS * high),
             "redesign": nothing,
         }
     return {

@@ -22,7 +22,7 @@ SMALL_BLOCK = 100
 """States of a block up to which all blocks come from powers of one matrix instead of one convolution each."""
 
 
-class Loop:
+class ClosedLoop:
     """x' = a x + b*y(measured), PV to be measured = c x + d*y(measured); the last state is the step itself, one."""
 
     def __init__(self, model: Model, gains: Gains, load: bool) -> None:

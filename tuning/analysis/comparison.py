@@ -26,7 +26,7 @@ SAME = 0.005
 
 
 @dataclass(frozen=True, slots=True)
-class StepWorth:
+class StepPerformance:
     """The answer to a unit step of the set-point (PV units), or of the load at the plant's input (MV units).
 
     IAE: integral of |error|, in units of PV over that of the step, times s; None where an offset stays.
@@ -41,7 +41,7 @@ class StepWorth:
 
 
 @dataclass(frozen=True, slots=True)
-class Worth:
+class LoopPerformance:
     """What gains are worth on a model. Where the loop is not stable there are no figures.
 
     GM: ratio.  PM_deg: degrees; None where there is no such crossing.  noise_gain: MV's answer to a jump of PV.
@@ -56,12 +56,12 @@ class Worth:
     PM_deg: float | None = None
     noise_gain: float | None = None
     overshoot_pct: float | None = None
-    setpoint: StepWorth | None = None
-    load: StepWorth | None = None
+    setpoint: StepPerformance | None = None
+    load: StepPerformance | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class RobustnessBounds:
     """Bounds of robustness; None: no bound. Ms, Mt, noise_gain: at most so much.  GM: at least so much.
 
     by: who asks, in words.
@@ -73,11 +73,11 @@ class Asked:
     noise_gain: float | None = None
     by: str = "asked for"
 
-    def worst(self, found: Worth) -> tuple[float, str]:
+    def worst(self, found: LoopPerformance) -> tuple[float, str]:
         """Of the bound that is passed farthest (or kept most narrowly): value over bound, and that in words."""
         return max(self._each(found))
 
-    def _each(self, found: Worth) -> Iterator[tuple[float, str]]:
+    def _each(self, found: LoopPerformance) -> Iterator[tuple[float, str]]:
         for name, value, maximum in (
             ("Ms", found.Ms, self.Ms),
             ("Mt", found.Mt, self.Mt),
@@ -96,8 +96,8 @@ class Comparison:
     by more than 5 %.  verdict: that in a sentence.
     """
 
-    before: Worth
-    after: Worth
+    before: LoopPerformance
+    after: LoopPerformance
     Ms_asked: float
     criterion: str
     J_before: float | None
@@ -121,7 +121,7 @@ class Predicted:
     IAE_per_unit: float | None
 
 
-def worth(model: Model, gains: Gains, sample_time_s: float = 0.0) -> Worth:
+def loop_performance(model: Model, gains: Gains, sample_time_s: float = 0.0) -> LoopPerformance:
     """What these gains are worth on this model, which has the delay of the sampling in it already.
 
     An ideal derivative is taken as a controller of this sample time carries it out.
@@ -133,16 +133,16 @@ def worth(model: Model, gains: Gains, sample_time_s: float = 0.0) -> Worth:
     try:
         found = assess(model, realised, band=BAND)
     except Ended:  # its response leaves all bounds
-        return Worth(gains, False)
+        return LoopPerformance(gains, False)
     m, setpoint, load = found.margins, found.setpoint, found.load
     if setpoint is None or load is None:
-        return Worth(gains, False)
+        return LoopPerformance(gains, False)
     jump = math.inf if realised.Td > 0.0 and realised.Tf == 0.0 else 1.0
     if realised.Tf > 0.0:
         jump += realised.Td / realised.Tf
     # without integral action an offset stays, and the integral of the error grows with the record
     offset = gains.Ti == 0.0
-    return Worth(
+    return LoopPerformance(
         gains=gains,
         stable=True,
         Ms=m.Ms,
@@ -156,14 +156,14 @@ def worth(model: Model, gains: Gains, sample_time_s: float = 0.0) -> Worth:
     )
 
 
-def weighted_IAE(found: Worth, setpoint: float, load: float) -> float | None:
+def weighted_IAE(found: LoopPerformance, setpoint: float, load: float) -> float | None:
     """Half of the set-point's and half of the load's IAE, each over the one given."""
     if found.setpoint is None or found.load is None or found.setpoint.IAE is None or found.load.IAE is None:
         return None
     return 0.5 * found.setpoint.IAE / setpoint + 0.5 * found.load.IAE / load
 
 
-def IAE_over_present(before: Worth, after: Worth) -> tuple[float | None, float | None]:
+def IAE_over_present(before: LoopPerformance, after: LoopPerformance) -> tuple[float | None, float | None]:
     """The same of both, over those of the old gains, where they have them."""
     for each in (before, after):
         if each.setpoint and each.load and each.setpoint.IAE and each.load.IAE:
@@ -172,10 +172,10 @@ def IAE_over_present(before: Worth, after: Worth) -> tuple[float | None, float |
     return None, None
 
 
-def compared(
-    before: Worth,
-    after: Worth,
-    asked: Asked,
+def compare(
+    before: LoopPerformance,
+    after: LoopPerformance,
+    asked: RobustnessBounds,
     criterion: str,
     J: tuple[float | None, float | None],
     anyway: bool = False,
@@ -191,7 +191,9 @@ def compared(
     return Comparison(before, after, asked.Ms, criterion, *J, gain, words)
 
 
-def _verdict(before: Worth, after: Worth, asked: Asked, J: tuple[float | None, float | None]) -> tuple[bool, str]:
+def _verdict(
+    before: LoopPerformance, after: LoopPerformance, asked: RobustnessBounds, J: tuple[float | None, float | None]
+) -> tuple[bool, str]:
     """Whether there is a gain, and a sentence, or the end of one where there is none."""
     Ms, wanted = after.Ms, f"{asked.by}: at most {asked.Ms:.2f}"
     if not before.stable:
@@ -208,7 +210,7 @@ def _verdict(before: Worth, after: Worth, asked: Asked, J: tuple[float | None, f
     return False, rest
 
 
-def _errors(before: Worth, after: Worth) -> str:
+def _errors(before: LoopPerformance, after: LoopPerformance) -> str:
     assert before.load and after.load and before.setpoint and after.setpoint
     load, setpoint = (_change(a.IAE, b.IAE) for a, b in ((before.load, after.load), (before.setpoint, after.setpoint)))
     return f"load disturbances are corrected with {load} integral error (IAE), steps of the set-point with {setpoint}"
@@ -225,12 +227,12 @@ def _change(before: float | None, after: float | None) -> str:
     return f"{100.0 * abs(change):.0f} % {'less' if change < 0.0 else 'more'}"
 
 
-def _better(before: Worth, after: Worth) -> bool:
+def _better(before: LoopPerformance, after: LoopPerformance) -> bool:
     """Whether any figure shown is better with the new gains."""
     return any(new < old * (1.0 - SAME) for old, new in zip(_figures(before), _figures(after), strict=True))
 
 
-def _figures(found: Worth) -> list[float]:
+def _figures(found: LoopPerformance) -> list[float]:
     """Of a stable loop; the less the better."""
     assert found.Ms is not None and found.overshoot_pct is not None and found.setpoint and found.load
     figures = [found.Ms, found.overshoot_pct, *(1.0 / margin if margin else 0.0 for margin in (found.GM, found.PM_deg))]
@@ -240,12 +242,12 @@ def _figures(found: Worth) -> list[float]:
     return figures
 
 
-def _step(figures: StepFigures, offset: bool) -> StepWorth:
+def _step(figures: StepFigures, offset: bool) -> StepPerformance:
     assert figures.TV is not None  # of a response with MV
-    return StepWorth(None if offset else figures.IAE, figures.peak, figures.settling_s, figures.TV)
+    return StepPerformance(None if offset else figures.IAE, figures.peak, figures.settling_s, figures.TV)
 
 
-def predicted(found: Worth) -> Predicted:
+def predicted(found: LoopPerformance) -> Predicted:
     """Of a stable loop."""
     assert found.Ms is not None and found.overshoot_pct is not None and found.setpoint is not None
     step = found.setpoint

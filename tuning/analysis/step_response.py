@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopwright.tuning.analysis.closed_loop import Loop
+from loopwright.tuning.analysis.closed_loop import ClosedLoop
 from loopwright.tuning.analysis.stability import is_stable, open_loop
 from loopwright.tuning.analysis.step_figures import StepFigures, response_figures
 from loopwright.tuning.gains import Gains
@@ -149,7 +149,7 @@ def _simulated(model: Model, gains: Gains, horizon: float, dt: float, load: bool
     if delay:
         dt = model.L / delay
     steps = math.ceil(horizon / dt - 1e-9)
-    loop = Loop(model, gains, load)
+    loop = ClosedLoop(model, gains, load)
     with np.errstate(over="ignore", invalid="ignore"):
         blocks = loop.delayed(steps, delay, dt) if delay else loop.immediate(steps, dt)
         found = _joined(blocks, _control(blocks, gains, dt, 0.0 if load else 1.0), dt, steps)

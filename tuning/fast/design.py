@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from loopwright.tuning.analysis.stability import is_stable
-from loopwright.tuning.fast.gain_bounds import encircles_not, largest_gains
+from loopwright.tuning.fast.gain_bounds import does_not_encircle, largest_gains
 from loopwright.tuning.fast.iae import Cost, LoopCost
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Complexes, Model, Reals, TransferFunction, sign
@@ -24,13 +24,13 @@ from loopwright.tuning.reasons import Reason, Refused
 POINTS = 440
 LOWEST, HIGHEST = 10**-2.8, 10**1.6
 """Of the frequency grid, in 2*pi/period."""
-TURNED = 13.0
+MAX_DEAD_TIME_ANGLE = 13.0
 """w*L, rad, from which the dead time turns by more than 0.3 rad from one point of the grid to the next."""
-BEYOND = 1e3
+TAIL_FACTOR = 1e3
 """How far above the grid a part that passes at once, or a lag too fast to see, is looked at."""
-TRUSTED = 0.6
+TAIL_MARGIN = 0.6
 """Of the bound there, for a derivative: it lives where the record says least of the plant."""
-SHORTEST, LONGEST = 0.25, 1.3
+MIN_PERIOD_RATIO, MAX_PERIOD_RATIO = 0.25, 1.3
 """Of the model's own ultimate period, in periods of the relay."""
 TI = np.geomspace(0.04, 30.0, 30)  # periods
 HALVINGS = 5
@@ -39,7 +39,7 @@ PID_TD = (0.03, 0.06, 0.15, 0.25, 0.4, 0.65)  # of Ti
 MIN_TD, MIN_TI = 0.045, 0.08  # periods
 MAX_TD = 2.0  # of Ti
 PID_STEPS = 45
-WORTH = 0.97
+MAX_J_RATIO = 0.97
 """A derivative must bring J below this part of the PI's."""
 
 
@@ -67,7 +67,7 @@ class DesignSpec:
 
 
 @dataclass(frozen=True, slots=True)
-class Best:
+class OptimalGains:
     """J: of the criterion.  cost: its parts.  least: what each of them is counted over.
 
     Gains for a controller that acts with the plant's sign.
@@ -79,7 +79,7 @@ class Best:
     minimum: Cost
 
 
-class Design:
+class GainDesign:
     """The criterion on one model, its dead time including what the sampling adds; relay_period: s."""
 
     def __init__(self, model: Model, spec: DesignSpec, relay_period: float) -> None:
@@ -91,18 +91,18 @@ class Design:
         self.cost = LoopCost(positive, self.period)
         # where the dead time turns faster than the grid can follow, and above the grid, the size alone must do
         end = float(self.w[-1])
-        start = min(TURNED / positive.L, end) if positive.L > 0.0 else end
-        self.tail = np.geomspace(start, BEYOND * end, POINTS)
+        start = min(MAX_DEAD_TIME_ANGLE / positive.L, end) if positive.L > 0.0 else end
+        self.tail = np.geomspace(start, TAIL_FACTOR * end, POINTS)
         self.G_tail = positive.frequency_response(self.tail)
         self.minimum: Cost | None = None
 
-    def best(self) -> Best:
+    def best(self) -> OptimalGains:
         """Raises Refused, NOT_ROBUST: no gain meets the bounds."""
         pi = self._pi()
         if not self.spec.derivative:
             return pi
         pid = self._pid()
-        return pid if pid is not None and pid.J < WORTH * pi.J else pi
+        return pid if pid is not None and pid.J < MAX_J_RATIO * pi.J else pi
 
     def candidates(self, Ti: float, Td: float = 0.0) -> list[tuple[Gains, Cost]]:
         """The largest gains of these times that are stable, with their cost."""
@@ -112,31 +112,31 @@ class Design:
         if spec.noise_gain is not None:
             cap = spec.noise_gain / (1.0 + spec.N if Td > 0.0 else 1.0)
         size = float(np.max(np.abs(self.G_tail * controller(self.tail, Ti, Td, spec.N))))
-        cap = min(cap, (TRUSTED if Td > 0.0 else 1.0) * (1.0 - 1.0 / spec.Ms) / size)
+        cap = min(cap, (TAIL_MARGIN if Td > 0.0 else 1.0) * (1.0 - 1.0 / spec.Ms) / size)
         found = []
         for end in largest_gains(g, spec.Ms, spec.Mt, cap):
-            if encircles_not(end * g):
+            if does_not_encircle(end * g):
                 cost = self.cost(end, Ti, Td, spec.N)
                 found.append((Gains(float(end), float(Ti), float(Td), float(Td) / spec.N), cost))
         return found
 
-    def _pi(self) -> Best:
+    def _pi(self) -> OptimalGains:
         scanned = [self.candidates(Ti * self.period) for Ti in TI]
         everything = [each for candidates in scanned for each in candidates]
         if not everything:
             raise Refused(Reason.NOT_ROBUST, f"no PI on the model has an Ms of at most {self.spec.Ms:g}")
         self.minimum = Cost(min(cost.setpoint for _, cost in everything), min(cost.load for _, cost in everything))
-        best = min((self._judged(each) for each in everything), key=_value)
+        best = min((self._evaluated(each) for each in everything), key=_value)
         step = math.log(TI[1] / TI[0])
         for _ in range(HALVINGS):
             step *= 0.5
             middle = best.gains.Ti
             for Ti in (middle * math.exp(-step), middle * math.exp(step)):
-                best = min((best, *map(self._judged, self.candidates(Ti))), key=_value)
+                best = min((best, *map(self._evaluated, self.candidates(Ti))), key=_value)
         self._require_stable(best)
         return best
 
-    def _pid(self) -> Best | None:
+    def _pid(self) -> OptimalGains | None:
         grid = [
             (each, (math.log(Ti * self.period), math.log(ratio * Ti * self.period)))
             for Ti in PID_TI
@@ -171,19 +171,19 @@ class Design:
             self._require_stable(best)
         return best
 
-    def _at(self, Ti: float, Td: float) -> Best | None:
+    def _at(self, Ti: float, Td: float) -> OptimalGains | None:
         """The best gain of these times, None where they are not permitted or have none."""
         if Td < MIN_TD * self.period or Ti < MIN_TI * self.period or Td > MAX_TD * Ti or Ti > 40.0 * self.period:
             return None
-        return min(map(self._judged, self.candidates(Ti, Td)), key=_value, default=None)
+        return min(map(self._evaluated, self.candidates(Ti, Td)), key=_value, default=None)
 
-    def _judged(self, each: tuple[Gains, Cost]) -> Best:
+    def _evaluated(self, each: tuple[Gains, Cost]) -> OptimalGains:
         gains, cost = each
         assert self.minimum is not None  # the PI comes first
         J = 0.5 * cost.setpoint / self.minimum.setpoint + 0.5 * cost.load / self.minimum.load
-        return Best(gains, J, cost, self.minimum)
+        return OptimalGains(gains, J, cost, self.minimum)
 
-    def _require_stable(self, best: Best) -> None:
+    def _require_stable(self, best: OptimalGains) -> None:
         if not is_stable(self.model, best.gains):
             raise Refused(Reason.NOT_ROBUST, "the best gains on the model are not stable by the exact count of poles")
 
@@ -208,8 +208,8 @@ def own_period(model: Model, relay_period: float) -> float:
     i = int(crossing[np.argmax(np.abs(G[crossing]))])
     part = -G.imag[i] / (G.imag[i + 1] - G.imag[i])
     at = float(w[i] * (w[i + 1] / w[i]) ** part)
-    return min(max(2.0 * math.pi / at, SHORTEST * relay_period), LONGEST * relay_period)
+    return min(max(2.0 * math.pi / at, MIN_PERIOD_RATIO * relay_period), MAX_PERIOD_RATIO * relay_period)
 
 
-def _value(best: Best) -> float:
+def _value(best: OptimalGains) -> float:
     return best.J

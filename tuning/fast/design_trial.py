@@ -10,9 +10,9 @@ from loopwright.tuning.experiments.preflight import preflight
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.step_test import StepResult
 from loopwright.tuning.experiments.verification import verification
-from loopwright.tuning.fast.design import Best, Design
+from loopwright.tuning.fast.design import GainDesign, OptimalGains
 from loopwright.tuning.fast.procedure import FAST, FastOptions
-from loopwright.tuning.fast.proposal import FastProposal, FoundModel, comparison_on, delayed, ultimate
+from loopwright.tuning.fast.proposal import FastProposal, IdentifiedModel, comparison_on, delayed, ultimate
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Model, TransferFunction, sign, time_constants
 from loopwright.tuning.plan import Plan, StageDone, StageStarted, worked
@@ -28,12 +28,12 @@ def trial_stages(verify: bool) -> tuple[str, ...]:
     return TRIAL_STAGES if verify else TRIAL_STAGES[:2]
 
 
-def designed_on(model: Model, options: FastOptions, sample_time_s: float) -> Best:
+def designed_on(model: Model, options: FastOptions, sample_time_s: float) -> OptimalGains:
     """The best gains on the model. Raises Refused, NOT_ROBUST."""
     known = ultimate(model)
     # without an ultimate point the loop's time is that of its lags and dead time
     period = known.Pu_s if known else 4.0 * (model.L + float(max(time_constants(model), default=0.0)))
-    return Design(delayed(model, 0.5 * sample_time_s), options.spec(), period).best()
+    return GainDesign(delayed(model, 0.5 * sample_time_s), options.spec(), period).best()
 
 
 def _considered(model: Model, options: FastOptions, facts: Facts) -> tuple[Gains, Comparison]:
@@ -77,7 +77,7 @@ def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal
     return FastProposal(
         method=FAST,
         chosen={"Ms": spec.Ms, **({"N": spec.N} if gains.Td else {})},
-        model=FoundModel("typed in", given.num, given.den, given.L),
+        model=IdentifiedModel("typed in", given.num, given.den, given.L),
         old_gains=facts.old_gains,
         gains=gains,
         predicted=promised,

@@ -53,7 +53,7 @@ def _forbidden(g: Complexes, minimum: float, leading: float) -> Reals:
     return np.array([(-x - root) / size, (-x + root) / size])
 
 
-def encircles_not(loop: Complexes) -> bool:
+def does_not_encircle(loop: Complexes) -> bool:
     """The closed loop is stable, for a plant without poles in the right half plane; loop on a rising grid.
 
     False as well where two integrators cross over too near to the grid's low end to tell.

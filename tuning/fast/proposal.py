@@ -7,14 +7,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopwright.tuning.analysis.comparison import Asked, Comparison, Predicted, compared, predicted, weighted_IAE, worth
+from loopwright.tuning.analysis.comparison import (
+    Comparison,
+    Predicted,
+    RobustnessBounds,
+    compare,
+    loop_performance,
+    predicted,
+    weighted_IAE,
+)
 from loopwright.tuning.analysis.margins import Ultimate, margins, ultimate_point
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.step_test import StepResult
-from loopwright.tuning.fast.design import Best, DesignSpec
-from loopwright.tuning.fast.record import Evidence
+from loopwright.tuning.fast.design import DesignSpec, OptimalGains
+from loopwright.tuning.fast.evaluation import Evaluation
+from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.fast.uncertainty import fit_covariance
-from loopwright.tuning.fast.verdict import Evaluation
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.output_error import Fit, Fitted
 from loopwright.tuning.identification.sensitivity import slopes_of
@@ -25,7 +33,7 @@ CRITERION = "half of the set-point's and half of the load's IAE, each over the l
 
 
 @dataclass(frozen=True, slots=True)
-class LoadStep:
+class LoadDisturbance:
     """A step of the load that the record shows. t_s: since the relay's start.  size: MV units at the plant's input."""
 
     t_s: float
@@ -33,7 +41,7 @@ class LoadStep:
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
+class RelayFigures:
     """The relay's record. period_s: as it swung.  span: of PV.  noise: of PV at rest, standard deviation.
 
     amplitude: of the relay's higher side, MV units.  samples: from the first at rest to the last.
@@ -48,7 +56,7 @@ class Recorded:
 
 
 @dataclass(frozen=True, slots=True)
-class FoundModel:
+class IdentifiedModel:
     """num, den (highest power of s first, den begins with 1) and the dead time, each with its standard error."""
 
     structure: str
@@ -61,7 +69,7 @@ class FoundModel:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class EvaluationSummary:
     """What one evaluation of the record came to.
 
     num, den (highest power first), L_s: the plant.  cause: why it is not enough, None if it is.  uncertainty,
@@ -77,16 +85,16 @@ class Found:
     uncertainty: float
     ambiguity: float
     residual: float
-    loads: tuple[LoadStep, ...]
+    loads: tuple[LoadDisturbance, ...]
     drift: bool
     switches: int
     period_s: float
-    cause: str | None
+    reason: Reason | None
     detail: str
 
 
 @dataclass(frozen=True, slots=True)
-class Verified:
+class VerifiedStep:
     """The set-point step under the gains of the first design, as measured; it begins while PV still swings.
 
     tested: those gains.  Ms: theirs on the model of the whole record.  fit_pct: how much of the step that model
@@ -114,32 +122,32 @@ class FastProposal:
 
     method: str
     chosen: Mapping[str, float]
-    model: FoundModel
+    model: IdentifiedModel
     old_gains: Gains
     gains: Gains
     predicted: Predicted
     predicted_before: Predicted | None
     comparison: Comparison
     ultimate: Ultimate | None
-    found: Found | None
-    verified: Verified | None
+    found: EvaluationSummary | None
+    verified: VerifiedStep | None
     verification: StepResult | None
     notes: tuple[str, ...]
 
 
-def found_of(evaluation: Evaluation) -> Found:
+def evaluation_summary(evaluation: Evaluation) -> EvaluationSummary:
     fit, best = evaluation.fit, evaluation.chosen.best
-    evidence, structure, theta, c = fit.evidence, best.structure, best.theta, best.linear.coefficients
-    order, count = structure.order, best.hypothesis.loads
+    record, structure, theta, c = fit.record, best.structure, best.theta, best.linear.coefficients
+    order, count = structure.order, best.hypothesis.load_disturbances
     first = len(c) - order * count
     loads = tuple(
-        LoadStep(
-            (float(theta[structure.searched + i] - theta[structure.lags]) - evidence.listened) * evidence.Ts,
-            float(c[first + i * order] / c[0]) * evidence.swing,
+        LoadDisturbance(
+            (float(theta[structure.searched + i] - theta[structure.lags]) - record.listened) * record.Ts,
+            float(c[first + i * order] / c[0]) * record.input_range,
         )
         for i in range(count)
     )
-    return Found(
+    return EvaluationSummary(
         structure=structure.name,
         num=evaluation.model.num,
         den=evaluation.model.den,
@@ -151,14 +159,14 @@ def found_of(evaluation: Evaluation) -> Found:
         residual=evaluation.residual,
         loads=loads,
         drift=best.hypothesis.drift,
-        switches=len(evidence.switches),
-        period_s=evidence.period * evidence.Ts,
-        cause=evaluation.cause,
+        switches=len(record.switches),
+        period_s=record.period * record.Ts,
+        reason=evaluation.reason,
         detail=evaluation.detail,
     )
 
 
-def model_of(fit: Fit[Evidence], found: Fitted) -> FoundModel:
+def identified_model(fit: Fit[ExperimentRecord], found: Fitted) -> IdentifiedModel:
     """With the standard errors that the parameters' covariance gives the coefficients (delta method)."""
     structure = found.structure
     searched, inputs = structure.searched, structure.inputs
@@ -176,30 +184,30 @@ def model_of(fit: Fit[Evidence], found: Fitted) -> FoundModel:
     kept = np.concatenate((np.arange(searched), len(found.theta) + np.arange(inputs)))
     covariance = whole[np.ix_(kept, kept)]
     errors = np.sqrt(np.maximum(np.einsum("ci,ij,cj->c", slopes, covariance, slopes), 0.0))
-    return FoundModel(
+    return IdentifiedModel(
         structure=structure.name,
         num=model.num,
         den=model.den,
         dead_time_s=model.L,
         num_errors=tuple(map(float, errors[:width])),
         den_errors=tuple(map(float, errors[width:])),
-        dead_time_error_s=float(np.sqrt(max(covariance[structure.lags, structure.lags], 0.0))) * fit.evidence.Ts,
+        dead_time_error_s=float(np.sqrt(max(covariance[structure.lags, structure.lags], 0.0))) * fit.record.Ts,
     )
 
 
-def verified(evaluation: Evaluation, tested: Gains, size: float, duration_s: float) -> Verified:
+def verified_step(evaluation: Evaluation, tested: Gains, size: float, duration_s: float) -> VerifiedStep:
     """size: of the set-point step under the tested gains, PV units; duration_s: since it was made."""
     fit, residual = evaluation.fit, evaluation.chosen.best.linear.residual
-    first = fit.evidence.relayed // fit.block
+    first = fit.record.relayed // fit.block
     rest, shown = residual[first:], fit.y[first:]
     spread = float(np.linalg.norm(shown - shown.mean()))
-    return Verified(
+    return VerifiedStep(
         tested=tested,
         Ms=margins(delayed(evaluation.model, evaluation.design_delay), tested).Ms,
         step=size,
         duration_s=duration_s,
         fit_pct=100.0 * (1.0 - float(np.linalg.norm(rest)) / spread) if spread > 0.0 else 0.0,
-        rms=float(np.sqrt(np.mean(rest**2))) * fit.evidence.span,
+        rms=float(np.sqrt(np.mean(rest**2))) * fit.record.output_range,
     )
 
 
@@ -208,14 +216,14 @@ def comparison_of(evaluation: Evaluation, facts: Facts, spec: DesignSpec, anyway
     return comparison_on(delayed(evaluation.model, evaluation.design_delay), evaluation.best, facts, spec, anyway)
 
 
-def comparison_on(sampled: Model, best: Best, facts: Facts, spec: DesignSpec, anyway: bool) -> Comparison:
+def comparison_on(sampled: Model, best: OptimalGains, facts: Facts, spec: DesignSpec, anyway: bool) -> Comparison:
     """sampled: the model with the delay of the sampling.  anyway: see `compared`. Raises Refused, NOT_ROBUST."""
-    before, after = (worth(sampled, gains, facts.sample_time_s) for gains in (facts.old_gains, best.gains))
+    before, after = (loop_performance(sampled, gains, facts.sample_time_s) for gains in (facts.old_gains, best.gains))
     if not after.stable:
         raise Refused(Reason.NOT_ROBUST, "the gains designed are not stable on their own model")
-    asked = Asked(spec.Ms, Mt=spec.Mt, noise_gain=spec.noise_gain)
+    asked = RobustnessBounds(spec.Ms, Mt=spec.Mt, noise_gain=spec.noise_gain)
     J = tuple(weighted_IAE(each, best.minimum.setpoint, best.minimum.load) for each in (before, after))
-    return compared(before, after, asked, CRITERION, (J[0], J[1]), anyway)
+    return compare(before, after, asked, CRITERION, (J[0], J[1]), anyway)
 
 
 def proposed(
@@ -223,20 +231,20 @@ def proposed(
     spec: DesignSpec,
     evaluation: Evaluation,
     comparison: Comparison,
-    verified: Verified | None,
+    verified: VerifiedStep | None,
     relay_at_s: float,
 ) -> FastProposal:
     """relay_at_s: plant time at which the relay began."""
-    found, gains = found_of(evaluation), evaluation.best.gains
+    found, gains = evaluation_summary(evaluation), evaluation.best.gains
     notes = [
         f"A step of the load of {load.size:+.3g} at the plant's input was found {load.t_s:.4g} s after the start of "
         f"the relay (at {relay_at_s + load.t_s:.4g} s), and allowed for."
         for load in found.loads
     ]
-    swing = evaluation.fit.evidence.swing
-    if any(abs(load.size) > swing for load in found.loads):
+    input_range = evaluation.fit.record.input_range
+    if any(abs(load.size) > input_range for load in found.loads):
         notes.append(
-            f"Such a load is larger than what the relay moved MV by ({swing:.3g}): a change of the plant would look so "
+            f"Such a load is larger than what the relay moved MV by ({input_range:.3g}): a change of the plant would look so "
             "too. Look at the record before accepting."
         )
     if found.drift:
@@ -244,7 +252,7 @@ def proposed(
     return FastProposal(
         method="fast",
         chosen={"Ms": spec.Ms, **({"N": spec.N} if gains.Td else {})},
-        model=model_of(evaluation.fit, evaluation.chosen.best),
+        model=identified_model(evaluation.fit, evaluation.chosen.best),
         old_gains=facts.old_gains,
         gains=gains,
         predicted=predicted(comparison.after),

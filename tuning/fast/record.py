@@ -19,7 +19,7 @@ MIN_SWITCHES = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
+class ExperimentRecord:
     """What a fast experiment has shown so far: time at rest first, then the relay, then perhaps a set-point step.
 
     Ts: s.  u: MV that held from each sample to the next, y: PV at it, both shape (N,) and as deviations from rest.
@@ -44,7 +44,7 @@ class Evidence:
             )
         if self.listened < MIN_LISTENED:
             raise Refused(Reason.BAD_INPUT, f"{self.listened} samples at rest; at least {MIN_LISTENED} are needed")
-        if not self.span > 0.0:
+        if not self.output_range > 0.0:
             raise Refused(Reason.NO_RESPONSE, "PV did not move at all under the relay")
 
     @property
@@ -53,17 +53,17 @@ class Evidence:
         return float(period(self.switches))
 
     @property
-    def span(self) -> float:
+    def output_range(self) -> float:
         """Of PV under the relay, PV units."""
         return float(np.ptp(self.y[self.listened : self.relayed]))
 
     @property
-    def swing(self) -> float:
+    def input_range(self) -> float:
         """The largest move of MV, MV units."""
         return float(np.max(np.abs(self.u)))
 
     @property
-    def most_dead_time(self) -> float:
+    def max_dead_time(self) -> float:
         """Samples."""
         return LONGEST_DEAD_TIME * self.period
 
@@ -81,11 +81,11 @@ class Evidence:
     @property
     def rounding(self) -> float:
         """Standard deviation of what a coarse sensor rounds away, PV units: at rest it may not show at all."""
-        steps = np.diff(np.unique(np.round(self.y / self.span, 9)))
-        return float(steps.min()) * self.span / math.sqrt(12.0)
+        steps = np.diff(np.unique(np.round(self.y / self.output_range, 9)))
+        return float(steps.min()) * self.output_range / math.sqrt(12.0)
 
     @property
-    def colour(self) -> float:
+    def durbin_watson_ratio_at_rest(self) -> float:
         """Variance at rest over that of the fast part: about 1 for white noise."""
         rest = averaged(self.y[: self.listened], self.block)
         fast = 0.5 * float(np.mean(np.diff(rest) ** 2))

@@ -9,8 +9,8 @@ from typing import TypeVar
 import numpy as np
 
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, no_oscillation
-from loopwright.tuning.fast.proposal import Recorded
-from loopwright.tuning.fast.record import MIN_SWITCHES, Evidence, noise_of, period
+from loopwright.tuning.fast.proposal import RelayFigures
+from loopwright.tuning.fast.record import MIN_SWITCHES, ExperimentRecord, noise_of, period
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import (
     Command,
@@ -30,26 +30,26 @@ from loopwright.tuning.reasons import Reason, Refused
 T = TypeVar("T")
 BIAS = 0.5
 """The lower amplitude in higher ones."""
-FIRST = 0.5
+FIRST_AMPLITUDE = 0.5
 """The amplitude that the relay begins with, of the largest that MV permits."""
 HYSTERESIS = 2.2  # standard deviations of the noise
-AVERAGED = 3
+SAMPLES_AVERAGED = 3
 MIN_HYSTERESIS = 1e-3
 """Of the set-point step permitted, for a PV without noise."""
 STALLED = 2.5
 """Longest half periods without a switch, after which the present side is raised."""
-RAISED, MAX_RAISED = 1.7, 2.0
-MIN_SPAN, GOOD_SPAN = 25.0, 60.0
+RAISE_FACTOR, MAX_RAISE = 1.7, 2.0
+MIN_OUTPUT_RANGE, GOOD_OUTPUT_RANGE = 25.0, 60.0
 """Of PV under the relay, standard deviations of the noise."""
-WIDEST_SPAN = 2.0
+MAX_OUTPUT_RANGE = 2.0
 """Of PV under the relay, permitted set-point steps."""
 MAX_PERIODS = 8.4
-VERIFIED_PERIODS = 3.0
-BACK = 0.5
+VERIFICATION_PERIODS = 3.0
+STEP_BACK_FRACTION = 0.5
 """Of the time of the first step."""
-SHORTEST = 0.5
+MIN_MODEL_PERIOD = 0.5
 """Of the relay's period: a model's that is shorter is not believed."""
-FAR = 20.0
+DIVERGED = 20.0
 """Spans of PV under the relay, at which the step under the new gains is ended."""
 
 
@@ -73,7 +73,7 @@ class Experiment:
                 Reason.BAD_LIMITS, f"a relay amplitude of {amplitude:g} is asked for; MV permits up to {self._max:.4g}"
             )
         self._fixed = amplitude is not None
-        self.amplitude = amplitude or FIRST * self._max
+        self.amplitude = amplitude or FIRST_AMPLITUDE * self._max
         self._sides = [BIAS, 1.0]  # low, high, in amplitudes
         self._high = True
         self._raise_at = 0
@@ -82,16 +82,16 @@ class Experiment:
         self._commands: tuple[Command, ...] = ()
         self._step = 0.0
 
-    def recorded(self) -> Recorded:
+    def relay_figures(self) -> RelayFigures:
         """The relay's record so far, in numbers."""
-        evidence = self.evidence()
-        return Recorded(
-            switches=len(evidence.switches),
-            period_s=evidence.period * evidence.Ts,
-            span=evidence.span,
+        record = self.experiment_record()
+        return RelayFigures(
+            switches=len(record.switches),
+            period_s=record.period * record.Ts,
+            span=record.output_range,
             noise=self.noise,
             amplitude=self.amplitude,
-            samples=len(evidence.y),
+            samples=len(record.y),
         )
 
     @property
@@ -99,9 +99,9 @@ class Experiment:
         """The set-point step, PV units, and how long ago it was made, s."""
         return self._step, self.trace.t[-1] - self.trace.t[self.relayed]
 
-    def tell(self, *events: Event) -> Plan[None]:
+    def report(self, *events: Event) -> Plan[None]:
         """The sample that an event takes belongs to the record."""
-        self._commands = self._hear((yield (*self._commands, *events)))
+        self._commands = self._on_sample((yield (*self._commands, *events)))
 
     def relay(self, switches: int) -> Plan[bool]:
         """Goes on until the relay has switched so often; False where the time is over first.
@@ -110,10 +110,10 @@ class Experiment:
         """
         if not self.relayed:
             self.listened = self.relayed = len(self.trace)
-            self._commands = (self._armed(), SetMode(Mode.EXPERIMENT))
+            self._commands = (self._relay_command(), SetMode(Mode.EXPERIMENT))
         while len(self.switches) < switches:
-            self._commands = self._hear((yield self._commands))
-            if self._over():
+            self._commands = self._on_sample((yield self._commands))
+            if self._time_is_over():
                 if len(self.switches) < MIN_SWITCHES:
                     raise self._stalled()
                 return False
@@ -125,9 +125,9 @@ class Experiment:
         model_period: s; a load, or hysteresis, makes the relay's longer.
         """
         relay_period = period(tuple(self.switches)) * self.facts.sample_time_s
-        self._follow_s = VERIFIED_PERIODS * min(max(model_period, SHORTEST * relay_period), relay_period)
+        self._follow_s = VERIFICATION_PERIODS * min(max(model_period, MIN_MODEL_PERIOD * relay_period), relay_period)
         facts, point = self.facts, self.point
-        span = self.evidence().span
+        span = self.experiment_record().output_range
         size = min(0.5 * span, self.amplitude / gains.Kp, facts.sp_deviation)
         self.relayed = len(self.trace)
         self._commands = ()
@@ -135,25 +135,25 @@ class Experiment:
         # from the proportional part alone it begins at rest
         error = (point.pv - self.trace.pv[-1]) * (1.0 if facts.reverse else -1.0)
         output = min(max(point.mv + gains.Kp * error, facts.mv_low), facts.mv_high)
-        self._keep((yield (SetMode(Mode.MANUAL), SetOutput(output), SetGains(gains))))
+        self._add((yield (SetMode(Mode.MANUAL), SetOutput(output), SetGains(gains))))
         self._step = size
         yield from self._follow((SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp + size)), span)
 
     def step_back(self) -> Plan[None]:
         """The set-point steps home, under the same gains, for half as long."""
-        self._follow_s *= BACK
-        yield from self._follow((SetSetpoint(self.point.sp),), self.evidence().span)
+        self._follow_s *= STEP_BACK_FRACTION
+        yield from self._follow((SetSetpoint(self.point.sp),), self.experiment_record().output_range)
 
     def _follow(self, commands: tuple[Command, ...], span: float) -> Plan[None]:
         """Raises Refused, DIVERGES."""
         self._steps.append(len(self.trace))
         sample = yield commands
-        self._keep(sample)
+        self._add(sample)
         end = sample.t + self._follow_s
         while sample.t < end:
             sample = yield ()
-            self._keep(sample)
-            if abs(sample.pv - self.point.pv) > FAR * span:
+            self._add(sample)
+            if abs(sample.pv - self.point.pv) > DIVERGED * span:
                 raise Refused(
                     Reason.DIVERGES,
                     f"PV is {sample.pv - self.point.pv:+.4g} away; the relay had moved it by {span:.4g}",
@@ -162,16 +162,16 @@ class Experiment:
     def computed(self, compute: Callable[[], T]) -> Plan[T]:
         """Its result; the record goes on meanwhile."""
         work = Work(compute)
-        self._commands = self._hear((yield (*self._commands, work)))
+        self._commands = self._on_sample((yield (*self._commands, work)))
         while not work.done:
-            self._commands = self._hear((yield self._commands))
+            self._commands = self._on_sample((yield self._commands))
         return work.result()
 
-    def evidence(self) -> Evidence:
+    def experiment_record(self) -> ExperimentRecord:
         """The record as it is."""
         trace = self.trace
         rest = slice(0, self.listened)
-        return Evidence(
+        return ExperimentRecord(
             Ts=self.facts.sample_time_s,
             u=np.asarray(trace.mv) - float(np.mean(trace.mv[rest])),
             y=np.asarray(trace.pv) - float(np.mean(trace.pv[rest])),
@@ -182,7 +182,7 @@ class Experiment:
             steps=tuple(self._steps),
         )
 
-    def _keep(self, sample: Sample) -> None:
+    def _add(self, sample: Sample) -> None:
         """Into the record; samples lost before it are made up: PV in between, MV as it was."""
         trace, Ts = self.trace, self.facts.sample_time_s
         lost = round((sample.t - trace.t[-1]) / Ts) - 1
@@ -196,10 +196,10 @@ class Experiment:
     def _stepping(self) -> bool:
         return self.relayed > self.listened
 
-    def _hear(self, sample: Sample) -> tuple[Command, ...]:
+    def _on_sample(self, sample: Sample) -> tuple[Command, ...]:
         """One sample under the relay; what is to be commanded for it."""
         trace = self.trace
-        self._keep(sample)
+        self._add(sample)
         at = len(trace) - 1
         if sample.mode != Mode.EXPERIMENT or self._stepping:
             return ()
@@ -211,7 +211,7 @@ class Experiment:
                 return self._adapted()
             if self._sides != [BIAS, 1.0]:
                 self._sides = [BIAS, 1.0]
-                return (self._armed(),)
+                return (self._relay_command(),)
         elif len(self.switches) >= 2:
             longest = max(np.diff([self.listened, *self.switches]))
             since = at - max(self.switches[-1], self._raise_at)
@@ -219,10 +219,10 @@ class Experiment:
                 self._raise_at = at
                 side = int(high)
                 maximum = self._max * (1.0 if high else BIAS) / self.amplitude
-                raised = min(RAISED * self._sides[side], MAX_RAISED * (1.0, BIAS)[not high], maximum)
+                raised = min(RAISE_FACTOR * self._sides[side], MAX_RAISE * (1.0, BIAS)[not high], maximum)
                 if raised > self._sides[side]:
                     self._sides[side] = raised
-                    return (self._armed(),)
+                    return (self._relay_command(),)
         return ()
 
     def _adapted(self) -> tuple[Command, ...]:
@@ -236,22 +236,22 @@ class Experiment:
                 f"the relay of {self.amplitude:.4g} has switched twice, and PV is exactly {self.trace.pv[-1]:.6g} "
                 f"all the time (noise {self.noise:.3g} before)",
             )
-        if seen < MIN_SPAN * self.noise:
-            factor = min(GOOD_SPAN * self.noise / seen, self._max / self.amplitude)
-        elif seen > WIDEST_SPAN * self.facts.sp_deviation:
-            factor = max(WIDEST_SPAN * self.facts.sp_deviation, MIN_SPAN * self.noise) / seen
+        if seen < MIN_OUTPUT_RANGE * self.noise:
+            factor = min(GOOD_OUTPUT_RANGE * self.noise / seen, self._max / self.amplitude)
+        elif seen > MAX_OUTPUT_RANGE * self.facts.sp_deviation:
+            factor = max(MAX_OUTPUT_RANGE * self.facts.sp_deviation, MIN_OUTPUT_RANGE * self.noise) / seen
         if 0.8 < factor < 1.25:
             return ()
         self.amplitude *= factor
-        return (self._armed(),)
+        return (self._relay_command(),)
 
-    def _armed(self) -> SetRelay:
+    def _relay_command(self) -> SetRelay:
         low, high = (self.amplitude * side for side in self._sides)
         hysteresis = max(HYSTERESIS * self.noise, MIN_HYSTERESIS * self.facts.sp_deviation)
-        average = AVERAGED if self.noise > 0.0 else 1
+        average = SAMPLES_AVERAGED if self.noise > 0.0 else 1
         return SetRelay(high, hysteresis, self.point.mv, amplitude_low=low, average=average)
 
-    def _over(self) -> bool:
+    def _time_is_over(self) -> bool:
         """The time is over: before the second switch by T95, after it by the half periods."""
         passed = len(self.trace) - self.listened
         if len(self.switches) < 2:

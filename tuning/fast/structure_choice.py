@@ -8,9 +8,9 @@ from functools import partial, reduce
 
 import numpy as np
 
-from loopwright.tuning.fast.record import Evidence
-from loopwright.tuning.identification.disturbances import better, by_bic, fits, stories, under
-from loopwright.tuning.identification.output_error import QUIET, Fit, Fitted, Hypothesis
+from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.identification.disturbances import better, by_bic, disturbance_candidates, fit_structures, under
+from loopwright.tuning.identification.output_error import UNDISTURBED, DisturbanceHypothesis, Fit, Fitted
 
 RIVAL = 10.0
 """Of BIC: structures this near to the best could be true as well."""
@@ -23,7 +23,7 @@ SLOW = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Chosen:
+class StructureChoice:
     """best: the fit to go on with.  rivals: others that could be true as well.  fits: all with the same story."""
 
     best: Fitted
@@ -31,36 +31,36 @@ class Chosen:
     fits: tuple[Fitted, ...]
 
 
-def choose(fit: Fit[Evidence], known: Sequence[Fitted] = ()) -> Chosen:
+def choose_structure(fit: Fit[ExperimentRecord], known: Sequence[Fitted] = ()) -> StructureChoice:
     """known: fits of an earlier part of the same record, from which is started as well."""
-    quiet = fits(fit, QUIET, known)
+    quiet = fit_structures(fit, UNDISTURBED, known)
     found = quiet
     first = min(quiet, key=by_bic)
     if _unexplained(fit, first):
-        found = better(found, reduce(better, stories(fit, quiet, partial(_unexplained, fit), known)))
+        found = better(found, reduce(better, disturbance_candidates(fit, quiet, partial(_unexplained, fit), known)))
     elif _slow(fit, first):
         # MV at rest is known as well as the noise lets it be; what it is off by is a drift to a slow plant
-        drift = Hypothesis(drift=True)
-        drifting = fits(fit, drift, [*known, *under(drift, quiet)])
+        drift = DisturbanceHypothesis(drift=True)
+        drifting = fit_structures(fit, drift, [*known, *under(drift, quiet)])
         found = drifting if min(map(by_bic, drifting)) < first.bic else found
     ranked = sorted(found, key=by_bic)
     # the record hardly shows the static gain of a slow plant; that it has the wrong sign is then no finding
     ranked = [each for each in ranked if _goes_right(fit, each)] or ranked
     rivals = tuple(each for each in ranked[1:] if each.bic < ranked[0].bic + RIVAL)
     same = tuple(each for each in ranked if each.hypothesis == ranked[0].hypothesis)
-    return Chosen(ranked[0], rivals, same)
+    return StructureChoice(ranked[0], rivals, same)
 
 
-def _goes_right(fit: Fit[Evidence], found: Fitted) -> bool:
+def _goes_right(fit: Fit[ExperimentRecord], found: Fitted) -> bool:
     """The static gain has the sign that the controller's action says."""
-    return fit.static_gain(found) * fit.evidence.direction > 0.0
+    return fit.static_gain(found) * fit.record.direction > 0.0
 
 
-def _slow(fit: Fit[Evidence], found: Fitted) -> bool:
+def _slow(fit: Fit[ExperimentRecord], found: Fitted) -> bool:
     """The slowest lag is longer than the relay's record can show whole."""
     poles = np.roots(np.append(1.0, found.structure.monic(found.theta[: found.structure.searched])))
     return bool(np.min(np.abs(poles)) < 1.0 / (SLOW * fit.period))
 
 
-def _unexplained(fit: Fit[Evidence], best: Fitted) -> bool:
-    return best.rms > max(UNEXPLAINED * fit.evidence.noise / fit.evidence.span, UNIMPORTANT)
+def _unexplained(fit: Fit[ExperimentRecord], best: Fitted) -> bool:
+    return best.rms > max(UNEXPLAINED * fit.record.noise / fit.record.output_range, UNIMPORTANT)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from loopwright.tuning.fast.design import controller
-from loopwright.tuning.fast.record import Evidence
+from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.output_error import LOG_STEP, Fit, Fitted
 from loopwright.tuning.identification.sensitivity import sensitivities
@@ -23,15 +23,15 @@ MIN_DISTANCE = 0.05
 """Of the loop from -1; nearer, Ms is anything."""
 
 
-def colour(residual: Reals) -> float:
+def durbin_watson_ratio(residual: Reals) -> float:
     """By how much slow averages of the residual vary more than white noise would, at least 1."""
     fast = 0.5 * float(np.mean(np.diff(residual) ** 2))
     return max(1.0, float(np.mean(residual**2)) / fast) if fast > 0.0 else 1.0
 
 
-def fit_covariance(fit: Fit[Evidence], found: Fitted) -> Reals:
+def fit_covariance(fit: Fit[ExperimentRecord], found: Fitted) -> Reals:
     """Of theta and the linear coefficients, in this order."""
-    variance = found.linear.rss / max(fit.samples - found.parameters, 1) * colour(found.linear.residual)
+    variance = found.linear.rss / max(fit.samples - found.parameters, 1) * durbin_watson_ratio(found.linear.residual)
     return seen_covariance(sensitivities(fit, found), variance)
 
 
@@ -43,7 +43,9 @@ def seen_covariance(columns: Reals, variance: float) -> Reals:
     return np.asarray(variance * (inverse @ inverse.T) / np.outer(lengths, lengths))
 
 
-def uncertainty_of_Ms(fit: Fit[Evidence], found: Fitted, gains: Gains, w: Reals, N: float, delay: float) -> float:
+def uncertainty_of_Ms(
+    fit: Fit[ExperimentRecord], found: Fitted, gains: Gains, w: Reals, N: float, delay: float
+) -> float:
     """Ms that would be met at two standard deviations, less the nominal one. delay: s, of the sampling."""
     structure, theta, c = found.structure, found.theta, found.linear.coefficients
     inputs = structure.inputs
@@ -58,7 +60,7 @@ def uncertainty_of_Ms(fit: Fit[Evidence], found: Fitted, gains: Gains, w: Reals,
     slopes = []
     for i in range(len(at)):
         if i == structure.lags:
-            slopes.append(-1j * w * fit.evidence.Ts * nominal)
+            slopes.append(-1j * w * fit.record.Ts * nominal)
             continue
         step = LOG_STEP * (abs(at[i]) + 1e-12 if i >= structure.searched else 1.0)
         move = np.zeros(len(at))
@@ -76,7 +78,7 @@ def uncertainty_of_Ms(fit: Fit[Evidence], found: Fitted, gains: Gains, w: Reals,
 
 
 def difference_of_rivals(
-    fit: Fit[Evidence], best: Fitted, rivals: Sequence[Fitted], gains: Gains, w: Reals, delay: float
+    fit: Fit[ExperimentRecord], best: Fitted, rivals: Sequence[Fitted], gains: Gains, w: Reals, delay: float
 ) -> float:
     """The largest |Ms - nominal Ms| that the same controller has on another model the record supports."""
     nominal = peak(fit.model(best), gains, w, delay)

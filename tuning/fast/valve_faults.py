@@ -11,29 +11,29 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopwright.tuning.fast.record import Evidence
+from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN
-from loopwright.tuning.identification.output_error import Fit, Fitted, Hypothesis
+from loopwright.tuning.identification.output_error import DisturbanceHypothesis, Fit, Fitted
 from loopwright.tuning.models import Reals
 
 SIZES = (0.03, 0.06, 0.11, 0.19, 0.31)  # of MV's largest move
-MIN_STICK = 0.04
+MIN_STICTION = 0.04
 """Of MV's largest move: less is not told from a plant that is none of the structures, and does not move Ms."""
-ENDS, WIDEST_END = (0.55, 0.7, 0.85), 0.96
+SATURATIONS, MAX_SATURATION = (0.55, 0.7, 0.85), 0.96
 FIRST_STEPS, STEPS = 4, 10
 REFINED = (1.25, 1.1, 1.04)
 """Factors by which the size of the likeliest fault is moved."""
 
 
 @dataclass(frozen=True, slots=True)
-class Suspicion:
+class ValveFault:
     """fault: in words.  gain: of BIC over the best model without it."""
 
     fault: str
     gain: float
 
 
-def play(u: Reals, band: float) -> Reals:
+def backlash(u: Reals, band: float) -> Reals:
     """The valve follows `band` behind."""
     at, found = 0.0, []
     for value in u:
@@ -42,7 +42,7 @@ def play(u: Reals, band: float) -> Reals:
     return np.array(found)
 
 
-def stick(u: Reals, size: float) -> Reals:
+def stiction(u: Reals, size: float) -> Reals:
     """The valve stays until MV is off by more than `size`, then jumps there."""
     at, found = 0.0, []
     for value in u:
@@ -52,27 +52,27 @@ def stick(u: Reals, size: float) -> Reals:
     return np.array(found)
 
 
-def end(u: Reals, size: float) -> Reals:
+def saturation(u: Reals, size: float) -> Reals:
     """The valve goes no further."""
     return np.clip(u, -size, size)
 
 
 FAULTS = {
-    play: (SIZES, "a valve that follows about {:.2g} of MV behind"),
-    stick: (SIZES, "a valve that sticks until MV is off by about {:.2g}"),
-    end: (ENDS, "an actuator that goes about {:.2g} of MV far"),
+    backlash: (SIZES, "a valve that follows about {:.2g} of MV behind"),
+    stiction: (SIZES, "a valve that sticks until MV is off by about {:.2g}"),
+    saturation: (SATURATIONS, "an actuator that goes about {:.2g} of MV far"),
 }
 
 
-def suspect(fit: Fit[Evidence], best: Fitted) -> Suspicion | None:
+def find_valve_fault(fit: Fit[ExperimentRecord], best: Fitted) -> ValveFault | None:
     """The fault that explains the record clearly better than the best model without one."""
-    structure, evidence = best.structure, fit.evidence
+    structure, record = best.structure, fit.record
     # at rest nobody knows where in its slack the valve stands: that is a load from the relay's start on
-    slack = Hypothesis(loads=1)
-    start = np.append(best.theta[: structure.searched], evidence.listened)
+    slack = DisturbanceHypothesis(load_disturbances=1)
+    start = np.append(best.theta[: structure.searched], record.listened)
 
     def under(fault: Callable[[Reals, float], Reals], size: float, theta: Reals, steps: int) -> Fitted:
-        moved = Fit(replace(evidence, u=evidence.swing * fault(fit.u, size)))
+        moved = Fit(replace(record, u=record.input_range * fault(fit.u, size)))
         return moved.search(structure, slack, [theta], steps)
 
     tried = [
@@ -80,17 +80,17 @@ def suspect(fit: Fit[Evidence], best: Fitted) -> Suspicion | None:
     ]
     found, fault, size = min(tried, key=_bic)
     for factor in REFINED:
-        sizes = [each for each in (size / factor, size * factor) if fault is not end or each <= WIDEST_END]
+        sizes = [each for each in (size / factor, size * factor) if fault is not saturation or each <= MAX_SATURATION]
         near = [(under(fault, each, found.theta, FIRST_STEPS), fault, each) for each in sizes]
         found, fault, size = min([(found, fault, size), *near], key=_bic)
-    if fault is stick and size < MIN_STICK:
+    if fault is stiction and size < MIN_STICTION:
         return None
     found = under(fault, size, found.theta, STEPS)
     # that freedom alone may explain as much: MV at rest is known only as well as the noise lets it be. Or the way that
     # the search has gone: the best fit may be a local minimum
     sound = fit.search(structure, slack, [start, found.theta], FIRST_STEPS + STEPS)
     gain = min(best.bic, sound.bic) - found.bic
-    return Suspicion(FAULTS[fault][1].format(size * evidence.swing), gain) if gain > MIN_BIC_GAIN else None
+    return ValveFault(FAULTS[fault][1].format(size * record.input_range), gain) if gain > MIN_BIC_GAIN else None
 
 
 def _bic(each: tuple[Fitted, object, float]) -> float:

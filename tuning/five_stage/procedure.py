@@ -115,7 +115,7 @@ class Options:
 
 
 @dataclass(frozen=True, slots=True)
-class Model:
+class EstimatedModel:
     """What the gains were made on: FOPDT, or SOPDT when zeta is given (T_s is then 1/(natural frequency)).
 
     K: PV units per MV unit, signed.  k_source: "k5" or "ke" (the estimate with either gain), "record" or "typed in".
@@ -147,7 +147,7 @@ class Proposal:
 
     method: str
     chosen: Mapping[str, float]
-    model: Model
+    model: EstimatedModel
     old_gains: Gains
     gains: Gains
     predicted: Predicted
@@ -166,7 +166,7 @@ class Finished:
     relay: RelayResult | None = None
     ultimate: UltimateResult | None = None
     zn_pi: ZnResult | None = None
-    estimate: Model | None = None
+    estimate: EstimatedModel | None = None
     optimise: Designed | None = None
 
 
@@ -225,7 +225,7 @@ def five_stage(facts: Facts, options: Options, finished: Finished = Finished()) 
     elif options.start == "zn_pi":
         ultimate = Ultimate(_typed(options.Ku), _typed(options.Pu_s))
 
-    def estimated() -> Plan[Model]:
+    def estimated() -> Plan[EstimatedModel]:
         if zn is None:
             Kp, Ti, overshoot = _typed(options.Kp), _typed(options.Ti_s), _typed(options.overshoot_pct)
             return _estimate(facts, Kp, Ti, overshoot, gain, options.k_source, notes)
@@ -296,7 +296,9 @@ def _baseline(facts: Facts, point: OperatingPoint) -> Plan[StepResult]:
     return result
 
 
-def _estimate(facts: Facts, Kp: float, Ti: float, overshoot: float, ke: float, source: str, notes: list[str]) -> Model:
+def _estimate(
+    facts: Facts, Kp: float, Ti: float, overshoot: float, ke: float, source: str, notes: list[str]
+) -> EstimatedModel:
     estimate = fopdt_from_overshoot(Kp, Ti, overshoot)
     sign = 1.0 if facts.reverse else -1.0
     k5 = sign * estimate.k5
@@ -309,10 +311,10 @@ def _estimate(facts: Facts, Kp: float, Ti: float, overshoot: float, ke: float, s
     if source == "ke" and not known:
         raise Refused(Reason.BAD_INPUT, 'k_source "ke" needs a measured static gain: enter at an earlier stage')
     K = ke if source == "ke" else k5
-    return Model(K, estimate.T, estimate.L, source, k5, ke if known else None)
+    return EstimatedModel(K, estimate.T, estimate.L, source, k5, ke if known else None)
 
 
-def _typed_in(facts: Facts, options: Options) -> Model:
+def _typed_in(facts: Facts, options: Options) -> EstimatedModel:
     plant = options.model
     assert plant is not None  # Options has checked it
     if (plant.K > 0) != facts.reverse:
@@ -320,7 +322,7 @@ def _typed_in(facts: Facts, options: Options) -> Model:
             Reason.WRONG_SIGN,
             f"the model's gain {plant.K:g} does not go with a {'reverse' if facts.reverse else 'direct'} action",
         )
-    return Model(plant.K, plant.T, plant.L, "typed in", zeta=plant.zeta if isinstance(plant, SOPDT) else None)
+    return EstimatedModel(plant.K, plant.T, plant.L, "typed in", zeta=plant.zeta if isinstance(plant, SOPDT) else None)
 
 
 def _wants_record(options: Options) -> bool:
@@ -328,8 +330,8 @@ def _wants_record(options: Options) -> bool:
 
 
 def _identified(
-    facts: Facts, point: OperatingPoint, step: Trace, estimate: Model, asked: bool, notes: list[str]
-) -> Plan[Model]:
+    facts: Facts, point: OperatingPoint, step: Trace, estimate: EstimatedModel, asked: bool, notes: list[str]
+) -> Plan[EstimatedModel]:
     """The model that the set-point step of Stage 3 supports best, while the loop goes on.
 
     Unless it was asked for, one that does not explain the step gives way to the estimate.
@@ -352,10 +354,10 @@ def _identified(
     if (plant.K > 0) != facts.reverse:
         raise Refused(Reason.WRONG_SIGN, f"the set-point step fits a gain of {plant.K:.4g}, of the wrong sign")
     zeta = plant.zeta if isinstance(plant, SOPDT) else None
-    return Model(plant.K, plant.T, plant.L, "record", estimate.k5, estimate.ke, zeta, found.fit_pct)
+    return EstimatedModel(plant.K, plant.T, plant.L, "record", estimate.k5, estimate.ke, zeta, found.fit_pct)
 
 
-def _designed(options: Options, model: Model, ultimate: Ultimate | None) -> Plan[Designed]:
+def _designed(options: Options, model: EstimatedModel, ultimate: Ultimate | None) -> Plan[Designed]:
     rule = rule_of(options.method)
     compute = partial(design, rule, model.plant(), ultimate, options.method_options)
     if METHODS[rule].slow:

@@ -131,7 +131,7 @@ def _p_run(facts: Facts, point: OperatingPoint, K: float, step: float, period: f
     ask = start + 2.5 * period
     limit = RUN_MV_LIMIT * point.room
     before: Growth | None = None
-    verdict: Growth | None = None
+    growth: Growth | None = None
     ended = "time"
     at_limit = 0
     while sample.t - start < longest:
@@ -143,23 +143,23 @@ def _p_run(facts: Facts, point: OperatingPoint, K: float, step: float, period: f
                 break
         if sample.t >= ask:
             ask += 0.5 * period
-            verdict = _growth(trace, start + period, period)
-            clear = abs(verdict.log_per_period) > max(0.02, 5 * verdict.error)
-            if clear and before and verdict.log_per_period * before.log_per_period > 0:
+            growth = _growth(trace, start + period, period)
+            clear = abs(growth.log_per_period) > max(0.02, 5 * growth.error)
+            if clear and before and growth.log_per_period * before.log_per_period > 0:
                 ended = "clear"
                 break
-            before = verdict
+            before = growth
         sample = yield ()
     if ended == "mv limit":
-        swings = verdict.log_per_period if verdict else 0.0
-        mean = verdict.mean if verdict else point.pv
+        swings = growth.log_per_period if growth else 0.0
+        mean = growth.mean if growth else point.pv
         return Run(K, max(0.05, swings), math.inf, period, sample.t - start, ended), mean
     if ended == "time":
-        verdict = _growth(trace, start + period, period)
-    assert verdict is not None
-    if not 0.5 < verdict.period / period < 2 or verdict.amplitude < 2 * verdict.noise / math.sqrt(len(trace)):
-        return Run(K, -0.5, 0.1, period, sample.t - start, "died out"), verdict.mean
-    return Run(K, verdict.log_per_period, verdict.error, verdict.period, sample.t - start, ended), verdict.mean
+        growth = _growth(trace, start + period, period)
+    assert growth is not None
+    if not 0.5 < growth.period / period < 2 or growth.amplitude < 2 * growth.noise / math.sqrt(len(trace)):
+        return Run(K, -0.5, 0.1, period, sample.t - start, "died out"), growth.mean
+    return Run(K, growth.log_per_period, growth.error, growth.period, sample.t - start, ended), growth.mean
 
 
 def _growth(trace: Trace, since: float, period: float) -> Growth:

@@ -24,10 +24,10 @@ from numpy.typing import ArrayLike
 
 from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN, by_bic
 from loopwright.tuning.identification.feedback_test import follows_from_pv
-from loopwright.tuning.identification.output_error import MOVING, QUIET, Fitted, count
-from loopwright.tuning.identification.problem import WHITE_ABOVE, Problem
-from loopwright.tuning.identification.record import recorded
-from loopwright.tuning.identification.structure_search import Search, confounded
+from loopwright.tuning.identification.output_error import NOT_AT_REST_INITIALLY, UNDISTURBED, Fitted, count
+from loopwright.tuning.identification.problem import WHITE_ABOVE, IdentificationProblem
+from loopwright.tuning.identification.record import recorded_test
+from loopwright.tuning.identification.structure_search import StructureSearch, confounded
 from loopwright.tuning.identification.structures import FIRST, INTEGRATOR, LAGGED_INTEGRATOR, SECOND
 from loopwright.tuning.models import Integrating, Model, Reals, TransferFunction
 
@@ -133,10 +133,10 @@ def identify(
     visibly and Refused(NOISE_TOO_HIGH) where the noise is more than half of the answer. The plant
     must be stable or integrate once.
     """
-    record = recorded(t, u, y, u_before)
-    problem = Problem(record)
+    record = recorded_test(t, u, y, u_before)
+    problem = IdentificationProblem(record)
     best, tried = _chosen(problem, lags_only)
-    problem.require_visible(best)
+    problem.require_visible_response(best)
     # of each structure and story the best alone
     ranked = {(fit.structure, fit.hypothesis): fit for fit in sorted([*tried, best], key=by_bic, reverse=True)}
     ranked[best.structure, best.hypothesis] = best
@@ -146,41 +146,41 @@ def identify(
     return found
 
 
-def _chosen(problem: Problem, lags_only: bool) -> tuple[Fitted, list[Fitted]]:
+def _chosen(problem: IdentificationProblem, lags_only: bool) -> tuple[Fitted, list[Fitted]]:
     """The fit to answer with, and all that were tried."""
-    tried = [problem.fit(structure, QUIET) for structure in STRUCTURES]
+    tried = [problem.fit(structure, UNDISTURBED) for structure in STRUCTURES]
     lags = best = min(tried, key=by_bic)
     if problem.explains(best, WHITE_ABOVE if lags_only else SURELY_WHITE):
         return best, tried
-    search = Search(problem, list(tried))
-    quiet = [each for each in search.quiet() if not each.structure.plain]
+    search = StructureSearch(problem, list(tried))
+    quiet = [each for each in search.quiet() if not each.structure.lags_only]
     tried += quiet
     richer = min((lags, *quiet), key=by_bic)
     if not (problem.explains(best) or problem.explains(richer)):
-        moving = [problem.fit(structure, MOVING) for structure in STRUCTURES]
+        moving = [problem.fit(structure, NOT_AT_REST_INITIALLY) for structure in STRUCTURES]
         tried += moving
         of_moving = min(moving, key=by_bic)
         if of_moving.bic < min(best.bic, richer.bic) and of_moving.rms < DISTURBED * best.rms:
             best = of_moving
     if lags_only:
         return best, tried
-    if best is lags and richer is not lags and problem.gain(richer, best) > MIN_BIC_GAIN:
+    if best is lags and richer is not lags and problem.bic_gain(richer, best) > MIN_BIC_GAIN:
         best = richer
     # where more than lags explain the record, only lags and one load can be simpler
     explained = best is richer and problem.explains(best, SURELY_WHITE)
-    for told in search.told(simple=explained) if problem.matters(best) else ():
+    for told in search.told(simple=explained) if problem.residual_matters(best) else ():
         tried += told
         story = min((best, *told), key=by_bic)
         # one that is told of fewer parameters needs no more than to be likelier, if anything beside lags is needed
         earned = 0.0 if best is not lags and count(story) <= count(best) else MIN_BIC_GAIN
-        if story is not best and problem.gain(story, best) > earned:
+        if story is not best and problem.bic_gain(story, best) > earned:
             best = story
-    if best is not lags and not best.hypothesis.moving:
+    if best is not lags and not best.hypothesis.not_at_rest_initially:
         best = _polished(problem, best, tried)
     return best, tried
 
 
-def _polished(problem: Problem, fit: Fitted, tried: list[Fitted]) -> Fitted:
+def _polished(problem: IdentificationProblem, fit: Fitted, tried: list[Fitted]) -> Fitted:
     """Searched to the end on every sample, unless another story comes of it; takes its own place in `tried`."""
     further = problem.refined(fit.structure, fit.hypothesis, [fit.theta])
     if further.bic >= fit.bic or confounded(problem, further):
@@ -189,13 +189,13 @@ def _polished(problem: Problem, fit: Fitted, tried: list[Fitted]) -> Fitted:
     return further
 
 
-def _result(problem: Problem, best: Fitted, ranked: Sequence[Fitted], t0: float) -> Identified:
+def _result(problem: IdentificationProblem, best: Fitted, ranked: Sequence[Fitted], t0: float) -> Identified:
     record, unit = problem.record, problem.pv_unit
     parameters, covariance = problem.parameters(best)
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     residual = unit * best.linear.residual
     ratio = float(np.linalg.norm(residual) / np.linalg.norm(record.y - record.y.mean()))
-    of_loads = [each for each in problem.loads(best) if not _at_the_start(problem, each[0])]
+    of_loads = [each for each in problem.load_disturbances(best) if not _at_the_start(problem, each[0])]
     found = Identified(
         model=problem.model(best),
         fit_pct=100.0 * (1.0 - ratio),
@@ -214,27 +214,29 @@ def _result(problem: Problem, best: Fitted, ranked: Sequence[Fitted], t0: float)
         fitted=record.y - residual,
         candidates=tuple(
             Candidate(
-                fit.structure.name, fit.bic, fit.parameters, unit * fit.rms, not fit.hypothesis.moving, fit is best,
-                fit.hypothesis.loads, fit.hypothesis.drift,
+                fit.structure.name, fit.bic, fit.parameters, unit * fit.rms, not fit.hypothesis.not_at_rest_initially, fit is best,
+                fit.hypothesis.load_disturbances, fit.hypothesis.drift,
             )
             for fit in ranked
         ),
         notes=(),
     )  # fmt: skip
-    at_rest = not best.hypothesis.moving and len(of_loads) == best.hypothesis.loads
+    at_rest = not best.hypothesis.not_at_rest_initially and len(of_loads) == best.hypothesis.load_disturbances
     return replace(found, notes=tuple(_notes(problem, best, ranked, found, at_rest)))
 
 
-def _at_the_start(problem: Problem, load: Reals) -> bool:
+def _at_the_start(problem: IdentificationProblem, load: Reals) -> bool:
     """What is told as a load is a plant that was not at rest, or under a load, when the record began."""
     return bool(load[0] <= AT_THE_START * problem.record.Ts)
 
 
-def _notes(problem: Problem, best: Fitted, ranked: Sequence[Fitted], found: Identified, at_rest: bool) -> list[str]:
+def _notes(
+    problem: IdentificationProblem, best: Fitted, ranked: Sequence[Fitted], found: Identified, at_rest: bool
+) -> list[str]:
     notes = []
     if not at_rest:
         notes.append("The plant was not at rest, or under a load, at the start of the record; this was allowed for.")
-    notes += _story(problem, found)
+    notes += _disturbance_notes(problem, found)
     if problem.resolution > COARSE:
         coarse = 100.0 * problem.resolution
         notes.append(f"PV is recorded in steps of {coarse:.2g} % of its span, which limits the result.")
@@ -244,14 +246,16 @@ def _notes(problem: Problem, best: Fitted, ranked: Sequence[Fitted], found: Iden
             "structure, or something else moved PV."
         )
     top = ranked[0]
-    if not top.structure.plain and top.bic < best.bic - RIVAL:
+    if not top.structure.lags_only and top.bic < best.bic - RIVAL:
         notes.append(
             f"A {_words(problem, top)} explains the record better: the model is an approximation."
-            if best.structure.plain
+            if best.structure.lags_only
             else f"A {_words(problem, top)} has a lower BIC, though not by what it would have to earn."
         )
-    near = best.bic + (RIVAL if best.structure.plain and best.hypothesis in (QUIET, MOVING) else RIVAL_OF_MANY)
-    rivals = {_named(fit) for fit in ranked if fit.bic < near and (fit.structure.plain or near > best.bic + RIVAL)}
+    near = best.bic + (
+        RIVAL if best.structure.lags_only and best.hypothesis in (UNDISTURBED, NOT_AT_REST_INITIALLY) else RIVAL_OF_MANY
+    )
+    rivals = {_named(fit) for fit in ranked if fit.bic < near and (fit.structure.lags_only or near > best.bic + RIVAL)}
     rivals.discard(_named(best))
     if rivals:
         notes.append(f"The record supports nearly as well: {', '.join(sorted(rivals))}.")
@@ -267,7 +271,7 @@ def _notes(problem: Problem, best: Fitted, ranked: Sequence[Fitted], found: Iden
     return notes
 
 
-def _poorly_known(problem: Problem, found: Identified) -> list[str]:
+def _poorly_known(problem: IdentificationProblem, found: Identified) -> list[str]:
     """Names of parameters."""
     poor = []
     for name, value in found.parameters.items():
@@ -286,12 +290,12 @@ def _poorly_known(problem: Problem, found: Identified) -> list[str]:
 
 def _named(fit: Fitted) -> str:
     """The structure with its story."""
-    loads = fit.hypothesis.loads
+    loads = fit.hypothesis.load_disturbances
     story = ("", " with a step of the load", " with two steps of the load")[loads]
     return fit.structure.name + (" and a drift" if fit.hypothesis.drift else story)
 
 
-def _words(problem: Problem, fit: Fitted) -> str:
+def _words(problem: IdentificationProblem, fit: Fitted) -> str:
     """Of a structure that is more than lags."""
     model = problem.model(fit)
     order = "second" if fit.structure.order == 2 else "third" if fit.structure.order == 3 else "first"
@@ -303,7 +307,7 @@ def _words(problem: Problem, fit: Fitted) -> str:
     return f"{order}-order model" + (f" with {' and '.join(parts)}" if parts else "")
 
 
-def _story(problem: Problem, found: Identified) -> list[str]:
+def _disturbance_notes(problem: IdentificationProblem, found: Identified) -> list[str]:
     """What moved PV beside MV, and when not to believe it."""
     notes = []
     for load in found.loads:

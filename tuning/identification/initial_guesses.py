@@ -18,7 +18,7 @@ RATIO = 2.0
 DAMPING_RATIOS = (0.15, 0.4, 0.7)
 
 
-def starts(structure: Structure, u: Reals, y: Reals, most_dead_time: int, nuisance: bool, keep: int) -> list[Reals]:
+def starts(structure: Structure, u: Reals, y: Reals, max_dead_time: int, nuisance: bool, keep: int) -> list[Reals]:
     """The `keep` best theta that differ, best first, of a coarse grid of denominators and every whole dead time.
 
     nuisance: a load step from the start is allowed for, with the same denominator.
@@ -30,7 +30,7 @@ def starts(structure: Structure, u: Reals, y: Reals, most_dead_time: int, nuisan
         others = np.ones((len(u), 1))
         if nuisance:
             others = np.concatenate((others, states(monic, 0.0, np.ones(len(u)), structure.order)), axis=1)
-        rss = _of_all_shifts(response, y, others, most_dead_time)
+        rss = _of_all_shifts(response, y, others, max_dead_time)
         m = int(np.argmin(rss))
         found.append((float(rss[m]), np.append(logs, float(m))))
     found.sort(key=lambda each: each[0])

@@ -12,7 +12,7 @@ import numpy as np
 
 from loopwright.tuning.analysis.zero_order_hold import pulses
 from loopwright.tuning.identification.structures import Structure
-from loopwright.tuning.identification.variable_projection import REDUNDANT, Bounded, Linear, descend, solve
+from loopwright.tuning.identification.variable_projection import REDUNDANT, LinearFit, SearchBounds, descend, solve
 from loopwright.tuning.models import Reals, TransferFunction
 
 FLOOR = 2e-4
@@ -30,7 +30,7 @@ LOG_STEP = 1e-4
 LOG_REACH = 1.5
 
 
-class Signals(Protocol):
+class RecordToFit(Protocol):
     """A record as the fit wants it.
 
     Ts: s.  u, y: MV and PV, shape (N,), as deviations from rest; MV is 0 before the record.  swing: of MV, span: of PV,
@@ -45,34 +45,34 @@ class Signals(Protocol):
     @property
     def y(self) -> Reals: ...
     @property
-    def swing(self) -> float: ...
+    def input_range(self) -> float: ...
     @property
-    def span(self) -> float: ...
+    def output_range(self) -> float: ...
     @property
     def period(self) -> float: ...
     @property
-    def most_dead_time(self) -> float: ...
+    def max_dead_time(self) -> float: ...
     @property
     def block(self) -> int: ...
 
 
-S = TypeVar("S", bound=Signals)
+S = TypeVar("S", bound=RecordToFit)
 
 
 @dataclass(frozen=True, slots=True)
-class Hypothesis:
+class DisturbanceHypothesis:
     """What moved PV beside MV. loads: steps of the load at times to be found.  drift: PV drifts at a steady rate.
 
     moving: the plant was not at rest, or under a load, when the record began.
     """
 
-    loads: int = 0
+    load_disturbances: int = 0
     drift: bool = False
-    moving: bool = False
+    not_at_rest_initially: bool = False
 
 
-QUIET = Hypothesis()
-MOVING = Hypothesis(moving=True)
+UNDISTURBED = DisturbanceHypothesis()
+NOT_AT_REST_INITIALLY = DisturbanceHypothesis(not_at_rest_initially=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,10 +83,10 @@ class Fitted:
     """
 
     structure: Structure
-    hypothesis: Hypothesis
+    hypothesis: DisturbanceHypothesis
     theta: Reals
     columns: Reals
-    linear: Linear
+    linear: LinearFit
     bic: float
 
     @property
@@ -100,31 +100,31 @@ class Fitted:
 
 def count(fit: Fitted) -> int:
     """Parameters, as BIC takes them: a load's time was chosen among many and counts twice."""
-    return fit.parameters + fit.hypothesis.loads
+    return fit.parameters + fit.hypothesis.load_disturbances
 
 
 class Fit(Generic[S]):
     """Fits one record. Time in samples, MV in swings, PV in spans."""
 
-    def __init__(self, evidence: S) -> None:
-        self.evidence = evidence
-        self.block = evidence.block
-        self.u = evidence.u / evidence.swing
-        self.y = averaged(evidence.y / evidence.span, self.block)
+    def __init__(self, record: S) -> None:
+        self.record = record
+        self.block = record.block
+        self.u = record.u / record.input_range
+        self.y = averaged(record.y / record.output_range, self.block)
         self.samples = len(self.y)
-        self.period = evidence.period
+        self.period = record.period
         self._step = np.ones(len(self.u))
         self._always = averaged(np.column_stack((self._step, np.linspace(-1.0, 1.0, len(self.u)))), self.block)
         self._rate = math.log(1.0 / self.period)
 
     # what is fitted
 
-    def regressors(self, structure: Structure, hypothesis: Hypothesis, thetas: Reals) -> Reals:
+    def regressors(self, structure: Structure, hypothesis: DisturbanceHypothesis, thetas: Reals) -> Reals:
         """Columns of everything linear for each theta, shape (thetas, rows, columns)."""
         many, inputs = len(thetas), structure.zeros + 1
         # one call for MV and every load: what it costs is mostly the call
         times = thetas[:, structure.lags :].T
-        if hypothesis.moving:
+        if hypothesis.not_at_rest_initially:
             # a step of every state at the start stands for any state there, and for a load
             times = np.append(times, np.zeros((1, many)), axis=0)
         steps = len(times) - 1
@@ -147,49 +147,53 @@ class Fit(Generic[S]):
             at += structure.order
         return out
 
-    def fitted(self, structure: Structure, hypothesis: Hypothesis, theta: Reals) -> Fitted:
+    def fitted(self, structure: Structure, hypothesis: DisturbanceHypothesis, theta: Reals) -> Fitted:
         """The best linear part for this theta."""
         columns = self.regressors(structure, hypothesis, theta[None])[0]
         linear = solve(columns, self.y)
         # a load's time was chosen among many: it counts twice
-        parameters = len(theta) + columns.shape[1] + hypothesis.loads
+        parameters = len(theta) + columns.shape[1] + hypothesis.load_disturbances
         bic = self.samples * math.log(linear.rss / self.samples + FLOOR**2) + parameters * math.log(self.samples)
         return Fitted(structure, hypothesis, theta, columns, linear, bic)
 
     def search(
-        self, structure: Structure, hypothesis: Hypothesis, starts: Sequence[Reals], most_steps: int = MAX_STEPS
+        self,
+        structure: Structure,
+        hypothesis: DisturbanceHypothesis,
+        starts: Sequence[Reals],
+        max_steps: int = MAX_STEPS,
     ) -> Fitted:
         """The best local minimum from these starts."""
         if len(starts) > LONG_SEARCHES:
             starts = self._descend(structure, hypothesis, starts, FIRST_STEPS)[:LONG_SEARCHES]
-        return self.fitted(structure, hypothesis, self._descend(structure, hypothesis, starts, most_steps)[0])
+        return self.fitted(structure, hypothesis, self._descend(structure, hypothesis, starts, max_steps)[0])
 
-    def followed(
-        self, structure: Structure, hypothesis: Hypothesis, starts: Sequence[Reals], steps: int
+    def descended(
+        self, structure: Structure, hypothesis: DisturbanceHypothesis, starts: Sequence[Reals], steps: int
     ) -> list[Fitted]:
         """Where so many steps lead from each start, the best first."""
         return [self.fitted(structure, hypothesis, at) for at in self._descend(structure, hypothesis, starts, steps)]
 
     def _descend(
-        self, structure: Structure, hypothesis: Hypothesis, starts: Sequence[Reals], most_steps: int
+        self, structure: Structure, hypothesis: DisturbanceHypothesis, starts: Sequence[Reals], max_steps: int
     ) -> list[Reals]:
         low, high = self.bounds(structure, hypothesis)
-        times = 1 + hypothesis.loads
-        reach = np.append(np.full(structure.lags, LOG_REACH), np.full(times, 0.25 * self.period))
+        times = 1 + hypothesis.load_disturbances
+        max_step = np.append(np.full(structure.lags, LOG_REACH), np.full(times, 0.25 * self.period))
         step = np.append(np.full(structure.lags, LOG_STEP), np.full(times, LOG_STEP * self.period))
 
         def columns(thetas: Reals) -> Reals:
             return self.regressors(structure, hypothesis, thetas)
 
-        bounded = Bounded(low, high, reach, step)
-        found, rss = descend(columns, self.y, np.array(starts), bounded, most_steps, RELATIVE_DECREASE)
+        bounded = SearchBounds(low, high, max_step, step)
+        found, rss = descend(columns, self.y, np.array(starts), bounded, max_steps, RELATIVE_DECREASE)
         return [found[i] for i in np.argsort(rss, kind="stable")]
 
-    def bounds(self, structure: Structure, hypothesis: Hypothesis) -> tuple[Reals, Reals]:
+    def bounds(self, structure: Structure, hypothesis: DisturbanceHypothesis) -> tuple[Reals, Reals]:
         powers = np.array([1.0, 2.0, 1.0][: structure.lags])
-        low = np.concatenate((LOG_LOW + powers * self._rate, np.zeros(1 + hypothesis.loads)))
-        high = np.concatenate((LOG_HIGH + powers * self._rate, [self.evidence.most_dead_time]))
-        return low, np.append(high, np.full(hypothesis.loads, len(self.u) - 2.0 * self.block))
+        low = np.concatenate((LOG_LOW + powers * self._rate, np.zeros(1 + hypothesis.load_disturbances)))
+        high = np.concatenate((LOG_HIGH + powers * self._rate, [self.record.max_dead_time]))
+        return low, np.append(high, np.full(hypothesis.load_disturbances, len(self.u) - 2.0 * self.block))
 
     # where to begin
 
@@ -223,14 +227,14 @@ class Fit(Generic[S]):
         thetas = [
             np.append(logs, max(L, 0.0) * self.period) for logs in self.denominators(structure) for L in dead_times
         ]
-        hypothesis = QUIET
+        hypothesis = UNDISTURBED
         if load_at is not None:
-            hypothesis = Hypothesis(loads=1)
+            hypothesis = DisturbanceHypothesis(load_disturbances=1)
             thetas = [np.append(theta, load_at) for theta in thetas]
-        rss = left_over(self.regressors(structure, hypothesis, np.array(thetas)), self.y)
-        return self.differing([thetas[i] for i in np.argsort(rss)], structure, keep)
+        rss = sums_of_squares_left(self.regressors(structure, hypothesis, np.array(thetas)), self.y)
+        return self.distinct([thetas[i] for i in np.argsort(rss)], structure, keep)
 
-    def differing(self, ranked: Sequence[Reals], structure: Structure, keep: int) -> list[Reals]:
+    def distinct(self, ranked: Sequence[Reals], structure: Structure, keep: int) -> list[Reals]:
         """The first few that are not near another."""
         kept: list[Reals] = []
         for theta in ranked:
@@ -260,8 +264,8 @@ class Fit(Generic[S]):
 
     def transfer(self, structure: Structure, theta: Reals, coefficients: Reals) -> TransferFunction:
         """The plant of these parameters; coefficients as fitted, those of no input ignored."""
-        evidence = self.evidence
-        Ts, unit = evidence.Ts, evidence.span / evidence.swing
+        record = self.record
+        Ts, unit = record.Ts, record.output_range / record.input_range
         order = structure.order
         monic = structure.monic(theta[: structure.searched])
         den = np.append(1.0, monic) * Ts ** -np.arange(order + 1.0)
@@ -275,7 +279,7 @@ class Fit(Generic[S]):
         return TransferFunction(tuple(num), tuple(den), max(float(theta[structure.lags]), 0.0) * Ts)
 
 
-def left_over(columns: Reals, y: Reals) -> Reals:
+def sums_of_squares_left(columns: Reals, y: Reals) -> Reals:
     """Sum of squares left of y by each set of columns, shape (sets,)."""
     lengths = np.sqrt(np.einsum("bij,bij->bj", columns, columns))
     lengths[lengths == 0.0] = 1.0

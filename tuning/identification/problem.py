@@ -9,12 +9,20 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from loopwright.tuning.identification.initial_guesses import starts
-from loopwright.tuning.identification.output_error import FLOOR, LOG_STEP, MOVING, Fit, Fitted, Hypothesis, count
-from loopwright.tuning.identification.record import Recorded
-from loopwright.tuning.identification.residuals import colour, whiteness
+from loopwright.tuning.identification.output_error import (
+    FLOOR,
+    LOG_STEP,
+    NOT_AT_REST_INITIALLY,
+    DisturbanceHypothesis,
+    Fit,
+    Fitted,
+    count,
+)
+from loopwright.tuning.identification.record import RecordedTest
+from loopwright.tuning.identification.residuals import variance_inflation, whiteness
 from loopwright.tuning.identification.sensitivity import sensitivities, slopes_of
 from loopwright.tuning.identification.structures import Plant, Structure
-from loopwright.tuning.identification.variable_projection import Bounded, covariance, descend, solve
+from loopwright.tuning.identification.variable_projection import SearchBounds, covariance, descend, solve
 from loopwright.tuning.models import Model, Reals, TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -41,23 +49,23 @@ MIN_PERIOD = 8.0  # samples
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scaled:
+class ScaledRecord:
     """The record in the units that `tuning.identification.output_error.Signals` wants."""
 
     Ts: float
     u: Reals
     y: Reals
-    swing: float
-    span: float
+    input_range: float
+    output_range: float
     period: float
-    most_dead_time: float
+    max_dead_time: float
     block: int
 
 
-class Problem:
+class IdentificationProblem:
     """The record in units of its own: time in samples, MV and PV in their largest change."""
 
-    def __init__(self, record: Recorded) -> None:
+    def __init__(self, record: RecordedTest) -> None:
         self.record = record
         change = record.u - record.u_before
         self.mv_unit = float(np.max(np.abs(change)))
@@ -69,57 +77,57 @@ class Problem:
         # what rounding leaves is spread evenly over a step of the resolution
         self.rounding = min(self.resolution, COARSEST) / math.sqrt(12.0)
         # a quarter more than rounding leaves on average, for it is not quite random
-        self.unimportant = max(UNIMPORTANT, 1.25 * self.rounding)
+        self.negligible_rms = max(UNIMPORTANT, 1.25 * self.rounding)
         # a response that begins later than this is not to be told from its beginning
-        self.most_dead_time = max(1, int(0.7 * (self.samples - record.first_move)))
-        self.whole = self.wide(0.1 * self.samples, 1)
+        self.max_dead_time = max(1, int(0.7 * (self.samples - record.first_move)))
+        self.full_fit = self.fit_around(0.1 * self.samples, 1)
 
-    def wide(self, period: float, block: int | None = None) -> Fit[Scaled]:
+    def fit_around(self, period: float, block: int | None = None) -> Fit[ScaledRecord]:
         """For a search around a time scale, in samples, on averages of so many samples; by default what it needs."""
         period = min(max(period, self.samples / MAX_PERIODS, MIN_PERIOD), float(self.samples))
         wanted = max(period / AVERAGES_PER_PERIOD, self.samples / MAX_AVERAGES)
         block = block or max(1, int(min(wanted, period / MIN_AVERAGES_PER_PERIOD)))
         record = self.record
-        signals = Scaled(
+        signals = ScaledRecord(
             record.Ts, self.mv_unit * self.u, self.pv_unit * self.y, self.mv_unit, self.pv_unit,
-            period, float(self.most_dead_time), block,
+            period, float(self.max_dead_time), block,
         )  # fmt: skip
         return Fit(signals)
 
-    def fit(self, structure: Structure, hypothesis: Hypothesis) -> Fitted:
+    def fit(self, structure: Structure, hypothesis: DisturbanceHypothesis) -> Fitted:
         """The best of a few searches from the most promising starts; nothing or MOVING for a hypothesis."""
-        moving = hypothesis == MOVING
-        begun = starts(structure, self.u, self.y, self.most_dead_time, moving, STARTS)
+        moving = hypothesis == NOT_AT_REST_INITIALLY
+        begun = starts(structure, self.u, self.y, self.max_dead_time, moving, STARTS)
         return self.refined(structure, hypothesis, begun)
 
-    def refined(self, structure: Structure, hypothesis: Hypothesis, begun: Sequence[Reals]) -> Fitted:
+    def refined(self, structure: Structure, hypothesis: DisturbanceHypothesis, begun: Sequence[Reals]) -> Fitted:
         """The best of the searches from these starts, on every sample."""
         low, high = self._bounds(structure, hypothesis)
-        times = 1 + hypothesis.loads
-        reach = np.append(np.full(structure.lags, 1.5), np.full(times, max(5.0, 0.2 * self.most_dead_time)))
+        times = 1 + hypothesis.load_disturbances
+        max_step = np.append(np.full(structure.lags, 1.5), np.full(times, max(5.0, 0.2 * self.max_dead_time)))
         step = np.append(np.full(structure.lags, 1e-5), np.full(times, 1e-4))
 
         def columns(thetas: Reals) -> Reals:
-            return self.whole.regressors(structure, hypothesis, thetas)
+            return self.full_fit.regressors(structure, hypothesis, thetas)
 
-        bounded = Bounded(low, high, reach, step)
+        bounded = SearchBounds(low, high, max_step, step)
         found, rss = descend(columns, self.y, np.array(begun), bounded, MAX_STEPS, RELATIVE_DECREASE)
         return self.fitted(structure, hypothesis, found[np.argmin(rss)])
 
-    def fitted(self, structure: Structure, hypothesis: Hypothesis, theta: Reals) -> Fitted:
+    def fitted(self, structure: Structure, hypothesis: DisturbanceHypothesis, theta: Reals) -> Fitted:
         """On every sample, with the BIC that all are compared by."""
-        found = self.whole.fitted(structure, hypothesis, theta)
+        found = self.full_fit.fitted(structure, hypothesis, theta)
         return replace(found, bic=self._bic(found.linear.rss, count(found)))
 
     # what is left
 
-    def matters(self, fit: Fitted) -> bool:
+    def residual_matters(self, fit: Fitted) -> bool:
         """Whether what is left must be noise."""
-        return fit.rms > self.unimportant
+        return fit.rms > self.negligible_rms
 
     def explains(self, fit: Fitted, white_above: float = WHITE_ABOVE) -> bool:
         """Nothing of weight is left that is not noise."""
-        return not self.matters(fit) or self.whiteness(fit) >= white_above
+        return not self.residual_matters(fit) or self.whiteness(fit) >= white_above
 
     def whiteness(self, fit: Fitted) -> float:
         """p-value, see `tuning.identification.residuals`."""
@@ -130,23 +138,23 @@ class Problem:
         inputs = fit.structure.inputs
         return fit.rms / float(np.ptp(fit.columns[:, :inputs] @ fit.linear.coefficients[:inputs]))
 
-    def gain(self, fit: Fitted, over: Fitted) -> float:
+    def bic_gain(self, fit: Fitted, over: Fitted) -> float:
         """Of BIC, where a residual that is not white counts as so many fewer samples."""
-        samples = self.samples / (colour(fit.linear.residual) if self.matters(fit) else 1.0)
+        samples = self.samples / (variance_inflation(fit.linear.residual) if self.residual_matters(fit) else 1.0)
         more = count(fit) - count(over)
         floor = self._floor()
         ratio = (over.linear.rss / self.samples + floor) / (fit.linear.rss / self.samples + floor)
         return samples * math.log(ratio) - more * math.log(max(samples, 2.0))
 
-    def visible(self, fit: Fitted) -> bool:
+    def response_visible(self, fit: Fitted) -> bool:
         """PV is explained better with MV than without, more than by chance."""
         inputs = fit.structure.inputs
         rss = solve(fit.columns[:, inputs:], self.y).rss
         return self._bic(rss, fit.parameters - inputs - len(fit.theta)) >= fit.bic + VISIBLE
 
-    def require_visible(self, fit: Fitted) -> None:
+    def require_visible_response(self, fit: Fitted) -> None:
         """Refused unless PV answers MV: more than by chance, and above the noise."""
-        if not self.visible(fit):
+        if not self.response_visible(fit):
             noise = self.pv_unit * solve(fit.columns[:, fit.structure.inputs :], self.y).rss ** 0.5 / self.samples**0.5
             raise Refused(
                 Reason.NO_RESPONSE,
@@ -183,7 +191,7 @@ class Problem:
         kept = np.concatenate((np.arange(searched), len(fit.theta) + np.arange(structure.inputs)))
         return values, slopes @ self.covariance(fit)[np.ix_(kept, kept)] @ slopes.T
 
-    def loads(self, fit: Fitted) -> list[tuple[Reals, Reals]]:
+    def load_disturbances(self, fit: Fitted) -> list[tuple[Reals, Reals]]:
         """Of each step of the load: (when PV answers, when it enters at MV's side, size), errors of the same.
 
         Times in s since the first sample, size in MV units.
@@ -191,13 +199,13 @@ class Problem:
         structure, lags = fit.structure, fit.structure.lags
         first = len(fit.theta)
         found = []
-        for i in range(fit.hypothesis.loads):
+        for i in range(fit.hypothesis.load_disturbances):
             of_load = first + structure.inputs + 1 + fit.hypothesis.drift + i * structure.order
 
             def values(at: Reals, i: int = i, of_load: int = of_load) -> Reals:
                 seen = at[structure.searched + i]
                 moved = replace(fit, theta=at[:first], linear=replace(fit.linear, coefficients=at[first:]))
-                size = at[of_load] / structure.slowest(at[:first]) / self.whole.static_gain(moved)
+                size = at[of_load] / structure.slowest(at[:first]) / self.full_fit.static_gain(moved)
                 Ts = self.record.Ts
                 return np.array([seen * Ts, (seen - at[lags]) * Ts, size * self.mv_unit])
 
@@ -209,27 +217,27 @@ class Problem:
 
     def covariance(self, fit: Fitted) -> Reals:
         """Of theta and the linear coefficients, in this order, linearised; the residual's colour is allowed for."""
-        variance = fit.linear.rss / max(self.samples - fit.parameters, 1) * colour(fit.linear.residual)
-        return covariance(sensitivities(self.whole, fit), variance)
+        variance = fit.linear.rss / max(self.samples - fit.parameters, 1) * variance_inflation(fit.linear.residual)
+        return covariance(sensitivities(self.full_fit, fit), variance)
 
     def _model(self, structure: Structure, theta: Reals, inputs: Reals) -> Model:
-        if structure.plain:
+        if structure.lags_only:
             return self._plant(structure, theta, float(inputs[0]))
-        plant = self.whole.transfer(structure, theta, inputs)
+        plant = self.full_fit.transfer(structure, theta, inputs)
         unit = plant.den[structure.lags]
         return TransferFunction(tuple(b / unit for b in plant.num), tuple(a / unit for a in plant.den), plant.L)
 
     def _plant(self, structure: Structure, theta: Reals, b0: float) -> Plant:
         return structure.plant(theta, b0 * self.pv_unit / self.mv_unit, self.record.Ts)
 
-    def _bounds(self, structure: Structure, hypothesis: Hypothesis) -> tuple[Reals, Reals]:
+    def _bounds(self, structure: Structure, hypothesis: DisturbanceHypothesis) -> tuple[Reals, Reals]:
         slow, fast = math.log(1.0 / (LONGEST_LAG * self.samples)), math.log(1.0 / SHORTEST_LAG)
         low, high = np.full(structure.lags, slow), np.full(structure.lags, fast)
         if structure.lags > 1:
             # the product of two rates; a natural period under six samples is an alias
             low[1], high[1] = 2.0 * slow, 0.0
-        low, high = np.append(low, 0.0), np.append(high, float(self.most_dead_time))
-        loads = hypothesis.loads
+        low, high = np.append(low, 0.0), np.append(high, float(self.max_dead_time))
+        loads = hypothesis.load_disturbances
         return np.append(low, np.zeros(loads)), np.append(high, np.full(loads, self.samples - 2.0))
 
     def _floor(self) -> float:

@@ -18,7 +18,7 @@ GAP = 1.5
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
+class RecordedTest:
     """Ts: s.  y: PV, shape (N,).  u: MV that held from each sample to the next, shape (N,).  u_before: MV before it.
 
     first_move: the first sample from which MV is not u_before.
@@ -31,7 +31,7 @@ class Recorded:
     first_move: int
 
 
-def recorded(t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | None = None) -> Recorded:
+def recorded_test(t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | None = None) -> RecordedTest:
     """Checks and puts together a record; t in s, evenly spaced, u and y of the same length.
 
     u_before: the MV that had held before the record, by default its first value.
@@ -60,7 +60,7 @@ def recorded(t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | None = 
         )
     if float(np.ptp(pv)) == 0.0:
         raise Refused(Reason.NO_RESPONSE, f"PV is constant at {pv[0]:g} while MV moves")
-    return Recorded(Ts, mv, pv, before, first)
+    return RecordedTest(Ts, mv, pv, before, first)
 
 
 def _column(name: str, values: ArrayLike) -> Reals:

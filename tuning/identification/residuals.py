@@ -21,7 +21,7 @@ def whiteness(residual: Reals, searched: int) -> float:
     return float(chdtrc(lags - searched, q))
 
 
-def colour(residual: Reals) -> float:
+def variance_inflation(residual: Reals) -> float:
     """By how much the noise varies more in slow averages than white noise of its variance would; at least 1.
 
     (1 + r)/(1 - r) with the correlation r of neighbours: exact for first-order autoregressive noise.

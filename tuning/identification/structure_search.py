@@ -12,10 +12,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from loopwright.tuning.analysis.margins import ultimate_point
-from loopwright.tuning.identification.disturbances import PLAIN, by_bic, fits, stories, timed_again
+from loopwright.tuning.identification.disturbances import (
+    LAGS_ONLY,
+    by_bic,
+    disturbance_candidates,
+    fit_structures,
+    search_last_load_again,
+)
 from loopwright.tuning.identification.disturbances import STRUCTURES as SEVEN
-from loopwright.tuning.identification.output_error import QUIET, Fitted
-from loopwright.tuning.identification.problem import WHITE_ABOVE, Problem
+from loopwright.tuning.identification.output_error import UNDISTURBED, Fitted
+from loopwright.tuning.identification.problem import WHITE_ABOVE, IdentificationProblem
 from loopwright.tuning.identification.residuals import whiteness
 from loopwright.tuning.identification.structures import (
     INTEGRATOR,
@@ -42,19 +48,19 @@ NEAR = range(-2, 3)
 """Samples, around the dead time found, in which the jump of a plant that passes MV at once is looked for."""
 
 
-class Search:
+class StructureSearch:
     """lags: the fits of the record by lags, the second order among them."""
 
-    def __init__(self, problem: Problem, lags: Sequence[Fitted]) -> None:
+    def __init__(self, problem: IdentificationProblem, lags: Sequence[Fitted]) -> None:
         self.problem = problem
         self._lags = lags
-        self._fit = problem.wide(_period(problem, next(each for each in lags if each.structure == SECOND)))
+        self._fit = problem.fit_around(_period(problem, next(each for each in lags if each.structure == SECOND)))
         self._quiet: list[Fitted] = []
 
     def quiet(self) -> list[Fitted]:
         """All structures from rest that the record can show, on every sample."""
-        known = [self.problem.fit(SECOND_WITH_ZERO, QUIET), *self._lags]
-        self._quiet = fits(self._fit, QUIET, known, STRUCTURES)
+        known = [self.problem.fit(SECOND_WITH_ZERO, UNDISTURBED), *self._lags]
+        self._quiet = fit_structures(self._fit, UNDISTURBED, known, STRUCTURES)
         return self._sound(self._quiet)
 
     def told(self, simple: bool) -> list[list[Fitted]]:
@@ -63,14 +69,16 @@ class Search:
         simple: one load and lags only.
         """
         unexplained = (lambda fit: False) if simple else self._unexplained
-        told = stories(self._fit, self._quiet, unexplained, structures=PLAIN if simple else STRUCTURES)
+        told = disturbance_candidates(
+            self._fit, self._quiet, unexplained, structures=LAGS_ONLY if simple else STRUCTURES
+        )
         for found in told:
-            if (best := min(found, key=by_bic)).hypothesis.loads:
-                found += timed_again(self._fit, best)
+            if (best := min(found, key=by_bic)).hypothesis.load_disturbances:
+                found += search_last_load_again(self._fit, best)
         return [[each for each in self._sound(found) if not confounded(self.problem, each)] for found in told]
 
     def _unexplained(self, fit: Fitted) -> bool:
-        return self.problem.matters(fit) and whiteness(fit.linear.residual, len(fit.theta)) < WHITE_ABOVE
+        return self.problem.residual_matters(fit) and whiteness(fit.linear.residual, len(fit.theta)) < WHITE_ABOVE
 
     def _sound(self, found: list[Fitted]) -> list[Fitted]:
         """Those that the record can show, the lowest BIC first."""
@@ -91,7 +99,7 @@ class Search:
 
         Around its own and around the dead time of the best fit.
         """
-        at, maximum = fit.structure.lags, float(self.problem.most_dead_time)
+        at, maximum = fit.structure.lags, float(self.problem.max_dead_time)
         thetas = [fit.theta]
         if fit.structure.feed_through:
             for whole in np.floor([fit.theta[at], dead_time])[:, None] + np.array(NEAR):
@@ -102,8 +110,8 @@ class Search:
         return self._further(tried[0])
 
 
-def _shown(problem: Problem, fit: Fitted) -> bool:
-    if fit.structure.plain:
+def _shown(problem: IdentificationProblem, fit: Fitted) -> bool:
+    if fit.structure.lags_only:
         return True
     model = problem.model(fit)
     corners = np.abs(np.concatenate((np.roots(model.num), np.roots(model.den))))
@@ -111,12 +119,12 @@ def _shown(problem: Problem, fit: Fitted) -> bool:
     return bool(np.all(corners[corners > 0.0] > 1.0 / longest))
 
 
-def confounded(problem: Problem, fit: Fitted) -> bool:
+def confounded(problem: IdentificationProblem, fit: Fitted) -> bool:
     """A story that may be the plant's own shape: MV is not needed, or a load comes with its move, or with another load.
 
     Where MV moves more often the plant's shape shows without the load.
     """
-    if not problem.visible(fit):
+    if not problem.response_visible(fit):
         return True
     seen = np.sort(fit.theta[fit.structure.searched :])
     near = NEAR_A_MOVE * problem.samples
@@ -129,7 +137,7 @@ def confounded(problem: Problem, fit: Fitted) -> bool:
     return bool(np.any((seen[:, None] > moves - near) & (seen[:, None] < moves + after)))
 
 
-def _period(problem: Problem, second: Fitted) -> float:
+def _period(problem: IdentificationProblem, second: Fitted) -> float:
     """Samples."""
     plant = problem.model(second)
     Ts = problem.record.Ts

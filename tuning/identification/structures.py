@@ -59,7 +59,7 @@ class Structure:
         return float(np.append(1.0, self.monic(theta[: self.searched]))[self.lags])
 
     @property
-    def plain(self) -> bool:
+    def lags_only(self) -> bool:
         """Lags and a dead time, nothing more: what `plant` has a form for."""
         return not (self.zeros or self.feed_through) and self.order <= 2
 
@@ -84,8 +84,8 @@ INTEGRATOR = Structure("integrating", 0, integrating=True)
 LAGGED_INTEGRATOR = Structure("integrating with lag", 1, integrating=True)
 INTEGRATOR_WITH_ZERO = Structure("integrating with lag and zero", 1, integrating=True, zeros=1)
 SECOND_WITH_ZERO = Structure("sopdt with zero", 2, zeros=1)
-FIRST_FED = Structure("fopdt with feed-through", 1, feed_through=True)
-SECOND_FED = Structure("sopdt with zero and feed-through", 2, zeros=1, feed_through=True)
+FIRST_WITH_FEED_THROUGH = Structure("fopdt with feed-through", 1, feed_through=True)
+SECOND_WITH_FEED_THROUGH = Structure("sopdt with zero and feed-through", 2, zeros=1, feed_through=True)
 THIRD = Structure("third order", 3)
 THIRD_WITH_ZERO = Structure("third order with zero", 3, zeros=1)
 THIRD_WITH_ZEROS = Structure("third order with two zeros", 3, zeros=2)

@@ -31,7 +31,7 @@ MIN_SINGULAR = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class Linear:
+class LinearFit:
     """coefficients: shape (columns,).  residual: shape (N,).  rss: its sum of squares."""
 
     coefficients: Reals
@@ -39,22 +39,22 @@ class Linear:
     rss: float
 
 
-def solve(columns: Reals, y: Reals) -> Linear:
+def solve(columns: Reals, y: Reals) -> LinearFit:
     """Least squares with columns of unit length."""
     lengths = np.sqrt(np.einsum("ij,ij->j", columns, columns))
     lengths = np.where(lengths > 0.0, lengths, 1.0)
     found = np.linalg.lstsq(columns / lengths, y, rcond=1e-12)[0] / lengths
     residual = y - columns @ found
-    return Linear(found, residual, float(residual @ residual))
+    return LinearFit(found, residual, float(residual @ residual))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Bounded:
+class SearchBounds:
     """Of each parameter: its bounds, its longest step, and the step of its forward difference."""
 
     low: Reals
     high: Reals
-    reach: Reals
+    max_step: Reals
     step: Reals
 
 
@@ -97,8 +97,8 @@ def descend(
     columns_of: Callable[[Reals], Reals],
     y: Reals,
     starts: Reals,
-    bounded: Bounded,
-    most_steps: int,
+    bounded: SearchBounds,
+    max_steps: int,
     relative_decrease: float,
 ) -> tuple[Reals, Reals]:
     """The local minimum of the sum of squares that each start leads to: (where, the sums there).
@@ -106,14 +106,14 @@ def descend(
     columns_of: the regressors, shape (points, N, columns), at points of shape (points, parameters).  y: shape (N,).
     starts: shape (starts, parameters).
     """
-    low, high, reach = bounded.low, bounded.high, bounded.reach
+    low, high, max_step = bounded.low, bounded.high, bounded.max_step
     at = np.clip(starts, low, high)
     here = _Projected.of(columns_of(at), y)
     cost = here.rss
     damping = np.full(len(at), FIRST_DAMPING)
     one = np.eye(at.shape[1])
     going = np.arange(len(at))
-    for _ in range(most_steps):
+    for _ in range(max_steps):
         slopes = _slopes(columns_of, at, here, going, bounded)
         turned = np.swapaxes(slopes, 1, 2)
         gradient = (turned @ here.rest[going, :, None])[:, :, 0]
@@ -140,7 +140,7 @@ def descend(
             trying, mine, move = trying[worth], mine[worth], move[worth]
             if not len(trying):
                 break
-            new = np.clip(at[mine] + np.clip(move / scale[trying], -reach, reach), low, high)
+            new = np.clip(at[mine] + np.clip(move / scale[trying], -max_step, max_step), low, high)
             there = _Projected.of(columns_of(new), y)
             better = there.rss < cost[mine]
             won = mine[better]
@@ -155,7 +155,9 @@ def descend(
     return at, cost
 
 
-def _slopes(columns_of: Callable[[Reals], Reals], at: Reals, here: _Projected, which: Rows, bounded: Bounded) -> Reals:
+def _slopes(
+    columns_of: Callable[[Reals], Reals], at: Reals, here: _Projected, which: Rows, bounded: SearchBounds
+) -> Reals:
     """Of the residuals at these points by each parameter, shape (points, N, parameters)."""
     points, count = at[which], at.shape[1]
     signed = np.where(points + bounded.step <= bounded.high, bounded.step, -bounded.step)

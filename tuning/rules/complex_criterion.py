@@ -100,7 +100,7 @@ class ComplexCriterion:
         if horizon < MIN_HORIZON:
             shown = f"at least {MIN_HORIZON * self.time_unit_s:.3g} s is accepted"
             raise Refused(Reason.BAD_INPUT, f"horizon_s {horizon_s}: {shown} for this model")
-        self._loops = (_Delayed if plant.L > 0.0 else _Immediate)(plant, horizon, samples)
+        self._loops = (_LoopsWithDeadTime if plant.L > 0.0 else _LoopsWithoutDeadTime)(plant, horizon, samples)
         self.horizon = self._loops.dt * self._loops.steps
         self._w = np.geomspace(1e-2 * self.time_unit_s / total, 1e2 * _fastest(plant), 400)
         self._plant = plant.frequency_response(self._w)
@@ -184,7 +184,7 @@ def _powers(step: Reals, start: Reals, count: int) -> Reals:
     return states
 
 
-class _Immediate:
+class _LoopsWithoutDeadTime:
     """Loops without dead time: states (plant's, integral part), as what is missing to rest at the set-point."""
 
     def __init__(self, plant: Model, horizon: float, samples: int) -> None:
@@ -233,7 +233,7 @@ class _Immediate:
         return np.asarray(np.linalg.eigvals(self._loop(kp, ki)[0]).real.max(axis=1))
 
 
-class _Delayed:
+class _LoopsWithDeadTime:
     """Loops with dead time. A dead time shorter than a sample is stepped over in powers of two."""
 
     def __init__(self, plant: Model, horizon: float, samples: int) -> None:

@@ -11,13 +11,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from loopwright.tuning.analysis.comparison import (
-    Asked,
     Comparison,
     IAE_over_present,
     Predicted,
-    compared,
+    RobustnessBounds,
+    compare,
+    loop_performance,
     predicted,
-    worth,
 )
 from loopwright.tuning.analysis.margins import Ultimate
 from loopwright.tuning.gains import Gains
@@ -59,7 +59,7 @@ def design(
     """
     setting = _setting(method, plant, ultimate, options or {})
     gains, notes = realisable(setting.gains, METHODS[method].filter)
-    found = worth(plant, gains)
+    found = loop_performance(plant, gains)
     robust = found.Ms is not None and found.Ms <= MAX_Ms * ROUNDING and (found.GM is None or found.GM >= MIN_GM)
     if not robust:
         GM = "none" if found.GM is None else f"{found.GM:.2f}"
@@ -94,16 +94,16 @@ def comparison_of(
     minimise nothing: their gains are worth having where they are more robust than the old ones, or bring the IAE down.
     anyway: see `tuning.analysis.comparison.compared`.
     """
-    before, after = worth(plant, old_gains, sample_time_s), worth(plant, designed.gains)
+    before, after = loop_performance(plant, old_gains, sample_time_s), loop_performance(plant, designed.gains)
     assert after.Ms is not None  # `design` sees to that
     of_robust = designed.method == ROBUST
-    asked = Asked(MAX_Ms, GM=MIN_GM) if of_robust else Asked(after.Ms, by=f"by {designed.method}")
+    asked = RobustnessBounds(MAX_Ms, GM=MIN_GM) if of_robust else RobustnessBounds(after.Ms, by=f"by {designed.method}")
     if of_robust and isinstance(plant, FOPDT) and _plain_pi(old_gains):
         scale_free = options.get("scale_free")
         of = Criterion(plant, designed.chosen["horizon_s"], None if scale_free is None else bool(scale_free))
         now, then = (None if J >= UNSTABLE else J for J in (of(g.Kp, g.Ti) for g in (old_gains, designed.gains)))
-        return compared(before, after, asked, CRITERION_7, (now, then), anyway)
-    return compared(before, after, asked, OVER_PRESENT, IAE_over_present(before, after), anyway)
+        return compare(before, after, asked, CRITERION_7, (now, then), anyway)
+    return compare(before, after, asked, OVER_PRESENT, IAE_over_present(before, after), anyway)
 
 
 def _plain_pi(gains: Gains) -> bool:

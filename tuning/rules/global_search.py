@@ -22,7 +22,7 @@ Cost = Callable[[Reals], Reals]
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class SearchResult:
     """point: (n,).  value: the criterion there.  evaluations: of single points.  epochs: starts of the search."""
 
     point: Reals
@@ -40,7 +40,7 @@ def multi_epoch_swarm(
     social: float = 2.1,
     cognitive: float = 0.1,
     acceptable_rate: float = 0.1,
-) -> Found:
+) -> SearchResult:
     """ME-PSO: x + cognitive*r1*(own best - x) + social*r2*(best of all - x), no velocity, clipped to the square.
 
     When an iteration lowers the best of all by no more than acceptable_rate of it, all particles are thrown anew and
@@ -69,10 +69,10 @@ def multi_epoch_swarm(
             at = rng.random(shape)
             own, own_value = at, np.full(particles, np.inf)
             epochs += 1
-    return Found(best, best_value, particles * iterations, epochs)
+    return SearchResult(best, best_value, particles * iterations, epochs)
 
 
-def differential_evolution(cost: Cost, dimensions: int, seed: int, budget: int = 2500) -> Found:
+def differential_evolution(cost: Cost, dimensions: int, seed: int, budget: int = 2500) -> SearchResult:
     """scipy's differential evolution, a whole generation of 25 points a dimension at once, at most `budget` points."""
     population, evaluations = 25 * dimensions, 0
 
@@ -92,10 +92,10 @@ def differential_evolution(cost: Cost, dimensions: int, seed: int, budget: int =
         updating="deferred",
         vectorized=True,
     )
-    return Found(np.asarray(found.x), float(found.fun), evaluations)
+    return SearchResult(np.asarray(found.x), float(found.fun), evaluations)
 
 
-def nelder_mead(cost: Cost, dimensions: int, seed: int, budget: int = 2500, starts: int = 10) -> Found:
+def nelder_mead(cost: Cost, dimensions: int, seed: int, budget: int = 2500, starts: int = 10) -> SearchResult:
     """scipy's Nelder-Mead from the best few of budget/5 random points that are apart, then once more from the best."""
     scattered: Reals = np.random.default_rng(seed).random((budget // 5, dimensions))
     values = cost(scattered)
@@ -106,7 +106,7 @@ def nelder_mead(cost: Cost, dimensions: int, seed: int, budget: int = 2500, star
     def one(x: Reals) -> float:
         return float(cost(x[None, :])[0])
 
-    def search(start: Reals, size: float) -> Found:
+    def search(start: Reals, size: float) -> SearchResult:
         inwards = np.where(start < 0.5, size, -size)
         simplex = start + np.concatenate((np.zeros((1, dimensions)), inwards * np.eye(dimensions)))
         found = optimize.minimize(
@@ -116,9 +116,9 @@ def nelder_mead(cost: Cost, dimensions: int, seed: int, budget: int = 2500, star
             bounds=optimize.Bounds(np.zeros(dimensions), np.ones(dimensions)),
             options={"initial_simplex": simplex, "xatol": 1e-6, "fatol": 1e-6, "maxfev": each},
         )
-        return Found(np.asarray(found.x), float(found.fun), int(found.nfev))
+        return SearchResult(np.asarray(found.x), float(found.fun), int(found.nfev))
 
-    runs: list[Found] = []
+    runs: list[SearchResult] = []
     while len(runs) < starts and len(left):
         runs.append(search(left[0], 0.05))
         left = left[np.abs(left - left[0]).max(axis=1) > 0.05]
@@ -127,4 +127,4 @@ def nelder_mead(cost: Cost, dimensions: int, seed: int, budget: int = 2500, star
     again = search(best.point, 0.01)
     evaluations += sum(run.evaluations for run in runs) + again.evaluations
     best = min(best, again, key=lambda run: run.value)
-    return Found(best.point, best.value, evaluations, len(runs) + 1)
+    return SearchResult(best.point, best.value, evaluations, len(runs) + 1)

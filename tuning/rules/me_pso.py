@@ -20,10 +20,16 @@ from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Model, Reals
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.complex_criterion import ComplexCriterion, Weighting
-from loopwright.tuning.rules.global_search import Cost, Found, differential_evolution, multi_epoch_swarm, nelder_mead
+from loopwright.tuning.rules.global_search import (
+    Cost,
+    SearchResult,
+    differential_evolution,
+    multi_epoch_swarm,
+    nelder_mead,
+)
 from loopwright.tuning.rules.setting import Setting
 
-OPTIMISERS: dict[str, Callable[[Cost, int, int], Found]] = {
+OPTIMISERS: dict[str, Callable[[Cost, int, int], SearchResult]] = {
     "me-pso": multi_epoch_swarm,
     "de": differential_evolution,
     "nelder-mead": nelder_mead,
@@ -118,7 +124,7 @@ def _highest_ti(criterion: ComplexCriterion, Ki_min: float | None) -> float:
 
 def _search(
     criterion: ComplexCriterion, highest: Reals, optimiser: str, seed: int
-) -> tuple[Found, tuple[float, float]]:
+) -> tuple[SearchResult, tuple[float, float]]:
     """(what was found, (kp, ti)). The swarm and differential evolution search evenly, as published."""
 
     def even(x: Reals) -> Reals:

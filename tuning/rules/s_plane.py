@@ -64,7 +64,7 @@ class Minimum:
 
 
 @dataclass(frozen=True, slots=True)
-class Design:
+class PolePlacement:
     """admissible: intervals of alpha, 1/s, ends included; beyond the last searched alpha it is not known.
 
     minima: by alpha. Both may be empty.
@@ -105,7 +105,7 @@ def s_plane(
                 f"alpha_per_s {alpha_per_s} with mu {mu}: a gain is not positive or the loop not stable; "
                 f"{shown or 'no alpha'} 1/s is accepted",
             )
-        found = Design((), (search.minimum(alpha_per_s * search.unit),))
+        found = PolePlacement((), (search.minimum(alpha_per_s * search.unit),))
     else:
         found = search.design()
         if not found.admissible:
@@ -136,7 +136,7 @@ def s_plane(
     return Setting(best.gains, chosen, tuple(notes))
 
 
-def design(model: Model, *, controller: str, mu: float, tau_s: float, k1: float = 1.2) -> Design:
+def design(model: Model, *, controller: str, mu: float, tau_s: float, k1: float = 1.2) -> PolePlacement:
     """The admissible alphas and all local minima of J on them; arguments as for `s_plane`.
 
     alpha is searched from 0.01 to 100 over all lags and the dead time together, not beyond 10/L. More poles than zeros
@@ -175,7 +175,7 @@ class _Search:
         self.unit, self.per_gain = unit, gain_unit(model, unit)
         self.plant, self.tau = plant, tau
         self.shape = np.array([-1.0 + 1j * mu] if k1 is None else [-1.0 + 1j * mu, -k1 + 0j])
-        self.loop: _Rational | _Delayed = _Delayed(plant) if plant.L > 0.0 else _Rational(plant)
+        self.loop: _RationalLoops | _DelayedLoops = _DelayedLoops(plant) if plant.L > 0.0 else _RationalLoops(plant)
 
     def gains(self, alpha: Reals) -> Reals:
         """(p, 3): Kp, Ki, Kd that place the prescribed roots; not finite where there are none."""
@@ -239,9 +239,9 @@ class _Search:
         J0, J1 = self.loop.squares(self.gains(np.array([alpha])))
         return float(J0[0] + self.tau**2 * J1[0])
 
-    def design(self) -> Design:
+    def design(self) -> PolePlacement:
         intervals = self.admissible()
-        return Design(
+        return PolePlacement(
             admissible=tuple((low / self.unit, high / self.unit) for low, high in intervals),
             minima=tuple(self.minimum(alpha) for low, high in intervals for alpha in self.local_minima(low, high)),
         )
@@ -270,7 +270,7 @@ class _Search:
         )
 
 
-class _Rational:
+class _RationalLoops:
     """Loops without dead time, by their polynomials P = s*A + N*B; the error of a unit step is A/P."""
 
     def __init__(self, plant: TransferFunction) -> None:
@@ -329,7 +329,7 @@ def _solved(systems: Reals, sides: Reals) -> Reals:
         return np.concatenate([_solved(systems[i : i + 1], sides[i : i + 1]) for i in range(len(systems))])
 
 
-class _Delayed:
+class _DelayedLoops:
     """Loops with dead time, by their map from one dead time to the next."""
 
     def __init__(self, plant: TransferFunction) -> None:
