@@ -105,8 +105,8 @@ ADVICE: dict[Reason, str] = {
     Reason.UNCERTAIN: "The record does not tell enough for this robustness: permit more MV, filter the measurement, or "
     "ask for a lower Ms.",
     Reason.AMBIGUOUS: "Several models explain the record and disagree: permit more MV, or retune in a steady time.",
-    Reason.MODEL_MISMATCH: "The loop behaved differently under the new gains than under the relay: look for changes of the "
-    "load or of the plant, then retune.",
+    Reason.MODEL_MISMATCH: "The loop behaved differently under the new gains than under the relay: look for changes of "
+    "the load or of the plant, then retune.",
     Reason.DIVERGES: "PV ran away under the new gains, which were taken back: keep the present gains, and repeat.",
     Reason.LOCKED: "Somebody has locked the loop: ask them, or unlock it (loopwright unlock TAG), then ask again.",
     Reason.NO_GAIN: "The loop is already tuned as well as asked: nothing needs to be done. For a faster or a more "

@@ -184,14 +184,14 @@ def compare(
 
     The new gains are stable: no procedure hands over others.
     """
-    gain, words = _verdict(before, after, asked, J)
+    gain, words = _conclusion(before, after, asked, J)
     if not gain:
         end = "the new gains are proposed because that was asked for" if anyway else "the present gains are kept"
         words = f"Nothing asked for gets better by more than {100.0 * MIN_GAIN:.0f} %: {end}; {words}."
     return Comparison(before, after, asked.Ms, criterion, *J, gain, words)
 
 
-def _verdict(
+def _conclusion(
     before: LoopPerformance, after: LoopPerformance, asked: RobustnessBounds, J: tuple[float | None, float | None]
 ) -> tuple[bool, str]:
     """Whether there is a gain, and a sentence, or the end of one where there is none."""

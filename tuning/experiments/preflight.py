@@ -15,7 +15,7 @@ from loopwright.tuning.plan import Mode, Note, Plan, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
 
 PREFLIGHT, SETTLE = "preflight", "settle"
-LOOKS = 4
+MAX_ATTEMPTS = 4
 MIN_LISTENED_SAMPLES = 60
 MAX_NOISE = 0.10
 """Noise (standard deviation) as a share of the set-point step, above which no overshoot can be read."""
@@ -41,19 +41,19 @@ def at_rest(
     """
     once_s = facts.T95_s / 2
     begin = (StageStarted(PREFLIGHT, once_s, after_s),)
-    for _ in range(LOOKS - 1):
+    for _ in range(MAX_ATTEMPTS - 1):
         yield begin
         try:
-            return (yield from look(facts, min_samples))
+            return (yield from check_at_rest(facts, min_samples))
         except Refused as refused:
             if refused.reason is not Reason.NOT_AT_REST:
                 raise
             yield from record(once_s, (Note(refused.detail), StageStarted(SETTLE, once_s, once_s + after_s)))
     yield begin
-    return (yield from look(facts, min_samples))
+    return (yield from check_at_rest(facts, min_samples))
 
 
-def look(facts: Facts, min_samples: int = MIN_LISTENED_SAMPLES) -> Plan[tuple[OperatingPoint, Trace]]:
+def check_at_rest(facts: Facts, min_samples: int = MIN_LISTENED_SAMPLES) -> Plan[tuple[OperatingPoint, Trace]]:
     """Listens once, for half T95 (at least so many samples) in automatic. Raises Refused as `at_rest`."""
     trace = yield from record(max(facts.T95_s / 2, min_samples * facts.sample_time_s))
     sample = yield ()

@@ -5,14 +5,14 @@ from __future__ import annotations
 from contextlib import closing, suppress
 from typing import TypeVar
 
-from loopwright.tuning.experiments.preflight import SETTLE, look
+from loopwright.tuning.experiments.preflight import SETTLE, check_at_rest
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.plan import Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Refused
 
 T = TypeVar("T")
 
-LOOKS = 20
+MAX_ATTEMPTS = 20
 """Of half a T95 each. The present gains may well swing, or creep, for much longer than the plant alone: that is why the
 loop is tuned."""
 
@@ -26,9 +26,9 @@ def after_settling(facts: Facts, plan: Plan[T]) -> Plan[T]:
         items = next(plan)
         ahead = sum(item.expected_s + item.remaining_s for item in items if isinstance(item, StageStarted))
         yield (StageStarted(SETTLE, facts.T95_s, ahead),)
-        for _ in range(LOOKS):
+        for _ in range(MAX_ATTEMPTS):
             with suppress(Refused):
-                yield from look(facts)
+                yield from check_at_rest(facts)
                 break
         items = (StageDone(SETTLE, None), *items)
         while True:

@@ -52,7 +52,7 @@ def step_test(
     band: float,
     max_s: float,
     smooth_s: float,
-    kept: Trace | None = None,
+    into: Trace | None = None,
 ) -> Plan[StepResult]:
     """Steps the set-point from rest by `step` and waits until PV stays within band * step for T95/5.
 
@@ -65,8 +65,8 @@ def step_test(
         sample = yield ()
     later, settled = yield from settle(target, band * abs(step), facts.T95_s / 5, max_s, point.noise)
     trace = Trace([sample.t, *later.t], [sample.sp, *later.sp], [sample.pv, *later.pv], [sample.mv, *later.mv])
-    if kept is not None:
-        kept.t, kept.sp, kept.pv, kept.mv = trace.t, trace.sp, trace.pv, trace.mv
+    if into is not None:
+        into.t, into.sp, into.pv, into.mv = trace.t, trace.sp, trace.pv, trace.mv
     t, pv, mv = (np.asarray(column) for column in (trace.t, trace.pv, trace.mv))
     t = t - t[0]
     tail = trace.tail(facts.T95_s / 5)

@@ -1,4 +1,4 @@
-"""Gains for another Ms on a model that is known already, tried on the loop: no relay."""
+"""Gains for another Ms are designed on a model that is known already and tried on the loop, without a relay test."""
 
 from __future__ import annotations
 
@@ -29,24 +29,26 @@ def trial_stages(verify: bool) -> tuple[str, ...]:
 
 
 def designed_on(model: Model, options: FastOptions, sample_time_s: float) -> OptimalGains:
-    """The best gains on the model. Raises Refused, NOT_ROBUST."""
+    """The best gains on the model, for a controller of this sample time. Raises Refused, NOT_ROBUST."""
     known = ultimate(model)
-    # without an ultimate point the loop's time is that of its lags and dead time
+    # a model without an ultimate point is designed on the time scale of its lags and dead time
     period = known.Pu_s if known else 4.0 * (model.L + float(max(time_constants(model), default=0.0)))
     return GainDesign(delayed(model, 0.5 * sample_time_s), options.spec(), period).best()
 
 
 def _considered(model: Model, options: FastOptions, facts: Facts) -> tuple[Gains, Comparison]:
-    """The best gains on the model, beside the old ones. Raises Refused, NOT_ROBUST."""
+    """The best gains on the model and their comparison with the present gains. Raises Refused, NOT_ROBUST."""
     best = designed_on(model, options, facts.sample_time_s)
     sampled = delayed(model, 0.5 * facts.sample_time_s)
     return best.gains, comparison_on(sampled, best, facts, options.spec(), options.propose_anyway)
 
 
 def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal]:
-    """On a loop in automatic and at rest. Raises Refused; restores nothing (the runner does).
+    """The plan of a trial, for a loop in automatic and at rest.
 
-    Gains that bring nothing that was asked for are tried only where `propose_anyway` is among the options.
+    model: the process model that the gains are designed on.
+    New gains that improve nothing that was asked for are tried only if the options contain `propose_anyway`.
+    Raises Refused. The plan restores nothing: the runner restores the loop.
     """
     expected = {"preflight": facts.T95_s / 2, "design": 0.0, "verify": 6 * facts.T95_s}
     todo = trial_stages(options.verify)

@@ -1,4 +1,4 @@
-"""Identification, design and verdict of a fast record in one call."""
+"""The evaluation of a fast record: identification, design, and the reasons for which the result is not trusted."""
 
 from __future__ import annotations
 
@@ -15,31 +15,43 @@ from loopwright.tuning.identification.output_error import Fit, Fitted
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.reasons import Reason
 
-MAX_RESIDUAL, UNIMPORTANT = 1.35, 0.004
-"""Of the residual: in noises at rest; in spans of PV, below which it does not matter."""
+MAX_RESIDUAL, NEGLIGIBLE_RESIDUAL = 1.35, 0.004
+"""Limits of the rms of the residual: the largest accepted, in standard deviations of the noise at rest; the fraction of
+the range of PV below which a residual is accepted in any case."""
 MAX_DURBIN_WATSON_RATIO = 1.35
 MAX_ROUNDED = 1.25
-"""Of what rounding leaves on average, which is not quite random and not white."""
+"""Residual, in average rounding errors, below which slow variations are accepted: rounding errors are not white."""
 MAX_UNCERTAINTY = 0.10
-"""Of Ms, by the delta method and among the rivals."""
+"""Largest accepted uncertainty of Ms, by the delta method and among rival models."""
 MAX_MODEL_MISMATCH, MAX_MODEL_MISMATCH_OF_TWO_LOADS = 0.5, 0.2
-"""Of Ms from what was asked, of the tested controller on the new model and the new one on the earlier model; where the
-load is said to have moved twice."""
+"""Largest accepted difference of Ms from the Ms asked for, of the tested gains on the new model and of the new gains on
+the earlier model; the second value holds where the model has two load disturbances."""
 LOAD_WINDOW = (0.15, 0.8)
-"""Periods before and after the step of the set-point, within which a load is said to have come with it."""
+"""Periods before and after the set-point step within which a load disturbance counts as coming with the step."""
 LATE_LOAD, SAME_LOAD = 0.5, 0.3
-"""Periods: a load so shortly before the step need not have shown in the relay, and if it has not, it may as well be a
-plant that has changed; two that are so near are the same."""
+"""Times in periods. A load disturbance at most LATE_LOAD before the step need not have shown in the relay's record; if
+it has not, it may really be a change of the plant. Two load disturbances closer than SAME_LOAD are the same one."""
 MAX_GAIN_CHANGE = 1.5
-"""Times by which the tested gains may change where a load is said to have come with them."""
+"""Largest accepted ratio of new to tested Kp or Ti where a load disturbance seems to have come with the tested
+gains."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """cause: the value of the reason why the result is not to be trusted, None if it is.
+    """The evaluation of one record.
 
-    model: without the delay of the sampling, which is in `design_delay` (s).  Ms: on the model.
-    uncertainty, ambiguity: of Ms.  residual: its rms in noises at rest.  period: ultimate, of the model, s.
+    reason: the reason why the result is not trusted, None if it is.
+    detail: the sentence with the numbers behind that reason.
+    model: the process model, without the delay of the sampling.
+    structure: the name of its structure.
+    best: the gains designed on the model.
+    Ms: the maximum sensitivity of these gains on the model, the delay of the sampling included.
+    uncertainty: how much larger Ms may be with the model two standard deviations off.
+    ambiguity: the largest difference of Ms on a rival model.
+    residual: the rms of the residual in standard deviations of the noise at rest.
+    chosen, fit: the choice of the structure, and the fits of the record behind it.
+    design_delay: the delay of the sampling, s.
+    period: the ultimate period of the model, s.
     """
 
     reason: Reason | None
@@ -58,9 +70,11 @@ class Evaluation:
 
 
 def evaluate(record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | None = None) -> Evaluation:
-    """earlier: of a first part of the record, whose gains were tested in the rest of it.
+    """Identifies the model, designs the gains and assesses both.
 
-    Raises Refused, NOT_ROBUST, where the model allows no such controller.
+    spec: the design specification.
+    earlier: the evaluation of the first part of the record, whose gains were tested in the rest of it.
+    Raises Refused, NOT_ROBUST, where the model permits no such controller.
     """
     fit = Fit(record)
     chosen = choose_structure(fit, earlier.chosen.fits if earlier else ())
@@ -75,11 +89,11 @@ def evaluate(record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | N
     ratio = durbin_watson_ratio(found.linear.residual)
     reason: Reason | None = None
     detail = ""
-    if found.rms > max(MAX_RESIDUAL * noise, UNIMPORTANT):
+    if found.rms > max(MAX_RESIDUAL * noise, NEGLIGIBLE_RESIDUAL):
         reason = Reason.UNEXPLAINED
         rms = 100.0 * found.rms
         detail = f"the model leaves {rms:.2g} % of PV's span unexplained, the noise is {100.0 * noise:.2g} %"
-    elif found.rms > max(UNIMPORTANT, MAX_ROUNDED * rounding) and ratio > MAX_DURBIN_WATSON_RATIO * max(
+    elif found.rms > max(NEGLIGIBLE_RESIDUAL, MAX_ROUNDED * rounding) and ratio > MAX_DURBIN_WATSON_RATIO * max(
         record.durbin_watson_ratio_at_rest, 1.0
     ):
         reason = Reason.DISTURBED
@@ -115,7 +129,7 @@ def evaluate(record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | N
 
 
 def evaluate_again(record: ExperimentRecord, spec: DesignSpec) -> Evaluation:
-    """The verdict on a whole record as the procedure comes to it, which judges the relay's part first.
+    """Evaluates a whole record as the procedure does: the relay's part first, then all of it.
 
     Raises Refused, NOT_ROBUST.
     """
@@ -128,11 +142,13 @@ def evaluate_again(record: ExperimentRecord, spec: DesignSpec) -> Evaluation:
 def _load_with_the_step(
     fit: Fit[ExperimentRecord], found: Fitted, earlier: Evaluation, gains: Gains
 ) -> tuple[Reason | None, str]:
-    """Loads that came with the new gains explain away what was to be tested: a plant that has changed looks the same.
+    """The reason and the detail where the model explains the test of the new gains by a load disturbance.
 
-    One may be true, if the step back is explained without another, by about the gains that were tested: relay and steps
-    show different frequencies, and one model can be drawn through both plants. So does one in mid-relay that the
-    relay's own record had not shown.
+    A load disturbance found together with the new gains may really be a change of the plant, so it is accepted only if
+    the step back is explained without another one and the gains designed on the whole record are close to those tested.
+    The second condition is needed because relay and steps excite different frequencies: one model can fit the plant
+    before the change at the former and the plant after the change at the latter. A load disturbance in mid-relay that
+    the relay's own record had not shown is treated in the same way.
     """
     steps, period = fit.record.steps, fit.period
     if not steps:
@@ -143,12 +159,12 @@ def _load_with_the_step(
         if len(steps) == 1:
             return (
                 Reason.AMBIGUOUS,
-                "the whole record tells of a load in mid-relay that the relay's own record did not show",
+                "the whole record shows a load disturbance in mid-relay that the relay's own record did not show",
             )
         if len(times) > 1:
             return (
                 Reason.MODEL_MISMATCH,
-                "the whole record tells of other loads in mid-relay than the relay's own record",
+                "the whole record shows other load disturbances in mid-relay than the relay's own record",
             )
     before, after = LOAD_WINDOW
     loads = [at for at in times if at > steps[0] - (LATE_LOAD if at in new else before) * period]
@@ -169,14 +185,18 @@ def _load_with_the_step(
 
 
 def _loads(found: Fitted) -> list[float]:
-    """Samples at which the load stepped."""
+    """The times of the load disturbances, in samples."""
     return [float(at) for at in found.theta[found.structure.searched :]]
 
 
 def _model_mismatch(
     earlier: Evaluation, model: TransferFunction, gains: Gains, spec: DesignSpec, design: GainDesign, loads: int
 ) -> tuple[Reason | None, str]:
-    """Both models must agree roughly on both controllers: one of them may be a story told of a disturbance."""
+    """The reason and the detail where the relay's model and that of the whole record disagree on a controller.
+
+    Both models must give both controllers about the Ms asked for. Otherwise a disturbance, or a change of the plant,
+    has entered one of the models.
+    """
     maximum = MAX_MODEL_MISMATCH_OF_TWO_LOADS if loads > 1 else MAX_MODEL_MISMATCH
     tested = peak(model, earlier.best.gains, design.w, earlier.design_delay)
     again = peak(earlier.model, gains, design.w, earlier.design_delay)

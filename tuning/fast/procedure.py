@@ -1,10 +1,10 @@
-"""The fast procedure as one plan made of plans.
+"""The fast procedure is one plan made of smaller plans.
 
     listen - relay (biased, 4 to 10 switches) - fit and design - verify (set-point step) - fit and design again
 
-The relay is ended by the uncertainty of what would be proposed, not by a count. The gains proposed are those designed
-on the whole record, relay and set-point step. Where the design brings nothing that was asked for, the procedure ends
-with it: no new gains are tried on the loop.
+The relay ends when the gains that would be proposed are certain enough, not after a fixed number of switches. The gains
+proposed are designed on the whole record of relay and set-point step. Where the design improves nothing that was asked
+for, the procedure ends after the design, and no new gains are tried on the loop.
 """
 
 from __future__ import annotations
@@ -38,18 +38,21 @@ FAST = "fast"
 FAST_STAGES = ("preflight", "relay", "design", "verify", "redesign")
 SWITCHES = (4, 6, 8, 10)
 OPEN_REASONS = (Reason.UNCERTAIN, Reason.AMBIGUOUS)
-"""What more of the same record may mend."""
+"""Reasons for a refusal that a longer record of the same kind may remove."""
 MIN_SAMPLES = 2 * MIN_LISTENED
-"""At rest, for the noise and the offset."""
+"""Smallest number of samples at rest, from which noise and offset are estimated."""
 
 
 @dataclass(frozen=True, slots=True)
 class FastOptions:
-    """What to design for, see `tuning.fast.design.DesignSpec`; how to test.
+    """The options of the procedure: the design specification and the conduct of the test.
 
-    amplitude: of the relay's higher side, MV units; by default half of what MV permits, adapted after the first wave.
-    verify: the set-point step under the new gains; without it the relay switches six times at least, as with careful.
-    propose_anyway: go on where the new gains bring nothing that was asked for.
+    Ms, derivative, Mt, noise_gain: see `tuning.fast.design.DesignSpec`.
+    amplitude: the amplitude of the relay's higher side, MV units; by default half of what MV permits, adapted after the
+    first wave.
+    careful: the relay switches six times at least.
+    verify: the set-point step under the new gains is made; without it the relay switches six times at least.
+    propose_anyway: the procedure goes on where the new gains improve nothing that was asked for.
     """
 
     Ms: float = 1.6
@@ -62,7 +65,7 @@ class FastOptions:
     propose_anyway: bool = False
 
     def spec(self) -> DesignSpec:
-        """Raises Refused, BAD_INPUT."""
+        """The design specification of these options. Raises Refused, BAD_INPUT."""
         return DesignSpec(self.Ms, self.derivative, self.Mt, self.noise_gain)
 
     def __post_init__(self) -> None:
@@ -77,7 +80,10 @@ def fast_stages(verify: bool) -> tuple[str, ...]:
 
 
 def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
-    """The whole procedure on a loop in automatic and at rest. Raises Refused; restores nothing (the runner does)."""
+    """The plan of the whole procedure, for a loop in automatic and at rest.
+
+    Raises Refused. The plan restores nothing: the runner restores the loop.
+    """
     T95, spec = facts.T95_s, options.spec()
     expected = {"preflight": T95 / 2, "relay": T95, "design": 0.0, "verify": 1.5 * T95, "redesign": 0.0}
     todo = fast_stages(options.verify)
@@ -106,7 +112,7 @@ def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
         if isinstance(outcome, Comparison) or not in_time:
             break
         yield from experiment.report(Note(f"after {switches} switches: {outcome.detail}"))
-    # refused or not, what the record came to is told: it says why
+    # the evaluation is reported even if the record is refused: its numbers say why
     yield from experiment.report(StageDone("relay", experiment.relay_figures()), *started("design"))
     if evaluation is not None:
         yield from experiment.report(StageDone("design", evaluation_summary(evaluation)))
@@ -139,9 +145,10 @@ def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
 def _evaluated(
     facts: Facts, options: FastOptions, record: ExperimentRecord, first: Evaluation | None = None
 ) -> tuple[Evaluation, Refused | Comparison]:
-    """The verdict on the record, and why nothing is to be proposed on it, or else what the new gains are worth.
+    """The evaluation of a record, with the refusal that follows from it or else the comparison of old and new gains.
 
-    first: as `earlier` of `evaluate`. Raises Refused, NOT_ROBUST.
+    first: the evaluation of the relay's record, see `earlier` of `evaluate`.
+    Raises Refused, NOT_ROBUST.
     """
     evaluation = evaluate(record, options.spec(), first)
     return evaluation, _refusal(facts, evaluation) or comparison_of(
@@ -150,7 +157,7 @@ def _evaluated(
 
 
 def _refusal(facts: Facts, evaluation: Evaluation) -> Refused | None:
-    """Why this is not to be proposed."""
+    """The refusal that follows from an evaluation, None where its gains may be proposed."""
     model = evaluation.model
     if (sign(model) > 0.0) != facts.reverse:
         return Refused(

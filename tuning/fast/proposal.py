@@ -1,4 +1,4 @@
-"""What a fast experiment hands on: record, model with its errors, the step under the new gains, the proposal."""
+"""The results of the fast procedure: figures of the relay, evaluation, model with errors, verified step, proposal."""
 
 from __future__ import annotations
 
@@ -30,11 +30,16 @@ from loopwright.tuning.models import Model, Reals, TransferFunction
 from loopwright.tuning.reasons import Ended, Reason, Refused
 
 CRITERION = "half of the set-point's and half of the load's IAE, each over the least under the bounds asked for"
+"""J in words, as the comparison of old and new gains shows it."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoadDisturbance:
-    """A step of the load that the record shows. t_s: since the relay's start.  size: MV units at the plant's input."""
+    """A step-shaped load disturbance that the record shows.
+
+    t_s: the time of the step since the start of the relay, s.
+    size: the size of the step at the plant's input, MV units.
+    """
 
     t_s: float
     size: float
@@ -42,9 +47,14 @@ class LoadDisturbance:
 
 @dataclass(frozen=True, slots=True)
 class RelayFigures:
-    """The relay's record. period_s: as it swung.  span: of PV.  noise: of PV at rest, standard deviation.
+    """The figures of a relay test.
 
-    amplitude: of the relay's higher side, MV units.  samples: from the first at rest to the last.
+    switches: the number of switches of the relay.
+    period_s: the period of the oscillation, s.
+    span: the range of PV (maximum less minimum) under the relay, PV units.
+    noise: the standard deviation of PV at rest, PV units.
+    amplitude: the amplitude of the relay's higher side, MV units.
+    samples: the number of samples of the record, those at rest included.
     """
 
     switches: int
@@ -57,7 +67,13 @@ class RelayFigures:
 
 @dataclass(frozen=True, slots=True)
 class IdentifiedModel:
-    """num, den (highest power of s first, den begins with 1) and the dead time, each with its standard error."""
+    """A transfer function with the standard errors of its coefficients and of its dead time.
+
+    structure: the name of the model structure.
+    num, den: the coefficients, highest power of s first; den begins with 1; PV units per MV unit, times in s.
+    dead_time_s: the dead time, s.
+    num_errors, den_errors, dead_time_error_s: the standard errors, None for a model that was typed in.
+    """
 
     structure: str
     num: tuple[float, ...]
@@ -70,10 +86,20 @@ class IdentifiedModel:
 
 @dataclass(frozen=True, slots=True)
 class EvaluationSummary:
-    """What one evaluation of the record came to.
+    """The figures of one evaluation of a record.
 
-    num, den (highest power first), L_s: the plant.  cause: why it is not enough, None if it is.  uncertainty,
-    ambiguity: of Ms.  residual: in noises at rest.
+    structure: the name of the model structure.
+    num, den, L_s: the process model; coefficients with the highest power of s first, dead time in s.
+    gains: the gains designed on that model.
+    Ms: the maximum sensitivity of these gains on the model, the delay of the sampling included.
+    uncertainty: how much larger Ms may be with the model two standard deviations off.
+    ambiguity: the largest difference of Ms on another model that explains the record as well.
+    residual: the rms of the residual divided by the standard deviation of the noise at rest.
+    loads: the load disturbances that the record shows.
+    drift: True if PV drifted at a steady rate, which the fit allows for.
+    switches, period_s: the number of switches of the relay and the period of the oscillation, s.
+    reason: the reason why the result is not good enough for a proposal, None if it is.
+    detail: the sentence with the numbers behind that reason.
     """
 
     structure: str
@@ -95,10 +121,14 @@ class EvaluationSummary:
 
 @dataclass(frozen=True, slots=True)
 class VerifiedStep:
-    """The set-point step under the gains of the first design, as measured; it begins while PV still swings.
+    """The set-point step under the gains of the first design, as measured. It begins while PV still oscillates.
 
-    tested: those gains.  Ms: theirs on the model of the whole record.  fit_pct: how much of the step that model
-    explains, NRMSE.  rms: what it leaves, PV units.
+    tested: the gains of the first design.
+    Ms: the maximum sensitivity of the tested gains on the model of the whole record.
+    step: the set-point step, PV units.
+    duration_s: the time since the step, s.
+    fit_pct: the NRMSE fit of that model to the step, percent.
+    rms: the rms of the residual of the step, PV units.
     """
 
     tested: Gains
@@ -111,13 +141,22 @@ class VerifiedStep:
 
 @dataclass(frozen=True, slots=True)
 class FastProposal:
-    """What the operator decides on. Gains in ISA form, MV per PV unit and seconds.
+    """The proposal that the operator decides on. Gains are in ISA form, MV units per PV unit and s.
 
-    comparison: old and new gains on the model, half a sample later for the sampling. Where it shows no gain the present
-    gains are kept, unless a proposal was asked for all the same: then there is nothing to decide on, and nothing was
-    verified.  predicted, predicted_before: some figures of it by themselves, predicted_before None where the old gains
-    would not be stable.  found: None without a record.  verified: of a step after the relay; verification: of one from
-    rest.
+    method: the name of the procedure.
+    chosen: the design parameters in effect.
+    model: the process model that the gains were designed on.
+    old_gains, gains: the present gains and the gains proposed.
+    predicted: the main figures of the new gains on the model.
+    predicted_before: the same figures of the old gains, None where the old gains are not stable on the model.
+    comparison: old and new gains on the model, with half a sample of delay added for the sampling. Where the comparison
+    shows no gain, the present gains are kept, nothing is verified and there is nothing to decide on, unless a proposal
+    was asked for all the same.
+    ultimate: the ultimate point of the model, None where the model has none.
+    found: the evaluation of the record, None without a record.
+    verified: the set-point step that followed the relay, None without one.
+    verification: the set-point step from rest, None without one.
+    notes: what the operator should know, one sentence each.
     """
 
     method: str
@@ -136,6 +175,7 @@ class FastProposal:
 
 
 def evaluation_summary(evaluation: Evaluation) -> EvaluationSummary:
+    """The figures of an evaluation as a job stores and shows them."""
     fit, best = evaluation.fit, evaluation.chosen.best
     record, structure, theta, c = fit.record, best.structure, best.theta, best.linear.coefficients
     order, count = structure.order, best.hypothesis.load_disturbances
@@ -167,7 +207,8 @@ def evaluation_summary(evaluation: Evaluation) -> EvaluationSummary:
 
 
 def identified_model(fit: Fit[ExperimentRecord], found: Fitted) -> IdentifiedModel:
-    """With the standard errors that the parameters' covariance gives the coefficients (delta method)."""
+    """The fitted model with the standard errors of its coefficients, from the covariance of the fitted parameters by
+    the delta method."""
     structure = found.structure
     searched, inputs = structure.searched, structure.inputs
     at = np.concatenate((found.theta[:searched], found.linear.coefficients[:inputs]))
@@ -176,7 +217,7 @@ def identified_model(fit: Fit[ExperimentRecord], found: Fitted) -> IdentifiedMod
 
     def coefficients(at: Reals) -> Reals:
         moved = fit.transfer(structure, at[:searched], at[searched:])
-        # a coefficient that happens to vanish is not left out
+        # a leading coefficient that happens to be zero keeps its place
         return np.concatenate((np.zeros(width - len(moved.num)), moved.num[-width:], moved.den))
 
     slopes = slopes_of(coefficients, at, searched)
@@ -196,7 +237,12 @@ def identified_model(fit: Fit[ExperimentRecord], found: Fitted) -> IdentifiedMod
 
 
 def verified_step(evaluation: Evaluation, tested: Gains, size: float, duration_s: float) -> VerifiedStep:
-    """size: of the set-point step under the tested gains, PV units; duration_s: since it was made."""
+    """The figures of the set-point step of a record.
+
+    tested: the gains under which the step was made.
+    size: the set-point step under the tested gains, PV units.
+    duration_s: the time since the step, s.
+    """
     fit, residual = evaluation.fit, evaluation.chosen.best.linear.residual
     first = fit.record.relayed // fit.block
     rest, shown = residual[first:], fit.y[first:]
@@ -212,12 +258,17 @@ def verified_step(evaluation: Evaluation, tested: Gains, size: float, duration_s
 
 
 def comparison_of(evaluation: Evaluation, facts: Facts, spec: DesignSpec, anyway: bool) -> Comparison:
-    """Of the old gains and those designed on the record. Raises as `comparison_on`."""
+    """The comparison of the old gains with the gains designed on the record. Raises Refused as `comparison_on`."""
     return comparison_on(delayed(evaluation.model, evaluation.design_delay), evaluation.best, facts, spec, anyway)
 
 
 def comparison_on(sampled: Model, best: OptimalGains, facts: Facts, spec: DesignSpec, anyway: bool) -> Comparison:
-    """sampled: the model with the delay of the sampling.  anyway: see `compared`. Raises Refused, NOT_ROBUST."""
+    """The comparison of the old gains with the optimal gains on a model.
+
+    sampled: the model with the delay of the sampling.
+    anyway: a proposal is wanted even without a gain, see `compare`.
+    Raises Refused, NOT_ROBUST.
+    """
     before, after = (loop_performance(sampled, gains, facts.sample_time_s) for gains in (facts.old_gains, best.gains))
     if not after.stable:
         raise Refused(Reason.NOT_ROBUST, "the gains designed are not stable on their own model")
@@ -234,18 +285,18 @@ def proposed(
     verified: VerifiedStep | None,
     relay_at_s: float,
 ) -> FastProposal:
-    """relay_at_s: plant time at which the relay began."""
+    """The proposal of the gains of an evaluation. relay_at_s: the plant time at which the relay began, s."""
     found, gains = evaluation_summary(evaluation), evaluation.best.gains
     notes = [
-        f"A step of the load of {load.size:+.3g} at the plant's input was found {load.t_s:.4g} s after the start of "
+        f"A load disturbance of {load.size:+.3g} at the plant's input was found {load.t_s:.4g} s after the start of "
         f"the relay (at {relay_at_s + load.t_s:.4g} s), and allowed for."
         for load in found.loads
     ]
     input_range = evaluation.fit.record.input_range
     if any(abs(load.size) > input_range for load in found.loads):
         notes.append(
-            f"Such a load is larger than what the relay moved MV by ({input_range:.3g}): a change of the plant would look so "
-            "too. Look at the record before accepting."
+            f"Such a load disturbance is larger than what the relay moved MV by ({input_range:.3g}): a change of the "
+            "plant would look the same. Look at the record before accepting."
         )
     if found.drift:
         notes.append("PV drifted at a steady rate during the test; this was allowed for.")
@@ -267,11 +318,12 @@ def proposed(
 
 
 def delayed(model: Model, delay: float) -> TransferFunction:
-    """As a sampled controller meets it."""
+    """The model with a longer dead time, as a sampled controller meets it. delay: the delay of the sampling, s."""
     return TransferFunction(model.num, model.den, model.L + delay)
 
 
 def ultimate(model: Model) -> Ultimate | None:
+    """The ultimate point of the model, None where the model has none."""
     try:
         return Ultimate(*ultimate_point(model))
     except Ended:

@@ -36,7 +36,7 @@ def zn_pi(
     static_gain: float,
     window: tuple[float, float],
     factor: float | None,
-    kept: Trace,
+    into: Trace,
 ) -> Plan[ZnResult]:
     """static_gain: a first idea (nan when there is none), to keep MV inside.  kept: gets the last step's samples.
 
@@ -55,7 +55,7 @@ def zn_pi(
         max_s = max(3 * facts.T95_s, 8 * Pu)
         yield from settle(point.sp, 0.005 * step, stay_s, max_s, point.noise, commands)
         found = yield from step_test(
-            facts, point, step, band=0.01, max_s=max(6 * facts.T95_s, 15 * Pu), smooth_s=Pu / 5, kept=kept
+            facts, point, step, band=0.01, max_s=max(6 * facts.T95_s, 15 * Pu), smooth_s=Pu / 5, into=into
         )
         unlimited(facts, found, gains)
         seen.append(found)

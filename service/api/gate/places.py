@@ -36,7 +36,8 @@ class RequestKind(StrEnum):
 
 DECIDES = (RequestKind.ABORT, RequestKind.DECISION)
 _LAST_WORDS = {
-    "abort": RequestKind.ABORT, "dismiss": RequestKind.ABORT, "accept": RequestKind.DECISION, "rollback": RequestKind.DECISION,
+    "abort": RequestKind.ABORT, "dismiss": RequestKind.ABORT,
+    "accept": RequestKind.DECISION, "rollback": RequestKind.DECISION,
 }  # fmt: skip
 _WATCHED = ("/readyz", "/metrics")
 

@@ -56,9 +56,9 @@ def test_a_part_that_passes_at_once_is_found() -> None:
 @pytest.mark.parametrize("size", [0.3, -0.4])
 @pytest.mark.parametrize("part", [0.3, 0.6])
 def test_a_step_of_the_load_in_mid_relay_is_found_within_ten_percent(bench: Bench, size: float, part: float) -> None:
-    quiet = record(bench)
-    at = quiet.listened + round(part * (quiet.relayed - quiet.listened))
-    evidence = record(bench, 0.01 * quiet.output_range, load=size, load_at=at)
+    undisturbed = record(bench)
+    at = undisturbed.listened + round(part * (undisturbed.relayed - undisturbed.listened))
+    evidence = record(bench, 0.01 * undisturbed.output_range, load=size, load_at=at)
     fit = Fit(evidence)
     chosen = choose_structure(fit)
     best = chosen.best
@@ -72,8 +72,10 @@ def test_a_step_of_the_load_in_mid_relay_is_found_within_ten_percent(bench: Benc
 
 
 def test_a_drift_is_found() -> None:
-    quiet = record(THREE_LAGS)
-    evidence = record(THREE_LAGS, 0.003 * quiet.output_range, drift=0.2 * quiet.output_range / len(quiet.u))
+    undisturbed = record(THREE_LAGS)
+    evidence = record(
+        THREE_LAGS, 0.003 * undisturbed.output_range, drift=0.2 * undisturbed.output_range / len(undisturbed.u)
+    )
     fit = Fit(evidence)
     chosen = choose_structure(fit)
     assert error_near_the_crossover(THREE_LAGS, fit.model(chosen.best)) < 0.05

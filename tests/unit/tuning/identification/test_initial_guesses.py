@@ -22,8 +22,8 @@ def test_the_dead_time_is_the_best_of_all_tried_one_by_one(structure: Structure,
     t, u, y = open_loop(loop, change, noise=0.05)
     fit = IdentificationProblem(recorded_test(t, u, y)).full_fit
     best = starts(structure, change, y, 60, nuisance, 1)[0]
-    story = NOT_AT_REST_INITIALLY if nuisance else UNDISTURBED
-    plain = [fit.fitted(structure, story, np.append(best[:-1], float(m))).linear.rss for m in range(61)]
+    hypothesis = NOT_AT_REST_INITIALLY if nuisance else UNDISTURBED
+    plain = [fit.fitted(structure, hypothesis, np.append(best[:-1], float(m))).linear.rss for m in range(61)]
     assert best[-1] == int(np.argmin(plain))
 
 

@@ -53,5 +53,5 @@ def test_a_load_step_at_another_sample_explains_less() -> None:
 
 def test_more_parameters_gain_less_where_the_residual_is_not_white() -> None:
     problem = with_load(0.005)
-    without, moving = problem.fit(FIRST, UNDISTURBED), problem.fit(FIRST, NOT_AT_REST_INITIALLY)
-    assert problem.bic_gain(moving, without) < without.bic - moving.bic
+    without, not_at_rest = problem.fit(FIRST, UNDISTURBED), problem.fit(FIRST, NOT_AT_REST_INITIALLY)
+    assert problem.bic_gain(not_at_rest, without) < without.bic - not_at_rest.bic
