@@ -1,1 +1,1 @@
-"""The procedure "fast": one short record of a biased relay is fitted as a whole, then gains are designed on the model."""
+"""The procedure "fast": one short biased relay record is fitted as a whole, then gains are designed on the model."""

@@ -27,7 +27,8 @@ def largest_gains(g: Complexes, Ms: float, Mt: float | None = None, maximum: flo
 
     g: the frequency response of the loop for Kp = 1 on a frequency grid, shape (points,).
     Ms, Mt: the bounds; None for no bound on Mt.
-    maximum: a bound on Kp itself. Where it lies inside a permitted interval, it is the upper end of that interval.
+    maximum: a bound on Kp itself. Where it lies inside a permitted interval, it is the upper end of that interval;
+    intervals above it are left out.
 
     The last interval has no upper end on the grid and is left out.
     """

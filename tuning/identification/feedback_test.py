@@ -7,8 +7,8 @@ import numpy as np
 from loopwright.tuning.models import Reals
 
 MAX_LEFT_BY_PV = 0.1
-"""Largest residual of MV's moves, predicted from the present PV and two earlier ones, as a fraction of the residual of
-a prediction from MV's own past; a larger residual is no feedback."""
+"""Largest residual of MV's moves, predicted from their own past and three values of PV, as a fraction of the residual
+of a prediction from their own past alone; a larger residual is no feedback."""
 MIN_LEFT_BY_OWN_PAST = 1e-3
 """Smallest residual of a prediction from MV's own past, as a fraction of the rms of MV's moves; a ramp or a sine leaves
 less, and the test cannot decide."""

@@ -43,7 +43,8 @@ SURELY_WHITE = 0.01
 POORLY_KNOWN = 0.25
 """Standard error, as a fraction of the parameter, above which the parameter is called poorly known."""
 NEGLIGIBLE_COEFFICIENT = 0.02
-"""Ratio of a numerator coefficient to one that would matter, below which its error does not matter."""
+"""Standard error of a numerator coefficient, relative to a coefficient that would matter, below which the coefficient
+is known well enough."""
 AT_THE_START = 2.0
 """Time in samples: a load disturbance that PV answers within this time of the first sample is a start not at rest."""
 FEEDBACK = (

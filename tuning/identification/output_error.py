@@ -19,7 +19,7 @@ from loopwright.tuning.models import Reals, TransferFunction
 FLOOR = 2e-4
 """Residual floor as a fraction of the range of PV; it prevents overfitting noise-free data."""
 LOG_LOW, LOG_HIGH = -8.5, 9.5
-"""Bounds of the logarithm of a rate in 1/period; for a product of two rates, the bounds of its square root apply."""
+"""Bounds of the logarithm of a rate in 1/period, and of the logarithm of a product of two rates in 1/period^2."""
 DEAD_TIMES = (0.01, 0.06, 0.14, 0.23, 0.32, 0.41, 0.49)
 LAGS = (0.02, 0.08, 0.25, 0.8, 4.0, 40.0)
 COMPLEX = ((3.0, 0.5), (6.0, 0.5), (10.0, 0.3))
