@@ -1,4 +1,4 @@
-"""Time to come to rest, for a loop whose test was cut off."""
+"""A loop whose test was cut off is given time to come to rest before its plan goes on."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from loopwright.tuning.reasons import Refused
 T = TypeVar("T")
 
 MAX_ATTEMPTS = 20
-"""Of half a T95 each. The present gains may well swing, or creep, for much longer than the plant alone: that is why the
-loop is tuned."""
+"""Number of checks, of half a T95 each. Under the present gains the loop may oscillate, or creep, for much longer than
+the plant alone."""
 
 
 def after_settling(facts: Facts, plan: Plan[T]) -> Plan[T]:
-    """The plan, once the loop is fit to be tested: what the cut-off test has left has to die away first.
+    """Waits until the loop is at rest, then carries out the plan: the transient of the test that was cut off dies away.
 
-    A loop that is not fit after LOOKS is the plan's own preflight to refuse.
+    A loop that is not at rest after MAX_ATTEMPTS checks is left to the preflight of the plan, which refuses it.
     """
     with closing(plan):
         items = next(plan)

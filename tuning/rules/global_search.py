@@ -1,6 +1,6 @@
-"""Search for the least of a criterion in the unit square (or cube): three seeded, deterministic optimisers.
+"""Three seeded, deterministic optimisers search for the minimum of a criterion in the unit square (or cube).
 
-A criterion takes many points at once, (p, n) to (p,); smaller is better; it must be finite everywhere.
+A criterion takes many points at once, shape (p, n), and gives the values, shape (p,); it must be finite everywhere.
 
     multi_epoch_swarm        Romasevych and Loveikin's swarm with restarts
     differential_evolution   scipy's
@@ -23,7 +23,13 @@ Cost = Callable[[Reals], Reals]
 
 @dataclass(frozen=True, slots=True)
 class SearchResult:
-    """point: (n,).  value: the criterion there.  evaluations: of single points.  epochs: starts of the search."""
+    """The result of a search.
+
+    point: the best point, shape (n,).
+    value: the criterion there.
+    evaluations: the number of points evaluated.
+    epochs: the number of starts of the search.
+    """
 
     point: Reals
     value: float
@@ -41,13 +47,15 @@ def multi_epoch_swarm(
     cognitive: float = 0.1,
     acceptable_rate: float = 0.1,
 ) -> SearchResult:
-    """ME-PSO: x + cognitive*r1*(own best - x) + social*r2*(best of all - x), no velocity, clipped to the square.
+    """The multi-epoch particle swarm (ME-PSO): x + cognitive*r1*(own best - x) + social*r2*(best of all - x), without
+    velocity, clipped to the square.
 
-    When an iteration lowers the best of all by no more than acceptable_rate of it, all particles are thrown anew and
-    forget their own bests; the best of all stays. particles*iterations evaluations. Source: "PI-controller tuning
-    optimization via PSO-based technique", equations (8) to (10) and the parameter table, read by its words: the larger
-    coefficient belongs to the best of all, and (10), which as printed always holds, means the relative reduction.
-    Thrown particles first move, then are evaluated; r1 and r2 are drawn for each coordinate: both are not stated there.
+    When an iteration lowers the best of all by no more than the fraction acceptable_rate, all particles are placed at
+    random again and lose their own bests; the best of all stays. The search takes particles*iterations evaluations.
+    Source: "PI-controller tuning optimization via PSO-based technique", equations (8) to (10) and the parameter table,
+    read by the text: the larger coefficient belongs to the best of all, and (10), which as printed always holds, means
+    the relative reduction. New particles first move, then are evaluated; r1 and r2 are drawn for each coordinate. The
+    paper states neither.
     """
     rng = np.random.default_rng(seed)
     shape = (particles, dimensions)
@@ -73,7 +81,8 @@ def multi_epoch_swarm(
 
 
 def differential_evolution(cost: Cost, dimensions: int, seed: int, budget: int = 2500) -> SearchResult:
-    """scipy's differential evolution, a whole generation of 25 points a dimension at once, at most `budget` points."""
+    """scipy's differential evolution with generations of 25 points per dimension, each evaluated at once, and at most
+    `budget` points."""
     population, evaluations = 25 * dimensions, 0
 
     def generation(x: Reals, /) -> Any:
@@ -96,7 +105,10 @@ def differential_evolution(cost: Cost, dimensions: int, seed: int, budget: int =
 
 
 def nelder_mead(cost: Cost, dimensions: int, seed: int, budget: int = 2500, starts: int = 10) -> SearchResult:
-    """scipy's Nelder-Mead from the best few of budget/5 random points that are apart, then once more from the best."""
+    """scipy's Nelder-Mead from the best distinct ones of budget/5 random points, then once more from the best result.
+
+    starts: the largest number of starts.
+    """
     scattered: Reals = np.random.default_rng(seed).random((budget // 5, dimensions))
     values = cost(scattered)
     left = scattered[np.argsort(values)]
