@@ -21,7 +21,7 @@ class Facts:
     """What is known of the loop before the experiment.
 
     sample_time_s: the sample time, s.
-    T95_s: the time in which the open loop comes within 5 % of its end, s.
+    T95_s: the time in which the plant covers 95 % of a step, s, as given by the user.
     mv_low, mv_high: the limits of MV, absolute, MV units.
     sp_deviation: the largest permitted set-point step, PV units, positive.
     old_gains: the accepted gains.
