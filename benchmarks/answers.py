@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 import httpx
 
 from benchmarks.command import command
-from loopwright.service.cli.child_process import Process
+from loopwright.service.cli.child_process import ChildProcess
 
 LOOPS = (1, 10, 50)
 RATE_PER_S, ASK_S, CONNECTIONS = 100, 10.0, 16
@@ -85,7 +85,7 @@ def answered_ms(url: str, paths: list[str]) -> list[float]:
 class Gateway:
     def __init__(self, folder: Path) -> None:
         arguments = ("benchmarks.rehearsed", str(folder), "local", str(max(LOOPS)), str(max(LOOPS)), "1", "")
-        self.process = Process("service", arguments, folder / "log")
+        self.process = ChildProcess("service", arguments, folder / "log")
 
     def __enter__(self) -> Gateway:
         self.url = self.process.wait_ready().split()[1]

@@ -27,8 +27,8 @@ from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.record import Evidence
-from loopwright.tuning.fast.verdict import evaluate
+from loopwright.tuning.fast.evaluation import evaluate
+from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.disturbances import STRUCTURES
 from loopwright.tuning.identification.output_error import Fit
@@ -46,13 +46,13 @@ DEAD_TIMES = (0.2,)
 Reals = NDArray[np.float64]
 
 
-def record(seed: int = 1) -> Evidence:
+def record(seed: int = 1) -> ExperimentRecord:
     """Rest, then a biased relay."""
-    span = _recorded(0.0, seed).span
+    span = _recorded(0.0, seed).output_range
     return _recorded(NOISE * span, seed)
 
 
-def _recorded(noise: float, seed: int) -> Evidence:
+def _recorded(noise: float, seed: int) -> ExperimentRecord:
     plant = LinearPlant(NUM, DEN, L, TS, noise_std=noise, seed=seed)
     channel = Channel(TS, Settings(-5.0, 5.0), Parameters(1.0), 0.0, Mode.MANUAL)
     u, y, switches = [], [], []
@@ -64,7 +64,7 @@ def _recorded(noise: float, seed: int) -> Evidence:
         if k > LISTENED and u[-1] != u[-2]:
             switches.append(k)
         plant.step(u[-1])
-    return Evidence(TS, np.array(u), np.array(y), 1.0, LISTENED, SAMPLES, tuple(switches))
+    return ExperimentRecord(TS, np.array(u), np.array(y), 1.0, LISTENED, SAMPLES, tuple(switches))
 
 
 def plain_response(structure: Structure, theta: Reals, b: Reals, u: Reals) -> Reals:
@@ -91,7 +91,7 @@ def plain_response(structure: Structure, theta: Reals, b: Reals, u: Reals) -> Re
     return out
 
 
-def plain_fit(evidence: Evidence) -> TransferFunction:
+def plain_fit(evidence: ExperimentRecord) -> TransferFunction:
     """The structure of the least BIC, every parameter searched."""
     fit = Fit(evidence)
     found = []

@@ -22,7 +22,7 @@ from sqlalchemy import Engine, create_engine, text
 
 from benchmarks.answers import processor_s
 from benchmarks.command import Missing, command
-from loopwright.service.cli.child_process import Process
+from loopwright.service.cli.child_process import ChildProcess
 from loopwright.service.job_states import ACTIVE
 from tests.unit.service.postgres import Server, binaries
 
@@ -49,7 +49,7 @@ def fleet(folder: Path, gateways: int, server: Server, pace: float, at_once: int
             home = folder / f"{name}-gw{n}"
             home.mkdir()
             settings = (str(LOOPS // gateways), str(at_once), str(pace), database)
-            processes.append(Process(name, ("benchmarks.rehearsed", str(home), f"gw{n}", *settings), home / "log"))
+            processes.append(ChildProcess(name, ("benchmarks.rehearsed", str(home), f"gw{n}", *settings), home / "log"))
             stack.callback(processes[-1].stop)
         urls = [process.wait_ready(120).split()[1] for process in processes]
         clients = [stack.enter_context(httpx.Client(base_url=url, timeout=60, trust_env=False)) for url in urls]

@@ -28,7 +28,7 @@ from benchmarks.command import command
 from loopwright.plantsim.catalogue import find
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE
 from loopwright.protocol.tuner import Tuner
-from loopwright.service.cli.child_process import Process
+from loopwright.service.cli.child_process import ChildProcess
 from loopwright.service.job_states import ACTIVE
 
 TS = 0.1
@@ -78,7 +78,7 @@ class Site:
             "service": ("loopwright.service", "serve", *where),
         }
         for name, line in arguments.items():
-            process = Process(name, line, folder / f"{name}.log")
+            process = ChildProcess(name, line, folder / f"{name}.log")
             stack.callback(process.stop)
             self.url = process.wait_ready(START_S).split()[1]
         self.service = process

@@ -1,4 +1,4 @@
-"""A rehearsal of fast that is refused, for each cause that can be provoked, with the picture of its job.
+"""A rehearsal of fast that is refused, for each reason that can be provoked, with the picture of its job.
 
 python -m benchmarks.refusals docs/refusals
 """
@@ -24,7 +24,7 @@ from loopwright.service.jsonable import to_jsonable
 from loopwright.service.plots.fast_job import fast_job
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.procedure import FastOptions, fast
-from loopwright.tuning.fast.proposal import Found
+from loopwright.tuning.fast.proposal import EvaluationSummary
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Event, Mode, Sample, StageDone, StageStarted
 
@@ -97,7 +97,7 @@ def _load(size: float, at: float) -> Change:
 
 
 def cases() -> dict[str, Case]:
-    """By the cause that each is meant to end with."""
+    """By the reason that each is meant to end with."""
     return {
         "no_response": Case("the valve is shut: MV reaches nothing", mv=lambda mv, t: 0.0),
         "wrong_sign": Case(
@@ -111,7 +111,7 @@ def cases() -> dict[str, Case]:
             pv=lambda pv, t: pv + 0.03 * math.sin(3.0 * t), noise=0.03,
         ),
         "uncertain": Case("the relay is too small for the noise", options={"amplitude": 1.0}, noise=0.1),
-        "surprise": Case(
+        "model_mismatch": Case(
             "the plant's gain doubles as the new gains are tried", mv=lambda mv, t: 2.0 * mv, of="verify", seed=5
         ),
         "diverges": Case("the sensor's range is switched as the new gains are tried", pv=lambda pv, t: 100.0 * pv,
@@ -119,7 +119,7 @@ def cases() -> dict[str, Case]:
     }  # fmt: skip
 
 
-def rehearsed(cause: str, case: Case) -> dict[str, Any]:
+def rehearsed(reason: str, case: Case) -> dict[str, Any]:
     """The job, as GET /jobs/{id} would show it, with its samples as columns."""
     plant = Odd(case)
     settings = Settings(mv_low=0.0, mv_high=100.0, safe_output=MIDDLE, pv_low=-1e9, pv_high=1e9, reverse=case.reverse)
@@ -134,7 +134,7 @@ def rehearsed(cause: str, case: Case) -> dict[str, Any]:
             stages.append((len(samples), event.stage))
             if event.stage == case.of:
                 plant.t = 0.0
-        elif isinstance(event, StageDone) and isinstance(event.result, Found):
+        elif isinstance(event, StageDone) and isinstance(event.result, EvaluationSummary):
             found = to_jsonable(event.result)
 
     class Heard:
@@ -168,10 +168,10 @@ def rehearsed(cause: str, case: Case) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def draw(folder: Path, cause: str, job: dict[str, Any]) -> Path:
+def draw(folder: Path, reason: str, job: dict[str, Any]) -> Path:
     record = relay_record(job["samples"])
     assert record is not None
-    path = folder / f"{cause.replace('_', '-')}.png"
+    path = folder / f"{reason.replace('_', '-')}.png"
     fast_job(path, job, record, "degC")
     Image.open(path).convert("RGB").quantize(COLOURS).save(path, optimize=True)
     return path
@@ -180,18 +180,18 @@ def draw(folder: Path, cause: str, job: dict[str, Any]) -> Path:
 def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("folder", type=Path, help="where the pictures go")
-    parser.add_argument("causes", metavar="CAUSE", nargs="*", help=f"only of these; default: {', '.join(cases())}")
+    parser.add_argument("reasons", metavar="REASON", nargs="*", help=f"only of these; default: {', '.join(cases())}")
     given = parser.parse_args()
-    folder, only = given.folder, given.causes
-    check_names(parser, "cause", only, cases())
+    folder, only = given.folder, given.reasons
+    check_names(parser, "reason", only, cases())
     folder.mkdir(parents=True, exist_ok=True)
-    for cause, case in cases().items():
-        if only and cause not in only:
+    for reason, case in cases().items():
+        if only and reason not in only:
             continue
-        job = rehearsed(cause, case)
-        path = draw(folder, cause, job)
+        job = rehearsed(reason, case)
+        path = draw(folder, reason, job)
         print(
-            f"{cause}: {job['state']} {job['reason']}: {job['detail']} ({path.stat().st_size // 1000} kB)", flush=True
+            f"{reason}: {job['state']} {job['reason']}: {job['detail']} ({path.stat().st_size // 1000} kB)", flush=True
         )
 
 

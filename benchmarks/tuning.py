@@ -43,11 +43,11 @@ from loopwright.service.jobs.relay_record import relay_record
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.experiments.preflight import PREFLIGHT, SETTLE, at_rest
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.design import Design, DesignSpec
+from loopwright.tuning.fast.design import DesignSpec, GainDesign
+from loopwright.tuning.fast.evaluation import evaluate_again
 from loopwright.tuning.fast.procedure import MIN_SAMPLES, FastOptions, FastProposal, fast
-from loopwright.tuning.fast.record import Evidence
+from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.fast.relay_test import Experiment
-from loopwright.tuning.fast.verdict import evaluate_again
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import sign
 from loopwright.tuning.plan import Command, Event, Mode, Plan, Sample, StageStarted
@@ -84,12 +84,12 @@ class Troubled(RehearsedLoop):
         if isinstance(event, StageStarted) and event.stage == PREFLIGHT:
             self.taken.clear()
 
-    def record(self, tail: int) -> Evidence | None:
+    def record(self, tail: int) -> ExperimentRecord | None:
         """Of what was taken, without the last so many samples."""
         columns = zip(*self.taken[: len(self.taken) - tail], strict=True)
         named = dict(zip(("t_s", "sp", "pv", "mv", "mode"), columns, strict=True))
         record = relay_record({"stage": len(named["t_s"]) * [PREFLIGHT], **named})
-        return record.evidence() if record else None
+        return record.experiment_record() if record else None
 
 
 def loop_of(
@@ -132,7 +132,7 @@ def relay_span(plant: Plant) -> float:
         point, listened = yield from at_rest(facts, 0.0, MIN_SAMPLES)
         experiment = Experiment(facts, point, listened, 1.0)
         yield from experiment.relay(4)
-        return experiment.evidence().span
+        return experiment.experiment_record().output_range
 
     loop, facts = loop_of(plant, 1.0, 1.0 / plant.Ku, 0.0, 1)
     result = run(plan(facts), loop, watch=Watch())
@@ -166,9 +166,9 @@ class Ran:
 
 
 @cache
-def optimum(plant: Plant, spec: DesignSpec) -> tuple[Design, float, tuple[float, float]]:
+def optimum(plant: Plant, spec: DesignSpec) -> tuple[GainDesign, float, tuple[float, float]]:
     """The design on the true plant, its J, and the least integrals that J is counted in."""
-    design = Design(plant.model(), spec, plant.Pu)
+    design = GainDesign(plant.model(), spec, plant.Pu)
     best = design.best()
     assert design.minimum is not None
     return design, best.J, (design.minimum.setpoint, design.minimum.load)
@@ -213,8 +213,8 @@ def measure(case: Case, plant: Plant, seed: int) -> Ran:
         evidence = loop.record(round(case.tail * case.samples))
         assert evidence is not None
         again = evaluate_again(evidence, case.spec(plant))
-        if again.cause is not None:
-            return replace(ran, reason=again.cause, detail=again.detail)
+        if again.reason is not None:
+            return replace(ran, reason=again.reason, detail=again.detail)
         gains = again.best.gains
     # a plant that has changed is judged as it is now
     now = replace(plant, num=tuple(case.how.gain * c for c in plant.num), L=plant.L + case.how.later * plant.Pu)

@@ -12,7 +12,7 @@ from loopwright.controller.channel import Settings
 from loopwright.controller.device import ControllerChannel, ControllerDevice
 from loopwright.controller.pid import Parameters
 from loopwright.controller.retained_state import FileKeeper, KeptError, remembered
-from loopwright.protocol.device_process import ConfigError, node_id, read_channels, run_device
+from loopwright.protocol.device_process import DeviceConfigError, node_id, read_channels, run_device
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, Mode
 
 _MODES = {"off": Mode.OFF, "manual": Mode.MANUAL, "automatic": Mode.AUTOMATIC}
@@ -43,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         kept = remembered(options.keep, [one.kept for one in channels]) if options.keep else None
         if kept:
             channels = [one.with_kept(own) for one, own in zip(channels, kept, strict=True)]
-    except (ConfigError, KeptError, KeyError, TypeError, ValueError) as error:
+    except (DeviceConfigError, KeptError, KeyError, TypeError, ValueError) as error:
         print(f"controller: {error.args[0]}", file=sys.stderr)
         return 2
     return run_device(
@@ -65,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _channel(row: Mapping[str, Any]) -> ControllerChannel:
     numbers = {name: float(row[name]) for name in _NUMBERS}
     if row["mode"] not in _MODES:
-        raise ConfigError(f"mode {row['mode']!r} is unknown; there are {', '.join(_MODES)}")
+        raise DeviceConfigError(f"mode {row['mode']!r} is unknown; there are {', '.join(_MODES)}")
     return ControllerChannel(
         Parameters(*(numbers[name] for name in ("kp", "ti", "td", "tf", "b", "c"))),
         numbers["sp"],

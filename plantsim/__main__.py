@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from loopwright.plantsim.catalogue import find
 from loopwright.plantsim.device import PlantChannel, PlantDevice
-from loopwright.protocol.device_process import ConfigError, node_id, read_channels, run_device
+from loopwright.protocol.device_process import DeviceConfigError, node_id, read_channels, run_device
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE
 
 
@@ -20,8 +20,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         rows += [{"model": name} for name in options.model]
         channels = [_channel(row.get("model", ""), float(row.get("noise", options.noise))) for row in rows]
         if not channels:
-            raise ConfigError("no plant given; use --model NAME or --config FILE")
-    except (ConfigError, KeyError, TypeError, ValueError) as error:
+            raise DeviceConfigError("no plant given; use --model NAME or --config FILE")
+    except (DeviceConfigError, KeyError, TypeError, ValueError) as error:
         print(f"plantsim: {error.args[0]}", file=sys.stderr)
         return 2
     if options.speed == 0.0:

@@ -20,7 +20,7 @@ Build = Callable[[float, float, int], Plant]
 
 
 @dataclass(frozen=True, slots=True)
-class Facts:
+class PlantFacts:
     """Ku, Pu_s: ultimate point of the continuous plant under P control, Ku in model units (None: there is none).
 
     T95_s: time after which an open-loop step response stays within 5 % (None: the plant integrates).
@@ -46,7 +46,7 @@ class Facts:
 
 
 @dataclass(frozen=True, slots=True)
-class TransferFunction:
+class CatalogueModel:
     """Coefficients from the highest power down, time in s."""
 
     num: tuple[float, ...]
@@ -59,8 +59,8 @@ class Entry:
     """`model` is None for plants that are not linear."""
 
     name: str
-    facts: Facts
-    model: TransferFunction | None
+    facts: PlantFacts
+    model: CatalogueModel | None
 
     def build(self, sample_time_s: float, noise_std: float = 0.0, seed: int = 1) -> Plant:
         if self.model is None:
@@ -93,7 +93,7 @@ def _printed_models() -> list[Entry]:
     entries = []
     for row in data["models"]:
         computed = row["computed"]
-        facts = Facts(
+        facts = PlantFacts(
             description=f"test plant No. {row['id']} of the five-stage procedure",
             Ku=computed["Ku"],
             Pu_s=computed["Pu"],
@@ -101,14 +101,14 @@ def _printed_models() -> list[Entry]:
             static_gain=computed["static_gain"],
             confidence=row["confidence"],
         )
-        model = TransferFunction(tuple(row["num"]), tuple(row["den"]), row["delay"])
+        model = CatalogueModel(tuple(row["num"]), tuple(row["den"]), row["delay"])
         entries.append(Entry(f"model-{row['id']}", facts, model))
     return entries
 
 
 _REACTOR = Entry(
     "reactor",
-    Facts(
+    PlantFacts(
         description="stirred reactor A + B -> C with inverse response and 10 s sensor delay",
         Ku=1.5294,
         Pu_s=42.53,
@@ -124,31 +124,33 @@ _REACTOR = Entry(
 )
 
 _NAMED = [
-    Entry("fopdt", Facts("first order, dead time 2 s", 8.5024, 7.442, 32.0, 1.0), TransferFunction((1,), (10, 1), 2.0)),
+    Entry(
+        "fopdt", PlantFacts("first order, dead time 2 s", 8.5024, 7.442, 32.0, 1.0), CatalogueModel((1,), (10, 1), 2.0)
+    ),
     Entry(
         "sopdt",
-        Facts("second order, dead time 1 s", 7.8757, 11.66, 37.8, 2.0),
-        TransferFunction((2,), (50, 15, 1), 1.0),
+        PlantFacts("second order, dead time 1 s", 7.8757, 11.66, 37.8, 2.0),
+        CatalogueModel((2,), (50, 15, 1), 1.0),
     ),
     Entry(
         "five-lags",
-        Facts("five equal lags", 2.8854, 8.648, 9.2, 1.0),
-        TransferFunction((1,), (1, 5, 10, 10, 5, 1), 0.0),
+        PlantFacts("five equal lags", 2.8854, 8.648, 9.2, 1.0),
+        CatalogueModel((1,), (1, 5, 10, 10, 5, 1), 0.0),
     ),
     Entry(
         "inverse-response",
-        Facts("right-half-plane zero", 3.1843, 16.19, 24.2, 1.0),
-        TransferFunction((-2, 1), (20, 9, 1), 1.0),
+        PlantFacts("right-half-plane zero", 3.1843, 16.19, 24.2, 1.0),
+        CatalogueModel((-2, 1), (20, 9, 1), 1.0),
     ),
     Entry(
         "integrating",
-        Facts("level-like: integrates, dead time 1 s", 15.708, 4.0, None, None),
-        TransferFunction((0.1,), (1, 0), 1.0),
+        PlantFacts("level-like: integrates, dead time 1 s", 15.708, 4.0, None, None),
+        CatalogueModel((0.1,), (1, 0), 1.0),
     ),
     Entry(
         "negative-gain",
-        Facts("PV falls as MV rises, dead time 2 s", 4.623, 7.325, 26.0, -1.5, reverse=False),
-        TransferFunction((-1.5,), (8, 1), 2.0),
+        PlantFacts("PV falls as MV rises, dead time 2 s", 4.623, 7.325, 26.0, -1.5, reverse=False),
+        CatalogueModel((-1.5,), (8, 1), 2.0),
     ),
 ]
 

@@ -16,7 +16,7 @@ import numpy as np
 from loopwright.plantsim.models import sampled
 
 
-class Process(Protocol):
+class SimulatedProcess(Protocol):
     @property
     def pv(self) -> float:
         """The present measured value, PV units, noise included."""
@@ -27,7 +27,7 @@ class Process(Protocol):
         ...
 
 
-class Plant(Process, Protocol):
+class Plant(SimulatedProcess, Protocol):
     """What can be disturbed."""
 
     disturbance: float

@@ -17,7 +17,7 @@ from loopwright.protocol.bus import Bus, BusError, open_bus
 from loopwright.protocol.device_runtime import Runtime
 
 
-class ConfigError(Exception):
+class DeviceConfigError(Exception):
     """The file or the options make no sense; the text says where."""
 
 
@@ -40,14 +40,16 @@ def read_channels(path: str, keys: Iterable[str]) -> list[dict[str, Any]]:
     try:
         rows = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     except (OSError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path}: {error}") from error
+        raise DeviceConfigError(f"{path}: {error}") from error
     if not isinstance(rows, list) or not rows or not all(isinstance(row, dict) for row in rows):
-        raise ConfigError(f"{path}: a list of channels is expected")
+        raise DeviceConfigError(f"{path}: a list of channels is expected")
     known = set(keys)
     for number, row in enumerate(rows, start=1):
         for key in row:
             if key not in known:
-                raise ConfigError(f"{path}: channel {number}: {key!r} is unknown; there are {', '.join(sorted(known))}")
+                raise DeviceConfigError(
+                    f"{path}: channel {number}: {key!r} is unknown; there are {', '.join(sorted(known))}"
+                )
     return rows
 
 

@@ -29,7 +29,7 @@ class Producer:
 
 
 @dataclass(slots=True)
-class Watch:
+class HeartbeatWatch:
     node: int
     limit_s: float
     heard: float | None = None
@@ -42,9 +42,9 @@ class Consumer:
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
-        self._watches: dict[int, Watch] = {}
+        self._watches: dict[int, HeartbeatWatch] = {}
 
-    def __iter__(self) -> Iterator[Watch]:
+    def __iter__(self) -> Iterator[HeartbeatWatch]:
         return iter(self._watches.values())
 
     def clear(self) -> None:
@@ -63,15 +63,15 @@ class Consumer:
             return
         if any(other != sub and watch.node == node for other, watch in self._watches.items()):
             raise SdoAbort(Abort.INCOMPATIBLE)
-        self._watches[sub] = Watch(node, limit_ms / 1000.0)
+        self._watches[sub] = HeartbeatWatch(node, limit_ms / 1000.0)
 
-    def heard(self, watch: Watch) -> bool:
+    def heard(self, watch: HeartbeatWatch) -> bool:
         """A heartbeat came; True when it had been missed."""
         watch.heard = self._clock()
         was_lost, watch.lost = watch.lost, False
         return was_lost
 
-    def overdue(self, now: float) -> list[Watch]:
+    def overdue(self, now: float) -> list[HeartbeatWatch]:
         """Those that have fallen silent since the last call. They are watched again from their next beat on."""
         silent = [each for each in self if each.heard is not None and now - each.heard > each.limit_s]
         for watch in silent:

@@ -67,7 +67,7 @@ ABORT_TEXT = {
 }
 
 
-class Kind(StrEnum):
+class FailureKind(StrEnum):
     TIMEOUT = "timeout"
     ABORT = "abort"
 
@@ -75,7 +75,7 @@ class Kind(StrEnum):
 class TunerError(Exception):
     """An SDO without success: no answer (TIMEOUT), or refused by the device with `code` (ABORT)."""
 
-    def __init__(self, kind: Kind, text: str, code: int = 0) -> None:
+    def __init__(self, kind: FailureKind, text: str, code: int = 0) -> None:
         super().__init__(text)
         self.kind = kind
         self.code = code
@@ -235,7 +235,7 @@ class Tuner:
             value = entry.type.decode(raw)
         except struct.error as error:
             text = f"{name}: {len(raw)} bytes do not make a {entry.type.name}"
-            raise TunerError(Kind.ABORT, text, Abort.LENGTH) from error
+            raise TunerError(FailureKind.ABORT, text, Abort.LENGTH) from error
         return shortest(float(value)) if entry.type is Type.REAL32 else value
 
     def number(self, name: str, sub: int | None = None, node: int | None = None) -> float:
@@ -253,7 +253,7 @@ class Tuner:
         if node is None:
             node = self._plant if entry.device is Device.PLANT else self._controller
         if node is None:
-            raise TunerError(Kind.TIMEOUT, f"{name}: this loop's plant has no node")
+            raise TunerError(FailureKind.TIMEOUT, f"{name}: this loop's plant has no node")
         if sub is None:
             sub = self._channel if entry.shape is Shape.CHANNELS else 0
         return entry, node, sub
@@ -297,7 +297,7 @@ class Tuner:
                     raise _aborted(entry, answer)
                 if answer[0] & 0xE0 == expected:
                     return answer
-        raise TunerError(Kind.TIMEOUT, f"node {node:02X}h does not answer ({entry.name})")
+        raise TunerError(FailureKind.TIMEOUT, f"node {node:02X}h does not answer ({entry.name})")
 
     def _segments(self, entry: Object, node: int) -> bytes:
         """The rest of a value longer than one frame: strings."""
@@ -306,11 +306,11 @@ class Tuner:
             self._bus.send(sdo_request_id(node), bytes([0x60 | toggle, 0, 0, 0, 0, 0, 0, 0]))
             answer = self._answer(node, self.station.monotonic() + self._sdo_timeout_s)
             if answer is None:
-                raise TunerError(Kind.TIMEOUT, f"node {node:02X}h stopped in the middle of {entry.name}")
+                raise TunerError(FailureKind.TIMEOUT, f"node {node:02X}h stopped in the middle of {entry.name}")
             if answer[0] == _ABORT:
                 raise _aborted(entry, answer)
             if answer[0] & 0xF0 != toggle:
-                raise TunerError(Kind.ABORT, f"{entry.name}: segments out of order", Abort.TOGGLE)
+                raise TunerError(FailureKind.ABORT, f"{entry.name}: segments out of order", Abort.TOGGLE)
             value += answer[1 : 8 - (answer[0] >> 1 & 7)]
             if answer[0] & 0x01:
                 return value
@@ -331,4 +331,4 @@ class Tuner:
 def _aborted(entry: Object, answer: bytes) -> TunerError:
     code = int.from_bytes(answer[4:8], "little")
     text = ABORT_TEXT.get(Abort(code)) if code in list(Abort) else None
-    return TunerError(Kind.ABORT, f"{entry.name}: {text or 'refused'} ({code:08X}h)", code)
+    return TunerError(FailureKind.ABORT, f"{entry.name}: {text or 'refused'} ({code:08X}h)", code)

@@ -5,7 +5,7 @@
     series       Kp (1 + 1/(Ti s)) (1 + Td s)/(1 + Tf s)         interacting; exists while both its zeros are real
     reciprocal   Kp + 1/(Ti s)                                   the ME-PSO paper's PI: its Ti is 1/Ki, no time
 
-Set-point weights belong to the ISA controller; converted are the terms that act on the measurement.
+The conversions cover the terms that act on the measurement; set-point weights belong to the ISA controller only.
 """
 
 from __future__ import annotations
@@ -19,7 +19,13 @@ from loopwright.tuning.reasons import Reason, Refused
 
 @dataclass(frozen=True, slots=True)
 class Parallel:
-    """Kp: MV per PV unit.  Ki: that per s.  Kd: that times s.  Tf: s."""
+    """The parallel form.
+
+    Kp: the proportional gain, MV units per PV unit.
+    Ki: the integral gain, MV units per PV unit and s.
+    Kd: the derivative gain, MV units * s per PV unit.
+    Tf: the derivative filter time, s.
+    """
 
     Kp: float
     Ki: float = 0.0
@@ -29,7 +35,13 @@ class Parallel:
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """Kp: MV per PV unit.  Ti, Td, Tf: s; Ti = 0: no integral action.  Td: the smaller of the two times."""
+    """The series form.
+
+    Kp: the proportional gain, MV units per PV unit.
+    Ti: the integral time, s; 0 is no integral action.
+    Td: the derivative time, s, the smaller of the two times.
+    Tf: the derivative filter time, s.
+    """
 
     Kp: float
     Ti: float = 0.0
@@ -39,27 +51,33 @@ class Series:
 
 @dataclass(frozen=True, slots=True)
 class Reciprocal:
-    """Kp: MV per PV unit.  Ti: 1/Ki, PV unit * s per MV unit."""
+    """The reciprocal form of the ME-PSO paper.
+
+    Kp: the proportional gain, MV units per PV unit.
+    Ti: the reciprocal 1/Ki of the integral gain, PV units * s per MV unit.
+    """
 
     Kp: float
     Ti: float
 
 
 def to_parallel(gains: Gains) -> Parallel:
-    """Ki = Kp/Ti (0 for Ti = 0), Kd = Kp Td."""
+    """The parallel form of ISA gains: Ki = Kp/Ti (0 for Ti = 0), Kd = Kp Td."""
     _check_isa(gains)
     Ki = gains.Kp / gains.Ti if gains.Ti > 0.0 else 0.0
     return Parallel(gains.Kp, Ki, gains.Kp * gains.Td, gains.Tf)
 
 
 def of_parallel(form: Parallel) -> Gains:
-    """Ti = Kp/Ki, Td = Kd/Kp; refused for Kp = 0, which the ISA form cannot say."""
+    """The ISA gains of a parallel form: Ti = Kp/Ki, Td = Kd/Kp. Raises Refused for Kp = 0, which the ISA form cannot
+    express."""
     _check(positive={"Kp": form.Kp}, not_negative={"Ki": form.Ki, "Kd": form.Kd, "Tf": form.Tf})
     return Gains(form.Kp, form.Kp / form.Ki if form.Ki > 0.0 else 0.0, form.Kd / form.Kp, form.Tf)
 
 
 def of_ascending(*C: float) -> Gains:
-    """The s-plane paper's coefficients: the numerator over s, (C0, C1) = (Kp, Ki), (C0, C1, C2) = (Kd, Kp, Ki)."""
+    """The ISA gains of the s-plane paper's coefficients, which are those of the numerator over s: (C0, C1) = (Kp, Ki)
+    or (C0, C1, C2) = (Kd, Kp, Ki)."""
     if len(C) == 2:
         return of_parallel(Parallel(C[0], C[1]))
     if len(C) == 3:
@@ -68,7 +86,8 @@ def of_ascending(*C: float) -> Gains:
 
 
 def to_reciprocal(gains: Gains) -> Reciprocal:
-    """Ti/Kp; refused for a controller with derivative or without integral action."""
+    """The reciprocal form of ISA gains: its Ti is Ti/Kp. Raises Refused for a controller with derivative or without
+    integral action."""
     _check_isa(gains)
     if gains.Td > 0.0 or gains.Ti == 0.0:
         raise Refused(
@@ -78,14 +97,17 @@ def to_reciprocal(gains: Gains) -> Reciprocal:
 
 
 def of_reciprocal(form: Reciprocal) -> Gains:
-    """Ti = Kp times the form's Ti; refused for the pure integral controller Kp = 0."""
+    """The ISA gains of a reciprocal form: Ti is Kp times the form's Ti. Raises Refused for the pure integral controller
+    Kp = 0."""
     _check(positive={"Kp": form.Kp, "Ti": form.Ti})
     return Gains(form.Kp, form.Kp * form.Ti)
 
 
 def to_series(gains: Gains) -> Series:
-    """The two times are the roots of x^2 - (Ti + Tf) x + Ti (Td + Tf); refused (outside_range) where they are complex,
-    without a filter for Ti < 4 Td."""
+    """The series form of ISA gains. Its two times are the roots of x^2 - (Ti + Tf) x + Ti (Td + Tf).
+
+    Raises Refused, OUTSIDE_RANGE, where the roots are complex: without a filter that is for Ti < 4 Td.
+    """
     _check_isa(gains)
     if gains.Td == 0.0 or gains.Ti == 0.0:
         # without the integral the filter is one of the lead's two poles still: Kp (1 + (Td + Tf) s)/(1 + Tf s)
@@ -104,8 +126,10 @@ def to_series(gains: Gains) -> Series:
 
 
 def of_series(form: Series) -> Gains:
-    """Ti + Td - Tf, (Ti - Tf)(Td - Tf)/(Ti + Td - Tf) and Kp (Ti + Td - Tf)/Ti; refused (outside_range) where a filter
-    too long leaves no setting."""
+    """The ISA gains of a series form: their Ti is Ti + Td - Tf, their Td is (Ti - Tf)(Td - Tf)/(Ti + Td - Tf), their Kp
+    is Kp (Ti + Td - Tf)/Ti, with the form's values on the right. Raises Refused, OUTSIDE_RANGE, where the filter is too
+    long.
+    """
     _check(positive={"Kp": form.Kp}, not_negative={"Ti": form.Ti, "Td": form.Td, "Tf": form.Tf})
     if form.Ti == 0.0:
         Kp, Ti, Td = form.Kp, 0.0, form.Td - form.Tf

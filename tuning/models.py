@@ -15,9 +15,11 @@ Complexes = NDArray[np.complex128]
 
 @dataclass(frozen=True, slots=True)
 class FOPDT:
-    """First order plus dead time, K*exp(-L*s)/(T*s + 1).
+    """A plant of first order plus dead time, K*exp(-L*s)/(T*s + 1).
 
-    K: PV units per MV unit, either sign.  T: time constant, s, positive.  L: dead time, s, not negative.
+    K: the gain, PV units per MV unit, either sign.
+    T: the time constant, s, positive.
+    L: the dead time, s, not negative.
     """
 
     K: float
@@ -41,16 +43,19 @@ class FOPDT:
         return self.K
 
     def frequency_response(self, w: Reals) -> Complexes:
-        """At angular frequencies w, rad/s."""
+        """The frequency response at the angular frequencies w, rad/s."""
         s = 1j * np.asarray(w, dtype=float)
         return np.asarray(self.K * np.exp(-self.L * s) / (self.T * s + 1.0))
 
 
 @dataclass(frozen=True, slots=True)
 class SOPDT:
-    """Second order plus dead time, K*exp(-L*s)/(T^2 s^2 + 2*zeta*T*s + 1); zeta < 1 has complex poles.
+    """A plant of second order plus dead time, K*exp(-L*s)/(T^2 s^2 + 2*zeta*T*s + 1).
 
-    K: PV units per MV unit, either sign.  T: s, positive.  zeta: damping ratio, positive.  L: dead time, s, >= 0.
+    K: the gain, PV units per MV unit, either sign.
+    T: the reciprocal of the natural frequency, s, positive.
+    zeta: the damping ratio, positive; the poles are complex for zeta < 1.
+    L: the dead time, s, not negative.
     """
 
     K: float
@@ -65,7 +70,7 @@ class SOPDT:
 
     @classmethod
     def of_time_constants(cls, K: float, T1: float, T2: float, L: float) -> SOPDT:
-        """K*exp(-L*s)/((T1*s + 1)(T2*s + 1)), both positive, s."""
+        """The model K*exp(-L*s)/((T1*s + 1)(T2*s + 1)) with positive time constants T1 and T2, s."""
         if not (T1 > 0.0 and T2 > 0.0):
             raise ValueError(f"time constants must be positive: T1={T1} s, T2={T2} s")
         T = math.sqrt(T1 * T2)
@@ -101,15 +106,17 @@ class SOPDT:
         return self.K
 
     def frequency_response(self, w: Reals) -> Complexes:
-        """At angular frequencies w, rad/s."""
+        """The frequency response at the angular frequencies w, rad/s."""
         return _response(self.num, self.den, self.L, w)
 
 
 @dataclass(frozen=True, slots=True)
 class Integrating:
-    """K*exp(-L*s)/(s*(T*s + 1)): an integrating plant with dead time and perhaps a lag.
+    """An integrating plant with dead time and possibly a lag, K*exp(-L*s)/(s*(T*s + 1)).
 
-    K: PV units per MV unit and second, either sign.  L: dead time, s, >= 0.  T: lag, s, >= 0.
+    K: the gain, PV units per MV unit and s, either sign.
+    L: the dead time, s, not negative.
+    T: the lag, s, not negative.
     """
 
     K: float
@@ -130,19 +137,20 @@ class Integrating:
 
     @property
     def static_gain(self) -> float:
-        """Infinite, with the sign of K."""
+        """The static gain, which is infinite, with the sign of K."""
         return math.copysign(math.inf, self.K)
 
     def frequency_response(self, w: Reals) -> Complexes:
-        """At angular frequencies w > 0, rad/s."""
+        """The frequency response at the angular frequencies w > 0, rad/s."""
         return _response(self.num, self.den, self.L, w)
 
 
 @dataclass(frozen=True, slots=True)
 class TransferFunction:
-    """num(s)/den(s)*exp(-L*s), coefficients from the highest power down; bi-proper and one pole at the origin allowed.
+    """The transfer function num(s)/den(s)*exp(-L*s). It may be bi-proper and may have one pole at the origin.
 
-    L: dead time, s.
+    num, den: the coefficients, from the highest power down.
+    L: the dead time, s.
     """
 
     num: tuple[float, ...]
@@ -161,13 +169,13 @@ class TransferFunction:
 
     @property
     def static_gain(self) -> float:
-        """Infinite, with the sign of the slope, for a pole at the origin."""
+        """The static gain; for a pole at the origin it is infinite, with the sign of the slope."""
         if self.den[-1] == 0.0:
             return math.copysign(math.inf, self.num[-1] * self.den[-2])
         return self.num[-1] / self.den[-1]
 
     def frequency_response(self, w: Reals) -> Complexes:
-        """At angular frequencies w, rad/s."""
+        """The frequency response at the angular frequencies w, rad/s."""
         return _response(self.num, self.den, self.L, w)
 
 
@@ -177,7 +185,8 @@ Model = FOPDT | SOPDT | Integrating | TransferFunction
 class LinearSystem(Protocol):
     """A transfer function of another library: control.TransferFunction, scipy.signal.TransferFunction.
 
-    num, den: coefficients from the highest power down, nested or not.  dt: None or 0 for continuous time.
+    num, den: the coefficients from the highest power down, nested or not.
+    dt: None or 0 for continuous time.
     """
 
     @property
@@ -189,10 +198,12 @@ class LinearSystem(Protocol):
 
 
 def as_model(system: Model | LinearSystem, dead_time_s: float = 0.0) -> Model:
-    """A model of this library from one of another, which has no dead time of its own; a model of ours is returned.
+    """The model of this library for a transfer function of another, which has no dead time of its own.
 
-    dead_time_s: s, of a system of another library.  Raises ValueError: more than one input or output, discrete time, a
-    dead time given twice, coefficients that make no model.
+    system: the transfer function; a model of this library is returned as it is.
+    dead_time_s: the dead time of a system of another library, s.
+    Raises ValueError: more than one input or output, discrete time, a dead time given twice, coefficients that make no
+    model.
     """
     if isinstance(system, Model):
         if dead_time_s:
@@ -209,13 +220,13 @@ def as_model(system: Model | LinearSystem, dead_time_s: float = 0.0) -> Model:
 
 
 def time_constants(model: Model) -> Reals:
-    """1/|p| of every pole p but those at the origin, s."""
+    """The time constants 1/|p| of all poles p that are not at the origin, s."""
     sizes = np.abs(np.roots(model.den))
     return np.asarray(1.0 / sizes[sizes > 0.0], dtype=float)
 
 
 def integrators(model: Model) -> int:
-    """How many poles are at the origin."""
+    """The number of poles at the origin."""
     den = model.den
     return len(den) - len(np.trim_zeros(np.asarray(den), "b"))
 

@@ -5,10 +5,10 @@
         sample = yield (SetMode(Mode.MANUAL),) # commands take effect before the next sample
         return Rest(...)
 
-Rules of the house. A plan owns no clock, no bus and no thread: time is `Sample.t`. A command may take effect a few
-samples late (a live bus), so a plan looks at what the samples say (`mode`, `sp`) rather than counting. A plan never
-restores the loop: the runner does, on every way out. A plan that cannot go on raises `Refused` or `Failed` from
-`tuning.reasons`. What a plan wants to tell (stages, results) it yields among the commands, as events.
+A plan owns no clock, no bus and no thread: time is `Sample.t`. A command may take effect a few samples late (on a live
+bus), so a plan reads the state from the samples (`mode`, `sp`) instead of counting them. A plan never restores the
+loop: the runner does, however the plan ends. A plan that cannot go on raises `Refused` or `Failed` from
+`tuning.reasons`. A plan reports stages and results by yielding events among the commands.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 
 class Mode(IntEnum):
-    """What drives the MV; the numbers are those of the controller's object dictionary."""
+    """The mode of the controller, which says what drives MV; the numbers are those of its object dictionary."""
 
     OFF = 0
     MANUAL = 1
@@ -33,7 +33,13 @@ class Mode(IntEnum):
 
 
 class Sample(NamedTuple):
-    """One sampling period: t in plant seconds; sp, pv in PV units; mv in MV units; the mode in effect."""
+    """One sample.
+
+    t: the plant time, s.
+    sp, pv: set-point and PV, PV units.
+    mv: MV, MV units.
+    mode: the mode in effect.
+    """
 
     t: float
     sp: float
@@ -44,35 +50,45 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SetMode:
+    """Sets the mode of the controller."""
+
     mode: Mode
 
 
 @dataclass(frozen=True, slots=True)
 class SetGains:
-    """Put these gains on trial, all in one sample, bumplessly."""
+    """Puts these gains on trial, all in one sample, without a bump of MV."""
 
     gains: Gains
 
 
 @dataclass(frozen=True, slots=True)
 class SetSetpoint:
+    """Sets the set-point, PV units."""
+
     value: float
 
 
 @dataclass(frozen=True, slots=True)
 class SetOutput:
-    """The output for manual mode, MV units."""
+    """Sets the output for manual mode, MV units."""
 
     value: float
 
 
 @dataclass(frozen=True, slots=True)
 class SetRelay:
-    """Arm and start the relay inside the controller (mode experiment).
+    """Arms and starts the relay inside the controller (mode experiment). A relay that is running keeps its present
+    side.
 
-    u = working_output +- amplitude, switching on the action-signed error, with hysteresis.
-    amplitude_low: of the lower side, if it is not the same.  average: the mean of so many samples switches.
-    While a relay is running it goes on from the side it is on.
+    The output is working_output + amplitude or working_output - amplitude_low; the relay switches on the error, signed
+    by the controller's action, with hysteresis.
+
+    amplitude: the amplitude of the higher side, MV units.
+    hysteresis: the hysteresis, PV units.
+    working_output: the output around which the relay switches, MV units.
+    amplitude_low: the amplitude of the lower side, MV units; None for the same as `amplitude`.
+    average: the number of samples of PV whose mean switches the relay.
     """
 
     amplitude: float
@@ -84,7 +100,12 @@ class SetRelay:
 
 @dataclass(frozen=True, slots=True)
 class StageStarted:
-    """expected_s: expected plant time of this stage; remaining_s: of all stages after it."""
+    """A stage has started.
+
+    stage: the name of the stage.
+    expected_s: the expected plant time of this stage, s.
+    remaining_s: the expected plant time of all stages after it, s.
+    """
 
     stage: str
     expected_s: float
@@ -93,7 +114,11 @@ class StageStarted:
 
 @dataclass(frozen=True, slots=True)
 class StageDone:
-    """result: a frozen dataclass with plain fields (numbers, strings, tuples)."""
+    """A stage has ended.
+
+    stage: the name of the stage.
+    result: its result, a frozen dataclass whose fields are numbers, strings and tuples.
+    """
 
     stage: str
     result: object
@@ -101,15 +126,15 @@ class StageDone:
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """Something worth telling the operator that is neither a stage's start nor its end."""
+    """A message for the operator that is neither the start nor the end of a stage."""
 
     text: str
 
 
 class Work(Generic[T]):
-    """A computation too long to do between two samples: the runner does it beside them, and goes on pumping.
+    """A computation that takes longer than a sampling period. The runner carries it out while the samples go on.
 
-    compute: to be done in this process or another; what can be pickled.
+    compute: the computation, a callable that can be pickled, for this process or another.
     """
 
     def __init__(self, compute: Callable[[], T]) -> None:
@@ -119,7 +144,7 @@ class Work(Generic[T]):
         self.done = False
 
     def run(self) -> None:
-        """Called once, by whoever pumps the plan, in a thread of its own or not."""
+        """Carries out the computation and keeps its result or its exception; the runner calls this once."""
         try:
             value = self.compute()
         except BaseException as error:
@@ -128,17 +153,17 @@ class Work(Generic[T]):
             self.finish(value)
 
     def finish(self, value: T) -> None:
-        """It came to this."""
+        """Ends the computation with this result."""
         self._value = value
         self.done = True
 
     def fail(self, error: BaseException) -> None:
-        """It raised this."""
+        """Ends the computation with this exception."""
         self._error = error
         self.done = True
 
     def result(self) -> T:
-        """What it came to; raises what it raised."""
+        """The result of the computation; raises the exception that it ended with."""
         if self._error is not None:
             raise self._error
         return cast(T, self._value)
@@ -150,7 +175,7 @@ Plan = Generator[Sequence[Command | Event | Work[Any]], Sample, T]
 
 
 def worked(compute: Callable[[], T]) -> Plan[T]:
-    """The result of a long computation, while the loop goes on under guard."""
+    """The plan of a long computation alone: the loop goes on, and the plan returns the result."""
     work = Work(compute)
     yield (work,)
     while not work.done:

@@ -1,11 +1,11 @@
-"""Why a job did not end as proposed: a closed list, each with advice for the person who can act on it.
+"""The reasons why a job did not end with a proposal: a closed list, each with advice for the person who can act on it.
 
     Refused   the loop or the data does not allow a trustworthy result; nothing is broken
     Failed    something broke or ran out on the way (a node, the bus, time)
     Aborted   someone asked for it to stop
     NoGain    the loop is tuned as well as asked already: a good end
 
-All four leave the loop as it was; the runner sees to that.
+The runner leaves the loop as it was after each of the four.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from enum import StrEnum
 
 
 class Reason(StrEnum):
-    """The closed list. The value is what the API shows; `ADVICE` says what to do."""
+    """The closed list of reasons. The API shows the value; `ADVICE` says what to do."""
 
     # refused
     NOT_AT_REST = "not_at_rest"
@@ -42,7 +42,7 @@ class Reason(StrEnum):
     DISTURBED = "disturbed"
     UNCERTAIN = "uncertain"
     AMBIGUOUS = "ambiguous"
-    SURPRISE = "surprise"
+    MODEL_MISMATCH = "model_mismatch"
     DIVERGES = "diverges"
     LOCKED = "locked"
     # no gain
@@ -105,8 +105,8 @@ ADVICE: dict[Reason, str] = {
     Reason.UNCERTAIN: "The record does not tell enough for this robustness: permit more MV, filter the measurement, or "
     "ask for a lower Ms.",
     Reason.AMBIGUOUS: "Several models explain the record and disagree: permit more MV, or retune in a steady time.",
-    Reason.SURPRISE: "The loop behaved differently under the new gains than under the relay: look for changes of the "
-    "load or of the plant, then retune.",
+    Reason.MODEL_MISMATCH: "The loop behaved differently under the new gains than under the relay: look for changes of "
+    "the load or of the plant, then retune.",
     Reason.DIVERGES: "PV ran away under the new gains, which were taken back: keep the present gains, and repeat.",
     Reason.LOCKED: "Somebody has locked the loop: ask them, or unlock it (loopwright unlock TAG), then ask again.",
     Reason.NO_GAIN: "The loop is already tuned as well as asked: nothing needs to be done. For a faster or a more "
@@ -125,7 +125,7 @@ ADVICE: dict[Reason, str] = {
     "it again by itself, and sends no NMT command.",
     Reason.DEVICE_WENT_BACK: "The controller ended the test by itself (lease, heartbeat): check this machine's load.",
     Reason.RESTORE_UNCONFIRMED: "The loop could not be read back after the test: look at the controller NOW.",
-    Reason.COMPUTATION_LIMIT: "Look for a number in the model or the wishes that is far from any plant's (gain, time "
+    Reason.COMPUTATION_LIMIT: "Look for a number in the model or the options that is far from any plant's (gain, time "
     "constants, dead time against T95 and sample time), or permit more by the option of `loopwright serve` named.",
     Reason.COMPUTATION_LOST: "The system ended the computation, or had no room for it: see that the machine has memory "
     "left, then repeat.",
@@ -139,7 +139,11 @@ ADVICE: dict[Reason, str] = {
 
 
 class Ended(Exception):
-    """A plan or its runner ended early; `reason` from the closed list, `detail` with the numbers."""
+    """A plan or its runner ended early.
+
+    reason: the reason from the closed list.
+    detail: a sentence with the numbers.
+    """
 
     def __init__(self, reason: Reason, detail: str) -> None:
         super().__init__(f"{reason.value}: {detail}")
@@ -151,11 +155,12 @@ class Ended(Exception):
 
     @property
     def advice(self) -> str:
+        """What the person who can act on the reason should do."""
         return ADVICE[self.reason]
 
 
 class Refused(Ended):
-    """No trustworthy result is to be had; nothing is broken."""
+    """The loop or the data does not allow a trustworthy result; nothing is broken."""
 
 
 class Failed(Ended):
@@ -163,8 +168,8 @@ class Failed(Ended):
 
 
 class NoGain(Ended):
-    """Nothing asked for would get better: the present gains are kept."""
+    """Nothing that was asked for would improve, so the present gains are kept."""
 
 
 class Aborted(Ended):
-    """Someone, or the service's own shutdown, asked for it to stop."""
+    """A person, or the shutdown of the service, has stopped the plan."""

@@ -10,7 +10,7 @@ from typing import Any
 from fastapi import Request
 
 from loopwright.service.errors import Stopping
-from loopwright.service.execution.computing.limits import Kind
+from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.computing.pool import NotWanted, Pool
 
 Work = Callable[[], dict[str, Any]]
@@ -22,7 +22,7 @@ async def computed(pool: Pool, work: Work, http: Request, stopping: Callable[[],
     gone = threading.Event()
     listening = asyncio.create_task(_until_gone(http, gone))
     try:
-        future = pool.submit(Kind.TUNING, work, lambda: gone.is_set() or stopping())
+        future = pool.submit(ComputationKind.TUNING, work, lambda: gone.is_set() or stopping())
         found: dict[str, Any] = await asyncio.wrap_future(future)
     except NotWanted:
         if gone.is_set():

@@ -278,7 +278,7 @@ def job_view(row: JobRow, events: Sequence[EventRow], running: Running | None) -
         rehearsed_on=rehearsed_on_view(result.get("rehearsed_on")),
         predicted=known(PredictedView, result.get("predicted")),
         predicted_before=known(PredictedView, result.get("predicted_before")),
-        evidence=known(EvidenceView, result.get("found") or _told(events, ("redesign", "design"), "cause")),
+        evidence=known(EvidenceView, result.get("found") or _told(events, ("redesign", "design"), "reason")),
         verification=verification_view(result.get("verified") or _told(events, ("verify",), "tested")),
         before=known(StepView, result.get("baseline")),
         after=known(StepView, result.get("verification")),

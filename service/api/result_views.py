@@ -68,8 +68,8 @@ class EvidenceView(BaseModel):
     drift: bool = Field(description="PV drifted at a steady rate, which was allowed for")
     switches: int = Field(description="Of the relay", examples=[4])
     period_s: float = Field(description="Of PV under the relay, s", examples=[12.5])
-    cause: str | None = Field(description="Why that is not enough for a proposal, from the closed list")
-    detail: str = Field(description="The cause's numbers")
+    reason: str | None = Field(description="Why that is not enough for a proposal, from the closed list")
+    detail: str = Field(description="The numbers behind that reason")
 
 
 class VerificationView(BaseModel):

@@ -16,7 +16,7 @@ class NotReady(Exception):
     """A process ended or said nothing in time; the text has its last words."""
 
 
-class Process:
+class ChildProcess:
     """python -m MODULE ARGS with its output in a log file; `ready` is its line that starts with "ready"."""
 
     def __init__(self, name: str, arguments: Sequence[str], log: Path) -> None:

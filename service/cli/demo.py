@@ -12,7 +12,7 @@ from typing import Any
 import yaml
 
 from loopwright.service.cli import job_tables
-from loopwright.service.cli.child_process import NotReady, Process
+from loopwright.service.cli.child_process import ChildProcess, NotReady
 from loopwright.service.cli.client import ApiError, Client
 from loopwright.service.plots.job import NoPicture, job_picture
 
@@ -81,7 +81,7 @@ def run_demo(folder: Path | None, speed: str, hub_only: bool) -> None:
 
 def _start(stack: ExitStack, folder: Path, speed: str, hub_only: bool) -> Client:
     def process(name: str, *arguments: str) -> str:
-        started = Process(name, arguments, folder / f"{name}.log")
+        started = ChildProcess(name, arguments, folder / f"{name}.log")
         stack.callback(started.stop)
         line = started.wait_ready()
         job_tables.console.print(f"{name:<11}{' '.join(arguments)}", highlight=False, soft_wrap=True)
@@ -122,6 +122,6 @@ def _tell(job: dict[str, Any], seconds: float, folder: Path, picture: Path) -> N
         f"picture          {picture}",
         f"jobs, samples    {folder / 'data' / 'loopwright.sqlite'}",
         f"configuration    {folder / 'loops.yaml'}",
-        'next             docs/rest.md: the same by hand; docs/one-job.md: how it works',
+        "next             docs/rest.md: the same by hand; docs/one-job.md: how it works",
     ]
     job_tables.console.print("\n".join(lines), highlight=False, soft_wrap=True)

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, Protocol
 
-from loopwright.service.execution.computing.limits import Kind
+from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.computing.pool import NoProcess, NotWanted
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop, Restored
@@ -47,7 +47,7 @@ def _alone() -> Iterator[None]:
 class Workers(Protocol):
     """Who computes in other processes: a `Pool`."""
 
-    def submit(self, kind: Kind, work: Callable[[], Any], unwanted: Callable[[], bool]) -> Future[Any]: ...
+    def submit(self, kind: ComputationKind, work: Callable[[], Any], unwanted: Callable[[], bool]) -> Future[Any]: ...
 
 
 class Computing:
@@ -70,7 +70,7 @@ class Computing:
         if self._workers is None:
             self._beside(work)
             return
-        future = self._workers.submit(Kind.LIVE, work.compute, lambda: self._over)
+        future = self._workers.submit(ComputationKind.LIVE, work.compute, lambda: self._over)
         future.add_done_callback(partial(self._came, work))
 
     def step(self, commands: Sequence[Command]) -> Sample:

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from loopwright.controller.channel import Channel, RelaySettings, Settings
 from loopwright.controller.pid import Parameters
-from loopwright.plantsim.plant import LinearPlant, Process
+from loopwright.plantsim.plant import LinearPlant, SimulatedProcess
 from loopwright.service.execution.guard import Watch
 from loopwright.service.execution.runner import RunResult, run
 from loopwright.service.jsonable import to_jsonable
@@ -58,7 +58,7 @@ class RehearsedLoop:
 
     waits = True
 
-    def __init__(self, plant: Process, channel: Channel, sample_time_s: float) -> None:
+    def __init__(self, plant: SimulatedProcess, channel: Channel, sample_time_s: float) -> None:
         self._plant = plant
         self._channel = channel
         self._dt = sample_time_s

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from loopwright.service.config import LoopConfig
-from loopwright.service.execution.computing.limits import Kind
+from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.computing.pool import NotWanted, Pool
 from loopwright.service.execution.procedures import Hooks, Outcome, Rehearse
 from loopwright.service.planning.ground import Ground
@@ -34,7 +34,7 @@ def apart(rehearse: Rehearse, pool: Pool) -> Rehearse:
 
         work = partial(_rehearsed, rehearse, config, request, hooks.ground)
         try:
-            outcome = pool.run(Kind.DRY_RUN, work, hear=hear, unwanted=lambda: hooks.stop() is not None)
+            outcome = pool.run(ComputationKind.DRY_RUN, work, hear=hear, unwanted=lambda: hooks.stop() is not None)
         except NotWanted:
             reason = hooks.stop() or Reason.SERVICE_STOPPED
             return Outcome(None, Aborted(reason, "the dry run was stopped"), None, {})

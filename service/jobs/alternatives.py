@@ -15,9 +15,9 @@ from loopwright.service.store.tables import EventRow, JobRow
 from loopwright.tuning.analysis.assessment import Assessment, assess
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.design_trial import designed_on
+from loopwright.tuning.fast.evaluation import evaluate_again
 from loopwright.tuning.fast.procedure import FAST, FastOptions
 from loopwright.tuning.fast.proposal import delayed
-from loopwright.tuning.fast.verdict import evaluate_again
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 from loopwright.tuning.reasons import Ended, Reason, Refused
@@ -68,15 +68,15 @@ def redesigned(
     """
     model = job_model(row, events)
     doubt: dict[str, float | None] = {"uncertainty": None, "ambiguity": None}
-    evidence = record.evidence() if record and row.request.get("method") == FAST else None
+    evidence = record.experiment_record() if record and row.request.get("method") == FAST else None
     _not_disproved(row, (Reason.WRONG_SIGN,) if evidence else DISPROVED)
     try:
         if evidence is not None:
             evaluation = evaluate_again(evidence, DesignSpec(ms, derivative))
             model, gains = evaluation.model, evaluation.best.gains
             doubt = {"uncertainty": evaluation.uncertainty, "ambiguity": evaluation.ambiguity}
-            if evaluation.cause is not None:
-                raise Refused(Reason(evaluation.cause), evaluation.detail)
+            if evaluation.reason is not None:
+                raise Refused(evaluation.reason, evaluation.detail)
             sampled: Model = delayed(model, evaluation.design_delay)
         else:
             Ts = (row.found or {}).get("sample_time_s") or 0.0

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from loopwright.tuning.fast.record import MIN_LISTENED, MIN_SWITCHES, Evidence
+from loopwright.tuning.fast.record import MIN_LISTENED, MIN_SWITCHES, ExperimentRecord
 from loopwright.tuning.models import Reals
 from loopwright.tuning.plan import Mode
 
@@ -37,13 +37,13 @@ class RelayRecord:
         """MV and PV at rest."""
         return float(np.mean(self.mv[: self.listened])), float(np.mean(self.pv[: self.listened]))
 
-    def evidence(self) -> Evidence | None:
+    def experiment_record(self) -> ExperimentRecord | None:
         """None where the relay did not come far enough for a fit."""
         if len(self.switches) < MIN_SWITCHES or self.listened < MIN_LISTENED:
             return None
         mv, pv = self.rest
         y = self.pv - pv
-        return Evidence(
+        return ExperimentRecord(
             Ts=self.Ts,
             u=self.mv - mv,
             y=y,

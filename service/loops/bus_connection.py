@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from loopwright.protocol.bus import BusError
 from loopwright.protocol.profile import Abort, NmtState
 from loopwright.protocol.station import NodeTaken, Station
-from loopwright.protocol.tuner import Kind, Tuner, TunerError
+from loopwright.protocol.tuner import FailureKind, Tuner, TunerError
 from loopwright.service.loops.bus_reading import BusReading, not_operational
 from loopwright.tuning.reasons import Failed, Reason, Refused
 
@@ -55,7 +55,7 @@ class BusConnection:
             text = f"bus {self.url!r} is lost ({error.strerror or error}): see that its interface is there and up"
             raise Failed(Reason.BUS_LOST, text) from error
         except TunerError as error:
-            if error.kind is Kind.TIMEOUT:
+            if error.kind is FailureKind.TIMEOUT:
                 raise self._no_answer(error) from error
             if error.code in _NOT_OURS:
                 raise Refused(Reason.DEVICE_MISMATCH, str(error)) from error

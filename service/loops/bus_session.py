@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 
 from loopwright.protocol.profile import FOREVER, Abort, Order
-from loopwright.protocol.tuner import Kind, Tuner, TunerError
+from loopwright.protocol.tuner import FailureKind, Tuner, TunerError
 from loopwright.protocol.tuner_session import Lease, TunerSession
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_connection import AGAIN_S, BusConnection
@@ -81,7 +81,7 @@ class BusSession:
         try:
             self._session.open(self._lease, note)
         except TunerError as error:
-            if error.kind is Kind.ABORT:  # there is no session: nothing to close, nothing to look after
+            if error.kind is FailureKind.ABORT:  # there is no session: nothing to close, nothing to look after
                 note(0)
             if error.code == Abort.LOCAL_CONTROL:
                 text = "an RPDO has just moved the set-point: an outer loop, a ramp or a recipe drives it"

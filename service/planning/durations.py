@@ -7,9 +7,9 @@ ten), and the limits of time of the procedures.
 from __future__ import annotations
 
 from loopwright.service.request import RetuneRequest
-from loopwright.tuning.experiments.preflight import LOOKS, MIN_LISTENED_SAMPLES
+from loopwright.tuning.experiments.preflight import MAX_ATTEMPTS, MIN_LISTENED_SAMPLES
 from loopwright.tuning.fast.procedure import MIN_SAMPLES
-from loopwright.tuning.fast.relay_test import BACK, MAX_PERIODS, VERIFIED_PERIODS
+from loopwright.tuning.fast.relay_test import MAX_PERIODS, STEP_BACK_FRACTION, VERIFICATION_PERIODS
 
 PU_OF_T95 = (0.07, 0.95)
 """The ultimate period in T95, of eight in ten of 116 self-regulating plants."""
@@ -22,7 +22,7 @@ def durations(request: RetuneRequest, t95_s: float, sample_time_s: float | None,
     minimum = MIN_SAMPLES if request.fast and request.start == "relay" else MIN_LISTENED_SAMPLES
     look = max(0.5 * t95_s, minimum * (sample_time_s or 0.0))
     # a loop that is not at rest is given half a T95 before each further look
-    listening = (look, LOOKS * look + (LOOKS - 1) * 0.5 * t95_s)
+    listening = (look, MAX_ATTEMPTS * look + (MAX_ATTEMPTS - 1) * 0.5 * t95_s)
     low, high = (pu_s, pu_s) if pu_s else (PU_OF_T95[0] * t95_s, PU_OF_T95[1] * t95_s)
     nothing = (0.0, 0.0)
     if request.fast and request.start == "design":
@@ -32,7 +32,7 @@ def durations(request: RetuneRequest, t95_s: float, sample_time_s: float | None,
             "preflight": listening,
             "relay": (1.8 * low, MAX_PERIODS * high),
             "design": nothing,
-            "verify": (VERIFIED_PERIODS * low, (1.0 + BACK) * VERIFIED_PERIODS * high),
+            "verify": (VERIFICATION_PERIODS * low, (1.0 + STEP_BACK_FRACTION) * VERIFICATION_PERIODS * high),
             "redesign": nothing,
         }
     return {

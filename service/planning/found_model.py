@@ -10,7 +10,7 @@ from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
 from loopwright.tuning.reasons import Reason
 
 FoundModel = FOPDT | SOPDT | TransferFunction
-DISPROVED = (Reason.WRONG_SIGN, Reason.SURPRISE, Reason.DIVERGES, Reason.UNEXPLAINED, Reason.DISTURBED)
+DISPROVED = (Reason.WRONG_SIGN, Reason.MODEL_MISMATCH, Reason.DIVERGES, Reason.UNEXPLAINED, Reason.DISTURBED)
 """How a job ends whose own record speaks against the model that an earlier stage had found."""
 TYPED_IN = "typed in"
 
@@ -31,7 +31,7 @@ def model_of(data: Mapping[str, Any]) -> FoundModel | None:
     if all(isinstance(data.get(name), int | float) for name in ("K", "T_s", "L_s")):
         K, T, L, zeta = data["K"], data["T_s"], data["L_s"], data.get("zeta")
         return FOPDT(K, T, L) if zeta is None else SOPDT(K, T, zeta, L)
-    if data.get("num") and data.get("den") and not data.get("cause"):
+    if data.get("num") and data.get("den") and not data.get("reason"):
         dead_time = data.get("dead_time_s", data.get("L_s", 0.0))
         return TransferFunction(tuple(data["num"]), tuple(data["den"]), dead_time)
     return None

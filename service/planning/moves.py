@@ -14,7 +14,7 @@ from loopwright.service.request import RetuneRequest
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.design_trial import trial_stages
 from loopwright.tuning.fast.procedure import fast_stages
-from loopwright.tuning.fast.relay_test import BIAS, FIRST, MAX_RAISED, WIDEST_SPAN, max_amplitude
+from loopwright.tuning.fast.relay_test import BIAS, FIRST_AMPLITUDE, MAX_OUTPUT_RANGE, MAX_RAISE, max_amplitude
 from loopwright.tuning.five_stage.procedure import stages_of
 from loopwright.tuning.five_stage.ultimate_gain import RUN_MV_LIMIT
 from loopwright.tuning.gains import Gains
@@ -121,8 +121,8 @@ def _fast(stage: str, config: LoopConfig, request: RetuneRequest, before: Before
     low, high, step, unit = config.mv_limits.low, config.mv_limits.high, config.sp_deviation, config.pv_unit
     maximum = (high - low) / (1.0 + BIAS) if before.mv is None else max(0.0, max_amplitude(before.mv, low, high))
     given = request.amplitude_pct
-    first = given or FIRST * maximum
-    up = min(MAX_RAISED * given, maximum) if given else maximum
+    first = given or FIRST_AMPLITUDE * maximum
+    up = min(MAX_RAISE * given, maximum) if given else maximum
     if stage != "relay":
         what = (
             f"The set-point is stepped up by up to {step:g} {unit} under the new gains, on trial; it is stepped back "
@@ -132,9 +132,11 @@ def _fast(stage: str, config: LoopConfig, request: RetuneRequest, before: Before
     size, mean = "Its size stays", 0.5 * (1.0 + BIAS)
     pv = _swing(mean * first, before.Ku)
     if given is None:
-        size = f"After its first wave it is adapted, so that PV moves by at most {WIDEST_SPAN * step:g} {unit} in all"
+        size = (
+            f"After its first wave it is adapted, so that PV moves by at most {MAX_OUTPUT_RANGE * step:g} {unit} in all"
+        )
         if pv is not None:  # nothing bounds the first wave but MV
-            pv = max(pv, min(0.5 * WIDEST_SPAN * step, pv * maximum / first if first else 0.0))
+            pv = max(pv, min(0.5 * MAX_OUTPUT_RANGE * step, pv * maximum / first if first else 0.0))
     what = (
         f"A relay in the controller moves MV by +{first:.4g} and -{BIAS * first:.4g} % at first. {size}; a side on "
         "which PV stalls is raised, up to twice."

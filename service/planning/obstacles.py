@@ -11,7 +11,7 @@ from loopwright.service.loop_state import OPERATIONAL, LoopState
 from loopwright.service.planning.facts import facts_of
 from loopwright.service.planning.moves import broken_limits, stages_asked
 from loopwright.service.request import RetuneRequest, narrow
-from loopwright.tuning.experiments.preflight import LOOKS, MAX_AWAY, MAX_NOISE, MIN_ROOM
+from loopwright.tuning.experiments.preflight import MAX_ATTEMPTS, MAX_AWAY, MAX_NOISE, MIN_ROOM
 from loopwright.tuning.fast.relay_test import BIAS, max_amplitude
 from loopwright.tuning.models import sign
 from loopwright.tuning.plan import Mode
@@ -130,7 +130,7 @@ def _of_pv(config: LoopConfig, request: RetuneRequest, state: LoopState) -> list
     if abs(away) > maximum:
         text = (
             f"PV is {away:+.3g} {unit} off the set-point in this moment, and at most {maximum:.3g} would be at rest; a "
-            f"retune looks {LOOKS} times, half a T95 each, before it gives up"
+            f"retune looks {MAX_ATTEMPTS} times, half a T95 each, before it gives up"
         )
         found.append(Obstacle(Reason.NOT_AT_REST, text))
     if request.model is not None and (sign(request.model.plant()) > 0.0) != state.reverse_acting:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from loopwright.service.jobs.relay_record import RelayRecord
 from loopwright.tuning.analysis.assessment import assess
 from loopwright.tuning.analysis.step_response import step_response
-from loopwright.tuning.fast.structure_choice import choose
+from loopwright.tuning.fast.structure_choice import choose_structure
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.output_error import Fit, averaged
 from loopwright.tuning.models import TransferFunction
@@ -46,16 +46,16 @@ def _record(pv: Axes, rest: Axes, mv: Axes, record: RelayRecord, found: dict[str
     t = record.t
     pv.plot(t, record.pv, color=GREY, linewidth=1.0, label="PV measured")
     pv.step(t, record.sp, where="post", color="black", linestyle=":", linewidth=1.0, label="set-point")
-    evidence = record.evidence()
+    evidence = record.experiment_record()
     if evidence is None:
         rest.text(0.5, 0.5, "too few switches of the relay for a fit", ha="center", transform=rest.transAxes)
         rest.set_yticks([])
     else:
         fit = Fit(evidence)
-        best = choose(fit).best
-        residual = best.linear.residual * evidence.span
+        best = choose_structure(fit).best
+        residual = best.linear.residual * evidence.output_range
         at = averaged(t[: len(fit.u)], fit.block)
-        pv.plot(at, fit.y * evidence.span - residual + record.rest[1], color=BLUE, linewidth=1.2,
+        pv.plot(at, fit.y * evidence.output_range - residual + record.rest[1], color=BLUE, linewidth=1.2,
                 label="model fitted to it")  # fmt: skip
         rest.plot(at, residual, color=RED, linewidth=0.8)
         noise = 2.0 * evidence.noise

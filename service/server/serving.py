@@ -32,7 +32,7 @@ from loopwright.service.api.gate.connections import (
 from loopwright.service.api.gate.gate import Policy, is_loopback
 from loopwright.service.api.gate.limits import RequestLimits
 from loopwright.service.config import LoopConfig, load_site
-from loopwright.service.execution.computing.limits import ComputingLimits, Kind
+from loopwright.service.execution.computing.limits import ComputationKind, ComputingLimits
 from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.execution.procedures import Tune, rehearse
 from loopwright.service.execution.procedures import tune as live
@@ -168,7 +168,9 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         listener = stack.enter_context(listen(setup.bind, setup.port))
         pool = stack.enter_context(closing(Pool(setup.computing)))
         if tune is None:
-            pool.submit(Kind.LIVE, os.getpid)  # loads the fork server: the first computation of a loop is not to wait
+            pool.submit(
+                ComputationKind.LIVE, os.getpid
+            )  # loads the fork server: the first computation of a loop is not to wait
         store = stack.enter_context(closing(Store(setup.data, setup.database, setup.host or LOCAL)))
         keyring = Keyring(store.engine) if setup.auth or not local else None
         if keyring is not None and not keyring.any_valid():

@@ -15,7 +15,7 @@ import yaml
 
 from loopwright.protocol.profile import FOREVER
 from loopwright.protocol.tuner import Tuner
-from loopwright.service.cli.child_process import Process
+from loopwright.service.cli.child_process import ChildProcess
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.tuning.plan import Mode
@@ -118,9 +118,9 @@ class Plantsite:
         where = ("--bus", self.bus, "--ts", str(case.ts))
         self.controller = self.launch("controller", "loopwright.controller", *where, *gains, *kept)
 
-    def launch(self, name: str, *arguments: str) -> Process:
+    def launch(self, name: str, *arguments: str) -> ChildProcess:
         """Starts a process and does not wait for it."""
-        process = Process(name, arguments, self._folder / f"{name}.log")
+        process = ChildProcess(name, arguments, self._folder / f"{name}.log")
         self._stack.callback(process.stop)
         return process
 
@@ -129,7 +129,7 @@ class Plantsite:
         self._service = self.launch_service()
         self._connect()
 
-    def launch_service(self) -> Process:
+    def launch_service(self) -> ChildProcess:
         """A service on our data, not waited for."""
         case = self.case
         low, high = case.pv_limits

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from loopwright.protocol.profile import Mode
-from loopwright.protocol.tuner import Kind, TunerError
+from loopwright.protocol.tuner import FailureKind, TunerError
 from tests.e2e.plantsite import BUS, MODEL_14, NEEDS_VCAN, STAGES, TAG, Plantsite, Stage
 
 pytestmark = NEEDS_VCAN
@@ -139,7 +139,7 @@ def test_nan_by_sdo_is_refused_and_the_loop_goes_on(here: Plantsite) -> None:
     for name in ("controller_setpoint", "controller_staged_kp"):
         with pytest.raises(TunerError) as refused:
             here.write(name, math.nan)
-        assert refused.value.kind is Kind.ABORT and refused.value.code == 0x06090030
+        assert refused.value.kind is FailureKind.ABORT and refused.value.code == 0x06090030
     assert here.is_home()
     before = here.read("sample_number")
     time.sleep(0.5)

@@ -12,7 +12,7 @@ import yaml
 
 from loopwright.plantsim.catalogue import find
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE
-from loopwright.service.cli.child_process import Process
+from loopwright.service.cli.child_process import ChildProcess
 from loopwright.service.cli.demo import vcan_usable
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_loop import BusLoop
@@ -69,25 +69,25 @@ class Site:
         self.url = self._start("service", "loopwright.service", "serve", *where).split()[1]
 
     def _start(self, name: str, *command: str) -> str:
-        process = Process(name, command, self._folder / f"{name}.log")
+        process = ChildProcess(name, command, self._folder / f"{name}.log")
         self._stack.callback(process.stop)
         if name == "service":
             self.service = process
         return process.wait_ready(START_S)
 
-    def attackers(self, *names: str, key: str = "") -> Process:
+    def attackers(self, *names: str, key: str = "") -> ChildProcess:
         number = len(list(self._folder.glob("attackers-*.log")))
         arguments = ("tests.hostile.attackers", self.url, *names, f"--silent={SILENT}", f"--loop={self.tags[-1]}")
-        process = Process(
+        process = ChildProcess(
             "attackers", (*arguments, *([f"--key={key}"] if key else [])), self._folder / f"attackers-{number}.log"
         )
         self._stack.callback(process.stop)
         process.wait_ready(START_S)
         return process
 
-    def listener(self) -> Process:
+    def listener(self) -> ChildProcess:
         """A process that listens to the heartbeat; `late` has what it found, once it was stopped."""
-        process = Process("listener", ("tests.hostile.listening", self.bus), self._folder / "listener.log")
+        process = ChildProcess("listener", ("tests.hostile.listening", self.bus), self._folder / "listener.log")
         self._stack.callback(process.stop)
         process.wait_ready(START_S)
         return process

@@ -117,7 +117,7 @@ def test_a_plant_that_changes_with_the_new_gains_is_not_taken_for_one_under_a_lo
     plant = next(plant for plant in plants() if plant.name == "model-9")
     result, _ = fast_run(plant, FURTHER[case], seed=1)
     assert result.value is None and result.ended is not None
-    assert result.ended.reason in ("surprise", "unexplained", "disturbed")
+    assert result.ended.reason in ("model_mismatch", "unexplained", "disturbed")
 
 
 @pytest.mark.parametrize("case", ["PV in steps of span/50", "2 % of samples lost", "two loads", "drift 2 % in Pu"])

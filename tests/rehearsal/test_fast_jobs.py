@@ -80,7 +80,7 @@ def test_a_load_step_in_mid_relay_is_found(tmp_path: Path, size: float) -> None:
     assert 4.0 < true_t < 9.0  # within the relay, after its first wave
     assert load["t_s"] == pytest.approx(true_t, rel=0.1)
     assert load["size"] == pytest.approx(size, rel=0.1)
-    assert any("A step of the load" in note for note in job["notes"])
+    assert any("A load disturbance" in note for note in job["notes"])
     gains = Gains(job["new_gains"]["Kp"], job["new_gains"]["Ti"])
     assert margins(FOPDT(K, T, L + TS / 2), gains).Ms == pytest.approx(1.6, abs=0.1)
 

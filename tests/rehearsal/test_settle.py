@@ -14,7 +14,7 @@ from loopwright.service.request import RetuneRequest
 from loopwright.service.store.tables import EventRow
 from loopwright.tuning.experiments.preflight import SETTLE
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.experiments.settle import LOOKS
+from loopwright.tuning.experiments.settle import MAX_ATTEMPTS
 from loopwright.tuning.plan import Event, Mode, Plan, SetMode, SetOutput, StageStarted
 from loopwright.tuning.reasons import Reason
 
@@ -58,7 +58,7 @@ def test_a_second_attempt_gives_the_loop_time_to_come_to_rest(swinging: tuple[Lo
     ran, stages = _attempt(loop, facts, CUT_OFF, method)
     assert ran.value is not None, ran.ended
     assert stages[:2] == [SETTLE, "preflight"]
-    assert facts.T95_s < ran.plant_time_s[SETTLE] < LOOKS / 2 * facts.T95_s
+    assert facts.T95_s < ran.plant_time_s[SETTLE] < MAX_ATTEMPTS / 2 * facts.T95_s
 
 
 def test_a_first_attempt_is_refused_there(swinging: tuple[Loop, Facts]) -> None:

@@ -9,7 +9,7 @@ from random import Random
 from typing import Any
 
 from loopwright.service.config import LoopConfig
-from loopwright.service.execution.computing.limits import Kind
+from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.guard import Watch
 from loopwright.service.execution.procedures import Hooks, Outcome, Tune, tune
 from loopwright.service.execution.runner import run
@@ -136,7 +136,7 @@ def tunes(actions: tuple[Action, ...]) -> Tune:
 class Here:
     """Workers that compute at once, in no simulated time."""
 
-    def submit(self, kind: Kind, work: Callable[[], Any], unwanted: Callable[[], bool]) -> Future[Any]:
+    def submit(self, kind: ComputationKind, work: Callable[[], Any], unwanted: Callable[[], bool]) -> Future[Any]:
         future: Future[Any] = Future()
         try:
             future.set_result(work())

@@ -1,1 +1,1 @@
-"""What a model and a controller make together: stability, margins, step responses and their figures."""
+"""The analysis of a loop of model and controller: stability, margins, step responses and their figures."""

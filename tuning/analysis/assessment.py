@@ -1,4 +1,4 @@
-"""What a setting is worth on a model: margins, and the figures of a set-point and of a load step."""
+"""The assessment of gains on a model: margins, and the figures of a set-point step and of a load disturbance."""
 
 from __future__ import annotations
 
@@ -13,7 +13,12 @@ from loopwright.tuning.models import Model
 
 @dataclass(frozen=True, slots=True)
 class Assessment:
-    """setpoint, load: of a unit step of the set-point, and of the plant's input; None when the loop is unstable."""
+    """The assessment of one set of gains on one model.
+
+    margins: the stability margins.
+    setpoint: the figures of a unit set-point step, None when the loop is unstable.
+    load: the figures of a unit load disturbance at the plant's input, None when the loop is unstable.
+    """
 
     margins: Margins
     setpoint: StepFigures | None
@@ -25,10 +30,11 @@ class Assessment:
 
 
 def assess(model: Model, gains: Gains, band: float = 0.02) -> Assessment:
-    """Margins and step figures of these gains on this model, with its exact dead time; Tf = 0 is the ideal derivative.
+    """The margins and step figures of these gains on this model, with its exact dead time.
 
-    band: of settling, a fraction of the final change (load: of the peak). Raises Refused, BAD_INPUT: gains that are
-    none, or an ideal derivative on a plant that passes jumps on.
+    gains: the gains; Tf = 0 is the ideal derivative.
+    band: the settling band, as a fraction of the final change (after a load disturbance: of the peak).
+    Raises Refused, BAD_INPUT: gains out of range, or an ideal derivative on a plant with feed-through.
     """
     found = margins(model, gains)
     if not found.stable:

@@ -1,9 +1,9 @@
-"""A loop in state space, without its dead time, and its response to a unit step.
+"""A closed loop in state space, and its response to a unit step, with exact dead time.
 
-Plant and controller are one linear system. Its input, the measured PV, comes back a dead time later: PV over the next
-dead time follows from PV over the last one (method of steps). The system is discretised exactly for an input that is
-linear between the steps; a dead time is a whole number of steps, so every jump and kink of the response falls between
-two of its blocks, where it does no harm. Without dead time the closed loop itself is discretised, exactly.
+Plant and controller without the dead time are one linear system. Its input, the measured PV, comes back a dead time
+later: PV over the next dead time follows from PV over the last one (method of steps). The system is discretised exactly
+for an input that is linear between the steps. A dead time is a whole number of steps, so every jump and kink of the
+response falls between two blocks, where it causes no error. A loop without dead time is discretised exactly as a whole.
 """
 
 from __future__ import annotations
@@ -19,11 +19,15 @@ from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Model, Reals, sign, time_constants
 
 SMALL_BLOCK = 100
-"""States of a block up to which all blocks come from powers of one matrix instead of one convolution each."""
+"""Number of states of a block up to which all blocks come from powers of one matrix instead of one convolution each."""
 
 
-class Loop:
-    """x' = a x + b*y(measured), PV to be measured = c x + d*y(measured); the last state is the step itself, one."""
+class ClosedLoop:
+    """The loop as x' = a x + b*y(measured), PV before the dead time = c x + d*y(measured).
+
+    The last state is the unit step itself, which is constant. load: True for a load disturbance, False for a set-point
+    step. Raises Refused as `open_loop`.
+    """
 
     def __init__(self, model: Model, gains: Gains, load: bool) -> None:
         g = gains
@@ -61,7 +65,7 @@ class Loop:
             self.d -= float(C @ B) * k
 
     def immediate(self, steps: int, dt: float) -> Reals:
-        """PV of one block of steps + 1 samples, shape (1, steps + 1): nothing is delayed."""
+        """PV of a loop without dead time: one block of steps + 1 samples, shape (1, steps + 1). dt: s."""
         closed = self.c / (1.0 - self.d)
         advance = _transition((self.a + np.outer(self.b, closed)) * dt)
         start = np.zeros(len(self.b))
@@ -69,7 +73,10 @@ class Loop:
         return np.asarray(closed @ _powers(advance, start, steps + 1))[None, :]
 
     def delayed(self, steps: int, delay: int, dt: float) -> Reals:
-        """PV in blocks of a dead time, shape (blocks, delay + 1); both ends of a block belong to it."""
+        """PV of a loop with dead time in blocks of one dead time, shape (blocks, delay + 1).
+
+        Both ends of a block belong to it. delay: the dead time, in steps. dt: s.
+        """
         order = len(self.b)
         augmented = np.zeros((order + 2, order + 2))
         augmented[:order, :order] = self.a * dt
@@ -146,7 +153,7 @@ def _transition(a: Reals) -> Reals:
 
 
 def _powers(a: Reals, x: Reals, count: int) -> Reals:
-    """x, a x, a^2 x, ...: shape (len(x), count), by doubling."""
+    """The vectors x, a x, a^2 x, ... as columns, shape (len(x), count), computed by doubling."""
     found = np.empty((len(x), count))
     found[:, 0] = x
     done = 1

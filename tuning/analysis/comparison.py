@@ -1,8 +1,8 @@
-"""Old and new gains side by side on the model found, and whether what was asked for gets better.
+"""The comparison of old and new gains on one model, and the conclusion whether the new gains are an improvement.
 
-Asked for are bounds of robustness (Ms, and what else there is) and, under these, the least J: the criterion that the
-procedure minimises. New gains are worth having where they restore a bound that the old ones pass, or bring J down, by
-more than `MIN_GAIN` each; and never where no figure shown is better.
+The user asks for bounds of robustness (Ms and others) and, under these, for the smallest J, the criterion that the
+procedure minimises. New gains are an improvement where they restore a bound that the old gains violate, or lower J, by
+more than `MIN_GAIN` each; they are none where no figure shown is better.
 """
 
 from __future__ import annotations
@@ -18,20 +18,21 @@ from loopwright.tuning.models import Model, integrators
 from loopwright.tuning.reasons import Ended
 
 MIN_GAIN = 0.05
-"""Of a bound or of J, as a fraction: less is not worth a change of a loop that works."""
+"""Smallest relative improvement of a bound or of J that justifies a change of a loop that works."""
 BAND = 0.05
-"""Of settling, a fraction of the final change (load: of the peak)."""
+"""Settling band, as a fraction of the final change (after a load disturbance: of the peak)."""
 SAME = 0.005
-"""Figures that are so near, as a fraction, are called the same."""
+"""Relative difference below which two figures are called the same."""
 
 
 @dataclass(frozen=True, slots=True)
-class StepWorth:
-    """The answer to a unit step of the set-point (PV units), or of the load at the plant's input (MV units).
+class StepPerformance:
+    """The answer to a unit set-point step (PV units), or to a unit load disturbance at the plant's input (MV units).
 
-    IAE: integral of |error|, in units of PV over that of the step, times s; None where an offset stays.
-    peak: largest change of PV.  settling_s: into 5 %; None where it is not within the response looked at.
-    TV: total variation of MV, the effort.
+    IAE: the integral of |error|, in PV units per unit of the step, times s; None where an offset stays.
+    peak: the largest change of PV.
+    settling_s: the time until PV stays within 5 %, s; None where the simulated response ends before that.
+    TV: the total variation of MV.
     """
 
     IAE: float | None
@@ -41,11 +42,16 @@ class StepWorth:
 
 
 @dataclass(frozen=True, slots=True)
-class Worth:
-    """What gains are worth on a model. Where the loop is not stable there are no figures.
+class LoopPerformance:
+    """The figures of one set of gains on a model; an unstable loop has none.
 
-    GM: ratio.  PM_deg: degrees; None where there is no such crossing.  noise_gain: MV's answer to a jump of PV.
-    overshoot_pct: of a step of the set-point.
+    gains, stable: the gains, and whether their loop is stable.
+    Ms, Mt: the peaks of |1/(1+L)| and |L/(1+L)|.
+    GM: the gain margin, a ratio; None where there is no phase crossover.
+    PM_deg: the phase margin, degrees; None where there is no gain crossover.
+    noise_gain: the answer of MV to a jump of PV, MV units per PV unit.
+    overshoot_pct: the overshoot after a set-point step, percent.
+    setpoint, load: the figures of the set-point step and of the load disturbance.
     """
 
     gains: Gains
@@ -56,15 +62,17 @@ class Worth:
     PM_deg: float | None = None
     noise_gain: float | None = None
     overshoot_pct: float | None = None
-    setpoint: StepWorth | None = None
-    load: StepWorth | None = None
+    setpoint: StepPerformance | None = None
+    load: StepPerformance | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """Bounds of robustness; None: no bound. Ms, Mt, noise_gain: at most so much.  GM: at least so much.
+class RobustnessBounds:
+    """The bounds of robustness that a design must keep; None is no bound.
 
-    by: who asks, in words.
+    Ms, Mt, noise_gain: the largest permitted values.
+    GM: the smallest permitted gain margin.
+    by: who asks for the bounds, in words.
     """
 
     Ms: float
@@ -73,11 +81,12 @@ class Asked:
     noise_gain: float | None = None
     by: str = "asked for"
 
-    def worst(self, found: Worth) -> tuple[float, str]:
-        """Of the bound that is passed farthest (or kept most narrowly): value over bound, and that in words."""
+    def worst(self, found: LoopPerformance) -> tuple[float, str]:
+        """The bound that is violated most, or kept most narrowly: the ratio of value to bound, and the same in
+        words."""
         return max(self._each(found))
 
-    def _each(self, found: Worth) -> Iterator[tuple[float, str]]:
+    def _each(self, found: LoopPerformance) -> Iterator[tuple[float, str]]:
         for name, value, maximum in (
             ("Ms", found.Ms, self.Ms),
             ("Mt", found.Mt, self.Mt),
@@ -91,13 +100,18 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """before, after: old and new gains on the same model.  J_before, J_after: of the criterion, the less the better;
-    None where it cannot be counted: the loop is not stable, or leaves an offset.  gain: what was asked for gets better
-    by more than 5 %.  verdict: that in a sentence.
+    """The comparison of old and new gains.
+
+    before, after: the figures of the old and of the new gains on the same model.
+    Ms_asked: the largest permitted Ms.
+    criterion: the criterion J in words.
+    J_before, J_after: the values of J, the lower the better; None where the loop is not stable or leaves an offset.
+    gain: True if what was asked for improves by more than 5 %.
+    verdict: the conclusion in a sentence.
     """
 
-    before: Worth
-    after: Worth
+    before: LoopPerformance
+    after: LoopPerformance
     Ms_asked: float
     criterion: str
     J_before: float | None
@@ -108,9 +122,13 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Predicted:
-    """Of the new gains on the model: Ms, GM (ratio), PM (degrees), set-point step figures (settling into 5 %).
+    """The main figures of gains on a model, as predicted.
 
-    None where the loop has no such crossing, does not settle, or keeps an offset (IAE).
+    Ms: the maximum sensitivity.
+    GM, PM_deg: the gain margin (a ratio) and the phase margin (degrees); None where there is no such crossover.
+    overshoot_pct, settling_s: the overshoot (percent) and the settling time into 5 % (s) of a set-point step; None
+    where PV does not settle.
+    IAE_per_unit: the IAE of a unit set-point step, s; None where an offset stays.
     """
 
     Ms: float
@@ -121,10 +139,10 @@ class Predicted:
     IAE_per_unit: float | None
 
 
-def worth(model: Model, gains: Gains, sample_time_s: float = 0.0) -> Worth:
-    """What these gains are worth on this model, which has the delay of the sampling in it already.
+def loop_performance(model: Model, gains: Gains, sample_time_s: float = 0.0) -> LoopPerformance:
+    """The figures of these gains on this model, whose dead time includes the delay of the sampling.
 
-    An ideal derivative is taken as a controller of this sample time carries it out.
+    An ideal derivative is taken as a controller of this sample time (s) carries it out.
     """
     realised = gains
     if gains.Td > 0.0 and gains.Tf == 0.0:
@@ -133,16 +151,16 @@ def worth(model: Model, gains: Gains, sample_time_s: float = 0.0) -> Worth:
     try:
         found = assess(model, realised, band=BAND)
     except Ended:  # its response leaves all bounds
-        return Worth(gains, False)
+        return LoopPerformance(gains, False)
     m, setpoint, load = found.margins, found.setpoint, found.load
     if setpoint is None or load is None:
-        return Worth(gains, False)
+        return LoopPerformance(gains, False)
     jump = math.inf if realised.Td > 0.0 and realised.Tf == 0.0 else 1.0
     if realised.Tf > 0.0:
         jump += realised.Td / realised.Tf
     # without integral action an offset stays, and the integral of the error grows with the record
     offset = gains.Ti == 0.0
-    return Worth(
+    return LoopPerformance(
         gains=gains,
         stable=True,
         Ms=m.Ms,
@@ -156,15 +174,17 @@ def worth(model: Model, gains: Gains, sample_time_s: float = 0.0) -> Worth:
     )
 
 
-def weighted_IAE(found: Worth, setpoint: float, load: float) -> float | None:
-    """Half of the set-point's and half of the load's IAE, each over the one given."""
+def weighted_IAE(found: LoopPerformance, setpoint: float, load: float) -> float | None:
+    """Half of the IAE of the set-point step and half of that of the load disturbance, each divided by the value given;
+    None where there is no such IAE."""
     if found.setpoint is None or found.load is None or found.setpoint.IAE is None or found.load.IAE is None:
         return None
     return 0.5 * found.setpoint.IAE / setpoint + 0.5 * found.load.IAE / load
 
 
-def IAE_over_present(before: Worth, after: Worth) -> tuple[float | None, float | None]:
-    """The same of both, over those of the old gains, where they have them."""
+def IAE_over_present(before: LoopPerformance, after: LoopPerformance) -> tuple[float | None, float | None]:
+    """The weighted IAE of old and new gains, divided by the IAE of the old gains, or of the new ones where the old have
+    none."""
     for each in (before, after):
         if each.setpoint and each.load and each.setpoint.IAE and each.load.IAE:
             over = each.setpoint.IAE, each.load.IAE
@@ -172,27 +192,32 @@ def IAE_over_present(before: Worth, after: Worth) -> tuple[float | None, float |
     return None, None
 
 
-def compared(
-    before: Worth,
-    after: Worth,
-    asked: Asked,
+def compare(
+    before: LoopPerformance,
+    after: LoopPerformance,
+    asked: RobustnessBounds,
     criterion: str,
     J: tuple[float | None, float | None],
     anyway: bool = False,
 ) -> Comparison:
-    """J: of the old and of the new gains.  anyway: a proposal is wanted where there is no gain, too; the words differ.
+    """The comparison of the figures of old and new gains. The new gains are stable: no procedure hands over others.
 
-    The new gains are stable: no procedure hands over others.
+    asked: the bounds of robustness.
+    criterion: the criterion J in words.
+    J: the values of J of the old and of the new gains.
+    anyway: a proposal is wanted even without an improvement; only the conclusion's words differ.
     """
-    gain, words = _verdict(before, after, asked, J)
+    gain, words = _conclusion(before, after, asked, J)
     if not gain:
         end = "the new gains are proposed because that was asked for" if anyway else "the present gains are kept"
         words = f"Nothing asked for gets better by more than {100.0 * MIN_GAIN:.0f} %: {end}; {words}."
     return Comparison(before, after, asked.Ms, criterion, *J, gain, words)
 
 
-def _verdict(before: Worth, after: Worth, asked: Asked, J: tuple[float | None, float | None]) -> tuple[bool, str]:
-    """Whether there is a gain, and a sentence, or the end of one where there is none."""
+def _conclusion(
+    before: LoopPerformance, after: LoopPerformance, asked: RobustnessBounds, J: tuple[float | None, float | None]
+) -> tuple[bool, str]:
+    """Whether there is an improvement, and the conclusion: a sentence, or only its last part without an improvement."""
     Ms, wanted = after.Ms, f"{asked.by}: at most {asked.Ms:.2f}"
     if not before.stable:
         return True, f"The present gains are not stable on the model found; the new ones have Ms {Ms:.2f} ({wanted})."
@@ -208,7 +233,7 @@ def _verdict(before: Worth, after: Worth, asked: Asked, J: tuple[float | None, f
     return False, rest
 
 
-def _errors(before: Worth, after: Worth) -> str:
+def _errors(before: LoopPerformance, after: LoopPerformance) -> str:
     assert before.load and after.load and before.setpoint and after.setpoint
     load, setpoint = (_change(a.IAE, b.IAE) for a, b in ((before.load, after.load), (before.setpoint, after.setpoint)))
     return f"load disturbances are corrected with {load} integral error (IAE), steps of the set-point with {setpoint}"
@@ -225,13 +250,13 @@ def _change(before: float | None, after: float | None) -> str:
     return f"{100.0 * abs(change):.0f} % {'less' if change < 0.0 else 'more'}"
 
 
-def _better(before: Worth, after: Worth) -> bool:
+def _better(before: LoopPerformance, after: LoopPerformance) -> bool:
     """Whether any figure shown is better with the new gains."""
     return any(new < old * (1.0 - SAME) for old, new in zip(_figures(before), _figures(after), strict=True))
 
 
-def _figures(found: Worth) -> list[float]:
-    """Of a stable loop; the less the better."""
+def _figures(found: LoopPerformance) -> list[float]:
+    """The figures of a stable loop that are compared; the lower the better."""
     assert found.Ms is not None and found.overshoot_pct is not None and found.setpoint and found.load
     figures = [found.Ms, found.overshoot_pct, *(1.0 / margin if margin else 0.0 for margin in (found.GM, found.PM_deg))]
     for step in (found.setpoint, found.load):
@@ -240,13 +265,13 @@ def _figures(found: Worth) -> list[float]:
     return figures
 
 
-def _step(figures: StepFigures, offset: bool) -> StepWorth:
+def _step(figures: StepFigures, offset: bool) -> StepPerformance:
     assert figures.TV is not None  # of a response with MV
-    return StepWorth(None if offset else figures.IAE, figures.peak, figures.settling_s, figures.TV)
+    return StepPerformance(None if offset else figures.IAE, figures.peak, figures.settling_s, figures.TV)
 
 
-def predicted(found: Worth) -> Predicted:
-    """Of a stable loop."""
+def predicted(found: LoopPerformance) -> Predicted:
+    """The main figures of a stable loop."""
     assert found.Ms is not None and found.overshoot_pct is not None and found.setpoint is not None
     step = found.setpoint
     return Predicted(found.Ms, found.GM, found.PM_deg, found.overshoot_pct, step.settling_s, step.IAE)

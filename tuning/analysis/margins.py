@@ -24,12 +24,16 @@ POINTS_PER_DECADE = 600
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """GM: ratio.  PM_deg: degrees.  Ms: peak of |1/(1+L)|.  Mt: peak of |L/(1+L)|.
+    """The stability margins of a loop. A margin without its crossover is None, and so is its frequency.
 
-    GM is the least factor above one that takes a stable loop to its limit. wc: gain crossover, wpc: phase crossover,
-    ws: where Ms is, all rad/s.  bandwidth: where |L/(1+L)| first falls to 1/sqrt(2) of its value at rest, rad/s. A
-    margin without its crossing is None, and so is its frequency. `stable` is exact (see `tuning.analysis.stability`);
-    with stable false the other figures describe the curve, not a margin.
+    GM: the gain margin, a ratio: the smallest factor above one that takes a stable loop to its stability limit.
+    PM_deg: the phase margin, degrees.
+    Ms, Mt: the peaks of |1/(1+L)| and |L/(1+L)|.
+    wc, wpc: the gain crossover and the phase crossover, rad/s.
+    ws: the frequency of the peak Ms, rad/s.
+    bandwidth: the frequency at which |L/(1+L)| first falls to 1/sqrt(2) of its value at rest, rad/s.
+    stable: whether the loop is stable, exactly (see `tuning.analysis.stability`). The other figures of an unstable loop
+    describe the curve and are no margins.
     """
 
     GM: float | None
@@ -44,16 +48,16 @@ class Margins:
 
     @property
     def delay_margin_s(self) -> float | None:
-        """The dead time that the loop bears in addition at its gain crossover wc, s."""
+        """The additional dead time at which the loop reaches its stability limit at the gain crossover wc, s."""
         if self.PM_deg is None or self.wc is None:
             return None
         return math.radians(self.PM_deg) / self.wc
 
 
 def margins(model: Model, gains: Gains) -> Margins:
-    """Margins of the loop of this model and these gains; Tf = 0 is the ideal derivative.
+    """The margins of the loop of this model and these gains; Tf = 0 is the ideal derivative.
 
-    Raises Refused, BAD_INPUT: gains that are none, or an ideal derivative on a bi-proper plant.
+    Raises Refused, BAD_INPUT: gains out of range, or an ideal derivative on a bi-proper plant.
     """
     N, D = open_loop(model, gains)
     stable = is_stable(model, gains)
@@ -100,14 +104,21 @@ def margins(model: Model, gains: Gains) -> Margins:
 
 @dataclass(frozen=True, slots=True)
 class Ultimate:
-    """Ku: MV units per PV unit.  Pu_s: s. As measured on the loop, or typed in."""
+    """An ultimate point, as measured on the loop, computed from a model, or typed in.
+
+    Ku: the ultimate gain, MV units per PV unit.
+    Pu_s: the ultimate period, s.
+    """
 
     Ku: float
     Pu_s: float
 
 
 def ultimate_point(model: Model) -> tuple[float, float]:
-    """(Ku, Pu): the gain, positive, at which a P loop just oscillates, and the period of it in s."""
+    """The ultimate point (Ku, Pu): the positive gain at which a P loop just oscillates, and the period in s.
+
+    Raises Refused, CANNOT_OSCILLATE, for a model without an ultimate point.
+    """
     found = margins(model, Gains(Kp=1.0))
     if found.GM is None or found.wpc is None:
         raise Refused(Reason.CANNOT_OSCILLATE, "the model's phase never reaches -180 degrees")
@@ -115,7 +126,7 @@ def ultimate_point(model: Model) -> tuple[float, float]:
 
 
 def _grid(model: Model, N: Reals, D: Reals) -> Reals:
-    """From well below the slowest to well above the fastest corner of the loop, crossovers included."""
+    """The frequency grid, rad/s, from well below the slowest to well above the fastest corner of the loop."""
     corners = [float(x) for x in np.abs(np.concatenate((np.roots(N), np.roots(D)))) if x > 0.0]
     kept = np.trim_zeros(D, "b")
     origin = len(D) - len(kept)
@@ -144,7 +155,7 @@ def _bandwidth(loop: Callable[[Reals], Complexes], w: Reals, closed: Reals, N: R
 
 
 def _crossings(f: Callable[[Reals], Reals], w: Reals, values: Reals, wanted: NDArray[np.bool_]) -> list[float]:
-    """Zeros of f between grid points that are both wanted."""
+    """The zeros of f between neighbouring grid points that are both wanted."""
     keep = wanted[:-1] & wanted[1:]
     at = np.flatnonzero((np.sign(values[:-1]) * np.sign(values[1:]) <= 0.0) & keep)
     # beyond a few dozen turns of the dead time the loop gain has long decayed: the first crossings decide
@@ -156,7 +167,7 @@ def _crossings(f: Callable[[Reals], Reals], w: Reals, values: Reals, wanted: NDA
 
 
 def _min(f: Callable[[float], float], w: Reals, at: int) -> tuple[float, float]:
-    """The least value of f near the grid point `at`: (where, value)."""
+    """The minimum of f near the grid point `at`, as (frequency, value)."""
     if at in (0, len(w) - 1):
         return float(w[at]), f(float(w[at]))
     found = minimize_scalar(f, bounds=(w[at - 1], w[at + 1]), method="bounded", options={"xatol": 1e-7 * float(w[at])})

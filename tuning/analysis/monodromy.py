@@ -1,9 +1,9 @@
 """A loop with dead time as a linear map from one dead time to the next.
 
-During one dead time the plant's input is already known, so everything in it is smooth: the error is kept as its values
-at Chebyshev points. The plant is carried forward exactly for an input that is a polynomial, however short its lags.
-What comes one dead time later is a matrix, affine in Kp, Ki and Kd. Its powers are the response, its eigenvalues the
-roots of the loop, exp(s*L), and the sum of its squares the integral of the squared error over all time.
+During one dead time the plant's input is already known, so all signals are smooth, and the error is represented by its
+values at Chebyshev points. The plant is advanced exactly for an input that is a polynomial, however short its lags. The
+map to the next dead time is a matrix that is affine in Kp, Ki and Kd. Its powers give the response, its eigenvalues are
+exp(s*L) for the roots s of the loop, and a sum over its powers gives the integral of the squared error over all time.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ class DeadTimeLoop:
     """The maps of one model (L > 0) under many controllers u = Kp*e + Ki*int(e) + Kd*e'; Kp, Ki, Kd of shape (p,).
 
     A state is (plant states at the end of a dead time, error at the nodes in it, integral part at its start), all as
-    what is missing to rest at the set-point; its length is `size`. Gains are for a plant of positive gain.
+    deviations from rest at the set-point; its length is `size`. Gains are for a plant of positive gain.
+    Raises ValueError for a model without dead time.
     """
 
     def __init__(self, model: Model) -> None:
@@ -76,30 +77,34 @@ class DeadTimeLoop:
         self._kick = np.concatenate((self.direction * plant.b, np.zeros(count + 1)))
 
     def maps(self, Kp: Reals, Ki: Reals, Kd: Reals | None = None) -> Reals:
-        """(p, size, size): state of the next dead time = map @ state."""
+        """The maps, shape (p, size, size): the state of the next dead time is map @ state."""
         gains = np.stack((np.ones_like(Kp), Kp, Ki, np.zeros_like(Kp) if Kd is None else Kd))
         return np.tensordot(gains.T, self._parts, axes=1)
 
     def start(self, Kp: Reals, Kd: Reals | None = None) -> Reals:
-        """(p, size): the first dead time after a unit step of the set-point, from rest. Its impulse by Kd included."""
+        """The states of the first dead time after a unit set-point step from rest, shape (p, size), with the impulse
+        that Kd makes of the step."""
         kick = np.zeros_like(Kp) if Kd is None else Kd
         return np.asarray(self._start + kick[:, None] * self._kick)
 
     def values(self, at: Reals) -> Reals:
-        """(len(at), nodes): from the error at the nodes to that at fractions `at` of the dead time."""
+        """The matrix from the error at the nodes to the error at fractions `at` of the dead time, shape (len(at),
+        nodes)."""
         return np.asarray(chebyshev.chebvander(2.0 * at - 1.0, self.nodes - 1) @ self._to_series)
 
     def areas(self, at: Reals) -> Reals:
-        """(len(at), nodes): from the error at the nodes to its integral since the dead time began, in s."""
+        """The matrix from the error at the nodes to its integral since the dead time began, s, shape (len(at),
+        nodes)."""
         series = [chebyshev.chebint(c, lbnd=-1.0) for c in np.eye(self.nodes)]
         areas = np.array([chebyshev.chebval(2.0 * at - 1.0, c) for c in series]).T
         return np.asarray(0.5 * self.L * areas @ self._to_series, dtype=np.float64)
 
     def rates(self, before: Reals, after: Reals, Kp: Reals, Ki: Reals) -> Reals:
-        """(p, order): first to last derivative of PV, 1/s each, at the end of the dead time whose states are `after`.
+        """The derivatives of PV up to the plant's order at the end of the dead time with the states `after`.
 
-        before: states of the dead time before. By the plant's equations: derivatives of the polynomial would lose all
-        digits in a short dead time.
+        before: the states of the dead time before.
+        The result has the shape (p, order), in PV units per s, s^2 and so on. It comes from the plant's equations, as
+        derivatives of the polynomial would lose all digits in a short dead time.
         """
         # the last node is the end
         error = before[:, self.errors]
@@ -119,9 +124,9 @@ class DeadTimeLoop:
         return np.stack(found, axis=1)
 
     def squares(self, maps: Reals, start: Reals) -> tuple[Reals, Reals]:
-        """(integral of e^2, integral of e'^2) over all time, each (p,); every loop must be stable.
+        """The integrals of e^2 and of e'^2 over all time, each of shape (p,); every loop must be stable.
 
-        Infinite where a loop is so near to being unstable that it cannot be told. The jump of e at t = 0 is no rate.
+        A value is infinite where a loop is too close to instability. The jump of e at t = 0 is not part of e'.
         """
         points, weights = np.polynomial.legendre.leggauss(self.nodes)
         value = self.values(0.5 * (points + 1.0))
@@ -140,16 +145,17 @@ class DeadTimeLoop:
         return np.where(np.isfinite(e), e, np.inf), np.where(np.isfinite(rate), rate, np.inf)
 
     def roots(self, maps: Reals) -> Complexes:
-        """(p, size): the rightmost roots of each loop, 1/s, those of least real part last and not accurate.
+        """The rightmost roots of each loop, 1/s, shape (p, size), by falling real part; the last ones are not accurate.
 
-        Imaginary parts are known up to a whole turn in one dead time.
+        Imaginary parts are known up to a multiple of 2*pi/L.
         """
         found = np.linalg.eigvals(maps).astype(np.complex128)
         ordered = np.take_along_axis(found, np.argsort(-np.abs(found), axis=1), axis=1)
         return np.asarray((np.log(np.maximum(np.abs(ordered), 1e-300)) + 1j * np.angle(ordered)) / self.L)
 
     def _plant(self, a: Reals, b: Reals) -> tuple[Reals, Reals]:
-        """(free (nodes, n, n), driven (nodes, n, nodes)): plant states at the nodes from their start and the input."""
+        """The matrices from the initial state, shape (nodes, n, n), and from the input, shape (nodes, n, nodes), to the
+        plant states at the nodes."""
         n = len(b)
         free, driven = np.zeros((self.nodes, n, n)), np.zeros((self.nodes, n, self.nodes))
         free[0] = np.eye(n)

@@ -1,9 +1,9 @@
-"""Whether a loop is stable: the count of its unstable poles, exact for any dead time.
+"""The stability of a loop is decided by the number of its unstable poles, which is exact for any dead time.
 
-The direct method of Walton and Marshall (IEE Proc. D 134, 1987): without dead time the poles are roots of a polynomial.
-As the dead time grows from zero, poles cross the imaginary axis only at the loop's gain crossovers, in a direction
-that the slope of |D(jw)|^2 - |N(jw)|^2 gives. No grid, and poles of the plant at the origin or in the right half plane
-need no care.
+The method is the direct method of Walton and Marshall (IEE Proc. D 134, 1987). Without dead time the poles are roots of
+a polynomial. As the dead time grows from zero, poles cross the imaginary axis only at the loop's gain crossovers, in a
+direction that the slope of |D(jw)|^2 - |N(jw)|^2 gives. The method needs no frequency grid, and poles of the plant at
+the origin or in the right half plane need no special case.
 """
 
 from __future__ import annotations
@@ -21,10 +21,12 @@ ON_AXIS = 1e-9
 
 
 def open_loop(model: Model, gains: Gains) -> tuple[Reals, Reals]:
-    """(N, D): the loop without its dead time, N/D, coefficients from the highest power down; positive static gain.
+    """The open loop N/D without its dead time, as (N, D): coefficients from the highest power down, positive static
+    gain.
 
-    Tf = 0 is the ideal derivative. Raises Refused, BAD_INPUT: an ideal derivative on a bi-proper plant (N would be of
-    higher degree than D), or gains that are none.
+    gains: the gains; Tf = 0 is the ideal derivative.
+    Raises Refused, BAD_INPUT: an ideal derivative on a bi-proper plant (N would be of higher degree than D), or gains
+    out of range.
     """
     g = gains
     if not (np.isfinite([g.Kp, g.Ti, g.Td, g.Tf]).all() and g.Kp > 0.0 and min(g.Ti, g.Td, g.Tf) >= 0.0):
@@ -51,9 +53,9 @@ def open_loop(model: Model, gains: Gains) -> tuple[Reals, Reals]:
 
 
 def unstable_poles(model: Model, gains: Gains) -> int | None:
-    """Poles of the closed loop that are not in the open left half plane; None: infinitely many.
+    """The number of poles of the closed loop that are not in the open left half plane; None for infinitely many.
 
-    Infinitely many when the loop gain does not fall below one at high frequency (dead time with an ideal derivative).
+    There are infinitely many if the loop gain stays above one at high frequency (dead time with an ideal derivative).
     """
     N, D = open_loop(model, gains)
     L = model.L
@@ -85,7 +87,7 @@ def unstable_poles(model: Model, gains: Gains) -> int | None:
 
 
 def is_stable(model: Model, gains: Gains) -> bool:
-    """Every pole of the closed loop is in the open left half plane."""
+    """Whether every pole of the closed loop is in the open left half plane."""
     return unstable_poles(model, gains) == 0
 
 

@@ -1,4 +1,4 @@
-"""A model's rational part as a balanced state space, with time and gain in units of one's own choice."""
+"""The rational part of a model as a balanced state space, and models scaled in time and gain."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from loopwright.tuning.models import Model, Reals, TransferFunction, integrators
 
 @dataclass(frozen=True, slots=True)
 class StateSpace:
-    """x' = a x + b u, y = c x + d u: a (n, n), b (n,), c (n,), d a number."""
+    """The state space x' = a x + b u, y = c x + d u, with a of shape (n, n), b and c of shape (n,), and d a number."""
 
     a: Reals
     b: Reals
@@ -21,7 +21,7 @@ class StateSpace:
     d: float
 
     def rest(self) -> tuple[Reals, float]:
-        """(x, u) at which the output rests at 1; the plant has no zero at the origin."""
+        """The state x and the input u at which the output rests at 1; the plant must have no zero at the origin."""
         n = len(self.b)
         system = np.block([[self.a, self.b[:, None]], [self.c[None, :], np.array([[self.d]])]])
         found = np.linalg.solve(system, np.eye(n + 1)[n])
@@ -29,18 +29,19 @@ class StateSpace:
 
 
 def time_sum(model: Model) -> float:
-    """All lags and the dead time together, s; 0 for a bare integrator."""
+    """The sum of all lags and of the dead time, s; 0 for a pure integrator."""
     return float(time_constants(model).sum()) + model.L
 
 
 def gain_unit(model: Model, time_unit: float) -> float:
-    """|K| of a self-regulating model; of an integrating one, what it rises in one time unit (s) per MV unit."""
+    """|K| of a self-regulating model, PV units per MV unit; for an integrating model the rise of PV within one time
+    unit (s) per MV unit."""
     slowest = np.trim_zeros(np.asarray(model.den), "b")[-1]
     return abs(float(model.num[-1] / slowest)) * time_unit ** integrators(model)
 
 
 def normalised(model: Model, time_unit: float) -> TransferFunction:
-    """The same plant with a positive gain of one, its time counted in time_unit, s."""
+    """The same plant with a gain of one and with its time in units of time_unit, s."""
     scale = sign(model) / gain_unit(model, time_unit)
     num = [c * scale * time_unit**-i for i, c in enumerate(reversed(model.num))]
     den = [c * time_unit**-i for i, c in enumerate(reversed(model.den))]
@@ -48,7 +49,7 @@ def normalised(model: Model, time_unit: float) -> TransferFunction:
 
 
 def state_space(model: Model) -> StateSpace:
-    """The model without its dead time. Balancing keeps lags far apart well conditioned."""
+    """The state space of the model without its dead time; balancing keeps very different lags well conditioned."""
     den = np.asarray(model.den) / model.den[0]
     order = len(den) - 1
     num = np.concatenate((np.zeros(len(den) - len(model.num)), model.num)) / model.den[0]

@@ -1,4 +1,4 @@
-"""The figures engineers read from a response to a step: of a simulated response or of a recorded one."""
+"""The figures that engineers read from a step response, simulated or recorded."""
 
 from __future__ import annotations
 
@@ -12,18 +12,25 @@ from loopwright.tuning.models import Reals
 
 @dataclass(frozen=True, slots=True)
 class StepFigures:
-    """Of a response to a step of the set-point, or of the load (for which overshoot is 0 and rise is None).
+    """The figures of a response to a set-point step or to a load disturbance.
 
-    overshoot_pct: of the final change, not below 0.  settling_s: counted from the step (dead time included) until PV is
-    within `band` (PV units) of its final value for good; None if not within the record.  rise_s: 10 to 90 %; None if
-    never.  peak: largest PV change along the step.
+    overshoot_pct: the overshoot, percent of the final change, not below 0; 0 for a load disturbance.
+    settling_s: the time from the step (dead time included) until PV stays within `band` of its final value, s; None if
+    the record ends before that.
+    band: the settling band, PV units.
+    rise_s: the time from 10 to 90 % of the final change, s; None if 90 % is never reached, or for a load disturbance.
+    peak: the largest change of PV in the direction of the step, PV units.
 
-    Of the error e to the set-point, over the record, for the step as made: IAE integral of |e|, PV units * s; ISE of
-    e^2; ITAE of t|e|; ITSE of t*e^2.  MIE: mean of |e| until settled, PV units. An offset that stays (a loop without
-    integral action) makes the integrals grow with the record.
+    The error e is the set-point less PV over the record. A lasting offset (a loop without integral action) makes the
+    integrals grow with the record.
+    IAE, ISE, ITAE, ITSE: the integrals of |e| (PV units * s), e^2, t|e| and t*e^2.
+    MIE: the mean of |e| until PV has settled, PV units.
 
-    Of MV's change u, None where no MV was given: MIC mean of |u| until settled, MV units; effort integral of (u - its
-    final value)^2, MV units^2 * s; TV total variation, from before the step; peak_u largest |u|.
+    The change u of MV has these figures, which are None where no MV was given.
+    MIC: the mean of |u| until PV has settled, MV units.
+    effort: the integral of (u - its final value)^2, MV units^2 * s.
+    TV: the total variation, counted from before the step, MV units.
+    peak_u: the largest |u|, MV units.
 
     MIE and MIC are those of Romasevych et al., PI-controller tuning optimization via PSO-based technique (there with a
     band of 5 %). A loop that does not settle within the record counts as settled at its end.
@@ -48,19 +55,26 @@ class StepFigures:
 def response_figures(
     t: Reals, y: Reals, u: Reals | None, *, final: float, reference: float, band: float, final_u: float = 0.0
 ) -> StepFigures:
-    """Figures of the change y, PV units, and u, MV units, over t, s, beginning with the step at t = 0.
+    """The figures of a response that begins with the step at t = 0. A time at which a signal jumps is there twice.
 
-    An instant at which a signal jumps is there twice. final: where y ends; 0 is a load's.  band: in PV units.
+    t, y, u: time (s), change of PV (PV units) and change of MV (MV units) or None, shape (N,).
+    final, final_u: the final values of y and u; final is 0 for a load disturbance.
+    reference: the set-point's change, PV units.
+    band: the settling band, PV units.
     """
     return _figures(t, y, y, u, final=final, reference=reference, band=band, final_u=final_u)
 
 
 def figures_of(t: Reals, y: Reals, step: float, y0: float, u: Reals | None = None, band: float = 0.02) -> StepFigures:
-    """Figures of a recorded set-point step of size `step` (PV units, either sign) made at t[0] from rest at y0.
+    """The figures of a recorded set-point step made at t[0] from rest.
 
-    u: MV, recorded at the same instants; its change is counted from u[0].  band: of the step. Where measurement noise
-    shows, overshoot, rise and settling are read from a moving mean over a tenth of the rise, and the settling band is
-    at least three times the noise left in it.
+    t, y: time (s) and PV (PV units), shape (N,).
+    step: the set-point step, PV units, either sign.
+    y0: PV at rest, PV units.
+    u: MV at the same times; its change is counted from u[0].
+    band: the settling band, as a fraction of the step.
+    Where measurement noise shows, overshoot, rise and settling are read from a moving mean over a tenth of the rise
+    time, and the settling band is at least three times the noise that remains in the mean.
     """
     time = np.asarray(t, dtype=float) - float(t[0])
     change = (np.asarray(y, dtype=float) - y0) / step
@@ -119,7 +133,7 @@ def _figures(
 
 
 def _settling(t: Reals, distance: Reals, band: float) -> float | None:
-    """When the distance to the final value falls to the band for good, s."""
+    """The time at which the distance to the final value falls into the band for good, s; None if it does not."""
     outside = np.flatnonzero(distance > band)
     if not len(outside):
         return 0.0
@@ -131,7 +145,7 @@ def _settling(t: Reals, distance: Reals, band: float) -> float | None:
 
 
 def _rise(t: Reals, y: Reals) -> float | None:
-    """From 10 to 90 % of one, s."""
+    """The time from 10 to 90 % of one, s; None if 90 % is not reached."""
     at = []
     for level in (0.1, 0.9):
         above = y >= level
@@ -153,7 +167,7 @@ def _mean_until(t: Reals, values: Reals, end: float) -> float:
 
 
 def _moving_mean(y: Reals, width: int) -> Reals:
-    """Centred, the ends held."""
+    """The centred moving mean, with the end values held beyond the ends."""
     half = width // 2
     padded = np.pad(y, half, mode="edge")
     return np.convolve(padded, np.full(2 * half + 1, 1.0 / (2 * half + 1)), "valid")

@@ -1,9 +1,9 @@
-"""Time responses of a loop with exact dead time to a step of the set-point or of the load.
+"""The time responses of a loop with exact dead time to a set-point step or to a load disturbance.
 
-How PV is computed stands in `tuning.analysis.closed_loop`; MV follows from PV by the controller's equation.
+`tuning.analysis.closed_loop` computes PV; MV follows from PV by the controller's equation.
 
-An ideal derivative (Tf = 0) is the exact one: it acts through a changed output of the plant's state, no filter is
-slipped in. The impulse that it puts into MV when the set-point steps (c > 0) reaches PV, but no figure of MV counts it.
+An ideal derivative (Tf = 0) is exact: it acts on a changed output of the plant's state, without an added filter. The
+impulse that it puts into MV when the set-point steps (c > 0) reaches PV, but no figure of MV counts it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopwright.tuning.analysis.closed_loop import Loop
+from loopwright.tuning.analysis.closed_loop import ClosedLoop
 from loopwright.tuning.analysis.stability import is_stable, open_loop
 from loopwright.tuning.analysis.step_figures import StepFigures, response_figures
 from loopwright.tuning.gains import Gains
@@ -22,14 +22,17 @@ from loopwright.tuning.reasons import Reason, Refused
 
 MAX_STEPS = 40_000
 LONGER = 24
-"""How often a default record is doubled at most."""
+"""Largest number of times that a default record is doubled."""
 
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """t: s.  y: PV change, PV units.  u: MV change, MV units. The loop has positive gain whatever the model's sign.
+    """A time response. The loop has positive gain whatever the model's sign.
 
-    t never decreases: an instant at which y or u jumps is there twice, just before and just after the jump.
+    t: the times, s, shape (N,). They never decrease: a time at which y or u jumps is there twice, just before and just
+    after the jump.
+    y: the change of PV, PV units.
+    u: the change of MV, MV units.
     """
 
     t: Reals
@@ -45,10 +48,11 @@ def step_figures(
     load: bool = False,
     band: float = 0.02,
 ) -> StepFigures:
-    """Figures of the loop's answer to a unit set-point step (or a unit step at the plant's input).
+    """The figures of the loop's answer to a unit set-point step, or (load) to a unit load disturbance.
 
-    horizon, dt: s; see `step_response` for the defaults.  band: of settling, a fraction of the final change (load: of
-    the peak). Raises Refused: NOT_ROBUST for an unstable loop, BAD_INPUT as `step_response`.
+    horizon, dt: the length and the step of the simulation, s; see `step_response` for the defaults.
+    band: the settling band, as a fraction of the final change (after a load disturbance: of the peak).
+    Raises Refused: NOT_ROBUST for an unstable loop, BAD_INPUT as `step_response`.
     """
     _require_stable(model, gains)
     response = step_response(model, gains, horizon, dt, load)
@@ -66,7 +70,7 @@ def step_figures(
 
 
 def final_value(model: Model, gains: Gains, load: bool) -> float:
-    """Where PV of the stable loop ends after a unit step, PV units."""
+    """The final value of PV of the stable loop after a unit step, PV units."""
     if gains.Ti > 0.0:
         return 0.0 if load else 1.0
     if integrators(model):
@@ -78,14 +82,15 @@ def final_value(model: Model, gains: Gains, load: bool) -> float:
 def step_response(
     model: Model, gains: Gains, horizon: float | None = None, dt: float | None = None, load: bool = False
 ) -> Response:
-    """The loop from rest under a unit step of the set-point, or (load) of the plant's input, at t = 0.
+    """The response of the loop from rest to a unit set-point step, or (load) to a unit load disturbance, at t = 0.
 
-    horizon: s, by default until the response has come to rest.  dt: s, at most; by default a hundredth of the dead time
-    and of the crossover's radian, unless that is more than 40,000 steps. A dead time has four steps at least;
-    one that is shorter than 2*dt and than a 20,000th of the horizon is taken as its second-order Pade approximant.
+    horizon: the length of the response, s; by default until the response has come to rest.
+    dt: the longest step, s; by default a hundredth of the dead time and of the crossover's radian, unless that is more
+    than 40,000 steps. A dead time has at least four steps. A dead time that is shorter than 2*dt and than a 20,000th of
+    the horizon is replaced by its second-order Pade approximant.
 
     Raises Refused: NOT_ROBUST for an unstable loop when no horizon is given, or when its response overflows; BAD_INPUT
-    for gains that are none or an ideal derivative on a bi-proper plant.
+    for gains out of range or an ideal derivative on a bi-proper plant.
     """
     for name, value in (("horizon", horizon), ("dt", dt)):
         if value is not None and not (math.isfinite(value) and value > 0.0):
@@ -112,7 +117,7 @@ def _require_stable(model: Model, gains: Gains) -> None:
 
 
 def _crossover(model: Model, gains: Gains) -> float:
-    """About the highest frequency at which the loop gain is one, rad/s; the fastest lag's where it never is."""
+    """About the highest frequency at which the loop gain is one, rad/s; a corner frequency where there is none."""
     N, D = open_loop(model, gains)
     corners = np.abs(np.concatenate((np.roots(N), np.roots(D), [1.0 / model.L if model.L > 0.0 else 0.0])))
     corners = corners[corners > 0.0]
@@ -133,7 +138,7 @@ def _fine(model: Model, gains: Gains, horizon: float) -> float:
 
 
 def _final_control(model: Model, gains: Gains, load: bool) -> float:
-    """Where MV of the stable loop ends, MV units."""
+    """The final value of MV of the stable loop, MV units."""
     if load and (gains.Ti > 0.0 or integrators(model)):
         return -1.0
     if integrators(model):
@@ -149,7 +154,7 @@ def _simulated(model: Model, gains: Gains, horizon: float, dt: float, load: bool
     if delay:
         dt = model.L / delay
     steps = math.ceil(horizon / dt - 1e-9)
-    loop = Loop(model, gains, load)
+    loop = ClosedLoop(model, gains, load)
     with np.errstate(over="ignore", invalid="ignore"):
         blocks = loop.delayed(steps, delay, dt) if delay else loop.immediate(steps, dt)
         found = _joined(blocks, _control(blocks, gains, dt, 0.0 if load else 1.0), dt, steps)
@@ -167,7 +172,7 @@ def _without_dead_time(model: Model) -> TransferFunction:
 
 
 def _control(y: Reals, gains: Gains, dt: float, setpoint: float) -> Reals:
-    """MV for PV in blocks; signals are linear between the samples of a block."""
+    """MV for PV in blocks, both of shape (blocks, samples); signals are linear between the samples of a block."""
     g = gains
     u = g.Kp * (g.b * setpoint - y)
     if g.Ti > 0.0:
@@ -185,7 +190,7 @@ def _control(y: Reals, gains: Gains, dt: float, setpoint: float) -> Reals:
 
 
 def _lagged(v: Reals, steps: float) -> Reals:
-    """v in blocks behind a first-order lag of so many steps, from rest."""
+    """The signal v, in blocks, behind a first-order lag with a time constant in steps, from rest."""
     decay = math.exp(-1.0 / steps)
     w1 = 1.0 - steps * (1.0 - decay)
     w0 = 1.0 - decay - w1
@@ -205,7 +210,7 @@ def _lagged(v: Reals, steps: float) -> Reals:
 
 
 def _joined(y: Reals, u: Reals, dt: float, steps: int) -> Response:
-    """The blocks in a row; where one ends and the next begins without a jump, one sample of the two is left out."""
+    """The blocks joined to one response; where two blocks meet without a jump, one of the two samples is left out."""
     blocks, width = y.shape
     jumps = np.zeros(blocks - 1, dtype=bool)
     for signal in (y, u):

@@ -1,4 +1,4 @@
-"""What the states of a linear plant do under an input that is held between the samples, exact for any dead time.
+"""The states of a linear plant under an input that is held between the samples, exact for any dead time.
 
 Time is counted in samples. With a dead time L = m + f (m whole, 0 <= f < 1) the plant sees u[k-m-1] for the first f of
 a sample and u[k-m] for the rest of it, so in controllable form x' = A x + e_n u(t - L):
@@ -24,9 +24,12 @@ from loopwright.tuning.models import Reals
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pulses:
-    """z^-delay * forward(z)/recursion(z), from the held input to each state, in powers of 1/z, of several plants.
+    """The pulse transfer functions z^-delay * forward(z)/recursion(z) from the held input to each state, of several
+    plants, in powers of 1/z.
 
-    forward: shape (plants, order + 2, states).  recursion: shape (plants, order + 1).  delay: (plants,), whole samples.
+    forward: the numerators, shape (plants, order + 2, states).
+    recursion: the denominators, shape (plants, order + 1).
+    delay: the delays in whole samples, shape (plants,).
     """
 
     forward: Reals
@@ -34,7 +37,7 @@ class Pulses:
     delay: NDArray[np.int64]
 
     def of(self, which: slice) -> Pulses:
-        """Of some of the plants."""
+        """The pulse transfer functions of some of the plants."""
         return Pulses(self.forward[which], self.recursion[which], self.delay[which])
 
     def drive(self, u: Reals, count: int | None = None) -> Reals:
@@ -62,7 +65,8 @@ def states(monic: Reals, L: float, u: Reals, count: int) -> Reals:
 
 
 def pulses(monics: Reals, dead_times: Sequence[float] | Reals, count: int) -> Pulses:
-    """How the first `count` states answer, for each denominator (rows of `monics`) and its dead time, see `states`."""
+    """The pulse transfer functions of the first `count` states for each denominator (a row of `monics`) and its dead
+    time, see `states`."""
     many, order = monics.shape
     L = np.asarray(dead_times, dtype=float)
     whole = np.floor(L)
@@ -90,7 +94,8 @@ def pulses(monics: Reals, dead_times: Sequence[float] | Reals, count: int) -> Pu
 
 
 def _characteristic(phi: Reals) -> Reals:
-    """Coefficients of det(z*I - phi) of each matrix, highest power first (Faddeev and LeVerrier)."""
+    """The coefficients of det(z*I - phi) of each matrix, highest power first, by the method of Faddeev and
+    LeVerrier."""
     many, order = phi.shape[:2]
     found = np.ones((many, order + 1))
     one = np.eye(order)

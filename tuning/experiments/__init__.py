@@ -1,1 +1,1 @@
-"""What every procedure moves on a live loop is made of: rest, a set-point step, settling, verification."""
+"""The experiments on a live loop that every procedure is made of: rest, a set-point step, settling, verification."""

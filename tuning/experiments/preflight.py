@@ -1,7 +1,7 @@
-"""Preflight: is the loop fit to be tested? Listens only; refuses with the numbers.
+"""The preflight checks whether a loop can be tested. It only listens, and refuses with the numbers.
 
-Noise alone moves a slow loop about, and what has just disturbed one dies away: a loop that is not at rest is given time
-and looked at again.
+Noise alone moves a slow loop, and a recent disturbance dies away. A loop that is not at rest is therefore given time
+and checked again.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from loopwright.tuning.plan import Mode, Note, Plan, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
 
 PREFLIGHT, SETTLE = "preflight", "settle"
-LOOKS = 4
+MAX_ATTEMPTS = 4
 MIN_LISTENED_SAMPLES = 60
 MAX_NOISE = 0.10
 """Noise (standard deviation) as a share of the set-point step, above which no overshoot can be read."""
@@ -26,7 +26,7 @@ MIN_ROOM = 0.05
 
 
 def preflight(facts: Facts, after_s: float) -> Plan[OperatingPoint]:
-    """Where the loop rests, see `at_rest`."""
+    """The operating point of a loop at rest, see `at_rest`."""
     point, _ = yield from at_rest(facts, after_s)
     return point
 
@@ -34,27 +34,31 @@ def preflight(facts: Facts, after_s: float) -> Plan[OperatingPoint]:
 def at_rest(
     facts: Facts, after_s: float, min_samples: int = MIN_LISTENED_SAMPLES
 ) -> Plan[tuple[OperatingPoint, Trace]]:
-    """Looks at the loop until it is at rest, LOOKS times at most; the last look's samples come with the point.
+    """Checks the loop until it is at rest, at most MAX_ATTEMPTS times.
 
-    after_s: expected of the stages that follow. Each look is a stage of its own, with one of settling before it.
+    The result is the operating point and the samples of the last check. Each check is a stage of its own, with a stage
+    of settling between two checks.
+
+    after_s: the expected plant time of the stages that follow, s.
+    min_samples: the smallest number of samples of a check.
     Raises Refused: WRONG_MODE, NOT_AT_REST, NOISE_TOO_HIGH, SATURATED.
     """
     once_s = facts.T95_s / 2
     begin = (StageStarted(PREFLIGHT, once_s, after_s),)
-    for _ in range(LOOKS - 1):
+    for _ in range(MAX_ATTEMPTS - 1):
         yield begin
         try:
-            return (yield from look(facts, min_samples))
+            return (yield from check_at_rest(facts, min_samples))
         except Refused as refused:
             if refused.reason is not Reason.NOT_AT_REST:
                 raise
             yield from record(once_s, (Note(refused.detail), StageStarted(SETTLE, once_s, once_s + after_s)))
     yield begin
-    return (yield from look(facts, min_samples))
+    return (yield from check_at_rest(facts, min_samples))
 
 
-def look(facts: Facts, min_samples: int = MIN_LISTENED_SAMPLES) -> Plan[tuple[OperatingPoint, Trace]]:
-    """Listens once, for half T95 (at least so many samples) in automatic. Raises Refused as `at_rest`."""
+def check_at_rest(facts: Facts, min_samples: int = MIN_LISTENED_SAMPLES) -> Plan[tuple[OperatingPoint, Trace]]:
+    """Checks the loop once, in automatic, for half of T95 and at least `min_samples`. Raises Refused as `at_rest`."""
     trace = yield from record(max(facts.T95_s / 2, min_samples * facts.sample_time_s))
     sample = yield ()
     trace.add(sample)

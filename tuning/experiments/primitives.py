@@ -1,4 +1,4 @@
-"""What every stage shares: the facts about the loop, its operating point, and the small plans they are made of."""
+"""The types and small plans that all stages share: facts about the loop, operating point, samples, settling."""
 
 from __future__ import annotations
 
@@ -20,9 +20,13 @@ Array = NDArray[np.float64]
 class Facts:
     """What is known of the loop before the experiment.
 
-    sample_time_s, T95_s: s.  mv_low, mv_high: permitted MV, absolute, MV units.
-    sp_deviation: largest permitted set-point step, PV units, > 0.  old_gains: the accepted set.
+    sample_time_s: the sample time, s.
+    T95_s: the time in which the plant covers 95 % of a step, s, as given by the user.
+    mv_low, mv_high: the limits of MV, absolute, MV units.
+    sp_deviation: the largest permitted set-point step, PV units, positive.
+    old_gains: the accepted gains.
     reverse: True when MV must fall as PV rises (positive plant gain).
+    Raises Refused: BAD_INPUT, BAD_LIMITS, SAMPLING_TOO_SLOW.
     """
 
     sample_time_s: float
@@ -48,7 +52,12 @@ class Facts:
 
 @dataclass(frozen=True, slots=True)
 class OperatingPoint:
-    """Where the loop rests: sp, pv, mv (means), noise (standard deviation of PV), room: permitted +-MV around mv."""
+    """The operating point of a loop at rest.
+
+    sp, pv, mv: the set-point and the means of PV and MV.
+    noise: the standard deviation of PV, PV units.
+    room: the largest move of MV around `mv` that is permitted in both directions, MV units.
+    """
 
     sp: float
     pv: float
@@ -59,7 +68,7 @@ class OperatingPoint:
 
 @dataclass(slots=True)
 class Trace:
-    """Samples of a stretch, as columns; t in plant seconds."""
+    """Consecutive samples as columns; t is plant time in s."""
 
     t: list[float] = field(default_factory=list)
     sp: list[float] = field(default_factory=list)
@@ -67,6 +76,7 @@ class Trace:
     mv: list[float] = field(default_factory=list)
 
     def add(self, sample: Sample) -> None:
+        """Appends a sample."""
         self.t.append(sample.t)
         self.sp.append(sample.sp)
         self.pv.append(sample.pv)
@@ -76,18 +86,19 @@ class Trace:
         return len(self.t)
 
     def tail(self, seconds: float) -> slice:
-        """The samples of the last so many seconds (at least ten, if there are)."""
+        """The slice of the samples of the last `seconds`, but at least ten samples where there are as many."""
         dt = (self.t[-1] - self.t[0]) / (len(self.t) - 1) if len(self.t) > 1 else 1.0
         return slice(-min(len(self.t), max(10, round(seconds / dt))), None)
 
 
 def same(a: float, b: float) -> bool:
-    """Equal as far as a REAL32 on the bus can tell."""
+    """Whether two numbers are equal to the precision of a REAL32 on the bus."""
     return abs(a - b) <= 1e-6 * max(abs(a), abs(b))
 
 
 def record(seconds: float, commands: Sequence[Command | Event] = (), *, into: Trace | None = None) -> Plan[Trace]:
-    """Carries out the commands, then listens for so long."""
+    """Carries out the commands and records the samples of this time (s). into: the samples are appended to this
+    trace."""
     trace = Trace() if into is None else into
     sample = yield commands
     end = sample.t + seconds
@@ -101,7 +112,11 @@ def record(seconds: float, commands: Sequence[Command | Event] = (), *, into: Tr
 def until(
     done: Callable[[Trace], bool], every_s: float, max_s: float, commands: Sequence[Command | Event] = ()
 ) -> Plan[tuple[Trace, bool]]:
-    """Listens until `done` (asked every so many seconds) or the time is over; tells which."""
+    """Records samples until `done` is true or the time is over; returns the samples and whether `done` was true.
+
+    done: the condition, evaluated every `every_s` seconds.
+    max_s: the longest time, s.
+    """
     trace = Trace()
     sample = yield commands
     start = sample.t
@@ -121,7 +136,12 @@ def until(
 def settle(
     target: float, band: float, stay_s: float, max_s: float, noise: float, commands: Sequence[Command | Event] = ()
 ) -> Plan[tuple[Trace, bool]]:
-    """Listens until PV has stayed around target for stay_s: its mean over each third of that time within the band."""
+    """Records samples until PV has stayed around the target, and returns them and whether it has.
+
+    target, band: PV units; the mean of PV over each third of `stay_s` must be within the band, widened for the noise.
+    stay_s, max_s: the time for which PV must stay, and the longest time, s.
+    noise: the standard deviation of PV, PV units.
+    """
 
     def done(trace: Trace) -> bool:
         if trace.t[-1] - trace.t[0] < stay_s:
@@ -133,7 +153,11 @@ def settle(
 
 
 def to_rest(facts: Facts, point: OperatingPoint, band: float) -> Plan[None]:
-    """Manual at the nominal output, set-point back, until PV is home again (at most 2 T95, then it must be near)."""
+    """Brings the loop back to rest in manual at the output of the operating point, with the set-point put back.
+
+    The plan waits at most 2 T95 for PV to be within the band (PV units) of the operating point.
+    Raises Refused: NOT_SELF_REGULATING or NOT_AT_REST if PV is then still far away.
+    """
     home = (SetMode(Mode.MANUAL), SetOutput(point.mv), SetSetpoint(point.sp))  # manual first: entering it is bumpless
     trace, rested = yield from settle(point.pv, band, facts.T95_s / 5, 2 * facts.T95_s, point.noise, home)
     if not rested:
@@ -148,7 +172,12 @@ def to_rest(facts: Facts, point: OperatingPoint, band: float) -> Plan[None]:
 
 
 def no_oscillation(facts: Facts, point: OperatingPoint, trace: Trace, switches: int) -> Refused:
-    """Why the relay has made PV swing by nothing that is steady: for a procedure to raise."""
+    """The refusal of a relay test without a steady oscillation, for a procedure to raise: NO_RESPONSE, WRONG_SIGN or
+    CANNOT_OSCILLATE.
+
+    trace: the samples since the start of the relay.
+    switches: the number of cycles of the relay.
+    """
     moved = float(np.mean(trace.pv[trace.tail(facts.T95_s / 5)])) - point.pv
     expected = 1.0 if facts.reverse else -1.0
     after = f"{trace.t[-1] - trace.t[0]:.3g} s of relay (+-{point.room:.3g}, {switches} cycles) PV is {moved:+.3g} away"

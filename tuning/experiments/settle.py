@@ -1,34 +1,34 @@
-"""Time to come to rest, for a loop whose test was cut off."""
+"""A loop whose test was cut off is given time to come to rest before its plan goes on."""
 
 from __future__ import annotations
 
 from contextlib import closing, suppress
 from typing import TypeVar
 
-from loopwright.tuning.experiments.preflight import SETTLE, look
+from loopwright.tuning.experiments.preflight import SETTLE, check_at_rest
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.plan import Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Refused
 
 T = TypeVar("T")
 
-LOOKS = 20
-"""Of half a T95 each. The present gains may well swing, or creep, for much longer than the plant alone: that is why the
-loop is tuned."""
+MAX_ATTEMPTS = 20
+"""Number of checks, of half a T95 each. Under the present gains the loop may oscillate, or creep, for much longer than
+the plant alone."""
 
 
 def after_settling(facts: Facts, plan: Plan[T]) -> Plan[T]:
-    """The plan, once the loop is fit to be tested: what the cut-off test has left has to die away first.
+    """Waits until the loop is at rest, then carries out the plan: the transient of the test that was cut off dies away.
 
-    A loop that is not fit after LOOKS is the plan's own preflight to refuse.
+    A loop that is not at rest after MAX_ATTEMPTS checks is left to the preflight of the plan, which refuses it.
     """
     with closing(plan):
         items = next(plan)
         ahead = sum(item.expected_s + item.remaining_s for item in items if isinstance(item, StageStarted))
         yield (StageStarted(SETTLE, facts.T95_s, ahead),)
-        for _ in range(LOOKS):
+        for _ in range(MAX_ATTEMPTS):
             with suppress(Refused):
-                yield from look(facts)
+                yield from check_at_rest(facts)
                 break
         items = (StageDone(SETTLE, None), *items)
         while True:

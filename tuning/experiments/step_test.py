@@ -1,4 +1,4 @@
-"""A set-point step on the live loop: up, until settled. Baseline, Stage 3 and verification are all made of it."""
+"""A set-point step on the live loop, until PV has settled. Baseline, Stage 3 and verification are made of it."""
 
 from __future__ import annotations
 
@@ -13,16 +13,23 @@ from loopwright.tuning.plan import Plan, SetSetpoint
 from loopwright.tuning.reasons import Reason, Refused
 
 KICK_OF_ROOM = 0.7
-"""Of the room for MV: the largest first kick of a set-point step."""
+"""Largest first kick of a set-point step, as a fraction of the room for MV."""
 
 
 @dataclass(frozen=True, slots=True)
 class StepResult:
-    """Figures of one measured set-point step.
+    """The figures of one measured set-point step.
 
-    step: PV units.  overshoot_pct: of the step.  IAE: PV unit * s.  settling_s: into 5 % (or the noise) for good, s.
-    static_gain: PV units per MV unit, signed; nan when the step did not settle, infinite when MV is back where it was.
-    mv_at_limit_s: how long MV was at the end of its permitted range.  settled: within the time allowed.
+    step: the set-point step, PV units.
+    overshoot_pct: the overshoot, percent of the step.
+    IAE: the integral of |error|, PV units * s.
+    settling_s: the time until PV stays within 5 % (or the noise), s.
+    static_gain: the static gain, PV units per MV unit, signed; nan when PV did not settle, infinite when MV came back
+    to where it was.
+    mv_span: the range of MV (maximum less minimum), MV units.
+    mv_at_limit_s: the time for which MV was at a limit, s.
+    settled: True if PV settled within the time allowed.
+    duration_s: the duration of the record, s.
     """
 
     step: float
@@ -37,7 +44,11 @@ class StepResult:
 
 
 def allowed_step(facts: Facts, point: OperatingPoint, Kp: float, static_gain: float) -> float:
-    """The largest permitted set-point step that keeps the kick and the final value of MV well inside its room."""
+    """The largest permitted set-point step (PV units) that keeps the kick and the final value of MV within its room.
+
+    Kp: the gain in effect during the step.
+    static_gain: the static gain of the plant, nan where it is not known.
+    """
     step = min(facts.sp_deviation, KICK_OF_ROOM * point.room / Kp)
     if static_gain == static_gain and static_gain != 0:
         step = min(step, 0.6 * point.room * abs(static_gain))
@@ -52,12 +63,14 @@ def step_test(
     band: float,
     max_s: float,
     smooth_s: float,
-    kept: Trace | None = None,
+    into: Trace | None = None,
 ) -> Plan[StepResult]:
-    """Steps the set-point from rest by `step` and waits until PV stays within band * step for T95/5.
+    """Steps the set-point from rest by `step` (PV units) and waits until PV stays within band * step for T95/5.
 
-    smooth_s: width of the parabola fitted around the peak (it must be shorter than the peak), s.
-    kept: filled with the samples, the first being that of the step.
+    band: the settling band, as a fraction of the step.
+    max_s: the longest time to wait, s.
+    smooth_s: the width of the parabola fitted around the peak, s; it must be shorter than the peak.
+    into: a trace that is filled with the samples, of which the first is that of the step.
     """
     target = point.sp + step
     sample = yield (SetSetpoint(target),)
@@ -65,8 +78,8 @@ def step_test(
         sample = yield ()
     later, settled = yield from settle(target, band * abs(step), facts.T95_s / 5, max_s, point.noise)
     trace = Trace([sample.t, *later.t], [sample.sp, *later.sp], [sample.pv, *later.pv], [sample.mv, *later.mv])
-    if kept is not None:
-        kept.t, kept.sp, kept.pv, kept.mv = trace.t, trace.sp, trace.pv, trace.mv
+    if into is not None:
+        into.t, into.sp, into.pv, into.mv = trace.t, trace.sp, trace.pv, trace.mv
     t, pv, mv = (np.asarray(column) for column in (trace.t, trace.pv, trace.mv))
     t = t - t[0]
     tail = trace.tail(facts.T95_s / 5)
@@ -88,9 +101,10 @@ def step_test(
 
 
 def unlimited(facts: Facts, result: StepResult, gains: Gains) -> None:
-    """Raises Refused when the limits of MV had a part in the response: it then says nothing about the loop.
+    """Raises Refused, MV_LIMIT, when the limits of MV have influenced the response, which then says nothing of the
+    loop.
 
-    A clipped kick of a sample or two leaves no mark on it.
+    A kick that is clipped for a sample or two has no influence.
     """
     if result.mv_at_limit_s > max(2.5 * facts.sample_time_s, 0.02 * gains.Ti):
         raise Refused(
@@ -105,9 +119,9 @@ def _ratio(pv_change: float, mv_change: float) -> float:
 
 
 def _peak(t: Array, y: Array, width: float) -> float:
-    """Height of the highest peak: a parabola by least squares around the highest moving average.
+    """The height of the highest peak, from a parabola fitted around the highest moving average.
 
-    Reading off the largest sample would add two or three standard deviations of noise to every overshoot.
+    The largest sample would be two or three standard deviations of the noise above the peak.
     """
     dt = t[1] - t[0] if len(t) > 1 else 1.0
     half = int(width / dt / 2)

@@ -1,4 +1,4 @@
-"""The last stage: a set-point step from rest under the new gains, against what their model predicts."""
+"""The last stage makes a set-point step from rest under the new gains and compares it with the model's prediction."""
 
 from __future__ import annotations
 
@@ -15,8 +15,12 @@ from loopwright.tuning.reasons import Reason, Refused
 def verification(
     facts: Facts, point: OperatingPoint, gains: Gains, predicted: Predicted, static_gain: float, dead_time_s: float
 ) -> Plan[StepResult]:
-    """static_gain: of the model, nan where it is not known. The step is the one that the old gains may have been
-    tried with. Raises Refused: NOT_CONFIRMED, MV_LIMIT.
+    """The set-point step under the new gains; it is not larger than a step under the old gains might have been.
+
+    predicted: what the model predicts for the new gains.
+    static_gain: the static gain of the model, PV units per MV unit, nan where it is not known.
+    dead_time_s: the dead time of the model, s.
+    Raises Refused: NOT_CONFIRMED, MV_LIMIT.
     """
     step = min(
         allowed_step(facts, point, gains.Kp, abs(static_gain)),
@@ -33,6 +37,6 @@ def verification(
             f"under the new gains the loop {'settled' if result.settled else 'did not settle'} with an overshoot of "
             f"{result.overshoot_pct:.1f} % (predicted {predicted.overshoot_pct:.1f} %, at most {maximum:.0f} %)",
         )
-    # home under the new gains, so that the old ones take over a loop at rest
+    # the loop returns under the new gains, so that the old ones take over a loop at rest
     yield from settle(point.sp, 0.05 * step, facts.T95_s / 5, 3 * facts.T95_s, point.noise, (SetSetpoint(point.sp),))
     return result

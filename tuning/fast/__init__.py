@@ -1,1 +1,1 @@
-"""One short biased relay record, fitted as a whole: identification, design and verdict of the procedure "fast"."""
+"""The procedure "fast": one short biased relay record is fitted as a whole, then gains are designed on the model."""

@@ -1,9 +1,10 @@
-"""The best PI or PID on a model for a robustness that is asked for.
+"""This module finds the best PI or PID on a model for a robustness that the user asks for. The design minimises
 
     J = 1/2 IAE_r/IAE_r° + 1/2 IAE_d/IAE_d°            under Ms <= asked (and Mt, and a bound on the noise gain)
 
-after a unit step of set-point and load; ° is the least value of each alone under the same bounds. For each (Ti, Td) the
-largest gains are known in closed form, so that only one or two numbers are searched.
+where IAE_r follows a unit set-point step and IAE_d a unit load disturbance; ° marks the minimum of each IAE alone under
+the same bounds. For each (Ti, Td) the largest gains are known in closed form (`gain_bounds`), so that the search runs
+over one number (PI) or two (PID).
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from loopwright.tuning.analysis.stability import is_stable
-from loopwright.tuning.fast.gain_bounds import encircles_not, largest_gains
+from loopwright.tuning.fast.gain_bounds import does_not_encircle, largest_gains
 from loopwright.tuning.fast.iae import Cost, LoopCost
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Complexes, Model, Reals, TransferFunction, sign
@@ -23,32 +24,36 @@ from loopwright.tuning.reasons import Reason, Refused
 
 POINTS = 440
 LOWEST, HIGHEST = 10**-2.8, 10**1.6
-"""Of the frequency grid, in 2*pi/period."""
-TURNED = 13.0
-"""w*L, rad, from which the dead time turns by more than 0.3 rad from one point of the grid to the next."""
-BEYOND = 1e3
-"""How far above the grid a part that passes at once, or a lag too fast to see, is looked at."""
-TRUSTED = 0.6
-"""Of the bound there, for a derivative: it lives where the record says least of the plant."""
-SHORTEST, LONGEST = 0.25, 1.3
-"""Of the model's own ultimate period, in periods of the relay."""
-TI = np.geomspace(0.04, 30.0, 30)  # periods
+"""Ends of the frequency grid, in units of 2*pi/period."""
+MAX_DEAD_TIME_ANGLE = 13.0
+"""Phase w*L in rad above which the dead time turns the loop by more than 0.3 rad between neighbouring grid points."""
+TAIL_FACTOR = 1e3
+"""Factor above the grid's highest frequency up to which feed-through, or a lag too fast for the record, is bounded."""
+TAIL_MARGIN = 0.6
+"""Fraction of the high-frequency bound that a controller with derivative may use: a derivative acts at frequencies at
+which the record says least of the plant."""
+MIN_PERIOD_RATIO, MAX_PERIOD_RATIO = 0.25, 1.3
+"""Limits of the model's own ultimate period, as a ratio to the period of the relay."""
+TI = np.geomspace(0.04, 30.0, 30)  # Ti of the PI grid, in periods
 HALVINGS = 5
-PID_TI = np.geomspace(0.1, 8.0, 11)
-PID_TD = (0.03, 0.06, 0.15, 0.25, 0.4, 0.65)  # of Ti
+PID_TI = np.geomspace(0.1, 8.0, 11)  # Ti of the PID grid, in periods
+PID_TD = (0.03, 0.06, 0.15, 0.25, 0.4, 0.65)  # Td as a fraction of Ti
 MIN_TD, MIN_TI = 0.045, 0.08  # periods
-MAX_TD = 2.0  # of Ti
+MAX_TD = 2.0  # Td as a multiple of Ti
 PID_STEPS = 45
-WORTH = 0.97
-"""A derivative must bring J below this part of the PI's."""
+MAX_J_RATIO = 0.97
+"""The PID is taken only if its J is below this fraction of the J of the best PI."""
 
 
 @dataclass(frozen=True, slots=True)
 class DesignSpec:
-    """What the user asks for. Ms: 1.2 robust, 1.6, 2.0 fast.  Mt: largest peak of the closed loop, None for no bound.
+    """The design specification: the robustness and the controller that the user asks for.
 
-    derivative: a PID where it pays.  N: its filter is Td/N.  noise_gain: the most that MV may answer to a jump of PV,
-    MV units per PV unit, None for no bound.
+    Ms: the maximum sensitivity permitted; 1.2 is robust, 1.6 the default, 2.0 fast.
+    derivative: True permits a PID, which is taken where it lowers J.
+    Mt: the largest permitted peak of the closed loop |L/(1+L)|, None for no bound.
+    noise_gain: the largest permitted answer of MV to a jump of PV, MV units per PV unit, None for no bound.
+    N: the derivative filter has the time constant Td/N.
     """
 
     Ms: float = 1.6
@@ -67,10 +72,13 @@ class DesignSpec:
 
 
 @dataclass(frozen=True, slots=True)
-class Best:
-    """J: of the criterion.  cost: its parts.  least: what each of them is counted over.
+class OptimalGains:
+    """The gains that minimise J under the bounds.
 
-    Gains for a controller that acts with the plant's sign.
+    gains: the ISA gains of a controller whose action has the plant's sign.
+    J: the value of the criterion, without unit.
+    cost: the two IAE of which J is made.
+    minimum: the smallest IAE_r and IAE_d by which J is normalised.
     """
 
     gains: Gains
@@ -79,8 +87,12 @@ class Best:
     minimum: Cost
 
 
-class Design:
-    """The criterion on one model, its dead time including what the sampling adds; relay_period: s."""
+class GainDesign:
+    """The search for the best gains on one model.
+
+    model: the process model; its dead time includes the delay of the sampling.
+    relay_period: the period of the relay oscillation, s.
+    """
 
     def __init__(self, model: Model, spec: DesignSpec, relay_period: float) -> None:
         positive = TransferFunction(tuple(sign(model) * c for c in model.num), model.den, model.L)
@@ -89,54 +101,55 @@ class Design:
         self.w = frequencies(self.period)
         self.G = positive.frequency_response(self.w)
         self.cost = LoopCost(positive, self.period)
-        # where the dead time turns faster than the grid can follow, and above the grid, the size alone must do
+        # where the dead time turns faster than the grid can follow, and above the grid, only the loop's size is bounded
         end = float(self.w[-1])
-        start = min(TURNED / positive.L, end) if positive.L > 0.0 else end
-        self.tail = np.geomspace(start, BEYOND * end, POINTS)
+        start = min(MAX_DEAD_TIME_ANGLE / positive.L, end) if positive.L > 0.0 else end
+        self.tail = np.geomspace(start, TAIL_FACTOR * end, POINTS)
         self.G_tail = positive.frequency_response(self.tail)
         self.minimum: Cost | None = None
 
-    def best(self) -> Best:
-        """Raises Refused, NOT_ROBUST: no gain meets the bounds."""
+    def best(self) -> OptimalGains:
+        """The best PI, or the best PID where it is permitted and lowers J. Raises Refused, NOT_ROBUST: no gain meets
+        the bounds."""
         pi = self._pi()
         if not self.spec.derivative:
             return pi
         pid = self._pid()
-        return pid if pid is not None and pid.J < WORTH * pi.J else pi
+        return pid if pid is not None and pid.J < MAX_J_RATIO * pi.J else pi
 
     def candidates(self, Ti: float, Td: float = 0.0) -> list[tuple[Gains, Cost]]:
-        """The largest gains of these times that are stable, with their cost."""
+        """The stable ones of the largest permitted gains for this Ti and Td (s), each with its cost."""
         spec = self.spec
         g = self.G * controller(self.w, Ti, Td, spec.N)
         cap = math.inf
         if spec.noise_gain is not None:
             cap = spec.noise_gain / (1.0 + spec.N if Td > 0.0 else 1.0)
         size = float(np.max(np.abs(self.G_tail * controller(self.tail, Ti, Td, spec.N))))
-        cap = min(cap, (TRUSTED if Td > 0.0 else 1.0) * (1.0 - 1.0 / spec.Ms) / size)
+        cap = min(cap, (TAIL_MARGIN if Td > 0.0 else 1.0) * (1.0 - 1.0 / spec.Ms) / size)
         found = []
         for end in largest_gains(g, spec.Ms, spec.Mt, cap):
-            if encircles_not(end * g):
+            if does_not_encircle(end * g):
                 cost = self.cost(end, Ti, Td, spec.N)
                 found.append((Gains(float(end), float(Ti), float(Td), float(Td) / spec.N), cost))
         return found
 
-    def _pi(self) -> Best:
+    def _pi(self) -> OptimalGains:
         scanned = [self.candidates(Ti * self.period) for Ti in TI]
         everything = [each for candidates in scanned for each in candidates]
         if not everything:
             raise Refused(Reason.NOT_ROBUST, f"no PI on the model has an Ms of at most {self.spec.Ms:g}")
         self.minimum = Cost(min(cost.setpoint for _, cost in everything), min(cost.load for _, cost in everything))
-        best = min((self._judged(each) for each in everything), key=_value)
+        best = min((self._evaluated(each) for each in everything), key=_value)
         step = math.log(TI[1] / TI[0])
         for _ in range(HALVINGS):
             step *= 0.5
             middle = best.gains.Ti
             for Ti in (middle * math.exp(-step), middle * math.exp(step)):
-                best = min((best, *map(self._judged, self.candidates(Ti))), key=_value)
+                best = min((best, *map(self._evaluated, self.candidates(Ti))), key=_value)
         self._require_stable(best)
         return best
 
-    def _pid(self) -> Best | None:
+    def _pid(self) -> OptimalGains | None:
         grid = [
             (each, (math.log(Ti * self.period), math.log(ratio * Ti * self.period)))
             for Ti in PID_TI
@@ -171,35 +184,37 @@ class Design:
             self._require_stable(best)
         return best
 
-    def _at(self, Ti: float, Td: float) -> Best | None:
-        """The best gain of these times, None where they are not permitted or have none."""
+    def _at(self, Ti: float, Td: float) -> OptimalGains | None:
+        """The best gains for this Ti and Td (s); None where the times are not permitted or no gain meets the bounds."""
         if Td < MIN_TD * self.period or Ti < MIN_TI * self.period or Td > MAX_TD * Ti or Ti > 40.0 * self.period:
             return None
-        return min(map(self._judged, self.candidates(Ti, Td)), key=_value, default=None)
+        return min(map(self._evaluated, self.candidates(Ti, Td)), key=_value, default=None)
 
-    def _judged(self, each: tuple[Gains, Cost]) -> Best:
+    def _evaluated(self, each: tuple[Gains, Cost]) -> OptimalGains:
         gains, cost = each
         assert self.minimum is not None  # the PI comes first
         J = 0.5 * cost.setpoint / self.minimum.setpoint + 0.5 * cost.load / self.minimum.load
-        return Best(gains, J, cost, self.minimum)
+        return OptimalGains(gains, J, cost, self.minimum)
 
-    def _require_stable(self, best: Best) -> None:
+    def _require_stable(self, best: OptimalGains) -> None:
         if not is_stable(self.model, best.gains):
             raise Refused(Reason.NOT_ROBUST, "the best gains on the model are not stable by the exact count of poles")
 
 
 def controller(w: Reals, Ti: float, Td: float, N: float) -> Complexes:
-    """C(jw)/Kp."""
+    """The frequency response C(jw)/Kp of the controller; w in rad/s, Ti and Td in s, derivative filter Td/N."""
     s = 1j * w
     return np.asarray(1.0 + 1.0 / (s * Ti) + (s * Td / (1.0 + s * Td / N) if Td > 0.0 else 0.0))
 
 
 def frequencies(period: float) -> Reals:
+    """The frequency grid of a design, rad/s, for an ultimate period in s."""
     return np.asarray(np.geomspace(LOWEST, HIGHEST, POINTS) * 2.0 * math.pi / period)
 
 
 def own_period(model: Model, relay_period: float) -> float:
-    """The model's ultimate period, s, within limits around the relay's, which a load makes longer."""
+    """The ultimate period of the model, s, limited around the period of the relay, which a load disturbance
+    prolongs."""
     w = frequencies(relay_period)
     G = model.frequency_response(w)
     crossing = np.flatnonzero((G.imag[:-1] < 0.0) & (G.imag[1:] >= 0.0) & (G.real[:-1] < 0.0))
@@ -208,8 +223,8 @@ def own_period(model: Model, relay_period: float) -> float:
     i = int(crossing[np.argmax(np.abs(G[crossing]))])
     part = -G.imag[i] / (G.imag[i + 1] - G.imag[i])
     at = float(w[i] * (w[i + 1] / w[i]) ** part)
-    return min(max(2.0 * math.pi / at, SHORTEST * relay_period), LONGEST * relay_period)
+    return min(max(2.0 * math.pi / at, MIN_PERIOD_RATIO * relay_period), MAX_PERIOD_RATIO * relay_period)
 
 
-def _value(best: Best) -> float:
+def _value(best: OptimalGains) -> float:
     return best.J

@@ -1,4 +1,4 @@
-"""Gains for another Ms on a model that is known already, tried on the loop: no relay."""
+"""Gains for another Ms are designed on a model that is known already and tried on the loop, without a relay test."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from loopwright.tuning.experiments.preflight import preflight
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.step_test import StepResult
 from loopwright.tuning.experiments.verification import verification
-from loopwright.tuning.fast.design import Best, Design
+from loopwright.tuning.fast.design import GainDesign, OptimalGains
 from loopwright.tuning.fast.procedure import FAST, FastOptions
-from loopwright.tuning.fast.proposal import FastProposal, FoundModel, comparison_on, delayed, ultimate
+from loopwright.tuning.fast.proposal import FastProposal, IdentifiedModel, comparison_on, delayed, ultimate
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Model, TransferFunction, sign, time_constants
 from loopwright.tuning.plan import Plan, StageDone, StageStarted, worked
@@ -28,25 +28,27 @@ def trial_stages(verify: bool) -> tuple[str, ...]:
     return TRIAL_STAGES if verify else TRIAL_STAGES[:2]
 
 
-def designed_on(model: Model, options: FastOptions, sample_time_s: float) -> Best:
-    """The best gains on the model. Raises Refused, NOT_ROBUST."""
+def designed_on(model: Model, options: FastOptions, sample_time_s: float) -> OptimalGains:
+    """The best gains on the model, for a controller of this sample time. Raises Refused, NOT_ROBUST."""
     known = ultimate(model)
-    # without an ultimate point the loop's time is that of its lags and dead time
+    # a model without an ultimate point is designed on the time scale of its lags and dead time
     period = known.Pu_s if known else 4.0 * (model.L + float(max(time_constants(model), default=0.0)))
-    return Design(delayed(model, 0.5 * sample_time_s), options.spec(), period).best()
+    return GainDesign(delayed(model, 0.5 * sample_time_s), options.spec(), period).best()
 
 
 def _considered(model: Model, options: FastOptions, facts: Facts) -> tuple[Gains, Comparison]:
-    """The best gains on the model, beside the old ones. Raises Refused, NOT_ROBUST."""
+    """The best gains on the model and their comparison with the present gains. Raises Refused, NOT_ROBUST."""
     best = designed_on(model, options, facts.sample_time_s)
     sampled = delayed(model, 0.5 * facts.sample_time_s)
     return best.gains, comparison_on(sampled, best, facts, options.spec(), options.propose_anyway)
 
 
 def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal]:
-    """On a loop in automatic and at rest. Raises Refused; restores nothing (the runner does).
+    """The plan of a trial, for a loop in automatic and at rest.
 
-    Gains that bring nothing that was asked for are tried only where `propose_anyway` is among the options.
+    model: the process model that the gains are designed on.
+    New gains that improve nothing that was asked for are tried only if the options contain `propose_anyway`.
+    Raises Refused. The plan restores nothing: the runner restores the loop.
     """
     expected = {"preflight": facts.T95_s / 2, "design": 0.0, "verify": 6 * facts.T95_s}
     todo = trial_stages(options.verify)
@@ -77,7 +79,7 @@ def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal
     return FastProposal(
         method=FAST,
         chosen={"Ms": spec.Ms, **({"N": spec.N} if gains.Td else {})},
-        model=FoundModel("typed in", given.num, given.den, given.L),
+        model=IdentifiedModel("typed in", given.num, given.den, given.L),
         old_gains=facts.old_gains,
         gains=gains,
         predicted=promised,

@@ -1,9 +1,9 @@
-"""The largest gains under a bound on Ms (and on Mt), in closed form: no search along the gain.
+"""The largest gains under a bound on Ms (and on Mt) are computed in closed form, without a search along the gain.
 
-At one frequency |1 + Kp*g| >= 1/Ms is a quadratic inequality in Kp and forbids an interval. What all frequencies leave
-falls into pieces; the upper end of each is a candidate, and several exist where small gains are forbidden too
-(integrating plants with a short integral time). Which of them is stable, the encirclements tell: the bound on Ms alone
-holds for unstable loops as well.
+At one frequency |1 + Kp*g| >= 1/Ms is a quadratic inequality in Kp and forbids an interval of gains. The gains that all
+frequencies permit form one or several intervals; the upper end of each is a candidate. Several intervals exist where
+small gains are forbidden too (integrating plants with a short integral time). The bound on Ms holds for unstable loops
+as well, so the encirclements of -1 decide which candidate is stable.
 """
 
 from __future__ import annotations
@@ -15,18 +15,22 @@ import numpy as np
 from loopwright.tuning.models import Complexes, Reals
 
 HIGHEST_END, LOWEST_END = math.radians(45.0), math.radians(-225.0)
-"""Phase of 1 + L at the lowest frequency, unwrapped from the highest: -90 degrees for one integrator, -180 for two."""
+"""Limits of the phase of 1 + L at the lowest frequency, unwrapped from the highest: the phase is -90 degrees for a loop
+with one integrator and -180 degrees for a loop with two."""
 
 MIN_LOW = 10.0
-"""Of a loop with two integrators at the lowest frequency."""
+"""Smallest size, at the lowest frequency, of a loop with two integrators whose encirclements can be counted."""
 
 
 def largest_gains(g: Complexes, Ms: float, Mt: float | None = None, maximum: float = math.inf) -> list[float]:
-    """Kp > 0 at the upper end of each permitted piece, ascending. g: the loop for Kp = 1 on a grid, shape (points,).
+    """The gains Kp > 0 at the upper ends of the permitted intervals, in ascending order.
 
-    maximum: a bound on Kp itself. It may lie where smaller gains are forbidden too, and then leaves those below alone.
+    g: the frequency response of the loop for Kp = 1 on a frequency grid, shape (points,).
+    Ms, Mt: the bounds; None for no bound on Mt.
+    maximum: a bound on Kp itself. Where it lies inside a permitted interval, it is the upper end of that interval;
+    intervals above it are left out.
 
-    The last piece, which has no end, is left out: the grid ends before its gains do.
+    The last interval has no upper end on the grid and is left out.
     """
     intervals = [_forbidden(g, 1.0 - 1.0 / Ms**2, 1.0)]
     if Mt is not None:
@@ -45,7 +49,10 @@ def largest_gains(g: Complexes, Ms: float, Mt: float | None = None, maximum: flo
 
 
 def _forbidden(g: Complexes, minimum: float, leading: float) -> Reals:
-    """(low, high) of leading*|g|^2 Kp^2 + 2 Re(g) Kp + least < 0 at each frequency where there is such a Kp > 0."""
+    """The forbidden intervals of Kp, shape (2, intervals): their lower and upper ends.
+
+    An interval is where leading*|g|^2 Kp^2 + 2 Re(g) Kp + minimum < 0; only frequencies with such a Kp > 0 have one.
+    """
     x, size = g.real, np.abs(g) ** 2
     root = x**2 - leading * size * minimum
     there = (x < 0.0) & (root > 0.0)
@@ -53,10 +60,12 @@ def _forbidden(g: Complexes, minimum: float, leading: float) -> Reals:
     return np.array([(-x - root) / size, (-x + root) / size])
 
 
-def encircles_not(loop: Complexes) -> bool:
-    """The closed loop is stable, for a plant without poles in the right half plane; loop on a rising grid.
+def does_not_encircle(loop: Complexes) -> bool:
+    """Whether the Nyquist curve does not encircle -1, so that the closed loop of a stable or integrating plant is
+    stable.
 
-    False as well where two integrators cross over too near to the grid's low end to tell.
+    loop: the open loop on a rising frequency grid, shape (points,).
+    The result is False as well where a loop with two integrators crosses over too near to the low end of the grid.
     """
     first = loop[0]
     if first.real < -abs(first.imag) and abs(first) < MIN_LOW:

@@ -1,11 +1,12 @@
-"""Integral of |error| after a unit step of set-point and load, quickly: one impulse response of the sampled loop.
+"""The IAE after a unit set-point step and a unit load disturbance is computed from one impulse response of the loop.
 
-The plant behind a hold is exact for any dead time. The continuous controller is taken at the simulation's step, whose
-mean delay of half a step is taken off the dead time. With z^-1 as variable and F the derivative's filter,
+The plant behind a zero-order hold is exact for any dead time. The continuous controller is discretised at the step of
+the simulation, and the mean delay of that step, half a step, is subtracted from the dead time. With z^-1 as variable
+and F the filter of the derivative,
 
     C = Kp*((1 + z^-1)/2*h/Ti + 1 - z^-1 + N*(1 - z^-1)^2/F) / (1 - z^-1),   F = 1 - exp(-h*N/Td)*z^-1
 
-the error after a set-point step (derivative on PV alone) and PV after a load step are the impulse responses of
+the error after a set-point step (derivative on PV alone) and PV after a load disturbance are the impulse responses of
 (A*F + z^-m*B*Cd)/D and z^-m*B*F/D, where D = A*F*(1 - z^-1) + z^-m*B*(...): the step cancels the integrator.
 """
 
@@ -28,14 +29,18 @@ _DIFFERENCE = np.array([1.0, -1.0])
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """IAE of PV after a unit set-point step, and after a unit load step at the plant's input."""
+    """The two IAE of one loop.
+
+    setpoint: the IAE after a unit set-point step, s.
+    load: the IAE after a unit load disturbance at the plant's input, PV units * s per MV unit.
+    """
 
     setpoint: float
     load: float
 
 
 class LoopCost:
-    """For one model of positive gain; period: its own ultimate period, s."""
+    """The IAE of loops on one model of positive gain. period: the ultimate period of that model, s."""
 
     def __init__(self, model: Model, period: float) -> None:
         self.h = h = period / STEPS_PER_PERIOD
@@ -55,7 +60,7 @@ class LoopCost:
         self._A, self._B = recursion, np.concatenate((np.zeros(int(pulse.delay[0])), B))
 
     def __call__(self, Kp: float, Ti: float, Td: float, N: float) -> Cost:
-        """Of a stable loop. N: the derivative's filter is Td/N."""
+        """The cost of these gains; the loop must be stable. Ti, Td: s. N: the derivative filter is Td/N."""
         h = self.h
         filtered = np.array([1.0, -math.exp(-h * N / Td)]) if Td > 0.0 else np.ones(1)
         proportional = np.array([1.0 + 0.5 * h / Ti, -1.0 + 0.5 * h / Ti])
@@ -78,7 +83,7 @@ class LoopCost:
 
 
 def _sum(a: Reals, b: Reals) -> Reals:
-    """Of two polynomials in 1/z."""
+    """The sum of two polynomials in 1/z."""
     if len(a) < len(b):
         a, b = b, a
     total = a.copy()

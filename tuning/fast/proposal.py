@@ -1,4 +1,4 @@
-"""What a fast experiment hands on: record, model with its errors, the step under the new gains, the proposal."""
+"""The results of the fast procedure: figures of the relay, evaluation, model with errors, verified step, proposal."""
 
 from __future__ import annotations
 
@@ -7,14 +7,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopwright.tuning.analysis.comparison import Asked, Comparison, Predicted, compared, predicted, weighted_IAE, worth
+from loopwright.tuning.analysis.comparison import (
+    Comparison,
+    Predicted,
+    RobustnessBounds,
+    compare,
+    loop_performance,
+    predicted,
+    weighted_IAE,
+)
 from loopwright.tuning.analysis.margins import Ultimate, margins, ultimate_point
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.step_test import StepResult
-from loopwright.tuning.fast.design import Best, DesignSpec
-from loopwright.tuning.fast.record import Evidence
+from loopwright.tuning.fast.design import DesignSpec, OptimalGains
+from loopwright.tuning.fast.evaluation import Evaluation
+from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.fast.uncertainty import fit_covariance
-from loopwright.tuning.fast.verdict import Evaluation
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.output_error import Fit, Fitted
 from loopwright.tuning.identification.sensitivity import slopes_of
@@ -22,21 +30,31 @@ from loopwright.tuning.models import Model, Reals, TransferFunction
 from loopwright.tuning.reasons import Ended, Reason, Refused
 
 CRITERION = "half of the set-point's and half of the load's IAE, each over the least under the bounds asked for"
+"""J in words, as the comparison of old and new gains shows it."""
 
 
 @dataclass(frozen=True, slots=True)
-class LoadStep:
-    """A step of the load that the record shows. t_s: since the relay's start.  size: MV units at the plant's input."""
+class LoadDisturbance:
+    """A step-shaped load disturbance that the record shows.
+
+    t_s: the time of the step since the start of the relay, s.
+    size: the size of the step at the plant's input, MV units.
+    """
 
     t_s: float
     size: float
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
-    """The relay's record. period_s: as it swung.  span: of PV.  noise: of PV at rest, standard deviation.
+class RelayFigures:
+    """The figures of a relay test.
 
-    amplitude: of the relay's higher side, MV units.  samples: from the first at rest to the last.
+    switches: the number of switches of the relay.
+    period_s: the period of the oscillation, s.
+    span: the range of PV (maximum less minimum) under the relay, PV units.
+    noise: the standard deviation of PV at rest, PV units.
+    amplitude: the amplitude of the relay's higher side, MV units.
+    samples: the number of samples of the record, those at rest included.
     """
 
     switches: int
@@ -48,8 +66,14 @@ class Recorded:
 
 
 @dataclass(frozen=True, slots=True)
-class FoundModel:
-    """num, den (highest power of s first, den begins with 1) and the dead time, each with its standard error."""
+class IdentifiedModel:
+    """A transfer function with the standard errors of its coefficients and of its dead time.
+
+    structure: the name of the model structure.
+    num, den: the coefficients, highest power of s first; den begins with 1; PV units per MV unit, times in s.
+    dead_time_s: the dead time, s.
+    num_errors, den_errors, dead_time_error_s: the standard errors, None for a model that was typed in.
+    """
 
     structure: str
     num: tuple[float, ...]
@@ -61,11 +85,21 @@ class FoundModel:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """What one evaluation of the record came to.
+class EvaluationSummary:
+    """The figures of one evaluation of a record.
 
-    num, den (highest power first), L_s: the plant.  cause: why it is not enough, None if it is.  uncertainty,
-    ambiguity: of Ms.  residual: in noises at rest.
+    structure: the name of the model structure.
+    num, den, L_s: the process model; coefficients with the highest power of s first, dead time in s.
+    gains: the gains designed on that model.
+    Ms: the maximum sensitivity of these gains on the model, the delay of the sampling included.
+    uncertainty: how much larger Ms may be with the model two standard deviations off.
+    ambiguity: the largest difference of Ms on another model that explains the record as well.
+    residual: the rms of the residual divided by the standard deviation of the noise at rest.
+    loads: the load disturbances that the record shows.
+    drift: True if PV drifted at a steady rate, which the fit allows for.
+    switches, period_s: the number of switches of the relay and the period of the oscillation, s.
+    reason: the reason why the result is not good enough for a proposal, None if it is.
+    detail: the sentence with the numbers behind that reason.
     """
 
     structure: str
@@ -77,20 +111,24 @@ class Found:
     uncertainty: float
     ambiguity: float
     residual: float
-    loads: tuple[LoadStep, ...]
+    loads: tuple[LoadDisturbance, ...]
     drift: bool
     switches: int
     period_s: float
-    cause: str | None
+    reason: Reason | None
     detail: str
 
 
 @dataclass(frozen=True, slots=True)
-class Verified:
-    """The set-point step under the gains of the first design, as measured; it begins while PV still swings.
+class VerifiedStep:
+    """The set-point step under the gains of the first design, as measured. It begins while PV still oscillates.
 
-    tested: those gains.  Ms: theirs on the model of the whole record.  fit_pct: how much of the step that model
-    explains, NRMSE.  rms: what it leaves, PV units.
+    tested: the gains of the first design.
+    Ms: the maximum sensitivity of the tested gains on the model of the whole record.
+    step: the set-point step, PV units.
+    duration_s: the time since the step, s.
+    fit_pct: the NRMSE fit of that model to the step, percent.
+    rms: the rms of the residual of the step, PV units.
     """
 
     tested: Gains
@@ -103,43 +141,53 @@ class Verified:
 
 @dataclass(frozen=True, slots=True)
 class FastProposal:
-    """What the operator decides on. Gains in ISA form, MV per PV unit and seconds.
+    """The proposal that the operator decides on. Gains are in ISA form, MV units per PV unit and s.
 
-    comparison: old and new gains on the model, half a sample later for the sampling. Where it shows no gain the present
-    gains are kept, unless a proposal was asked for all the same: then there is nothing to decide on, and nothing was
-    verified.  predicted, predicted_before: some figures of it by themselves, predicted_before None where the old gains
-    would not be stable.  found: None without a record.  verified: of a step after the relay; verification: of one from
-    rest.
+    method: the name of the procedure.
+    chosen: the design parameters in effect.
+    model: the process model that the gains were designed on.
+    old_gains, gains: the present gains and the gains proposed.
+    predicted: the main figures of the new gains on the model.
+    predicted_before: the same figures of the old gains, None where the old gains are not stable on the model.
+    comparison: old and new gains on the model, with half a sample of delay added for the sampling. Where the comparison
+    shows no gain, the present gains are kept, nothing is verified and there is nothing to decide on, unless a proposal
+    was asked for all the same.
+    ultimate: the ultimate point of the model, None where the model has none.
+    found: the evaluation of the record, None without a record.
+    verified: the set-point step that followed the relay, None without one.
+    verification: the set-point step from rest, None without one.
+    notes: what the operator should know, one sentence each.
     """
 
     method: str
     chosen: Mapping[str, float]
-    model: FoundModel
+    model: IdentifiedModel
     old_gains: Gains
     gains: Gains
     predicted: Predicted
     predicted_before: Predicted | None
     comparison: Comparison
     ultimate: Ultimate | None
-    found: Found | None
-    verified: Verified | None
+    found: EvaluationSummary | None
+    verified: VerifiedStep | None
     verification: StepResult | None
     notes: tuple[str, ...]
 
 
-def found_of(evaluation: Evaluation) -> Found:
+def evaluation_summary(evaluation: Evaluation) -> EvaluationSummary:
+    """The figures of an evaluation as a job stores and shows them."""
     fit, best = evaluation.fit, evaluation.chosen.best
-    evidence, structure, theta, c = fit.evidence, best.structure, best.theta, best.linear.coefficients
-    order, count = structure.order, best.hypothesis.loads
+    record, structure, theta, c = fit.record, best.structure, best.theta, best.linear.coefficients
+    order, count = structure.order, best.hypothesis.load_disturbances
     first = len(c) - order * count
     loads = tuple(
-        LoadStep(
-            (float(theta[structure.searched + i] - theta[structure.lags]) - evidence.listened) * evidence.Ts,
-            float(c[first + i * order] / c[0]) * evidence.swing,
+        LoadDisturbance(
+            (float(theta[structure.searched + i] - theta[structure.lags]) - record.listened) * record.Ts,
+            float(c[first + i * order] / c[0]) * record.input_range,
         )
         for i in range(count)
     )
-    return Found(
+    return EvaluationSummary(
         structure=structure.name,
         num=evaluation.model.num,
         den=evaluation.model.den,
@@ -151,15 +199,16 @@ def found_of(evaluation: Evaluation) -> Found:
         residual=evaluation.residual,
         loads=loads,
         drift=best.hypothesis.drift,
-        switches=len(evidence.switches),
-        period_s=evidence.period * evidence.Ts,
-        cause=evaluation.cause,
+        switches=len(record.switches),
+        period_s=record.period * record.Ts,
+        reason=evaluation.reason,
         detail=evaluation.detail,
     )
 
 
-def model_of(fit: Fit[Evidence], found: Fitted) -> FoundModel:
-    """With the standard errors that the parameters' covariance gives the coefficients (delta method)."""
+def identified_model(fit: Fit[ExperimentRecord], found: Fitted) -> IdentifiedModel:
+    """The fitted model with the standard errors of its coefficients, from the covariance of the fitted parameters by
+    the delta method."""
     structure = found.structure
     searched, inputs = structure.searched, structure.inputs
     at = np.concatenate((found.theta[:searched], found.linear.coefficients[:inputs]))
@@ -168,7 +217,7 @@ def model_of(fit: Fit[Evidence], found: Fitted) -> FoundModel:
 
     def coefficients(at: Reals) -> Reals:
         moved = fit.transfer(structure, at[:searched], at[searched:])
-        # a coefficient that happens to vanish is not left out
+        # a leading coefficient that happens to be zero keeps its place
         return np.concatenate((np.zeros(width - len(moved.num)), moved.num[-width:], moved.den))
 
     slopes = slopes_of(coefficients, at, searched)
@@ -176,46 +225,56 @@ def model_of(fit: Fit[Evidence], found: Fitted) -> FoundModel:
     kept = np.concatenate((np.arange(searched), len(found.theta) + np.arange(inputs)))
     covariance = whole[np.ix_(kept, kept)]
     errors = np.sqrt(np.maximum(np.einsum("ci,ij,cj->c", slopes, covariance, slopes), 0.0))
-    return FoundModel(
+    return IdentifiedModel(
         structure=structure.name,
         num=model.num,
         den=model.den,
         dead_time_s=model.L,
         num_errors=tuple(map(float, errors[:width])),
         den_errors=tuple(map(float, errors[width:])),
-        dead_time_error_s=float(np.sqrt(max(covariance[structure.lags, structure.lags], 0.0))) * fit.evidence.Ts,
+        dead_time_error_s=float(np.sqrt(max(covariance[structure.lags, structure.lags], 0.0))) * fit.record.Ts,
     )
 
 
-def verified(evaluation: Evaluation, tested: Gains, size: float, duration_s: float) -> Verified:
-    """size: of the set-point step under the tested gains, PV units; duration_s: since it was made."""
+def verified_step(evaluation: Evaluation, tested: Gains, size: float, duration_s: float) -> VerifiedStep:
+    """The figures of the set-point step of a record.
+
+    tested: the gains under which the step was made.
+    size: the set-point step under the tested gains, PV units.
+    duration_s: the time since the step, s.
+    """
     fit, residual = evaluation.fit, evaluation.chosen.best.linear.residual
-    first = fit.evidence.relayed // fit.block
+    first = fit.record.relayed // fit.block
     rest, shown = residual[first:], fit.y[first:]
     spread = float(np.linalg.norm(shown - shown.mean()))
-    return Verified(
+    return VerifiedStep(
         tested=tested,
         Ms=margins(delayed(evaluation.model, evaluation.design_delay), tested).Ms,
         step=size,
         duration_s=duration_s,
         fit_pct=100.0 * (1.0 - float(np.linalg.norm(rest)) / spread) if spread > 0.0 else 0.0,
-        rms=float(np.sqrt(np.mean(rest**2))) * fit.evidence.span,
+        rms=float(np.sqrt(np.mean(rest**2))) * fit.record.output_range,
     )
 
 
 def comparison_of(evaluation: Evaluation, facts: Facts, spec: DesignSpec, anyway: bool) -> Comparison:
-    """Of the old gains and those designed on the record. Raises as `comparison_on`."""
+    """The comparison of the old gains with the gains designed on the record. Raises Refused as `comparison_on`."""
     return comparison_on(delayed(evaluation.model, evaluation.design_delay), evaluation.best, facts, spec, anyway)
 
 
-def comparison_on(sampled: Model, best: Best, facts: Facts, spec: DesignSpec, anyway: bool) -> Comparison:
-    """sampled: the model with the delay of the sampling.  anyway: see `compared`. Raises Refused, NOT_ROBUST."""
-    before, after = (worth(sampled, gains, facts.sample_time_s) for gains in (facts.old_gains, best.gains))
+def comparison_on(sampled: Model, best: OptimalGains, facts: Facts, spec: DesignSpec, anyway: bool) -> Comparison:
+    """The comparison of the old gains with the optimal gains on a model.
+
+    sampled: the model with the delay of the sampling.
+    anyway: a proposal is wanted even without a gain, see `compare`.
+    Raises Refused, NOT_ROBUST.
+    """
+    before, after = (loop_performance(sampled, gains, facts.sample_time_s) for gains in (facts.old_gains, best.gains))
     if not after.stable:
         raise Refused(Reason.NOT_ROBUST, "the gains designed are not stable on their own model")
-    asked = Asked(spec.Ms, Mt=spec.Mt, noise_gain=spec.noise_gain)
+    asked = RobustnessBounds(spec.Ms, Mt=spec.Mt, noise_gain=spec.noise_gain)
     J = tuple(weighted_IAE(each, best.minimum.setpoint, best.minimum.load) for each in (before, after))
-    return compared(before, after, asked, CRITERION, (J[0], J[1]), anyway)
+    return compare(before, after, asked, CRITERION, (J[0], J[1]), anyway)
 
 
 def proposed(
@@ -223,28 +282,28 @@ def proposed(
     spec: DesignSpec,
     evaluation: Evaluation,
     comparison: Comparison,
-    verified: Verified | None,
+    verified: VerifiedStep | None,
     relay_at_s: float,
 ) -> FastProposal:
-    """relay_at_s: plant time at which the relay began."""
-    found, gains = found_of(evaluation), evaluation.best.gains
+    """The proposal of the gains of an evaluation. relay_at_s: the plant time at which the relay began, s."""
+    found, gains = evaluation_summary(evaluation), evaluation.best.gains
     notes = [
-        f"A step of the load of {load.size:+.3g} at the plant's input was found {load.t_s:.4g} s after the start of "
+        f"A load disturbance of {load.size:+.3g} at the plant's input was found {load.t_s:.4g} s after the start of "
         f"the relay (at {relay_at_s + load.t_s:.4g} s), and allowed for."
         for load in found.loads
     ]
-    swing = evaluation.fit.evidence.swing
-    if any(abs(load.size) > swing for load in found.loads):
+    input_range = evaluation.fit.record.input_range
+    if any(abs(load.size) > input_range for load in found.loads):
         notes.append(
-            f"Such a load is larger than what the relay moved MV by ({swing:.3g}): a change of the plant would look so "
-            "too. Look at the record before accepting."
+            f"Such a load disturbance is larger than what the relay moved MV by ({input_range:.3g}): a change of the "
+            "plant would look the same. Look at the record before accepting."
         )
     if found.drift:
         notes.append("PV drifted at a steady rate during the test; this was allowed for.")
     return FastProposal(
         method="fast",
         chosen={"Ms": spec.Ms, **({"N": spec.N} if gains.Td else {})},
-        model=model_of(evaluation.fit, evaluation.chosen.best),
+        model=identified_model(evaluation.fit, evaluation.chosen.best),
         old_gains=facts.old_gains,
         gains=gains,
         predicted=predicted(comparison.after),
@@ -259,11 +318,12 @@ def proposed(
 
 
 def delayed(model: Model, delay: float) -> TransferFunction:
-    """As a sampled controller meets it."""
+    """The model with a longer dead time, as a sampled controller meets it. delay: the delay of the sampling, s."""
     return TransferFunction(model.num, model.den, model.L + delay)
 
 
 def ultimate(model: Model) -> Ultimate | None:
+    """The ultimate point of the model, None where the model has none."""
     try:
         return Ultimate(*ultimate_point(model))
     except Ended:

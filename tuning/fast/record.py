@@ -1,4 +1,4 @@
-"""The record of a fast experiment, in the units of its fit."""
+"""The record of a fast experiment, with the figures that scale its fit."""
 
 from __future__ import annotations
 
@@ -12,20 +12,25 @@ from loopwright.tuning.models import Reals
 from loopwright.tuning.reasons import Reason, Refused
 
 MIN_LISTENED = 60
-"""Averages in which the time at rest must still be told, for noise and offset."""
+"""Smallest number of averages of the time at rest, from which noise and offset are estimated."""
 AVERAGES_PER_PERIOD = 80
 LONGEST_DEAD_TIME = 0.75  # periods
 MIN_SWITCHES = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
-    """What a fast experiment has shown so far: time at rest first, then the relay, then perhaps a set-point step.
+class ExperimentRecord:
+    """The record of a fast experiment so far: time at rest, then the relay, then possibly set-point steps.
 
-    Ts: s.  u: MV that held from each sample to the next, y: PV at it, both shape (N,) and as deviations from rest.
-    direction: +1 where PV finally rises with MV, else -1: known from the controller's action.
-    listened: samples at rest.  relayed: samples up to the end of the relay.  switches: samples at which it switched,
-    its start not among them.  steps: samples at which the set-point stepped under the new gains.
+    Ts: the sample time, s.
+    u: MV as a deviation from rest, held from each sample to the next, MV units, shape (N,).
+    y: PV as a deviation from rest at each sample, PV units, shape (N,).
+    direction: +1 if PV finally rises with MV, else -1; the action of the controller tells which.
+    listened: the number of samples at rest.
+    relayed: the number of samples up to the end of the relay.
+    switches: the samples at which the relay switched, without its start.
+    steps: the samples at which the set-point stepped under the new gains.
+    Raises Refused: CANNOT_OSCILLATE, BAD_INPUT, NO_RESPONSE.
     """
 
     Ts: float
@@ -44,62 +49,71 @@ class Evidence:
             )
         if self.listened < MIN_LISTENED:
             raise Refused(Reason.BAD_INPUT, f"{self.listened} samples at rest; at least {MIN_LISTENED} are needed")
-        if not self.span > 0.0:
+        if not self.output_range > 0.0:
             raise Refused(Reason.NO_RESPONSE, "PV did not move at all under the relay")
 
     @property
     def period(self) -> float:
-        """Samples: half the sum of the last four half periods of the relay (of the last two, if there are no more)."""
+        """The period of the relay oscillation, in samples, see `period`."""
         return float(period(self.switches))
 
     @property
-    def span(self) -> float:
-        """Of PV under the relay, PV units."""
+    def output_range(self) -> float:
+        """The range of PV (maximum less minimum) under the relay, PV units."""
         return float(np.ptp(self.y[self.listened : self.relayed]))
 
     @property
-    def swing(self) -> float:
-        """The largest move of MV, MV units."""
+    def input_range(self) -> float:
+        """The largest deviation of MV from rest, MV units."""
         return float(np.max(np.abs(self.u)))
 
     @property
-    def most_dead_time(self) -> float:
-        """Samples."""
+    def max_dead_time(self) -> float:
+        """The longest dead time that is searched, in samples."""
         return LONGEST_DEAD_TIME * self.period
 
     @property
     def block(self) -> int:
-        """Samples averaged into one for the fit: sampling faster than this tells nothing more."""
+        """The number of samples averaged into one for the fit: faster sampling adds no information."""
         return max(1, min(int(self.period / AVERAGES_PER_PERIOD), self.listened // MIN_LISTENED))
 
     @property
     def noise(self) -> float:
-        """Standard deviation of what cannot be fitted, PV units: the noise at rest, and what rounding takes."""
+        """The standard deviation of what no model can explain, PV units: noise at rest and rounding errors together."""
         rest = averaged(self.y[: self.listened], self.block)
         return math.hypot(noise_of(rest), self.rounding)
 
     @property
     def rounding(self) -> float:
-        """Standard deviation of what a coarse sensor rounds away, PV units: at rest it may not show at all."""
-        steps = np.diff(np.unique(np.round(self.y / self.span, 9)))
-        return float(steps.min()) * self.span / math.sqrt(12.0)
+        """The standard deviation of the rounding error of a coarse sensor, PV units. At rest this error may not
+        show."""
+        steps = np.diff(np.unique(np.round(self.y / self.output_range, 9)))
+        return float(steps.min()) * self.output_range / math.sqrt(12.0)
 
     @property
-    def colour(self) -> float:
-        """Variance at rest over that of the fast part: about 1 for white noise."""
+    def durbin_watson_ratio_at_rest(self) -> float:
+        """2/d of PV at rest, with the Durbin-Watson statistic d: about 1 for white noise, larger for slow noise.
+
+        The ratio is the variance of PV at rest divided by half the mean square of the differences of neighbours.
+        """
         rest = averaged(self.y[: self.listened], self.block)
         fast = 0.5 * float(np.mean(np.diff(rest) ** 2))
         return float(np.var(rest)) / fast if fast > 0.0 else 1.0
 
 
 def period(switches: tuple[int, ...]) -> float:
-    """Samples, see `Evidence.period`."""
+    """The period of a relay oscillation, in samples: half the sum of its last four half periods, or the sum of the last
+    two if there are fewer than four. switches: the samples at which the relay switched."""
     halves = np.diff(switches)[-4:]
     return float(np.sum(halves)) / 2.0 if len(halves) == 4 else float(np.sum(halves[-2:]))
 
 
 def noise_of(rest: Reals) -> float:
-    """Standard deviation: the larger of that of neighbours' differences and of what a parabola leaves."""
+    """The standard deviation of the noise of PV at rest, PV units.
+
+    The result is the larger of two estimates: one from the differences of neighbouring samples, one from the residual
+    of a fitted parabola.
+    """
     fast = float(np.sqrt(0.5 * np.mean(np.diff(rest) ** 2)))
     t = np.linspace(-1.0, 1.0, len(rest))
     slow = rest - np.polyval(np.polyfit(t, rest, 2), t)

@@ -1,4 +1,4 @@
-"""The biased relay and the set-point step, sample by sample, and the record that they leave."""
+"""The biased relay test and the set-point step of the fast procedure, sample by sample, with their record."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import TypeVar
 import numpy as np
 
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, no_oscillation
-from loopwright.tuning.fast.proposal import Recorded
-from loopwright.tuning.fast.record import MIN_SWITCHES, Evidence, noise_of, period
+from loopwright.tuning.fast.proposal import RelayFigures
+from loopwright.tuning.fast.record import MIN_SWITCHES, ExperimentRecord, noise_of, period
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import (
     Command,
@@ -29,37 +29,43 @@ from loopwright.tuning.reasons import Reason, Refused
 
 T = TypeVar("T")
 BIAS = 0.5
-"""The lower amplitude in higher ones."""
-FIRST = 0.5
-"""The amplitude that the relay begins with, of the largest that MV permits."""
+"""Ratio of the relay's lower amplitude to its higher one."""
+FIRST_AMPLITUDE = 0.5
+"""Fraction of the largest permitted amplitude with which the relay begins."""
 HYSTERESIS = 2.2  # standard deviations of the noise
-AVERAGED = 3
+SAMPLES_AVERAGED = 3
 MIN_HYSTERESIS = 1e-3
-"""Of the set-point step permitted, for a PV without noise."""
+"""Smallest hysteresis as a fraction of the permitted set-point step, for a PV without noise."""
 STALLED = 2.5
-"""Longest half periods without a switch, after which the present side is raised."""
-RAISED, MAX_RAISED = 1.7, 2.0
-MIN_SPAN, GOOD_SPAN = 25.0, 60.0
-"""Of PV under the relay, standard deviations of the noise."""
-WIDEST_SPAN = 2.0
-"""Of PV under the relay, permitted set-point steps."""
+"""Time without a switch, in longest half periods, after which the amplitude of the present side is raised."""
+RAISE_FACTOR, MAX_RAISE = 1.7, 2.0
+MIN_OUTPUT_RANGE, GOOD_OUTPUT_RANGE = 25.0, 60.0
+"""Smallest and desired range of PV under the relay, in standard deviations of the noise."""
+MAX_OUTPUT_RANGE = 2.0
+"""Largest range of PV under the relay, in permitted set-point steps."""
 MAX_PERIODS = 8.4
-VERIFIED_PERIODS = 3.0
-BACK = 0.5
-"""Of the time of the first step."""
-SHORTEST = 0.5
-"""Of the relay's period: a model's that is shorter is not believed."""
-FAR = 20.0
-"""Spans of PV under the relay, at which the step under the new gains is ended."""
+VERIFICATION_PERIODS = 3.0
+STEP_BACK_FRACTION = 0.5
+"""Duration of the step back as a fraction of the duration of the first step."""
+MIN_MODEL_PERIOD = 0.5
+"""Fraction of the relay's period below which the ultimate period of a model is not used."""
+DIVERGED = 20.0
+"""Deviation of PV, in ranges of PV under the relay, at which the step under the new gains is ended."""
 
 
 def max_amplitude(mv: float, mv_low: float, mv_high: float) -> float:
-    """Of the higher side of a relay around `mv` that stays within the limits, MV units."""
+    """The largest amplitude of the higher side of a relay around `mv` that keeps MV within its limits, MV units."""
     return min(mv_high - mv, (mv - mv_low) / BIAS)
 
 
 class Experiment:
-    """One record, grown by its plans. Amplitudes in MV units."""
+    """The experiment of the fast procedure on one loop: its plans move the loop and extend its record.
+
+    facts, point: what is known of the loop, and the operating point at rest.
+    listened: the samples at rest, with which the record begins.
+    amplitude: the amplitude of the relay's higher side, MV units; None for the default, adapted after the first wave.
+    Raises Refused, BAD_LIMITS: an amplitude that MV does not permit.
+    """
 
     def __init__(self, facts: Facts, point: OperatingPoint, listened: Trace, amplitude: float | None) -> None:
         self.facts, self.point, self.trace = facts, point, listened
@@ -73,7 +79,7 @@ class Experiment:
                 Reason.BAD_LIMITS, f"a relay amplitude of {amplitude:g} is asked for; MV permits up to {self._max:.4g}"
             )
         self._fixed = amplitude is not None
-        self.amplitude = amplitude or FIRST * self._max
+        self.amplitude = amplitude or FIRST_AMPLITUDE * self._max
         self._sides = [BIAS, 1.0]  # low, high, in amplitudes
         self._high = True
         self._raise_at = 0
@@ -82,96 +88,98 @@ class Experiment:
         self._commands: tuple[Command, ...] = ()
         self._step = 0.0
 
-    def recorded(self) -> Recorded:
-        """The relay's record so far, in numbers."""
-        evidence = self.evidence()
-        return Recorded(
-            switches=len(evidence.switches),
-            period_s=evidence.period * evidence.Ts,
-            span=evidence.span,
+    def relay_figures(self) -> RelayFigures:
+        """The figures of the relay test so far."""
+        record = self.experiment_record()
+        return RelayFigures(
+            switches=len(record.switches),
+            period_s=record.period * record.Ts,
+            span=record.output_range,
             noise=self.noise,
             amplitude=self.amplitude,
-            samples=len(evidence.y),
+            samples=len(record.y),
         )
 
     @property
     def stepped(self) -> tuple[float, float]:
-        """The set-point step, PV units, and how long ago it was made, s."""
+        """The size of the set-point step, PV units, and the time since that step, s."""
         return self._step, self.trace.t[-1] - self.trace.t[self.relayed]
 
-    def tell(self, *events: Event) -> Plan[None]:
-        """The sample that an event takes belongs to the record."""
-        self._commands = self._hear((yield (*self._commands, *events)))
+    def report(self, *events: Event) -> Plan[None]:
+        """Hands events to the runner; the sample that comes back belongs to the record."""
+        self._commands = self._on_sample((yield (*self._commands, *events)))
 
     def relay(self, switches: int) -> Plan[bool]:
-        """Goes on until the relay has switched so often; False where the time is over first.
+        """Runs the relay until it has switched this number of times; False if the time is over before that.
 
         Raises Refused: NO_RESPONSE, WRONG_SIGN, CANNOT_OSCILLATE up to the second switch, STALLED before the fourth.
         """
         if not self.relayed:
             self.listened = self.relayed = len(self.trace)
-            self._commands = (self._armed(), SetMode(Mode.EXPERIMENT))
+            self._commands = (self._relay_command(), SetMode(Mode.EXPERIMENT))
         while len(self.switches) < switches:
-            self._commands = self._hear((yield self._commands))
-            if self._over():
+            self._commands = self._on_sample((yield self._commands))
+            if self._time_is_over():
                 if len(self.switches) < MIN_SWITCHES:
                     raise self._stalled()
                 return False
         return True
 
     def step(self, gains: Gains, model_period: float) -> Plan[None]:
-        """The new gains take over with nothing in the integral, and the set-point steps by up to half the span.
+        """Puts the new gains in effect with an empty integral, then steps the set-point by at most half the range of
+        PV under the relay.
 
-        model_period: s; a load, or hysteresis, makes the relay's longer.
+        model_period: the ultimate period of the model, s; a load disturbance or the hysteresis prolongs the relay's own
+        period.
         """
         relay_period = period(tuple(self.switches)) * self.facts.sample_time_s
-        self._follow_s = VERIFIED_PERIODS * min(max(model_period, SHORTEST * relay_period), relay_period)
+        self._follow_s = VERIFICATION_PERIODS * min(max(model_period, MIN_MODEL_PERIOD * relay_period), relay_period)
         facts, point = self.facts, self.point
-        span = self.evidence().span
+        span = self.experiment_record().output_range
         size = min(0.5 * span, self.amplitude / gains.Kp, facts.sp_deviation)
         self.relayed = len(self.trace)
         self._commands = ()
-        # bumpless from the relay's side, the integral would begin there, as far away as a load that has been lifted;
-        # from the proportional part alone it begins at rest
+        # A bumpless transfer from the relay would start the integral at the relay's output, which acts like a load
+        # disturbance. The output is set to the proportional part first, so that the integral starts at rest.
         error = (point.pv - self.trace.pv[-1]) * (1.0 if facts.reverse else -1.0)
         output = min(max(point.mv + gains.Kp * error, facts.mv_low), facts.mv_high)
-        self._keep((yield (SetMode(Mode.MANUAL), SetOutput(output), SetGains(gains))))
+        self._add((yield (SetMode(Mode.MANUAL), SetOutput(output), SetGains(gains))))
         self._step = size
         yield from self._follow((SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp + size)), span)
 
     def step_back(self) -> Plan[None]:
-        """The set-point steps home, under the same gains, for half as long."""
-        self._follow_s *= BACK
-        yield from self._follow((SetSetpoint(self.point.sp),), self.evidence().span)
+        """Steps the set-point back under the same gains and follows PV for half as long as after the first step."""
+        self._follow_s *= STEP_BACK_FRACTION
+        yield from self._follow((SetSetpoint(self.point.sp),), self.experiment_record().output_range)
 
     def _follow(self, commands: tuple[Command, ...], span: float) -> Plan[None]:
-        """Raises Refused, DIVERGES."""
+        """Follows PV after a set-point step. Raises Refused, DIVERGES."""
         self._steps.append(len(self.trace))
         sample = yield commands
-        self._keep(sample)
+        self._add(sample)
         end = sample.t + self._follow_s
         while sample.t < end:
             sample = yield ()
-            self._keep(sample)
-            if abs(sample.pv - self.point.pv) > FAR * span:
+            self._add(sample)
+            if abs(sample.pv - self.point.pv) > DIVERGED * span:
                 raise Refused(
                     Reason.DIVERGES,
                     f"PV is {sample.pv - self.point.pv:+.4g} away; the relay had moved it by {span:.4g}",
                 )
 
     def computed(self, compute: Callable[[], T]) -> Plan[T]:
-        """Its result; the record goes on meanwhile."""
+        """The result of a long computation; the record goes on meanwhile."""
         work = Work(compute)
-        self._commands = self._hear((yield (*self._commands, work)))
+        self._commands = self._on_sample((yield (*self._commands, work)))
         while not work.done:
-            self._commands = self._hear((yield self._commands))
+            self._commands = self._on_sample((yield self._commands))
         return work.result()
 
-    def evidence(self) -> Evidence:
-        """The record as it is."""
+    def experiment_record(self) -> ExperimentRecord:
+        """The record so far, as deviations from rest."""
         trace = self.trace
         rest = slice(0, self.listened)
-        return Evidence(
+        return ExperimentRecord(
             Ts=self.facts.sample_time_s,
             u=np.asarray(trace.mv) - float(np.mean(trace.mv[rest])),
             y=np.asarray(trace.pv) - float(np.mean(trace.pv[rest])),
@@ -182,8 +190,8 @@ class Experiment:
             steps=tuple(self._steps),
         )
 
-    def _keep(self, sample: Sample) -> None:
-        """Into the record; samples lost before it are made up: PV in between, MV as it was."""
+    def _add(self, sample: Sample) -> None:
+        """Adds a sample to the record. Missing samples before it are filled: PV interpolated, MV held."""
         trace, Ts = self.trace, self.facts.sample_time_s
         lost = round((sample.t - trace.t[-1]) / Ts) - 1
         t, pv = trace.t[-1], trace.pv[-1]
@@ -196,10 +204,10 @@ class Experiment:
     def _stepping(self) -> bool:
         return self.relayed > self.listened
 
-    def _hear(self, sample: Sample) -> tuple[Command, ...]:
-        """One sample under the relay; what is to be commanded for it."""
+    def _on_sample(self, sample: Sample) -> tuple[Command, ...]:
+        """Records one sample and returns the commands that follow from it."""
         trace = self.trace
-        self._keep(sample)
+        self._add(sample)
         at = len(trace) - 1
         if sample.mode != Mode.EXPERIMENT or self._stepping:
             return ()
@@ -211,7 +219,7 @@ class Experiment:
                 return self._adapted()
             if self._sides != [BIAS, 1.0]:
                 self._sides = [BIAS, 1.0]
-                return (self._armed(),)
+                return (self._relay_command(),)
         elif len(self.switches) >= 2:
             longest = max(np.diff([self.listened, *self.switches]))
             since = at - max(self.switches[-1], self._raise_at)
@@ -219,15 +227,17 @@ class Experiment:
                 self._raise_at = at
                 side = int(high)
                 maximum = self._max * (1.0 if high else BIAS) / self.amplitude
-                raised = min(RAISED * self._sides[side], MAX_RAISED * (1.0, BIAS)[not high], maximum)
+                raised = min(RAISE_FACTOR * self._sides[side], MAX_RAISE * (1.0, BIAS)[not high], maximum)
                 if raised > self._sides[side]:
                     self._sides[side] = raised
-                    return (self._armed(),)
+                    return (self._relay_command(),)
         return ()
 
     def _adapted(self) -> tuple[Command, ...]:
-        """After the first wave: more amplitude above the noise, or less where PV went too far. Raises Refused,
-        NO_RESPONSE: MV has switched, and PV stands still."""
+        """Adapts the amplitude after the first wave: up where PV hardly exceeds the noise, down where PV moved too far.
+
+        Raises Refused, NO_RESPONSE: MV has switched, and PV stands still.
+        """
         seen = float(np.ptp(self.trace.pv[self.listened :]))
         factor = 1.0
         if seen == 0.0:
@@ -236,27 +246,28 @@ class Experiment:
                 f"the relay of {self.amplitude:.4g} has switched twice, and PV is exactly {self.trace.pv[-1]:.6g} "
                 f"all the time (noise {self.noise:.3g} before)",
             )
-        if seen < MIN_SPAN * self.noise:
-            factor = min(GOOD_SPAN * self.noise / seen, self._max / self.amplitude)
-        elif seen > WIDEST_SPAN * self.facts.sp_deviation:
-            factor = max(WIDEST_SPAN * self.facts.sp_deviation, MIN_SPAN * self.noise) / seen
+        if seen < MIN_OUTPUT_RANGE * self.noise:
+            factor = min(GOOD_OUTPUT_RANGE * self.noise / seen, self._max / self.amplitude)
+        elif seen > MAX_OUTPUT_RANGE * self.facts.sp_deviation:
+            factor = max(MAX_OUTPUT_RANGE * self.facts.sp_deviation, MIN_OUTPUT_RANGE * self.noise) / seen
         if 0.8 < factor < 1.25:
             return ()
         self.amplitude *= factor
-        return (self._armed(),)
+        return (self._relay_command(),)
 
-    def _armed(self) -> SetRelay:
+    def _relay_command(self) -> SetRelay:
         low, high = (self.amplitude * side for side in self._sides)
         hysteresis = max(HYSTERESIS * self.noise, MIN_HYSTERESIS * self.facts.sp_deviation)
-        average = AVERAGED if self.noise > 0.0 else 1
+        average = SAMPLES_AVERAGED if self.noise > 0.0 else 1
         return SetRelay(high, hysteresis, self.point.mv, amplitude_low=low, average=average)
 
-    def _over(self) -> bool:
-        """The time is over: before the second switch by T95, after it by the half periods."""
+    def _time_is_over(self) -> bool:
+        """Whether the time of the relay is over. The limit comes from T95 before the second switch, and from the half
+        periods after it. Raises Refused before the second switch, see `no_oscillation`."""
         passed = len(self.trace) - self.listened
         if len(self.switches) < 2:
             if passed * self.facts.sample_time_s > max(3.0 * self.facts.T95_s, 40 * self.facts.sample_time_s):
-                point = replace(self.point, room=self.amplitude)  # what it tells is what the relay moved
+                point = replace(self.point, room=self.amplitude)  # the message names the amplitude of the relay
                 raise no_oscillation(self.facts, point, self._since(), len(self.switches))
             return False
         halves = np.diff(self.switches)

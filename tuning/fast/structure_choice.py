@@ -1,4 +1,7 @@
-"""Which structure a fast record supports, and whether something beside MV moved PV: seven structures by BIC."""
+"""The choice of the model structure that a fast record supports, and of the disturbances that also moved PV.
+
+Seven structures are fitted, and the Bayesian information criterion (BIC) chooses among them.
+"""
 
 from __future__ import annotations
 
@@ -8,59 +11,75 @@ from functools import partial, reduce
 
 import numpy as np
 
-from loopwright.tuning.fast.record import Evidence
-from loopwright.tuning.identification.disturbances import better, by_bic, fits, stories, under
-from loopwright.tuning.identification.output_error import QUIET, Fit, Fitted, Hypothesis
+from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.identification.disturbances import (
+    by_bic,
+    disturbance_candidates,
+    fit_structures,
+    preferred,
+    started_under,
+)
+from loopwright.tuning.identification.output_error import UNDISTURBED, DisturbanceHypothesis, Fit, Fitted
 
-RIVAL = 10.0
-"""Of BIC: structures this near to the best could be true as well."""
-UNEXPLAINED = 1.15
-"""Of the noise at rest: a residual above it asks for a story."""
-UNIMPORTANT = 0.0015
-"""Of PV's span: a residual below it never does."""
-SLOW = 2.0
-"""Periods, of the slowest lag, from which a drift is tried in any case."""
+RIVAL_BIC = 10.0
+"""Difference of BIC within which another structure is a rival: it explains the record almost as well as the best."""
+MAX_RESIDUAL = 1.15
+"""Residual, in standard deviations of the noise at rest, above which disturbance hypotheses are tried."""
+NEGLIGIBLE_RESIDUAL = 0.0015
+"""Residual, as a fraction of the range of PV, below which no disturbance hypothesis is tried."""
+SLOW_LAG = 2.0
+"""Slowest time constant, in periods, above which a drift is tried in any case."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Chosen:
-    """best: the fit to go on with.  rivals: others that could be true as well.  fits: all with the same story."""
+class StructureChoice:
+    """The structure chosen, with its competitors.
+
+    best: the fit that the design uses.
+    rivals: fits of other structures whose BIC is within RIVAL_BIC of the best.
+    fits: all fits under the disturbance hypothesis of the best one.
+    """
 
     best: Fitted
     rivals: tuple[Fitted, ...]
     fits: tuple[Fitted, ...]
 
 
-def choose(fit: Fit[Evidence], known: Sequence[Fitted] = ()) -> Chosen:
-    """known: fits of an earlier part of the same record, from which is started as well."""
-    quiet = fits(fit, QUIET, known)
-    found = quiet
-    first = min(quiet, key=by_bic)
+def choose_structure(fit: Fit[ExperimentRecord], known: Sequence[Fitted] = ()) -> StructureChoice:
+    """The structure and the disturbance hypothesis that explain the record best.
+
+    known: fits of an earlier part of the same record, which are further starts of the search.
+    """
+    undisturbed = fit_structures(fit, UNDISTURBED, known)
+    found = undisturbed
+    first = min(undisturbed, key=by_bic)
     if _unexplained(fit, first):
-        found = better(found, reduce(better, stories(fit, quiet, partial(_unexplained, fit), known)))
+        found = preferred(
+            found, reduce(preferred, disturbance_candidates(fit, undisturbed, partial(_unexplained, fit), known))
+        )
     elif _slow(fit, first):
-        # MV at rest is known as well as the noise lets it be; what it is off by is a drift to a slow plant
-        drift = Hypothesis(drift=True)
-        drifting = fits(fit, drift, [*known, *under(drift, quiet)])
+        # The noise limits how well MV at rest is known; an error of MV at rest makes a slow plant drift.
+        drift = DisturbanceHypothesis(drift=True)
+        drifting = fit_structures(fit, drift, [*known, *started_under(drift, undisturbed)])
         found = drifting if min(map(by_bic, drifting)) < first.bic else found
     ranked = sorted(found, key=by_bic)
-    # the record hardly shows the static gain of a slow plant; that it has the wrong sign is then no finding
-    ranked = [each for each in ranked if _goes_right(fit, each)] or ranked
-    rivals = tuple(each for each in ranked[1:] if each.bic < ranked[0].bic + RIVAL)
+    # The record hardly shows the static gain of a slow plant, so a wrong sign alone does not rule a model out.
+    ranked = [each for each in ranked if _gain_has_the_right_sign(fit, each)] or ranked
+    rivals = tuple(each for each in ranked[1:] if each.bic < ranked[0].bic + RIVAL_BIC)
     same = tuple(each for each in ranked if each.hypothesis == ranked[0].hypothesis)
-    return Chosen(ranked[0], rivals, same)
+    return StructureChoice(ranked[0], rivals, same)
 
 
-def _goes_right(fit: Fit[Evidence], found: Fitted) -> bool:
-    """The static gain has the sign that the controller's action says."""
-    return fit.static_gain(found) * fit.evidence.direction > 0.0
+def _gain_has_the_right_sign(fit: Fit[ExperimentRecord], found: Fitted) -> bool:
+    """Whether the static gain has the sign that agrees with the controller's action."""
+    return fit.static_gain(found) * fit.record.direction > 0.0
 
 
-def _slow(fit: Fit[Evidence], found: Fitted) -> bool:
-    """The slowest lag is longer than the relay's record can show whole."""
+def _slow(fit: Fit[ExperimentRecord], found: Fitted) -> bool:
+    """Whether the slowest lag is too long for the relay's record to show it completely."""
     poles = np.roots(np.append(1.0, found.structure.monic(found.theta[: found.structure.searched])))
-    return bool(np.min(np.abs(poles)) < 1.0 / (SLOW * fit.period))
+    return bool(np.min(np.abs(poles)) < 1.0 / (SLOW_LAG * fit.period))
 
 
-def _unexplained(fit: Fit[Evidence], best: Fitted) -> bool:
-    return best.rms > max(UNEXPLAINED * fit.evidence.noise / fit.evidence.span, UNIMPORTANT)
+def _unexplained(fit: Fit[ExperimentRecord], best: Fitted) -> bool:
+    return best.rms > max(MAX_RESIDUAL * fit.record.noise / fit.record.output_range, NEGLIGIBLE_RESIDUAL)

@@ -1,4 +1,4 @@
-"""How far Ms of a controller may be off, as the record leaves the model uncertain: the delta method, and the rivals."""
+"""The uncertainty of Ms that the uncertainty of the model causes: by the delta method, and among rival models."""
 
 from __future__ import annotations
 
@@ -8,43 +8,61 @@ from collections.abc import Sequence
 import numpy as np
 
 from loopwright.tuning.fast.design import controller
-from loopwright.tuning.fast.record import Evidence
+from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.output_error import LOG_STEP, Fit, Fitted
 from loopwright.tuning.identification.sensitivity import sensitivities
 from loopwright.tuning.models import Complexes, Reals, TransferFunction, sign
 
 NEAR_THE_PEAK = 0.7
-"""Of |S|: where it is less, an error of the model costs nothing."""
+"""Smallest |S| at which a model error is counted: where the sensitivity S is smaller, an error does not raise Ms."""
 STANDARD_DEVIATIONS = 2.0
 UNSEEN = 1e-7
-"""Singular value, of columns of unit length."""
+"""Singular value, of columns of unit length, below which the record does not show a direction of the parameters."""
 MIN_DISTANCE = 0.05
-"""Of the loop from -1; nearer, Ms is anything."""
+"""Smallest distance of the loop from -1 that is used; closer than that, Ms is not bounded."""
 
 
-def colour(residual: Reals) -> float:
-    """By how much slow averages of the residual vary more than white noise would, at least 1."""
+def durbin_watson_ratio(residual: Reals) -> float:
+    """2/d with the Durbin-Watson statistic d of the residual, at least 1: 1 for white noise, larger for slow noise.
+
+    residual: shape (N,), with a mean of about zero. Source: J. Durbin, G. S. Watson, Biometrika 37, 1950, the statistic
+    d, which is the sum of the squared differences of neighbours divided by the sum of squares.
+    """
     fast = 0.5 * float(np.mean(np.diff(residual) ** 2))
     return max(1.0, float(np.mean(residual**2)) / fast) if fast > 0.0 else 1.0
 
 
-def fit_covariance(fit: Fit[Evidence], found: Fitted) -> Reals:
-    """Of theta and the linear coefficients, in this order."""
-    variance = found.linear.rss / max(fit.samples - found.parameters, 1) * colour(found.linear.residual)
+def fit_covariance(fit: Fit[ExperimentRecord], found: Fitted) -> Reals:
+    """The covariance of theta and of the linear coefficients, in this order, shape (parameters, parameters).
+
+    The variance of the residual is multiplied by its Durbin-Watson ratio.
+    """
+    variance = found.linear.rss / max(fit.samples - found.parameters, 1) * durbin_watson_ratio(found.linear.residual)
     return seen_covariance(sensitivities(fit, found), variance)
 
 
 def seen_covariance(columns: Reals, variance: float) -> Reals:
-    """variance * (A'A)^-1 without the directions that move PV by next to nothing: they move the loop as little."""
+    """variance * (A'A)^-1 without the directions of the parameters that hardly move PV: they hardly move the loop.
+
+    columns: the sensitivities A, shape (N, parameters).
+    """
     lengths = np.sqrt(np.einsum("ij,ij->j", columns, columns))
     lengths = np.where(lengths > 0.0, lengths, 1.0)
     inverse = np.linalg.pinv(columns / lengths, rcond=UNSEEN)
     return np.asarray(variance * (inverse @ inverse.T) / np.outer(lengths, lengths))
 
 
-def uncertainty_of_Ms(fit: Fit[Evidence], found: Fitted, gains: Gains, w: Reals, N: float, delay: float) -> float:
-    """Ms that would be met at two standard deviations, less the nominal one. delay: s, of the sampling."""
+def uncertainty_of_Ms(
+    fit: Fit[ExperimentRecord], found: Fitted, gains: Gains, w: Reals, N: float, delay: float
+) -> float:
+    """Ms with the model two standard deviations off, less the nominal Ms, by the delta method.
+
+    gains: the controller.
+    w: the frequency grid, rad/s.
+    N: the derivative filter is Td/N.
+    delay: the delay of the sampling, s.
+    """
     structure, theta, c = found.structure, found.theta, found.linear.coefficients
     inputs = structure.inputs
     at = np.concatenate((theta[: structure.searched], c[:inputs]))
@@ -58,12 +76,12 @@ def uncertainty_of_Ms(fit: Fit[Evidence], found: Fitted, gains: Gains, w: Reals,
     slopes = []
     for i in range(len(at)):
         if i == structure.lags:
-            slopes.append(-1j * w * fit.evidence.Ts * nominal)
+            slopes.append(-1j * w * fit.record.Ts * nominal)
             continue
         step = LOG_STEP * (abs(at[i]) + 1e-12 if i >= structure.searched else 1.0)
         move = np.zeros(len(at))
         move[i] = step
-        # weak directions are long: their parts must cancel to many digits
+        # Weak directions of the covariance are long, so their contributions must cancel to many digits.
         slopes.append((loop(at + move) - loop(at - move)) / (2.0 * step))
     distance = np.abs(1.0 + nominal)
     along = np.real(np.array(slopes) * np.conj(1.0 + nominal) / distance)
@@ -76,15 +94,15 @@ def uncertainty_of_Ms(fit: Fit[Evidence], found: Fitted, gains: Gains, w: Reals,
 
 
 def difference_of_rivals(
-    fit: Fit[Evidence], best: Fitted, rivals: Sequence[Fitted], gains: Gains, w: Reals, delay: float
+    fit: Fit[ExperimentRecord], best: Fitted, rivals: Sequence[Fitted], gains: Gains, w: Reals, delay: float
 ) -> float:
-    """The largest |Ms - nominal Ms| that the same controller has on another model the record supports."""
+    """The largest |Ms - nominal Ms| that the same controller has on a rival model; w in rad/s, delay in s."""
     nominal = peak(fit.model(best), gains, w, delay)
     return max((abs(peak(fit.model(rival), gains, w, delay) - nominal) for rival in rivals), default=0.0)
 
 
 def peak(model: TransferFunction, gains: Gains, w: Reals, delay: float = 0.0) -> float:
-    """Ms of the loop on the grid w."""
+    """Ms of the loop on the frequency grid w (rad/s), with a further delay (s)."""
     N = gains.Td / gains.Tf if gains.Tf > 0.0 else 10.0
     C = gains.Kp * controller(w, gains.Ti, gains.Td, N) * sign(model)
     minimum = float(np.abs(1.0 + C * _delayed(model, w, delay)).min())

@@ -1,4 +1,4 @@
-"""The five-stage procedure as one plan made of plans.
+"""The five-stage procedure is one plan made of smaller plans.
 
     preflight - baseline - 1 relay - 2 ultimate gain - 3 ZN PI, overshoot - 4 model - 5 gains - verify
 
@@ -40,12 +40,12 @@ STAGES = ("preflight", "baseline", "relay", "ultimate", "zn_pi", "estimate", "op
 R = TypeVar("R")
 PROCEDURE = "five-stage"
 MAX_GAIN = 60.0
-"""Ku * K of a FOPDT plant with L/T = 0.026, half the least that formula (2) was checked for."""
+"""Ku * K of a FOPDT plant with L/T = 0.026, which is half the smallest value that formula (2) was checked for."""
 Entry = Literal["relay", "zn_pi", "estimate", "optimise"]
 
 
 def stages_of(start: Entry, baseline: bool, verify: bool) -> tuple[str, ...]:
-    """The stages of a run that enters there, in their order."""
+    """The stages of a run that enters at `start`, in their order."""
     entered = STAGES.index(start)
     left_out = {stage for stage, wanted in (("baseline", baseline), ("verify", verify)) if not wanted}
     return tuple(
@@ -60,15 +60,23 @@ def rule_of(method: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """Where to enter, and what was typed in for that: zn_pi needs Ku, Pu_s; estimate needs Kp, Ti_s, overshoot_pct;
-    optimise needs model.
+    """The options of the procedure.
 
-    k_source: the gain that goes into the FOPDT estimate, "k5" (formula 5) or "ke" (measured).
-    method, method_options: what gives the gains, "five-stage" (criterion 7) or another of `tuning.rules.registry`.
-    model_from: the model it gets, "overshoot" (the paper's FOPDT estimate) or "record" (identified from the set-point
-    step of Stage 3). By default five-stage takes the first; the others the second, unless it does not explain the step.
-    kp_step_factor: Stage 3 multiplies Kp by this instead of adding 0.1 (Ku - Kp).
-    propose_anyway: go on where the new gains bring nothing that was asked for.
+    start: the stage at which the procedure is entered.
+    Ku, Pu_s: the ultimate point that a start at zn_pi needs.
+    Kp, Ti_s, overshoot_pct: the PI and its overshoot that a start at estimate needs.
+    model: the model that a start at optimise needs.
+    k_source: the gain in the FOPDT estimate, "k5" (formula 5) or "ke" (measured).
+    kp_step_factor: Stage 3 multiplies Kp by this factor instead of adding 0.1 (Ku - Kp).
+    overshoot_window_pct: the overshoots, percent, that Stage 3 accepts.
+    baseline, verify: whether the steps before and after are made.
+    method, method_options: the method that gives the gains, "five-stage" (criterion 7) or another of
+    `tuning.rules.registry`.
+    model_from: the model that the method gets, "overshoot" (the paper's FOPDT estimate) or "record" (identified from
+    the set-point step of Stage 3). By default five-stage takes the first, and the others take the second unless it does
+    not explain the step.
+    propose_anyway: the procedure goes on where the new gains improve nothing that was asked for.
+    Raises Refused, BAD_INPUT.
     """
 
     start: Entry = "relay"
@@ -115,11 +123,16 @@ class Options:
 
 
 @dataclass(frozen=True, slots=True)
-class Model:
-    """What the gains were made on: FOPDT, or SOPDT when zeta is given (T_s is then 1/(natural frequency)).
+class EstimatedModel:
+    """The model on which the gains are designed: FOPDT, or SOPDT when zeta is given.
 
-    K: PV units per MV unit, signed.  k_source: "k5" or "ke" (the estimate with either gain), "record" or "typed in".
-    fit_pct: NRMSE fit to the record, where there was one.
+    K: the gain, PV units per MV unit, signed.
+    T_s: the time constant, or 1/(natural frequency) of a SOPDT, s.
+    L_s: the dead time, s.
+    k_source: "k5" or "ke" (the estimate with either gain), "record" (identified) or "typed in".
+    k5, ke: the gain by formula (5) and the measured gain, PV units per MV unit.
+    zeta: the damping ratio of a SOPDT.
+    fit_pct: the NRMSE fit to the record, percent, None without a record.
     """
 
     K: float
@@ -132,6 +145,7 @@ class Model:
     fit_pct: float | None = None
 
     def plant(self) -> FOPDT | SOPDT:
+        """The same model as a process model of the library."""
         if self.zeta is None:
             return FOPDT(self.K, self.T_s, self.L_s)
         return SOPDT(self.K, self.T_s, self.zeta, self.L_s)
@@ -139,15 +153,22 @@ class Model:
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """What the operator decides on. Gains in ISA form, MV per PV unit and seconds.
+    """The proposal that the operator decides on. Gains are in ISA form, MV units per PV unit and s.
 
-    comparison: old and new gains on the model. Where it shows no gain the present gains are kept, unless a proposal was
-    asked for all the same: then there is nothing to decide on, and nothing was verified.
+    method, chosen: the method, and the design parameters in effect.
+    model: the model on which the gains were designed.
+    old_gains, gains: the present gains and the gains proposed.
+    predicted: the main figures of the new gains on the model.
+    comparison: old and new gains on the model. Where it shows no gain, the present gains are kept, nothing is verified
+    and there is nothing to decide on, unless a proposal was asked for all the same.
+    ultimate: the ultimate point, None where none was measured or typed in.
+    baseline, verification: the set-point steps under the old and under the new gains, None where they were not made.
+    notes: what the operator should know, one sentence each.
     """
 
     method: str
     chosen: Mapping[str, float]
-    model: Model
+    model: EstimatedModel
     old_gains: Gains
     gains: Gains
     predicted: Predicted
@@ -160,18 +181,22 @@ class Proposal:
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """What an earlier attempt, cut off later, had found: those stages are not run again. Preflight and verify are."""
+    """The results of an earlier attempt that was cut off. Their stages are not run again; preflight and verify are."""
 
     baseline: StepResult | None = None
     relay: RelayResult | None = None
     ultimate: UltimateResult | None = None
     zn_pi: ZnResult | None = None
-    estimate: Model | None = None
+    estimate: EstimatedModel | None = None
     optimise: Designed | None = None
 
 
 def five_stage(facts: Facts, options: Options, finished: Finished = Finished()) -> Plan[Proposal]:
-    """The whole procedure on a loop in automatic and at rest. Raises Refused; restores nothing (the runner does)."""
+    """The plan of the whole procedure, for a loop in automatic and at rest.
+
+    finished: the results of an earlier attempt.
+    Raises Refused. The plan restores nothing: the runner restores the loop.
+    """
     T95 = facts.T95_s
     pu_guess = options.Pu_s or T95 / 2
     expected = {
@@ -225,7 +250,7 @@ def five_stage(facts: Facts, options: Options, finished: Finished = Finished()) 
     elif options.start == "zn_pi":
         ultimate = Ultimate(_typed(options.Ku), _typed(options.Pu_s))
 
-    def estimated() -> Plan[Model]:
+    def estimated() -> Plan[EstimatedModel]:
         if zn is None:
             Kp, Ti, overshoot = _typed(options.Kp), _typed(options.Ti_s), _typed(options.overshoot_pct)
             return _estimate(facts, Kp, Ti, overshoot, gain, options.k_source, notes)
@@ -236,7 +261,7 @@ def five_stage(facts: Facts, options: Options, finished: Finished = Finished()) 
 
     zn: ZnResult | None = None
     if ultimate is not None:
-        # the record of this stage is not kept: whoever wants a model of it needs it anew
+        # the record of this stage is not stored, so a model identified from it needs a new record
         done = finished.zn_pi if finished.estimate is not None or not _wants_record(options) else None
         known, window, factor = ultimate, options.overshoot_window_pct, options.kp_step_factor
         zn = yield from stage(
@@ -278,7 +303,7 @@ def _typed(value: float | None) -> float:
 
 
 def _baseline(facts: Facts, point: OperatingPoint) -> Plan[StepResult]:
-    """The set-point step under the accepted gains, for the comparison, and a first look at gain and sign."""
+    """The set-point step under the accepted gains, for the comparison and for a first value of the static gain."""
     step = allowed_step(facts, point, facts.old_gains.Kp, math.nan)
     result = yield from step_test(facts, point, step, band=0.05, max_s=5 * facts.T95_s, smooth_s=facts.T95_s / 12)
     if abs(result.static_gain) * facts.old_gains.Kp > MAX_GAIN:
@@ -296,7 +321,9 @@ def _baseline(facts: Facts, point: OperatingPoint) -> Plan[StepResult]:
     return result
 
 
-def _estimate(facts: Facts, Kp: float, Ti: float, overshoot: float, ke: float, source: str, notes: list[str]) -> Model:
+def _estimate(
+    facts: Facts, Kp: float, Ti: float, overshoot: float, ke: float, source: str, notes: list[str]
+) -> EstimatedModel:
     estimate = fopdt_from_overshoot(Kp, Ti, overshoot)
     sign = 1.0 if facts.reverse else -1.0
     k5 = sign * estimate.k5
@@ -309,10 +336,10 @@ def _estimate(facts: Facts, Kp: float, Ti: float, overshoot: float, ke: float, s
     if source == "ke" and not known:
         raise Refused(Reason.BAD_INPUT, 'k_source "ke" needs a measured static gain: enter at an earlier stage')
     K = ke if source == "ke" else k5
-    return Model(K, estimate.T, estimate.L, source, k5, ke if known else None)
+    return EstimatedModel(K, estimate.T, estimate.L, source, k5, ke if known else None)
 
 
-def _typed_in(facts: Facts, options: Options) -> Model:
+def _typed_in(facts: Facts, options: Options) -> EstimatedModel:
     plant = options.model
     assert plant is not None  # Options has checked it
     if (plant.K > 0) != facts.reverse:
@@ -320,7 +347,7 @@ def _typed_in(facts: Facts, options: Options) -> Model:
             Reason.WRONG_SIGN,
             f"the model's gain {plant.K:g} does not go with a {'reverse' if facts.reverse else 'direct'} action",
         )
-    return Model(plant.K, plant.T, plant.L, "typed in", zeta=plant.zeta if isinstance(plant, SOPDT) else None)
+    return EstimatedModel(plant.K, plant.T, plant.L, "typed in", zeta=plant.zeta if isinstance(plant, SOPDT) else None)
 
 
 def _wants_record(options: Options) -> bool:
@@ -328,11 +355,11 @@ def _wants_record(options: Options) -> bool:
 
 
 def _identified(
-    facts: Facts, point: OperatingPoint, step: Trace, estimate: Model, asked: bool, notes: list[str]
-) -> Plan[Model]:
-    """The model that the set-point step of Stage 3 supports best, while the loop goes on.
+    facts: Facts, point: OperatingPoint, step: Trace, estimate: EstimatedModel, asked: bool, notes: list[str]
+) -> Plan[EstimatedModel]:
+    """The model that the set-point step of Stage 3 supports best, identified while the loop goes on.
 
-    Unless it was asked for, one that does not explain the step gives way to the estimate.
+    A model that does not explain the step is replaced by the estimate, unless it was asked for.
     """
     try:
         found = yield from worked(partial(identify, step.t, step.mv, step.pv, point.mv, lags_only=True))
@@ -352,10 +379,10 @@ def _identified(
     if (plant.K > 0) != facts.reverse:
         raise Refused(Reason.WRONG_SIGN, f"the set-point step fits a gain of {plant.K:.4g}, of the wrong sign")
     zeta = plant.zeta if isinstance(plant, SOPDT) else None
-    return Model(plant.K, plant.T, plant.L, "record", estimate.k5, estimate.ke, zeta, found.fit_pct)
+    return EstimatedModel(plant.K, plant.T, plant.L, "record", estimate.k5, estimate.ke, zeta, found.fit_pct)
 
 
-def _designed(options: Options, model: Model, ultimate: Ultimate | None) -> Plan[Designed]:
+def _designed(options: Options, model: EstimatedModel, ultimate: Ultimate | None) -> Plan[Designed]:
     rule = rule_of(options.method)
     compute = partial(design, rule, model.plant(), ultimate, options.method_options)
     if METHODS[rule].slow:

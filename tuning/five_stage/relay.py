@@ -1,9 +1,9 @@
-"""Stage 1: relay test, rough ultimate gain and period.
+"""Stage 1 is a relay test, which gives a rough ultimate gain and period.
 
-The relay runs inside the controller, centred on the present output. Ku_a = |U1| / |Y1| from the first harmonics of MV
-and PV over the last cycles: with an ideal relay this is the describing function 4d/(pi a), and it stays right with
-hysteresis and noise (the print's `max(P) - SP` does not). The print's parallel path, Ts/10 * e, is left out: its weight
-depends on the unit of PV, and on top of the relay it leaves the permitted range of MV.
+The relay runs inside the controller, centred on the present output. Ku_a = |U1| / |Y1| comes from the first harmonics
+of MV and PV over the last cycles. With an ideal relay this is the describing function 4d/(pi a), and it stays right
+with hysteresis and noise (the paper's `max(P) - SP` does not). The paper's parallel path, Ts/10 * e, is left out: its
+weight depends on the unit of PV, and added to the relay it leaves the permitted range of MV.
 """
 
 from __future__ import annotations
@@ -23,7 +23,15 @@ MIN_SAMPLES_PER_PERIOD = 22
 
 @dataclass(frozen=True, slots=True)
 class RelayResult:
-    """Ku_a: MV units per PV unit.  Pu_a_s: s.  amplitude: of PV, PV units.  relay: its amplitude, MV units."""
+    """The result of the relay test.
+
+    Ku_a: the approximate ultimate gain, MV units per PV unit.
+    Pu_a_s: the approximate ultimate period, s.
+    amplitude: the amplitude of PV, PV units.
+    relay: the amplitude of the relay, MV units.
+    hysteresis: the hysteresis of the relay, PV units.
+    cycles: the number of cycles.
+    """
 
     Ku_a: float
     Pu_a_s: float
@@ -34,7 +42,7 @@ class RelayResult:
 
 
 def relay_test(facts: Facts, point: OperatingPoint) -> Plan[RelayResult]:
-    """Raises Refused: WRONG_SIGN, NO_RESPONSE, CANNOT_OSCILLATE."""
+    """The relay test, until its oscillation is steady. Raises Refused: WRONG_SIGN, NO_RESPONSE, CANNOT_OSCILLATE."""
     d = point.room
     hysteresis = 3 * point.noise
     sample = yield (SetRelay(d, hysteresis, point.mv), SetMode(Mode.EXPERIMENT))
@@ -75,7 +83,10 @@ def relay_test(facts: Facts, point: OperatingPoint) -> Plan[RelayResult]:
 
 
 def _steady(trace: Trace, ups: list[int]) -> bool:
-    """Three cycles in a row alike within 10 % in height and period (the third closes the print's 3 L)."""
+    """Whether the last three cycles agree within 10 % in height and period (the third closes the paper's 3 L).
+
+    ups: the samples at which the relay switched up.
+    """
     if len(ups) < 5:
         return False
     heights = [max(trace.pv[a:b]) - min(trace.pv[a:b]) for a, b in zip(ups[-4:-1], ups[-3:], strict=True)]

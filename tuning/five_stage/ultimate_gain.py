@@ -1,9 +1,9 @@
-"""Stage 2: ultimate gain and period by P control.
+"""Stage 2 finds the ultimate gain and period by P control.
 
-A P controller, a set-point step, and the question whether the oscillation grows or dies. Each gain's growth per period
-is fitted (tuning.oscillation); the sign tables of the print become a bracket, and the next gain comes from the
-measured growth (false position on ln K, kept inside the bracket) instead of a sweep: the same end, a gap below 1 %, in
-two to five runs, and without trying gains far above Ku on the plant.
+Each run makes a set-point step under a P controller and measures whether the oscillation grows or decays. The growth
+per period is fitted (`tuning.identification.oscillation`). The sign tables of the paper become a bracket, and the next
+gain comes from the measured growth (false position on ln K, kept inside the bracket) instead of a sweep. The result is
+the same, a gap below 1 %, after two to five runs, and no gain far above Ku is tried on the plant.
 """
 
 from __future__ import annotations
@@ -22,21 +22,29 @@ from loopwright.tuning.reasons import Reason, Refused
 
 GAP = 0.01
 EQUAL = 0.002
-"""Growth per period that counts as equal swings: 0.1 % of Ku on a plant of this class."""
+"""Growth per period below which the oscillation counts as undamped: 0.1 % of Ku on a plant of this class."""
 SLOPE = 2.5
 """d ln(growth per period) / d ln K near Ku for a FOPDT plant with L/T = 0.5; a start value only."""
 MAX_RUNS = 16
 KICK, NOISY_KICK = 0.25, 0.45
-"""The step's first kick as a share of the room for MV: gains stay near Ku, so swings stay inside. Noise buys more."""
+"""First kick of the step as a fraction of the room for MV, without and with noise. Gains stay near Ku, so MV stays
+within its room."""
 RUN_MV_LIMIT = 0.98
-"""Of the room for MV, at which a run is ended."""
+"""Move of MV, as a fraction of its room, at which a run is ended."""
 UNCERTAIN = 0.05
-"""Noise as a share of the step, above which the oscillation feeds on noise and Ku is no longer sharp."""
+"""Noise, as a fraction of the step, above which noise sustains the oscillation and Ku is uncertain."""
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One P run: its gain, ln of growth per period, that figure's standard error, period (s), duration (s)."""
+    """One run under P control.
+
+    K: the gain, MV units per PV unit.
+    growth: the logarithm of the growth of the oscillation per period.
+    error: the standard error of `growth`.
+    period_s, duration_s: the period of the oscillation and the duration of the run, s.
+    ended: why the run ended.
+    """
 
     K: float
     growth: float
@@ -48,8 +56,14 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class UltimateResult:
-    """Ku: MV units per PV unit.  Pu_s: s.  gap: width of the last bracket, relative.  static_gain: from the P
-    offsets.
+    """The ultimate point, as measured.
+
+    Ku: the ultimate gain, MV units per PV unit.
+    Pu_s: the ultimate period, s.
+    gap: the relative width of the last bracket.
+    static_gain: the static gain from the offsets under P control, PV units per MV unit, signed.
+    step: the set-point step of the runs, PV units.
+    runs: all runs.
     """
 
     Ku: float
@@ -61,7 +75,8 @@ class UltimateResult:
 
 
 def ultimate_gain(facts: Facts, point: OperatingPoint, rough: RelayResult) -> Plan[UltimateResult]:
-    """Raises Refused: NO_BRACKET, NOISE_TOO_HIGH."""
+    """Finds the ultimate point, starting from the result of the relay test. Raises Refused: NO_BRACKET,
+    NOISE_TOO_HIGH."""
     step = KICK * point.room / rough.Ku_a
     step = min(facts.sp_deviation, step if point.noise < UNCERTAIN / 2 * step else NOISY_KICK / KICK * step)
     if point.noise > UNCERTAIN * step:
@@ -104,7 +119,8 @@ def ultimate_gain(facts: Facts, point: OperatingPoint, rough: RelayResult) -> Pl
 
 
 def _next_gain(runs: list[Run], low: Run | None, high: Run | None) -> float:
-    """Where growth should be zero, a little beyond it on the other side, so that the bracket closes from both."""
+    """The gain of the next run: a little beyond the gain at which the growth should be zero, so that the bracket closes
+    from both sides."""
     last = runs[-1]
     slope = SLOPE
     if len(runs) > 1:
@@ -120,7 +136,10 @@ def _next_gain(runs: list[Run], low: Run | None, high: Run | None) -> float:
 
 
 def _p_run(facts: Facts, point: OperatingPoint, K: float, step: float, period: float) -> Plan[tuple[Run, float]]:
-    """One P run; ends as soon as the sign is clear twice in a row, at the latest after max(1.2 T95, 6 periods)."""
+    """One run under P control, and the mean of PV in it.
+
+    The run ends when the sign of the growth is clear twice in a row, at the latest after max(1.2 T95, 6 periods).
+    """
     target = point.sp + step
     sample = yield (SetGains(Gains(Kp=K)), SetMode(Mode.AUTOMATIC), SetSetpoint(target))
     while not same(sample.sp, target) or sample.mode != Mode.AUTOMATIC:
@@ -131,7 +150,7 @@ def _p_run(facts: Facts, point: OperatingPoint, K: float, step: float, period: f
     ask = start + 2.5 * period
     limit = RUN_MV_LIMIT * point.room
     before: Growth | None = None
-    verdict: Growth | None = None
+    growth: Growth | None = None
     ended = "time"
     at_limit = 0
     while sample.t - start < longest:
@@ -143,27 +162,30 @@ def _p_run(facts: Facts, point: OperatingPoint, K: float, step: float, period: f
                 break
         if sample.t >= ask:
             ask += 0.5 * period
-            verdict = _growth(trace, start + period, period)
-            clear = abs(verdict.log_per_period) > max(0.02, 5 * verdict.error)
-            if clear and before and verdict.log_per_period * before.log_per_period > 0:
+            growth = _growth(trace, start + period, period)
+            clear = abs(growth.log_per_period) > max(0.02, 5 * growth.error)
+            if clear and before and growth.log_per_period * before.log_per_period > 0:
                 ended = "clear"
                 break
-            before = verdict
+            before = growth
         sample = yield ()
     if ended == "mv limit":
-        swings = verdict.log_per_period if verdict else 0.0
-        mean = verdict.mean if verdict else point.pv
+        swings = growth.log_per_period if growth else 0.0
+        mean = growth.mean if growth else point.pv
         return Run(K, max(0.05, swings), math.inf, period, sample.t - start, ended), mean
     if ended == "time":
-        verdict = _growth(trace, start + period, period)
-    assert verdict is not None
-    if not 0.5 < verdict.period / period < 2 or verdict.amplitude < 2 * verdict.noise / math.sqrt(len(trace)):
-        return Run(K, -0.5, 0.1, period, sample.t - start, "died out"), verdict.mean
-    return Run(K, verdict.log_per_period, verdict.error, verdict.period, sample.t - start, ended), verdict.mean
+        growth = _growth(trace, start + period, period)
+    assert growth is not None
+    if not 0.5 < growth.period / period < 2 or growth.amplitude < 2 * growth.noise / math.sqrt(len(trace)):
+        return Run(K, -0.5, 0.1, period, sample.t - start, "died out"), growth.mean
+    return Run(K, growth.log_per_period, growth.error, growth.period, sample.t - start, ended), growth.mean
 
 
 def _growth(trace: Trace, since: float, period: float) -> Growth:
-    """Of the last four periods at most: what came before is only the transient."""
+    """The growth of the oscillation over at most the last four periods; earlier samples show only the transient.
+
+    since: the plant time from which samples are used, s.
+    """
     t = np.asarray(trace.t)
     keep = t >= max(since, t[-1] - 4 * period)
     return fit_growth(t[keep], np.asarray(trace.pv)[keep], period)

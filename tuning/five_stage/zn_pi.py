@@ -1,6 +1,6 @@
-"""Stage 3: Ziegler-Nichols PI, static gain and overshoot, with Kp moved until the overshoot is informative.
+"""Stage 3 measures the static gain and the overshoot under a Ziegler-Nichols PI, formula (1): Kp = Ku/2.2, Ti = Pu/1.2.
 
-(1)  Kp = Ku/2.2, Ti = Pu/1.2.  Outside the window Kp moves by 0.1 (Ku - Kp_zn), or by a factor (the manual mode).
+While the overshoot is outside its window, Kp is changed by 0.1 (Ku - Kp_zn), or by a factor (the paper's manual mode).
 """
 
 from __future__ import annotations
@@ -18,7 +18,14 @@ MAX_STEPS = 12
 
 @dataclass(frozen=True, slots=True)
 class ZnResult:
-    """Kp, Ti_s: the PI in effect when overshoot_pct was measured.  static_gain: signed, PV per MV units."""
+    """The result of Stage 3.
+
+    Kp, Ti_s: the PI in effect when the overshoot was measured.
+    overshoot_pct: the overshoot, percent of the step.
+    static_gain: the static gain, PV units per MV unit, signed.
+    step: the set-point step, PV units.
+    tests: the number of steps made.
+    """
 
     Kp: float
     Ti_s: float
@@ -36,10 +43,15 @@ def zn_pi(
     static_gain: float,
     window: tuple[float, float],
     factor: float | None,
-    kept: Trace,
+    into: Trace,
 ) -> Plan[ZnResult]:
-    """static_gain: a first idea (nan when there is none), to keep MV inside.  kept: gets the last step's samples.
+    """Makes set-point steps until the overshoot is inside its window.
 
+    Ku, Pu: the ultimate point, MV units per PV unit and s.
+    static_gain: a first estimate of the static gain, nan without one, which keeps MV within its room.
+    window: the overshoots that are accepted, percent.
+    factor: the factor by which Kp is changed, None for the increment of the paper.
+    into: a trace that is filled with the samples of the last step.
     Raises Refused: NO_OVERSHOOT, MV_LIMIT.
     """
     Kp, Ti = Ku / 2.2, Pu / 1.2
@@ -50,12 +62,12 @@ def zn_pi(
     while True:
         gains = Gains(Kp=Kp, Ti=Ti)
         commands = (SetGains(gains), SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp))
-        # a remnant of the last movement adds to the overshoot: a whole period of rest, whatever T95 was stated
+        # A remnant of the last movement would add to the overshoot, so the loop rests for a whole period at least.
         stay_s = max(facts.T95_s / 5, Pu)
         max_s = max(3 * facts.T95_s, 8 * Pu)
         yield from settle(point.sp, 0.005 * step, stay_s, max_s, point.noise, commands)
         found = yield from step_test(
-            facts, point, step, band=0.01, max_s=max(6 * facts.T95_s, 15 * Pu), smooth_s=Pu / 5, kept=kept
+            facts, point, step, band=0.01, max_s=max(6 * facts.T95_s, 15 * Pu), smooth_s=Pu / 5, into=into
         )
         unlimited(facts, found, gains)
         seen.append(found)

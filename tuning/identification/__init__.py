@@ -1,1 +1,1 @@
-"""From a record to a model, or the reason why the record does not determine one."""
+"""Identification turns a record into a model, or gives the reason why the record does not determine one."""

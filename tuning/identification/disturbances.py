@@ -1,7 +1,7 @@
-"""What moved PV beside MV, and through which structure: every structure under a story, and the stories themselves.
+"""Fits every model structure under each disturbance hypothesis: none, one or two load disturbances, or a drift.
 
-What the noise does not explain is first taken for a step of the load at a free time, then for two, or for a drift; such
-a story must earn its parameters clearly.
+A residual larger than the noise is explained first by one step-shaped load disturbance at a free time, then by two, or
+by a drift of PV. A disturbance hypothesis is accepted only if it lowers BIC by MIN_BIC_GAIN.
 """
 
 from __future__ import annotations
@@ -14,14 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.tuning.analysis.zero_order_hold import pulses
-from loopwright.tuning.identification.output_error import QUIET, Fit, Fitted, Hypothesis, Signals, averaged
+from loopwright.tuning.identification.output_error import (
+    UNDISTURBED,
+    DisturbanceHypothesis,
+    Fit,
+    Fitted,
+    RecordToFit,
+    averaged,
+)
 from loopwright.tuning.identification.structures import (
     FIRST,
-    FIRST_FED,
+    FIRST_WITH_FEED_THROUGH,
     INTEGRATOR,
     LAGGED_INTEGRATOR,
     SECOND,
-    SECOND_FED,
+    SECOND_WITH_FEED_THROUGH,
     SECOND_WITH_ZERO,
     THIRD_WITH_ZERO,
     THIRD_WITH_ZEROS,
@@ -29,69 +36,94 @@ from loopwright.tuning.identification.structures import (
 )
 from loopwright.tuning.models import Reals
 
-STRUCTURES = (FIRST, FIRST_FED, SECOND, SECOND_WITH_ZERO, SECOND_FED, THIRD_WITH_ZERO, THIRD_WITH_ZEROS)
-PLAIN = (FIRST, SECOND, INTEGRATOR, LAGGED_INTEGRATOR)
-"""Of each denominator the one without a zero: fitted from a grid, and the others begin where it has come to."""
+STRUCTURES = (
+    FIRST,
+    FIRST_WITH_FEED_THROUGH,
+    SECOND,
+    SECOND_WITH_ZERO,
+    SECOND_WITH_FEED_THROUGH,
+    THIRD_WITH_ZERO,
+    THIRD_WITH_ZEROS,
+)
+LAGS_ONLY = (FIRST, SECOND, INTEGRATOR, LAGGED_INTEGRATOR)
+"""The structures without zeros, one for each denominator. Their fits start from a grid, and the structures with the
+same denominator start from these fits."""
 MIN_BIC_GAIN = 15.0
-"""Of BIC: what a story beside MV must gain."""
+"""Smallest decrease of BIC for which a disturbance hypothesis, or a structure with more than lags, is accepted."""
 STARTS = 2
-THIRD_RATES = (1.0, 40.0)  # 1/period
+THIRD_RATES = (1.0, 40.0)  # rates of the third lag, in 1/period
 THIRD_STARTS = 3
-THIRD_DEAD_TIMES = (-0.12, -0.04, 0.02)  # periods, from that of two lags
-EVERY = 0.1  # periods, between the first guesses of a load's time
+THIRD_DEAD_TIMES = (-0.12, -0.04, 0.02)  # dead times of a third-order start less that of two lags, in periods
+LOAD_TIME_SPACING = 0.1  # between the first guesses of the time of a load disturbance, in periods
 FIRST_STEPS = 8
 LOAD_DEAD_TIMES = (0.06, 0.14, 0.23, 0.41)  # periods
-S = TypeVar("S", bound=Signals)
+S = TypeVar("S", bound=RecordToFit)
 
 
-def stories(
+def disturbance_candidates(
     fit: Fit[S],
-    quiet: list[Fitted],
+    undisturbed: list[Fitted],
     unexplained: Callable[[Fitted], bool],
     known: Sequence[Fitted] = (),
     structures: Sequence[Structure] = STRUCTURES,
 ) -> list[list[Fitted]]:
-    """All structures with one step of the load; and, where that leaves something over, with a drift and with two steps.
+    """The fits of all structures under disturbance hypotheses, one list for each hypothesis.
 
-    quiet: the same without a story.  unexplained: whether a fit leaves something over.  known: fits of an earlier part
-    of the same record, from which is started as well.
+    The first hypothesis is one load disturbance. A drift and two load disturbances are tried only where the best fit
+    with one load disturbance leaves a residual that is not explained.
+
+    undisturbed: the fits without a disturbance.
+    unexplained: tells whether a fit leaves a residual that is not explained.
+    known: fits of an earlier part of the same record, which are further starts of the search.
+    structures: the structures that are fitted.
     """
-    once = fits(fit, Hypothesis(loads=1), (*known, *_with_load(fit, quiet, known)), structures)
-    if not unexplained(min(once, key=by_bic)):
-        return [once]
-    drift = Hypothesis(drift=True)
-    twice = fits(fit, Hypothesis(loads=2), (*known, *_with_load(fit, once, known)), structures)
-    return [once, fits(fit, drift, [*known, *under(drift, quiet)], structures), twice]
+    one_load = fit_structures(
+        fit, DisturbanceHypothesis(load_disturbances=1), (*known, *_with_load(fit, undisturbed, known)), structures
+    )
+    if not unexplained(min(one_load, key=by_bic)):
+        return [one_load]
+    drift = DisturbanceHypothesis(drift=True)
+    two_loads = fit_structures(
+        fit, DisturbanceHypothesis(load_disturbances=2), (*known, *_with_load(fit, one_load, known)), structures
+    )
+    return [one_load, fit_structures(fit, drift, [*known, *started_under(drift, undisturbed)], structures), two_loads]
 
 
-def better(simple: list[Fitted], story: list[Fitted]) -> list[Fitted]:
-    """The story, if it has earned its parameters."""
-    return story if min(map(by_bic, story)) < min(map(by_bic, simple)) - MIN_BIC_GAIN else simple
+def preferred(undisturbed: list[Fitted], disturbed: list[Fitted]) -> list[Fitted]:
+    """The fits with the disturbance if their lowest BIC is at least MIN_BIC_GAIN lower, else those without."""
+    return disturbed if min(map(by_bic, disturbed)) < min(map(by_bic, undisturbed)) - MIN_BIC_GAIN else undisturbed
 
 
 def by_bic(fitted: Fitted) -> float:
+    """The sort key of fits: BIC, the lower the better."""
     return fitted.bic
 
 
-def under(hypothesis: Hypothesis, found: Sequence[Fitted]) -> list[Fitted]:
-    """The same parameters to begin with under a hypothesis that has as many."""
-    return [replace(each, hypothesis=hypothesis) for each in found if not each.hypothesis.loads]
+def started_under(hypothesis: DisturbanceHypothesis, found: Sequence[Fitted]) -> list[Fitted]:
+    """The fits without load disturbances as starts under a hypothesis that has as many searched parameters."""
+    return [replace(each, hypothesis=hypothesis) for each in found if not each.hypothesis.load_disturbances]
 
 
-def fits(
-    fit: Fit[S], hypothesis: Hypothesis, known: Sequence[Fitted] = (), structures: Sequence[Structure] = STRUCTURES
+def fit_structures(
+    fit: Fit[S],
+    hypothesis: DisturbanceHypothesis,
+    known: Sequence[Fitted] = (),
+    structures: Sequence[Structure] = STRUCTURES,
 ) -> list[Fitted]:
-    """Every structure under this hypothesis; those with the same denominator share where they begin."""
+    """The fits of every structure under this hypothesis. Structures with the same denominator share their starts.
+
+    known: fits whose parameters are further starts of the search.
+    """
     times = _times(hypothesis, known)
     begun: dict[tuple[int, bool], list[Reals]] = {}
-    quiet = hypothesis == QUIET
-    for plain in PLAIN:
-        if plain not in structures:
+    undisturbed = hypothesis == UNDISTURBED
+    for lags in LAGS_ONLY:
+        if lags not in structures:
             continue
-        if hypothesis.loads == 1:
-            begun[_poles(plain)] = fit.grid(plain, STARTS, float(times[0]))
+        if hypothesis.load_disturbances == 1:
+            begun[_poles(lags)] = fit.grid(lags, STARTS, float(times[0]))
         else:
-            begun[_poles(plain)] = [np.append(theta, times) for theta in fit.grid(plain, STARTS)]
+            begun[_poles(lags)] = [np.append(theta, times) for theta in fit.grid(lags, STARTS)]
     found: list[Fitted] = []
     for structure in structures:
         same = [k.theta for k in known if _poles(k.structure) == _poles(structure) and k.hypothesis == hypothesis]
@@ -99,15 +131,15 @@ def fits(
         starts = [*exact, *same[:STARTS], *begun.get(_poles(structure), [])]
         if structure.lags == 3:
             simpler = [each for each in found if each.structure in (SECOND, SECOND_WITH_ZERO)]
-            if quiet and _poles(structure) not in begun:
-                # three lags have many local minima: a grid around the dead time that two lags have come to
+            if undisturbed and _poles(structure) not in begun:
+                # three lags have many local minima: the grid lies around the dead time fitted with two lags
                 L = min(simpler, key=by_bic).theta[2] / fit.period
                 around = [L + change for change in THIRD_DEAD_TIMES]
                 begun[_poles(structure)] = fit.grid(THIRD_WITH_ZEROS, THIRD_STARTS, dead_times=around)
                 starts += begun[_poles(structure)]
             starts += [_third(fit, each, rate) for each in simpler for rate in THIRD_RATES]
             starts += [each.theta for each in found if each.structure == THIRD_WITH_ZERO]
-        elif structure not in PLAIN:
+        elif structure not in LAGS_ONLY:
             starts += [each.theta for each in found if _poles(each.structure) == _poles(structure)]
         found.append(fit.search(structure, hypothesis, _distinct(starts)))
     return found
@@ -118,7 +150,7 @@ def _poles(structure: Structure) -> tuple[int, bool]:
 
 
 def _third(fit: Fit[S], simpler: Fitted, rate: float) -> Reals:
-    """A fast lag more, and as much less dead time."""
+    """A third-order start: the simpler fit with one fast lag added, and with the dead time shortened by that lag."""
     theta = simpler.theta
     p = rate / fit.period
     L = max(theta[2] - 0.8 / p, 0.0)
@@ -133,54 +165,60 @@ def _distinct(starts: Sequence[Reals]) -> list[Reals]:
     return kept
 
 
-def _times(hypothesis: Hypothesis, known: Sequence[Fitted]) -> Reals:
-    """Of the loads, as best known."""
+def _times(hypothesis: DisturbanceHypothesis, known: Sequence[Fitted]) -> Reals:
+    """The best known times of the load disturbances, in samples; zeros where none are known."""
     best = min((k for k in known if k.hypothesis == hypothesis), key=by_bic, default=None)
-    return best.theta[best.structure.searched :] if best is not None else np.zeros(hypothesis.loads)
+    return best.theta[best.structure.searched :] if best is not None else np.zeros(hypothesis.load_disturbances)
 
 
 def _with_load(fit: Fit[S], simpler: Sequence[Fitted], known: Sequence[Fitted]) -> list[Fitted]:
-    """Fits with one step of the load more than `simpler`, from the most promising times.
+    """The fits with one load disturbance more than `simpler` has, started from the most promising times.
 
-    Of the second order, and of the structure that has explained most so far.
+    The structures fitted are the second order and the one that has explained most so far.
     """
-    loads = simpler[0].hypothesis.loads
+    loads = simpler[0].hypothesis.load_disturbances
     second = min((each for each in simpler if each.structure == SECOND), key=by_bic)
     thetas = [second.theta]
     if not loads:
         thetas += [np.append(logs, L * fit.period) for logs in fit.denominators(SECOND) for L in LOAD_DEAD_TIMES]
-    found = _timed(fit, SECOND, loads, thetas)
-    likely = [min(simpler, key=by_bic), *(each for each in known if each.hypothesis.loads == loads)][:2]
+    found = _with_load_time(fit, SECOND, loads, thetas)
+    likely = [min(simpler, key=by_bic), *(each for each in known if each.hypothesis.load_disturbances == loads)][:2]
     for each in likely:
         if each.structure != SECOND:
-            found += _timed(fit, each.structure, loads, [each.theta])
+            found += _with_load_time(fit, each.structure, loads, [each.theta])
     return found
 
 
-def _timed(fit: Fit[S], structure: Structure, loads: int, thetas: Sequence[Reals]) -> list[Fitted]:
-    """Two fits at most with one step of the load more than each theta has."""
-    hypothesis = Hypothesis(loads + 1)
-    times = np.arange(0.0, len(fit.u) - 0.2 * fit.period, EVERY * fit.period)
+def _with_load_time(fit: Fit[S], structure: Structure, loads: int, thetas: Sequence[Reals]) -> list[Fitted]:
+    """At most two fits of a structure with one load disturbance more than each theta has.
+
+    loads: the number of load disturbances of each theta.
+    """
+    hypothesis = DisturbanceHypothesis(loads + 1)
+    times = np.arange(0.0, len(fit.u) - 0.2 * fit.period, LOAD_TIME_SPACING * fit.period)
     shifts = np.round(times / fit.block).astype(np.int64)
     guesses: list[tuple[float, Reals]] = []
     for theta in thetas:
-        rss = _by_time(fit, structure, theta, shifts)
+        rss = _rss_by_load_time(fit, structure, theta, shifts)
         guesses += [(float(rss[i]), np.append(theta, shifts[i] * fit.block)) for i in np.argsort(rss)[:3]]
     guesses.sort(key=lambda each: each[0])
-    starts = fit.differing([theta for _, theta in guesses], structure, 6)
-    rough = sorted(fit.followed(structure, hypothesis, starts, FIRST_STEPS), key=by_bic)
+    starts = fit.distinct([theta for _, theta in guesses], structure, 6)
+    rough = sorted(fit.descended(structure, hypothesis, starts, FIRST_STEPS), key=by_bic)
     return [fit.search(structure, hypothesis, [each.theta]) for each in rough[:2]]
 
 
-def timed_again(fit: Fit[S], found: Fitted) -> list[Fitted]:
-    """The last step of the load looked for once more over the whole record, with the plant now better known."""
-    return _timed(fit, found.structure, found.hypothesis.loads - 1, [found.theta[:-1]])
+def search_last_load_again(fit: Fit[S], found: Fitted) -> list[Fitted]:
+    """The fits with the last load disturbance searched again over the whole record, starting from the better model."""
+    return _with_load_time(fit, found.structure, found.hypothesis.load_disturbances - 1, [found.theta[:-1]])
 
 
-def _by_time(fit: Fit[S], structure: Structure, theta: Reals, shifts: NDArray[np.int64]) -> Reals:
-    """Sum of squares left with one step of the load more at each of these rows; a load only shifts its response."""
+def _rss_by_load_time(fit: Fit[S], structure: Structure, theta: Reals, shifts: NDArray[np.int64]) -> Reals:
+    """The residual sums of squares with one more load disturbance at each of these rows, shape (shifts,).
+
+    The time of a load disturbance only shifts its response, so one response serves all times.
+    """
     order = structure.order
-    base = fit.regressors(structure, Hypothesis(len(theta) - structure.searched), theta[None])[0]
+    base = fit.regressors(structure, DisturbanceHypothesis(len(theta) - structure.searched), theta[None])[0]
     q = np.linalg.qr(base)[0]
     rest = fit.y - q @ (q.T @ fit.y)
     monic = structure.monic(theta[: structure.searched])[None, :]

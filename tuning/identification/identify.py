@@ -1,16 +1,15 @@
-"""A process model from a recorded test of any shape: open-loop steps, a relay, a set-point change in closed loop.
+"""A process model is identified from a recorded test: open-loop steps, a relay, a set-point change in closed loop.
 
-Output error: the whole record is simulated from MV with the exact zero-order hold and dead time and compared with PV,
-so the noise should be PV's own and white. Each structure is fitted by separable least squares; the data choose
-among them by the Bayesian information criterion (Schwarz, 1978),
+The method is output error: the whole record is simulated from MV with the exact zero-order hold and dead time and
+compared with PV, so the noise should be added to PV and white. Each structure is fitted by separable least squares. The
+Bayesian information criterion (Schwarz, 1978) chooses among the structures,
 
-    BIC = N*ln(RSS/N + floor^2) + k*ln(N)           RSS in units of the span of PV, squared; k parameters
+    BIC = N*ln(RSS/N + floor^2) + k*ln(N)           RSS in units of the range of PV, squared; k parameters
 
-whose floor (2e-4, and what rounding PV to its resolution does) keeps data without noise from asking for ever higher
-order. Lags and a dead time come first. What they leave unexplained is taken, one after another, for a plant with a
-zero, a feed-through or a third lag; for one that was not at rest when the record began; and for steps of the load at
-times to be found, or a drift. Each must clearly earn what it takes (15 of BIC), and a residual that is not white counts
-as fewer samples.
+The floor (2e-4 and the rounding error of PV) prevents overfitting noise-free data. Structures of lags and a dead time
+are tried first. If they do not explain the record, the following are tried in this order: a plant with a zero, a
+feed-through or a third lag; a plant that was not at rest when the record began; load disturbances at free times, or a
+drift. Each of these must lower BIC by at least 15, and a residual that is not white counts as fewer samples.
 """
 
 from __future__ import annotations
@@ -24,42 +23,53 @@ from numpy.typing import ArrayLike
 
 from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN, by_bic
 from loopwright.tuning.identification.feedback_test import follows_from_pv
-from loopwright.tuning.identification.output_error import MOVING, QUIET, Fitted, count
-from loopwright.tuning.identification.problem import WHITE_ABOVE, Problem
-from loopwright.tuning.identification.record import recorded
-from loopwright.tuning.identification.structure_search import Search, confounded
+from loopwright.tuning.identification.output_error import NOT_AT_REST_INITIALLY, UNDISTURBED, Fitted, count
+from loopwright.tuning.identification.problem import WHITE_ABOVE, IdentificationProblem
+from loopwright.tuning.identification.record import recorded_test
+from loopwright.tuning.identification.structure_search import StructureSearch, confounded
 from loopwright.tuning.identification.structures import FIRST, INTEGRATOR, LAGGED_INTEGRATOR, SECOND
 from loopwright.tuning.models import Integrating, Model, Reals, TransferFunction
 
 STRUCTURES = (INTEGRATOR, FIRST, LAGGED_INTEGRATOR, SECOND)
-# difference of BIC of a structure worth naming beside the best
-RIVAL = 4.0
-# and where many structures and stories have been tried
-RIVAL_OF_MANY = 10.0
-# a start not at rest must leave less than this of the residual's rms: it can hide a little of a wrong structure
-DISTURBED = 0.8
-# p-value of the residual of lags above which nothing more is looked for
+RIVAL_BIC = 4.0
+"""Difference of BIC within which another structure is named beside the best."""
+RIVAL_BIC_OF_MANY = 10.0
+"""The same difference where many structures and disturbance hypotheses have been tried."""
+MAX_RMS_RATIO_NOT_AT_REST = 0.8
+"""Largest ratio of the residual's rms with and without a start not at rest for which such a start is accepted: the free
+initial state can hide a little of a wrong structure."""
 SURELY_WHITE = 0.01
+"""p-value of the residual of a model of lags above which no further structure is tried."""
 POORLY_KNOWN = 0.25
-# of a coefficient of the numerator, against one that would matter
-NEXT_TO_NOTHING = 0.02
-# a load that PV answers within so many samples of the first is a start not at rest
+"""Standard error, as a fraction of the parameter, above which the parameter is called poorly known."""
+NEGLIGIBLE_COEFFICIENT = 0.02
+"""Standard error of a numerator coefficient, relative to a coefficient that would matter, below which the coefficient
+is known well enough."""
 AT_THE_START = 2.0
+"""Time in samples: a load disturbance that PV answers within this time of the first sample is a start not at rest."""
 FEEDBACK = (
     "MV follows from PV alone, as under a controller whose set-point rests: the model may be the controller turned "
     "around. Step the set-point, or move MV by hand."
 )
-COARSE = 0.02
-# noise, as a part of the response's span, beyond which the errors are not small enough to be linear
+COARSE_RESOLUTION = 0.02
+"""Resolution of PV, as a fraction of its range, above which a note warns of a coarse record."""
 NOISY = 0.2
+"""Noise, as a fraction of the range of PV's response to MV, above which linearised standard errors are too small."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """One structure as fitted.  parameters: how many were.  rms: of the residual, PV units.  at_rest: at the start.
+    """One candidate model: a structure fitted under a disturbance hypothesis.
 
-    loads, drift: what beside MV is said to have moved PV.  chosen: it is the model; that need not be the one of the
-    lowest BIC, which may not have earned its parameters.
+    structure: the name of the structure.
+    bic: its BIC; the lowest is the best.
+    parameters: the number of fitted parameters.
+    rms: the rms of the residual, PV units.
+    at_rest: True if the plant is taken to be at rest at the start of the record.
+    chosen: True for the model that is the answer. It need not have the lowest BIC, as a more complex candidate must be
+    better by MIN_BIC_GAIN.
+    loads: the number of load disturbances of the hypothesis.
+    drift: True if the hypothesis has a drift of PV.
     """
 
     structure: str
@@ -73,12 +83,13 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True)
-class Load:
-    """A step of the load that the record shows.
+class IdentifiedLoadDisturbance:
+    """A step-shaped load disturbance that the record shows, with standard errors.
 
-    seen_s: when PV began to answer it.  t_s: a dead time earlier, when it entered if it did so at the plant's input.
-    Both in the time of the record.  size: MV units at the plant's input that move PV as far.  The others: standard
-    errors.
+    t_s: the time at which it entered, if at the plant's input, in the time of the record, s: a dead time before seen_s.
+    seen_s: the time at which PV began to answer it, in the time of the record, s.
+    size: the step at the plant's input that moves PV as far, MV units.
+    t_error_s, seen_error_s, size_error: the standard errors of these.
     """
 
     t_s: float
@@ -91,16 +102,21 @@ class Load:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Identified:
-    """The model that the record supports best, and how far to trust it.
+    """The model that the record supports best, and the figures that say how far to trust it.
 
-    model: FOPDT, SOPDT or Integrating, else a transfer function whose den ends in 1 (of an integrating plant in 1, 0).
-    fit_pct: 100*(1 - |y - fitted|/|y - mean y|) (NRMSE fit).  r2_pct: 100*(1 - the square of that ratio).
-    noise_std: of what the model leaves unexplained, PV units.  parameters: of the model by name (K, T, zeta, L; or
-    num[0], den[0], dead_time_s), in their units.  standard_errors: theirs, by the same names.  covariance: theirs, in
-    the same order, shape (parameters, parameters).  loads, drift: what moved PV beside MV.
-    whiteness: Ljung-Box p-value of the residual, below 0.001 not white noise.  explained: the
-    residual is white, or too small to matter (0.15 % of PV's span, or what rounding PV to its resolution leaves).
-    fitted: PV as modelled, PV units, shape (N,).  candidates: all structures tried, the lowest BIC first.
+    model: FOPDT, SOPDT or Integrating, else a transfer function whose den ends in 1 (for an integrating plant in 1, 0).
+    fit_pct: the NRMSE fit, 100*(1 - |y - fitted|/|y - mean y|).
+    r2_pct: 100*(1 - the square of that ratio).
+    noise_std: the standard deviation of the residual, PV units.
+    parameters: the parameters of the model by name (K, T, zeta, L; or num[0], den[0], dead_time_s), in their units.
+    standard_errors: the standard errors of the parameters by the same names.
+    covariance: the covariance of the parameters in the same order, shape (parameters, parameters).
+    loads: the load disturbances that the record shows.
+    drift: True if PV drifted at a steady rate, which the fit allows for.
+    whiteness: the Ljung-Box p-value of the residual; below 0.001 the residual is not white noise.
+    explained: True if the residual is white or negligible (0.15 % of the range of PV, or the rounding error of PV).
+    fitted: PV as modelled, PV units, shape (N,).
+    candidates: all candidate models, the lowest BIC first.
     notes: what the user should know, one sentence each.
     """
 
@@ -111,7 +127,7 @@ class Identified:
     parameters: dict[str, float]
     standard_errors: dict[str, float]
     covariance: Reals
-    loads: tuple[Load, ...]
+    loads: tuple[IdentifiedLoadDisturbance, ...]
     drift: bool
     whiteness: float
     explained: bool
@@ -123,21 +139,23 @@ class Identified:
 def identify(
     t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | None = None, lags_only: bool = False
 ) -> Identified:
-    """The model from a record: two lags at most where they explain it, else more; see the head of this file.
+    """Identifies the model of a record: at most two lags where they explain it, else more; see the head of this file.
 
-    t: s, evenly spaced.  u: MV that holds from its sample to the next.  y: PV at the sample.  u_before: the MV that
-    held before the record, by default u[0]; give it when the record begins with the move. (A log that shows with each
-    sample the MV before it gives a dead time that is one sample too short.)
-    lags_only: FOPDT, SOPDT or Integrating in any case; what explains the record better is only named.
-    Raises Refused(BAD_INPUT) for a record that cannot be used, Refused(NO_RESPONSE) where PV does not answer MV
-    visibly and Refused(NOISE_TOO_HIGH) where the noise is more than half of the answer. The plant
-    must be stable or integrate once.
+    t: the times of the samples, s, evenly spaced.
+    u: MV, held from its sample to the next, MV units. (A log that shows the previous MV with each sample makes the dead
+    time one sample too short.)
+    y: PV at the sample, PV units.
+    u_before: MV before the record, by default u[0]; it is needed when the record begins with the move of MV.
+    lags_only: the answer is FOPDT, SOPDT or Integrating in any case; a structure that explains the record better is
+    only named in the notes.
+    Raises Refused: BAD_INPUT for a record that cannot be used, NO_RESPONSE where PV does not visibly answer MV,
+    NOISE_TOO_HIGH where the noise is more than half of the answer. The plant must be stable or integrate once.
     """
-    record = recorded(t, u, y, u_before)
-    problem = Problem(record)
+    record = recorded_test(t, u, y, u_before)
+    problem = IdentificationProblem(record)
     best, tried = _chosen(problem, lags_only)
-    problem.require_visible(best)
-    # of each structure and story the best alone
+    problem.require_visible_response(best)
+    # only the best fit of each structure and disturbance hypothesis becomes a candidate
     ranked = {(fit.structure, fit.hypothesis): fit for fit in sorted([*tried, best], key=by_bic, reverse=True)}
     ranked[best.structure, best.hypothesis] = best
     found = _result(problem, best, sorted(ranked.values(), key=by_bic), float(np.asarray(t, dtype=float)[0]))
@@ -146,42 +164,48 @@ def identify(
     return found
 
 
-def _chosen(problem: Problem, lags_only: bool) -> tuple[Fitted, list[Fitted]]:
-    """The fit to answer with, and all that were tried."""
-    tried = [problem.fit(structure, QUIET) for structure in STRUCTURES]
+def _chosen(problem: IdentificationProblem, lags_only: bool) -> tuple[Fitted, list[Fitted]]:
+    """The fit that is the answer, and all fits that were tried."""
+    tried = [problem.fit(structure, UNDISTURBED) for structure in STRUCTURES]
     lags = best = min(tried, key=by_bic)
     if problem.explains(best, WHITE_ABOVE if lags_only else SURELY_WHITE):
         return best, tried
-    search = Search(problem, list(tried))
-    quiet = [each for each in search.quiet() if not each.structure.plain]
-    tried += quiet
-    richer = min((lags, *quiet), key=by_bic)
+    search = StructureSearch(problem, list(tried))
+    undisturbed = [each for each in search.undisturbed() if not each.structure.lags_only]
+    tried += undisturbed
+    richer = min((lags, *undisturbed), key=by_bic)
     if not (problem.explains(best) or problem.explains(richer)):
-        moving = [problem.fit(structure, MOVING) for structure in STRUCTURES]
-        tried += moving
-        of_moving = min(moving, key=by_bic)
-        if of_moving.bic < min(best.bic, richer.bic) and of_moving.rms < DISTURBED * best.rms:
-            best = of_moving
+        not_at_rest = [problem.fit(structure, NOT_AT_REST_INITIALLY) for structure in STRUCTURES]
+        tried += not_at_rest
+        best_not_at_rest = min(not_at_rest, key=by_bic)
+        if (
+            best_not_at_rest.bic < min(best.bic, richer.bic)
+            and best_not_at_rest.rms < MAX_RMS_RATIO_NOT_AT_REST * best.rms
+        ):
+            best = best_not_at_rest
     if lags_only:
         return best, tried
-    if best is lags and richer is not lags and problem.gain(richer, best) > MIN_BIC_GAIN:
+    if best is lags and richer is not lags and problem.bic_gain(richer, best) > MIN_BIC_GAIN:
         best = richer
-    # where more than lags explain the record, only lags and one load can be simpler
+    # where a structure with more than lags explains the record, only lags with one load disturbance can be simpler
     explained = best is richer and problem.explains(best, SURELY_WHITE)
-    for told in search.told(simple=explained) if problem.matters(best) else ():
-        tried += told
-        story = min((best, *told), key=by_bic)
-        # one that is told of fewer parameters needs no more than to be likelier, if anything beside lags is needed
-        earned = 0.0 if best is not lags and count(story) <= count(best) else MIN_BIC_GAIN
-        if story is not best and problem.gain(story, best) > earned:
-            best = story
-    if best is not lags and not best.hypothesis.moving:
+    for disturbed in search.disturbed(lags_and_one_load=explained) if problem.residual_matters(best) else ():
+        tried += disturbed
+        likeliest = min((best, *disturbed), key=by_bic)
+        # a candidate with fewer parameters than the best needs only a lower BIC, if lags alone are not enough
+        needed = 0.0 if best is not lags and count(likeliest) <= count(best) else MIN_BIC_GAIN
+        if likeliest is not best and problem.bic_gain(likeliest, best) > needed:
+            best = likeliest
+    if best is not lags and not best.hypothesis.not_at_rest_initially:
         best = _polished(problem, best, tried)
     return best, tried
 
 
-def _polished(problem: Problem, fit: Fitted, tried: list[Fitted]) -> Fitted:
-    """Searched to the end on every sample, unless another story comes of it; takes its own place in `tried`."""
+def _polished(problem: IdentificationProblem, fit: Fitted, tried: list[Fitted]) -> Fitted:
+    """The fit refined on every sample, which replaces it in `tried`.
+
+    The fit stays as it is where the refined one is no better or confounds the plant with a load disturbance.
+    """
     further = problem.refined(fit.structure, fit.hypothesis, [fit.theta])
     if further.bic >= fit.bic or confounded(problem, further):
         return fit
@@ -189,13 +213,13 @@ def _polished(problem: Problem, fit: Fitted, tried: list[Fitted]) -> Fitted:
     return further
 
 
-def _result(problem: Problem, best: Fitted, ranked: Sequence[Fitted], t0: float) -> Identified:
+def _result(problem: IdentificationProblem, best: Fitted, ranked: Sequence[Fitted], t0: float) -> Identified:
     record, unit = problem.record, problem.pv_unit
     parameters, covariance = problem.parameters(best)
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     residual = unit * best.linear.residual
     ratio = float(np.linalg.norm(residual) / np.linalg.norm(record.y - record.y.mean()))
-    of_loads = [each for each in problem.loads(best) if not _at_the_start(problem, each[0])]
+    of_loads = [each for each in problem.load_disturbances(best) if not _at_the_start(problem, each[0])]
     found = Identified(
         model=problem.model(best),
         fit_pct=100.0 * (1.0 - ratio),
@@ -205,7 +229,9 @@ def _result(problem: Problem, best: Fitted, ranked: Sequence[Fitted], t0: float)
         standard_errors=dict(zip(parameters, map(float, errors), strict=True)),
         covariance=covariance,
         loads=tuple(
-            Load(t0 + float(at[1]), t0 + float(at[0]), float(at[2]), float(off[1]), float(off[0]), float(off[2]))
+            IdentifiedLoadDisturbance(
+                t0 + float(at[1]), t0 + float(at[0]), float(at[2]), float(off[1]), float(off[0]), float(off[2])
+            )
             for at, off in of_loads
         ),
         drift=best.hypothesis.drift,
@@ -214,28 +240,30 @@ def _result(problem: Problem, best: Fitted, ranked: Sequence[Fitted], t0: float)
         fitted=record.y - residual,
         candidates=tuple(
             Candidate(
-                fit.structure.name, fit.bic, fit.parameters, unit * fit.rms, not fit.hypothesis.moving, fit is best,
-                fit.hypothesis.loads, fit.hypothesis.drift,
+                fit.structure.name, fit.bic, fit.parameters, unit * fit.rms, not fit.hypothesis.not_at_rest_initially,
+                fit is best, fit.hypothesis.load_disturbances, fit.hypothesis.drift,
             )
             for fit in ranked
         ),
         notes=(),
     )  # fmt: skip
-    at_rest = not best.hypothesis.moving and len(of_loads) == best.hypothesis.loads
+    at_rest = not best.hypothesis.not_at_rest_initially and len(of_loads) == best.hypothesis.load_disturbances
     return replace(found, notes=tuple(_notes(problem, best, ranked, found, at_rest)))
 
 
-def _at_the_start(problem: Problem, load: Reals) -> bool:
-    """What is told as a load is a plant that was not at rest, or under a load, when the record began."""
+def _at_the_start(problem: IdentificationProblem, load: Reals) -> bool:
+    """Whether a load disturbance is really a plant that was not at rest when the record began."""
     return bool(load[0] <= AT_THE_START * problem.record.Ts)
 
 
-def _notes(problem: Problem, best: Fitted, ranked: Sequence[Fitted], found: Identified, at_rest: bool) -> list[str]:
+def _notes(
+    problem: IdentificationProblem, best: Fitted, ranked: Sequence[Fitted], found: Identified, at_rest: bool
+) -> list[str]:
     notes = []
     if not at_rest:
         notes.append("The plant was not at rest, or under a load, at the start of the record; this was allowed for.")
-    notes += _story(problem, found)
-    if problem.resolution > COARSE:
+    notes += _disturbance_notes(problem, found)
+    if problem.resolution > COARSE_RESOLUTION:
         coarse = 100.0 * problem.resolution
         notes.append(f"PV is recorded in steps of {coarse:.2g} % of its span, which limits the result.")
     if not found.explained:
@@ -244,14 +272,20 @@ def _notes(problem: Problem, best: Fitted, ranked: Sequence[Fitted], found: Iden
             "structure, or something else moved PV."
         )
     top = ranked[0]
-    if not top.structure.plain and top.bic < best.bic - RIVAL:
+    if not top.structure.lags_only and top.bic < best.bic - RIVAL_BIC:
         notes.append(
-            f"A {_words(problem, top)} explains the record better: the model is an approximation."
-            if best.structure.plain
-            else f"A {_words(problem, top)} has a lower BIC, though not by what it would have to earn."
+            f"A {_in_words(problem, top)} explains the record better: the model is an approximation."
+            if best.structure.lags_only
+            else f"A {_in_words(problem, top)} has a lower BIC, though not by the {MIN_BIC_GAIN:g} that are asked for."
         )
-    near = best.bic + (RIVAL if best.structure.plain and best.hypothesis in (QUIET, MOVING) else RIVAL_OF_MANY)
-    rivals = {_named(fit) for fit in ranked if fit.bic < near and (fit.structure.plain or near > best.bic + RIVAL)}
+    near = best.bic + (
+        RIVAL_BIC
+        if best.structure.lags_only and best.hypothesis in (UNDISTURBED, NOT_AT_REST_INITIALLY)
+        else RIVAL_BIC_OF_MANY
+    )
+    rivals = {
+        _named(fit) for fit in ranked if fit.bic < near and (fit.structure.lags_only or near > best.bic + RIVAL_BIC)
+    }
     rivals.discard(_named(best))
     if rivals:
         notes.append(f"The record supports nearly as well: {', '.join(sorted(rivals))}.")
@@ -267,8 +301,8 @@ def _notes(problem: Problem, best: Fitted, ranked: Sequence[Fitted], found: Iden
     return notes
 
 
-def _poorly_known(problem: Problem, found: Identified) -> list[str]:
-    """Names of parameters."""
+def _poorly_known(problem: IdentificationProblem, found: Identified) -> list[str]:
+    """The names of the parameters that the record determines poorly."""
     poor = []
     for name, value in found.parameters.items():
         error = found.standard_errors[name]
@@ -278,49 +312,49 @@ def _poorly_known(problem: Problem, found: Identified) -> list[str]:
             # and so is a zero that is certainly far away
             model = found.model
             power = len(model.num) - 1 - int(name[4:-1])
-            enough = NEXT_TO_NOTHING * abs(model.num[-1]) * abs(model.den[0]) ** (power / (len(model.den) - 1))
+            enough = NEGLIGIBLE_COEFFICIENT * abs(model.num[-1]) * abs(model.den[0]) ** (power / (len(model.den) - 1))
         if error > POORLY_KNOWN * abs(value) and error > enough:
             poor.append(name)
     return poor
 
 
 def _named(fit: Fitted) -> str:
-    """The structure with its story."""
-    loads = fit.hypothesis.loads
-    story = ("", " with a step of the load", " with two steps of the load")[loads]
-    return fit.structure.name + (" and a drift" if fit.hypothesis.drift else story)
+    """The structure with its disturbance hypothesis, in words."""
+    loads = fit.hypothesis.load_disturbances
+    disturbed = ("", " with a load disturbance", " with two load disturbances")[loads]
+    return fit.structure.name + (" and a drift" if fit.hypothesis.drift else disturbed)
 
 
-def _words(problem: Problem, fit: Fitted) -> str:
-    """Of a structure that is more than lags."""
+def _in_words(problem: IdentificationProblem, fit: Fitted) -> str:
+    """A structure with more than lags, in words."""
     model = problem.model(fit)
     order = "second" if fit.structure.order == 2 else "third" if fit.structure.order == 3 else "first"
     parts = []
     if fit.structure.zeros:
         parts.append("an inverse response" if np.any(np.roots(model.num).real > 0.0) else "a zero")
     if fit.structure.feed_through:
-        parts.append("a part that passes at once")
+        parts.append("feed-through")
     return f"{order}-order model" + (f" with {' and '.join(parts)}" if parts else "")
 
 
-def _story(problem: Problem, found: Identified) -> list[str]:
-    """What moved PV beside MV, and when not to believe it."""
+def _disturbance_notes(problem: IdentificationProblem, found: Identified) -> list[str]:
+    """The notes on the disturbances found, and on when they may really be something else."""
     notes = []
     for load in found.loads:
         notes.append(
-            f"A step of the load of {load.size:+.3g} MV units at the plant's input (standard error "
+            f"A load disturbance of {load.size:+.3g} MV units at the plant's input (standard error "
             f"{load.size_error:.2g}) was found at {load.t_s:.4g} s, which PV answers from {load.seen_s:.4g} s on, and "
             "allowed for."
         )
         if load.size_error > POORLY_KNOWN * abs(load.size):
-            notes.append("The size of this load is poorly known.")
+            notes.append("The size of this load disturbance is poorly known.")
         if abs(load.size) > problem.mv_unit:
             notes.append(
-                f"Such a load is larger than what MV moved by ({problem.mv_unit:.3g}): a change of the plant would "
-                "look so too."
+                f"Such a load disturbance is larger than what MV moved by ({problem.mv_unit:.3g}): a change of the "
+                "plant would look the same."
             )
     if len(found.loads) > 1:
-        notes.append("A plant that is not linear, or a faulty valve, could be told as several loads.")
+        notes.append("A plant that is not linear, or a faulty valve, could look like several load disturbances.")
     if found.drift:
         notes.append("PV drifted at a steady rate; this was allowed for.")
     return notes

@@ -1,6 +1,6 @@
-"""Where to start the search: every whole dead time of a denominator at the cost of one.
+"""The starts of the search: for each denominator, every dead time of whole samples is evaluated at the cost of one.
 
-A dead time of whole samples only shifts the response, so its correlation with PV for all of them is one convolution.
+A dead time of whole samples only shifts the response, so the correlations with PV for all of them are one convolution.
 """
 
 from __future__ import annotations
@@ -18,10 +18,13 @@ RATIO = 2.0
 DAMPING_RATIOS = (0.15, 0.4, 0.7)
 
 
-def starts(structure: Structure, u: Reals, y: Reals, most_dead_time: int, nuisance: bool, keep: int) -> list[Reals]:
-    """The `keep` best theta that differ, best first, of a coarse grid of denominators and every whole dead time.
+def starts(structure: Structure, u: Reals, y: Reals, max_dead_time: int, nuisance: bool, keep: int) -> list[Reals]:
+    """The `keep` best distinct theta, best first, from a coarse grid of denominators and every whole dead time.
 
-    nuisance: a load step from the start is allowed for, with the same denominator.
+    structure: the model structure.
+    u, y: MV and PV in scaled units, shape (N,).
+    max_dead_time: the longest dead time, in samples.
+    nuisance: a load disturbance at the start of the record, with the same denominator, is allowed for.
     """
     found: list[tuple[float, Reals]] = []
     for logs in _denominators(structure, len(u)):
@@ -30,7 +33,7 @@ def starts(structure: Structure, u: Reals, y: Reals, most_dead_time: int, nuisan
         others = np.ones((len(u), 1))
         if nuisance:
             others = np.concatenate((others, states(monic, 0.0, np.ones(len(u)), structure.order)), axis=1)
-        rss = _of_all_shifts(response, y, others, most_dead_time)
+        rss = _of_all_shifts(response, y, others, max_dead_time)
         m = int(np.argmin(rss))
         found.append((float(rss[m]), np.append(logs, float(m))))
     found.sort(key=lambda each: each[0])
@@ -49,7 +52,7 @@ def _differ(a: Reals, b: Reals) -> bool:
 
 
 def _denominators(structure: Structure, samples: int) -> list[Reals]:
-    """Logs of the searched coefficients; time constants from half a sample to ten records."""
+    """The logarithms of the searched coefficients on the grid: time constants from half a sample to ten records."""
     count = 1 + math.ceil(math.log(20.0 * samples) / math.log(RATIO))
     times = np.geomspace(0.5, 10.0 * samples, count)
     if structure.lags == 0:
@@ -62,7 +65,8 @@ def _denominators(structure: Structure, samples: int) -> list[Reals]:
 
 
 def _of_all_shifts(responses: Reals, y: Reals, others: Reals, maximum: int) -> Reals:
-    """Sum of squares left of y by a fit of the columns, shifted by 0, 1, ... `maximum` samples, and of the others."""
+    """The residual sums of squares of fits of y by the responses, shifted by 0, 1, ... `maximum` samples, and the
+    other columns; shape (maximum + 1,)."""
     columns = responses / np.maximum(np.sqrt(np.sum(responses**2, axis=0)), 1e-300)
     basis = np.linalg.qr(others)[0]
     rest = y - basis @ (basis.T @ y)
@@ -72,14 +76,14 @@ def _of_all_shifts(responses: Reals, y: Reals, others: Reals, maximum: int) -> R
     gram = 1e-9 * np.eye(count) - np.einsum("mqi,mqj->mij", with_basis, with_basis)
     for i in range(count):
         for j in range(count):
-            # what is shifted out at the end is lost
+            # samples shifted beyond the end do not count
             gram[:, i, j] += np.cumsum(columns[:, i] * columns[:, j])[::-1][: maximum + 1]
     weights = np.linalg.solve(gram, with_y[:, :, None])[:, :, 0]
     return np.asarray(rest @ rest - np.sum(weights * with_y, axis=1))
 
 
 def _shifted_products(fixed: Reals, shifted: Reals, maximum: int) -> Reals:
-    """Sum over k of fixed[k, q]*shifted[k-m, i] for m = 0 ... most, shape (most + 1, columns of each)."""
+    """The sums over k of fixed[k, q]*shifted[k-m, i] for m = 0 ... maximum, shape (maximum + 1, columns of each)."""
     size = next_fast_len(2 * len(fixed), real=True)
     spectrum = np.fft.rfft(fixed, size, axis=0)[:, :, None] * np.fft.rfft(shifted, size, axis=0).conj()[:, None, :]
     return np.asarray(np.fft.irfft(spectrum, size, axis=0)[: maximum + 1])

@@ -1,10 +1,11 @@
-"""Growth of an oscillation, fitted as a whole instead of read off its peaks.
+"""The growth of an oscillation is fitted to the whole record instead of being read off its peaks.
 
     y(t) = c0 + c1 t + c2 t^2 + exp(sigma t) (a cos wt + b sin wt)
 
-c0..c2 and a, b are eliminated by linear least squares (variable projection); sigma and w are searched. The trend takes
-what a slow pole leaves behind, so the mean may drift without being mistaken for growth (the procedure's peak heights
-mix the two), and noise averages out over every sample. Source of the need: five-stage procedure, Stage 2, guards.
+c0..c2 and a, b are eliminated by linear least squares (variable projection); sigma and w are searched. The trend
+absorbs the transient of a slow pole, so a drifting mean is not mistaken for growth (the peak heights of the paper's
+procedure mix the two), and noise averages out over every sample. The guards of Stage 2 of the five-stage procedure need
+this.
 """
 
 from __future__ import annotations
@@ -18,15 +19,19 @@ from scipy.optimize import least_squares
 
 Array = NDArray[np.float64]
 PER_PERIOD = 24
-"""Samples a period that the fit keeps; more are averaged in bins, which loses no information worth its time."""
+"""Samples per period that the fit uses; faster records are averaged in bins, which loses no useful information."""
 
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """log_per_period: ln of the amplitude's ratio from one period to the next; error: its standard error.
+    """The growth of an oscillation.
 
-    period: s.  amplitude: at the middle of the record, PV units.  mean: of the trend there, PV units.
-    noise: standard deviation of what the model does not explain, PV units.
+    log_per_period: the logarithm of the ratio of the amplitudes of one period and the period before.
+    error: the standard error of log_per_period.
+    period: the period, s.
+    amplitude: the amplitude at the middle of the record, PV units.
+    mean: the trend at the middle of the record, PV units.
+    noise: the standard deviation of the residual, PV units.
     """
 
     log_per_period: float
@@ -38,7 +43,12 @@ class Growth:
 
 
 def fit_growth(t: Array, y: Array, period_guess: float) -> Growth:
-    """Fits the model above to a record of at least about 1.5 periods (t in s, evenly spaced)."""
+    """Fits the model above to a record of at least about 1.5 periods.
+
+    t: the times of the samples, s, evenly spaced.
+    y: PV, shape (N,).
+    period_guess: a rough period, s.
+    """
     bins = max(1, int(period_guess / (t[1] - t[0]) / PER_PERIOD))
     if bins > 1:
         count = len(t) // bins
@@ -78,7 +88,7 @@ def fit_growth(t: Array, y: Array, period_guess: float) -> Growth:
 
 
 def harmonic(t: Array, y: Array, period: float) -> complex:
-    """First harmonic of y at this period (phasor, amplitude in y's unit), by least squares over whole periods."""
+    """The first harmonic of y at this period (s) as a phasor in y's unit, by least squares over whole periods."""
     w = 2 * math.pi / period
     basis = np.stack([np.ones_like(t), np.cos(w * t), -np.sin(w * t)], axis=1)
     c = np.linalg.lstsq(basis, y, rcond=None)[0]

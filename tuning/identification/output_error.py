@@ -1,4 +1,5 @@
-"""Structures fitted to a whole record, with steps of the load at free times and a drift if need be."""
+"""Output-error fits of model structures to a whole record, with load disturbances at free times and a drift if
+needed."""
 
 from __future__ import annotations
 
@@ -12,30 +13,33 @@ import numpy as np
 
 from loopwright.tuning.analysis.zero_order_hold import pulses
 from loopwright.tuning.identification.structures import Structure
-from loopwright.tuning.identification.variable_projection import REDUNDANT, Bounded, Linear, descend, solve
+from loopwright.tuning.identification.variable_projection import REDUNDANT, LinearFit, SearchBounds, descend, solve
 from loopwright.tuning.models import Reals, TransferFunction
 
 FLOOR = 2e-4
-"""Of the residual in spans of PV: data without noise would ask for ever more parameters."""
+"""Residual floor as a fraction of the range of PV; it prevents overfitting noise-free data."""
 LOG_LOW, LOG_HIGH = -8.5, 9.5
-"""Of a rate in 1/period (a product of two: its square)."""
+"""Bounds of the logarithm of a rate in 1/period, and of the logarithm of a product of two rates in 1/period^2."""
 DEAD_TIMES = (0.01, 0.06, 0.14, 0.23, 0.32, 0.41, 0.49)
 LAGS = (0.02, 0.08, 0.25, 0.8, 4.0, 40.0)
 COMPLEX = ((3.0, 0.5), (6.0, 0.5), (10.0, 0.3))
 MAX_STEPS = 25
 FIRST_STEPS, LONG_SEARCHES = 5, 2
-"""Of many starts, all are followed so far, and so many to the end."""
+"""Steps made from every start of many, and the number of searches that are then carried to the end."""
 RELATIVE_DECREASE = 1e-6
 LOG_STEP = 1e-4
 LOG_REACH = 1.5
 
 
-class Signals(Protocol):
-    """A record as the fit wants it.
+class RecordToFit(Protocol):
+    """A record with the scales that the fit needs.
 
-    Ts: s.  u, y: MV and PV, shape (N,), as deviations from rest; MV is 0 before the record.  swing: of MV, span: of PV,
-    which measure them.  period: samples, the time scale: about that of an oscillation at the limit of stability.
-    most_dead_time: samples.  block: samples averaged into one.
+    Ts: the sample time, s.
+    u, y: MV and PV as deviations from rest, shape (N,); MV is 0 before the record.
+    input_range, output_range: the scales of MV and PV, MV units and PV units.
+    period: the time scale, in samples: about the period of an oscillation at the limit of stability.
+    max_dead_time: the longest dead time, in samples.
+    block: the number of samples that are averaged into one.
     """
 
     @property
@@ -45,87 +49,95 @@ class Signals(Protocol):
     @property
     def y(self) -> Reals: ...
     @property
-    def swing(self) -> float: ...
+    def input_range(self) -> float: ...
     @property
-    def span(self) -> float: ...
+    def output_range(self) -> float: ...
     @property
     def period(self) -> float: ...
     @property
-    def most_dead_time(self) -> float: ...
+    def max_dead_time(self) -> float: ...
     @property
     def block(self) -> int: ...
 
 
-S = TypeVar("S", bound=Signals)
+S = TypeVar("S", bound=RecordToFit)
 
 
 @dataclass(frozen=True, slots=True)
-class Hypothesis:
-    """What moved PV beside MV. loads: steps of the load at times to be found.  drift: PV drifts at a steady rate.
+class DisturbanceHypothesis:
+    """A disturbance hypothesis: what else than MV moved PV.
 
-    moving: the plant was not at rest, or under a load, when the record began.
+    load_disturbances: the number of step-shaped load disturbances, at times that are searched.
+    drift: PV drifts at a steady rate.
+    not_at_rest_initially: the plant was not at rest, or under a load, when the record began.
     """
 
-    loads: int = 0
+    load_disturbances: int = 0
     drift: bool = False
-    moving: bool = False
+    not_at_rest_initially: bool = False
 
 
-QUIET = Hypothesis()
-MOVING = Hypothesis(moving=True)
+UNDISTURBED = DisturbanceHypothesis()
+NOT_AT_REST_INITIALLY = DisturbanceHypothesis(not_at_rest_initially=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """theta: the structure's, then the times of the loads, in samples.  columns: regressors there, averaged.
+    """A structure fitted to a record under a disturbance hypothesis.
 
-    linear: their coefficients (MV in swings, PV in spans) and the residual in spans.
+    theta: the searched parameters of the structure, then the times of the load disturbances, in samples.
+    columns: the regressors at theta, averaged, shape (rows, columns).
+    linear: the coefficients of the regressors and the residual, with MV in units of its range and PV in units of its.
+    bic: the Bayesian information criterion.
     """
 
     structure: Structure
-    hypothesis: Hypothesis
+    hypothesis: DisturbanceHypothesis
     theta: Reals
     columns: Reals
-    linear: Linear
+    linear: LinearFit
     bic: float
 
     @property
     def rms(self) -> float:
+        """The rms of the residual, as a fraction of the range of PV."""
         return math.sqrt(self.linear.rss / len(self.linear.residual))
 
     @property
     def parameters(self) -> int:
+        """The number of fitted parameters."""
         return len(self.theta) + int(self.columns.shape[1])
 
 
 def count(fit: Fitted) -> int:
-    """Parameters, as BIC takes them: a load's time was chosen among many and counts twice."""
-    return fit.parameters + fit.hypothesis.loads
+    """The number of parameters that BIC counts: the time of a load disturbance was chosen among many and counts
+    twice."""
+    return fit.parameters + fit.hypothesis.load_disturbances
 
 
 class Fit(Generic[S]):
-    """Fits one record. Time in samples, MV in swings, PV in spans."""
+    """The fits of one record. Time is in samples, MV in units of its range and PV in units of its range."""
 
-    def __init__(self, evidence: S) -> None:
-        self.evidence = evidence
-        self.block = evidence.block
-        self.u = evidence.u / evidence.swing
-        self.y = averaged(evidence.y / evidence.span, self.block)
+    def __init__(self, record: S) -> None:
+        self.record = record
+        self.block = record.block
+        self.u = record.u / record.input_range
+        self.y = averaged(record.y / record.output_range, self.block)
         self.samples = len(self.y)
-        self.period = evidence.period
+        self.period = record.period
         self._step = np.ones(len(self.u))
         self._always = averaged(np.column_stack((self._step, np.linspace(-1.0, 1.0, len(self.u)))), self.block)
         self._rate = math.log(1.0 / self.period)
 
     # what is fitted
 
-    def regressors(self, structure: Structure, hypothesis: Hypothesis, thetas: Reals) -> Reals:
-        """Columns of everything linear for each theta, shape (thetas, rows, columns)."""
+    def regressors(self, structure: Structure, hypothesis: DisturbanceHypothesis, thetas: Reals) -> Reals:
+        """The regressors of all linear parameters for each theta, shape (thetas, rows, columns)."""
         many, inputs = len(thetas), structure.zeros + 1
-        # one call for MV and every load: what it costs is mostly the call
+        # one call serves MV and every load disturbance, as call overhead dominates
         times = thetas[:, structure.lags :].T
-        if hypothesis.moving:
-            # a step of every state at the start stands for any state there, and for a load
+        if hypothesis.not_at_rest_initially:
+            # a step of every state at the start represents any initial state, and a load disturbance
             times = np.append(times, np.zeros((1, many)), axis=0)
         steps = len(times) - 1
         answers = pulses(np.tile(structure.monic(thetas), (1 + steps, 1)), times.ravel(), structure.order)
@@ -147,54 +159,59 @@ class Fit(Generic[S]):
             at += structure.order
         return out
 
-    def fitted(self, structure: Structure, hypothesis: Hypothesis, theta: Reals) -> Fitted:
-        """The best linear part for this theta."""
+    def fitted(self, structure: Structure, hypothesis: DisturbanceHypothesis, theta: Reals) -> Fitted:
+        """The fit at this theta: the linear parameters by least squares."""
         columns = self.regressors(structure, hypothesis, theta[None])[0]
         linear = solve(columns, self.y)
-        # a load's time was chosen among many: it counts twice
-        parameters = len(theta) + columns.shape[1] + hypothesis.loads
+        # the time of a load disturbance was chosen among many: it counts twice
+        parameters = len(theta) + columns.shape[1] + hypothesis.load_disturbances
         bic = self.samples * math.log(linear.rss / self.samples + FLOOR**2) + parameters * math.log(self.samples)
         return Fitted(structure, hypothesis, theta, columns, linear, bic)
 
     def search(
-        self, structure: Structure, hypothesis: Hypothesis, starts: Sequence[Reals], most_steps: int = MAX_STEPS
+        self,
+        structure: Structure,
+        hypothesis: DisturbanceHypothesis,
+        starts: Sequence[Reals],
+        max_steps: int = MAX_STEPS,
     ) -> Fitted:
         """The best local minimum from these starts."""
         if len(starts) > LONG_SEARCHES:
             starts = self._descend(structure, hypothesis, starts, FIRST_STEPS)[:LONG_SEARCHES]
-        return self.fitted(structure, hypothesis, self._descend(structure, hypothesis, starts, most_steps)[0])
+        return self.fitted(structure, hypothesis, self._descend(structure, hypothesis, starts, max_steps)[0])
 
-    def followed(
-        self, structure: Structure, hypothesis: Hypothesis, starts: Sequence[Reals], steps: int
+    def descended(
+        self, structure: Structure, hypothesis: DisturbanceHypothesis, starts: Sequence[Reals], steps: int
     ) -> list[Fitted]:
-        """Where so many steps lead from each start, the best first."""
+        """The fits that are reached from each start in this number of steps, the best first."""
         return [self.fitted(structure, hypothesis, at) for at in self._descend(structure, hypothesis, starts, steps)]
 
     def _descend(
-        self, structure: Structure, hypothesis: Hypothesis, starts: Sequence[Reals], most_steps: int
+        self, structure: Structure, hypothesis: DisturbanceHypothesis, starts: Sequence[Reals], max_steps: int
     ) -> list[Reals]:
         low, high = self.bounds(structure, hypothesis)
-        times = 1 + hypothesis.loads
-        reach = np.append(np.full(structure.lags, LOG_REACH), np.full(times, 0.25 * self.period))
+        times = 1 + hypothesis.load_disturbances
+        max_step = np.append(np.full(structure.lags, LOG_REACH), np.full(times, 0.25 * self.period))
         step = np.append(np.full(structure.lags, LOG_STEP), np.full(times, LOG_STEP * self.period))
 
         def columns(thetas: Reals) -> Reals:
             return self.regressors(structure, hypothesis, thetas)
 
-        bounded = Bounded(low, high, reach, step)
-        found, rss = descend(columns, self.y, np.array(starts), bounded, most_steps, RELATIVE_DECREASE)
+        bounded = SearchBounds(low, high, max_step, step)
+        found, rss = descend(columns, self.y, np.array(starts), bounded, max_steps, RELATIVE_DECREASE)
         return [found[i] for i in np.argsort(rss, kind="stable")]
 
-    def bounds(self, structure: Structure, hypothesis: Hypothesis) -> tuple[Reals, Reals]:
+    def bounds(self, structure: Structure, hypothesis: DisturbanceHypothesis) -> tuple[Reals, Reals]:
+        """The lower and the upper bounds of theta."""
         powers = np.array([1.0, 2.0, 1.0][: structure.lags])
-        low = np.concatenate((LOG_LOW + powers * self._rate, np.zeros(1 + hypothesis.loads)))
-        high = np.concatenate((LOG_HIGH + powers * self._rate, [self.evidence.most_dead_time]))
-        return low, np.append(high, np.full(hypothesis.loads, len(self.u) - 2.0 * self.block))
+        low = np.concatenate((LOG_LOW + powers * self._rate, np.zeros(1 + hypothesis.load_disturbances)))
+        high = np.concatenate((LOG_HIGH + powers * self._rate, [self.record.max_dead_time]))
+        return low, np.append(high, np.full(hypothesis.load_disturbances, len(self.u) - 2.0 * self.block))
 
     # where to begin
 
     def denominators(self, structure: Structure) -> list[Reals]:
-        """Logs of the rates to begin with."""
+        """The logarithms of the rates on the grid of starts."""
         unit = self.period
         if structure.lags == 0:
             return [np.empty(0)]
@@ -216,22 +233,23 @@ class Fit(Generic[S]):
         load_at: float | None = None,
         dead_times: Sequence[float] = DEAD_TIMES,
     ) -> list[Reals]:
-        """The `keep` best theta that differ, best first.
+        """The `keep` best distinct theta of a grid, best first.
 
-        load_at: with one step of the load at this sample.  dead_times: periods.
+        load_at: each theta has one load disturbance at this sample, None for none.
+        dead_times: the dead times of the grid, in periods.
         """
         thetas = [
             np.append(logs, max(L, 0.0) * self.period) for logs in self.denominators(structure) for L in dead_times
         ]
-        hypothesis = QUIET
+        hypothesis = UNDISTURBED
         if load_at is not None:
-            hypothesis = Hypothesis(loads=1)
+            hypothesis = DisturbanceHypothesis(load_disturbances=1)
             thetas = [np.append(theta, load_at) for theta in thetas]
-        rss = left_over(self.regressors(structure, hypothesis, np.array(thetas)), self.y)
-        return self.differing([thetas[i] for i in np.argsort(rss)], structure, keep)
+        rss = sums_of_squares_left(self.regressors(structure, hypothesis, np.array(thetas)), self.y)
+        return self.distinct([thetas[i] for i in np.argsort(rss)], structure, keep)
 
-    def differing(self, ranked: Sequence[Reals], structure: Structure, keep: int) -> list[Reals]:
-        """The first few that are not near another."""
+    def distinct(self, ranked: Sequence[Reals], structure: Structure, keep: int) -> list[Reals]:
+        """The first `keep` of the ranked theta that are not close to an earlier one."""
         kept: list[Reals] = []
         for theta in ranked:
             if all(self._differ(theta, other, structure.lags) for other in kept):
@@ -247,7 +265,7 @@ class Fit(Generic[S]):
     # what it means
 
     def static_gain(self, fit: Fitted) -> float:
-        """In spans per swing; its sign and per sample where the plant integrates."""
+        """The static gain, in ranges of PV per range of MV; the slope per sample where the plant integrates."""
         structure, c = fit.structure, fit.linear.coefficients
         gain = float(c[0] / structure.slowest(fit.theta))
         if structure.feed_through:
@@ -255,13 +273,14 @@ class Fit(Generic[S]):
         return gain
 
     def model(self, fit: Fitted) -> TransferFunction:
-        """In s and the units of the record."""
+        """The fitted model in s and the units of the record."""
         return self.transfer(fit.structure, fit.theta, fit.linear.coefficients)
 
     def transfer(self, structure: Structure, theta: Reals, coefficients: Reals) -> TransferFunction:
-        """The plant of these parameters; coefficients as fitted, those of no input ignored."""
-        evidence = self.evidence
-        Ts, unit = evidence.Ts, evidence.span / evidence.swing
+        """The model of these parameters in s and the units of the record. Only the coefficients of the plant's input
+        are used."""
+        record = self.record
+        Ts, unit = record.Ts, record.output_range / record.input_range
         order = structure.order
         monic = structure.monic(theta[: structure.searched])
         den = np.append(1.0, monic) * Ts ** -np.arange(order + 1.0)
@@ -275,8 +294,12 @@ class Fit(Generic[S]):
         return TransferFunction(tuple(num), tuple(den), max(float(theta[structure.lags]), 0.0) * Ts)
 
 
-def left_over(columns: Reals, y: Reals) -> Reals:
-    """Sum of squares left of y by each set of columns, shape (sets,)."""
+def sums_of_squares_left(columns: Reals, y: Reals) -> Reals:
+    """The residual sums of squares of y by each set of columns, shape (sets,).
+
+    columns: shape (sets, N, columns).
+    y: shape (N,).
+    """
     lengths = np.sqrt(np.einsum("bij,bij->bj", columns, columns))
     lengths[lengths == 0.0] = 1.0
     turned = np.swapaxes(columns / lengths[:, None, :], 1, 2)
@@ -287,7 +310,7 @@ def left_over(columns: Reals, y: Reals) -> Reals:
 
 
 def averaged(columns: Reals, block: int, axis: int = 0) -> Reals:
-    """Means of `block` rows each, which lie along the axis; rows left over at the end are dropped."""
+    """The means of `block` rows each along the axis; rows that fill no block at the end are dropped."""
     if block == 1:
         return columns
     before, rows, after = columns.shape[:axis], columns.shape[axis] // block, columns.shape[axis + 1 :]

@@ -1,7 +1,7 @@
-"""FOPDT estimate from the overshoot under a Ziegler-Nichols PI: formulas (2)-(5) of the five-stage procedure.
+"""The FOPDT estimate from the overshoot under a Ziegler-Nichols PI: formulas (2)-(5) of the five-stage procedure.
 
-Source: Stopakevych et al., automatic re-tuning of PI controllers, Problemele Energeticii Regionale. Right to 1.5 % in
-L/T for FOPDT plants with 0.08 <= L/T <= 1; on plants of other shapes it serves tuning, not identification.
+Source: Stopakevych et al., automatic re-tuning of PI controllers, Problemele Energeticii Regionale. The estimate of L/T
+is right to 1.5 % for FOPDT plants with 0.08 <= L/T <= 1; on other plants it serves tuning, not identification.
 """
 
 from __future__ import annotations
@@ -12,7 +12,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """d = L/T.  T, L: s.  k5: gain by formula (5), PV units per MV unit, positive."""
+    """A FOPDT estimate.
+
+    d: the normalised dead time L/T.
+    T, L: the time constant and the dead time, s.
+    k5: the gain by formula (5), PV units per MV unit, positive.
+    """
 
     d: float
     T: float
@@ -21,9 +26,11 @@ class Estimate:
 
 
 def fopdt_from_overshoot(Kp: float, Ti: float, overshoot_pct: float) -> Estimate:
-    """From the PI in use (Ti = Pu/1.2, s) and the overshoot it gave, in percent of the set-point step.
+    """The FOPDT estimate from a set-point step under a Ziegler-Nichols PI.
 
-    Below about 74 % overshoot only: there d reaches zero and the formula ends.
+    Kp, Ti: the PI in use, MV units per PV unit and s; Ti = Pu/1.2.
+    overshoot_pct: the overshoot, percent of the set-point step; it must be below about 74 %, where d reaches zero.
+    Raises ValueError for gains that are not positive and for an overshoot beyond the formula.
     """
     if not (math.isfinite(Kp) and math.isfinite(Ti) and Kp > 0.0 and Ti > 0.0):
         raise ValueError(f"Kp and Ti must be positive: {Kp}, {Ti} s")

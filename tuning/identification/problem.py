@@ -1,4 +1,5 @@
-"""Structures fitted to one record of any shape: separable least squares from several starts, BIC, covariance."""
+"""The fits of model structures to one record of any shape: separable least squares from several starts, with BIC,
+tests of the residual, and the covariance of the parameters."""
 
 from __future__ import annotations
 
@@ -9,30 +10,39 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from loopwright.tuning.identification.initial_guesses import starts
-from loopwright.tuning.identification.output_error import FLOOR, LOG_STEP, MOVING, Fit, Fitted, Hypothesis, count
-from loopwright.tuning.identification.record import Recorded
-from loopwright.tuning.identification.residuals import colour, whiteness
+from loopwright.tuning.identification.output_error import (
+    FLOOR,
+    LOG_STEP,
+    NOT_AT_REST_INITIALLY,
+    DisturbanceHypothesis,
+    Fit,
+    Fitted,
+    count,
+)
+from loopwright.tuning.identification.record import RecordedTest
+from loopwright.tuning.identification.residuals import variance_inflation, whiteness
 from loopwright.tuning.identification.sensitivity import sensitivities, slopes_of
 from loopwright.tuning.identification.structures import Plant, Structure
-from loopwright.tuning.identification.variable_projection import Bounded, covariance, descend, solve
+from loopwright.tuning.identification.variable_projection import SearchBounds, covariance, descend, solve
 from loopwright.tuning.models import Model, Reals, TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
 
-# rms of a residual, as a part of PV's span, of which it does not matter what it consists of
-UNIMPORTANT = 1.5e-3
-# a resolution coarser than this part of the span hides the response, not only the noise
-COARSEST = 0.1
+NEGLIGIBLE_RMS = 1.5e-3
+"""rms of a residual, as a fraction of the range of PV, below which its whiteness does not matter."""
+MAX_RESOLUTION = 0.1
+"""Resolution of PV, as a fraction of its range, above which it hides the response and not only the noise."""
 WHITE_ABOVE = 1e-3
-# difference of BIC by which PV must be better explained with MV than without
-VISIBLE = 10.0
-# noise, as a part of the response's span, beyond which what is found may be a shape of the noise
-NOISIEST = 0.5
+"""p-value above which a residual counts as white."""
+MIN_BIC_GAIN_OF_MV = 10.0
+"""Smallest decrease of BIC by which PV must be better explained with MV than without MV."""
+MAX_NOISE = 0.5
+"""Noise, as a fraction of the range of PV's response to MV, above which the noise itself may determine the model."""
 STARTS = 3
 MAX_STEPS = 60
 RELATIVE_DECREASE = 1e-7
 LONGEST_LAG = 30.0  # in records
 SHORTEST_LAG = 0.1  # in samples
-# of a wider search: periods that a record has at most, averages in it, and averages in a period at least
+# limits of a search around a time scale: the periods in a record, the averages in it, and the averages in a period
 MAX_PERIODS = 50.0
 MAX_AVERAGES = 1000
 AVERAGES_PER_PERIOD = 80.0
@@ -41,23 +51,26 @@ MIN_PERIOD = 8.0  # samples
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scaled:
-    """The record in the units that `tuning.identification.output_error.Signals` wants."""
+class ScaledRecord:
+    """A record with the scales that `tuning.identification.output_error.RecordToFit` asks for."""
 
     Ts: float
     u: Reals
     y: Reals
-    swing: float
-    span: float
+    input_range: float
+    output_range: float
     period: float
-    most_dead_time: float
+    max_dead_time: float
     block: int
 
 
-class Problem:
-    """The record in units of its own: time in samples, MV and PV in their largest change."""
+class IdentificationProblem:
+    """The identification problem of one record: its fits, their residuals and their meaning.
 
-    def __init__(self, record: Recorded) -> None:
+    The record is scaled: time is in samples, MV and PV are in units of their largest change.
+    """
+
+    def __init__(self, record: RecordedTest) -> None:
         self.record = record
         change = record.u - record.u_before
         self.mv_unit = float(np.max(np.abs(change)))
@@ -66,87 +79,96 @@ class Problem:
         self.y = (record.y - record.y[0]) / self.pv_unit
         self.samples = len(self.y)
         self.resolution = float(np.min(np.diff(np.unique(np.round(self.y, 9)))))
-        # what rounding leaves is spread evenly over a step of the resolution
-        self.rounding = min(self.resolution, COARSEST) / math.sqrt(12.0)
-        # a quarter more than rounding leaves on average, for it is not quite random
-        self.unimportant = max(UNIMPORTANT, 1.25 * self.rounding)
-        # a response that begins later than this is not to be told from its beginning
-        self.most_dead_time = max(1, int(0.7 * (self.samples - record.first_move)))
-        self.whole = self.wide(0.1 * self.samples, 1)
+        # the rounding error is uniform over a step of the resolution
+        self.rounding = min(self.resolution, MAX_RESOLUTION) / math.sqrt(12.0)
+        # a quarter more than the average rounding error, which is not quite random
+        self.negligible_rms = max(NEGLIGIBLE_RMS, 1.25 * self.rounding)
+        # a response that begins later than this shows too little of itself
+        self.max_dead_time = max(1, int(0.7 * (self.samples - record.first_move)))
+        self.full_fit = self.fit_around(0.1 * self.samples, 1)
 
-    def wide(self, period: float, block: int | None = None) -> Fit[Scaled]:
-        """For a search around a time scale, in samples, on averages of so many samples; by default what it needs."""
+    def fit_around(self, period: float, block: int | None = None) -> Fit[ScaledRecord]:
+        """The fits for a search around a time scale.
+
+        period: the time scale, in samples.
+        block: the number of samples that are averaged into one; by default as many as the time scale permits.
+        """
         period = min(max(period, self.samples / MAX_PERIODS, MIN_PERIOD), float(self.samples))
         wanted = max(period / AVERAGES_PER_PERIOD, self.samples / MAX_AVERAGES)
         block = block or max(1, int(min(wanted, period / MIN_AVERAGES_PER_PERIOD)))
         record = self.record
-        signals = Scaled(
+        signals = ScaledRecord(
             record.Ts, self.mv_unit * self.u, self.pv_unit * self.y, self.mv_unit, self.pv_unit,
-            period, float(self.most_dead_time), block,
+            period, float(self.max_dead_time), block,
         )  # fmt: skip
         return Fit(signals)
 
-    def fit(self, structure: Structure, hypothesis: Hypothesis) -> Fitted:
-        """The best of a few searches from the most promising starts; nothing or MOVING for a hypothesis."""
-        moving = hypothesis == MOVING
-        begun = starts(structure, self.u, self.y, self.most_dead_time, moving, STARTS)
+    def fit(self, structure: Structure, hypothesis: DisturbanceHypothesis) -> Fitted:
+        """The best of a few searches from the most promising starts.
+
+        hypothesis: UNDISTURBED or NOT_AT_REST_INITIALLY.
+        """
+        not_at_rest = hypothesis == NOT_AT_REST_INITIALLY
+        begun = starts(structure, self.u, self.y, self.max_dead_time, not_at_rest, STARTS)
         return self.refined(structure, hypothesis, begun)
 
-    def refined(self, structure: Structure, hypothesis: Hypothesis, begun: Sequence[Reals]) -> Fitted:
+    def refined(self, structure: Structure, hypothesis: DisturbanceHypothesis, begun: Sequence[Reals]) -> Fitted:
         """The best of the searches from these starts, on every sample."""
         low, high = self._bounds(structure, hypothesis)
-        times = 1 + hypothesis.loads
-        reach = np.append(np.full(structure.lags, 1.5), np.full(times, max(5.0, 0.2 * self.most_dead_time)))
+        times = 1 + hypothesis.load_disturbances
+        max_step = np.append(np.full(structure.lags, 1.5), np.full(times, max(5.0, 0.2 * self.max_dead_time)))
         step = np.append(np.full(structure.lags, 1e-5), np.full(times, 1e-4))
 
         def columns(thetas: Reals) -> Reals:
-            return self.whole.regressors(structure, hypothesis, thetas)
+            return self.full_fit.regressors(structure, hypothesis, thetas)
 
-        bounded = Bounded(low, high, reach, step)
+        bounded = SearchBounds(low, high, max_step, step)
         found, rss = descend(columns, self.y, np.array(begun), bounded, MAX_STEPS, RELATIVE_DECREASE)
         return self.fitted(structure, hypothesis, found[np.argmin(rss)])
 
-    def fitted(self, structure: Structure, hypothesis: Hypothesis, theta: Reals) -> Fitted:
-        """On every sample, with the BIC that all are compared by."""
-        found = self.whole.fitted(structure, hypothesis, theta)
+    def fitted(self, structure: Structure, hypothesis: DisturbanceHypothesis, theta: Reals) -> Fitted:
+        """The fit at this theta on every sample, with the BIC by which all candidates are compared."""
+        found = self.full_fit.fitted(structure, hypothesis, theta)
         return replace(found, bic=self._bic(found.linear.rss, count(found)))
 
     # what is left
 
-    def matters(self, fit: Fitted) -> bool:
-        """Whether what is left must be noise."""
-        return fit.rms > self.unimportant
+    def residual_matters(self, fit: Fitted) -> bool:
+        """Whether the residual is large enough that its whiteness matters."""
+        return fit.rms > self.negligible_rms
 
     def explains(self, fit: Fitted, white_above: float = WHITE_ABOVE) -> bool:
-        """Nothing of weight is left that is not noise."""
-        return not self.matters(fit) or self.whiteness(fit) >= white_above
+        """Whether the fit explains the record: its residual is negligible or white, with a p-value above the limit."""
+        return not self.residual_matters(fit) or self.whiteness(fit) >= white_above
 
     def whiteness(self, fit: Fitted) -> float:
-        """p-value, see `tuning.identification.residuals`."""
+        """The p-value of the test of whiteness of the residual, see `tuning.identification.residuals`."""
         return whiteness(fit.linear.residual, len(fit.theta))
 
     def noise(self, fit: Fitted) -> float:
-        """The residual's rms as a part of the span of PV's response to MV."""
+        """The rms of the residual as a fraction of the range of PV's response to MV."""
         inputs = fit.structure.inputs
         return fit.rms / float(np.ptp(fit.columns[:, :inputs] @ fit.linear.coefficients[:inputs]))
 
-    def gain(self, fit: Fitted, over: Fitted) -> float:
-        """Of BIC, where a residual that is not white counts as so many fewer samples."""
-        samples = self.samples / (colour(fit.linear.residual) if self.matters(fit) else 1.0)
+    def bic_gain(self, fit: Fitted, over: Fitted) -> float:
+        """By how much BIC is lower for `fit` than for `over`. A residual that is not white counts as fewer samples, by
+        its variance inflation."""
+        samples = self.samples / (variance_inflation(fit.linear.residual) if self.residual_matters(fit) else 1.0)
         more = count(fit) - count(over)
         floor = self._floor()
         ratio = (over.linear.rss / self.samples + floor) / (fit.linear.rss / self.samples + floor)
         return samples * math.log(ratio) - more * math.log(max(samples, 2.0))
 
-    def visible(self, fit: Fitted) -> bool:
-        """PV is explained better with MV than without, more than by chance."""
+    def response_visible(self, fit: Fitted) -> bool:
+        """Whether PV is explained better with MV than without MV, by more than chance."""
         inputs = fit.structure.inputs
         rss = solve(fit.columns[:, inputs:], self.y).rss
-        return self._bic(rss, fit.parameters - inputs - len(fit.theta)) >= fit.bic + VISIBLE
+        return self._bic(rss, fit.parameters - inputs - len(fit.theta)) >= fit.bic + MIN_BIC_GAIN_OF_MV
 
-    def require_visible(self, fit: Fitted) -> None:
-        """Refused unless PV answers MV: more than by chance, and above the noise."""
-        if not self.visible(fit):
+    def require_visible_response(self, fit: Fitted) -> None:
+        """Raises Refused, NO_RESPONSE or NOISE_TOO_HIGH, unless PV answers MV by more than chance and above the
+        noise."""
+        if not self.response_visible(fit):
             noise = self.pv_unit * solve(fit.columns[:, fit.structure.inputs :], self.y).rss ** 0.5 / self.samples**0.5
             raise Refused(
                 Reason.NO_RESPONSE,
@@ -154,22 +176,23 @@ class Problem:
                 f"PV units, with it to within {self.pv_unit * fit.rms:.3g}; move MV further (it moved by "
                 f"{self.mv_unit:.3g}) or record for longer",
             )
-        if self.noise(fit) > NOISIEST:
+        if self.noise(fit) > MAX_NOISE:
             raise Refused(
                 Reason.NOISE_TOO_HIGH,
                 f"the noise of PV, {self.pv_unit * fit.rms:.3g} PV units, is {100.0 * self.noise(fit):.0f} % of its "
-                f"response to MV; at most {100.0 * NOISIEST:.0f} % is accepted: move MV further (it moved by "
+                f"response to MV; at most {100.0 * MAX_NOISE:.0f} % is accepted: move MV further (it moved by "
                 f"{self.mv_unit:.3g})",
             )
 
     # what it means
 
     def model(self, fit: Fitted) -> Model:
-        """In s and the units of the record."""
+        """The fitted model in s and the units of the record."""
         return self._model(fit.structure, fit.theta, fit.linear.coefficients[: fit.structure.inputs])
 
     def parameters(self, fit: Fitted) -> tuple[dict[str, float], Reals]:
-        """Of the model by name, in their units, and their covariance, in the same order; see `parameters_of`."""
+        """The parameters of the model by name, in their units, and their covariance in the same order; see
+        `parameters_of`."""
         structure, searched = fit.structure, fit.structure.searched
         at = np.concatenate((fit.theta[:searched], fit.linear.coefficients[: structure.inputs]))
         values = parameters_of(self.model(fit))
@@ -177,27 +200,28 @@ class Problem:
         def moved(at: Reals) -> Reals:
             return np.array(list(parameters_of(self._model(structure, at[:searched], at[searched:])).values()))
 
-        # a dead time is not less than 0, but it has a slope there
+        # a dead time cannot be negative, but central differences need room below it
         at[structure.lags] = max(at[structure.lags], 2.0 * LOG_STEP)
         slopes = slopes_of(moved, at, searched)
         kept = np.concatenate((np.arange(searched), len(fit.theta) + np.arange(structure.inputs)))
         return values, slopes @ self.covariance(fit)[np.ix_(kept, kept)] @ slopes.T
 
-    def loads(self, fit: Fitted) -> list[tuple[Reals, Reals]]:
-        """Of each step of the load: (when PV answers, when it enters at MV's side, size), errors of the same.
+    def load_disturbances(self, fit: Fitted) -> list[tuple[Reals, Reals]]:
+        """For each load disturbance: (time at which PV answers, time at which it enters at the plant's input, size),
+        and the standard errors of these.
 
-        Times in s since the first sample, size in MV units.
+        Times are in s since the first sample, the size is in MV units.
         """
         structure, lags = fit.structure, fit.structure.lags
         first = len(fit.theta)
         found = []
-        for i in range(fit.hypothesis.loads):
+        for i in range(fit.hypothesis.load_disturbances):
             of_load = first + structure.inputs + 1 + fit.hypothesis.drift + i * structure.order
 
             def values(at: Reals, i: int = i, of_load: int = of_load) -> Reals:
                 seen = at[structure.searched + i]
                 moved = replace(fit, theta=at[:first], linear=replace(fit.linear, coefficients=at[first:]))
-                size = at[of_load] / structure.slowest(at[:first]) / self.whole.static_gain(moved)
+                size = at[of_load] / structure.slowest(at[:first]) / self.full_fit.static_gain(moved)
                 Ts = self.record.Ts
                 return np.array([seen * Ts, (seen - at[lags]) * Ts, size * self.mv_unit])
 
@@ -208,28 +232,31 @@ class Problem:
         return found
 
     def covariance(self, fit: Fitted) -> Reals:
-        """Of theta and the linear coefficients, in this order, linearised; the residual's colour is allowed for."""
-        variance = fit.linear.rss / max(self.samples - fit.parameters, 1) * colour(fit.linear.residual)
-        return covariance(sensitivities(self.whole, fit), variance)
+        """The linearised covariance of theta and of the linear coefficients, in this order.
+
+        The variance of the residual is multiplied by its variance inflation, which allows for noise that is not white.
+        """
+        variance = fit.linear.rss / max(self.samples - fit.parameters, 1) * variance_inflation(fit.linear.residual)
+        return covariance(sensitivities(self.full_fit, fit), variance)
 
     def _model(self, structure: Structure, theta: Reals, inputs: Reals) -> Model:
-        if structure.plain:
+        if structure.lags_only:
             return self._plant(structure, theta, float(inputs[0]))
-        plant = self.whole.transfer(structure, theta, inputs)
+        plant = self.full_fit.transfer(structure, theta, inputs)
         unit = plant.den[structure.lags]
         return TransferFunction(tuple(b / unit for b in plant.num), tuple(a / unit for a in plant.den), plant.L)
 
     def _plant(self, structure: Structure, theta: Reals, b0: float) -> Plant:
         return structure.plant(theta, b0 * self.pv_unit / self.mv_unit, self.record.Ts)
 
-    def _bounds(self, structure: Structure, hypothesis: Hypothesis) -> tuple[Reals, Reals]:
+    def _bounds(self, structure: Structure, hypothesis: DisturbanceHypothesis) -> tuple[Reals, Reals]:
         slow, fast = math.log(1.0 / (LONGEST_LAG * self.samples)), math.log(1.0 / SHORTEST_LAG)
         low, high = np.full(structure.lags, slow), np.full(structure.lags, fast)
         if structure.lags > 1:
             # the product of two rates; a natural period under six samples is an alias
             low[1], high[1] = 2.0 * slow, 0.0
-        low, high = np.append(low, 0.0), np.append(high, float(self.most_dead_time))
-        loads = hypothesis.loads
+        low, high = np.append(low, 0.0), np.append(high, float(self.max_dead_time))
+        loads = hypothesis.load_disturbances
         return np.append(low, np.zeros(loads)), np.append(high, np.full(loads, self.samples - 2.0))
 
     def _floor(self) -> float:
@@ -240,10 +267,10 @@ class Problem:
 
 
 def parameters_of(model: Model) -> dict[str, float]:
-    """The model's parameters by name, without a lag that it does not have.
+    """The parameters of a model by name; a lag that the model does not have is left out.
 
-    Of a transfer function the coefficients as num[0], den[0] and so on, highest power first, and dead_time_s; not what
-    is 0 or 1 in any case.
+    A transfer function has its coefficients as num[0], den[0] and so on, highest power first, and dead_time_s.
+    Coefficients that are 0 or 1 by definition are left out.
     """
     if isinstance(model, TransferFunction):
         num = {f"num[{i}]": value for i, value in enumerate(model.num)}

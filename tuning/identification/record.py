@@ -1,4 +1,4 @@
-"""A recorded test of a loop, checked: what an identification can be asked to explain."""
+"""The record of a test of a loop, checked before an identification uses it."""
 
 from __future__ import annotations
 
@@ -12,16 +12,21 @@ from loopwright.tuning.reasons import Reason, Refused
 
 MIN_SAMPLES = 20
 MIN_AFTER_THE_FIRST_MOVE = 10
-# of the sample time, between one sample and the next
 UNEVEN = 0.2
+"""Largest accepted deviation of an interval between samples, as a fraction of the sample time."""
 GAP = 1.5
+"""Interval between samples, in sample times, above which it is called a gap."""
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
-    """Ts: s.  y: PV, shape (N,).  u: MV that held from each sample to the next, shape (N,).  u_before: MV before it.
+class RecordedTest:
+    """A checked record of a test.
 
-    first_move: the first sample from which MV is not u_before.
+    Ts: the sample time, s.
+    u: MV, held from each sample to the next, MV units, shape (N,).
+    y: PV at each sample, PV units, shape (N,).
+    u_before: MV before the record.
+    first_move: the first sample at which MV differs from u_before.
     """
 
     Ts: float
@@ -31,11 +36,13 @@ class Recorded:
     first_move: int
 
 
-def recorded(t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | None = None) -> Recorded:
-    """Checks and puts together a record; t in s, evenly spaced, u and y of the same length.
+def recorded_test(t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | None = None) -> RecordedTest:
+    """Checks the columns of a record and puts them together.
 
-    u_before: the MV that had held before the record, by default its first value.
-    Raises Refused(BAD_INPUT), naming the sample, for what cannot be used.
+    t: the times of the samples, s, evenly spaced.
+    u, y: MV and PV, as many values as t.
+    u_before: MV before the record, by default the first value of u.
+    Raises Refused: BAD_INPUT, naming the sample that cannot be used; NO_RESPONSE for a constant PV.
     """
     time, mv, pv = (_column(name, values) for name, values in (("t", t), ("u", u), ("y", y)))
     if not len(time) == len(mv) == len(pv):
@@ -60,7 +67,7 @@ def recorded(t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | None = 
         )
     if float(np.ptp(pv)) == 0.0:
         raise Refused(Reason.NO_RESPONSE, f"PV is constant at {pv[0]:g} while MV moves")
-    return Recorded(Ts, mv, pv, before, first)
+    return RecordedTest(Ts, mv, pv, before, first)
 
 
 def _column(name: str, values: ArrayLike) -> Reals:

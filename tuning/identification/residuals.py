@@ -1,4 +1,4 @@
-"""What is left of a record after a fit: is it noise?"""
+"""Tests of the residual of a fit: whether it is white noise, and by how much slow noise inflates a variance."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ from loopwright.tuning.models import Reals
 
 
 def whiteness(residual: Reals, searched: int) -> float:
-    """p-value of the Ljung-Box test (1978) on the residual's autocorrelation."""
+    """The p-value of the test of Ljung and Box (1978) on the autocorrelation of the residual.
+
+    residual: shape (N,).
+    searched: the number of searched parameters, which reduces the degrees of freedom.
+    """
     n = len(residual)
     lags = max(searched + 3, min(20, n // 5))
     r = residual - residual.mean()
@@ -21,10 +25,11 @@ def whiteness(residual: Reals, searched: int) -> float:
     return float(chdtrc(lags - searched, q))
 
 
-def colour(residual: Reals) -> float:
-    """By how much the noise varies more in slow averages than white noise of its variance would; at least 1.
+def variance_inflation(residual: Reals) -> float:
+    """The variance inflation of slow averages of the residual, against white noise of the same variance; at least 1.
 
-    (1 + r)/(1 - r) with the correlation r of neighbours: exact for first-order autoregressive noise.
+    The inflation is (1 + r)/(1 - r) = 4/d - 1, with the correlation r of neighbours and the Durbin-Watson statistic d;
+    it is exact for first-order autoregressive noise.
     """
     variance = float(np.mean(residual**2))
     fast = 0.5 * float(np.mean(np.diff(residual) ** 2))

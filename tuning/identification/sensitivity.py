@@ -1,4 +1,4 @@
-"""How the output and the model of a fitted record move with its parameters: what the delta method needs."""
+"""The sensitivities of the output and of the model of a fitted record to its parameters, for the delta method."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from loopwright.tuning.models import Reals
 
 
 def sensitivities(fit: Fit[S], found: Fitted) -> Reals:
-    """Derivatives of the output by theta and the linear coefficients, in this order, shape (rows, parameters)."""
+    """The derivatives of the output by theta and the linear coefficients, in this order, shape (rows, parameters)."""
     structure, hypothesis, c = found.structure, found.hypothesis, found.linear.coefficients
     low, high = fit.bounds(structure, hypothesis)
-    # a corner has no derivative: half a sample for a time, a whole one where MV passes at once
+    # The response has corners, so a time moves by half a sample, or by a whole one with feed-through.
     time = (1.0 if structure.feed_through else 0.5) * fit.block
     step = np.append(np.full(structure.lags, LOG_STEP), np.full(len(found.theta) - structure.lags, time))
     above = [np.minimum(found.theta + move, high) for move in np.diag(step)]
@@ -27,7 +27,10 @@ def sensitivities(fit: Fit[S], found: Fitted) -> Reals:
 
 
 def slopes_of(function: Callable[[Reals], Reals], at: Reals, searched: int) -> Reals:
-    """Central differences, shape (values, parameters); of `at` the first `searched` are logs and times in samples."""
+    """The derivatives of a function by central differences, shape (values, parameters).
+
+    at: the point; its first `searched` values are logarithms and times in samples, the others linear coefficients.
+    """
     columns = []
     for i in range(len(at)):
         move = np.zeros(len(at))

@@ -1,6 +1,6 @@
-"""FOPDT models of recorded steps: areas, moments and least squares on an open step, a fit on a closed loop.
+"""FOPDT models of recorded steps: areas, moments and least squares for an open-loop step, a fit for a closed loop.
 
-All take the record as arrays over t, s, that begin at the step. For records of other shapes see identification.
+Each function takes the record as arrays over t (s) that begin at the step. For records of other shapes see `identify`.
 """
 
 from __future__ import annotations
@@ -19,14 +19,18 @@ from loopwright.tuning.reduction.moments_and_areas import fopdt_of_areas, fopdt_
 MIN_SAMPLES = 20
 FINE = 4000
 REST = 0.02
-"""How far the ends of the last two twentieths of a record may be apart, as a fraction of the step, to be at rest."""
+"""Largest difference of the means of the last two twentieths of a record at rest, as a fraction of the largest
+change."""
 
 
 def two_areas_of(t: Reals, y: Reals, step: float, y0: float) -> FOPDT:
-    """FOPDT from a step of MV by `step` (MV units) at t[0] from rest at y0 (PV units), by two areas.
+    """The FOPDT model of an open-loop step by two areas; equations and source: `tuning.reduction.moments_and_areas`.
 
-    Equations and source: `tuning.reduction.moments_and_areas`. Raises Refused, BAD_INPUT: a record that is none, or not
-    at rest at its end; NO_RESPONSE.
+    t: the times of the samples, s; the step is at t[0].
+    y: PV, PV units.
+    step: the step of MV, MV units.
+    y0: PV at rest before the step, PV units.
+    Raises Refused: BAD_INPUT for a record that cannot be used or does not end at rest; NO_RESPONSE.
     """
     time, share, K = _normalised(t, y, step, y0)
     A0 = float(np.trapezoid(1.0 - share, time))
@@ -36,11 +40,10 @@ def two_areas_of(t: Reals, y: Reals, step: float, y0: float) -> FOPDT:
 
 
 def moments_of(t: Reals, y: Reals, step: float, y0: float) -> FOPDT:
-    """FOPDT from a step of MV by its moments (see `tuning.reduction.moments_and_areas`).
+    """The FOPDT model of an open-loop step by its moments (see `tuning.reduction.moments_and_areas`).
 
-    Arguments and errors are those of `two_areas_of`.
-
-    mean = integral of 1 - y/K, variance = 2 * integral of t*(1 - y/K) - mean^2: noise late in the record weighs most.
+    Arguments and errors are those of `two_areas_of`. The moments are mean = integral of 1 - y/K and
+    variance = 2 * integral of t*(1 - y/K) - mean^2, so noise late in the record weighs most.
     """
     time, share, K = _normalised(t, y, step, y0)
     mean = float(np.trapezoid(1.0 - share, time))
@@ -48,9 +51,11 @@ def moments_of(t: Reals, y: Reals, step: float, y0: float) -> FOPDT:
 
 
 def fit_step(t: Reals, y: Reals, step: float, y0: float, K: float | None = None) -> FOPDT:
-    """FOPDT by least squares over time on a step of MV; the record need not end at rest. Arguments as `two_areas_of`.
+    """The FOPDT model of an open-loop step by least squares over time; the record need not end at rest.
 
-    K: gain, PV units per MV unit, to be kept; by default it is fitted too. Raises Refused, BAD_INPUT or NO_RESPONSE.
+    t, y, step, y0: as for `two_areas_of`.
+    K: a known gain, PV units per MV unit; by default the gain is fitted too.
+    Raises Refused: BAD_INPUT, NO_RESPONSE.
     """
     time, change = _checked(t, y, step, y0)
     end = float(time[-1])
@@ -70,7 +75,7 @@ def fit_step(t: Reals, y: Reals, step: float, y0: float, K: float | None = None)
     def difference(x: Reals) -> Reals:
         return gain(math.exp(x[0]), float(x[1]))[1]
 
-    # before the step has come to rest many pairs look alike: the best of a coarse grid to begin with
+    # while the response is not complete many pairs (T, L) fit alike, so the search starts from a coarse grid
     T, L = min(((T, L) for T in end * np.geomspace(0.01, 3.0, 12) for L in end * np.linspace(0.0, 0.6, 13)), key=cost)
     found = least_squares(
         difference,
@@ -89,11 +94,19 @@ def fit_step(t: Reals, y: Reals, step: float, y0: float, K: float | None = None)
 
 
 def fit_closed_loop(t: Reals, y: Reals, gains: Gains, step: float, y0: float, K: float | None = None) -> FOPDT:
-    """FOPDT from a set-point step of `step` (PV units) at t[0] from rest at y0, under known gains: a reverse fit.
+    """The FOPDT model of a set-point step in closed loop under known gains.
 
-    The model whose own loop under these gains answers most alike, in the sum of squares over the record. K: gain to be
-    kept, PV units per MV unit; by default it is fitted too. The model's K is positive: the record does not tell the
-    direction of the plant. Raises Refused, BAD_INPUT: a record or gains that are none; NO_RESPONSE.
+    The result is the model whose loop under these gains has the response with the smallest sum of squared differences
+    from the record.
+
+    t: the times of the samples, s; the step is at t[0].
+    y: PV, PV units.
+    gains: the gains in effect.
+    step: the set-point step, PV units.
+    y0: PV at rest before the step, PV units.
+    K: a known gain, PV units per MV unit; by default the gain is fitted too. The model's K is positive, as the record
+    does not show the direction of the plant.
+    Raises Refused: BAD_INPUT for a record or gains that cannot be used; NO_RESPONSE.
 
     Source: Stopakevych et al., automatic re-tuning of PI controllers, Problemele Energeticii Regionale (row 5 of
     Table 1, which reproduces with the squares, not with the absolute differences that its text names).
@@ -135,7 +148,8 @@ def fit_closed_loop(t: Reals, y: Reals, gains: Gains, step: float, y0: float, K:
 
 
 def _static_gain(time: Reals, share: Reals, gains: Gains) -> float:
-    """A first idea of the gain: with integral action from the error's integral, Ti/(K*Kp); else from the end."""
+    """A first estimate of the gain: with integral action from the integral of the error, which is Ti/(K*Kp); without it
+    from the end of the record."""
     if gains.Ti > 0.0:
         area = float(np.trapezoid(1.0 - share, time))
         # from a record that ends too early the area is too small, at worst negative
@@ -145,7 +159,7 @@ def _static_gain(time: Reals, share: Reals, gains: Gains) -> float:
 
 
 def _checked(t: Reals, y: Reals, step: float, y0: float) -> tuple[Reals, Reals]:
-    """(t from 0, change of y). Raises Refused, BAD_INPUT or NO_RESPONSE."""
+    """The record as (t from 0, change of y). Raises Refused, BAD_INPUT or NO_RESPONSE."""
     time, change = np.asarray(t, dtype=float), np.asarray(y, dtype=float) - y0
     if time.ndim != 1 or time.shape != change.shape or len(time) < MIN_SAMPLES:
         raise Refused(
@@ -163,7 +177,7 @@ def _checked(t: Reals, y: Reals, step: float, y0: float) -> tuple[Reals, Reals]:
 
 
 def _normalised(t: Reals, y: Reals, step: float, y0: float) -> tuple[Reals, Reals, float]:
-    """(t from 0, change as a fraction of its end, gain)."""
+    """The record as (t from 0, change of y as a fraction of its final value, gain)."""
     time, change = _checked(t, y, step, y0)
     part = max(len(time) // 20, 1)
     last, before = float(np.mean(change[-part:])), float(np.mean(change[-2 * part : -part]))

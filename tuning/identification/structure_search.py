@@ -1,7 +1,7 @@
-"""Where lags do not explain a record: zeros, feed-through and a third lag, and stories of what moved PV beside MV.
+"""The search beyond lags, for records that lags do not explain: zeros, feed-through, a third lag, and disturbances.
 
-The search is that of the procedure "fast" (`output_error`, `disturbances`). The time scale that a relay would give
-comes from the second-order model of the same record: its ultimate period.
+The search is that of the procedure "fast" (`output_error`, `disturbances`). Its time scale, which a relay would give,
+is the ultimate period of the second-order model of the same record.
 """
 
 from __future__ import annotations
@@ -12,10 +12,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from loopwright.tuning.analysis.margins import ultimate_point
-from loopwright.tuning.identification.disturbances import PLAIN, by_bic, fits, stories, timed_again
+from loopwright.tuning.identification.disturbances import (
+    LAGS_ONLY,
+    by_bic,
+    disturbance_candidates,
+    fit_structures,
+    search_last_load_again,
+)
 from loopwright.tuning.identification.disturbances import STRUCTURES as SEVEN
-from loopwright.tuning.identification.output_error import QUIET, Fitted
-from loopwright.tuning.identification.problem import WHITE_ABOVE, Problem
+from loopwright.tuning.identification.output_error import UNDISTURBED, Fitted
+from loopwright.tuning.identification.problem import WHITE_ABOVE, IdentificationProblem
 from loopwright.tuning.identification.residuals import whiteness
 from loopwright.tuning.identification.structures import (
     INTEGRATOR,
@@ -29,57 +35,62 @@ from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.reasons import Ended
 
 STRUCTURES = (*SEVEN, THIRD, INTEGRATOR, LAGGED_INTEGRATOR, INTEGRATOR_WITH_ZERO)
-SLOWEST = 1.0
-"""Records after the first move of MV: a slower pole or zero of a plant of more than lags is a shape, no finding."""
-A_MOVE = 0.2
-"""Of MV's largest: what counts as one."""
+MAX_TIME_CONSTANT = 1.0
+"""Largest time constant of a pole or zero of a model of more than lags, in lengths of the record after the first move
+of MV; a slower one is not supported by the record."""
+MIN_MOVE = 0.2
+"""Smallest change of MV, as a fraction of the largest, that counts as a move."""
 FEW_MOVES = 2
 NEAR_A_MOVE = 0.02
-"""Of the record: the neighbourhood of a move."""
+"""Distance from a move of MV, as a fraction of the record, within which a load disturbance comes with the move."""
 LIKELIEST = 4
-"""Of the fits to averages, so many are searched further on every sample."""
-NEAR = range(-2, 3)
-"""Samples, around the dead time found, in which the jump of a plant that passes MV at once is looked for."""
+"""Number of the best fits to averages that are refined on every sample."""
+NEIGHBOURS = range(-2, 3)
+"""Samples around the fitted dead time at which the jump of a plant with feed-through is searched."""
 
 
-class Search:
-    """lags: the fits of the record by lags, the second order among them."""
+class StructureSearch:
+    """The search for structures of more than lags and for disturbances. lags: the fits of structures of lags, the
+    second order among them."""
 
-    def __init__(self, problem: Problem, lags: Sequence[Fitted]) -> None:
+    def __init__(self, problem: IdentificationProblem, lags: Sequence[Fitted]) -> None:
         self.problem = problem
         self._lags = lags
-        self._fit = problem.wide(_period(problem, next(each for each in lags if each.structure == SECOND)))
-        self._quiet: list[Fitted] = []
+        self._fit = problem.fit_around(_period(problem, next(each for each in lags if each.structure == SECOND)))
+        self._undisturbed: list[Fitted] = []
 
-    def quiet(self) -> list[Fitted]:
-        """All structures from rest that the record can show, on every sample."""
-        known = [self.problem.fit(SECOND_WITH_ZERO, QUIET), *self._lags]
-        self._quiet = fits(self._fit, QUIET, known, STRUCTURES)
-        return self._sound(self._quiet)
+    def undisturbed(self) -> list[Fitted]:
+        """The fits of all structures without a disturbance that the record supports, on every sample."""
+        known = [self.problem.fit(SECOND_WITH_ZERO, UNDISTURBED), *self._lags]
+        self._undisturbed = fit_structures(self._fit, UNDISTURBED, known, STRUCTURES)
+        return self._supported(self._undisturbed)
 
-    def told(self, simple: bool) -> list[list[Fitted]]:
-        """The same with what else moved PV, the simplest story first; `quiet` comes before.
+    def disturbed(self, lags_and_one_load: bool) -> list[list[Fitted]]:
+        """The fits with disturbances that the record supports, the simplest hypothesis first; `undisturbed` must be
+        called before.
 
-        simple: one load and lags only.
+        lags_and_one_load: only structures of lags with one load disturbance are tried.
         """
-        unexplained = (lambda fit: False) if simple else self._unexplained
-        told = stories(self._fit, self._quiet, unexplained, structures=PLAIN if simple else STRUCTURES)
-        for found in told:
-            if (best := min(found, key=by_bic)).hypothesis.loads:
-                found += timed_again(self._fit, best)
-        return [[each for each in self._sound(found) if not confounded(self.problem, each)] for found in told]
+        unexplained = (lambda fit: False) if lags_and_one_load else self._unexplained
+        disturbed = disturbance_candidates(
+            self._fit, self._undisturbed, unexplained, structures=LAGS_ONLY if lags_and_one_load else STRUCTURES
+        )
+        for found in disturbed:
+            if (best := min(found, key=by_bic)).hypothesis.load_disturbances:
+                found += search_last_load_again(self._fit, best)
+        return [[each for each in self._supported(found) if not confounded(self.problem, each)] for found in disturbed]
 
     def _unexplained(self, fit: Fitted) -> bool:
-        return self.problem.matters(fit) and whiteness(fit.linear.residual, len(fit.theta)) < WHITE_ABOVE
+        return self.problem.residual_matters(fit) and whiteness(fit.linear.residual, len(fit.theta)) < WHITE_ABOVE
 
-    def _sound(self, found: list[Fitted]) -> list[Fitted]:
-        """Those that the record can show, the lowest BIC first."""
+    def _supported(self, found: list[Fitted]) -> list[Fitted]:
+        """The fits that the record supports, on every sample, the lowest BIC first."""
         best = min(found, key=by_bic)
         dead_time = float(best.theta[best.structure.lags])
         ranked = sorted((self._on_every_sample(fit, dead_time) for fit in found), key=by_bic)
-        shown = [each for each in ranked if _shown(self.problem, each)]
+        shown = [each for each in ranked if _within_the_record(self.problem, each)]
         if self._fit.block > 1:
-            # times are sharper on every sample than on averages, and that must not decide between structures
+            # times are sharper on every sample than on averages; all competing structures must profit from that
             shown[:LIKELIEST] = [self._further(each) for each in shown[:LIKELIEST]]
         return shown
 
@@ -87,14 +98,12 @@ class Search:
         return min(fit, self.problem.refined(fit.structure, fit.hypothesis, [fit.theta]), key=by_bic)
 
     def _on_every_sample(self, fit: Fitted, dead_time: float) -> Fitted:
-        """Where MV passes at once whole samples of dead time are tried one by one: no slope leads across a jump.
-
-        Around its own and around the dead time of the best fit.
-        """
-        at, maximum = fit.structure.lags, float(self.problem.most_dead_time)
+        """The fit on every sample. With feed-through, dead times of whole samples around its own and around `dead_time`
+        are tried one by one, as no slope leads across a jump."""
+        at, maximum = fit.structure.lags, float(self.problem.max_dead_time)
         thetas = [fit.theta]
         if fit.structure.feed_through:
-            for whole in np.floor([fit.theta[at], dead_time])[:, None] + np.array(NEAR):
+            for whole in np.floor([fit.theta[at], dead_time])[:, None] + np.array(NEIGHBOURS):
                 thetas += [np.insert(np.delete(fit.theta, at), at, np.clip(L + 0.5, 0.0, maximum)) for L in whole]
         tried = sorted((self.problem.fitted(fit.structure, fit.hypothesis, theta) for theta in thetas), key=by_bic)
         if len(tried) == 1:
@@ -102,35 +111,37 @@ class Search:
         return self._further(tried[0])
 
 
-def _shown(problem: Problem, fit: Fitted) -> bool:
-    if fit.structure.plain:
+def _within_the_record(problem: IdentificationProblem, fit: Fitted) -> bool:
+    if fit.structure.lags_only:
         return True
     model = problem.model(fit)
     corners = np.abs(np.concatenate((np.roots(model.num), np.roots(model.den))))
-    longest = SLOWEST * (problem.samples - problem.record.first_move) * problem.record.Ts
+    longest = MAX_TIME_CONSTANT * (problem.samples - problem.record.first_move) * problem.record.Ts
     return bool(np.all(corners[corners > 0.0] > 1.0 / longest))
 
 
-def confounded(problem: Problem, fit: Fitted) -> bool:
-    """A story that may be the plant's own shape: MV is not needed, or a load comes with its move, or with another load.
+def confounded(problem: IdentificationProblem, fit: Fitted) -> bool:
+    """Whether the disturbance may be confounded with the plant's own response.
 
-    Where MV moves more often the plant's shape shows without the load.
+    It may be where MV is not needed for the fit, where a load disturbance comes with a move of MV, or where two load
+    disturbances come together. Where MV moves more than FEW_MOVES times, the record shows the plant's response apart
+    from the load disturbance.
     """
-    if not problem.visible(fit):
+    if not problem.response_visible(fit):
         return True
     seen = np.sort(fit.theta[fit.structure.searched :])
     near = NEAR_A_MOVE * problem.samples
     if np.any(np.diff(seen) < near):
         return True
-    moves = np.flatnonzero(np.abs(np.diff(problem.u, prepend=0.0)) > A_MOVE)
+    moves = np.flatnonzero(np.abs(np.diff(problem.u, prepend=0.0)) > MIN_MOVE)
     if len(moves) > FEW_MOVES:
         return False
     after = float(fit.theta[fit.structure.lags]) + near
     return bool(np.any((seen[:, None] > moves - near) & (seen[:, None] < moves + after)))
 
 
-def _period(problem: Problem, second: Fitted) -> float:
-    """Samples."""
+def _period(problem: IdentificationProblem, second: Fitted) -> float:
+    """The ultimate period of the second-order model, in samples; infinite where the model has none."""
     plant = problem.model(second)
     Ts = problem.record.Ts
     try:

@@ -1,4 +1,4 @@
-"""Model structures that can be fitted to a record: what is searched for, and what follows from it linearly.
+"""The model structures that can be fitted to a record, with their searched and their linear parameters.
 
 A structure is stable by construction: the coefficients of its denominator are searched as logarithms, which covers two
 real poles, a double pole and a complex pair without a distinction of cases.
@@ -18,10 +18,17 @@ Plant = FOPDT | SOPDT | Integrating
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """(b_z s^z + ... + b_0) * exp(-L*s) / den(s), den monic with `lags` searched coefficients, times s if integrating.
+    """A structure (b_z s^z + ... + b_0) * exp(-L*s) / den(s).
 
-    Three lags are (s^2 + a1 s + a0)(s + p). feed_through: a part g*exp(-L*s) of MV is in PV at once. The b and g are
-    linear, theta = (logs of the searched coefficients, highest power first, p last; L) is not; time in samples.
+    The denominator den is monic with `lags` searched coefficients, times s if the plant integrates; that of three lags
+    is (s^2 + a1 s + a0)(s + p). The b and g are linear parameters. The searched ones are theta = (logarithms of the
+    searched coefficients, highest power first, p last; L); time is in samples.
+
+    name: the name of the structure.
+    lags: the number of lags, 0 to 3.
+    integrating: True for a pole at the origin.
+    zeros: the number of zeros z.
+    feed_through: True for a part g*exp(-L*s) of the transfer function, by which PV jumps with MV.
     """
 
     name: str
@@ -32,20 +39,21 @@ class Structure:
 
     @property
     def order(self) -> int:
+        """The degree of the denominator."""
         return self.lags + self.integrating
 
     @property
     def searched(self) -> int:
-        """How many numbers theta has."""
+        """The number of searched parameters, the length of theta."""
         return self.lags + 1
 
     @property
     def inputs(self) -> int:
-        """How many linear coefficients belong to the plant's input."""
+        """The number of linear coefficients that belong to the plant's input."""
         return self.zeros + 1 + self.feed_through
 
     def monic(self, theta: Reals) -> Reals:
-        """The denominator without its leading 1, highest power first; of each theta, shape (..., order)."""
+        """The denominator of each theta without its leading 1, highest power first, shape (..., order)."""
         searched = np.exp(theta[..., : self.lags])
         if self.lags == 3:
             a1, a0, p = np.moveaxis(searched, -1, 0)
@@ -55,16 +63,21 @@ class Structure:
         return np.asarray(searched)
 
     def slowest(self, theta: Reals) -> float:
-        """The denominator's last coefficient other than 0."""
+        """The last coefficient of the denominator that is not 0."""
         return float(np.append(1.0, self.monic(theta[: self.searched]))[self.lags])
 
     @property
-    def plain(self) -> bool:
-        """Lags and a dead time, nothing more: what `plant` has a form for."""
+    def lags_only(self) -> bool:
+        """Whether the structure has lags and a dead time only, at most second order, so that `plant` has a form for
+        it."""
         return not (self.zeros or self.feed_through) and self.order <= 2
 
     def plant(self, theta: Reals, b0: float, Ts: float) -> Plant:
-        """The model of these parameters, time in s again; b0 in PV units per MV unit (and sample^order)."""
+        """The model of these parameters with time in s.
+
+        b0: the numerator, PV units per MV unit and sample^order.
+        Ts: the sample time, s.
+        """
         L = max(float(theta[self.lags]), 0.0) * Ts
         if self.integrating:
             if not self.lags:
@@ -84,8 +97,8 @@ INTEGRATOR = Structure("integrating", 0, integrating=True)
 LAGGED_INTEGRATOR = Structure("integrating with lag", 1, integrating=True)
 INTEGRATOR_WITH_ZERO = Structure("integrating with lag and zero", 1, integrating=True, zeros=1)
 SECOND_WITH_ZERO = Structure("sopdt with zero", 2, zeros=1)
-FIRST_FED = Structure("fopdt with feed-through", 1, feed_through=True)
-SECOND_FED = Structure("sopdt with zero and feed-through", 2, zeros=1, feed_through=True)
+FIRST_WITH_FEED_THROUGH = Structure("fopdt with feed-through", 1, feed_through=True)
+SECOND_WITH_FEED_THROUGH = Structure("sopdt with zero and feed-through", 2, zeros=1, feed_through=True)
 THIRD = Structure("third order", 3)
 THIRD_WITH_ZERO = Structure("third order with zero", 3, zeros=1)
 THIRD_WITH_ZEROS = Structure("third order with two zeros", 3, zeros=2)

@@ -1,9 +1,9 @@
-"""Separable least squares: linear coefficients solved for, the few others searched from many starts side by side.
+"""Separable least squares: the linear coefficients are solved for, the few other parameters are searched from starts.
 
-Variable projection (Golub and Pereyra, 1973), steps of Levenberg and Marquardt, Kaufman's slopes (BIT 15, 1975): the
-slope of the projected residual without the term that vanishes with the residual, so that all slopes cost one solution
-of the linear part. The starts do not know of each other; they share the calls, which cost more than the arithmetic in
-them.
+The method is variable projection (Golub and Pereyra, 1973) with steps of Levenberg and Marquardt and Kaufman's slopes
+(BIT 15, 1975): the slope of the projected residual without the term that vanishes with the residual, so that all slopes
+cost one solution of the linear part. Starts are independent and evaluated as one batch, because call overhead
+dominates.
 """
 
 from __future__ import annotations
@@ -18,51 +18,64 @@ from loopwright.tuning.models import Reals
 
 Rows = NDArray[np.int64]
 Flags = NDArray[np.bool_]
-TRIES = 12
+MAX_TRIES = 12
 FIRST_DAMPING, MIN_DAMPING = 1e-3, 1e-12
-WORTH_TRYING = 0.1
-"""Of the decrease at which a search ends: a step that promises less is not tried."""
-UNFELT = 1e-9
-"""Of the largest slope: a parameter whose slope is less does nothing, but for rounding."""
+MIN_PROMISED_DECREASE = 0.1
+"""Smallest decrease that a step must promise to be tried, as a fraction of the decrease at which a search ends."""
+MIN_SLOPE = 1e-9
+"""Smallest slope of a parameter, as a fraction of the largest slope; a smaller one is a rounding error."""
 REDUNDANT = 1e-10
-"""Of a direction, in columns of unit length, that the others have left nothing of."""
-# directions weaker than this, in columns of unit length, are not seen in the data
+"""Size of a direction, in columns of unit length, below which it is a linear combination of the others."""
 MIN_SINGULAR = 1e-9
+"""Relative singular value, of columns of unit length, below which the data do not show a direction."""
 
 
 @dataclass(frozen=True, slots=True)
-class Linear:
-    """coefficients: shape (columns,).  residual: shape (N,).  rss: its sum of squares."""
+class LinearFit:
+    """A linear least-squares fit.
+
+    coefficients: shape (columns,).
+    residual: shape (N,).
+    rss: the residual sum of squares.
+    """
 
     coefficients: Reals
     residual: Reals
     rss: float
 
 
-def solve(columns: Reals, y: Reals) -> Linear:
-    """Least squares with columns of unit length."""
+def solve(columns: Reals, y: Reals) -> LinearFit:
+    """The linear least-squares fit of y, shape (N,), by the columns, shape (N, columns), scaled to unit length."""
     lengths = np.sqrt(np.einsum("ij,ij->j", columns, columns))
     lengths = np.where(lengths > 0.0, lengths, 1.0)
     found = np.linalg.lstsq(columns / lengths, y, rcond=1e-12)[0] / lengths
     residual = y - columns @ found
-    return Linear(found, residual, float(residual @ residual))
+    return LinearFit(found, residual, float(residual @ residual))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Bounded:
-    """Of each parameter: its bounds, its longest step, and the step of its forward difference."""
+class SearchBounds:
+    """The limits of the search for each parameter, arrays of shape (parameters,).
+
+    low, high: the bounds.
+    max_step: the longest step of one iteration.
+    step: the step of the forward difference.
+    """
 
     low: Reals
     high: Reals
-    reach: Reals
+    max_step: Reals
     step: Reals
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Projected:
-    """y after the best linear fit at each point.
+    """The best linear fit of y at each point.
 
-    columns, basis (orthonormal): shape (points, N, columns).  linear: (points, columns).  rest: (points, N).
+    columns: the regressors, shape (points, N, columns).
+    basis: an orthonormal basis of the columns, of the same shape.
+    linear: the linear coefficients, shape (points, columns).
+    rest: the residual, shape (points, N).
     """
 
     columns: Reals
@@ -97,23 +110,27 @@ def descend(
     columns_of: Callable[[Reals], Reals],
     y: Reals,
     starts: Reals,
-    bounded: Bounded,
-    most_steps: int,
+    bounded: SearchBounds,
+    max_steps: int,
     relative_decrease: float,
 ) -> tuple[Reals, Reals]:
-    """The local minimum of the sum of squares that each start leads to: (where, the sums there).
+    """The local minimum of the sum of squares that each start leads to: (the points, the sums of squares there).
 
-    columns_of: the regressors, shape (points, N, columns), at points of shape (points, parameters).  y: shape (N,).
-    starts: shape (starts, parameters).
+    columns_of: gives the regressors, shape (points, N, columns), at points of shape (points, parameters).
+    y: the output, shape (N,).
+    starts: the starts, shape (starts, parameters).
+    bounded: the limits of the search.
+    max_steps: the largest number of iterations.
+    relative_decrease: a search ends when an iteration lowers its sum of squares by less than this fraction.
     """
-    low, high, reach = bounded.low, bounded.high, bounded.reach
+    low, high, max_step = bounded.low, bounded.high, bounded.max_step
     at = np.clip(starts, low, high)
     here = _Projected.of(columns_of(at), y)
     cost = here.rss
     damping = np.full(len(at), FIRST_DAMPING)
     one = np.eye(at.shape[1])
     going = np.arange(len(at))
-    for _ in range(most_steps):
+    for _ in range(max_steps):
         slopes = _slopes(columns_of, at, here, going, bounded)
         turned = np.swapaxes(slopes, 1, 2)
         gradient = (turned @ here.rest[going, :, None])[:, :, 0]
@@ -122,7 +139,7 @@ def descend(
         free = ~(((now <= low) & (gradient > 0.0)) | ((now >= high) & (gradient < 0.0)))
         normal = turned @ slopes
         scale = np.sqrt(np.einsum("bii->bi", normal))
-        free &= scale > UNFELT * scale.max(axis=1, keepdims=True)
+        free &= scale > MIN_SLOPE * scale.max(axis=1, keepdims=True)
         gradient = np.where(free, gradient, 0.0)
         normal = np.where(free[:, :, None] & free[:, None, :], normal, 0.0)
         scale[~free] = 1.0
@@ -131,16 +148,16 @@ def descend(
 
         before = cost[going]
         trying = np.arange(len(going))
-        for _ in range(TRIES):
+        for _ in range(MAX_TRIES):
             mine = going[trying]
             A, b = normal[trying], gradient[trying]
             move = -np.linalg.solve(A + damping[mine, None, None] * one, b[:, :, None])[:, :, 0]
             promised = -2.0 * np.einsum("bi,bi->b", b, move) - np.einsum("bi,bij,bj->b", move, A, move)
-            worth = promised > WORTH_TRYING * relative_decrease * cost[mine]
+            worth = promised > MIN_PROMISED_DECREASE * relative_decrease * cost[mine]
             trying, mine, move = trying[worth], mine[worth], move[worth]
             if not len(trying):
                 break
-            new = np.clip(at[mine] + np.clip(move / scale[trying], -reach, reach), low, high)
+            new = np.clip(at[mine] + np.clip(move / scale[trying], -max_step, max_step), low, high)
             there = _Projected.of(columns_of(new), y)
             better = there.rss < cost[mine]
             won = mine[better]
@@ -155,8 +172,10 @@ def descend(
     return at, cost
 
 
-def _slopes(columns_of: Callable[[Reals], Reals], at: Reals, here: _Projected, which: Rows, bounded: Bounded) -> Reals:
-    """Of the residuals at these points by each parameter, shape (points, N, parameters)."""
+def _slopes(
+    columns_of: Callable[[Reals], Reals], at: Reals, here: _Projected, which: Rows, bounded: SearchBounds
+) -> Reals:
+    """The slopes of the residuals at these points by each parameter, shape (points, N, parameters)."""
     points, count = at[which], at.shape[1]
     signed = np.where(points + bounded.step <= bounded.high, bounded.step, -bounded.step)
     moved = points[:, None, :] + signed[:, :, None] * np.eye(count)
@@ -169,7 +188,7 @@ def _slopes(columns_of: Callable[[Reals], Reals], at: Reals, here: _Projected, w
 
 
 def _back(r: Reals, along: Reals) -> Reals:
-    """R c = along, without a direction that the columns have left out."""
+    """The solutions c of R c = along, where a redundant direction gets the solution of least size."""
     seen = np.abs(np.einsum("bii->bi", r)).min(axis=1) > REDUNDANT
     if seen.all():
         return np.asarray(np.linalg.solve(r, along[:, :, None])[:, :, 0])
@@ -181,7 +200,8 @@ def _back(r: Reals, along: Reals) -> Reals:
 
 
 def covariance(columns: Reals, variance: float) -> Reals:
-    """variance * (A'A)^-1 of the columns A; a direction the data do not show gets a very large but finite value."""
+    """variance * (A'A)^-1 of the columns A; a direction that the data do not show gets a very large but finite
+    value."""
     lengths = np.sqrt(np.einsum("ij,ij->j", columns, columns))
     lengths = np.where(lengths > 0.0, lengths, 1.0)
     _, singular, turned = np.linalg.svd(columns / lengths, full_matrices=False)

@@ -1,1 +1,1 @@
-"""From any model to the few parameters that a rule asks for."""
+"""The reduction of any model to the few parameters that a rule asks for."""

@@ -1,9 +1,9 @@
-"""Skogestad's half rule: fewer lags, the rest as dead time.
+"""Skogestad's half rule reduces the number of lags and turns the others into dead time.
 
-The largest lag that is left out is shared: one half goes to the smallest lag kept, the other to the dead time. The
-smaller lags, and the time constants of zeros in the right half-plane, go to the dead time whole. An integrator counts
-as the largest lag, but has no use for the half of another: that goes to the dead time as well, and the ramp that the
-plant answers a step with stays where it is.
+The largest lag that is left out is divided: one half is added to the smallest lag that remains, the other half to the
+dead time. The smaller lags, and the time constants of zeros in the right half-plane, are added to the dead time. An
+integrator counts as the largest lag. Where only the integrator remains, the whole of the largest lag is added to the
+dead time, so that the ramp with which the plant answers a step stays where it is.
 
 Source: S. Skogestad, Simple analytic rules for model reduction and PID controller tuning, J. Process Control 13, 2003.
 The rule is for real poles. Zeros in the left half-plane are refused here: which lag they cancel is a choice.
@@ -20,13 +20,14 @@ from loopwright.tuning.models import FOPDT, SOPDT, Complexes, Integrating, Model
 from loopwright.tuning.reasons import Reason, Refused
 
 REAL = 0.01
-"""A pole with |Im/p| below this is real: a pole of high multiplicity comes from its coefficients as a small ring."""
+"""A pole p with |Im p|/|p| below this is real: the computed roots of a multiple pole form a small ring around it."""
 
 
 def half_rule(model: Model, order: Literal[1, 2] = 1) -> FOPDT | SOPDT | Integrating:
-    """The model with `order` lags kept, an integrator being one of them; as it is if it has no more.
+    """The model reduced to `order` lags, an integrator being one of them; a model with no more lags is returned as it
+    is.
 
-    Refused (outside_range) for complex or unstable poles and for zeros in the left half-plane.
+    Raises Refused, OUTSIDE_RANGE, for complex or unstable poles and for zeros in the left half-plane.
     """
     gain, integrates, lags, dead = _parts(model)
     kept = order - 1 if integrates else order
@@ -46,7 +47,7 @@ def half_rule(model: Model, order: Literal[1, 2] = 1) -> FOPDT | SOPDT | Integra
 
 
 def exact(model: TransferFunction) -> Model:
-    """The same plant as FOPDT, SOPDT or Integrating where it is one, else as it is."""
+    """The same plant as FOPDT, SOPDT or Integrating where it has that form, else the transfer function itself."""
     if len(model.num) > 1 or len(model.den) > 3:
         return model
     a2, a1, a0 = (0.0,) * (3 - len(model.den)) + model.den
@@ -62,8 +63,8 @@ def exact(model: TransferFunction) -> Model:
 
 
 def _parts(model: Model) -> tuple[float, bool, list[float], float]:
-    """Gain (of an integrating plant, per s), whether it integrates, its lags from the largest down and its dead time,
-    s, with the zeros in it."""
+    """The parts of a model: its gain (per s if it integrates), whether it integrates, its lags (s) from the largest
+    down, and its dead time (s), to which the time constants of the zeros are added."""
     if isinstance(model, FOPDT):
         return model.K, False, [model.T], model.L
     if isinstance(model, Integrating):
@@ -87,7 +88,7 @@ def _parts(model: Model) -> tuple[float, bool, list[float], float]:
 
 
 def _lags(poles: Complexes) -> list[float]:
-    """-1/p from the largest down; the poles of a ring around a multiple pole all at its centre."""
+    """The lags -1/p from the largest down; the computed roots of a multiple pole are replaced by their mean."""
     lags = np.asarray(-1.0 / poles)
     ring = np.zeros(len(lags), dtype=bool)
     for i in np.flatnonzero(lags.imag > 0.0):

@@ -1,4 +1,4 @@
-"""A FOPDT model for a given one by moments or two areas. The gain is kept; the half rule is in tuning.half_rule."""
+"""The reduction of a model to FOPDT by moments or by two areas; the gain stays the same."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from loopwright.tuning.reasons import Reason, Refused
 
 
 def moments(model: Model) -> FOPDT:
-    """FOPDT with the mean and the variance of the model's impulse response: T = sqrt(variance), L = mean - T.
+    """The FOPDT model with the mean and the variance of the model's impulse response: T = sqrt(variance), L = mean - T.
 
-    Reproduces the FOPDT models of Romasevych et al., PI-controller tuning optimization via PSO-based technique. Raises
-    Refused: NOT_SELF_REGULATING; BAD_INPUT: unstable poles, or moments that no FOPDT has.
+    The reduction reproduces the FOPDT models of Romasevych et al., PI-controller tuning optimization via PSO-based
+    technique. Raises Refused: NOT_SELF_REGULATING; BAD_INPUT for unstable poles, or moments that no FOPDT model has.
     """
     _require_self_regulating(model)
     mean, variance = _moments(model)
@@ -24,7 +24,7 @@ def moments(model: Model) -> FOPDT:
 
 
 def two_areas(model: Model) -> FOPDT:
-    """FOPDT by the areas above and below the step response (area method), computed exactly.
+    """The FOPDT model by the areas above and below the step response (area method), computed exactly.
 
     A0 = integral of 1 - y/K = T + L;  A1 = integral of y/K from 0 to A0 = T/e. Source: K. J. Astrom, T. Hagglund, PID
     Controllers: Theory, Design and Tuning (1995), section 2.4. Raises Refused as `moments`.
@@ -46,13 +46,15 @@ def two_areas(model: Model) -> FOPDT:
 
 
 def fopdt_of_moments(K: float, mean: float, variance: float) -> FOPDT:
-    """mean: s.  variance: s^2, of the impulse response. Raises Refused, BAD_INPUT: moments that no FOPDT has."""
+    """The FOPDT model with this mean (s) and variance (s^2) of the impulse response. Raises Refused, BAD_INPUT: moments
+    that no FOPDT model has."""
     T = math.sqrt(max(variance, 0.0))
     return _fopdt(K, T, mean - T, f"a mean of {mean:.4g} s and a variance of {variance:.4g} s^2")
 
 
 def fopdt_of_areas(K: float, A0: float, A1: float) -> FOPDT:
-    """A0, A1: s, of the step response divided by K. Raises Refused, BAD_INPUT: areas that no FOPDT has."""
+    """The FOPDT model with these areas A0, A1 (s) of the step response divided by K. Raises Refused, BAD_INPUT: areas
+    that no FOPDT model has."""
     T = math.e * A1
     return _fopdt(K, T, A0 - T, f"areas of {A0:.4g} s and {A1:.4g} s")
 
@@ -67,7 +69,7 @@ def _fopdt(K: float, T: float, L: float, found: str) -> FOPDT:
 
 
 def _moments(model: Model) -> tuple[float, float]:
-    """(mean in s, variance in s^2) of the impulse response."""
+    """The mean (s) and the variance (s^2) of the impulse response."""
 
     def of(p: tuple[float, ...]) -> tuple[float, float]:
         low = [*reversed(p), 0.0, 0.0]

@@ -1,4 +1,4 @@
-"""The tangent at the steepest point of a step response: what the rules made on the reaction curve mean by L and T."""
+"""The tangent at the steepest point of a step response gives the L and T of the rules made on the reaction curve."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from loopwright.tuning.reasons import Reason, Refused
 
 
 def tangent(model: SOPDT) -> FOPDT:
-    """The tangent meets zero at L and the final value at L + T. Refused (outside_range) for complex poles, whose
-    response is no S.
+    """The FOPDT model of the tangent, which meets zero at L and the final value at L + T.
 
     With real T1 > T2 the steepest point is at t = T1 T2 ln(T1/T2)/(T1 - T2) after the dead time, T = T1 exp(t/T1), and
-    the area left, T1 + T2, gives L. Source: I. A. Polishchuk, 2023, its comparison methods.
+    the remaining area, T1 + T2, gives L. Source: I. A. Polishchuk, 2023, its comparison methods. Raises Refused,
+    OUTSIDE_RANGE, for complex poles, whose step response is not S-shaped.
     """
     T1, T2 = model.T1, model.T2
     if math.isnan(T1):

@@ -1,4 +1,4 @@
-"""Tuning rules, one family a file. A rule is `rule(model, *, option=...) -> Setting`.
+"""The tuning rules, one family in each file. A rule is a function `rule(model, *, option=...) -> Setting`.
 
-`tuning.rules.registry` lists them all.
+`tuning.rules.registry` lists all of them.
 """

@@ -3,7 +3,7 @@
     PI     K Kp = 0.15 + (0.35 - L T/(L + T)^2) T/L    Ti = 0.35 L + 13 L T^2/(T^2 + 12 L T + 7 L^2)
     PID    K Kp = 0.2 + 0.45 T/L                       Ti = L (0.4 L + 0.8 T)/(L + 0.1 T)    Td = 0.5 L T/(0.3 L + T)
 
-An integrating plant K exp(-L s)/s is the limit of T and K without bound, K/T kept:
+An integrating plant K exp(-L s)/s is the limit of T and K without bound with K/T constant:
 
     PI     K Kp = 0.35/L    Ti = 13.35 L               PID    K Kp = 0.45/L    Ti = 8 L    Td = 0.5 L
 
@@ -22,7 +22,7 @@ CONTROLLERS = ("pi", "pid")
 
 
 def amigo(model: FOPDT | Integrating, *, controller: str = "pi") -> Setting:
-    """An integrating plant must have no lag."""
+    """The AMIGO setting; an integrating plant must have no lag. controller: "pi" or "pid"."""
     one_of("controller", controller, CONTROLLERS)
     needs_dead_time(model, "AMIGO")
     K, L = abs(model.K), model.L

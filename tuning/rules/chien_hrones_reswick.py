@@ -1,4 +1,4 @@
-"""Chien, Hrones and Reswick: the fastest response with 0 or 20 % overshoot, for the set-point or for the load.
+"""The rule of Chien, Hrones and Reswick: the fastest response with 0 or 20 % overshoot, for set-points or for loads.
 
     a = K L/T         set-point, 0 %          set-point, 20 %           load, 0 %              load, 20 %
     P                 0.3/a                   0.7/a                     0.3/a                  0.7/a
@@ -38,7 +38,13 @@ def chien_hrones_reswick(
     overshoot_pct: float = 0.0,
     extrapolate: bool = False,
 ) -> Setting:
-    """aim: what the response is to, "setpoint" or "load".  overshoot_pct: 0 or 20."""
+    """The setting of Chien, Hrones and Reswick.
+
+    controller: "p", "pi" or "pid".
+    aim: the response that the setting is made for, "setpoint" or "load".
+    overshoot_pct: the overshoot of that response, 0 or 20 percent.
+    extrapolate: True uses the rule outside its range of L/T, with a note.
+    """
     one_of("controller", controller, CONTROLLERS)
     one_of("aim", aim, AIMS)
     if overshoot_pct not in OVERSHOOTS_PCT:

@@ -1,4 +1,4 @@
-"""Cohen and Coon: quarter decay of a load disturbance, with r = L/T.
+"""The rule of Cohen and Coon: quarter decay of a load disturbance, with r = L/T.
 
     P      K Kp = (1 + r/3)/r
     PI     K Kp = (9/10 + r/12)/r    Ti = L (30 + 3r)/(9 + 20r)
@@ -29,7 +29,12 @@ RATIO = (0.05, 1.0)
 def cohen_coon(
     model: FOPDT, *, controller: str = "pi", variant: str = "original", extrapolate: bool = False
 ) -> Setting:
-    """variant "tau": see above, for comparison with the paper only."""
+    """The setting of Cohen and Coon.
+
+    controller: "p", "pi" or "pid".
+    variant: "original", or "tau" (see above) for comparison with the paper only.
+    extrapolate: True uses the rule outside its range of L/T, with a note.
+    """
     one_of("controller", controller, CONTROLLERS)
     one_of("variant", variant, VARIANTS)
     if variant == "tau" and controller != "pi":

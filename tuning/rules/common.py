@@ -1,4 +1,4 @@
-"""What every rule checks, and how it answers."""
+"""The checks that the rules share, and the making of a setting."""
 
 from __future__ import annotations
 
@@ -24,8 +24,11 @@ def setting(
     chosen: Mapping[str, float] | None = None,
     notes: tuple[str, ...] = (),
 ) -> Setting:
-    """Refused (outside_range) when a setting left the range of numbers: the model's units are far off, or L is next to
-    nothing."""
+    """The setting with these gains; Ti, Td: s.
+
+    Raises Refused, OUTSIDE_RANGE, when a gain or time is not a usable number: the units of the model are wrong by far,
+    or L is close to zero.
+    """
     if not (all(math.isfinite(x) for x in (Kp, Ti, Td)) and Kp > 0.0):
         raise Refused(
             Reason.OUTSIDE_RANGE,
@@ -35,7 +38,7 @@ def setting(
 
 
 def in_words(model: FOPDT | SOPDT | Integrating) -> str:
-    """For a note on what a plant was reduced to; a SOPDT with real poles."""
+    """The reduced model in words, for a note; a SOPDT must have real poles."""
     if isinstance(model, FOPDT):
         return f"first order with K = {model.K:.4g}, T = {model.T:.4g} s, L = {model.L:.4g} s"
     if isinstance(model, SOPDT):
@@ -45,24 +48,26 @@ def in_words(model: FOPDT | SOPDT | Integrating) -> str:
 
 
 def one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
+    """Raises Refused, BAD_INPUT, unless the value is one of those allowed."""
     if value not in allowed:
         raise Refused(Reason.BAD_INPUT, f"{name} must be one of {', '.join(allowed)}, not {value!r}")
 
 
 def positive(name: str, value: float, unit: str) -> float:
+    """The value; raises Refused, BAD_INPUT, unless it is a positive number."""
     if not (math.isfinite(value) and value > 0.0):
         raise Refused(Reason.BAD_INPUT, f"{name} must be a number > 0 {unit}, not {value!r}")
     return value
 
 
 def needs_dead_time(model: FOPDT | SOPDT | Integrating, rule: str) -> None:
-    """Rules that divide by the dead time have no answer without it."""
+    """Raises Refused, OUTSIDE_RANGE, for a model without dead time: the rule divides by it."""
     if model.L == 0.0:
         raise Refused(Reason.OUTSIDE_RANGE, f"{rule} needs a dead time L > 0 s, not L = 0: its gain grows as 1/L")
 
 
 def no_lag(model: Integrating, rule: str) -> None:
-    """Rules for K exp(-L s)/s know nothing of a lag."""
+    """Raises Refused, OUTSIDE_RANGE, for an integrating plant with a lag: the rule is made for K exp(-L s)/s."""
     if model.T > 0.0:
         raise Refused(
             Reason.OUTSIDE_RANGE,
@@ -71,7 +76,7 @@ def no_lag(model: Integrating, rule: str) -> None:
 
 
 def stable_plant(model: Model, rule: str) -> None:
-    """Rules on the ultimate cycle presume a plant that would not run away by itself."""
+    """Raises Refused, OUTSIDE_RANGE, for an unstable plant: rules on the ultimate cycle assume a stable one."""
     if np.any(np.roots(model.den).real > 0.0):
         raise Refused(
             Reason.OUTSIDE_RANGE, f"{rule} takes stable plants, and this one has a pole in the right half-plane"
@@ -79,14 +84,18 @@ def stable_plant(model: Model, rule: str) -> None:
 
 
 def refuse_unstable(model: Model, found: Setting, rule: str) -> Setting:
-    """The setting, if the loop of it and this self-regulating model is stable."""
+    """The setting; raises Refused, OUTSIDE_RANGE, if its loop with this self-regulating model is unstable."""
     if not margins(model, found.gains).stable:
         raise Refused(Reason.OUTSIDE_RANGE, f"{rule} would make the loop of this model unstable; choose another method")
     return found
 
 
 def ratio_within(model: FOPDT, low: float, high: float, rule: str, extrapolate: bool | None = None) -> tuple[str, ...]:
-    """Refused unless low <= L/T <= high; with `extrapolate` a note instead (None: the rule has no such option)."""
+    """The notes on the range of L/T that a rule was made for.
+
+    Raises Refused, OUTSIDE_RANGE, unless low <= L/T <= high. With `extrapolate` a note is given instead; None means
+    that the rule has no such option.
+    """
     needs_dead_time(model, rule)
     ratio = model.L / model.T
     # a model made at the very edge must not fall off it by rounding

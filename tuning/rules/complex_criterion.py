@@ -2,16 +2,18 @@
 
     Cr + dT*Ter,   Cr = d1*MIE + d2*MIC + d3*OS + d4*ts
 
-of the answer to a unit set-point step. ts: last instant outside 5 % of the set-point. MIE, MIC: mean |e| and mean |u|
-from 0 to ts. OS: overshoot as a fraction. Ter: distance to the 5 % band and the sum of the sizes of all derivatives of
-PV up to the plant's order, at the end of the horizon (the paper leaves that instant open). Three weightings are named.
+The terms describe the answer to a unit set-point step. ts is the last time outside 5 % of the set-point. MIE and MIC
+are the means of |e| and |u| from 0 to ts. OS is the overshoot as a fraction. Ter is the distance to the 5 % band plus
+the sum of the sizes of all derivatives of PV up to the plant's order, at the end of the horizon (the paper does not
+state that time). There are three weightings.
 Source: "PI-controller tuning optimization via PSO-based technique", the criterion, its terminal term and the weights.
 
-Everything is counted in the plant's own units: time in its largest lag or its dead time, whichever is longer, MV in
-what holds PV at the set-point. For the five plants of the paper these are its own second and its own unit.
+All terms are in the plant's own units: time in units of its largest lag or its dead time, whichever is longer, MV in
+units of the MV that holds PV at the set-point. For the five plants of the paper these are the paper's second and unit
+of MV.
 
-How it is made fast. All settings given together are simulated together. The rational loop is advanced by its matrix
-exponential, one with dead time by its map from one dead time to the next; powers of these matrices give all samples.
+All settings given together are simulated together, for speed. The rational loop is advanced by its matrix exponential,
+a loop with dead time by its map from one dead time to the next; powers of these matrices give all samples.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ BLOCK = 64
 
 
 class Weighting(StrEnum):
-    """What the criterion looks at most: the error, the control, or the duration of the answer."""
+    """The term with the largest weight: the error, the control effort, or the duration of the response."""
 
     ERROR = "error"
     CONTROL = "control"
@@ -54,10 +56,13 @@ TERMINAL_WEIGHT = 1000.0
 
 @dataclass(frozen=True, slots=True)
 class Indices:
-    """Of p settings, each (p,). MIE: fraction of the step.  MIC: of the MV that holds PV there.  overshoot: fraction.
+    """The terms of the criterion for p settings, each of shape (p,). Terms of a diverging loop may be inf or NaN.
 
-    settling: in time units, the horizon if not settled.  terminal: the penalty at the end, without its weight. All of a
-    diverging loop may be inf or NaN.
+    MIE: the mean |e| as a fraction of the step.
+    MIC: the mean |u| as a fraction of the MV that holds PV at the set-point.
+    overshoot: the overshoot as a fraction of the step.
+    settling: the settling time in time units; the horizon if the loop has not settled.
+    terminal: the penalty at the end of the horizon, without its weight.
     """
 
     MIE: Reals
@@ -68,11 +73,13 @@ class Indices:
 
 
 class ComplexCriterion:
-    """The criterion of one model; what does not depend on the controller is computed once.
+    """The criterion of one model; the parts that do not depend on the controller are computed once.
 
-    time_unit_s: s.  gain_unit: PV units per MV unit.  horizon: in time units. Settings are given as kp = Kp*gain_unit
-    and ti = 1/(Ki*gain_unit*time_unit_s), which is the paper's Ti, the reciprocal of the integral gain.
-    Ms_max: loops of a greater maximum sensitivity are penalised in proportion; none if None.
+    Settings are given as kp = Kp*gain_unit and ti = 1/(Ki*gain_unit*time_unit_s), which is the paper's Ti, the
+    reciprocal of the integral gain. The attributes are time_unit_s (s), gain_unit (PV units per MV unit) and horizon
+    (in time units).
+
+    Ms_max: loops with a larger maximum sensitivity are penalised in proportion; None for no penalty.
     """
 
     def __init__(
@@ -83,10 +90,13 @@ class ComplexCriterion:
         Ms_max: float | None = None,
         samples: int = SAMPLES,
     ) -> None:
-        """horizon_s: simulated time, s, rounded up to whole dead times; by default 20 times all lags and the dead time.
+        """Prepares the criterion.
 
-        samples: about how many of each response are looked at. Raises Refused for a model without any time of its own
-        and for a horizon of less than half a time unit.
+        horizon_s: the simulated time, s, rounded up to whole dead times; by default 20 times all lags and the dead
+        time.
+        samples: the approximate number of samples of each response.
+        Raises Refused, BAD_INPUT, for a model without lag and dead time and for a horizon of less than half a time
+        unit.
         """
         total = time_sum(model)
         if total <= 0.0:
@@ -100,13 +110,14 @@ class ComplexCriterion:
         if horizon < MIN_HORIZON:
             shown = f"at least {MIN_HORIZON * self.time_unit_s:.3g} s is accepted"
             raise Refused(Reason.BAD_INPUT, f"horizon_s {horizon_s}: {shown} for this model")
-        self._loops = (_Delayed if plant.L > 0.0 else _Immediate)(plant, horizon, samples)
+        self._loops = (_LoopsWithDeadTime if plant.L > 0.0 else _LoopsWithoutDeadTime)(plant, horizon, samples)
         self.horizon = self._loops.dt * self._loops.steps
         self._w = np.geomspace(1e-2 * self.time_unit_s / total, 1e2 * _fastest(plant), 400)
         self._plant = plant.frequency_response(self._w)
 
     def __call__(self, kp: Reals, ti: Reals) -> Reals:
-        """The criterion of each setting, (p,) from (p,) and (p,), finite; above DIVERGED where a loop diverges."""
+        """The criterion of each setting, shape (p,), for kp and ti of shape (p,). It is finite, and above DIVERGED
+        where a loop diverges."""
         found = self.indices(kp, ti)
         d1, d2, d3, d4 = self.weights
         with np.errstate(over="ignore", invalid="ignore"):
@@ -122,13 +133,13 @@ class ComplexCriterion:
         return np.asarray(value)
 
     def indices(self, kp: Reals, ti: Reals) -> Indices:
-        """The parts of the criterion, for kp and ti of shape (p,)."""
+        """The terms of the criterion, for kp and ti of shape (p,)."""
         with np.errstate(over="ignore", invalid="ignore"):
             e, u, slopes = self._loops.sample(kp, 1.0 / ti)
             return _indices(e, u, slopes, self._loops.dt)
 
     def sensitivity(self, kp: Reals, ti: Reals) -> Reals:
-        """Ms of each loop on a grid of frequencies, (p,)."""
+        """Ms of each loop on a grid of frequencies, shape (p,)."""
         loop = (kp[:, None] + 1.0 / (1j * ti[:, None] * self._w)) * self._plant
         return np.asarray(1.0 / np.abs(1.0 + loop).min(axis=1))
 
@@ -138,9 +149,12 @@ class ComplexCriterion:
 
 
 def _indices(e: Reals, u: Reals, slopes: Reals, dt: float) -> Indices:
-    """e, u: (p, n), u of which the first and last samples may jump.  slopes: (p,), sum of the derivatives' sizes.
+    """The terms of the criterion from the responses.
 
-    e is overwritten.
+    e: the error, shape (p, n); it is overwritten.
+    u: the control, shape (p, n); its first and last samples may jump.
+    slopes: the sum of the sizes of the derivatives at the end, shape (p,).
+    dt: the step, in time units.
     """
     overshoot = np.maximum(-e.min(axis=1), 0.0)
     size = np.abs(e, out=e)
@@ -155,7 +169,7 @@ def _indices(e: Reals, u: Reals, slopes: Reals, dt: float) -> Indices:
     settling = np.where(settled, dt * (here + part), dt * steps)
 
     def mean(f: Reals) -> Reals:
-        """Of |f| from 0 to the settling, trapezoids and the first part of the last of them."""
+        """The mean of |f| from 0 to the settling time, by trapezoids of which the last is cut off."""
         first, second = np.abs(f[rows, here]), np.abs(f[rows, here + 1])
         sums = np.array([np.abs(row[: end + 1]).sum() for row, end in zip(f, here, strict=True)])
         whole = sums - 0.5 * (np.abs(f[:, 0]) + first)
@@ -175,7 +189,11 @@ def _fastest(plant: Model) -> float:
 
 
 def _powers(step: Reals, start: Reals, count: int) -> Reals:
-    """(p, count, s): start (p, s) and what `step` (p, s, s) makes of it again and again, by doubling."""
+    """The states start, step @ start, step @ step @ start and so on, shape (p, count, s), computed by doubling.
+
+    step: shape (p, s, s).
+    start: shape (p, s).
+    """
     states, across = start[:, None, :], step.transpose(0, 2, 1)
     while states.shape[1] < count:
         states = np.concatenate((states, states[:, : count - states.shape[1]] @ across), axis=1)
@@ -184,8 +202,9 @@ def _powers(step: Reals, start: Reals, count: int) -> Reals:
     return states
 
 
-class _Immediate:
-    """Loops without dead time: states (plant's, integral part), as what is missing to rest at the set-point."""
+class _LoopsWithoutDeadTime:
+    """Loops without dead time. The states are (plant states, integral part), as deviations from rest at the
+    set-point."""
 
     def __init__(self, plant: Model, horizon: float, samples: int) -> None:
         self.dt, self.steps = horizon / samples, samples
@@ -194,7 +213,7 @@ class _Immediate:
         self._start = np.concatenate((-rest, [-self.u_rest]))
 
     def _loop(self, kp: Reals, ki: Reals) -> tuple[Reals, Reals]:
-        """(A (p, s, s), output row of e (p, s)) of the closed loop."""
+        """The matrix of each closed loop, shape (p, s, s), and its output row for e, shape (p, s)."""
         g, n = self.plant, len(self.plant.b)
         # e = -(c x + d u) and u = kp*e + integral part
         error = -np.append(g.c, g.d) / (1.0 + g.d * kp[:, None])
@@ -233,8 +252,9 @@ class _Immediate:
         return np.asarray(np.linalg.eigvals(self._loop(kp, ki)[0]).real.max(axis=1))
 
 
-class _Delayed:
-    """Loops with dead time. A dead time shorter than a sample is stepped over in powers of two."""
+class _LoopsWithDeadTime:
+    """Loops with dead time. Where a dead time is shorter than a sample, one step covers a power of two of dead
+    times."""
 
     def __init__(self, plant: Model, horizon: float, samples: int) -> None:
         self.loop = DeadTimeLoop(plant)
@@ -250,7 +270,8 @@ class _Delayed:
         self._held: Reals | None = None
 
     def sample(self, kp: Reals, ki: Reals) -> tuple[Reals, Reals, Reals]:
-        """e and u are overwritten by the next call: new memory for every swarm takes longer than the arithmetic."""
+        """The responses e and u, shape (p, n), and the derivatives' sizes at the end, shape (p,). The next call
+        overwrites e and u, as the allocation of memory would take longer than the arithmetic."""
         once, start = self.loop.maps(kp, ki), self.loop.start(kp)
         advance = once
         for _ in range(self.squarings):

@@ -1,7 +1,7 @@
-"""From a model to gains worth trying on the loop: any rule of `registry`, judged on the model before it is tried.
+"""The gains of any rule of `registry` are checked on the model before they are tried on the loop.
 
-Nothing that would not be robust on its own model, or that comes near instability at the ultimate point measured on the
-loop, is handed over.
+Gains that would not be robust on their own model, or that come near instability at the ultimate point measured on the
+loop, are refused.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from loopwright.tuning.analysis.comparison import (
-    Asked,
     Comparison,
     IAE_over_present,
     Predicted,
-    compared,
+    RobustnessBounds,
+    compare,
+    loop_performance,
     predicted,
-    worth,
 )
 from loopwright.tuning.analysis.margins import Ultimate
 from loopwright.tuning.gains import Gains
@@ -29,19 +29,26 @@ from loopwright.tuning.rules.setting import Setting
 
 MAX_Ms, MIN_GM = 2.0, 2.0
 ROUNDING = 1.002
-"""A method that seeks the bound ends on it."""
+"""Factor by which Ms may exceed its bound: a method that searches on the bound ends on it."""
 SLOWER = {"lambda_s": "larger", "tau_c_s": "larger", "c": "smaller"}
 """The options that make a rule more robust."""
 CRITERION_7 = "criterion (7): 10 ITAE + overshoot + 10 Ms, the largest with K, T and L 20 % off"
 OVER_PRESENT = "half of the set-point's and half of the load's IAE, each over that of the present gains"
 ROBUST = "robust"
 MIN_DISTANCE = 0.45
-"""From the loop's response at the measured ultimate frequency to -1."""
+"""Smallest distance from -1 of the loop's response at the measured ultimate frequency."""
 
 
 @dataclass(frozen=True, slots=True)
 class Designed:
-    """What stage 5 hands on. chosen: the rule's design parameters, by name with unit."""
+    """The result of Stage 5.
+
+    method: the name of the rule.
+    gains: the gains, realisable by the controller.
+    predicted: their main figures on the model.
+    chosen: the design parameters of the rule, by name with unit.
+    notes: what the user should know, one sentence each.
+    """
 
     method: str
     gains: Gains
@@ -53,13 +60,14 @@ class Designed:
 def design(
     method: str, plant: FOPDT | SOPDT, ultimate: Ultimate | None, options: Mapping[str, object] | None = None
 ) -> Designed:
-    """The rule's gains for this plant, realisable, with what the model predicts of them.
+    """The realisable gains of a rule for this plant, with their figures on the model.
 
-    The rules made on the ultimate point take the measured one. Refused: as the rule says; NOT_ROBUST.
+    ultimate: the measured ultimate point, which the rules made on the ultimate point use; None without one.
+    Raises Refused: NOT_ROBUST, or as the rule does.
     """
     setting = _setting(method, plant, ultimate, options or {})
     gains, notes = realisable(setting.gains, METHODS[method].filter)
-    found = worth(plant, gains)
+    found = loop_performance(plant, gains)
     robust = found.Ms is not None and found.Ms <= MAX_Ms * ROUNDING and (found.GM is None or found.GM >= MIN_GM)
     if not robust:
         GM = "none" if found.GM is None else f"{found.GM:.2f}"
@@ -88,31 +96,32 @@ def comparison_of(
     options: Mapping[str, object],
     anyway: bool,
 ) -> Comparison:
-    """The old gains and those of the rule on the model that these were made for.
+    """The comparison of the old gains with those of the rule, on the model that the rule was given.
 
-    The robust PI was asked for the bounds of this module, and for the least of its own criterion. The other rules
-    minimise nothing: their gains are worth having where they are more robust than the old ones, or bring the IAE down.
-    anyway: see `tuning.analysis.comparison.compared`.
+    The robust PI is compared by the bounds of this module and by its own criterion. The other rules minimise nothing:
+    their gains are an improvement where they are more robust than the old ones, or lower the IAE.
+    sample_time_s: the sample time, s.
+    anyway: see `tuning.analysis.comparison.compare`.
     """
-    before, after = worth(plant, old_gains, sample_time_s), worth(plant, designed.gains)
+    before, after = loop_performance(plant, old_gains, sample_time_s), loop_performance(plant, designed.gains)
     assert after.Ms is not None  # `design` sees to that
     of_robust = designed.method == ROBUST
-    asked = Asked(MAX_Ms, GM=MIN_GM) if of_robust else Asked(after.Ms, by=f"by {designed.method}")
+    asked = RobustnessBounds(MAX_Ms, GM=MIN_GM) if of_robust else RobustnessBounds(after.Ms, by=f"by {designed.method}")
     if of_robust and isinstance(plant, FOPDT) and _plain_pi(old_gains):
         scale_free = options.get("scale_free")
         of = Criterion(plant, designed.chosen["horizon_s"], None if scale_free is None else bool(scale_free))
         now, then = (None if J >= UNSTABLE else J for J in (of(g.Kp, g.Ti) for g in (old_gains, designed.gains)))
-        return compared(before, after, asked, CRITERION_7, (now, then), anyway)
-    return compared(before, after, asked, OVER_PRESENT, IAE_over_present(before, after), anyway)
+        return compare(before, after, asked, CRITERION_7, (now, then), anyway)
+    return compare(before, after, asked, OVER_PRESENT, IAE_over_present(before, after), anyway)
 
 
 def _plain_pi(gains: Gains) -> bool:
-    """Such as criterion (7) is made for."""
+    """Whether the gains are a PI without set-point weight, for which criterion (7) is made."""
     return gains.Ti > 0.0 and gains.Td == 0.0 and gains.b == 1.0
 
 
 def _slower(setting: Setting) -> str:
-    """What to ask for instead, where the rule has a number for it."""
+    """The option to ask for instead, where the rule has a number that makes it more robust."""
     for name, direction in SLOWER.items():
         if name in setting.chosen:
             return f"; ask for a {direction} {name} than {setting.chosen[name]:.4g}"
@@ -120,9 +129,10 @@ def _slower(setting: Setting) -> str:
 
 
 def realisable(gains: Gains, filter: float) -> tuple[Gains, tuple[str, ...]]:
-    """An ideal derivative gets the filter Tf = Td/filter, and acts on PV alone; notes say so.
+    """The gains as a controller can realise them: an ideal derivative gets the filter Tf = Td/filter and acts on PV
+    alone, and notes say so.
 
-    It would answer noise without bound, and a set-point step would kick MV.
+    An ideal derivative would amplify noise without bound, and a set-point step would kick MV.
     """
     if gains.Td == 0.0:
         return gains, ()
@@ -137,7 +147,7 @@ def realisable(gains: Gains, filter: float) -> tuple[Gains, tuple[str, ...]]:
 
 
 def _controller(gains: Gains, w: float) -> complex:
-    """C(jw) of the feedback path."""
+    """The frequency response C(jw) of the feedback path; w in rad/s."""
     s = 1j * w
     integral = 1.0 / (gains.Ti * s) if gains.Ti > 0.0 else 0.0
     return gains.Kp * (1.0 + integral + gains.Td * s / (1.0 + gains.Tf * s))

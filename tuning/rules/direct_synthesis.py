@@ -33,8 +33,12 @@ PAPER_STABLE_C = 2.0
 
 @dataclass(frozen=True, slots=True)
 class GainRange:
-    """Values of Kp, MV units per PV unit.  paper: rule (27).  no_overshoot, stable: the upper ends with the dead time
-    exact.  paper_stable: the paper's bound (21), beyond the end of stability."""
+    """The ranges of Kp, MV units per PV unit.
+
+    paper: Kp by rule (27).
+    no_overshoot, stable: the largest Kp without overshoot and with a stable loop, with the exact dead time.
+    paper_stable: the paper's bound (21), at which the loop is unstable.
+    """
 
     paper: float
     no_overshoot: float
@@ -43,14 +47,15 @@ class GainRange:
 
 
 def gain_range(model: SOPDT | FOPDT) -> GainRange:
-    """What Kp may be once Ti and Td cancel the poles."""
+    """The ranges of Kp for the Ti and Td that cancel the poles. Raises Refused, OUTSIDE_RANGE, without dead time."""
     needs_dead_time(model, "direct synthesis")
     unit = _sums(model)[0] / model.L / abs(model.K)
     return GainRange(PAPER_C * unit, NO_OVERSHOOT_C * unit, STABLE_C * unit, PAPER_STABLE_C * unit)
 
 
 def direct_synthesis(model: SOPDT | FOPDT, *, c: float = PAPER_C) -> Setting:
-    """c: K Kp L/(T1 + T2), below pi/2; up to 1/e a set-point step does not overshoot."""
+    """The setting of direct synthesis. c: K Kp L/(T1 + T2), below pi/2; up to 1/e a set-point step does not
+    overshoot."""
     needs_dead_time(model, "direct synthesis")
     positive("c", c, "(no unit)")
     if c >= STABLE_C:
@@ -73,7 +78,7 @@ def direct_synthesis(model: SOPDT | FOPDT, *, c: float = PAPER_C) -> Setting:
 
 
 def _sums(model: SOPDT | FOPDT) -> tuple[float, float]:
-    """T1 + T2, s, and T1 T2, s^2."""
+    """The sum T1 + T2, s, and the product T1 T2, s^2."""
     if isinstance(model, FOPDT):
         return model.T, 0.0
     return 2.0 * model.zeta * model.T, model.T * model.T

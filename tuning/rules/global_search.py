@@ -1,6 +1,6 @@
-"""Search for the least of a criterion in the unit square (or cube): three seeded, deterministic optimisers.
+"""Three seeded, deterministic optimisers search for the minimum of a criterion in the unit square (or cube).
 
-A criterion takes many points at once, (p, n) to (p,); smaller is better; it must be finite everywhere.
+A criterion takes many points at once, shape (p, n), and gives the values, shape (p,); it must be finite everywhere.
 
     multi_epoch_swarm        Romasevych and Loveikin's swarm with restarts
     differential_evolution   scipy's
@@ -22,8 +22,14 @@ Cost = Callable[[Reals], Reals]
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """point: (n,).  value: the criterion there.  evaluations: of single points.  epochs: starts of the search."""
+class SearchResult:
+    """The result of a search.
+
+    point: the best point, shape (n,).
+    value: the criterion there.
+    evaluations: the number of points evaluated.
+    epochs: the number of starts of the search.
+    """
 
     point: Reals
     value: float
@@ -40,14 +46,16 @@ def multi_epoch_swarm(
     social: float = 2.1,
     cognitive: float = 0.1,
     acceptable_rate: float = 0.1,
-) -> Found:
-    """ME-PSO: x + cognitive*r1*(own best - x) + social*r2*(best of all - x), no velocity, clipped to the square.
+) -> SearchResult:
+    """The multi-epoch particle swarm (ME-PSO): x + cognitive*r1*(own best - x) + social*r2*(best of all - x), without
+    velocity, clipped to the square.
 
-    When an iteration lowers the best of all by no more than acceptable_rate of it, all particles are thrown anew and
-    forget their own bests; the best of all stays. particles*iterations evaluations. Source: "PI-controller tuning
-    optimization via PSO-based technique", equations (8) to (10) and the parameter table, read by its words: the larger
-    coefficient belongs to the best of all, and (10), which as printed always holds, means the relative reduction.
-    Thrown particles first move, then are evaluated; r1 and r2 are drawn for each coordinate: both are not stated there.
+    When an iteration lowers the best of all by no more than the fraction acceptable_rate, all particles are placed at
+    random again and lose their own bests; the best of all stays. The search takes particles*iterations evaluations.
+    Source: "PI-controller tuning optimization via PSO-based technique", equations (8) to (10) and the parameter table,
+    read by the text: the larger coefficient belongs to the best of all, and (10), which as printed always holds, means
+    the relative reduction. New particles first move, then are evaluated; r1 and r2 are drawn for each coordinate. The
+    paper states neither.
     """
     rng = np.random.default_rng(seed)
     shape = (particles, dimensions)
@@ -69,11 +77,12 @@ def multi_epoch_swarm(
             at = rng.random(shape)
             own, own_value = at, np.full(particles, np.inf)
             epochs += 1
-    return Found(best, best_value, particles * iterations, epochs)
+    return SearchResult(best, best_value, particles * iterations, epochs)
 
 
-def differential_evolution(cost: Cost, dimensions: int, seed: int, budget: int = 2500) -> Found:
-    """scipy's differential evolution, a whole generation of 25 points a dimension at once, at most `budget` points."""
+def differential_evolution(cost: Cost, dimensions: int, seed: int, budget: int = 2500) -> SearchResult:
+    """scipy's differential evolution with generations of 25 points per dimension, each evaluated at once, and at most
+    `budget` points."""
     population, evaluations = 25 * dimensions, 0
 
     def generation(x: Reals, /) -> Any:
@@ -92,11 +101,14 @@ def differential_evolution(cost: Cost, dimensions: int, seed: int, budget: int =
         updating="deferred",
         vectorized=True,
     )
-    return Found(np.asarray(found.x), float(found.fun), evaluations)
+    return SearchResult(np.asarray(found.x), float(found.fun), evaluations)
 
 
-def nelder_mead(cost: Cost, dimensions: int, seed: int, budget: int = 2500, starts: int = 10) -> Found:
-    """scipy's Nelder-Mead from the best few of budget/5 random points that are apart, then once more from the best."""
+def nelder_mead(cost: Cost, dimensions: int, seed: int, budget: int = 2500, starts: int = 10) -> SearchResult:
+    """scipy's Nelder-Mead from the best distinct ones of budget/5 random points, then once more from the best result.
+
+    starts: the largest number of starts.
+    """
     scattered: Reals = np.random.default_rng(seed).random((budget // 5, dimensions))
     values = cost(scattered)
     left = scattered[np.argsort(values)]
@@ -106,7 +118,7 @@ def nelder_mead(cost: Cost, dimensions: int, seed: int, budget: int = 2500, star
     def one(x: Reals) -> float:
         return float(cost(x[None, :])[0])
 
-    def search(start: Reals, size: float) -> Found:
+    def search(start: Reals, size: float) -> SearchResult:
         inwards = np.where(start < 0.5, size, -size)
         simplex = start + np.concatenate((np.zeros((1, dimensions)), inwards * np.eye(dimensions)))
         found = optimize.minimize(
@@ -116,9 +128,9 @@ def nelder_mead(cost: Cost, dimensions: int, seed: int, budget: int = 2500, star
             bounds=optimize.Bounds(np.zeros(dimensions), np.ones(dimensions)),
             options={"initial_simplex": simplex, "xatol": 1e-6, "fatol": 1e-6, "maxfev": each},
         )
-        return Found(np.asarray(found.x), float(found.fun), int(found.nfev))
+        return SearchResult(np.asarray(found.x), float(found.fun), int(found.nfev))
 
-    runs: list[Found] = []
+    runs: list[SearchResult] = []
     while len(runs) < starts and len(left):
         runs.append(search(left[0], 0.05))
         left = left[np.abs(left - left[0]).max(axis=1) > 0.05]
@@ -127,4 +139,4 @@ def nelder_mead(cost: Cost, dimensions: int, seed: int, budget: int = 2500, star
     again = search(best.point, 0.01)
     evaluations += sum(run.evaluations for run in runs) + again.evaluations
     best = min(best, again, key=lambda run: run.value)
-    return Found(best.point, best.value, evaluations, len(runs) + 1)
+    return SearchResult(best.point, best.value, evaluations, len(runs) + 1)

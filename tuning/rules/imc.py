@@ -15,7 +15,7 @@
 Source: B. Mabu Sarif, D. V. Ashok Kumar, M. Venu Gopal Rao, IJECE 10(3), 2020; the integrating filter rules follow
 from its (13), and agree with D. E. Rivera, M. Morari, S. Skogestad, Ind. Eng. Chem. Process Des. Dev. 25, 1986.
 
-The loop of each rule depends on lambda/L alone. `SAFE` holds the least lambda/L accepted: there Ms is 2, about. The
+The loop of each rule depends on lambda/L alone. `SAFE` holds the smallest lambda/L accepted, where Ms is about 2. The
 paper's own guidelines are lambda > 0.8 L and a start between 1/5 and 1/3 of the dominant time constant; the default is
 max(0.8 L, T/5), for an integrating plant sqrt(10) L. Form "zero" is unstable for lambda < 0.1445 L.
 
@@ -36,7 +36,7 @@ SAFE = {"taylor": 0.5, "all-pass": 0.25, "zero": 0.8, "integrating": 2.0}
 UNSTABLE_ZERO = 0.1445307
 """Form "zero": GM = (lambda/L + 1/2)/0.6445307; x - atan(x/2) = pi/2 is its crossover."""
 MIN_PSI = {"pi": 10.0, "pid": 2.5}
-"""Least psi/L: below it the integral time gets so short that Ms is well above 2 at the least safe lambda."""
+"""Smallest psi/L: below it the integral time is so short that Ms is well above 2 at the smallest safe lambda."""
 
 
 def imc_pi(
@@ -46,9 +46,12 @@ def imc_pi(
     psi_s: float | None = None,
     extrapolate: bool = False,
 ) -> Setting:
-    """lambda_s: s, by default as above.  psi_s: s, for an integrating plant by way of (36).
+    """The IMC setting of a PI.
 
-    Refused (outside_range) for a lambda below the safe range; extrapolate = true takes it with a note.
+    lambda_s: the time constant of the filter, s; the default is stated above.
+    psi_s: the lag that replaces the integrator of an integrating plant, s, by (36).
+    extrapolate: True accepts a lambda below the safe range, with a note.
+    Raises Refused, OUTSIDE_RANGE, for a lambda below the safe range.
     """
     if isinstance(model, Integrating) and psi_s is None:
         lambda_s, chosen, notes = _filter(model, lambda_s, "integrating", extrapolate)
@@ -69,7 +72,12 @@ def imc_pid(
     psi_s: float | None = None,
     extrapolate: bool = False,
 ) -> Setting:
-    """lambda_s, psi_s, extrapolate: as for `imc_pi`.  form: how a FOPDT's Pade factor is split, see above."""
+    """The IMC setting of a PID.
+
+    lambda_s, psi_s, extrapolate: as for `imc_pi`.
+    form: how the Pade factor of a FOPDT model is split, "zero" or "all-pass", see above.
+    Raises Refused as `imc_pi`.
+    """
     one_of("form", form, FORMS)
     if isinstance(model, SOPDT):
         _only_for_integrating(psi_s)
@@ -95,7 +103,7 @@ def imc_pid(
 def _filter(
     model: FOPDT | SOPDT | Integrating, lambda_s: float | None, loop: str, extrapolate: bool
 ) -> tuple[float, dict[str, float], tuple[str, ...]]:
-    """lambda, s, checked; what was chosen; notes."""
+    """The checked lambda (s), the design parameters in effect, and the notes."""
     L = model.L
     if isinstance(model, Integrating):
         no_lag(model, "IMC")
@@ -123,7 +131,7 @@ def _filter(
 
 
 def _as_fopdt(model: FOPDT | Integrating, psi_s: float | None, controller: str) -> tuple[FOPDT, dict[str, float]]:
-    """(30): an integrator as a lag of psi, s; a FOPDT as it is."""
+    """The model as FOPDT: by (30) an integrator becomes a lag of psi (s); a FOPDT model stays as it is."""
     if isinstance(model, FOPDT):
         _only_for_integrating(psi_s)
         return model, {}

@@ -1,10 +1,11 @@
-"""The kappa-tau rule, step-response form, PI: dominant pole designs of a batch of plants, fitted in tau = L/(L + T).
+"""The kappa-tau rule in its step-response form for a PI: dominant pole designs of many plants, fitted in tau = L/(L +
+T).
 
     Ms = 1.4    K Kp L/T = 0.29 exp(-2.7 tau + 3.7 tau^2)    Ti = 8.9 L exp(-6.6 tau + 3.0 tau^2)
     Ms = 2      K Kp L/T = 0.78 exp(-4.1 tau + 5.7 tau^2)    Ti as above
 
-Ms is what the design aimed at, 1.4 (cautious) or 2 (fast); a loop's own Ms differs, for the fit goes through many
-plants: with Ms = 1.4 a FOPDT plant has 1.25 to 1.35.
+Ms is the value that the designs were made for, 1.4 (cautious) or 2 (fast). The Ms of a loop differs, as the fit covers
+many plants: with Ms = 1.4 the loop of a FOPDT plant has 1.25 to 1.35.
 
 Source: K. J. Astrom, T. Hagglund, PID controllers: theory, design and tuning, 2nd edition, 1995, section 5.3: plants
 with essentially monotone step responses, L/T from 0.1 to 5.5. The book's PID fits are left out: they are for plants
@@ -25,7 +26,7 @@ RATIO = (0.1, 5.5)
 
 
 def kappa_tau(model: FOPDT, *, Ms: float = 1.4, extrapolate: bool = False) -> Setting:
-    """Ms: 1.4 or 2."""
+    """The kappa-tau setting. Ms: 1.4 or 2. extrapolate: True uses the rule outside its range of L/T, with a note."""
     if Ms not in MS:
         raise Refused(Reason.BAD_INPUT, f"Ms must be 1.4 or 2, not {Ms!r}")
     notes = ratio_within(model, *RATIO, "the kappa-tau rule", extrapolate)

@@ -18,7 +18,11 @@ from loopwright.tuning.rules.setting import Setting
 
 
 def lambda_tuning(model: FOPDT | Integrating, *, lambda_s: float | None = None) -> Setting:
-    """lambda_s: s, at least the dead time; by default 3 T, or the dead time if that is more (integrating: 3 L)."""
+    """The setting of lambda tuning.
+
+    lambda_s: the time constant of the closed loop, s, at least the dead time; by default 3 T, or the dead time if that
+    is longer (3 L for an integrating plant).
+    """
     K, L = abs(model.K), model.L
     if isinstance(model, Integrating):
         no_lag(model, "lambda tuning")

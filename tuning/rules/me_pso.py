@@ -1,11 +1,11 @@
 """ME-PSO: the PI that a multi-epoch particle swarm finds on the complex criterion.
 
 Source: Y. Romasevych, V. Loveikin, S. Usenko, "PI-controller tuning optimization via PSO-based technique". The
-criterion is in tuning.complex_criterion, the swarm in tuning.search; both say how what the paper leaves open is read.
+criterion is in `complex_criterion`, the swarm in `global_search`; both state how the open points of the paper are read.
 
-What is ours and not the paper's: the bound on Ms, without which the criterion returns loops that no engineer would
-accept (Ms above 5 among the paper's five plants); the time and gain units, which make the result follow the plant's
-scale; the choice of the search domain; the other two optimisers on the same criterion.
+The following are additions to the paper: the bound on Ms, without which the criterion returns loops that no engineer
+would accept (Ms above 5 among the paper's five plants); the time and gain units, which make the result follow the
+plant's scale; the choice of the search domain; the other two optimisers on the same criterion.
 """
 
 from __future__ import annotations
@@ -20,16 +20,22 @@ from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Model, Reals
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.complex_criterion import ComplexCriterion, Weighting
-from loopwright.tuning.rules.global_search import Cost, Found, differential_evolution, multi_epoch_swarm, nelder_mead
+from loopwright.tuning.rules.global_search import (
+    Cost,
+    SearchResult,
+    differential_evolution,
+    multi_epoch_swarm,
+    nelder_mead,
+)
 from loopwright.tuning.rules.setting import Setting
 
-OPTIMISERS: dict[str, Callable[[Cost, int, int], Found]] = {
+OPTIMISERS: dict[str, Callable[[Cost, int, int], SearchResult]] = {
     "me-pso": multi_epoch_swarm,
     "de": differential_evolution,
     "nelder-mead": nelder_mead,
 }
 LOWEST = np.array([1e-4, 1e-3])
-"""Of kp and ti in the plant's units: ISA gains have no pure integral controller, and no gain is infinite."""
+"""Smallest kp and ti in the plant's units: the ISA form has no pure integral controller, and no gain is infinite."""
 KP_MAX = 10.0
 TI_MAX = 10.0
 ROBUST_MS = 2.0
@@ -46,15 +52,18 @@ def me_pso(
     Kp_max: float | None = None,
     Ki_min: float | None = None,
 ) -> Setting:
-    """The PI of least complex criterion for a unit set-point step, b = 1.
+    """The PI with the smallest complex criterion for a unit set-point step, with b = 1.
 
-    weighting: "error", "control" or "duration", the paper's three.  seed: the same seed gives the same gains.
+    weighting: "error", "control" or "duration", the three weightings of the paper.
+    seed: the seed of the search; the same seed gives the same gains.
     optimiser: "me-pso" (2,500 evaluations, as published), "de" (differential evolution) or "nelder-mead" (multi-start),
-    both with at most as many.  Ms_max: bound on the maximum sensitivity, above 1; 0 for none, as published.
-    horizon_s: simulated time, s; by default 20 times all lags and the dead time together.
-    Kp_max: MV per PV units, by default the ultimate gain (10/K without one).  Ki_min: MV per PV units and s, by default
-    a tenth of 1/(K*time unit). With Ms_max = 0 and the paper's horizon and domain it is the paper's problem, but for
-    Kp, which is not quite 0 at the least.
+    the last two with at most as many evaluations.
+    Ms_max: the bound on the maximum sensitivity, above 1; 0 for none, as published.
+    horizon_s: the simulated time, s; by default 20 times all lags and the dead time together.
+    Kp_max: the largest Kp, MV units per PV unit; by default the ultimate gain (10/K without one).
+    Ki_min: the smallest Ki, MV units per PV unit and s; by default a tenth of 1/(K*time unit).
+    With Ms_max = 0 and the paper's horizon and domain the problem is that of the paper, except that the smallest Kp is
+    not quite 0.
     Raises Refused for a bad argument, a model without lag and dead time, or when no stable loop was found.
     """
     if weighting not in tuple(Weighting):
@@ -118,8 +127,9 @@ def _highest_ti(criterion: ComplexCriterion, Ki_min: float | None) -> float:
 
 def _search(
     criterion: ComplexCriterion, highest: Reals, optimiser: str, seed: int
-) -> tuple[Found, tuple[float, float]]:
-    """(what was found, (kp, ti)). The swarm and differential evolution search evenly, as published."""
+) -> tuple[SearchResult, tuple[float, float]]:
+    """The result of the search and its (kp, ti). The swarm and differential evolution search ti linearly, as published;
+    Nelder-Mead searches it logarithmically."""
 
     def even(x: Reals) -> Reals:
         return np.asarray(LOWEST + x * (highest - LOWEST))

@@ -1,7 +1,7 @@
 """The registry of tuning methods, and one call for all of them: `tune(name, model, **options)`.
 
-A method that takes a simpler kind of model than it is given gets it reduced where a sound reduction exists, and a note
-says so: the half rule, or the tangent for rules made on the reaction curve. Otherwise it refuses.
+A model that is not of a kind that the method takes is reduced where a sound reduction exists, and a note says so: by
+the half rule, or by the tangent for rules made on the reaction curve. Otherwise the method refuses.
 """
 
 from __future__ import annotations
@@ -36,8 +36,15 @@ Value = float | str | bool | None
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """unit: "" for none.  default: None where the model decides.  choices: the only values.  range: least and most,
-    None for no end; a rule may refuse more, depending on the model."""
+    """An option of a method.
+
+    unit: the unit of the value, "" for none.
+    default: the default value, None where it depends on the model.
+    meaning: the meaning of the option, for the user.
+    choices: the only permitted values, empty for any.
+    range: the smallest and the largest value, None for no limit; a rule may refuse more, depending on the model.
+    kind: the kind of the value.
+    """
 
     unit: str
     default: Value
@@ -47,7 +54,7 @@ class Option:
     kind: Literal["number", "whole", "flag", "choice"] = "number"
 
     def check(self, name: str, value: object) -> Value:
-        """The value as the rule takes it; refused (bad_input) if it is none."""
+        """The value as the rule takes it. Raises Refused, BAD_INPUT, for a value that is not permitted."""
         if value is None and self.default is None:
             return None
         if self.kind == "choice":
@@ -74,11 +81,20 @@ class Option:
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """for_what: when to choose it, one sentence.  needs: the models it takes, in words; takes: as types, lag saying
-    whether an Integrating may have one.  reaction_curve: made on the tangent of a step response.
+    """A tuning method.
 
-    measured: the same rule from a measured (Ku, Pu).  filter: Td/Tf where the loop realises an ideal derivative.
-    slow: takes longer than a loop may go without being attended to (0.2 s).
+    name, title: its name in requests, and its title for people.
+    source: the publication.
+    for_what: when to choose the method, in one sentence.
+    needs: the models that it takes, in words.
+    takes: the same models as types.
+    rule: the function that computes the setting.
+    options: its options by name.
+    lag: whether an `Integrating` model may have a lag.
+    reaction_curve: True for a rule made on the tangent of a step response.
+    measured: the same rule from a measured (Ku, Pu), None without one.
+    slow: True if the computation takes longer than 0.2 s, the time for which a loop may be left unattended.
+    filter: Td/Tf where the loop realises an ideal derivative.
     """
 
     name: str
@@ -96,20 +112,25 @@ class Method:
     filter: float = 10.0
 
     def tune(self, model: Model, **options: object) -> Setting:
-        """Refused: bad_input (an option), not_self_regulating, outside_range, cannot_oscillate, as the rule says."""
+        """The setting of the method for a model.
+
+        Raises Refused: BAD_INPUT (an option), or as the rule does: NOT_SELF_REGULATING, OUTSIDE_RANGE,
+        CANNOT_OSCILLATE.
+        """
         checked = self.checked(options)
         fitted, notes = self._fitted(model)
         found = self.rule(fitted, **checked)
         return replace(found, notes=notes + found.notes)
 
     def tune_measured(self, Ku: float, Pu: float, **options: object) -> Setting:
-        """From the ultimate gain (MV units per PV unit) and period (s) found on the loop."""
+        """The setting from the ultimate gain (MV units per PV unit) and period (s) measured on the loop. Raises
+        Refused, BAD_INPUT, for a method that does not use them."""
         if self.measured is None:
             raise Refused(Reason.BAD_INPUT, f"{self.name} does not use the ultimate point")
         return self.measured(Ku, Pu, **self.checked(options))
 
     def checked(self, options: Mapping[str, object]) -> dict[str, Value]:
-        """The options as the rule takes them; refused (bad_input) if one is unknown or out of range."""
+        """The options as the rule takes them. Raises Refused, BAD_INPUT, if one is unknown or out of range."""
         checked: dict[str, Value] = {}
         for name, value in options.items():
             if name not in self.options:
@@ -119,7 +140,7 @@ class Method:
         return checked
 
     def _fitted(self, model: Model) -> tuple[Model, tuple[str, ...]]:
-        """The model as a kind that the rule takes, and a note on how it was reduced."""
+        """The model, reduced if need be to a kind that the rule takes, and a note on the reduction."""
         if isinstance(model, TransferFunction):
             model = exact(model)
         integrating = integrators(model) > 0
@@ -138,7 +159,7 @@ class Method:
 
 
 def tune(name: str, model: Model, **options: object) -> Setting:
-    """The setting that a method of `METHODS` gives this model."""
+    """The setting that the method with this name in `METHODS` gives for this model. Raises Refused as `Method.tune`."""
     if name not in METHODS:
         raise Refused(Reason.BAD_INPUT, f"method must be one of {', '.join(METHODS)}, not {name!r}")
     return METHODS[name].tune(model, **options)

@@ -2,13 +2,13 @@
 
     J = max over the 8 corners of [ 10*ITAE + 1*overshoot + 10*Ms ],   K, T and L each 20 % low or high
 
-for a unit set-point step; overshoot as a fraction, not below 0; ITAE in s^2 (or scale-free, times (5 s/T)^2). Source:
-Stopakevych et al., automatic re-tuning of PI controllers, Problemele Energeticii Regionale.
+J is for a unit set-point step; overshoot is a fraction, not below 0; ITAE is in s^2 (or scale-free, times (5 s/T)^2).
+Source: Stopakevych et al., automatic re-tuning of PI controllers, Problemele Energeticii Regionale.
 
-How it is made fast. Time is counted in each corner's own dead time. Within one dead time the error is smooth and is
-kept as its values at a few Chebyshev points; what it becomes one dead time later is a linear map (the method of steps:
-the plant's input is already known). All eight maps depend on Kp and Kp/Ti alone through fixed matrices, and a response
-of 2^n dead times takes n squarings.
+The computation is made fast as follows. Time is in units of each corner's own dead time. Within one dead time the error
+is smooth and is represented by its values at a few Chebyshev points; its values one dead time later follow by a linear
+map (the method of steps: the plant's input is already known). All eight maps depend on Kp and Kp/Ti alone through fixed
+matrices, and a response of 2^n dead times takes n squarings.
 """
 
 from __future__ import annotations
@@ -32,12 +32,17 @@ MS_POINTS = 300
 SCALE_FREE_BELOW_S = 5.0
 UNSTABLE = 1e30
 RATIO = (0.02, 20.0)
-"""L/T. The search takes about 0.1 s inside, and many times as long outside."""
+"""Range of L/T. The search takes about 0.1 s inside this range, and many times as long outside."""
 
 
 @dataclass(frozen=True, slots=True)
 class Optimum:
-    """gains: Ti in s.  J: the criterion there (lower is better, comparable for one model and horizon only)."""
+    """The result of the search.
+
+    gains: the optimal gains.
+    J: the criterion there; lower is better, and values are comparable for one model and horizon only.
+    evaluations: the number of evaluations of the criterion.
+    """
 
     gains: Gains
     J: float
@@ -53,8 +58,10 @@ def optimise(
 ) -> Optimum:
     """The PI that minimises criterion (7) on this model; Kp is positive whatever the sign of K.
 
-    start: by default the Ziegler-Nichols PI of the model.  horizon_s: length of the step response, s, by default
-    horizon_factor*(T + L).  scale_free: by default for T < 5 s, where the printed criterion depends on the time unit.
+    start: the start of the search, by default the Ziegler-Nichols PI of the model.
+    horizon_s: the length of the step response, s; by default horizon_factor*(T + L).
+    scale_free: whether time is weighted in units of T; by default True for T < 5 s, where the printed criterion depends
+    on the unit of time.
     """
     if start is None or start.Ti == 0.0:
         ku, pu = ultimate_point(model)
@@ -68,7 +75,8 @@ def optimise(
     while (J := cost(best)) >= UNSTABLE:
         best = best + np.array([math.log(0.7), 0.0])
     for size, xatol, fatol in ((0.15, 5e-4, 1e-5), (0.03, 5e-4, 1e-5), (0.004, 1e-5, 1e-8)):
-        # J has kinks where corners tie; a second, smaller simplex frees a search stuck on one, a third goes to its foot
+        # J has kinks where two corners are equal; a second, smaller simplex frees a search stuck there, a third
+        # refines it
         simplex = best + np.array([[0.0, 0.0], [size, 0.0], [0.0, size]])
         found = minimize(
             cost,
@@ -81,7 +89,7 @@ def optimise(
 
 
 class Criterion:
-    """J(Kp, Ti) of one model: what does not depend on the controller is computed once."""
+    """The criterion J(Kp, Ti) of one model; the parts that do not depend on the controller are computed once."""
 
     def __init__(self, model: FOPDT, horizon_s: float, scale_free: bool | None = None) -> None:
         if model.L <= 0.0:
@@ -98,7 +106,7 @@ class Criterion:
         self._prepare_time(horizon_s)
 
     def __call__(self, Kp: float, Ti: float) -> float:
-        """J; beyond UNSTABLE if some corner is unstable, and the more so the farther it is from being stable."""
+        """The value of J; if a corner is unstable it is above UNSTABLE, and grows with the distance from stability."""
         self.evaluations += 1
         sensitivity, excess = self._frequency(Kp, Ti)
         if excess > 0.0:
@@ -114,7 +122,7 @@ class Criterion:
         self.proportional, self.integral = plant, plant / (jw * self.dead[:, None] ** -1)
 
     def _frequency(self, Kp: float, Ti: float) -> tuple[Reals, float]:
-        """(Ms of each corner, 0 or how far the worst unstable corner is beyond its limit, as a gain)."""
+        """Ms of each corner, and the gain by which the worst unstable corner exceeds its limit, 0 if all are stable."""
         L = Kp * self.proportional + (Kp / Ti) * self.integral
         above = L.imag > 0.0
         # Nyquist: net crossings of the real axis left of -1
@@ -129,9 +137,10 @@ class Criterion:
         return 1.0 / np.sqrt(np.min(one_plus.real**2 + one_plus.imag**2, axis=1)), 0.0
 
     def _prepare_time(self, horizon_s: float) -> None:
-        """The map of one dead time, in deviations from the final state, time in dead times.
+        """Prepares the map of one dead time, for deviations from the final state and with time in dead times.
 
-        lag*e' = -e - K*q(one dead time ago),  q = Kp*(e + j/Ti),  j' = e:  state (e at the nodes, j at the start).
+        The equations are lag*e' = -e - K*q(one dead time ago), q = Kp*(e + j/Ti) and j' = e; the state is (e at the
+        nodes, j at the start).
         """
         shortest = float(self.lag.min())
         nodes = 10 + 2 * math.ceil(1.0 / shortest)
@@ -173,10 +182,10 @@ class Criterion:
         self.time_weights = np.asarray(self.dead[:, None, None] ** 2 * midpoint * inside / fine)
 
     def _time(self, Kp: float, Ti: float) -> tuple[Reals, Reals]:
-        """(ITAE in s^2, overshoot as a fraction) of each corner."""
+        """The ITAE (s^2) and the overshoot (a fraction) of each corner."""
         advance = self.free + Kp * self.by_kp + (Kp / Ti) * self.by_ki
         corners, size, _ = advance.shape
-        # the first dead time: e = 1, while j starts at what is missing to the final output
+        # in the first dead time e = 1, while j starts at its deviation from the final value
         states = np.ones((corners, size, 1))
         states[:, -1, 0] = -Ti / (self.K * Kp * self.dead)
         while states.shape[2] < self.blocks:
@@ -190,13 +199,17 @@ class Criterion:
 
 
 def _antiderivative(c: Reals, x: Reals) -> Reals:
-    """Of a Chebyshev series on [-1, 1], zero at -1, at 2x - 1."""
+    """The antiderivative, zero at -1, of a Chebyshev series on [-1, 1], at the points 2x - 1."""
     return np.asarray(chebyshev.chebval(2.0 * x - 1.0, chebyshev.chebint(c, lbnd=-1.0)))
 
 
 def robust(model: FOPDT, *, horizon_s: float | None = None, scale_free: bool | None = None) -> Setting:
-    """horizon_s: length of the step response, s, by default 10 (T + L).  scale_free: by default for T < 5 s, where the
-    printed criterion depends on the unit of time."""
+    """The setting of the robust PI.
+
+    horizon_s: the length of the step response, s, by default 10 (T + L).
+    scale_free: whether time is weighted in units of T; by default True for T < 5 s, where the printed criterion depends
+    on the unit of time.
+    """
     ratio_within(model, *RATIO, "the robust PI")
     if horizon_s is None:
         horizon_s = 10.0 * (model.T + model.L)

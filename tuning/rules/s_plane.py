@@ -1,17 +1,18 @@
-"""Pole placement with a quadratic criterion: prescribe the shape of the dominant roots, search their size.
+"""Pole placement with a quadratic criterion: the shape of the dominant roots is prescribed, their size is searched.
 
     roots  s = alpha*(-1 +/- j*mu),  for a PID also  s = -k1*alpha;     J = integral of (e^2 + tau^2 * e'^2) dt
 
-For each alpha the prescribed roots fix the gains by a linear system; alpha is where J of a unit set-point step is least
-among the alphas with positive gains and a stable loop. Source: M. Horbiichuk, M. Vasylenchuk, I. Yednak, A. Lahoida,
-"Devising a combined method for setting PI/PID controller parameters for oil and gas facilities", Eastern-European
-Journal of Enterprise Technologies 1(2(133)), 2025, the pole equations and J of its three plant orders.
+For each alpha the prescribed roots determine the gains by a linear system. The chosen alpha minimises J of a unit
+set-point step among the alphas with positive gains and a stable loop. Source: M. Horbiichuk, M. Vasylenchuk, I. Yednak,
+A. Lahoida, "Devising a combined method for setting PI/PID controller parameters for oil and gas facilities",
+Eastern-European Journal of Enterprise Technologies 1(2(133)), 2025, the pole equations and J of its three plant orders.
 
-Here the same is done for any order and with exact dead time: each prescribed root must satisfy C(s)*G(s) = -1, and J is
-that of a Lyapunov equation. On the paper's three orders this is what the paper does.
+This module does the same for any order and with exact dead time: each prescribed root must satisfy C(s)*G(s) = -1, and
+J comes from a Lyapunov equation. On the paper's three orders the results are those of the paper.
 
-What is ours and not the paper's: the selection among several minima. The paper takes the one in an interval picked by
-hand; here it is the one of least J whose other roots all decay at 0.8*alpha or faster. Otherwise mu describes nothing.
+The selection among several minima is an addition to the paper, which takes the minimum in an interval chosen by hand.
+Here the minimum of smallest J is taken whose other roots all decay at 0.8*alpha or faster; with a slower root the shape
+mu would not describe the response.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ INSIDE = 200
 SLOWER = 0.8
 SHOWN = 8
 STABLE_BY = 1e-9
-"""Over all lags and the dead time together: what rounding may hide."""
+"""Smallest decay rate of a stable loop, in units of one over all lags and the dead time together, for rounding
+errors."""
 CONTROLLERS = ("pi", "pid")
 
 
@@ -45,9 +47,11 @@ CONTROLLERS = ("pi", "pid")
 class Minimum:
     """One local minimum of J.
 
-    alpha: 1/s.  gains: ISA; a PID has its derivative on the error, without filter.  J0: integral of e^2, s.  J1: of
-    e'^2, 1/s.  J: J0 + tau^2*J1, s.  left_over: the roots that were not prescribed, 1/s, the slowest first, at
-    most eight of them.
+    alpha: the size of the prescribed roots, 1/s.
+    gains: the ISA gains; the derivative of a PID acts on the error, without filter.
+    J0, J1: the integral of e^2, s, and of e'^2, 1/s.
+    J: the criterion J0 + tau^2*J1, s.
+    left_over: the roots that were not prescribed, 1/s, the slowest first, at most eight.
     """
 
     alpha: float
@@ -64,10 +68,11 @@ class Minimum:
 
 
 @dataclass(frozen=True, slots=True)
-class Design:
-    """admissible: intervals of alpha, 1/s, ends included; beyond the last searched alpha it is not known.
+class PolePlacement:
+    """The result of pole placement for all alphas.
 
-    minima: by alpha. Both may be empty.
+    admissible: the admissible intervals of alpha, 1/s, ends included, up to the largest alpha searched; may be empty.
+    minima: the local minima of J by rising alpha; may be empty.
     """
 
     admissible: tuple[tuple[float, float], ...]
@@ -83,14 +88,17 @@ def s_plane(
     k1: float = 1.2,
     alpha_per_s: float | None = None,
 ) -> Setting:
-    """The PI or PID whose dominant roots have the shape mu and the size of least J; b = 1, for a PID c = 1 and Tf = 0.
+    """The PI or PID whose dominant roots have the shape mu and the size of smallest J; b = 1, for a PID c = 1 and Tf =
+    0.
 
-    controller: "pi" or "pid".  mu: imaginary over real part of the pair, 0.01 to 10; damping ratio 1/sqrt(1 + mu^2).
-    tau_s: weight of the error's rate, s, near the wanted closed-loop time constant; by default a quarter of all lags
-    and the dead time together.  k1: the real root of a PID over the pair's real part, 0.01 to 100.  alpha_per_s: the
-    pair's real part, 1/s, when it is not to be searched: pole placement alone.
-    Raises Refused for a bad argument, a model that `design` does not take, or when no alpha (or not the given one) has
-    positive gains and a stable loop, or J no minimum.
+    controller: "pi" or "pid".
+    mu: the ratio of imaginary to real part of the pair, 0.01 to 10; the damping ratio is 1/sqrt(1 + mu^2).
+    tau_s: the weight of the error's rate, s, close to the desired time constant of the closed loop; by default a
+    quarter of all lags and the dead time together.
+    k1: the ratio of the real root of a PID to the pair's real part, 0.01 to 100.
+    alpha_per_s: the pair's real part, 1/s, for pole placement without a search.
+    Raises Refused, BAD_INPUT, for a bad argument, a model that `design` does not take, when no alpha (or not the given
+    one) has positive gains and a stable loop, or when J has no minimum.
     """
     if tau_s is None:
         tau_s = 0.25 * time_sum(model)
@@ -105,7 +113,7 @@ def s_plane(
                 f"alpha_per_s {alpha_per_s} with mu {mu}: a gain is not positive or the loop not stable; "
                 f"{shown or 'no alpha'} 1/s is accepted",
             )
-        found = Design((), (search.minimum(alpha_per_s * search.unit),))
+        found = PolePlacement((), (search.minimum(alpha_per_s * search.unit),))
     else:
         found = search.design()
         if not found.admissible:
@@ -136,7 +144,7 @@ def s_plane(
     return Setting(best.gains, chosen, tuple(notes))
 
 
-def design(model: Model, *, controller: str, mu: float, tau_s: float, k1: float = 1.2) -> Design:
+def design(model: Model, *, controller: str, mu: float, tau_s: float, k1: float = 1.2) -> PolePlacement:
     """The admissible alphas and all local minima of J on them; arguments as for `s_plane`.
 
     alpha is searched from 0.01 to 100 over all lags and the dead time together, not beyond 10/L. More poles than zeros
@@ -168,17 +176,18 @@ def _search(model: Model, controller: str, mu: float, tau_s: float, k1: float) -
 
 
 class _Search:
-    """One plant made of gain one, all times in its own `unit`, s; alphas of shape (p,)."""
+    """The search on one plant, scaled to a gain of one and with times in units of `unit` (s); alphas have shape
+    (p,)."""
 
     def __init__(self, model: Model, unit: float, mu: float, k1: float | None, tau: float) -> None:
         plant = normalised(model, unit)
         self.unit, self.per_gain = unit, gain_unit(model, unit)
         self.plant, self.tau = plant, tau
         self.shape = np.array([-1.0 + 1j * mu] if k1 is None else [-1.0 + 1j * mu, -k1 + 0j])
-        self.loop: _Rational | _Delayed = _Delayed(plant) if plant.L > 0.0 else _Rational(plant)
+        self.loop: _RationalLoops | _DelayedLoops = _DelayedLoops(plant) if plant.L > 0.0 else _RationalLoops(plant)
 
     def gains(self, alpha: Reals) -> Reals:
-        """(p, 3): Kp, Ki, Kd that place the prescribed roots; not finite where there are none."""
+        """The Kp, Ki, Kd that place the prescribed roots, shape (p, 3); not finite where there are none."""
         s = alpha[:, None] * self.shape
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             wanted = -s * np.polyval(self.plant.den, s) / np.polyval(self.plant.num, s) * np.exp(self.plant.L * s)
@@ -239,15 +248,15 @@ class _Search:
         J0, J1 = self.loop.squares(self.gains(np.array([alpha])))
         return float(J0[0] + self.tau**2 * J1[0])
 
-    def design(self) -> Design:
+    def design(self) -> PolePlacement:
         intervals = self.admissible()
-        return Design(
+        return PolePlacement(
             admissible=tuple((low / self.unit, high / self.unit) for low, high in intervals),
             minima=tuple(self.minimum(alpha) for low, high in intervals for alpha in self.local_minima(low, high)),
         )
 
     def minimum(self, alpha: float) -> Minimum:
-        """What there is to say of one alpha."""
+        """The gains, the criterion and the other roots at one alpha."""
         unit = self.unit
         gains = self.gains(np.array([alpha]))
         J0, J1 = (float(each[0]) for each in self.loop.squares(gains))
@@ -270,14 +279,14 @@ class _Search:
         )
 
 
-class _Rational:
-    """Loops without dead time, by their polynomials P = s*A + N*B; the error of a unit step is A/P."""
+class _RationalLoops:
+    """Loops without dead time, described by their polynomials P = s*A + N*B; the error of a unit step is A/P."""
 
     def __init__(self, plant: TransferFunction) -> None:
         self.a, self.b = np.asarray(plant.den), np.asarray(plant.num)
 
     def polynomials(self, gains: Reals) -> Reals:
-        """(p, n + 2), the leading coefficient not zero."""
+        """The polynomials P, shape (p, n + 2), with a leading coefficient that is not zero."""
         size = len(self.a) + 1
         total = np.zeros((len(gains), size))
         total[:, :-1] = self.a
@@ -301,7 +310,7 @@ class _Rational:
         return np.asarray(self.roots(gains).real.max(axis=1) < -STABLE_BY)
 
     def squares(self, gains: Reals) -> tuple[Reals, Reals]:
-        """(integral of e^2, of e'^2 after t = 0), each (p,); infinite where a loop is on the edge of stability."""
+        """The integrals of e^2 and of e'^2 after t = 0, each of shape (p,); infinite at the limit of stability."""
         P = self.polynomials(gains)
         e = np.broadcast_to(self.a, (len(P), len(self.a))) / P[:, :1]
         # the jump at t = 0 is not a rate: s*E - e(0+)
@@ -319,8 +328,8 @@ class _Rational:
 
 
 def _solved(systems: Reals, sides: Reals) -> Reals:
-    """Of linear systems, NaN where one is singular: at an end of the admissible alphas, where gains run to infinity,
-    it may be so or not, as the processor rounds."""
+    """The solutions of linear systems, NaN where one is singular. At an end of the admissible alphas, where gains go to
+    infinity, rounding decides whether a system is singular."""
     try:
         return np.asarray(np.linalg.solve(systems, sides))
     except np.linalg.LinAlgError:
@@ -329,8 +338,8 @@ def _solved(systems: Reals, sides: Reals) -> Reals:
         return np.concatenate([_solved(systems[i : i + 1], sides[i : i + 1]) for i in range(len(systems))])
 
 
-class _Delayed:
-    """Loops with dead time, by their map from one dead time to the next."""
+class _DelayedLoops:
+    """Loops with dead time, described by their map from one dead time to the next."""
 
     def __init__(self, plant: TransferFunction) -> None:
         self.loop = DeadTimeLoop(plant)
@@ -345,5 +354,5 @@ class _Delayed:
         return np.asarray(self.loop.roots(self._maps(gains))[:, 0].real < -STABLE_BY)
 
     def squares(self, gains: Reals) -> tuple[Reals, Reals]:
-        """(integral of e^2, of e'^2 after t = 0), each (p,)."""
+        """The integrals of e^2 and of e'^2 after t = 0, each of shape (p,)."""
         return self.loop.squares(self._maps(gains), self.loop.start(gains[:, 0], gains[:, 2]))

@@ -1,4 +1,4 @@
-"""What a tuning rule answers with."""
+"""The setting that a tuning rule gives."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ from loopwright.tuning.gains import Gains
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """gains: ISA form, Kp positive.  chosen: the design parameters in effect (lambda_s, tau_c_s, ...), by name with
-    unit.  notes: what the user should know (a guideline left, an approximation taken), one sentence each.
+    """The gains of a rule, with the design parameters behind them.
+
+    gains: the ISA gains, Kp positive.
+    chosen: the design parameters in effect (lambda_s, tau_c_s, ...), by name with unit.
+    notes: what the user should know (a guideline exceeded, an approximation made), one sentence each.
     """
 
     gains: Gains

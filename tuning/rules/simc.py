@@ -27,9 +27,12 @@ CONTROLLERS = ("pi", "pid")
 
 
 def simc(model: Model, *, controller: str = "pi", tau_c_s: float | None = None) -> Setting:
-    """tau_c_s: s, not negative; by default the dead time that is left after reduction.
+    """The SIMC setting.
 
-    controller "pid" needs a second lag: refused (bad_input) for a FOPDT or a lagless integrating plant.
+    controller: "pi" or "pid"; "pid" needs a second lag.
+    tau_c_s: the time constant of the closed loop, s, not negative; by default the dead time of the reduced model.
+    Raises Refused: BAD_INPUT, also for a PID on a FOPDT model or an integrating plant without lag; OUTSIDE_RANGE
+    without dead time and tau_c_s.
     """
     one_of("controller", controller, CONTROLLERS)
     if isinstance(model, TransferFunction):

@@ -1,4 +1,4 @@
-"""A model tuned by hand: gains that a controller can carry out, what they do to the loop, and a picture of it."""
+"""The tuning of a model by hand: gains that a controller can realise, their assessment, and a picture of the loop."""
 
 from __future__ import annotations
 
@@ -20,11 +20,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Tuned:
-    """What a method makes of a model.
+    """The result of a method on a model.
 
-    gains: in ISA form; an ideal derivative has been given a filter.  chosen: the design parameters of the rule, by name
-    with unit.  notes: what the rule, and the filter, have to say.  assessment: margins and step figures of these gains
-    on this model, with its exact dead time.
+    method, model: the method and the model.
+    gains: the ISA gains; an ideal derivative has been given a filter.
+    chosen: the design parameters of the rule, by name with unit.
+    notes: the notes of the rule and of the filter, one sentence each.
+    assessment: the margins and step figures of these gains on this model, with its exact dead time.
     """
 
     method: Method
@@ -43,8 +45,8 @@ class Tuned:
         return f"{gains}; Ms {found.margins.Ms:.3g}, overshoot {found.setpoint.overshoot_pct:.1f} %"
 
     def plot(self) -> Figure:
-        """PV and MV after a unit step of the set-point, and of the load. Needs matplotlib; raises Refused, NOT_ROBUST,
-        for a loop that is not stable."""
+        """The picture of PV and MV after a unit set-point step and after a unit load disturbance; needs matplotlib.
+        Raises Refused, NOT_ROBUST, for a loop that is not stable."""
         from matplotlib.figure import Figure
 
         if not self.assessment.stable:
@@ -64,7 +66,7 @@ class Tuned:
         return figure
 
     def _repr_png_(self) -> bytes | None:
-        """What a notebook shows."""
+        """The picture that a notebook shows."""
         from io import BytesIO
 
         if not self.assessment.stable:
@@ -75,12 +77,13 @@ class Tuned:
 
 
 def tune(model: Model | LinearSystem, method: str = "simc", dead_time_s: float = 0.0, **options: object) -> Tuned:
-    """The gains that a method gives a model, and what they do to the loop.
+    """The gains that a method gives for a model, with their assessment.
 
-    model: one of this library, or a transfer function of another (control, scipy.signal) with its dead time, s.
-    method, options: a name of `METHODS`, and options that it has.
-    Raises Refused: BAD_INPUT (method, option), or as the rule says: NOT_SELF_REGULATING, OUTSIDE_RANGE,
-    CANNOT_OSCILLATE; ValueError: a model that is none.
+    model: a model of this library, or a transfer function of another one (control, scipy.signal).
+    method, options: a name of `METHODS`, and options of that method.
+    dead_time_s: the dead time of a transfer function of another library, s.
+    Raises Refused: BAD_INPUT (method, option), or as the rule does: NOT_SELF_REGULATING, OUTSIDE_RANGE,
+    CANNOT_OSCILLATE. Raises ValueError for coefficients that make no model.
     """
     if method not in METHODS:
         raise Refused(Reason.BAD_INPUT, f"method must be one of {', '.join(METHODS)}, not {method!r}")

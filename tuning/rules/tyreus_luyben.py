@@ -1,4 +1,4 @@
-"""Tyreus and Luyben: the ultimate cycle, well damped.
+"""The rule of Tyreus and Luyben: a well damped setting from the ultimate cycle.
 
     PI     Kp = Ku/3.2    Ti = 2.2 Pu
     PID    Kp = Ku/2.2    Ti = 2.2 Pu    Td = Pu/6.3
@@ -20,7 +20,7 @@ VARIANTS = ("2.2", "0.45")
 
 
 def ultimate(Ku: float, Pu: float, *, controller: str = "pi", variant: str = "2.2") -> Setting:
-    """From the ultimate gain Ku (MV units per PV unit) and period Pu, s."""
+    """The setting from the ultimate gain Ku (MV units per PV unit) and the ultimate period Pu (s)."""
     one_of("controller", controller, CONTROLLERS)
     one_of("variant", variant, VARIANTS)
     positive("Ku", Ku, "MV units per PV unit")
@@ -33,11 +33,14 @@ def ultimate(Ku: float, Pu: float, *, controller: str = "pi", variant: str = "2.
 
 
 def tyreus_luyben(model: Model, *, controller: str = "pi", variant: str = "2.2") -> Setting:
-    """From the model's own ultimate point; refused (cannot_oscillate) for a plant that has none, and (outside_range)
-    where the loop would be unstable: the PID of a plant with L/T above 5."""
+    """The setting from the model's own ultimate point.
+
+    Raises Refused: CANNOT_OSCILLATE for a plant without an ultimate point; OUTSIDE_RANGE where the loop would be
+    unstable, as with a PID on a plant with L/T above 5.
+    """
     one_of("controller", controller, CONTROLLERS)
     one_of("variant", variant, VARIANTS)
     stable_plant(model, "Tyreus-Luyben")
     found = ultimate(*ultimate_point(model), controller=controller, variant=variant)
-    # with much dead time the ideal derivative alone is too much
+    # with a long dead time the ideal derivative alone makes the loop unstable
     return found if integrators(model) else refuse_unstable(model, found, "Tyreus-Luyben")

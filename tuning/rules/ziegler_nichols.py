@@ -1,4 +1,4 @@
-"""Ziegler and Nichols' two rules: quarter decay of a load disturbance.
+"""The two rules of Ziegler and Nichols: quarter decay of a load disturbance.
 
     ultimate cycle          Kp         Ti       Td            step response       Kp       Ti     Td
     P                       0.5 Ku                            P                   1/a
@@ -31,7 +31,7 @@ RATIO = (0.1, 1.0)
 
 
 def ultimate(Ku: float, Pu: float, *, controller: str = "pi") -> Setting:
-    """From the ultimate gain Ku (MV units per PV unit) and period Pu, s."""
+    """The setting from the ultimate gain Ku (MV units per PV unit) and the ultimate period Pu (s)."""
     one_of("controller", controller, CONTROLLERS)
     positive("Ku", Ku, "MV units per PV unit")
     positive("Pu", Pu, "s")
@@ -44,17 +44,24 @@ def ultimate(Ku: float, Pu: float, *, controller: str = "pi") -> Setting:
 
 
 def zn_ultimate(model: Model, *, controller: str = "pi") -> Setting:
-    """From the model's own ultimate point; refused (cannot_oscillate) for a plant that has none, and (outside_range)
-    where the loop would be unstable: the PID of a plant with L/T from about 5."""
+    """The setting from the model's own ultimate point.
+
+    Raises Refused: CANNOT_OSCILLATE for a plant without an ultimate point; OUTSIDE_RANGE where the loop would be
+    unstable, as with a PID on a plant with L/T from about 5.
+    """
     one_of("controller", controller, CONTROLLERS)
     stable_plant(model, "Ziegler-Nichols")
     found = ultimate(*ultimate_point(model), controller=controller)
-    # with much dead time the ideal derivative alone is too much
+    # with a long dead time the ideal derivative alone makes the loop unstable
     return found if integrators(model) else refuse_unstable(model, found, "Ziegler-Nichols")
 
 
 def zn_step(model: FOPDT | Integrating, *, controller: str = "pi", extrapolate: bool = False) -> Setting:
-    """From the step response. The lag of an integrating plant counts as dead time: its ramp starts at L + T."""
+    """The setting from the step response. The lag of an integrating plant counts as dead time: its ramp starts at L +
+    T.
+
+    extrapolate: True uses the rule outside its range of L/T, with a note.
+    """
     one_of("controller", controller, CONTROLLERS)
     notes: tuple[str, ...] = ()
     if isinstance(model, FOPDT):

@@ -20,7 +20,16 @@ from loopwright.service.api import problems
 from loopwright.service.api.gate.bodies import Bodies, BodyRefused, begins_with
 from loopwright.service.api.gate.key_checks import KeyChecks, TooOften
 from loopwright.service.api.gate.limits import Buckets, RequestLimits, retry_after
-from loopwright.service.api.gate.places import DECIDES, SAFE_METHODS, Full, Kind, Places, Turn, changes_nothing, kind_of
+from loopwright.service.api.gate.places import (
+    DECIDES,
+    SAFE_METHODS,
+    Full,
+    Places,
+    RequestKind,
+    Turn,
+    changes_nothing,
+    kind_of,
+)
 from loopwright.service.loops.shared_reading import asked_at
 from loopwright.service.security.keys import Scope
 from loopwright.service.security.principal import LOCAL, Principal, current
@@ -111,8 +120,8 @@ class Gate:
         except TooOften as refused:
             await _refusal(429, str(refused), refused.wait_s)(scope, receive, send)
 
-    def _refuse_often(self, kind: Kind, client: str) -> None:
-        if kind is Kind.WATCH:
+    def _refuse_often(self, kind: RequestKind, client: str) -> None:
+        if kind is RequestKind.WATCH:
             return
         if wait := (self._decided if kind in DECIDES else self._asked).take(client):
             raise TooOften("too many requests from this caller", wait)

@@ -21,7 +21,7 @@ SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
 _PREVIEW = re.compile(r"/loops/[^/]+/retune/preview|/retunes/preview")
 
 
-class Kind(StrEnum):
+class RequestKind(StrEnum):
     """What a request asks for, in the words of a refusal."""
 
     ABORT = "aborts and dismissals"
@@ -34,9 +34,10 @@ class Kind(StrEnum):
     WATCH = "looks at /readyz and /metrics"
 
 
-DECIDES = (Kind.ABORT, Kind.DECISION)
+DECIDES = (RequestKind.ABORT, RequestKind.DECISION)
 _LAST_WORDS = {
-    "abort": Kind.ABORT, "dismiss": Kind.ABORT, "accept": Kind.DECISION, "rollback": Kind.DECISION,
+    "abort": RequestKind.ABORT, "dismiss": RequestKind.ABORT,
+    "accept": RequestKind.DECISION, "rollback": RequestKind.DECISION,
 }  # fmt: skip
 _WATCHED = ("/readyz", "/metrics")
 
@@ -46,22 +47,22 @@ def changes_nothing(path: str) -> bool:
     return path == "/tunings" or _PREVIEW.fullmatch(path) is not None
 
 
-def kind_of(method: str, path: str) -> Kind | None:
+def kind_of(method: str, path: str) -> RequestKind | None:
     """The kind of a request; None: it costs nothing, and is always answered."""
     if path == "/healthz":
         return None
     last = path.rpartition("/")[2]
     if path == "/tunings" or last == "alternatives":
-        return Kind.COMPUTATION
+        return RequestKind.COMPUTATION
     if last == "preview":
-        return Kind.BUS
+        return RequestKind.BUS
     if method not in SAFE_METHODS:
-        return _LAST_WORDS.get(last, Kind.COMMAND)
+        return _LAST_WORDS.get(last, RequestKind.COMMAND)
     if path in _WATCHED:
-        return Kind.WATCH
+        return RequestKind.WATCH
     if last == "events":
-        return Kind.STREAM
-    return Kind.BUS if path.startswith("/loops/") and path.count("/") == 2 else Kind.READ
+        return RequestKind.STREAM
+    return RequestKind.BUS if path.startswith("/loops/") and path.count("/") == 2 else RequestKind.READ
 
 
 @dataclass(frozen=True)
@@ -81,18 +82,18 @@ class Room:
         return max(1, self.turns - 1)
 
 
-def rooms(limits: RequestLimits) -> dict[Kind, Room]:
+def rooms(limits: RequestLimits) -> dict[RequestKind, Room]:
     """Threads that read, and show what they read, contend for one interpreter with those that pump the loops and with
     the event loop, which gives it away in each system call: few turns. Those who wait for a bus need hardly any."""
     return {
-        Kind.ABORT: Room(64, 4),
-        Kind.DECISION: Room(32, 8),
-        Kind.COMMAND: Room(32, 2),
-        Kind.READ: Room(limits.at_once, 2),
-        Kind.BUS: Room(32, 4),
-        Kind.COMPUTATION: Room(limits.computations_at_once, limits.computations_at_once),
-        Kind.STREAM: Room(limits.streams_at_once, 2),
-        Kind.WATCH: Room(16, 2),
+        RequestKind.ABORT: Room(64, 4),
+        RequestKind.DECISION: Room(32, 8),
+        RequestKind.COMMAND: Room(32, 2),
+        RequestKind.READ: Room(limits.at_once, 2),
+        RequestKind.BUS: Room(32, 4),
+        RequestKind.COMPUTATION: Room(limits.computations_at_once, limits.computations_at_once),
+        RequestKind.STREAM: Room(limits.streams_at_once, 2),
+        RequestKind.WATCH: Room(16, 2),
     }
 
 
@@ -120,7 +121,7 @@ class Turn:
 class _Places:
     """Those of one kind. For one event loop."""
 
-    def __init__(self, kind: Kind, room: Room) -> None:
+    def __init__(self, kind: RequestKind, room: Room) -> None:
         self._kind, self._room = kind, room
         self.taken: Counter[str] = Counter()
         self._working: Counter[str] = Counter()
@@ -177,16 +178,16 @@ class _Places:
 class Places:
     """Those of every kind."""
 
-    def __init__(self, limits: RequestLimits, of: Mapping[Kind, Room] | None = None) -> None:
+    def __init__(self, limits: RequestLimits, of: Mapping[RequestKind, Room] | None = None) -> None:
         self._wait_s = limits.wait_s
         self._of = {kind: _Places(kind, room) for kind, room in (of or rooms(limits)).items()}
 
-    def check(self, kind: Kind, client: str) -> None:
+    def check(self, kind: RequestKind, client: str) -> None:
         """Whether there would be a place. Raises Full."""
         self._of[kind].check(client)
 
     @asynccontextmanager
-    async def taken(self, kind: Kind, client: str) -> AsyncIterator[Turn]:
+    async def taken(self, kind: RequestKind, client: str) -> AsyncIterator[Turn]:
         """A place, and the turn in it. Raises Full."""
         places = self._of[kind]
         places.take(client)

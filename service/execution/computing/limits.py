@@ -10,7 +10,7 @@ MAX_AT_ONCE = 4
 MB = 1 << 20
 
 
-class Kind(IntEnum):
+class ComputationKind(IntEnum):
     """What is computed. The least goes first: the others pause while it needs a processor."""
 
     LIVE = 0
@@ -19,11 +19,15 @@ class Kind(IntEnum):
 
 
 WORDS = {
-    Kind.LIVE: "the computation of a loop under test",
-    Kind.TUNING: "the tuning",
-    Kind.DRY_RUN: "the dry run",
+    ComputationKind.LIVE: "the computation of a loop under test",
+    ComputationKind.TUNING: "the tuning",
+    ComputationKind.DRY_RUN: "the dry run",
 }
-OPTIONS = {Kind.LIVE: "--live-cpu-s", Kind.TUNING: "--tuning-cpu-s", Kind.DRY_RUN: "--dry-run-cpu-s"}
+OPTIONS = {
+    ComputationKind.LIVE: "--live-cpu-s",
+    ComputationKind.TUNING: "--tuning-cpu-s",
+    ComputationKind.DRY_RUN: "--dry-run-cpu-s",
+}
 MEMORY_OPTION = "--computation-memory-mb"
 
 
@@ -40,8 +44,12 @@ class ComputingLimits:
     dry_run_cpu_s: int = 300
     memory_mb: int = 512
 
-    def cpu_s(self, kind: Kind) -> int:
-        return {Kind.LIVE: self.live_cpu_s, Kind.TUNING: self.tuning_cpu_s, Kind.DRY_RUN: self.dry_run_cpu_s}[kind]
+    def cpu_s(self, kind: ComputationKind) -> int:
+        return {
+            ComputationKind.LIVE: self.live_cpu_s,
+            ComputationKind.TUNING: self.tuning_cpu_s,
+            ComputationKind.DRY_RUN: self.dry_run_cpu_s,
+        }[kind]
 
 
 def at_once() -> int:

@@ -23,10 +23,17 @@ from multiprocessing.context import ForkServerProcess
 from typing import Any
 
 from loopwright.service.execution.computing.child import GO_ON, PAUSE, Said, compute
-from loopwright.service.execution.computing.limits import MEMORY_OPTION, OPTIONS, WORDS, ComputingLimits, Kind, at_once
+from loopwright.service.execution.computing.limits import (
+    MEMORY_OPTION,
+    OPTIONS,
+    WORDS,
+    ComputationKind,
+    ComputingLimits,
+    at_once,
+)
 from loopwright.tuning.reasons import Failed, Reason
 
-NICE = {Kind.LIVE: 5, Kind.TUNING: 10, Kind.DRY_RUN: 10}
+NICE = {ComputationKind.LIVE: 5, ComputationKind.TUNING: 10, ComputationKind.DRY_RUN: 10}
 _LOOK_S, _LOOK_WAITING_S = 0.1, 0.5
 """Wall time between two looks whether a computation is still wanted, one that runs and one that waits for its turn:
 fifty loops may wait at once, and each look takes the interpreter."""
@@ -58,7 +65,7 @@ class _Died(Exception):
 class _Place:
     """The place of a computation in the order. Everything but `turn` is guarded by the pool."""
 
-    def __init__(self, rank: tuple[Kind, int]) -> None:
+    def __init__(self, rank: tuple[ComputationKind, int]) -> None:
         self.rank = rank
         self.turn = threading.Event()
         self.control: Connection | None = None
@@ -97,7 +104,7 @@ class Pool:
 
     def run(
         self,
-        kind: Kind,
+        kind: ComputationKind,
         work: Callable[..., Any],
         *,
         hear: Callable[[Any], None] | None = None,
@@ -128,7 +135,9 @@ class Pool:
                     _log.warning("the process of %s was killed, it is computed once more", WORDS[kind])
         raise AssertionError("every try returns or raises")
 
-    def submit(self, kind: Kind, work: Callable[[], Any], unwanted: Callable[[], bool] = lambda: False) -> Future[Any]:
+    def submit(
+        self, kind: ComputationKind, work: Callable[[], Any], unwanted: Callable[[], bool] = lambda: False
+    ) -> Future[Any]:
         """The same in a thread of its own, for who does not wait."""
         future: Future[Any] = Future()
         future.set_running_or_notify_cancel()  # it is ended by `unwanted` alone
@@ -152,7 +161,7 @@ class Pool:
     # -- whose turn it is
 
     @contextmanager
-    def _place(self, kind: Kind) -> Iterator[_Place]:
+    def _place(self, kind: ComputationKind) -> Iterator[_Place]:
         place = _Place((kind, next(self._numbers)))
         with self._changed:
             self._places.append(place)
@@ -177,7 +186,12 @@ class Pool:
     # -- one process
 
     def _one(
-        self, kind: Kind, work: Callable[..., Any], place: _Place, heard: _Heard, unwanted: Callable[[], bool]
+        self,
+        kind: ComputationKind,
+        work: Callable[..., Any],
+        place: _Place,
+        heard: _Heard,
+        unwanted: Callable[[], bool],
     ) -> Any:
         with self._process(kind, work, place, heard.wanted) as (process, connection):
             while True:
@@ -203,7 +217,7 @@ class Pool:
 
     @contextmanager
     def _process(
-        self, kind: Kind, work: Callable[..., Any], place: _Place, reports: bool
+        self, kind: ComputationKind, work: Callable[..., Any], place: _Place, reports: bool
     ) -> Iterator[tuple[ForkServerProcess, Connection]]:
         """Whatever ends it in here, the process is gone behind it. Raises NoProcess, and what pickling raises."""
         limits = self.limits.cpu_s(kind), self.limits.memory_mb, NICE[kind]
@@ -250,7 +264,7 @@ class _Heard:
         self._hear(value)
 
 
-def _no_process(kind: Kind, error: Exception) -> NoProcess:
+def _no_process(kind: ComputationKind, error: Exception) -> NoProcess:
     text = f"no process can be made for {WORDS[kind]} ({type(error).__name__}: {error})"
     return NoProcess(Reason.COMPUTATION_LOST, text)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loopwright.plantsim.catalogue import CATALOGUE, Entry, TransferFunction, find
+from loopwright.plantsim.catalogue import CATALOGUE, CatalogueModel, Entry, find
 
 LINEAR = [(entry, entry.model) for entry in CATALOGUE.values() if entry.model is not None]
 BY_NAME = pytest.mark.parametrize(("entry", "model"), LINEAR, ids=[entry.name for entry, _ in LINEAR])
@@ -21,7 +21,7 @@ def test_builds_and_rests(name: str) -> None:
 
 
 @BY_NAME
-def test_ultimate_point(entry: Entry, model: TransferFunction) -> None:
+def test_ultimate_point(entry: Entry, model: CatalogueModel) -> None:
     facts = entry.facts
     assert facts.Ku is not None and facts.Pu_s is not None
     s = 2j * np.pi / facts.Pu_s
@@ -31,7 +31,7 @@ def test_ultimate_point(entry: Entry, model: TransferFunction) -> None:
 
 
 @BY_NAME
-def test_gain_and_settling_time(entry: Entry, model: TransferFunction) -> None:
+def test_gain_and_settling_time(entry: Entry, model: CatalogueModel) -> None:
     facts = entry.facts
     if facts.static_gain is None or facts.T95_s is None:
         assert model.den[-1] == 0

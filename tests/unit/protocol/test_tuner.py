@@ -27,7 +27,7 @@ from loopwright.protocol.profile import (
 )
 from loopwright.protocol.sdo import SdoServer
 from loopwright.protocol.station import HEARTBEAT_S, Station
-from loopwright.protocol.tuner import Kind, Tuner, TunerError
+from loopwright.protocol.tuner import FailureKind, Tuner, TunerError
 
 NODE, PLANT = 0x20, 0x10
 IDS = channel_ids(1)
@@ -122,7 +122,7 @@ def test_a_long_value_comes_in_segments(tuner: Tuner) -> None:
 def test_a_refusal_says_what_and_why(tuner: Tuner, name: str, value: float, code: Abort) -> None:
     with pytest.raises(TunerError, match=name) as caught:
         tuner.write(name, value)
-    assert (caught.value.kind, caught.value.code) == (Kind.ABORT, code)
+    assert (caught.value.kind, caught.value.code) == (FailureKind.ABORT, code)
 
 
 def test_a_lost_answer_is_asked_for_again(tuner: Tuner, bus: ListBus) -> None:
@@ -134,7 +134,7 @@ def test_a_silent_node_is_a_timeout(tuner: Tuner, bus: ListBus) -> None:
     bus.mute = 100
     with pytest.raises(TunerError, match="20h does not answer") as caught:
         tuner.read("controller_mode")
-    assert caught.value.kind is Kind.TIMEOUT
+    assert caught.value.kind is FailureKind.TIMEOUT
 
 
 def test_an_answer_to_another_request_is_passed_over(tuner: Tuner, bus: ListBus) -> None:

@@ -12,7 +12,7 @@ from loopwright.protocol.bus import Frame
 from loopwright.protocol.objects import BY_NAME, lookup
 from loopwright.protocol.profile import CONTROLLER_NODE, Abort, Order, sdo_request_id, sdo_response_id
 from loopwright.protocol.station import Station
-from loopwright.protocol.tuner import Kind, Tuner, TunerError
+from loopwright.protocol.tuner import FailureKind, Tuner, TunerError
 from loopwright.protocol.tuner_session import Lease, TunerSession
 from tests.unit.protocol.memory_bus import MemoryBus, Wire
 
@@ -146,7 +146,7 @@ def test_two_tuners_exclude_each_other(site: Site) -> None:
     first = opened(site, 0x7D)
     with pytest.raises(TunerError) as refused:
         opened(site, 0x7C)
-    assert (refused.value.kind, refused.value.code) == (Kind.ABORT, Abort.DEVICE_STATE)
+    assert (refused.value.kind, refused.value.code) == (FailureKind.ABORT, Abort.DEVICE_STATE)
     first.give(Order.SETPOINT, (51.0,))
     first.close()
     second = opened(site, 0x7C)

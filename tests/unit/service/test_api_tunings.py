@@ -167,7 +167,7 @@ def test_no_gains_on_a_model_that_the_job_has_disproved(
 ) -> None:
     service.tune.ends = Refused(reason, "the plant is another")
     job = finished(service, client)
-    result = {"num": [1.0], "den": [3.0, 1.0], "L_s": 1.0, "cause": None}
+    result = {"num": [1.0], "den": [3.0, 1.0], "L_s": 1.0, "reason": None}
     service.store.append(job["id"], "stage_done", {"stage": "design", "result": result}, 1.0)
     problem = assert_problem(client.get(f"{job['url']}/alternatives{query}"), 409)
     assert reason in problem["detail"] and "the plant is another" in problem["detail"]

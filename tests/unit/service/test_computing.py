@@ -20,7 +20,7 @@ import pytest
 from loopwright.protocol.bus import open_bus
 from loopwright.protocol.hub import Hub
 from loopwright.service.execution.beside import Computing
-from loopwright.service.execution.computing.limits import ComputingLimits, Kind
+from loopwright.service.execution.computing.limits import ComputationKind, ComputingLimits
 from loopwright.service.execution.computing.pool import NoProcess, NotWanted, Pool
 from loopwright.service.store.store import Store
 from loopwright.tuning.plan import Work
@@ -102,7 +102,7 @@ class TestPool:
             "loopwright.service.jobs.alternatives",
             "loopwright.service.execution.rehearsal",
         }
-        assert wanted <= pool.run(Kind.TUNING, modules)
+        assert wanted <= pool.run(ComputationKind.TUNING, modules)
 
     def test_what_it_raises_is_raised_here(self, pool: Pool) -> None:
         with pytest.raises(Refused, match="Ms 3") as refused:
@@ -119,7 +119,7 @@ class TestPool:
 
     def test_reports_come_in_order_before_the_result(self, pool: Pool) -> None:
         heard: list[int] = []
-        assert pool.run(Kind.DRY_RUN, partial(tell_numbers, 1000), hear=heard.append) == "told"
+        assert pool.run(ComputationKind.DRY_RUN, partial(tell_numbers, 1000), hear=heard.append) == "told"
         assert heard == list(range(1000))
 
     def test_who_hears_may_end_it(self, pool: Pool) -> None:
@@ -127,13 +127,13 @@ class TestPool:
             raise Refused(Reason.NOT_ROBUST, f"heard {n}")
 
         with pytest.raises(Refused, match="heard 0"):
-            pool.run(Kind.DRY_RUN, partial(tell_numbers, 10**9), hear=hear)
+            pool.run(ComputationKind.DRY_RUN, partial(tell_numbers, 10**9), hear=hear)
 
 
 class TestLimits:
     def test_processor_time(self, pool: Pool) -> None:
         with pytest.raises(Failed, match="the tuning was ended after 1 s of processor time") as over:
-            pool.run(Kind.TUNING, burn)
+            pool.run(ComputationKind.TUNING, burn)
         assert over.value.reason is Reason.COMPUTATION_LIMIT and "--tuning-cpu-s" in over.value.detail
 
     def test_those_of_a_live_loop_end_its_plan_by_name(self) -> None:
@@ -144,9 +144,9 @@ class TestLimits:
 
     @pytest.mark.skipif(sys.platform != "linux", reason="the system does not count it")
     def test_memory(self, pool: Pool) -> None:
-        assert pool.run(Kind.TUNING, partial(ask_for, 50)) == 50 << 20
+        assert pool.run(ComputationKind.TUNING, partial(ask_for, 50)) == 50 << 20
         with pytest.raises(Failed, match="asked for more than 100 MB of memory") as over:
-            pool.run(Kind.TUNING, partial(ask_for, 150))
+            pool.run(ComputationKind.TUNING, partial(ask_for, 150))
         assert over.value.reason is Reason.COMPUTATION_LIMIT and "--computation-memory-mb" in over.value.detail
 
 
@@ -162,14 +162,14 @@ class TestDeath:
     def test_what_has_told_something_does_not_begin_anew(self, pool: Pool) -> None:
         heard: list[int] = []
         with pytest.raises(Failed, match="was killed"):
-            pool.run(Kind.DRY_RUN, tell_and_die, hear=heard.append)
+            pool.run(ComputationKind.DRY_RUN, tell_and_die, hear=heard.append)
         assert heard == [1]
 
     def test_of_the_fork_server_too(self, pool: Pool) -> None:
         def parent_of(pid: int) -> int:
             return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
 
-        server = pool.run(Kind.LIVE, os.getppid)
+        server = pool.run(ComputationKind.LIVE, os.getppid)
         assert parent_of(server) == os.getpid()
         os.kill(server, signal.SIGKILL)
         assert done(Work(os.getpid), pool) != os.getpid()
@@ -184,17 +184,17 @@ class TestDeath:
         assert done(Work(os.getpid), pool) == os.getpid()
         assert "the service computes by itself" in caplog.text
         with pytest.raises(NoProcess, match="no process can be made for the tuning"):
-            pool.run(Kind.TUNING, os.getpid)
+            pool.run(ComputationKind.TUNING, os.getpid)
 
 
 class TestOrder:
     def test_a_live_loop_does_not_wait_behind_what_runs(self, pool: Pool, tmp_path: Path) -> None:
         """The dry run pauses meanwhile, and goes on behind it."""
         ticks, over = tmp_path / "ticks", tmp_path / "over"
-        rehearsal = pool.submit(Kind.DRY_RUN, partial(count, ticks, over))
+        rehearsal = pool.submit(ComputationKind.DRY_RUN, partial(count, ticks, over))
         until(ticks.exists)
         live_ticks, live_over = tmp_path / "live", tmp_path / "live-over"
-        live = pool.submit(Kind.LIVE, partial(count, live_ticks, live_over))
+        live = pool.submit(ComputationKind.LIVE, partial(count, live_ticks, live_over))
         until(live_ticks.exists)
 
         def stands() -> bool:
@@ -204,7 +204,7 @@ class TestOrder:
 
         until(stands)
         paused_at = ticks.read_text()
-        tuning = pool.submit(Kind.TUNING, os.getpid)
+        tuning = pool.submit(ComputationKind.TUNING, os.getpid)
         assert not tuning.done() and stands() and paused_at == ticks.read_text()
         live_over.touch()
         assert live.result(60) == "counted"
@@ -215,15 +215,15 @@ class TestOrder:
 
     def test_what_nobody_wants_any_more_gives_its_place_free(self, pool: Pool, tmp_path: Path) -> None:
         ended, mark = threading.Event(), tmp_path / "mark"
-        running = pool.submit(Kind.LIVE, partial(burn, mark), ended.is_set)
-        waiting = pool.submit(Kind.LIVE, burn, ended.is_set)
+        running = pool.submit(ComputationKind.LIVE, partial(burn, mark), ended.is_set)
+        waiting = pool.submit(ComputationKind.LIVE, burn, ended.is_set)
         until(lambda: mark.exists() and mark.read_text() != "")
         ended.set()
         for future in (running, waiting):
             with pytest.raises(NotWanted):
                 future.result(60)
         assert gone(int(mark.read_text()))
-        assert pool.run(Kind.DRY_RUN, partial(ask_for, 1)) == 1 << 20
+        assert pool.run(ComputationKind.DRY_RUN, partial(ask_for, 1)) == 1 << 20
 
     def test_so_does_the_computation_of_a_test_that_has_ended(self, pool: Pool, tmp_path: Path) -> None:
         mark = tmp_path / "mark"
@@ -238,19 +238,19 @@ class TestEnd:
     def test_closing_ends_and_waits(self, tmp_path: Path) -> None:
         mark = tmp_path / "mark"
         ends, pool = [], Pool(max_workers=1)
-        ends.append(pool.submit(Kind.LIVE, partial(burn, mark)))
-        ends.append(pool.submit(Kind.DRY_RUN, os.getpid))
+        ends.append(pool.submit(ComputationKind.LIVE, partial(burn, mark)))
+        ends.append(pool.submit(ComputationKind.DRY_RUN, os.getpid))
         until(lambda: mark.exists() and mark.read_text() != "")
         pool.close()
         assert gone(int(mark.read_text()))
         for each in ends:
             assert isinstance(each.exception(60), NotWanted)
         with pytest.raises(NotWanted):
-            pool.run(Kind.LIVE, os.getpid)
+            pool.run(ComputationKind.LIVE, os.getpid)
 
     def test_signals_to_the_whole_group_leave_it_alone(self, pool: Pool, tmp_path: Path) -> None:
         ticks, over = tmp_path / "ticks", tmp_path / "over"
-        running = pool.submit(Kind.LIVE, partial(count, ticks, over))
+        running = pool.submit(ComputationKind.LIVE, partial(count, ticks, over))
         until(ticks.exists)
         server = [int(each) for each in children_of(os.getpid())]
         for each in server + [int(child) for parent in server for child in children_of(parent)]:
@@ -270,7 +270,7 @@ def children_of(pid: int) -> list[str]:
 def test_a_computation_has_no_file_and_no_socket_of_the_service(tmp_path: Path, first: bool) -> None:
     if first:
         with closing(Pool()) as early:
-            early.run(Kind.LIVE, os.getpid)
+            early.run(ComputationKind.LIVE, os.getpid)
     hub = Hub(0)
     serving = threading.Thread(target=hub.serve)
     serving.start()
@@ -283,7 +283,7 @@ def test_a_computation_has_no_file_and_no_socket_of_the_service(tmp_path: Path, 
         ):
             assert store.unfinished() == []  # it has its file open
             ours = {name for name in own_files() if name.startswith("socket:") or str(tmp_path) in name}
-            theirs = set(pool.run(Kind.LIVE, own_files))
+            theirs = set(pool.run(ComputationKind.LIVE, own_files))
             assert len(ours) >= 5 and not ours & theirs
     finally:
         hub.stop()

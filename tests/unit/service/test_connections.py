@@ -19,7 +19,7 @@ from loopwright.service.api.gate import key_checks
 from loopwright.service.api.gate.connections import Connections, OnceAMinute, Told
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.api.gate.limits import RequestLimits
-from loopwright.service.api.gate.places import Full, Kind, Places, Room, kind_of
+from loopwright.service.api.gate.places import Full, Places, RequestKind, Room, kind_of
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.service.security.keys import Scope, matches, new_key
@@ -139,25 +139,25 @@ def test_an_abort_goes_before_the_rate_of_reading(service: Service, stack: ExitS
     ("method", "path", "kind"),
     [
         ("GET", "/healthz", None),
-        ("GET", "/readyz", Kind.WATCH),
-        ("GET", "/metrics", Kind.WATCH),
-        ("POST", "/jobs/4f0c2a9be113/abort", Kind.ABORT),
-        ("POST", "/retunes/4f0c2a9be113/abort", Kind.ABORT),
-        ("POST", "/loops/TIC-101/dismiss", Kind.ABORT),
-        ("POST", "/jobs/4f0c2a9be113/accept", Kind.DECISION),
-        ("POST", "/jobs/4f0c2a9be113/rollback", Kind.DECISION),
-        ("POST", "/loops/TIC-101/retune", Kind.COMMAND),
-        ("POST", "/retunes", Kind.COMMAND),
-        ("GET", "/loops", Kind.READ),
-        ("GET", "/loops/TIC-101", Kind.BUS),
-        ("GET", "/loops/TIC-101/jobs", Kind.READ),
-        ("GET", "/jobs/4f0c2a9be113/abort", Kind.READ),
-        ("GET", "/jobs/4f0c2a9be113/events", Kind.STREAM),
-        ("GET", "/jobs/4f0c2a9be113/alternatives", Kind.COMPUTATION),
-        ("POST", "/tunings", Kind.COMPUTATION),
+        ("GET", "/readyz", RequestKind.WATCH),
+        ("GET", "/metrics", RequestKind.WATCH),
+        ("POST", "/jobs/4f0c2a9be113/abort", RequestKind.ABORT),
+        ("POST", "/retunes/4f0c2a9be113/abort", RequestKind.ABORT),
+        ("POST", "/loops/TIC-101/dismiss", RequestKind.ABORT),
+        ("POST", "/jobs/4f0c2a9be113/accept", RequestKind.DECISION),
+        ("POST", "/jobs/4f0c2a9be113/rollback", RequestKind.DECISION),
+        ("POST", "/loops/TIC-101/retune", RequestKind.COMMAND),
+        ("POST", "/retunes", RequestKind.COMMAND),
+        ("GET", "/loops", RequestKind.READ),
+        ("GET", "/loops/TIC-101", RequestKind.BUS),
+        ("GET", "/loops/TIC-101/jobs", RequestKind.READ),
+        ("GET", "/jobs/4f0c2a9be113/abort", RequestKind.READ),
+        ("GET", "/jobs/4f0c2a9be113/events", RequestKind.STREAM),
+        ("GET", "/jobs/4f0c2a9be113/alternatives", RequestKind.COMPUTATION),
+        ("POST", "/tunings", RequestKind.COMPUTATION),
     ],
 )
-def test_kinds_of_work(method: str, path: str, kind: Kind | None) -> None:
+def test_kinds_of_work(method: str, path: str, kind: RequestKind | None) -> None:
     assert kind_of(method, path) is kind
 
 
@@ -165,27 +165,27 @@ def test_places_and_turns() -> None:
     limits = RequestLimits(wait_s=0.01)
 
     async def tried() -> None:
-        places = Places(limits, {Kind.READ: Room(places=6, turns=2)})
+        places = Places(limits, {RequestKind.READ: Room(places=6, turns=2)})
         async with ExitStackOf(places, "a") as first:
             await first.take()
             with pytest.raises(Full, match=r"no turn in 0\.01 s") as late:  # one of the two turns is for the others
                 await first.take()
             assert late.value.status == 503
-            waiting = [asyncio.ensure_future(places.taken(Kind.READ, "a").__aenter__()) for _ in range(2)]
+            waiting = [asyncio.ensure_future(places.taken(RequestKind.READ, "a").__aenter__()) for _ in range(2)]
             await asyncio.sleep(0)
             with pytest.raises(Full, match="3 reads of the database of this client") as full:
-                places.check(Kind.READ, "a")
+                places.check(RequestKind.READ, "a")
             assert full.value.status == 429
-            async with places.taken(Kind.READ, "b"):  # goes before those who wait: its turn is not theirs
-                places.check(Kind.READ, "b")
+            async with places.taken(RequestKind.READ, "b"):  # goes before those who wait: its turn is not theirs
+                places.check(RequestKind.READ, "b")
             for each in waiting:
                 each.cancel()
             await asyncio.gather(*waiting, return_exceptions=True)
-            async with places.taken(Kind.READ, "c"):
+            async with places.taken(RequestKind.READ, "c"):
                 first.turns[0].over()
-                async with places.taken(Kind.READ, "a"):
+                async with places.taken(RequestKind.READ, "a"):
                     pass
-        places.check(Kind.READ, "a")
+        places.check(RequestKind.READ, "a")
 
     asyncio.run(tried())
 
@@ -198,7 +198,7 @@ class ExitStackOf:
         self.turns: list[Any] = []
 
     async def take(self) -> None:
-        self.turns.append(await self._stack.enter_async_context(self._places.taken(Kind.READ, self._client)))
+        self.turns.append(await self._stack.enter_async_context(self._places.taken(RequestKind.READ, self._client)))
 
     async def __aenter__(self) -> ExitStackOf:
         return self

@@ -12,7 +12,7 @@ from typing import Any
 import httpx
 import pytest
 
-from loopwright.service.cli.child_process import Process
+from loopwright.service.cli.child_process import ChildProcess
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Store
@@ -43,7 +43,7 @@ class Door:
                     )
                 )  # fmt: skip
         arguments = [str(folder), f"--tag={TAG}", f"--on-bus={SILENT}", f"--limits={json.dumps(limits)}"]
-        self.process = Process(
+        self.process = ChildProcess(
             "gateway", ("tests.unit.service.gateway", *arguments, *(["--auth"] if auth else [])), folder / "gateway.log"
         )
         stack.callback(self.process.stop)
@@ -59,7 +59,7 @@ class Door:
         """Begins; what is returned ends them, and says what they were answered."""
         log = self._folder / f"{attackers[0].partition('=')[0]}.log"
         arguments = ("tests.hostile.attackers", self.url, *attackers, f"--silent={SILENT}", f"--loop={TAG}")
-        process = Process("attackers", (*arguments, *([f"--key={key}"] if key else [])), log)
+        process = ChildProcess("attackers", (*arguments, *([f"--key={key}"] if key else [])), log)
         self._stack.callback(process.stop)
         process.wait_ready(60)
 

@@ -9,7 +9,7 @@ import pytest
 
 from loopwright.service.execution.rehearsal import rehearse
 from loopwright.service.jobs.relay_record import relay_record
-from loopwright.tuning.fast.structure_choice import choose
+from loopwright.tuning.fast.structure_choice import choose_structure
 from loopwright.tuning.identification.output_error import Fit
 from loopwright.tuning.plan import Event, Mode, Sample, StageStarted
 
@@ -55,12 +55,12 @@ def test_the_same_model_comes_out_of_it_again(
     record = relay_record(without(columns, set(lost)))
     assert record is not None and len(record.t) == len(columns["t_s"])
     assert record.Ts == pytest.approx(0.1) and record.t[record.listened] == 0.0
-    evidence = record.evidence()
+    evidence = record.experiment_record()
     assert evidence is not None
     assert len(evidence.switches) == answer["found"]["switches"]
     assert evidence.direction == -1.0  # the plant's gain is negative
     fit = Fit(evidence)
-    model = fit.model(choose(fit).best)
+    model = fit.model(choose_structure(fit).best)
     assert model.num[-1] / model.den[-1] == pytest.approx(-1.5, rel=0.01)
     assert abs(model.L - 2.0) < 0.05
 
@@ -98,4 +98,4 @@ def test_no_relay_no_record(job: tuple[dict[str, Any], dict[str, list[Any]]]) ->
     assert relay_record({name: [] for name in columns}) is None
     first = columns["mode"].index(Mode.EXPERIMENT)
     begun = relay_record({name: values[: first + 5] for name, values in columns.items()})
-    assert begun is not None and begun.evidence() is None
+    assert begun is not None and begun.experiment_record() is None

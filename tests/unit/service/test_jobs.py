@@ -156,7 +156,7 @@ def test_a_real_rehearsal_through_a_job(service: Service, method: str) -> None:
     assert model.dead_time_s == pytest.approx(L, rel=1e-3)
     assert view.predicted.Ms == pytest.approx(1.6, abs=0.01)
     assert view.predicted_before and view.evidence and view.verification
-    assert view.evidence.cause is None and view.evidence.switches >= 4
+    assert view.evidence.reason is None and view.evidence.switches >= 4
     assert view.verification.fit_pct > 99.9 and view.verification.Ms == pytest.approx(1.6, abs=0.05)
     assert view.before is None and view.after is None
     assert "overshoot_window_pct" not in row.request and row.request["ms"] == 1.6

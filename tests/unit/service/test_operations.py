@@ -16,7 +16,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from sqlalchemy.exc import OperationalError
 
 from loopwright.protocol.station import Station
-from loopwright.protocol.tuner import Kind, Tuner, TunerError
+from loopwright.protocol.tuner import FailureKind, Tuner, TunerError
 from loopwright.service.api import operations
 from loopwright.service.api.app import create_app
 from loopwright.service.api.operations import Readiness
@@ -196,7 +196,7 @@ def test_an_sdo_without_answer_counts_its_retries() -> None:
     with pytest.raises(TunerError) as caught:
         tuner.read("controller_mode")
     tuner.close()
-    assert caught.value.kind is Kind.TIMEOUT and station.sdo_retries == {"virtual:nobody": 2}
+    assert caught.value.kind is FailureKind.TIMEOUT and station.sdo_retries == {"virtual:nobody": 2}
 
 
 # logs

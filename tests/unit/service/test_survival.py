@@ -16,7 +16,7 @@ import pytest
 from sqlalchemy import create_engine, select
 from sqlalchemy.orm import Session
 
-from loopwright.service.cli.child_process import NotReady, Process
+from loopwright.service.cli.child_process import ChildProcess, NotReady
 from loopwright.service.store.database import WAIT_S
 from loopwright.service.store.tables import EventRow
 from tests.unit.service.fakes import NEW, OLD, TAG
@@ -51,9 +51,9 @@ class Gateway:
         folder.mkdir(parents=True, exist_ok=True)
         self.serve(*first)
 
-    def launch(self, *more: str) -> Process:
+    def launch(self, *more: str) -> ChildProcess:
         arguments = ("tests.unit.service.gateway", str(self.folder), *self._arguments, *more)
-        process = Process("gateway", arguments, self.folder / "gateway.log")
+        process = ChildProcess("gateway", arguments, self.folder / "gateway.log")
         self._stack.callback(process.stop)
         return process
 
@@ -157,7 +157,7 @@ def test_a_second_service_on_the_same_data_is_told_who_has_it(
         other = tmp_path / "other"
         other.mkdir()
         arguments = ("tests.unit.service.gateway", str(other), f"--tag={TAG}", f"--database={database}")
-        second = Process("second", arguments, tmp_path / "second.log")
+        second = ChildProcess("second", arguments, tmp_path / "second.log")
         stack.callback(second.stop)
     with pytest.raises(NotReady) as refused:
         second.wait_ready(180)
@@ -280,11 +280,11 @@ def test_a_gateway_that_comes_too_late_for_its_name_ends_its_tests(
     assert "Traceback" not in (tmp_path / "one" / "gateway.log").read_text()
 
 
-def another(stack: ExitStack, folder: Path, database: str) -> Process:
+def another(stack: ExitStack, folder: Path, database: str) -> ChildProcess:
     """A gateway of the same name with a data folder of its own."""
     (folder / "other").mkdir()
     arguments = ("tests.unit.service.gateway", str(folder / "other"), f"--tag={TAG}", f"--database={database}")
-    process = Process("another", arguments, folder / "another.log")
+    process = ChildProcess("another", arguments, folder / "another.log")
     stack.callback(process.stop)
     return process
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy.exc import OperationalError
 
-from loopwright.service.cli.child_process import Process
+from loopwright.service.cli.child_process import ChildProcess
 from loopwright.service.server import watchdog
 from loopwright.service.server.watchdog import Watchdog, interval_s
 from tests.unit.service.fakes import TAG, Service
@@ -85,7 +85,9 @@ def test_a_service_says_so_again_and_again(tmp_path: Path, monkeypatch: pytest.M
         systemd.settimeout(120)
         monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
         monkeypatch.setenv("WATCHDOG_USEC", "300000")
-        process = Process("gateway", ("tests.unit.service.gateway", str(tmp_path), f"--tag={TAG}"), tmp_path / "log")
+        process = ChildProcess(
+            "gateway", ("tests.unit.service.gateway", str(tmp_path), f"--tag={TAG}"), tmp_path / "log"
+        )
         try:
             assert [systemd.recv(100) for _ in range(4)] == [b"READY=1", *[b"WATCHDOG=1"] * 3]
         finally:

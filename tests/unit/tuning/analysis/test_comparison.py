@@ -7,7 +7,14 @@ from dataclasses import replace
 
 import pytest
 
-from loopwright.tuning.analysis.comparison import Asked, Comparison, Worth, compared, weighted_IAE, worth
+from loopwright.tuning.analysis.comparison import (
+    Comparison,
+    LoopPerformance,
+    RobustnessBounds,
+    compare,
+    loop_performance,
+    weighted_IAE,
+)
 from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.analysis.step_response import step_figures
 from loopwright.tuning.experiments.primitives import Facts
@@ -106,9 +113,9 @@ def test_a_rule_is_asked_for_the_robustness_that_it_gives() -> None:
     assert by_fast(own("amigo")).gain
 
 
-def one(Ms: float, IAE: float, peak: float = 1.0) -> Worth:
+def one(Ms: float, IAE: float, peak: float = 1.0) -> LoopPerformance:
     """Made-up figures."""
-    some = worth(PLANT, Gains(0.2 * Ku, Pu))
+    some = loop_performance(PLANT, Gains(0.2 * Ku, Pu))
     assert some.setpoint is not None and some.load is not None
     step, load = replace(some.setpoint, IAE=IAE), replace(some.load, IAE=IAE, peak=peak)
     return replace(some, Ms=Ms, setpoint=step, load=load)
@@ -116,8 +123,8 @@ def one(Ms: float, IAE: float, peak: float = 1.0) -> Worth:
 
 def test_what_is_worse_on_every_figure_is_never_proposed_whatever_the_criterion_says() -> None:
     before, after = one(1.5, 10.0), one(1.6, 11.0, 1.1)
-    assert not compared(before, after, Asked(2.0), "another", (100.0, 1.0)).gain
-    assert compared(before, replace(after, Ms=1.4), Asked(2.0), "another", (100.0, 1.0)).gain
+    assert not compare(before, after, RobustnessBounds(2.0), "another", (100.0, 1.0)).gain
+    assert compare(before, replace(after, Ms=1.4), RobustnessBounds(2.0), "another", (100.0, 1.0)).gain
 
 
 @pytest.mark.parametrize(
@@ -133,22 +140,26 @@ def test_what_is_worse_on_every_figure_is_never_proposed_whatever_the_criterion_
 def test_five_percent_is_where_a_gain_begins(
     before: tuple[float, float], after: tuple[float, float], J: tuple[float, float], gain: bool
 ) -> None:
-    assert compared(one(*before), one(*after), Asked(1.6), "J", J).gain is gain
+    assert compare(one(*before), one(*after), RobustnessBounds(1.6), "J", J).gain is gain
 
 
 @pytest.mark.parametrize(
     ("asked", "present"),
-    [(Asked(2.0, Mt=1.05), "Mt"), (Asked(2.0, GM=4.0), "GM"), (Asked(2.0, noise_gain=0.5), "noise gain")],
+    [
+        (RobustnessBounds(2.0, Mt=1.05), "Mt"),
+        (RobustnessBounds(2.0, GM=4.0), "GM"),
+        (RobustnessBounds(2.0, noise_gain=0.5), "noise gain"),
+    ],
 )
-def test_each_bound_counts(asked: Asked, present: str) -> None:
-    before, after = (worth(PLANT, Gains(part * Ku, Pu)) for part in (0.5, 0.15))
-    found = compared(before, after, asked, "J", (1.0, 2.0))
+def test_each_bound_counts(asked: RobustnessBounds, present: str) -> None:
+    before, after = (loop_performance(PLANT, Gains(part * Ku, Pu)) for part in (0.5, 0.15))
+    found = compare(before, after, asked, "J", (1.0, 2.0))
     assert found.gain and f"have {present}" in found.verdict
 
 
 def test_the_figures_are_those_of_the_responses() -> None:
     gains = Gains(0.3 * Ku, Pu, 0.1 * Pu, 0.01 * Pu, 0.6)
-    found = worth(PLANT, gains)
+    found = loop_performance(PLANT, gains)
     assert found.setpoint is not None and found.load is not None
     setpoint, load = step_figures(PLANT, gains, band=0.05), step_figures(PLANT, gains, load=True, band=0.05)
     assert (found.setpoint.IAE, found.setpoint.TV, found.load.peak) == (setpoint.IAE, setpoint.TV, load.peak)
@@ -158,16 +169,16 @@ def test_the_figures_are_those_of_the_responses() -> None:
 
 
 def test_an_ideal_derivative_is_taken_as_the_controller_carries_it_out() -> None:
-    found = worth(PLANT, Gains(0.3 * Ku, Pu, 0.1 * Pu, 0.0), SAMPLE_S)
+    found = loop_performance(PLANT, Gains(0.3 * Ku, Pu, 0.1 * Pu, 0.0), SAMPLE_S)
     assert found.gains.Tf == 0.0
     assert found.noise_gain == pytest.approx(0.3 * Ku * (1.0 + 0.1 * Pu / (0.5 * SAMPLE_S)))
 
 
 def test_without_integral_action_an_offset_stays_and_is_no_figure() -> None:
-    found = worth(PLANT, Gains(0.3 * Ku))
+    found = loop_performance(PLANT, Gains(0.3 * Ku))
     assert found.stable and found.setpoint is not None and found.load is not None
     assert found.setpoint.IAE is None and found.load.IAE is None and weighted_IAE(found, 1.0, 1.0) is None
-    integrates = worth(Integrating(0.1, 1.0), Gains(2.0))
+    integrates = loop_performance(Integrating(0.1, 1.0), Gains(2.0))
     assert integrates.setpoint is not None and integrates.setpoint.IAE is not None
     assert math.isfinite(integrates.setpoint.IAE)
     better = by_fast(Gains(0.1 * Ku))

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from loopwright.tuning.experiments.preflight import LOOKS, at_rest
+from loopwright.tuning.experiments.preflight import MAX_ATTEMPTS, at_rest
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode, Sample, StageStarted
@@ -51,7 +51,7 @@ def test_patience_ends() -> None:
     with pytest.raises(Refused) as refused:
         listen(lambda t: SP + 0.1 * t)
     assert refused.value.reason is Reason.NOT_AT_REST
-    assert float(refused.value.detail) == pytest.approx((2 * LOOKS - 1) * LOOK_S, abs=2.0)
+    assert float(refused.value.detail) == pytest.approx((2 * MAX_ATTEMPTS - 1) * LOOK_S, abs=2.0)
 
 
 def test_what_time_does_not_mend_is_refused_at_once() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from loopwright.controller.channel import Channel, Mode, Parameters, RelaySettings, Settings
 from loopwright.plantsim.plant import LinearPlant
-from loopwright.tuning.fast.record import Evidence
+from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.models import TransferFunction, sign
 
 LISTENED = 130
@@ -52,7 +52,7 @@ def record(
     load: float = 0.0,
     load_at: int = 0,
     drift: float = 0.0,
-) -> Evidence:
+) -> ExperimentRecord:
     """Amplitudes +1, -1/2. noise: PV units.  load: MV units, from the sample load_at on.  drift: of PV, per sample."""
     plant = LinearPlant(bench.num, bench.den, bench.L, bench.Ts, noise_std=noise, seed=seed)
     channel = Channel(
@@ -72,4 +72,4 @@ def record(
         if k > LISTENED and u[-1] != u[-2]:
             switched.append(k)
         plant.step(u[-1])
-    return Evidence(bench.Ts, np.array(u), np.array(y), sign(bench.model), LISTENED, len(u), tuple(switched))
+    return ExperimentRecord(bench.Ts, np.array(u), np.array(y), sign(bench.model), LISTENED, len(u), tuple(switched))

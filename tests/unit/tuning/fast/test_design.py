@@ -10,8 +10,8 @@ import pytest
 from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.analysis.stability import is_stable
 from loopwright.tuning.analysis.step_response import step_figures
-from loopwright.tuning.fast.design import Design, DesignSpec, controller, frequencies
-from loopwright.tuning.fast.gain_bounds import encircles_not, largest_gains
+from loopwright.tuning.fast.design import DesignSpec, GainDesign, controller, frequencies
+from loopwright.tuning.fast.gain_bounds import does_not_encircle, largest_gains
 from loopwright.tuning.fast.iae import LoopCost
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction, sign
@@ -50,7 +50,7 @@ def test_the_largest_gain_has_the_Ms_asked(name: str, Ms: float, ratio: float) -
     Ti = ratio * period(model)
     w = frequencies(period(model))
     g = sign(model) * model.frequency_response(w) * controller(w, Ti, 0.0, 10.0)
-    stable = [Kp for Kp in largest_gains(g, Ms) if encircles_not(Kp * g)]
+    stable = [Kp for Kp in largest_gains(g, Ms) if does_not_encircle(Kp * g)]
     for Kp in stable:
         found = margins(model, Gains(Kp, Ti))
         assert found.stable
@@ -67,7 +67,7 @@ def test_a_bound_on_Mt_is_kept_and_met(Mt: float) -> None:
     Ti = 3.0 * period(model)
     w = frequencies(period(model))
     g = model.frequency_response(w) * controller(w, Ti, 0.0, 10.0)
-    ends = [Kp for Kp in largest_gains(g, 2.0, Mt) if encircles_not(Kp * g)]
+    ends = [Kp for Kp in largest_gains(g, 2.0, Mt) if does_not_encircle(Kp * g)]
     for Kp in ends:
         found = margins(model, Gains(Kp, Ti))
         assert found.Mt <= Mt + 2e-3 and found.Ms <= 2.0 + 2e-3
@@ -88,7 +88,7 @@ def test_what_the_encirclements_say_is_what_the_poles_say() -> None:
         for _ in range(12):
             gains = Gains(Ku * random.uniform(0.2, 1.5), Pu * math.exp(random.uniform(-2.0, 2.0)))
             loop = gains.Kp * sign(model) * model.frequency_response(w) * controller(w, gains.Ti, 0.0, 10.0)
-            verdicts.append((encircles_not(loop), is_stable(model, gains)))
+            verdicts.append((does_not_encircle(loop), is_stable(model, gains)))
     assert all(ours == exact for ours, exact in verdicts)
     assert {exact for _, exact in verdicts} == {True, False}
 
@@ -97,7 +97,7 @@ def test_what_the_encirclements_say_is_what_the_poles_say() -> None:
 def test_no_other_integral_time_is_better(name: str) -> None:
     bench = BENCHES[name]
     model = TransferFunction(tuple(sign(bench.model) * c for c in bench.num), bench.den, bench.L)
-    design = Design(model, DesignSpec(1.6), period(model))
+    design = GainDesign(model, DesignSpec(1.6), period(model))
     best = design.best()
     assert margins(model, best.gains).Ms == pytest.approx(1.6, abs=2e-3)
     assert design.minimum is not None
@@ -109,11 +109,11 @@ def test_no_other_integral_time_is_better(name: str) -> None:
 
 def test_a_derivative_pays_on_lags_and_is_left_out_where_it_does_not() -> None:
     lags, delay = THREE_LAGS.model, TransferFunction((1.0,), (0.05, 1.0), 1.0)
-    pi = Design(lags, DesignSpec(1.6), period(lags)).best()
-    pid = Design(lags, DesignSpec(1.6, derivative=True), period(lags)).best()
+    pi = GainDesign(lags, DesignSpec(1.6), period(lags)).best()
+    pid = GainDesign(lags, DesignSpec(1.6, derivative=True), period(lags)).best()
     assert pid.gains.Td > 0.0 and pid.J < 0.97 * pi.J
     assert margins(lags, pid.gains).Ms == pytest.approx(1.6, abs=2e-3)
-    assert Design(delay, DesignSpec(1.6, derivative=True), period(delay)).best().gains.Td == 0.0
+    assert GainDesign(delay, DesignSpec(1.6, derivative=True), period(delay)).best().gains.Td == 0.0
 
 
 @pytest.mark.parametrize("name", BENCHES)
@@ -122,17 +122,17 @@ def test_a_gain_held_below_the_largest_keeps_Ms(name: str, part: float) -> None:
     """With a short integral time a smaller gain may be the less robust one."""
     bench = BENCHES[name]
     model = TransferFunction(tuple(sign(bench.model) * c for c in bench.num), bench.den, bench.L)
-    maximum = part * Design(model, DesignSpec(1.6), period(model)).best().gains.Kp
-    held = Design(model, DesignSpec(1.6, noise_gain=maximum), period(model)).best().gains
+    maximum = part * GainDesign(model, DesignSpec(1.6), period(model)).best().gains.Kp
+    held = GainDesign(model, DesignSpec(1.6, noise_gain=maximum), period(model)).best().gains
     assert held.Kp <= maximum * (1.0 + 1e-9)
     assert margins(model, held).Ms <= 1.602
 
 
 def test_a_bound_on_the_noise_gain_holds() -> None:
     model = THREE_LAGS.model
-    free = Design(model, DesignSpec(1.6, derivative=True), period(model)).best().gains
+    free = GainDesign(model, DesignSpec(1.6, derivative=True), period(model)).best().gains
     maximum = 0.5 * free.Kp * 11.0
-    held = Design(model, DesignSpec(1.6, derivative=True, noise_gain=maximum), period(model)).best().gains
+    held = GainDesign(model, DesignSpec(1.6, derivative=True, noise_gain=maximum), period(model)).best().gains
     assert held.Kp * (11.0 if held.Td else 1.0) <= maximum * (1.0 + 1e-9)
     assert margins(model, held).Ms <= 1.602
 

@@ -131,7 +131,7 @@ def test_a_step_of_the_load_is_found_within_ten_percent(plant: Plant, noise: flo
     (load,) = found.loads
     assert load.t_s == pytest.approx(LOAD_AT * 60.0, rel=0.1)
     assert load.size == pytest.approx(LOAD, rel=0.1)
-    assert any("step of the load" in note for note in found.notes)
+    assert any("load disturbance" in note for note in found.notes)
     assert error_near_the_corner(found, plant) < 0.1
     kind = {FIRST: FOPDT, SECOND: SOPDT, INTEGRATES: Integrating}.get(plant, TransferFunction)
     assert isinstance(found.model, kind)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from loopwright.tuning.identification.initial_guesses import starts
-from loopwright.tuning.identification.output_error import MOVING, QUIET
-from loopwright.tuning.identification.problem import Problem
-from loopwright.tuning.identification.record import recorded
+from loopwright.tuning.identification.output_error import NOT_AT_REST_INITIALLY, UNDISTURBED
+from loopwright.tuning.identification.problem import IdentificationProblem
+from loopwright.tuning.identification.record import recorded_test
 from loopwright.tuning.identification.structures import FIRST, SECOND, SECOND_WITH_ZERO, Structure
 from tests.unit.tuning.recordings import COMPLEX_POLES, FIRST_ORDER, INVERSE_RESPONSE, Loop, moves, open_loop
 
@@ -20,10 +20,10 @@ from tests.unit.tuning.recordings import COMPLEX_POLES, FIRST_ORDER, INVERSE_RES
 def test_the_dead_time_is_the_best_of_all_tried_one_by_one(structure: Structure, loop: Loop, nuisance: bool) -> None:
     change = moves(300)
     t, u, y = open_loop(loop, change, noise=0.05)
-    fit = Problem(recorded(t, u, y)).whole
+    fit = IdentificationProblem(recorded_test(t, u, y)).full_fit
     best = starts(structure, change, y, 60, nuisance, 1)[0]
-    story = MOVING if nuisance else QUIET
-    plain = [fit.fitted(structure, story, np.append(best[:-1], float(m))).linear.rss for m in range(61)]
+    hypothesis = NOT_AT_REST_INITIALLY if nuisance else UNDISTURBED
+    plain = [fit.fitted(structure, hypothesis, np.append(best[:-1], float(m))).linear.rss for m in range(61)]
     assert best[-1] == int(np.argmin(plain))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from loopwright.tuning.identification.variable_projection import Bounded, covariance, descend, solve
+from loopwright.tuning.identification.variable_projection import SearchBounds, covariance, descend, solve
 from loopwright.tuning.models import Reals
 
 T = np.linspace(0.0, 5.0, 200)
@@ -22,7 +22,7 @@ def measured() -> Reals:
 
 
 def descended(y: Reals, starts: list[list[float]], high: float, steps: int = 60) -> tuple[Reals, Reals]:
-    bounded = Bounded(np.full(2, -6.0), np.full(2, high), np.full(2, 1.5), np.full(2, 1e-6))
+    bounded = SearchBounds(np.full(2, -6.0), np.full(2, high), np.full(2, 1.5), np.full(2, 1e-6))
 
     def columns(thetas: Reals) -> Reals:
         return np.array([two_exponentials(theta) for theta in thetas])
@@ -62,7 +62,7 @@ def test_a_parameter_that_does_nothing_stays() -> None:
     def columns(thetas: Reals) -> Reals:
         return np.array([two_exponentials(theta[:2]) for theta in thetas])
 
-    bounded = Bounded(np.full(3, -6.0), np.full(3, 6.0), np.full(3, 1.5), np.full(3, 1e-6))
+    bounded = SearchBounds(np.full(3, -6.0), np.full(3, 6.0), np.full(3, 1.5), np.full(3, 1e-6))
     found, rss = descend(columns, y, np.array([[-1.5, 2.0, 0.7]]), bounded, 60, 1e-7)
     expected, minimum = descended(y, [[-1.5, 2.0]], 6.0)
     assert found[0, 2] == 0.7

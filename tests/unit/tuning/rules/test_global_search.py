@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from loopwright.tuning.models import Reals
-from loopwright.tuning.rules.global_search import Cost, Found, differential_evolution, multi_epoch_swarm, nelder_mead
+from loopwright.tuning.rules.global_search import (
+    Cost,
+    SearchResult,
+    differential_evolution,
+    multi_epoch_swarm,
+    nelder_mead,
+)
 
 SEARCHES = [multi_epoch_swarm, differential_evolution, nelder_mead]
 LEAST = np.array([0.31, 0.72])
@@ -47,7 +53,7 @@ class Watched:
 @pytest.mark.parametrize(("cost", "point"), [(bowl, LEAST), (ripples, LEAST), (corner, np.array([0.0, 1.0]))])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_finds_the_least_within_the_budget(
-    search: Callable[[Cost, int, int], Found], cost: Cost, point: Reals, seed: int
+    search: Callable[[Cost, int, int], SearchResult], cost: Cost, point: Reals, seed: int
 ) -> None:
     watched = Watched(cost)
     found = search(watched, 2, seed)
@@ -57,7 +63,7 @@ def test_finds_the_least_within_the_budget(
 
 
 @pytest.mark.parametrize("search", SEARCHES)
-def test_the_same_seed_gives_the_same_point(search: Callable[[Cost, int, int], Found]) -> None:
+def test_the_same_seed_gives_the_same_point(search: Callable[[Cost, int, int], SearchResult]) -> None:
     first, second, other = search(ripples, 2, 5), search(ripples, 2, 5), search(ripples, 2, 6)
     assert np.array_equal(first.point, second.point)
     assert not np.array_equal(first.point, other.point)

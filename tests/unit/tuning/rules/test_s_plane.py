@@ -15,7 +15,7 @@ from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, Reals, TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
-from loopwright.tuning.rules.s_plane import Design, Minimum, _Rational, design, s_plane
+from loopwright.tuning.rules.s_plane import Minimum, PolePlacement, _RationalLoops, design, s_plane
 from tests.unit.tuning.parseval import error_squares
 from tests.unit.tuning.s_plane_printed import J0_J1, first_order, second_order, third_order
 from tests.unit.tuning.search_tables import OBJECTS, PLANTS, S_PLANE
@@ -32,7 +32,7 @@ def kind(name: str) -> str:
     return "pid" if name == "third" else "pi"
 
 
-def row_design(name: str, mu: float) -> Design:
+def row_design(name: str, mu: float) -> PolePlacement:
     return design(OBJECTS[name], controller=kind(name), mu=mu, tau_s=TAU_S, k1=K1)
 
 
@@ -284,7 +284,7 @@ def test_a_slow_root_is_not_taken_for_a_lower_J() -> None:
 
 def test_a_loop_on_the_edge_of_stability_has_no_finite_J() -> None:
     # s^2 + 1: its Lyapunov equation is singular; the loop beside it is not touched
-    J0, J1 = _Rational(TransferFunction((1.0,), (1.0, 1.0))).squares(np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0]]))
+    J0, J1 = _RationalLoops(TransferFunction((1.0,), (1.0, 1.0))).squares(np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0]]))
     expected = J0_J1(np.array([1.0, 1.0]), np.array([1.0]), np.array([1.0, 1.0]))
     assert (J0[0], J1[0]) == (math.inf, math.inf)
     assert (J0[1], J1[1]) == pytest.approx(expected, rel=1e-12)

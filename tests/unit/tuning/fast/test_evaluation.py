@@ -10,8 +10,8 @@ from scipy.signal import lfilter
 
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.evaluation import evaluate
 from loopwright.tuning.fast.uncertainty import peak, seen_covariance
-from loopwright.tuning.fast.verdict import evaluate
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
 from tests.unit.tuning.fast.records import BENCHES, FIRST, THREE_LAGS, record
@@ -20,9 +20,9 @@ from tests.unit.tuning.fast.records import BENCHES, FIRST, THREE_LAGS, record
 def true_Ms(name: str, noise: float, seed: int = 1) -> tuple[float, float, str | None]:
     """(Ms on the true plant with the sampling's half sample, two standard deviations by the verdict, cause)."""
     bench = BENCHES[name]
-    found = evaluate(record(bench, noise * record(bench).span, seed=seed), DesignSpec(1.6))
+    found = evaluate(record(bench, noise * record(bench).output_range, seed=seed), DesignSpec(1.6))
     true = TransferFunction(bench.num, bench.den, bench.L + 0.5 * bench.Ts)
-    return margins(true, found.best.gains).Ms, found.uncertainty, found.cause
+    return margins(true, found.best.gains).Ms, found.uncertainty, found.reason
 
 
 @pytest.mark.parametrize("name", BENCHES)
@@ -42,35 +42,37 @@ def test_the_uncertainty_is_that_of_many_seeds() -> None:
 
 
 def test_a_record_that_no_linear_model_explains_is_refused() -> None:
-    evidence = record(THREE_LAGS, 0.002 * record(THREE_LAGS).span)
+    evidence = record(THREE_LAGS, 0.002 * record(THREE_LAGS).output_range)
     # a second plant that only some of the time is there
-    knocked = evidence.y + 0.05 * evidence.span * np.sin(np.arange(len(evidence.y)) / 7.0)
+    knocked = evidence.y + 0.05 * evidence.output_range * np.sin(np.arange(len(evidence.y)) / 7.0)
     found = evaluate(replace(evidence, y=np.where(np.arange(len(knocked)) < evidence.listened, evidence.y, knocked)),
                   DesignSpec(1.6))  # fmt: skip
-    assert found.cause == Reason.UNEXPLAINED
+    assert found.reason == Reason.UNEXPLAINED
     assert "unexplained" in found.detail
 
 
 def test_slow_noise_that_was_not_there_at_rest_is_told_from_white_noise() -> None:
-    evidence = record(FIRST, 0.01 * record(FIRST).span)
+    evidence = record(FIRST, 0.01 * record(FIRST).output_range)
     slow = lfilter([1.0], [1.0, -0.97], np.random.default_rng(2).normal(size=len(evidence.y)))
     slow[: evidence.listened] = 0.0
-    found = evaluate(replace(evidence, y=evidence.y + 0.004 * evidence.span * slow / np.std(slow)), DesignSpec(1.6))
-    assert found.cause in (Reason.DISTURBED, Reason.UNEXPLAINED) or abs(found.Ms - 1.6) < 0.1
+    found = evaluate(
+        replace(evidence, y=evidence.y + 0.004 * evidence.output_range * slow / np.std(slow)), DesignSpec(1.6)
+    )
+    assert found.reason in (Reason.DISTURBED, Reason.UNEXPLAINED) or abs(found.Ms - 1.6) < 0.1
 
 
 def test_much_noise_and_few_switches_are_uncertain() -> None:
-    found = evaluate(record(THREE_LAGS, 0.4 * record(THREE_LAGS).span, switches=4, seed=3), DesignSpec(1.6))
-    assert found.cause == Reason.UNCERTAIN
+    found = evaluate(record(THREE_LAGS, 0.4 * record(THREE_LAGS).output_range, switches=4, seed=3), DesignSpec(1.6))
+    assert found.reason == Reason.UNCERTAIN
     assert "Ms" in found.detail
 
 
 def test_gains_that_came_of_another_plant_are_a_surprise() -> None:
-    evidence = record(FIRST, 0.01 * record(FIRST).span)
+    evidence = record(FIRST, 0.01 * record(FIRST).output_range)
     other = evaluate(evidence, DesignSpec(1.6))
     stronger = replace(other.best, gains=replace(other.best.gains, Kp=1.6 * other.best.gains.Kp))
     found = evaluate(evidence, DesignSpec(1.6), replace(other, best=stronger))
-    assert found.cause == Reason.SURPRISE
+    assert found.reason == Reason.MODEL_MISMATCH
     assert f"{peak(found.model, stronger.gains, np.geomspace(1e-3, 30.0, 4000), 0.05):.2f}" in found.detail
 
 

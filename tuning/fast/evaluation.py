@@ -1,0 +1,209 @@
+"""The evaluation of a fast record: identification, design, and the reasons for which the result is not trusted."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from loopwright.tuning.fast.design import DesignSpec, GainDesign, OptimalGains
+from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.structure_choice import StructureChoice, choose_structure
+from loopwright.tuning.fast.uncertainty import difference_of_rivals, durbin_watson_ratio, peak, uncertainty_of_Ms
+from loopwright.tuning.fast.valve_faults import find_valve_fault
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.identification.output_error import Fit, Fitted
+from loopwright.tuning.models import TransferFunction
+from loopwright.tuning.reasons import Reason
+
+MAX_RESIDUAL, NEGLIGIBLE_RESIDUAL = 1.35, 0.004
+"""Limits of the rms of the residual: the largest accepted, in standard deviations of the noise at rest; the fraction of
+the range of PV below which a residual is accepted in any case."""
+MAX_DURBIN_WATSON_RATIO = 1.35
+MAX_ROUNDED = 1.25
+"""Residual, in average rounding errors, below which slow variations are accepted: rounding errors are not white."""
+MAX_UNCERTAINTY = 0.10
+"""Largest accepted uncertainty of Ms, by the delta method and among rival models."""
+MAX_MODEL_MISMATCH, MAX_MODEL_MISMATCH_OF_TWO_LOADS = 0.5, 0.2
+"""Largest accepted difference of Ms from the Ms asked for, of the tested gains on the new model and of the new gains on
+the earlier model; the second value holds where the model has two load disturbances."""
+LOAD_WINDOW = (0.15, 0.8)
+"""Periods before and after the set-point step within which a load disturbance counts as coming with the step."""
+LATE_LOAD, SAME_LOAD = 0.5, 0.3
+"""Times in periods. A load disturbance at most LATE_LOAD before the step need not have shown in the relay's record; if
+it has not, it may really be a change of the plant. Two load disturbances closer than SAME_LOAD are the same one."""
+MAX_GAIN_CHANGE = 1.5
+"""Largest accepted ratio of new to tested Kp or Ti where a load disturbance seems to have come with the tested
+gains."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluation:
+    """The evaluation of one record.
+
+    reason: the reason why the result is not trusted, None if it is.
+    detail: the sentence with the numbers behind that reason.
+    model: the process model, without the delay of the sampling.
+    structure: the name of its structure.
+    best: the gains designed on the model.
+    Ms: the maximum sensitivity of these gains on the model, the delay of the sampling included.
+    uncertainty: how much larger Ms may be with the model two standard deviations off.
+    ambiguity: the largest difference of Ms on a rival model.
+    residual: the rms of the residual in standard deviations of the noise at rest.
+    chosen, fit: the choice of the structure, and the fits of the record behind it.
+    design_delay: the delay of the sampling, s.
+    period: the ultimate period of the model, s.
+    """
+
+    reason: Reason | None
+    detail: str
+    model: TransferFunction
+    structure: str
+    best: OptimalGains
+    Ms: float
+    uncertainty: float
+    ambiguity: float
+    residual: float
+    chosen: StructureChoice
+    fit: Fit[ExperimentRecord]
+    design_delay: float
+    period: float
+
+
+def evaluate(record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | None = None) -> Evaluation:
+    """Identifies the model, designs the gains and assesses both.
+
+    spec: the design specification.
+    earlier: the evaluation of the first part of the record, whose gains were tested in the rest of it.
+    Raises Refused, NOT_ROBUST, where the model permits no such controller.
+    """
+    fit = Fit(record)
+    chosen = choose_structure(fit, earlier.chosen.fits if earlier else ())
+    found = chosen.best
+    model = fit.model(found)
+    delay = 0.5 * record.Ts
+    design = GainDesign(replace(model, L=model.L + delay), spec, record.period * record.Ts)
+    best = design.best()
+    spread = uncertainty_of_Ms(fit, found, best.gains, design.w, spec.N, delay)
+    rivals = difference_of_rivals(fit, found, chosen.rivals, best.gains, design.w, delay)
+    noise, rounding = record.noise / record.output_range, record.rounding / record.output_range
+    ratio = durbin_watson_ratio(found.linear.residual)
+    reason: Reason | None = None
+    detail = ""
+    if found.rms > max(MAX_RESIDUAL * noise, NEGLIGIBLE_RESIDUAL):
+        reason = Reason.UNEXPLAINED
+        rms = 100.0 * found.rms
+        detail = f"the model leaves {rms:.2g} % of PV's span unexplained, the noise is {100.0 * noise:.2g} %"
+    elif found.rms > max(NEGLIGIBLE_RESIDUAL, MAX_ROUNDED * rounding) and ratio > MAX_DURBIN_WATSON_RATIO * max(
+        record.durbin_watson_ratio_at_rest, 1.0
+    ):
+        reason = Reason.DISTURBED
+        at_rest = f"{record.durbin_watson_ratio_at_rest:.2f} at rest"
+        detail = f"what the model leaves varies slowly: {ratio:.2f} times white noise, {at_rest}"
+    elif spread > MAX_UNCERTAINTY:
+        reason = Reason.UNCERTAIN
+        detail = f"Ms is known to +{spread:.2g} only"
+    elif rivals > MAX_UNCERTAINTY:
+        reason = Reason.AMBIGUOUS
+        detail = f"another model that explains the record as well gives an Ms off by {rivals:.2g}"
+    elif earlier is not None:
+        reason, detail = _model_mismatch(earlier, model, best.gains, spec, design, found.hypothesis.load_disturbances)
+        if reason is None and (fault := find_valve_fault(fit, found)) is not None:
+            reason, detail = Reason.UNEXPLAINED, f"{fault.fault} explains the record better, or the plant is not linear"
+        if reason is None:
+            reason, detail = _load_with_the_step(fit, found, earlier, best.gains)
+    return Evaluation(
+        reason=reason,
+        detail=detail,
+        model=model,
+        structure=found.structure.name,
+        best=best,
+        Ms=peak(model, best.gains, design.w, delay),
+        uncertainty=spread,
+        ambiguity=rivals,
+        residual=found.rms / noise if noise > 0.0 else math.inf,
+        chosen=chosen,
+        fit=fit,
+        design_delay=delay,
+        period=design.period,
+    )
+
+
+def evaluate_again(record: ExperimentRecord, spec: DesignSpec) -> Evaluation:
+    """Evaluates a whole record as the procedure does: the relay's part first, then all of it.
+
+    Raises Refused, NOT_ROBUST.
+    """
+    if not record.steps:
+        return evaluate(record, spec)
+    until = slice(record.relayed)
+    return evaluate(record, spec, evaluate(replace(record, u=record.u[until], y=record.y[until], steps=()), spec))
+
+
+def _load_with_the_step(
+    fit: Fit[ExperimentRecord], found: Fitted, earlier: Evaluation, gains: Gains
+) -> tuple[Reason | None, str]:
+    """The reason and the detail where the model explains the test of the new gains by a load disturbance.
+
+    A load disturbance found together with the new gains may really be a change of the plant, so it is accepted only if
+    the step back is explained without another one and the gains designed on the whole record are close to those tested.
+    The second condition is needed because relay and steps excite different frequencies: one model can fit the plant
+    before the change at the former and the plant after the change at the latter. A load disturbance in mid-relay that
+    the relay's own record had not shown is treated in the same way.
+    """
+    steps, period = fit.record.steps, fit.period
+    if not steps:
+        return None, ""
+    times, shown = _loads(found), _loads(earlier.chosen.best)
+    new = [at for at in times if all(abs(at - each) > SAME_LOAD * period for each in shown)]
+    if any(at < steps[0] - LATE_LOAD * period for at in new):
+        if len(steps) == 1:
+            return (
+                Reason.AMBIGUOUS,
+                "the whole record shows a load disturbance in mid-relay that the relay's own record did not show",
+            )
+        if len(times) > 1:
+            return (
+                Reason.MODEL_MISMATCH,
+                "the whole record shows other load disturbances in mid-relay than the relay's own record",
+            )
+    before, after = LOAD_WINDOW
+    loads = [at for at in times if at > steps[0] - (LATE_LOAD if at in new else before) * period]
+    with_the_step = any(at < steps[0] + after * period for at in loads)
+    if len(steps) == 1 and (with_the_step or len(loads) > 1):
+        return (
+            Reason.AMBIGUOUS,
+            "a load seems to have come with the new gains; a plant that has changed would look the same",
+        )
+    if len(loads) > 1:
+        return Reason.MODEL_MISMATCH, "PV answered each step of the new gains as if a load had come with it"
+    tested = earlier.best.gains
+    Kp, Ti = gains.Kp / tested.Kp, gains.Ti / tested.Ti
+    if with_the_step and max(Kp, 1.0 / Kp, Ti, 1.0 / Ti) > MAX_GAIN_CHANGE:
+        text = f"a load seems to have come with the new gains, and would ask for {Kp:.2f} times their Kp, {Ti:.2f} Ti"
+        return Reason.MODEL_MISMATCH, f"{text}; a plant that has changed would look the same"
+    return None, ""
+
+
+def _loads(found: Fitted) -> list[float]:
+    """The times of the load disturbances, in samples."""
+    return [float(at) for at in found.theta[found.structure.searched :]]
+
+
+def _model_mismatch(
+    earlier: Evaluation, model: TransferFunction, gains: Gains, spec: DesignSpec, design: GainDesign, loads: int
+) -> tuple[Reason | None, str]:
+    """The reason and the detail where the relay's model and that of the whole record disagree on a controller.
+
+    Both models must give both controllers about the Ms asked for. Otherwise a disturbance, or a change of the plant,
+    has entered one of the models.
+    """
+    maximum = MAX_MODEL_MISMATCH_OF_TWO_LOADS if loads > 1 else MAX_MODEL_MISMATCH
+    tested = peak(model, earlier.best.gains, design.w, earlier.design_delay)
+    again = peak(earlier.model, gains, design.w, earlier.design_delay)
+    if abs(tested - spec.Ms) > maximum:
+        text = f"the controller that was tested has Ms {tested:.2f} on the model of the whole record, not {spec.Ms:g}"
+        return Reason.MODEL_MISMATCH, text
+    if abs(again - spec.Ms) > maximum:
+        text = f"the controller designed on the whole record has Ms {again:.2f} on the relay's model, not {spec.Ms:g}"
+        return Reason.MODEL_MISMATCH, text
+    return None, ""
