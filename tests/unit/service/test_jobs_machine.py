@@ -151,6 +151,10 @@ class Job:
     def active(self) -> bool:
         return self.state in ("queued", "running")
 
+    @property
+    def waits_for_a_loop(self) -> bool:
+        return self.active and not self.begun and not self.dry
+
 
 class JobsMachine(RuleBasedStateMachine):
     """The service on the left, the model on the right."""
@@ -361,6 +365,14 @@ class JobsMachine(RuleBasedStateMachine):
         self.lock(job.loop)
         assert not self.decide(job, "rollback", self.service.decisions.rollback, ("proposed", "accepted"))
 
+    @precondition(lambda self: not self.locked and any(job.waits_for_a_loop for job in self.jobs))
+    @rule()
+    def lock_what_waits(self) -> None:
+        """Locks the loop of a job that has not begun, which then begins: by chance alone that is rare, too."""
+        job = next(job for job in self.jobs if job.waits_for_a_loop)
+        self.lock(job.loop)
+        self.begun(job)
+
     @precondition(lambda self: self.locked)
     @rule()
     def unlock(self) -> None:
@@ -455,7 +467,7 @@ def test_jobs_do_what_the_model_says(
 
     monkeypatch.setattr(database, "_pragmas", hasty)
     Store(tmp_path).close()
-    for round_number in range(10):  # threads decide too what happens: a rare outcome may want another round
+    for round_number in range(4):  # threads decide too what happens: a rare outcome may want another round
         run_state_machine_as_test(  # type: ignore[no-untyped-call]
             lambda: JobsMachine(tmp_path / FILE, machine_count),
             settings=settings(
