@@ -67,8 +67,8 @@ class Aftercare:
     directory: its loops; each look at one is made alone with it.  machine: its clock and threads.
     """
 
-    def __init__(self, directory: LoopDirectory, store: Store, machine: Machine) -> None:
-        self._directory, self._store = directory, store
+    def __init__(self, store: Store, directory: LoopDirectory, machine: Machine) -> None:
+        self._store, self._directory = store, directory
         self._machine = machine
         self._clock = self._machine.monotonic
         self._again: dict[str, _Again] = {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -40,12 +39,13 @@ class LoopDirectory:
         self.open_loop = open_loop
         self._registry = registry
         self._buses = buses or {}
+        self._machine = machine
         # By loop: who is about to begin a job on it, to decide one, or to look after it.
-        self._loop_locks: defaultdict[str, AbstractContextManager[Any]] = defaultdict(machine.lock)
+        self._loop_locks: dict[str, AbstractContextManager[Any]] = {}
 
     def alone_with(self, tag: str) -> AbstractContextManager[Any]:
         """Returns the lock that is held while a job on the loop begins or is decided, or the loop is looked after."""
-        return self._loop_locks[tag]
+        return self._loop_locks.setdefault(tag, self._machine.lock())  # one, also for two who ask at the same time
 
     def at_once(self, bus: str) -> int:
         """Returns how many loops of one of our buses may be under test at the same time."""

@@ -51,7 +51,7 @@ def make_jobs(
         worker=Worker(store, journal, directory, registry, tune, rehearse, machine),
         decisions=decisions,
         locking=Locking(store, directory, decisions),
-        aftercare=Aftercare(directory, store, machine),
+        aftercare=Aftercare(store, directory, machine),
         recovery=Recovery(loops, store, open_loop, resume, lambda: registry.stopping),
         machine=machine,
     )
