@@ -92,7 +92,7 @@ def evaluate(record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | N
     if found.rms > max(MAX_RESIDUAL * noise, NEGLIGIBLE_RESIDUAL):
         reason = Reason.UNEXPLAINED
         rms = 100.0 * found.rms
-        detail = f"the model leaves {rms:.2g} % of PV's span unexplained, the noise is {100.0 * noise:.2g} %"
+        detail = f"the model leaves {rms:.2g} % of PV's range unexplained, the noise is {100.0 * noise:.2g} %"
     elif found.rms > max(NEGLIGIBLE_RESIDUAL, MAX_ROUNDED * rounding) and ratio > MAX_DURBIN_WATSON_RATIO * max(
         record.durbin_watson_ratio_at_rest, 1.0
     ):
@@ -172,14 +172,15 @@ def _load_with_the_step(
     if len(steps) == 1 and (with_the_step or len(loads) > 1):
         return (
             Reason.AMBIGUOUS,
-            "a load seems to have come with the new gains; a plant that has changed would look the same",
+            "a load disturbance seems to have come with the new gains; a plant that has changed would look the same",
         )
     if len(loads) > 1:
-        return Reason.MODEL_MISMATCH, "PV answered each step of the new gains as if a load had come with it"
+        return Reason.MODEL_MISMATCH, "PV answered each step of the new gains as if a load disturbance had come with it"
     tested = earlier.best.gains
     Kp, Ti = gains.Kp / tested.Kp, gains.Ti / tested.Ti
     if with_the_step and max(Kp, 1.0 / Kp, Ti, 1.0 / Ti) > MAX_GAIN_CHANGE:
-        text = f"a load seems to have come with the new gains, and would ask for {Kp:.2f} times their Kp, {Ti:.2f} Ti"
+        come = "a load disturbance seems to have come with the new gains"
+        text = f"{come}, and would ask for {Kp:.2f} times their Kp, {Ti:.2f} Ti"
         return Reason.MODEL_MISMATCH, f"{text}; a plant that has changed would look the same"
     return None, ""
 

@@ -135,8 +135,8 @@ class Experiment:
         relay_period = period(tuple(self.switches)) * self.facts.sample_time_s
         self._follow_s = VERIFICATION_PERIODS * min(max(model_period, MIN_MODEL_PERIOD * relay_period), relay_period)
         facts, point = self.facts, self.point
-        span = self.experiment_record().output_range
-        size = min(0.5 * span, self.amplitude / gains.Kp, facts.sp_deviation)
+        output_range = self.experiment_record().output_range
+        size = min(0.5 * output_range, self.amplitude / gains.Kp, facts.sp_deviation)
         self.relayed = len(self.trace)
         self._commands = ()
         # A bumpless transfer from the relay would start the integral at the relay's output, which acts like a load
@@ -145,14 +145,14 @@ class Experiment:
         output = min(max(point.mv + gains.Kp * error, facts.mv_low), facts.mv_high)
         self._add((yield (SetMode(Mode.MANUAL), SetOutput(output), SetGains(gains))))
         self._step = size
-        yield from self._follow((SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp + size)), span)
+        yield from self._follow((SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp + size)), output_range)
 
     def step_back(self) -> Plan[None]:
         """Steps the set-point back under the same gains and follows PV for half as long as after the first step."""
         self._follow_s *= STEP_BACK_FRACTION
         yield from self._follow((SetSetpoint(self.point.sp),), self.experiment_record().output_range)
 
-    def _follow(self, commands: tuple[Command, ...], span: float) -> Plan[None]:
+    def _follow(self, commands: tuple[Command, ...], output_range: float) -> Plan[None]:
         """Follows PV after a set-point step. Raises Refused, DIVERGES."""
         self._steps.append(len(self.trace))
         sample = yield commands
@@ -161,10 +161,10 @@ class Experiment:
         while sample.t < end:
             sample = yield ()
             self._add(sample)
-            if abs(sample.pv - self.point.pv) > DIVERGED * span:
+            if abs(sample.pv - self.point.pv) > DIVERGED * output_range:
                 raise Refused(
                     Reason.DIVERGES,
-                    f"PV is {sample.pv - self.point.pv:+.4g} away; the relay had moved it by {span:.4g}",
+                    f"PV is {sample.pv - self.point.pv:+.4g} away; the relay had moved it by {output_range:.4g}",
                 )
 
     def computed(self, compute: Callable[[], T]) -> Plan[T]:

@@ -69,8 +69,8 @@ def relay_test(facts: Facts, point: OperatingPoint) -> Plan[RelayResult]:
     if period < MIN_SAMPLES_PER_PERIOD * facts.sample_time_s:
         raise Refused(
             Reason.CANNOT_OSCILLATE,
-            f"under the relay PV swings with a period of {period:.3g} s, {period / facts.sample_time_s:.1f} samples: "
-            "there is no ultimate point slower than the sampling",
+            f"under the relay PV oscillates with a period of {period:.3g} s, {period / facts.sample_time_s:.1f} "
+            "samples: there is no ultimate point slower than the sampling",
         )
     amplitude = abs(harmonic(t, pv, period))
     if amplitude < 2 * point.noise or amplitude == 0:

@@ -170,9 +170,9 @@ def _p_run(facts: Facts, point: OperatingPoint, K: float, step: float, period: f
             before = growth
         sample = yield ()
     if ended == "mv limit":
-        swings = growth.log_per_period if growth else 0.0
+        growth_per_period = growth.log_per_period if growth else 0.0
         mean = growth.mean if growth else point.pv
-        return Run(K, max(0.05, swings), math.inf, period, sample.t - start, ended), mean
+        return Run(K, max(0.05, growth_per_period), math.inf, period, sample.t - start, ended), mean
     if ended == "time":
         growth = _growth(trace, start + period, period)
     assert growth is not None

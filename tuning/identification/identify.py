@@ -265,10 +265,10 @@ def _notes(
     notes += _disturbance_notes(problem, found)
     if problem.resolution > COARSE_RESOLUTION:
         coarse = 100.0 * problem.resolution
-        notes.append(f"PV is recorded in steps of {coarse:.2g} % of its span, which limits the result.")
+        notes.append(f"PV is recorded in steps of {coarse:.2g} % of its range, which limits the result.")
     if not found.explained:
         notes.append(
-            f"The residual is not white noise ({100.0 * best.rms:.2g} % of PV's span): the plant has another "
+            f"The residual is not white noise ({100.0 * best.rms:.2g} % of PV's range): the plant has another "
             "structure, or something else moved PV."
         )
     top = ranked[0]

@@ -28,7 +28,7 @@ FIRST_STEPS, LONG_SEARCHES = 5, 2
 """Steps made from every start of many, and the number of searches that are then carried to the end."""
 RELATIVE_DECREASE = 1e-6
 LOG_STEP = 1e-4
-LOG_REACH = 1.5
+MAX_LOG_STEP = 1.5
 
 
 class RecordToFit(Protocol):
@@ -191,7 +191,7 @@ class Fit(Generic[S]):
     ) -> list[Reals]:
         low, high = self.bounds(structure, hypothesis)
         times = 1 + hypothesis.load_disturbances
-        max_step = np.append(np.full(structure.lags, LOG_REACH), np.full(times, 0.25 * self.period))
+        max_step = np.append(np.full(structure.lags, MAX_LOG_STEP), np.full(times, 0.25 * self.period))
         step = np.append(np.full(structure.lags, LOG_STEP), np.full(times, LOG_STEP * self.period))
 
         def columns(thetas: Reals) -> Reals:

@@ -153,8 +153,8 @@ def descend(
             A, b = normal[trying], gradient[trying]
             move = -np.linalg.solve(A + damping[mine, None, None] * one, b[:, :, None])[:, :, 0]
             promised = -2.0 * np.einsum("bi,bi->b", b, move) - np.einsum("bi,bij,bj->b", move, A, move)
-            worth = promised > MIN_PROMISED_DECREASE * relative_decrease * cost[mine]
-            trying, mine, move = trying[worth], mine[worth], move[worth]
+            promising = promised > MIN_PROMISED_DECREASE * relative_decrease * cost[mine]
+            trying, mine, move = trying[promising], mine[promising], move[promising]
             if not len(trying):
                 break
             new = np.clip(at[mine] + np.clip(move / scale[trying], -max_step, max_step), low, high)
