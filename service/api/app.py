@@ -34,7 +34,7 @@ from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.fleet import Fleet
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.loops.shared_reading import SharedReading
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import FastRetune, RetuneRequest
 from loopwright.service.security.principal import current
 from loopwright.service.store.idempotency import IdempotencyKeys
 from loopwright.service.store.tables import JobRow
@@ -138,7 +138,7 @@ def create_app(
     def retune(
         tag: Tag, request: Request, response: Response, options: Annotated[RetuneRequest | None, Body()] = None
     ) -> JobView:
-        row = jobs.start(tag, options or RetuneRequest())
+        row = jobs.start(tag, options or FastRetune())
         response.headers["Location"] = str(request.url_for("job", job_id=row.id).path)
         return view(row)
 

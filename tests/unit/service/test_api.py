@@ -160,7 +160,7 @@ def test_absent_node(service: Service, client: TestClient) -> None:
             "bad_input",
             "five-stage takes a model of the form K, T_s, L_s",
         ),
-        ({"start": "design", "model": {"num": [1], "den": [1]}}, "bad_input", "needs a pole"),
+        ({"start": "design", "model": {"num": [1], "den": [1]}}, "bad_input", "den must have a pole"),
         ({"ms": 1.1}, "bad_input", "ms"),
         ({"ms": 2.1}, "bad_input", "ms"),
         ({"amplitude_pct": 70}, "bad_limits", "needs 105 % of MV between its limits, there are 100 %"),
