@@ -114,13 +114,13 @@ Gain = Annotated[
         json_schema_extra={"not": {"const": 0}},
     ),
 ]
-TimeConstant = Annotated[float, BeforeValidator(_time_constant), Field(ge=MIN_TIME_S, le=MAX_TIME_S)]
-Lag = Annotated[float, BeforeValidator(_dead_time), Field(ge=0, le=MAX_TIME_S)]
+TimeConstant = Annotated[float, Field(ge=MIN_TIME_S, le=MAX_TIME_S), BeforeValidator(_time_constant)]
+Lag = Annotated[float, Field(ge=0, le=MAX_TIME_S), BeforeValidator(_dead_time)]
 DeadTime = Annotated[Lag, Field(description="Dead time, s", examples=[1.0])]
 Coefficients = Annotated[
     list[Annotated[float, Field(allow_inf_nan=False)]],
-    BeforeValidator(_coefficients),
     Field(min_length=1, max_length=MAX_COEFFICIENTS),
+    BeforeValidator(_coefficients),
 ]
 
 
@@ -189,7 +189,7 @@ class SecondOrderModel(_Form):
 
     K: Gain
     T_s: TimeConstant = Field(description="1/(natural frequency), s", examples=[6.0])
-    zeta: Annotated[float, BeforeValidator(_positive), Field(gt=0)] = Field(
+    zeta: Annotated[float, Field(gt=0), BeforeValidator(_positive)] = Field(
         description="Damping ratio; below 1 the poles are complex", examples=[0.5]
     )
     L_s: DeadTime

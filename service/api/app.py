@@ -80,6 +80,7 @@ def create_app(
         openapi_url=None,  # would make the document anew for each who asks: operations.py has it
         docs_url=None,  # would load its scripts from elsewhere
         redoc_url=None,
+        generate_unique_id_function=lambda route: route.name,  # clients that are generated name their functions so
     )
     app.router.route_class = JsonRoute
     app.add_middleware(Idempotent, keys=IdempotencyKeys(jobs.store))

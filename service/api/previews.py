@@ -30,7 +30,7 @@ def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
         summary="What a retune with this body would do now: moves, time, limits, and all that would refuse it",
         responses=problems.responses(404, 422, 503),
     )
-    def one(tag: Tag, options: Annotated[RetuneRequest | None, Body()] = None) -> Preview:
+    def retune_preview(tag: Tag, options: Annotated[RetuneRequest | None, Body()] = None) -> Preview:
         request = options or FastRetune()
         config, _ = jobs.owner(tag)
         return preview(config, request, _now(jobs, tag, request), _last(jobs.store.last_models(tag).get(tag)))
@@ -41,7 +41,7 @@ def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
         summary="What a retune of many loops would do, from configuration and earlier jobs: no controller is asked",
         responses=problems.responses(422, 503),
     )
-    def many(wish: Annotated[FleetRequest, Body()]) -> FleetPreview:
+    def retune_many_preview(wish: Annotated[FleetRequest, Body()]) -> FleetPreview:
         options, busy, models = wish.each(), jobs.store.busy(), jobs.store.last_models()
         locked = _locked(jobs)
         return fleet_preview([
