@@ -268,6 +268,20 @@ def test_every_schema_has_a_name_of_its_own() -> None:
     assert not [name for name in names if "__" in name]
 
 
+def test_models_and_retunes_are_unions_of_named_schemas(client: TestClient) -> None:
+    schemas = client.get("/openapi.json").json()["components"]["schemas"]
+    forms = {f"#/components/schemas/{name}Model" for name in (
+        "FirstOrder", "TwoLag", "SecondOrder", "Integrating", "TransferFunction"
+    )}  # fmt: skip
+    assert {one["$ref"] for one in schemas["TuningRequest"]["properties"]["model"]["oneOf"]} == forms
+    for kind in ("FastRetune", "FiveStageRetune", "RuleRetune", "FastRetunes", "FiveStageRetunes", "RuleRetunes"):
+        union, null = schemas[kind]["properties"]["model"]["anyOf"]
+        assert {one["$ref"] for one in union["oneOf"]} == forms and null == {"type": "null"}
+        assert schemas[kind]["additionalProperties"] is False
+    time = schemas["FirstOrderModel"]["properties"]["T_s"]
+    assert (time["minimum"], time["maximum"]) == (1e-6, 1e8)
+
+
 def test_openapi_is_the_golden_one(client: TestClient) -> None:
     document = client.get("/openapi.json").json()
     document["info"]["version"] = "0"

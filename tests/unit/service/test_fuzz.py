@@ -62,7 +62,7 @@ BOUNDED = settings(
 )
 ABORT = "POST /jobs/{job_id}/abort"
 _NUMBER = st.floats(allow_nan=False, allow_infinity=False) | st.floats(0.01, 100.0)
-# A model is any object to the document; nearly all that could be made up would be refused at once.
+# Of the models that the document allows nearly all are no plant's, and would be refused at once.
 BODIES = {
     "POST /tunings": st.fixed_dictionaries(
         {

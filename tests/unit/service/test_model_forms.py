@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loopwright.service.model_json import BadModel, describe, dump_model, parse_model
+from loopwright.service.model_json import BadModel, describe, dump_model, form_shown, parse_model
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 
 FORMS: list[tuple[dict[str, Any], Model]] = [
@@ -95,3 +95,21 @@ def test_in_words() -> None:
     assert describe(dump_model(SOPDT.of_time_constants(2.0, 4.0, 10.0, 3.0))) == "K 2, T1 10 s, T2 4 s, L 3 s"
     assert describe(dump_model(SOPDT(2.0, 4.0, 0.5, 3.0))) == "K 2, T 4 s, zeta 0.5, L 3 s"
     assert describe({"num": [2.0], "den": [10.0, 1.0], "dead_time_s": 3.0}) == "num [2], den [10, 1], dead time 3 s"
+
+
+def test_what_a_fit_has_found_is_shown_also_where_nobody_could_type_it() -> None:
+    found = dump_model(TransferFunction((1e-12, 2.0), (1e-9, 10.0, 1.0), 3.0))
+    with pytest.raises(BadModel):
+        parse_model(found)
+    assert form_shown(found).model_dump() == found
+    integrating = dump_model(Integrating(1e-30, 1e12))
+    assert form_shown(integrating).model_dump() == integrating
+
+
+@pytest.mark.parametrize(
+    "data",
+    [{"K": 1, "T1_s": 1e300, "T2_s": 1e300, "L_s": 1}, {"K": 1, "T1_s": 1e-200, "T2_s": 1e-200, "L_s": 1}],
+)
+def test_times_whose_product_no_number_holds(data: dict[str, Any]) -> None:
+    with pytest.raises(BadModel, match=r"T1_s 1e.* s is no plant's; permitted are 1e-06 to 1e\+08 s"):
+        parse_model(data)
