@@ -12,7 +12,6 @@ from loopwright.service.offline.csv_record import Record
 from loopwright.tuning.identification.identify import Identified
 from loopwright.tuning.reasons import Refused
 
-
 _IN_JSON = {"T": "T_s", "L": "L_s"}
 
 

@@ -13,7 +13,7 @@ import pytest
 from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.execution.procedures import rehearse
-from loopwright.service.security.principal import Scope
+from loopwright.service.security.keys import Scope
 from loopwright.service.store.keyring import Keyring
 from tests.unit.service.fakes import FakeLoop, Service
 from tests.unit.service.served import served
