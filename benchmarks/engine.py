@@ -17,7 +17,7 @@ from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.dbos_engine import DurableEngine
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import FastRetune, RetuneRequest
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.tuning.plan import StageDone, StageStarted
@@ -43,7 +43,7 @@ def cost(folder: Path) -> dict[str, float]:
         time.sleep(1.5)  # the engine has found its queues
         began = time.perf_counter()
         for tag in loops:
-            jobs.start(tag, RetuneRequest())
+            jobs.start(tag, FastRetune())
         asked = time.perf_counter() - began
         while store.unfinished():
             time.sleep(0.01)

@@ -1,12 +1,23 @@
-"""What may be asked of a retune, and how it combines with the loop's configuration."""
+"""What may be asked of a retune, by the method that is to do it, and how it combines with the loop's configuration."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    PrivateAttr,
+    TypeAdapter,
+    model_validator,
+)
 
 from loopwright.service.config import LoopConfig
+from loopwright.service.model_json import ModelForm
 from loopwright.service.plausible import (
     Finite,
     Gain,
@@ -15,17 +26,22 @@ from loopwright.service.plausible import (
     Positive,
     Size,
     Time,
-    check_damping,
     check_dead_time,
     check_model,
     check_option,
     check_step,
 )
-from loopwright.tuning.fast.procedure import FAST
-from loopwright.tuning.five_stage.procedure import PROCEDURE, rule_of
-from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
+from loopwright.service.validation import branch, branch_of
+from loopwright.tuning.fast.procedure import FAST, FastOptions
+from loopwright.tuning.five_stage.procedure import PROCEDURE, Options, rule_of
+from loopwright.tuning.models import FOPDT, SOPDT
 from loopwright.tuning.reasons import Refused
 from loopwright.tuning.rules.registry import METHODS
+
+if TYPE_CHECKING:
+    RuleName = str
+else:
+    RuleName = Literal[tuple(METHODS)]
 
 Percent = Annotated[float, Field(gt=0, lt=74, allow_inf_nan=False)]
 MIN_AMPLITUDE_PCT = 1e-3
@@ -36,63 +52,22 @@ class BadLimits(ValueError):
     """The limits asked for contradict each other or the loop's configuration."""
 
 
-class ProcessModel(BaseModel):
-    """K exp(-L s) / (T s + 1), or with zeta K exp(-L s) / (T^2 s^2 + 2 zeta T s + 1)."""
+class PlantModel(BaseModel):
+    """A transfer function for a dry run, coefficients by falling powers of s, deviation variables."""
 
-    model_config = ConfigDict(extra="forbid")
-
-    K: Finite = Field(description="Static gain, PV units per MV unit (percent)", examples=[0.8])
-    T_s: Time = Field(description="Time constant, s; of second order 1/(natural frequency)", examples=[3.0])
-    L_s: NotNegative = Field(description="Dead time, s", examples=[1.0])
-    zeta: Positive | None = Field(default=None, description="Damping ratio; leave out for first order", examples=[1.2])
-
-    def plant(self) -> FOPDT | SOPDT:
-        if self.zeta is None:
-            return FOPDT(self.K, self.T_s, self.L_s)
-        return SOPDT(self.K, self.T_s, self.zeta, self.L_s)
-
-    @model_validator(mode="after")
-    def _gain(self) -> Self:
-        if self.K == 0:
-            raise ValueError("K must not be 0")
-        if self.zeta is not None:
-            check_damping(self.zeta)
-        plant = self.plant()
-        check_model(plant.num, plant.den, plant.L)
-        return self
-
-
-class _Coefficients(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     num: list[Finite] = Field(min_length=1, max_length=12, description="Numerator", examples=[[3.0, 2.0]])
     den: list[Finite] = Field(min_length=1, max_length=12, description="Denominator", examples=[[3.0, 4.0, 1.0]])
     dead_time_s: NotNegative = Field(default=0.0, description="Dead time, s", examples=[1.0])
+    noise_std: Size = Field(default=0.0, description="Standard deviation of the PV noise, PV units", examples=[0.0])
+    seed: int = Field(default=1, ge=0, le=2**53, description="Seed of the noise", examples=[1])
+    sample_time_s: Time | None = Field(default=None, description="Sampling period, s", examples=[0.1])
 
     @model_validator(mode="after")
     def _plausible(self) -> Self:
         check_model(self.num, self.den, self.dead_time_s)
         return self
-
-
-class TransferModel(_Coefficients):
-    """num(s)/den(s) exp(-dead_time_s s), coefficients by falling powers of s, PV units over MV percent."""
-
-    def plant(self) -> TransferFunction:
-        return TransferFunction(tuple(self.num), tuple(self.den), self.dead_time_s)
-
-    @model_validator(mode="after")
-    def _is_one(self) -> Self:
-        self.plant()
-        return self
-
-
-class PlantModel(_Coefficients):
-    """A transfer function for a dry run, coefficients by falling powers of s, deviation variables."""
-
-    noise_std: Size = Field(default=0.0, description="Standard deviation of the PV noise, PV units", examples=[0.0])
-    seed: int = Field(default=1, ge=0, le=2**53, description="Seed of the noise", examples=[1])
-    sample_time_s: Time | None = Field(default=None, description="Sampling period, s", examples=[0.1])
 
 
 class Bounds(BaseModel):
@@ -112,25 +87,155 @@ class Bounds(BaseModel):
     )
 
 
-class FastWishes(BaseModel):
-    """Options of method fast."""
+class _Retune(Bounds):
+    """What every method may be asked."""
 
-    ms: Annotated[float, Field(ge=1.2, le=2.0, allow_inf_nan=False)] = Field(
-        default=1.6, description="fast: largest peak of the sensitivity: 1.2 robust .. 1.6 .. 2.0 fast", examples=[1.4]
+    model_config = ConfigDict(extra="forbid")
+
+    model: ModelForm | None = Field(
+        default=None,
+        description="Model for start=design or, of first or second order, for start=optimise; in a dry run without "
+        "`plant` the plant itself",
     )
-    derivative: bool = Field(default=False, description="fast: a PID, where a derivative pays")
+    verify: bool = Field(default=True, description="Record the set-point step with the new gains")
+    propose_anyway: bool = Field(
+        default=False,
+        description="Propose new gains also where nothing asked for gets better by more than 5 %; without it such a "
+        "job ends as no_gain, the present gains are kept, and the new ones are not tried on the loop",
+    )
+    dry_run: bool = Field(
+        default=False,
+        description="Rehearse in memory; the loop is not touched. On the plant given, else on the last model found on "
+        "the loop, else on a guess; the job says which",
+    )
+    plant: PlantModel | None = Field(default=None, description="Plant to rehearse on; only with dry_run")
+    requested_by: str = Field(default="api", max_length=100, description="Who asks", examples=["night shift"])
+
+    def asked(self) -> dict[str, Any]:
+        """As JSON."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+    @classmethod
+    def _foreign(cls, data: Mapping[str, Any]) -> list[str]:
+        """What another method would know, and this one does not."""
+        return [name for name in cls._of_another() if name in data]
+
+    @classmethod
+    def _of_another(cls) -> list[str]:
+        raise NotImplementedError
+
+    @classmethod
+    def _not_mine(cls, foreign: str, method: object) -> str:
+        raise NotImplementedError
+
+    @model_validator(mode="before")
+    @classmethod
+    def _own_options(cls, data: Any) -> Any:
+        """An option of another method says nothing to this one: better refused than ignored."""
+        if not isinstance(data, Mapping):
+            return data
+        foreign = cls._foreign(data)
+        if foreign:
+            given = "" if "method" in data else ', which is used unless a "method" is named'
+            told = cls._not_mine(", ".join(foreign), f"{data.get('method', FAST)}{given}")
+            raise ValueError(f"{told}; its options are {', '.join(cls.model_fields)}")
+        unknown = [str(name) for name in data if name not in cls.model_fields]
+        if unknown:
+            known = ", ".join(cls.model_fields)
+            raise ValueError(f"{', '.join(unknown)}: no option of {data.get('method', FAST)}; its options are {known}")
+        return data
+
+    @model_validator(mode="after")
+    def _rehearsed(self) -> Self:
+        if self.plant is not None and not self.dry_run:
+            raise ValueError("plant is for a dry run only")
+        return self
+
+
+class FastRetune(_Retune):
+    """A retune by one short relay record, fitted as a whole: the best gains for the Ms asked."""
+
+    method: Literal["fast"] = Field(default="fast", description="May be left out")
+    start: Literal["relay", "design"] = Field(
+        default="relay", description="Stage to enter at: design takes the model that is then typed in, without a relay"
+    )
+    baseline: bool | None = Field(
+        default=None, description="fast records no set-point step with the old gains: false, or left out"
+    )
+    ms: Annotated[float, Field(ge=1.2, le=2.0, allow_inf_nan=False)] = Field(
+        default=1.6, description="largest peak of the sensitivity: 1.2 robust .. 1.6 .. 2.0 fast", examples=[1.4]
+    )
+    derivative: bool = Field(default=False, description="a PID, where a derivative pays")
     amplitude_pct: Positive | None = Field(
         default=None,
-        description="fast: MV under the relay goes so far up, and half as far down, percent; by default half of what "
+        description="MV under the relay goes so far up, and half as far down, percent; by default half of what "
         "the limits of MV allow, adapted after the first wave",
         examples=[10.0],
     )
-    careful: bool = Field(default=False, description="fast: at least six switches of the relay, not four")
+    careful: bool = Field(default=False, description="at least six switches of the relay, not four")
+
+    _options: FastOptions = PrivateAttr()
+
+    @property
+    def options(self) -> FastOptions:
+        return self._options
+
+    @classmethod
+    def _of_another(cls) -> list[str]:
+        return [name for name in FiveStages.model_fields if name not in cls.model_fields]
+
+    @classmethod
+    def _foreign(cls, data: Mapping[str, Any]) -> list[str]:
+        return [
+            *super()._foreign(data),
+            *["baseline"] * (data.get("baseline") is True),
+            *["start"] * (data.get("start") in FIVE_STAGE_STARTS and data["start"] != "relay"),
+        ]
+
+    @classmethod
+    def _not_mine(cls, foreign: str, method: object) -> str:
+        return (
+            f"{foreign}: of the five-stage experiment, not of {method}; "
+            'add "method": "five-stage" (or a rule of GET /methods), or leave it out'
+        )
+
+    @model_validator(mode="after")
+    def _understood(self) -> Self:
+        if self.baseline:
+            raise ValueError(self._not_mine("baseline", FAST))
+        if self.start == "design" and self.model is None:
+            raise ValueError("start=design needs model")
+        if self.start == "relay" and self.model is not None and not self.dry_run:
+            raise ValueError("model is for start=design, or for a dry run: the relay finds its own")
+        try:
+            self._options = FastOptions(
+                Ms=self.ms,
+                derivative=self.derivative,
+                amplitude=self.amplitude_pct,
+                careful=self.careful,
+                verify=self.verify,
+                propose_anyway=self.propose_anyway,
+            )
+        except Refused as refused:
+            raise ValueError(refused.detail) from refused
+        return self
 
 
-class FiveStageWishes(BaseModel):
-    """Options of the five-stage experiment, which the rules of GET /methods share."""
+FIVE_STAGE_STARTS = ("relay", "zn_pi", "estimate", "optimise")
 
+
+class FiveStages(_Retune):
+    """What the five-stage experiment may be asked, whichever rule the gains are of."""
+
+    method: str
+    start: Literal["relay", "zn_pi", "estimate", "optimise"] = Field(
+        default="relay",
+        description="Stage to enter at; what earlier stages would have found is then typed in: Ku and Pu_s for zn_pi; "
+        "Kp, Ti_s and overshoot_pct for estimate; model for optimise",
+    )
+    baseline: bool | None = Field(
+        default=None, description="Record the set-point step with the old gains; by default it is recorded"
+    )
     method_options: dict[str, bool | float | str] = Field(
         default_factory=dict,
         description="Options of a method of GET /methods, by name",
@@ -165,122 +270,99 @@ class FiveStageWishes(BaseModel):
         examples=[[8.0, 50.0]],
     )
 
-
-STARTS = {"fast": ("relay", "design"), "five-stage": ("relay", "zn_pi", "estimate", "optimise")}
-
-
-class RetuneRequest(FiveStageWishes, FastWishes, Bounds):
-    """Options of a retune; what is left out comes from the loop's configuration."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    method: str = Field(
-        default=FAST,
-        description="fast: one short relay record, fitted as a whole, the best gains for the Ms asked. five-stage: the "
-        "procedure of the paper with its own optimisation. Any of GET /methods: the experiment of five-stage, gains by "
-        "that rule",
-        json_schema_extra={"enum": [FAST, PROCEDURE, *METHODS]},
-    )
-    start: Literal["relay", "zn_pi", "estimate", "optimise", "design"] = Field(
-        default="relay",
-        description="Stage to enter at; what earlier stages would have found is then typed in. fast: relay, design; "
-        "five-stage and the rules: relay, zn_pi, estimate, optimise",
-    )
-    model: ProcessModel | TransferModel | None = Field(
-        default=None,
-        description="Model for start=design, or (K, T_s, L_s) for start=optimise; in a dry run without `plant` the "
-        "plant itself",
-    )
-    baseline: bool | None = Field(
-        default=None,
-        description="Record the set-point step with the old gains: five-stage does by default; fast never does",
-    )
-    verify: bool = Field(default=True, description="Record the set-point step with the new gains")
-    propose_anyway: bool = Field(
-        default=False,
-        description="Propose new gains also where nothing asked for gets better by more than 5 %; without it such a "
-        "job ends as no_gain, the present gains are kept, and the new ones are not tried on the loop",
-    )
-    dry_run: bool = Field(
-        default=False,
-        description="Rehearse in memory; the loop is not touched. On the plant given, else on the last model found on "
-        "the loop, else on a guess; the job says which",
-    )
-    plant: PlantModel | None = Field(default=None, description="Plant to rehearse on; only with dry_run")
-    requested_by: str = Field(default="api", max_length=100, description="Who asks", examples=["night shift"])
+    _options: Options = PrivateAttr()
 
     @property
-    def fast(self) -> bool:
-        return self.method == FAST
+    def options(self) -> Options:
+        return self._options
 
-    def asked(self) -> dict[str, Any]:
-        """As JSON, without the other procedure's options."""
-        foreign = FiveStageWishes if self.fast else FastWishes
-        return self.model_dump(mode="json", exclude_none=True, exclude=set(foreign.model_fields))
+    @classmethod
+    def _of_another(cls) -> list[str]:
+        return [name for name in FastRetune.model_fields if name not in cls.model_fields]
+
+    @classmethod
+    def _foreign(cls, data: Mapping[str, Any]) -> list[str]:
+        return [*super()._foreign(data), *["start"] * (data.get("start") == "design")]
+
+    @classmethod
+    def _not_mine(cls, foreign: str, method: object) -> str:
+        return f'{foreign}: of "method": "fast", not of {method}'
 
     @model_validator(mode="after")
-    def _known_method(self) -> Self:
-        if self.fast:
-            return self
-        if self.method != PROCEDURE and self.method not in METHODS:
-            raise ValueError(f"method must be one of {FAST}, {PROCEDURE}, {', '.join(METHODS)}, not {self.method!r}")
-        if self.model_from == "record" and self.start in ("estimate", "optimise"):
-            raise ValueError(f"model_from=record needs the step of stage zn_pi; the start is {self.start}")
+    def _understood(self) -> Self:
+        model = self.model.plant() if self.model is not None else None
+        known = model if isinstance(model, FOPDT | SOPDT) else None
+        if self.start == "optimise" and model is not None and known is None:
+            raise ValueError(f"{self.method} takes a model of the form K, T_s, L_s, perhaps with zeta")
         try:
-            method = METHODS[rule_of(self.method)]
-            method.checked(self.method_options)
-            for name, value in self.method_options.items():
-                check_option(name, method.options[name].unit, value)
+            self._options = Options(
+                start=self.start,
+                Ku=self.Ku,
+                Pu_s=self.Pu_s,
+                Kp=self.Kp,
+                Ti_s=self.Ti_s,
+                overshoot_pct=self.overshoot_pct,
+                model=known,
+                k_source=self.k_source,
+                kp_step_factor=self.kp_step_factor,
+                overshoot_window_pct=self.overshoot_window_pct,
+                baseline=self.baseline is not False,
+                verify=self.verify,
+                method=self.method,
+                method_options=self.method_options,
+                model_from=self.model_from,
+                propose_anyway=self.propose_anyway,
+            )
         except Refused as refused:
             raise ValueError(refused.detail) from refused
-        return self
-
-    @model_validator(mode="after")
-    def _of_the_method(self) -> Self:
-        """Options of one procedure say nothing to the other: better refused than ignored."""
-        if self.fast:
-            foreign = _given(self, FiveStageWishes) + ["baseline"] * bool(self.baseline)
-            foreign += ["start"] * (self.start not in STARTS[FAST])
-            if foreign:
-                add = "" if "method" in self.model_fields_set else ', which is used unless a "method" is named'
-                raise ValueError(
-                    f"{', '.join(foreign)}: of the five-stage experiment, not of fast{add}; "
-                    'add "method": "five-stage" (or a rule of GET /methods), or leave it out'
-                )
-            return self
-        foreign = _given(self, FastWishes) + ["start"] * (self.start not in STARTS[PROCEDURE])
-        if foreign:
-            raise ValueError(f'{", ".join(foreign)}: of "method": "fast", not of {self.method}')
-        if self.start == "optimise" and isinstance(self.model, TransferModel):
-            raise ValueError(f"{self.method} takes a model of the form K, T_s, L_s, perhaps with zeta")
-        return self
-
-    @model_validator(mode="after")
-    def _complete(self) -> Self:
-        needed = {
-            "relay": (),
-            "zn_pi": ("Ku", "Pu_s"),
-            "estimate": ("Kp", "Ti_s", "overshoot_pct"),
-            "optimise": ("model",),
-            "design": ("model",),
-        }[self.start]
-        missing = [name for name in needed if getattr(self, name) is None]
-        if missing:
-            raise ValueError(f"start={self.start} needs {', '.join(missing)}")
-        low, high = self.overshoot_window_pct
-        if not low < high:
-            raise ValueError(f"overshoot_window_pct: {low:g} must be less than {high:g}")
-        if self.plant is not None and not self.dry_run:
-            raise ValueError("plant is for a dry run only")
-        if self.fast and self.start == "relay" and self.model is not None and not self.dry_run:
-            raise ValueError("model is for start=design, or for a dry run: the relay finds its own")
+        options = METHODS[rule_of(self.method)].options
+        for name, value in self.method_options.items():
+            check_option(name, options[name].unit, value)
         return self
 
 
-def _given(request: BaseModel, options: type[BaseModel]) -> list[str]:
-    """Those of the options that are not left at their default."""
-    fields = options.model_fields.items()
-    return [name for name, field in fields if getattr(request, name) != field.get_default(call_default_factory=True)]
+class FiveStageRetune(FiveStages):
+    """A retune by the procedure of the paper with its own optimisation."""
+
+    method: Literal["five-stage"]
+
+
+def _named(value: object) -> object:
+    if not isinstance(value, str) or value not in METHODS:
+        raise ValueError(f"method must be one of {FAST}, {PROCEDURE}, {', '.join(METHODS)}, not {value!r}")
+    return value
+
+
+class RuleRetune(FiveStages):
+    """A retune by the experiment of five-stage, with the gains of a rule of GET /methods."""
+
+    method: Annotated[RuleName, BeforeValidator(_named)] = Field(description="The rule that the gains are of")
+
+
+def by_method(fast: type, five_stage: type, rule: type) -> Discriminator:
+    """Chooses the branch of a union by the method; what is no method is for the branch of the rules to name."""
+
+    def kind(data: Any) -> str:
+        method = data.get("method", FAST) if isinstance(data, Mapping) else getattr(data, "method", FAST)
+        return branch_of(fast if method == FAST else five_stage if method == PROCEDURE else rule)
+
+    return Discriminator(kind)
+
+
+AnyRetune = FastRetune | FiveStageRetune | RuleRetune
+RetuneRequest = Annotated[
+    Annotated[FastRetune, branch(FastRetune)]
+    | Annotated[FiveStageRetune, branch(FiveStageRetune)]
+    | Annotated[RuleRetune, branch(RuleRetune)],
+    by_method(FastRetune, FiveStageRetune, RuleRetune),
+]
+"""Options of a retune; what is left out comes from the loop's configuration, and a method left out is fast."""
+_ADAPTER: TypeAdapter[AnyRetune] = TypeAdapter(RetuneRequest)
+
+
+def retune_request(**options: Any) -> AnyRetune:
+    """The request with these options, in the names and values of its JSON object. Raises pydantic.ValidationError."""
+    return _ADAPTER.validate_python(options)
 
 
 def within(loop: LoopConfig, request: RetuneRequest) -> LoopConfig:
@@ -310,7 +392,8 @@ def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[s
         if not low < high:
             problems.append(f"{name}_low {low:g} must be less than {name}_high {high:g} {unit}")
         limits[f"{name}_limits"] = allowed.model_copy(update={"low": low, "high": high})
-    mv, amplitude = limits["mv_limits"], request.amplitude_pct
+    mv = limits["mv_limits"]
+    amplitude = request.amplitude_pct if isinstance(request, FastRetune) else None
     if amplitude is not None and 1.5 * amplitude > mv.high - mv.low and not problems:
         problems.append(
             f"a relay of amplitude_pct {amplitude:g} needs {1.5 * amplitude:g} % of MV between its limits, "

@@ -34,7 +34,7 @@ from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.fleet import Fleet
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.loops.shared_reading import SharedReading
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import FastRetune, RetuneRequest
 from loopwright.service.security.principal import current
 from loopwright.service.store.idempotency import IdempotencyKeys
 from loopwright.service.store.tables import JobRow
@@ -81,6 +81,7 @@ def create_app(
         openapi_url=None,  # would make the document anew for each who asks: operations.py has it
         docs_url=None,  # would load its scripts from elsewhere
         redoc_url=None,
+        generate_unique_id_function=lambda route: route.name,  # clients that are generated name their functions so
     )
     app.router.route_class = JsonRoute
     app.add_middleware(Idempotent, keys=IdempotencyKeys(jobs.store))
@@ -140,7 +141,7 @@ def create_app(
     def retune(
         tag: Tag, request: Request, response: Response, options: Annotated[RetuneRequest | None, Body()] = None
     ) -> JobView:
-        row = jobs.start(tag, options or RetuneRequest())
+        row = jobs.start(tag, options or FastRetune())
         response.headers["Location"] = str(request.url_for("job", job_id=row.id).path)
         return view(row)
 

@@ -164,7 +164,7 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Jo
         status_code=202,
         responses=problems.responses(404, 409, 422),
     )
-    def abort(retune_id: RetuneId, decision: Annotated[Decision | None, Body()] = None) -> RetuneView:
+    def retunes_abort(retune_id: RetuneId, decision: Annotated[Decision | None, Body()] = None) -> RetuneView:
         fleet.abort(retune_id, (decision or Decision()).by)
         return _view(*fleet.get(retune_id))
 

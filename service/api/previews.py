@@ -13,7 +13,7 @@ from loopwright.service.jobs.manager import Jobs
 from loopwright.service.loop_state import loop_state
 from loopwright.service.planning.obstacles import Now
 from loopwright.service.planning.preview import FleetPreview, LastProposal, Preview, fleet_preview, preview
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import FastRetune, RetuneRequest
 from loopwright.service.store import loop_locks
 from loopwright.service.store.tables import JobRow
 from loopwright.tuning.reasons import Ended
@@ -30,8 +30,8 @@ def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
         summary="What a retune with this body would do now: moves, time, limits, and all that would refuse it",
         responses=problems.responses(404, 422, 503),
     )
-    def one(tag: Tag, options: Annotated[RetuneRequest | None, Body()] = None) -> Preview:
-        request = options or RetuneRequest()
+    def retune_preview(tag: Tag, options: Annotated[RetuneRequest | None, Body()] = None) -> Preview:
+        request = options or FastRetune()
         config, _ = jobs.directory.owner(tag)
         return preview(config, request, _now(jobs, tag, request), _last(jobs.store.last_models(tag).get(tag)))
 
@@ -41,8 +41,8 @@ def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
         summary="What a retune of many loops would do, from configuration and earlier jobs: no controller is asked",
         responses=problems.responses(422, 503),
     )
-    def many(wish: Annotated[FleetRequest, Body()]) -> FleetPreview:
-        options, busy, models = wish.options(), jobs.store.busy(), jobs.store.last_models()
+    def retune_many_preview(wish: Annotated[FleetRequest, Body()]) -> FleetPreview:
+        options, busy, models = wish.each(), jobs.store.busy(), jobs.store.last_models()
         locked = _locked(jobs)
         return fleet_preview([
             preview(

@@ -17,12 +17,13 @@ from loopwright.service.errors import Conflict, Locked, Stopping, UnknownLoop
 from loopwright.service.execution.computing.pool import NotWanted
 from loopwright.service.job_states import IllegalMove
 from loopwright.service.jobs.journal import temporary
-from loopwright.service.offline.model_json import BadModel
+from loopwright.service.model_json import BadModel
 from loopwright.service.offline.tunings import BadTuning
 from loopwright.service.request import BadLimits
 from loopwright.service.store.claims import StillAnswering
 from loopwright.service.store.damage import is_damage
 from loopwright.service.store.store import Busy, FolderInUse, NoSuchJob
+from loopwright.service.validation import place, words
 from loopwright.tuning.reasons import ADVICE, Ended, Reason
 
 MEDIA_TYPE = "application/problem+json"
@@ -78,7 +79,7 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     async def _invalid(_request: Request, error: RequestValidationError) -> JSONResponse:
         # The input itself is left out: it may be NaN, which JSON cannot say.
-        errors = [{"where": ".".join(map(str, e["loc"])), "why": e["msg"]} for e in error.errors()]
+        errors = [{"where": place(e["loc"]), "why": words(e["msg"])} for e in error.errors()]
         detail = "; ".join(f"{e['where']}: {e['why']}" for e in errors)
         return problem(422, detail, reason=Reason.BAD_INPUT, errors=errors)
 

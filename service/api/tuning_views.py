@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from loopwright.service.api.job_views import GainsView
+from loopwright.service.model_json import ModelForm, form_shown
 from loopwright.tuning.reasons import Reason
 from loopwright.tuning.rules.design import MIN_GM, MAX_Ms
+
+ShownModel = Annotated[ModelForm, BeforeValidator(form_shown)]
 
 
 class OptionView(BaseModel):
@@ -39,10 +42,8 @@ class TuningRequest(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    model: dict[str, Any] = Field(
-        description="{K, T, L}, {K, T1, T2, L}, {K, T, zeta, L}, {K, L, integrating: true} perhaps with T, or "
-        "{num, den, dead_time_s} with the highest power of s first; K in PV units per MV unit, times in s",
-        examples=[{"K": 0.8, "T": 3.0, "L": 1.0}],
+    model: ModelForm = Field(
+        description="The model, in one of five forms", examples=[{"K": 0.8, "T_s": 3.0, "L_s": 1.0}]
     )
     method: str = Field(default="all", description="One of GET /methods, or all", examples=["simc"])
     options: dict[str, Any] = Field(
@@ -113,7 +114,7 @@ class TunedView(BaseModel):
 class TuningsView(BaseModel):
     """A model and what the methods say of it."""
 
-    model: dict[str, Any] = Field(description="The model as understood", examples=[{"K": 0.8, "T": 3.0, "L": 1.0}])
+    model: ShownModel = Field(description="The model as understood", examples=[{"K": 0.8, "T_s": 3.0, "L_s": 1.0}])
     methods: list[TunedView]
     form: str = Field(description="The controller that the gains belong to")
     figures_are: str = Field(description="What margins and figures were computed with")
@@ -124,7 +125,7 @@ class AlternativeView(TunedView):
     retune: dict[str, Any] | None = Field(
         description="Body for POST /loops/{tag}/retune, which tries these gains on the loop without another "
         f"experiment; null without gains, where Ms is above {MAX_Ms:g} or GM below {MIN_GM:g}, and for a rule on a "
-        "model that is not K, T, L",
+        "model that is not K, T_s, L_s",
         examples=[
             {
                 "start": "optimise",
@@ -148,7 +149,7 @@ class AlternativesView(BaseModel):
 
     job: str = Field(examples=["4f0c2a9be113"])
     loop: str = Field(examples=["TIC-101"])
-    model: dict[str, Any] = Field(description="The job's model", examples=[{"K": 0.8, "T": 3.0, "L": 1.0}])
+    model: ShownModel = Field(description="The job's model", examples=[{"K": 0.8, "T_s": 3.0, "L_s": 1.0}])
     methods: list[AlternativeView]
     form: str = Field(description="The controller that the gains belong to")
     figures_are: str = Field(description="What margins and figures were computed with")

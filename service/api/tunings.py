@@ -18,7 +18,6 @@ from loopwright.service.jobs.alternatives import alternatives, redesigned
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.relay_record import relay_record
 from loopwright.service.offline import tunings
-from loopwright.service.offline.model_json import parse_model
 from loopwright.tuning.fast.procedure import FAST
 
 
@@ -37,7 +36,7 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
         responses=problems.responses(422),
     )
     async def tune(request: TuningRequest, http: Request) -> TuningsView:
-        work = partial(tunings.tunings, parse_model(request.model), request.method, request.options)
+        work = partial(tunings.tunings, request.model.plant(), request.method, request.options)
         return TuningsView(**await computed(pool, work, http, lambda: jobs.stopping))
 
     @routes.get(

@@ -29,7 +29,7 @@ def methods(as_json: AsJson = False) -> None:
 
 
 def tune(
-    model: Annotated[str, typer.Option(metavar="JSON|FILE", help='As {"K": 2, "T": 10, "L": 3}, or a file of it.')],
+    model: Annotated[str, typer.Option(metavar="JSON|FILE", help='As {"K": 2, "T_s": 10, "L_s": 3}, or a file of it.')],
     method: Annotated[str, typer.Option(metavar="NAME", help="One of `loopwright methods`, or all.")] = "all",
     option: Annotated[
         list[str] | None, typer.Option(metavar="NAME=VALUE", help="Of the method, as lambda_s=5; may be repeated.")
@@ -40,8 +40,8 @@ def tune(
     """Gains for a process model by one method or all, compared on it. Exit 0: gains found, 3: none."""
     # the matrices are small: threads of the linear algebra cost more than they save
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from loopwright.service.model_json import BadModel, parse_model
     from loopwright.service.offline import tunings
-    from loopwright.service.offline.model_json import BadModel, parse_model
 
     check_plot(plot)
     try:

@@ -13,7 +13,7 @@ from loopwright.service.loops.loop import Loop
 from loopwright.service.planning.facts import facts_of, time_budget_s
 from loopwright.service.planning.ground import Ground, rehearsal_spec
 from loopwright.service.planning.moves import broken_limits
-from loopwright.service.request import ProcessModel, RetuneRequest
+from loopwright.service.request import FastRetune, RetuneRequest
 from loopwright.service.store.tables import EventRow
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.settle import after_settling
@@ -124,18 +124,17 @@ def plan(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow] = ())
 
 
 def _procedure(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow]) -> Plan[Any]:
-    if request.fast:
+    if isinstance(request, FastRetune):
         from loopwright.tuning.fast.design_trial import trial
-        from loopwright.tuning.fast.procedure import FastOptions, fast
+        from loopwright.tuning.fast.procedure import fast
 
-        wishes = FastOptions(**_options(request))
         known = _known_model(request)
-        return fast(facts, wishes) if known is None else trial(facts, wishes, known)
+        return fast(facts, request.options) if known is None else trial(facts, request.options, known)
     from loopwright.service.execution.checkpoints import finished
-    from loopwright.tuning.five_stage.procedure import Options, five_stage
+    from loopwright.tuning.five_stage.procedure import five_stage
 
     done = ((event.data["stage"], event.data["result"]) for event in earlier if event.kind == "stage_done")
-    return five_stage(facts, Options(**_options(request)), finished(done))
+    return five_stage(facts, request.options, finished(done))
 
 
 def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:
@@ -146,11 +145,11 @@ def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcom
     spec, on = rehearsal_spec(config, request, hooks.ground)
     told = to_json_object(on)
     hooks.on_event(Note(f"rehearsed on {on.plant_text}; {on.gains_text}; nothing is tested on the loop"))
-    options = _options(request)
-    if request.fast:
-        options["model"] = _known_model(request)
+    known = _known_model(request) if isinstance(request, FastRetune) else None
     # A model typed in for a dry run is the plant itself; the procedure still starts where the request says.
-    answer = rehearse_spec(spec, on_event=hooks.on_event, on_samples=hooks.on_samples, **options)
+    answer = rehearse_spec(
+        spec, on_event=hooks.on_event, on_samples=hooks.on_samples, model=known, asked=request.options
+    )
     times = {name: float(value) for name, value in (answer.get("plant_time_s") or {}).items() if name != "total"}
     if answer["outcome"] in ("proposed", "no_gain"):
         return Outcome(_as_proposal(answer) | {"rehearsed_on": told}, None, None, times)
@@ -159,41 +158,9 @@ def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcom
     return Outcome({"rehearsed_on": told}, kind(reason, str(answer.get("detail") or "")), None, times)
 
 
-def _known_model(request: RetuneRequest) -> Model | None:
+def _known_model(request: FastRetune) -> Model | None:
     """What fast designs for without a relay."""
     return request.model.plant() if request.start == "design" and request.model else None
-
-
-def _options(request: RetuneRequest) -> dict[str, Any]:
-    """The request in the words of tuning.fast.procedure.FastOptions or tuning.five_stage.Options."""
-    if request.fast:
-        return {
-            "Ms": request.ms,
-            "derivative": request.derivative,
-            "amplitude": request.amplitude_pct,
-            "careful": request.careful,
-            "verify": request.verify,
-            "propose_anyway": request.propose_anyway,
-        }
-    model = request.model
-    return {
-        "start": request.start,
-        "Ku": request.Ku,
-        "Pu_s": request.Pu_s,
-        "Kp": request.Kp,
-        "Ti_s": request.Ti_s,
-        "overshoot_pct": request.overshoot_pct,
-        "model": model.plant() if isinstance(model, ProcessModel) else None,
-        "k_source": request.k_source,
-        "kp_step_factor": request.kp_step_factor,
-        "overshoot_window_pct": request.overshoot_window_pct,
-        "method": request.method,
-        "method_options": request.method_options,
-        "model_from": request.model_from,
-        "baseline": request.baseline is not False,
-        "verify": request.verify,
-        "propose_anyway": request.propose_anyway,
-    }
 
 
 def _as_proposal(answer: dict[str, Any]) -> dict[str, Any]:

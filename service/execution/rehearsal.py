@@ -32,6 +32,7 @@ from loopwright.service.plausible import (
     check_model,
     check_sampling,
 )
+from loopwright.service.validation import lines
 from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.fast.design_trial import trial
 from loopwright.tuning.fast.procedure import FAST, FAST_STAGES, FastOptions, FastProposal, fast
@@ -239,13 +240,15 @@ def rehearse(
     on_event: Callable[[Event], None] | None = None,
     on_samples: Callable[[list[Sample]], None] | None = None,
     model: Model | None = None,
+    asked: FastOptions | Options | None = None,
     **options: Any,
 ) -> dict[str, Any]:
     """Preflight to verification on a model in memory. Returns the JSON object of `loopwright rehearse`.
 
     spec: the fields of `PlantFile`.  method: "fast", "five-stage", or a rule of `tuning.rules.registry` in place of the
     fifth stage.  model: what to design for; fast then needs no relay.  options: those of
-    `tuning.fast.procedure.FastOptions`, or of `tuning.five_stage.procedure.Options`.
+    `tuning.fast.procedure.FastOptions`, or of `tuning.five_stage.procedure.Options`.  asked: the options as they are
+    then made; in place of method and options.
     A spec that cannot be used gives outcome "refused", reason "bad_input".
     """
     results: dict[str, object] = {}
@@ -262,30 +265,29 @@ def rehearse(
         outcome: RunResult[Proposal] | RunResult[FastProposal]
         watch = _watch(facts, _reach(file))
         hear = on_samples or (lambda samples: None)
-        if method == FAST:
-            wishes = FastOptions(**options)
-            plan = fast(facts, wishes) if model is None else trial(facts, wishes, model)
+        asked = asked or _asked(method, model, options)
+        if isinstance(asked, FastOptions):
+            plan = fast(facts, asked) if model is None else trial(facts, asked, model)
             outcome = run(plan, loop, watch=watch, on_event=listen, on_samples=hear)
         else:
-            entered = Options(method=method, model=_entered(model), **options)
-            outcome = run(five_stage(facts, entered), loop, watch=watch, on_event=listen, on_samples=hear)
+            outcome = run(five_stage(facts, asked), loop, watch=watch, on_event=listen, on_samples=hear)
     except ValidationError as error:
-        lines = "; ".join(map(_line, error.errors()))
-        return _answer(None, RunResult(ended=Refused(Reason.BAD_INPUT, lines)), results)
+        return _answer(None, RunResult(ended=Refused(Reason.BAD_INPUT, lines(error))), results)
     except Ended as ended:
         return _answer(None, RunResult(ended=ended), results)
-    return _answer(file, outcome, results, anyway=bool(options.get("propose_anyway")))
+    return _answer(file, outcome, results, anyway=asked.propose_anyway)
 
 
-def _line(error: Any) -> str:
-    where = ".".join(map(str, error["loc"]))
-    words = str(error["msg"]).removeprefix("Value error, ")
-    return f"{where}: {words}" if where else words
+def _asked(method: str, model: Model | None, options: dict[str, Any]) -> FastOptions | Options:
+    """Raises Refused."""
+    if method == FAST:
+        return FastOptions(**options)
+    return Options(method=method, model=_entered(model), **options)
 
 
 def _entered(model: Model | None) -> FOPDT | SOPDT | None:
     if model is not None and not isinstance(model, FOPDT | SOPDT):
-        raise Refused(Reason.BAD_INPUT, "five-stage takes a model of the form K, T, L, perhaps with zeta")
+        raise Refused(Reason.BAD_INPUT, "five-stage takes a model of the form K, T_s, L_s, perhaps with zeta")
     return model
 
 

@@ -8,9 +8,9 @@ from typing import Any
 from loopwright.service.errors import Conflict
 from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.relay_record import RelayRecord
+from loopwright.service.model_json import dump_model, parse_model
 from loopwright.service.offline.tunings import MethodResult, answer, tune_each
-from loopwright.service.planning.found_model import DISPROVED, FoundModel, found_model, model_of
-from loopwright.service.request import ProcessModel
+from loopwright.service.planning.found_model import DISPROVED, FoundModel, found_model
 from loopwright.service.store.tables import EventRow, JobRow
 from loopwright.tuning.analysis.assessment import Assessment, assess
 from loopwright.tuning.fast.design import DesignSpec
@@ -103,10 +103,16 @@ def job_model(row: JobRow, events: Sequence[EventRow]) -> FoundModel:
     """The model of the job's result, else the last that a stage found, else the one typed in; or Conflict."""
     if JobState(row.state) in ACTIVE:
         raise Conflict(f"job {row.id} is not over: it has no model to compare methods on yet")
-    model = found_model(row, events) or model_of(row.request.get("model") or {})
+    model = found_model(row, events) or _typed_in(row)
     if model is not None:
         return model
     raise Conflict(f"job {row.id} ended as {row.state} before it had a model")
+
+
+def _typed_in(row: JobRow) -> FoundModel | None:
+    asked = row.request.get("model")
+    model = parse_model(asked) if asked else None
+    return TransferFunction(model.num, model.den, model.L) if isinstance(model, Integrating) else model
 
 
 def _not_disproved(row: JobRow, reasons: Sequence[Reason]) -> None:
@@ -123,5 +129,4 @@ def _retune(found: MethodResult, model: FoundModel) -> dict[str, Any] | None:
     m = found.assessment.margins
     if not (m.stable and m.Ms <= MAX_Ms and (m.GM is None or m.GM >= MIN_GM)):
         return None
-    asked = ProcessModel(K=model.K, T_s=model.T, L_s=model.L, zeta=model.zeta if isinstance(model, SOPDT) else None)
-    return {"start": "optimise", "method": found.method.name, "model": asked.model_dump(exclude_none=True)} | ANYWAY
+    return {"start": "optimise", "method": found.method.name, "model": dump_model(model)} | ANYWAY

@@ -11,20 +11,30 @@ import threading
 from collections import Counter
 from collections.abc import Collection, Sequence
 from fnmatch import fnmatchcase
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
-from pydantic import Field, model_validator
+from pydantic import BaseModel, Field, TypeAdapter, model_validator
 from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.service.config import BusConfig, LoopConfig
 from loopwright.service.errors import Locked, Stopping, UnknownLoop
 from loopwright.service.job_states import IllegalMove
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.request import BadLimits, RetuneRequest, within
+from loopwright.service.request import (
+    AnyRetune,
+    BadLimits,
+    FastRetune,
+    FiveStageRetune,
+    RuleRetune,
+    by_method,
+    retune_request,
+    within,
+)
 from loopwright.service.store import retunes
 from loopwright.service.store.retunes import Part, RetuneOver, StopReason
 from loopwright.service.store.store import Busy, FolderInUse
 from loopwright.service.store.tables import RetuneRow
+from loopwright.service.validation import branch
 from loopwright.tuning.reasons import Reason
 
 log = logging.getLogger(__name__)
@@ -35,8 +45,8 @@ _OWN = ("loops", "pattern", "at_once_per_bus", "at_once_per_area", "stop_after_f
 AtOnce = Annotated[int, Field(ge=1, le=1000)]
 
 
-class FleetRequest(RetuneRequest):
-    """Which loops, how many of them at once, and the options of the retune of each."""
+class _Loops(BaseModel):
+    """Which loops, and how many of them at once."""
 
     loops: list[Annotated[str, Field(max_length=64)]] | None = Field(
         default=None, min_length=1, max_length=10_000, description="Tags, in the order in which they are to be begun",
@@ -65,9 +75,35 @@ class FleetRequest(RetuneRequest):
             raise ValueError("either loops or pattern must be given, and not both")
         return self
 
-    def options(self) -> RetuneRequest:
+    def each(self) -> AnyRetune:
         """What is asked of each loop."""
-        return RetuneRequest.model_validate(self.model_dump(exclude=set(_OWN), exclude_none=True))
+        return retune_request(**self.model_dump(exclude=set(_OWN), exclude_none=True))
+
+
+class FastRetunes(_Loops, FastRetune):
+    """Which loops, how many of them at once, and the options of the retune of each, by fast."""
+
+
+class FiveStageRetunes(_Loops, FiveStageRetune):
+    """Which loops, how many of them at once, and the options of the retune of each, by five-stage."""
+
+
+class RuleRetunes(_Loops, RuleRetune):
+    """Which loops, how many of them at once, and the options of the retune of each, by a rule of GET /methods."""
+
+
+FleetRequest = Annotated[
+    Annotated[FastRetunes, branch(FastRetunes)]
+    | Annotated[FiveStageRetunes, branch(FiveStageRetunes)]
+    | Annotated[RuleRetunes, branch(RuleRetunes)],
+    by_method(FastRetunes, FiveStageRetunes, RuleRetunes),
+]
+_ADAPTER: TypeAdapter[FastRetunes | FiveStageRetunes | RuleRetunes] = TypeAdapter(FleetRequest)
+
+
+def fleet_request(**options: Any) -> FleetRequest:
+    """The request with these options, in the names and values of its JSON object. Raises pydantic.ValidationError."""
+    return _ADAPTER.validate_python(options)
 
 
 class BadFleet(ValueError):
@@ -125,7 +161,7 @@ class Fleet:
         if self._jobs.stopping:
             raise Stopping(self._jobs.why_stopping)
         known = self._known()
-        tags, options, wrong = _tags(request, known), request.options(), []
+        tags, options, wrong = _tags(request, known), request.each(), []
         for tag in tags:
             try:
                 if tag not in known:
@@ -179,7 +215,7 @@ class Fleet:
                 self._one(*self.get(row.id))
 
     def _one(self, row: RetuneRow, parts: list[Part]) -> None:
-        request = FleetRequest.model_validate(row.request | {"loops": [part.loop for part in parts]} | _NO_PATTERN)
+        request = fleet_request(**row.request | {"loops": [part.loop for part in parts]} | _NO_PATTERN)
         failures = sum(part.failed for part in parts)
         if row.stop_reason is None and request.stop_after_failures and failures >= request.stop_after_failures:
             named = ", ".join(part.loop for part in parts if part.failed)
@@ -197,7 +233,7 @@ class Fleet:
 
     def _begin(self, row: RetuneRow, request: FleetRequest, parts: Sequence[Part]) -> None:
         """Begins the loops that wait, in order, as far as bus and area have room for more under test, by whomever."""
-        known, options = self._known(), request.options()
+        known, options = self._known(), request.each()
         under_test = {part.loop for part in parts if part.active}
         if not request.dry_run:
             under_test |= self._store.busy().keys()

@@ -14,7 +14,7 @@ from loopwright.service.jobs.engine import WORKFLOW_VERSION
 from loopwright.service.loop_state import state_json
 from loopwright.service.loops.loop import Loop
 from loopwright.service.loops.restoration import Restoration, look
-from loopwright.service.request import RetuneRequest, within
+from loopwright.service.request import retune_request, within
 from loopwright.service.store import loop_locks
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow
@@ -79,7 +79,7 @@ class Recovery:
         if row.attempt >= MAX_ATTEMPTS:
             return Reason.SERVICE_STOPPED, f"that was attempt {row.attempt} of at most {MAX_ATTEMPTS}"
         try:
-            within(config, RetuneRequest.model_validate(row.request))
+            within(config, retune_request(**row.request))
         except ValueError as error:  # BadLimits too
             return Reason.BAD_LIMITS, f"the loop's configuration has changed: {error}"
         return None

@@ -25,7 +25,7 @@ from loopwright.service.loops.observed_loop import ObservedLoop
 from loopwright.service.loops.restoration import restore_abandoned
 from loopwright.service.machine import Machine
 from loopwright.service.planning.known_loop import known
-from loopwright.service.request import BadLimits, RetuneRequest, within
+from loopwright.service.request import BadLimits, RetuneRequest, retune_request, within
 from loopwright.service.store import looked_after
 from loopwright.service.store.lock import FolderInUse
 from loopwright.service.store.store import NoSuchJob, Store
@@ -102,7 +102,7 @@ class Worker:
 
     def _run(self, running: Running, row: JobRow) -> Outcome:
         try:
-            request = RetuneRequest.model_validate(row.request)
+            request = retune_request(**row.request)
             config = within(self._directory.config(row.loop), request)
             run = self._dry if row.dry_run else self._live
             return run(running, row, config, request)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
 from loopwright.service.jsonable import to_jsonable
+from loopwright.service.model_json import dump_model
 from loopwright.service.offline.csv_record import Record
-from loopwright.service.offline.model_json import dump_model
 from loopwright.tuning.identification.identify import Identified
 from loopwright.tuning.reasons import Refused
+
+_IN_JSON = {"T": "T_s", "L": "L_s"}
 
 
 def identified(found: Identified, record: Record) -> dict[str, Any]:
@@ -25,8 +28,8 @@ def identified(found: Identified, record: Record) -> dict[str, Any]:
             "detail": None,
             "advice": None,
             "model": dump_model(found.model),
-            "parameters": found.parameters,
-            "standard_errors": found.standard_errors,
+            "parameters": _named(found.parameters),
+            "standard_errors": _named(found.standard_errors),
             "covariance": found.covariance.tolist(),
             "loads": [asdict(each) for each in found.loads],
             "drift": found.drift,
@@ -41,6 +44,11 @@ def identified(found: Identified, record: Record) -> dict[str, Any]:
         }
     )
     return answer
+
+
+def _named(values: Mapping[str, float]) -> dict[str, float]:
+    """Parameters by the names that they have in a model as JSON."""
+    return {_IN_JSON.get(name, name): value for name, value in values.items()}
 
 
 def refused(refusal: Refused) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from loopwright.service.jsonable import to_jsonable
-from loopwright.service.offline.model_json import dump_model
+from loopwright.service.model_json import dump_model
 from loopwright.service.plausible import Implausible, check_option
 from loopwright.tuning.analysis.assessment import Assessment
 from loopwright.tuning.analysis.step_figures import StepFigures

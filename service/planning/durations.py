@@ -6,7 +6,7 @@ ten), and the limits of time of the procedures.
 
 from __future__ import annotations
 
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import FastRetune, RetuneRequest
 from loopwright.tuning.experiments.preflight import MAX_ATTEMPTS, MIN_LISTENED_SAMPLES
 from loopwright.tuning.fast.procedure import MIN_SAMPLES
 from loopwright.tuning.fast.relay_test import MAX_PERIODS, STEP_BACK_FRACTION, VERIFICATION_PERIODS
@@ -19,15 +19,15 @@ Span = tuple[float, float]
 
 def durations(request: RetuneRequest, t95_s: float, sample_time_s: float | None, pu_s: float | None) -> dict[str, Span]:
     """The shortest and the longest time to be expected of each stage, s. pu_s: None where no model is known."""
-    minimum = MIN_SAMPLES if request.fast and request.start == "relay" else MIN_LISTENED_SAMPLES
+    minimum = MIN_SAMPLES if isinstance(request, FastRetune) and request.start == "relay" else MIN_LISTENED_SAMPLES
     look = max(0.5 * t95_s, minimum * (sample_time_s or 0.0))
     # a loop that is not at rest is given half a T95 before each further look
     listening = (look, MAX_ATTEMPTS * look + (MAX_ATTEMPTS - 1) * 0.5 * t95_s)
     low, high = (pu_s, pu_s) if pu_s else (PU_OF_T95[0] * t95_s, PU_OF_T95[1] * t95_s)
     nothing = (0.0, 0.0)
-    if request.fast and request.start == "design":
+    if isinstance(request, FastRetune) and request.start == "design":
         return {"preflight": listening, "design": nothing, "verify": (0.6 * t95_s, 11.0 * t95_s)}
-    if request.fast:
+    if isinstance(request, FastRetune):
         return {
             "preflight": listening,
             "relay": (1.8 * low, MAX_PERIODS * high),

@@ -14,7 +14,7 @@ from loopwright.service.planning.found_model import FoundModel
 from loopwright.service.request import RetuneRequest
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.models import FOPDT
+from loopwright.tuning.models import FOPDT, Model
 from loopwright.tuning.reasons import Ended
 
 TAMEST_Ms = 2.5
@@ -177,7 +177,7 @@ def _works(plant: FOPDT, gains: Gains) -> bool:
     return found.stable and found.Ms <= TAMEST_Ms
 
 
-def _plant(model: FoundModel) -> dict[str, Any]:
+def _plant(model: Model) -> dict[str, Any]:
     return {"num": list(model.num), "den": list(model.den), "dead_time_s": model.L}
 
 

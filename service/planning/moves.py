@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 from loopwright.service.config import LoopConfig
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import FastRetune, FiveStages, RetuneRequest
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.design_trial import trial_stages
 from loopwright.tuning.fast.procedure import fast_stages
@@ -46,10 +46,9 @@ class Moves:
 
 def stages_asked(request: RetuneRequest) -> tuple[str, ...]:
     """The stages of the retune, in their order."""
-    if request.fast:
+    if isinstance(request, FastRetune):
         return trial_stages(request.verify) if request.start == "design" else fast_stages(request.verify)
-    assert request.start != "design"  # the request has checked it
-    return stages_of(request.start, request.baseline is not False, request.verify)
+    return stages_of(request.start, request.options.baseline, request.verify)
 
 
 def broken_limits(config: LoopConfig, request: RetuneRequest, sp: float) -> list[str]:
@@ -65,7 +64,7 @@ def broken_limits(config: LoopConfig, request: RetuneRequest, sp: float) -> list
         return [f"the set-point {sp:.6g} {unit} is not within the PV limits {low:g} .. {high:g}"]
     stages, broken = stages_asked(request), []
     share = 1.0
-    if "zn_pi" in stages:
+    if isinstance(request, FiveStages) and "zn_pi" in stages:
         share += request.overshoot_window_pct[0] / 100.0
     if any(stage in stages for stage in _STEPPING) and sp + share * step > high + hair:
         overshoot = f" and an overshoot of {100 * (share - 1):g} % is looked for," if share > 1 else ","
@@ -73,7 +72,7 @@ def broken_limits(config: LoopConfig, request: RetuneRequest, sp: float) -> list
             f"the set-point is stepped from {sp:.6g} by up to {step:g} {unit} (sp_deviation),{overshoot} which takes "
             f"PV to {sp + share * step:.6g}, above the PV limit {high:g}: {_remedy((high - sp) / share, unit)}"
         )
-    adapted = request.fast and request.amplitude_pct is None
+    adapted = isinstance(request, FastRetune) and request.amplitude_pct is None
     if adapted and "relay" in stages and sp - step < low - hair:
         broken.append(
             f"the relay may move PV from {sp:.6g} by up to {step:g} {unit} (sp_deviation), which takes it to "
@@ -105,7 +104,6 @@ def moves(config: LoopConfig, request: RetuneRequest, before: Before) -> list[Mo
 
     Where the present gains or MV are not known, the figures are the largest that the limits leave room for.
     """
-    one = _five_stage if not request.fast else _trial if request.start == "design" else _fast
     found = []
     for stage in stages_asked(request):
         if stage == "preflight":
@@ -113,11 +111,17 @@ def moves(config: LoopConfig, request: RetuneRequest, before: Before) -> list[Mo
         elif stage in _COMPUTING:
             found.append(Moves(stage, "Nothing is moved by the test: the record is computed on."))
         else:
-            found.append(one(stage, config, request, before))
+            found.append(_moving(stage, config, request, before))
     return found
 
 
-def _fast(stage: str, config: LoopConfig, request: RetuneRequest, before: Before) -> Moves:
+def _moving(stage: str, config: LoopConfig, request: RetuneRequest, before: Before) -> Moves:
+    if not isinstance(request, FastRetune):
+        return _five_stage(stage, config, request, before)
+    return _trial(stage, config, before) if request.start == "design" else _fast(stage, config, request, before)
+
+
+def _fast(stage: str, config: LoopConfig, request: FastRetune, before: Before) -> Moves:
     low, high, step, unit = config.mv_limits.low, config.mv_limits.high, config.sp_deviation, config.pv_unit
     maximum = (high - low) / (1.0 + BIAS) if before.mv is None else max(0.0, max_amplitude(before.mv, low, high))
     given = request.amplitude_pct
@@ -144,13 +148,13 @@ def _fast(stage: str, config: LoopConfig, request: RetuneRequest, before: Before
     return Moves(stage, what, BIAS * up, up, pv=pv, first_mv=first)
 
 
-def _trial(stage: str, config: LoopConfig, request: RetuneRequest, before: Before) -> Moves:
+def _trial(stage: str, config: LoopConfig, before: Before) -> Moves:
     kick, step = KICK_OF_ROOM * _room(config, before.mv), config.sp_deviation
     what = f"The set-point is stepped up by up to {step:g} {config.pv_unit} under the new gains, on trial, and back."
     return Moves(stage, what, kick, kick, step, _UNDER_NEW_GAINS * step)
 
 
-def _five_stage(stage: str, config: LoopConfig, request: RetuneRequest, before: Before) -> Moves:
+def _five_stage(stage: str, config: LoopConfig, request: FiveStages, before: Before) -> Moves:
     room, step, unit, gains = _room(config, before.mv), config.sp_deviation, config.pv_unit, before.gains
     kick = KICK_OF_ROOM * room
     if stage == "relay":

@@ -10,7 +10,7 @@ from loopwright.service.config import LoopConfig
 from loopwright.service.loop_state import OPERATIONAL, LoopState
 from loopwright.service.planning.facts import facts_of
 from loopwright.service.planning.moves import broken_limits, stages_asked
-from loopwright.service.request import RetuneRequest, narrow
+from loopwright.service.request import FastRetune, RetuneRequest, narrow
 from loopwright.tuning.experiments.preflight import MAX_ATTEMPTS, MAX_AWAY, MAX_NOISE, MIN_ROOM
 from loopwright.tuning.fast.relay_test import BIAS, max_amplitude
 from loopwright.tuning.models import sign
@@ -106,7 +106,8 @@ def _of_mv(request: RetuneRequest, mv: float, low: float, high: float) -> list[O
     if room < minimum:
         text = f"MV {mv:.4g} leaves {room:.3g} of room within {low:.4g} .. {high:.4g}; at least {minimum:.3g} is needed"
         return [Obstacle(Reason.SATURATED, text)]
-    maximum, asked = max_amplitude(mv, low, high), request.amplitude_pct
+    maximum = max_amplitude(mv, low, high)
+    asked = request.amplitude_pct if isinstance(request, FastRetune) else None
     fits_nowhere = asked is not None and (1.0 + BIAS) * asked > high - low  # `narrow` has told that
     if asked is not None and asked > maximum and not fits_nowhere and "relay" in stages_asked(request):
         text = (

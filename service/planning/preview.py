@@ -15,7 +15,7 @@ from loopwright.service.planning.durations import Span, durations
 from loopwright.service.planning.facts import time_budget_s
 from loopwright.service.planning.moves import Before, Moves, moves
 from loopwright.service.planning.obstacles import Now, Obstacle, Occupied, obstacles
-from loopwright.service.request import RetuneRequest, narrow
+from loopwright.service.request import FiveStages, RetuneRequest, narrow
 from loopwright.tuning.gains import Gains
 
 
@@ -133,10 +133,11 @@ def preview(config: LoopConfig, request: RetuneRequest, now: Now, last: LastProp
     state = None if request.dry_run else now.state
     permitted = _permitted(narrowed, state)
     limited = narrowed.model_copy(update={"mv_limits": permitted})
-    pu_s = request.Pu_s or (last.Pu_s if last else None)
+    Ku, Pu_s = _typed_in(request)
+    pu_s = Pu_s or (last.Pu_s if last else None)
     times = durations(request, config.t95_s, state.sample_time_s if state else None, pu_s)
     mv, sp = (_finite(state.mv), _finite(state.sp)) if state else (None, None)
-    before = Before(state.gains if state else None, mv, request.Ku or (last.Ku if last else None))
+    before = Before(state.gains if state else None, mv, Ku or (last.Ku if last else None))
     moved = [] if request.dry_run else moves(limited, request, before)
     stages = [_stage(each, times[each.stage], permitted, mv, sp) for each in moved]
     in_the_way = obstacles(config, request, now)
@@ -209,11 +210,16 @@ def _budget_s(request: RetuneRequest, config: LoopConfig, state: LoopState | Non
     return time_budget_s(request.method, config.t95_s, state.sample_time_s)
 
 
+def _typed_in(request: RetuneRequest) -> tuple[float | None, float | None]:
+    """The ultimate gain and period of the request."""
+    return (request.Ku, request.Pu_s) if isinstance(request, FiveStages) else (None, None)
+
+
 def _basis(request: RetuneRequest, config: LoopConfig, last: LastProposal | None) -> str:
     if request.dry_run:
         return "a dry run takes no time of the plant"
-    if request.Pu_s:
-        return f"Pu {request.Pu_s:g} s as typed in, and T95 {config.t95_s:g} s of the configuration"
+    if (Pu_s := _typed_in(request)[1]) is not None:
+        return f"Pu {Pu_s:g} s as typed in, and T95 {config.t95_s:g} s of the configuration"
     if last is not None and last.Pu_s:
         return f"Pu {last.Pu_s:.4g} s of the model that job {last.job_id} found, and T95 {config.t95_s:g} s"
     return f"T95 {config.t95_s:g} s of the configuration alone, which leaves the loop's period open by a factor of ten"

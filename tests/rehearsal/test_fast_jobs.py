@@ -16,7 +16,7 @@ from loopwright.service.api.samples import record_columns
 from loopwright.service.config import LoopConfig, parse_site
 from loopwright.service.execution.procedures import rehearse, tune
 from loopwright.service.execution.rehearsal import RehearsedLoop
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import retune_request
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.tuning.analysis.margins import margins
@@ -59,7 +59,7 @@ def proposal(folder: Path, size: float, at_s: float, **options: Any) -> tuple[di
     store, engine = Store(folder), ThreadEngine()
     jobs = make_jobs(loops, store, open_loop, tune, rehearse, engine=engine)
     jobs.boot()
-    row = jobs.start(TAG, RetuneRequest(**{"amplitude_pct": AMPLITUDE, **options}))
+    row = jobs.start(TAG, retune_request(**{"amplitude_pct": AMPLITUDE, **options}))
     for thread in list(engine._threads.values()):
         thread.join(100)
     jobs.stop()

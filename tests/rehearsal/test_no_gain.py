@@ -19,7 +19,7 @@ from loopwright.service.execution.procedures import rehearse as dry_run
 from loopwright.service.execution.procedures import tune
 from loopwright.service.execution.rehearsal import RehearsedLoop, rehearse
 from loopwright.service.job_states import JobState
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import retune_request
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.retunes import Part
 from loopwright.service.store.store import Store
@@ -47,7 +47,7 @@ def retuned(folder: Path, present: Gains, **options: Any) -> dict[str, Any]:
     store, engine = Store(folder), ThreadEngine()
     jobs = make_jobs(loops, store, open_loop, tune, dry_run, engine=engine)
     jobs.boot()
-    row = jobs.start(TAG, RetuneRequest(**options))
+    row = jobs.start(TAG, retune_request(**options))
     for thread in list(engine._threads.values()):
         thread.join(100)
     jobs.stop()

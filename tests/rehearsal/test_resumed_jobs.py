@@ -14,7 +14,7 @@ from loopwright.service.config import parse_site
 from loopwright.service.execution.procedures import rehearse, tune
 from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import retune_request
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.tuning.experiments.preflight import SETTLE
@@ -88,12 +88,12 @@ def test_a_job_cut_off_in_a_stage_ends_as_one_that_was_not(tmp_path: Path, metho
         return row
 
     store, jobs, _ = service(tmp_path / "whole", None)
-    jobs.start(TAG, RetuneRequest(method=method))
+    jobs.start(TAG, retune_request(method=method))
     whole = finish(store, jobs)
     assert whole.state == "proposed", whole.detail
 
     store, jobs, engine = service(tmp_path / "cut", stage)
-    jobs.start(TAG, RetuneRequest(method=method))
+    jobs.start(TAG, retune_request(method=method))
     assert engine.dead.wait(60)
     assert jobs.journal.flush(10)
     jobs.stop_watching()

@@ -10,7 +10,7 @@ from loopwright.service.execution.guard import Watch
 from loopwright.service.execution.procedures import plan
 from loopwright.service.execution.runner import RunResult, run
 from loopwright.service.loops.loop import Loop
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import retune_request
 from loopwright.service.store.tables import EventRow
 from loopwright.tuning.experiments.preflight import SETTLE
 from loopwright.tuning.experiments.primitives import Facts
@@ -49,7 +49,7 @@ def _attempt(loop: Loop, facts: Facts, earlier: list[EventRow], method: str) -> 
         if isinstance(event, StageStarted):
             stages.append(event.stage)
 
-    return run(plan(RetuneRequest(method=method), facts, earlier), loop, watch=Watch(), on_event=hear), stages
+    return run(plan(retune_request(method=method), facts, earlier), loop, watch=Watch(), on_event=hear), stages
 
 
 @pytest.mark.parametrize("method", ["fast", "five-stage"])

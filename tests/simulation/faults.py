@@ -14,7 +14,8 @@ from loopwright.protocol.profile import (
     channel_ids,
     sdo_request_id,
 )
-from loopwright.service.request import ProcessModel, RetuneRequest
+from loopwright.service.model_json import FirstOrderModel
+from loopwright.service.request import RetuneRequest, retune_request
 from tests.simulation import plans
 from tests.simulation.gateway import Gateway
 from tests.simulation.history import World
@@ -474,15 +475,15 @@ def _real(world: World, request: RetuneRequest, takes_s: float) -> None:
 
 
 def real_fast(world: World) -> None:
-    _real(world, RetuneRequest(method="fast", verify=world.random.random() < 0.7), 500 * world.loop.wall_s)
+    _real(world, retune_request(method="fast", verify=world.random.random() < 0.7), 500 * world.loop.wall_s)
 
 
 def real_five_stage(world: World) -> None:
     world.time_constant, world.dead_time = 36.0, 9.0  # in samples: the procedure asks for more of them per period
-    _real(world, RetuneRequest(method="five-stage"), 6000 * world.loop.wall_s)
+    _real(world, retune_request(method="five-stage"), 6000 * world.loop.wall_s)
 
 
 def real_trial(world: World) -> None:
     Ts = world.loop.sample_time_s
-    model = ProcessModel(K=1.0, T_s=world.time_constant * Ts, L_s=world.dead_time * Ts)
-    _real(world, RetuneRequest(method="fast", start="design", model=model), 300 * world.loop.wall_s)
+    model = FirstOrderModel(K=1.0, T_s=world.time_constant * Ts, L_s=world.dead_time * Ts)
+    _real(world, retune_request(method="fast", start="design", model=model), 300 * world.loop.wall_s)

@@ -17,7 +17,7 @@ from loopwright.service.execution.procedures import Tune
 from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.loop_state import LoopState, state_json
 from loopwright.service.loops.bus_loop import BusLoop
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import retune_request
 from loopwright.service.store.tables import JobRow
 from tests.simulation import plans
 from tests.simulation.devices import Controller, PlantNode
@@ -112,7 +112,7 @@ class World:
             wire.frame_s = _BLOCKS_FRAME_S
         self.actions = plans.draw(self.random, loop.samples)
         self.tune: Tune = plans.tunes(self.actions)
-        self.request = RetuneRequest(method="fast")
+        self.request = retune_request(method="fast")
         self.pv_limits = Limits(low=20.0, high=80.0) if self.random.random() < 0.2 else Limits(low=-50.0, high=150.0)
         self.listen_s = 2.0 if self.random.random() < 0.25 else 0.0
         tick_s = 0.02 if loop.wall_s < 0.05 else 0.04 if loop.wall_s <= 0.5 else 0.1

@@ -103,10 +103,12 @@ class Options:
             "estimate": ("Kp", "Ti_s", "overshoot_pct"),
             "optimise": (),
         }
-        for name in needed[self.start]:
-            value = getattr(self, name)
-            if value is None or not math.isfinite(value) or value <= 0:
-                raise Refused(Reason.BAD_INPUT, f"entering at {self.start} needs {name}, a number > 0, not {value!r}")
+        given = {name: getattr(self, name) for name in needed[self.start]}
+        bad = {name: each for name, each in given.items() if each is None or not math.isfinite(each) or each <= 0}
+        if bad:
+            values = ", ".join(map(repr, bad.values()))
+            text = f"entering at {self.start} needs {', '.join(bad)}, numbers > 0, not {values}"
+            raise Refused(Reason.BAD_INPUT, text)
         if self.start == "optimise" and self.model is None:
             raise Refused(Reason.BAD_INPUT, "entering at optimise needs a model")
         if self.method != PROCEDURE and self.method not in METHODS:

@@ -20,7 +20,7 @@ from loopwright.service.cli.client import Client
 from loopwright.service.jobs import aftercare
 from loopwright.service.jobs.aftercare import EVERY_S, LONGEST_S, Aftercare
 from loopwright.service.loop_state import state_json
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import FastRetune
 from loopwright.service.store import audit, looked_after
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow, LoopRow
@@ -58,7 +58,7 @@ def left_by_a_job(service: Service, becomes: Callable[[FakeController], None]) -
     """A job that ends with what has become of its controller in the middle of the test."""
     service.tune.hold.clear()
     service.tune.inside.clear()
-    row = service.jobs.start(TAG, RetuneRequest())
+    row = service.jobs.start(TAG, FastRetune())
     assert service.tune.inside.wait(60)
     becomes(service.controller)
     service.tune.hold.set()
@@ -171,7 +171,7 @@ def test_a_loop_with_an_active_job_is_that_jobs(service: Service, clock: Clock) 
     service.tune.inside.clear()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(looked_after, "opened", lambda job_id, columns: lambda session: None)
-        second = service.jobs.start(TAG, RetuneRequest())
+        second = service.jobs.start(TAG, FastRetune())
         assert service.tune.inside.wait(60)
     service.jobs.aftercare.look()
     assert service.store.get(row.id).look_after and service.controller.session
@@ -181,12 +181,12 @@ def test_a_loop_with_an_active_job_is_that_jobs(service: Service, clock: Clock) 
 
 def test_a_job_that_opens_a_session_answers_for_the_loop(service: Service, clock: Clock) -> None:
     row = left_by_a_job(service, stopped)
-    refused = service.jobs.start(TAG, RetuneRequest())  # the node is still where it was
+    refused = service.jobs.start(TAG, FastRetune())  # the node is still where it was
     service.wait(refused.id)
     assert service.store.get(refused.id).state == "failed" and service.store.get(row.id).look_after
     assert not service.store.get(refused.id).look_after  # it has touched nothing
     started(service.controller)
-    second = service.jobs.start(TAG, RetuneRequest())
+    second = service.jobs.start(TAG, FastRetune())
     service.wait(second.id)
     assert service.store.get(second.id).state == "proposed" and not service.store.get(row.id).look_after
     assert second.id in told(service, row.id)[0]

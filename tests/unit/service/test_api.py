@@ -160,7 +160,7 @@ def test_absent_node(service: Service, client: TestClient) -> None:
             "bad_input",
             "five-stage takes a model of the form K, T_s, L_s",
         ),
-        ({"start": "design", "model": {"num": [1], "den": [1]}}, "bad_input", "needs a pole"),
+        ({"start": "design", "model": {"num": [1], "den": [1]}}, "bad_input", "den must have a pole"),
         ({"ms": 1.1}, "bad_input", "ms"),
         ({"ms": 2.1}, "bad_input", "ms"),
         ({"amplitude_pct": 70}, "bad_limits", "needs 105 % of MV between its limits, there are 100 %"),
@@ -266,6 +266,20 @@ def test_every_schema_has_a_name_of_its_own() -> None:
     """Two models of one name would be told apart by their modules: service__api__fleet__PartView."""
     names = json.loads(GOLDEN.read_text())["components"]["schemas"]
     assert not [name for name in names if "__" in name]
+
+
+def test_models_and_retunes_are_unions_of_named_schemas(client: TestClient) -> None:
+    schemas = client.get("/openapi.json").json()["components"]["schemas"]
+    forms = {f"#/components/schemas/{name}Model" for name in (
+        "FirstOrder", "TwoLag", "SecondOrder", "Integrating", "TransferFunction"
+    )}  # fmt: skip
+    assert {one["$ref"] for one in schemas["TuningRequest"]["properties"]["model"]["oneOf"]} == forms
+    for kind in ("FastRetune", "FiveStageRetune", "RuleRetune", "FastRetunes", "FiveStageRetunes", "RuleRetunes"):
+        union, null = schemas[kind]["properties"]["model"]["anyOf"]
+        assert {one["$ref"] for one in union["oneOf"]} == forms and null == {"type": "null"}
+        assert schemas[kind]["additionalProperties"] is False
+    time = schemas["FirstOrderModel"]["properties"]["T_s"]
+    assert (time["minimum"], time["maximum"]) == (1e-6, 1e8)
 
 
 def test_openapi_is_the_golden_one(client: TestClient) -> None:

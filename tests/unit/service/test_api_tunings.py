@@ -10,10 +10,10 @@ from fastapi.testclient import TestClient
 
 from loopwright.service.execution.procedures import rehearse
 from loopwright.service.jobs.alternatives import alternatives
-from loopwright.service.offline.model_json import parse_model
+from loopwright.service.model_json import parse_model
 from loopwright.service.offline.tunings import tunings
 from loopwright.service.planning.found_model import DISPROVED
-from loopwright.service.request import PlantModel, RetuneRequest
+from loopwright.service.request import PlantModel, retune_request
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
@@ -35,10 +35,10 @@ def test_methods(client: TestClient) -> None:
 
 
 def test_one_method(client: TestClient) -> None:
-    body = {"model": {"K": 2, "T": 10, "L": 8}, "method": "simc", "options": {"tau_c_s": 4}}
+    body = {"model": {"K": 2, "T_s": 10, "L_s": 8}, "method": "simc", "options": {"tau_c_s": 4}}
     found = client.post("/tunings", json=body).json()
     (simc,) = found["methods"]
-    assert found["model"] == {"K": 2.0, "T": 10.0, "L": 8.0}
+    assert found["model"] == {"K": 2.0, "T_s": 10.0, "L_s": 8.0}
     assert simc["outcome"] == "tuned" and simc["gains"]["form"] == "ISA"
     # k e^(-Ls)/s is left, k = 1/12
     assert simc["gains"]["Kp"] == pytest.approx(5.0 / 12.0) and simc["gains"]["Ti"] == 10.0
@@ -46,7 +46,7 @@ def test_one_method(client: TestClient) -> None:
 
 
 def test_all_methods_as_the_command_line_has_them(client: TestClient) -> None:
-    body = {"model": {"K": 0.1, "L": 3, "integrating": True}}
+    body = {"model": {"K": 0.1, "L_s": 3, "integrating": True}}
     answer = client.post("/tunings", json=body)
     assert answer.status_code == 200
     assert answer.json() == tunings(parse_model(body["model"]))
@@ -55,7 +55,7 @@ def test_all_methods_as_the_command_line_has_them(client: TestClient) -> None:
 
 
 def test_a_refusal_is_an_answer(client: TestClient) -> None:
-    body = {"model": {"K": 0.1, "L": 3, "integrating": True}, "method": "robust"}
+    body = {"model": {"K": 0.1, "L_s": 3, "integrating": True}, "method": "robust"}
     (found,) = client.post("/tunings", json=body).json()["methods"]
     assert (found["outcome"], found["reason"], found["gains"]) == ("refused", "not_self_regulating", None)
     assert found["advice"]
@@ -66,13 +66,13 @@ def test_a_refusal_is_an_answer(client: TestClient) -> None:
     [
         ({}, "model"),
         ({"model": 1}, "model"),
-        ({"model": {"K": 2}}, "T, L: missing"),
-        ({"model": {"K": 2, "T": -1, "L": 0}}, "T must be a number > 0 (s), not -1"),
-        ({"model": {"K": 2, "T": 1, "L": 1}, "method": "magic"}, "method must be one of"),
-        ({"model": {"K": 2, "T": 1, "L": 1}, "method": "simc", "options": {"Ms": 1}}, "no option 'Ms'"),
-        ({"model": {"K": 2, "T": 1, "L": 1}, "options": {"tau_c_s": "fast"}}, "tau_c_s must be"),
-        ({"model": {"K": 2, "T": 1, "L": 1}, "options": {"tau_c_s": [1]}}, "tau_c_s must be"),
-        ({"model": {"K": 2, "T": 1, "L": 1}, "surplus": 1}, "surplus"),
+        ({"model": {"K": 2}}, "T_s, L_s: missing"),
+        ({"model": {"K": 2, "T_s": -1, "L_s": 0}}, "T_s must be a number > 0 (s), not -1"),
+        ({"model": {"K": 2, "T_s": 1, "L_s": 1}, "method": "magic"}, "method must be one of"),
+        ({"model": {"K": 2, "T_s": 1, "L_s": 1}, "method": "simc", "options": {"Ms": 1}}, "no option 'Ms'"),
+        ({"model": {"K": 2, "T_s": 1, "L_s": 1}, "options": {"tau_c_s": "fast"}}, "tau_c_s must be"),
+        ({"model": {"K": 2, "T_s": 1, "L_s": 1}, "options": {"tau_c_s": [1]}}, "tau_c_s must be"),
+        ({"model": {"K": 2, "T_s": 1, "L_s": 1}, "surplus": 1}, "surplus"),
     ],
 )
 def test_bad_requests(client: TestClient, body: dict[str, Any], words: str) -> None:
@@ -81,7 +81,7 @@ def test_bad_requests(client: TestClient, body: dict[str, Any], words: str) -> N
 
 
 def test_nan_is_a_problem(client: TestClient) -> None:
-    text = '{"model": {"K": NaN, "T": 1, "L": 1}}'
+    text = '{"model": {"K": NaN, "T_s": 1, "L_s": 1}}'
     answer = client.post("/tunings", content=text, headers={"content-type": "application/json"})
     assert "body.model.K: NaN" in assert_problem(answer, 422)["detail"]
 
@@ -91,7 +91,7 @@ def test_alternatives_to_a_proposal(service: Service, client: TestClient) -> Non
     found = client.get(f"{job['url']}/alternatives").json()
     assert (found["job"], found["loop"]) == (job["id"], job["loop"])
     # the job's model, in the form that POST /tunings takes
-    assert found["model"] == {"K": 2.0, "T": 3.0, "L": 1.0}
+    assert found["model"] == {"K": 2.0, "T_s": 3.0, "L_s": 1.0}
     assert [each["method"] for each in found["methods"]] == FAST
     tried = {each["method"] for each in found["methods"] if each["retune"]}
     assert {"simc", "amigo", "robust"} <= tried < set(FAST)
@@ -104,7 +104,7 @@ def test_alternatives_to_a_proposal(service: Service, client: TestClient) -> Non
         except Refused as refused:
             assert refused.reason is Reason.NOT_ROBUST and each["retune"] is None
         else:
-            asked = RetuneRequest(**each["retune"])
+            asked = retune_request(**each["retune"])
             assert asked.start == "optimise" and asked.method == each["method"]
             assert asked.model and asked.model.plant() == FOPDT(2.0, 3.0, 1.0)
     direct = client.post("/tunings", json={"model": found["model"], "method": "amigo"}).json()["methods"][0]
@@ -144,7 +144,7 @@ def test_a_second_order_model(service: Service, client: TestClient, monkeypatch:
     job = finished(service, client)
     found = client.get(f"{job['url']}/alternatives?method=direct-synthesis").json()
     assert parse_model(found["model"]) == SOPDT(2.0, 6.0, 0.5, 3.0)
-    asked = RetuneRequest(**found["methods"][0]["retune"])
+    asked = retune_request(**found["methods"][0]["retune"])
     assert asked.model and asked.model.plant() == SOPDT(2.0, 6.0, 0.5, 3.0)
 
 
@@ -157,7 +157,7 @@ def test_a_refused_job_whose_stages_found_a_model(service: Service, client: Test
         service.store.append(job["id"], "stage_done", {"stage": "estimate", "result": result}, 1.0)
     service.store.append(job["id"], "stage_done", {"stage": "optimise", "result": None}, 1.0)
     found = client.get(f"{job['url']}/alternatives?method=simc").json()
-    assert job["state"] == "refused" and found["model"] == {"K": 2.0, "T": 3.0, "L": 1.0}
+    assert job["state"] == "refused" and found["model"] == {"K": 2.0, "T_s": 3.0, "L_s": 1.0}
 
 
 @pytest.mark.parametrize("reason", DISPROVED)
@@ -178,7 +178,7 @@ def test_a_refused_job_whose_model_was_typed_in(service: Service, client: TestCl
     model = {"K": 2.0, "T_s": 6.0, "L_s": 3.0, "zeta": 0.5}
     job = finished(service, client, method="five-stage", start="optimise", model=model)
     found = client.get(f"{job['url']}/alternatives?method=direct-synthesis").json()
-    assert job["state"] == "refused" and found["model"] == {"K": 2.0, "T": 6.0, "zeta": 0.5, "L": 3.0}
+    assert job["state"] == "refused" and found["model"] == {"K": 2.0, "T_s": 6.0, "zeta": 0.5, "L_s": 3.0}
 
 
 @pytest.mark.parametrize(("Ms", "derivative"), [(1.2, False), (1.4, True), (2.0, False)])
@@ -194,7 +194,7 @@ def test_gains_of_fast_for_another_Ms(service: Service, client: TestClient, Ms: 
     assert margins(FOPDT(2.0, 3.0, 1.05), gains).Ms == pytest.approx(Ms, abs=0.01)
     assert fast["margins"]["Ms"] == pytest.approx(Ms, abs=0.01) and fast["setpoint"]["IAE"] > 0
     assert (gains.Td > 0) == derivative
-    asked = RetuneRequest(**fast["retune"])
+    asked = retune_request(**fast["retune"])
     assert (asked.method, asked.start, asked.ms, asked.derivative) == ("fast", "design", Ms, derivative)
     assert asked.model is not None
     plant = asked.model.plant()
@@ -215,7 +215,7 @@ def test_another_Ms_from_the_record_of_a_job(service: Service, client: TestClien
     jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
     plant = {"num": [1.0], "den": [8.0, 6.0, 1.0], "dead_time_s": 1.0, "noise_std": 0.02, "sample_time_s": 0.1}
     rows = [
-        jobs.start(TAG, RetuneRequest(dry_run=True, plant=PlantModel(**plant), ms=ms, verify=False))
+        jobs.start(TAG, retune_request(dry_run=True, plant=PlantModel(**plant), ms=ms, verify=False))
         for ms in (1.4, 1.6)
     ]
     for row in rows:

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from loopwright.service.cli import main as cli
 from loopwright.service.job_states import JobState
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import FastRetune
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.backup import BackupProblem, back_up, restore
 from loopwright.service.store.keyring import Keyring
@@ -31,7 +31,7 @@ def data(tmp_path: Path) -> Path:
 def filled(data: Path) -> tuple[str, str, str]:
     """A finished job, a queued one, and a key, in a folder whose service is gone."""
     service = Service(data)
-    job = service.jobs.start(TAG, RetuneRequest())
+    job = service.jobs.start(TAG, FastRetune())
     service.wait(job.id)
     _, key = Keyring(service.store.engine).create("a", Scope.READ)
     service.close()

@@ -14,7 +14,7 @@ from loopwright.service.api.app import create_app
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.gate.bodies import SMALL
 from loopwright.service.api.gate.places import DECIDES, kind_of
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import FastRetune
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from tests.unit.service.fakes import TAG, FakeController, FakeLoop, FakeTune, Service, ThreadEngine, fake_rehearse
@@ -70,7 +70,7 @@ def test_what_is_no_body_is_422_everywhere(client: TestClient, url: str, body: b
 
 
 def test_a_body_with_a_byte_order_mark_is_read(client: TestClient) -> None:
-    body = b"\xef\xbb\xbf" + json.dumps({"model": {"K": 1.0, "T": 3.0, "L": 1.0}, "method": "simc"}).encode()
+    body = b"\xef\xbb\xbf" + json.dumps({"model": {"K": 1.0, "T_s": 3.0, "L_s": 1.0}, "method": "simc"}).encode()
     assert client.post("/tunings", content=body, headers=JSON).status_code == 200
 
 
@@ -84,7 +84,7 @@ def test_a_body_that_is_not_said_to_be_json(client: TestClient, kind: str) -> No
 @pytest.mark.parametrize("what", ["event", "/jobs?limit=", "/jobs?cursor=", "/retunes?cursor=", "/audit?before="])
 def test_whole_numbers_out_of_all_bounds(client: TestClient, service: Service, number: str, what: str) -> None:
     if what == "event":
-        job = service.jobs.start(TAG, RetuneRequest()).id
+        job = service.jobs.start(TAG, FastRetune()).id
         service.wait(job)
         headers = {"Last-Event-ID": number.encode()}
         answer = client.get(f"/jobs/{job}/events", headers=headers)
@@ -94,7 +94,7 @@ def test_whole_numbers_out_of_all_bounds(client: TestClient, service: Service, n
 
 
 def test_the_last_event_there_can_be(client: TestClient, service: Service) -> None:
-    job = service.jobs.start(TAG, RetuneRequest()).id
+    job = service.jobs.start(TAG, FastRetune()).id
     service.wait(job)
     assert client.get(f"/jobs/{job}/events", headers={"Last-Event-ID": str(2**53)}).status_code == 204
 

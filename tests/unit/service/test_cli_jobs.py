@@ -169,9 +169,9 @@ def rehearsed(service: Service, through: Through) -> str:
     from loopwright.service.execution.procedures import rehearse
 
     jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
-    from loopwright.service.request import PlantModel, RetuneRequest
+    from loopwright.service.request import PlantModel, retune_request
 
-    row = jobs.start(TAG, RetuneRequest(dry_run=True, plant=PlantModel(**PLANT)))
+    row = jobs.start(TAG, retune_request(dry_run=True, plant=PlantModel(**PLANT)))
     service.wait(row.id, 60)
     jobs.stop()
     assert service.store.get(row.id).state == "rehearsed", service.store.get(row.id).detail

@@ -19,11 +19,11 @@ from loopwright.tuning.reasons import Reason
 from loopwright.tuning.rules.registry import METHODS
 
 MODELS = {
-    "lag-dominant": '{"K": 2, "T": 50, "L": 2}',
-    "balanced": '{"K": 2, "T": 10, "L": 8}',
-    "delay-dominant": '{"K": 1, "T": 2, "L": 10}',
-    "second-order": '{"K": 2, "T1": 10, "T2": 4, "L": 3}',
-    "integrating": '{"K": 0.1, "L": 3, "integrating": true}',
+    "lag-dominant": '{"K": 2, "T_s": 50, "L_s": 2}',
+    "balanced": '{"K": 2, "T_s": 10, "L_s": 8}',
+    "delay-dominant": '{"K": 1, "T_s": 2, "L_s": 10}',
+    "second-order": '{"K": 2, "T1_s": 10, "T2_s": 4, "L_s": 3}',
+    "integrating": '{"K": 0.1, "L_s": 3, "integrating": true}',
     "inverse-response": '{"num": [-2, 1], "den": [15, 8, 1], "dead_time_s": 1}',
 }
 SELF_REGULATING_ONLY = {"cohen-coon", "chr", "kappa-tau", "direct-synthesis", "robust"}
@@ -88,7 +88,7 @@ def test_one_method_by_its_equation() -> None:
     # pole and zero cancel: the loop is k e^(-Ls)/s with k = 1/12, of known margins
     assert simc["margins"]["GM"] == pytest.approx(math.pi / 2 * 12.0 / 8.0, rel=1e-6)
     assert simc["margins"]["PM_deg"] == pytest.approx(90.0 - math.degrees(8.0 / 12.0), rel=1e-6)
-    assert found["model"] == {"K": 2.0, "T": 10.0, "L": 8.0}
+    assert found["model"] == {"K": 2.0, "T_s": 10.0, "L_s": 8.0}
     assert found["units"]["Kp"] == "MV per PV unit" and "ISA" in found["form"] and "filter" in found["figures_are"]
 
 
@@ -119,7 +119,7 @@ def test_a_model_from_a_plant_file(tmp_path: Path) -> None:
     file.write_text('{"name": "heater", "num": [0.8], "den": [13, 1], "dead_time_s": 2, "noise_std": 0.002}')
     found = answer("tune", "--model", str(file), "--method", "amigo")
     assert found["model"] == {"num": [0.8], "den": [13.0, 1.0], "dead_time_s": 2.0}
-    assert found["methods"] == answer("tune", "--model", '{"K":0.8,"T":13,"L":2}', "--method", "amigo")["methods"]
+    assert found["methods"] == answer("tune", "--model", '{"K":0.8,"T_s":13,"L_s":2}', "--method", "amigo")["methods"]
 
 
 def test_an_unstable_loop_is_said_to_be_one() -> None:
@@ -161,10 +161,10 @@ def test_exit_status_3_when_no_method_gave_gains() -> None:
     ("arguments", "words"),
     [
         (["--model", "{"], "--model: not JSON"),
-        (["--model", '{"K": 2}'], "T, L: missing"),
-        (["--model", '{"K": NaN, "T": 1, "L": 1}'], "--model: K: NaN, Infinity and what is beyond"),
-        (["--model", '{"K": 2, "T": -1, "L": 1}'], "T must be a number > 0 (s), not -1"),
-        (["--model", '{"K": 2, "T": 1, "L": 1, "x": 1}'], "x: not a quantity"),
+        (["--model", '{"K": 2}'], "T_s, L_s: missing"),
+        (["--model", '{"K": NaN, "T_s": 1, "L_s": 1}'], "--model: K: NaN, Infinity and what is beyond"),
+        (["--model", '{"K": 2, "T_s": -1, "L_s": 1}'], "T_s must be a number > 0 (s), not -1"),
+        (["--model", '{"K": 2, "T_s": 1, "L_s": 1, "x": 1}'], "x: not a quantity"),
         (["--model", "/nowhere/plant.json"], "No such file"),
         (["--model", "[1]"], "--model: expected one JSON object"),
         (["--model", MODELS["balanced"], "--method", "magic"], "method must be one of zn-ultimate"),
@@ -223,7 +223,7 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_identify_finds_the_plant(record: Path, tmp_path: Path) -> None:
     picture = tmp_path / "fit.png"
     found = answer("identify", str(record), "--plot", str(picture))
-    truth = {"K": 2.0, "T": math.sqrt(40.0), "zeta": 14.0 / (2.0 * math.sqrt(40.0)), "L": 3.0}
+    truth = {"K": 2.0, "T_s": math.sqrt(40.0), "zeta": 14.0 / (2.0 * math.sqrt(40.0)), "L_s": 3.0}
     for name, value in truth.items():
         assert abs(found["model"][name] - value) < 4.0 * found["standard_errors"][name]
         assert found["standard_errors"][name] < 0.02 * value

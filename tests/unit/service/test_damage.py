@@ -21,7 +21,7 @@ from loopwright.service.api.app import create_app
 from loopwright.service.cli import main as cli
 from loopwright.service.job_states import JobState
 from loopwright.service.jobs.dbos_engine import DurableEngine
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import FastRetune
 from loopwright.service.store.damage import FileCheck, Log, read_log
 from loopwright.service.store.database import ENGINE_FILE, FILE, BadDatabase
 from loopwright.service.store.store import Store, event_of
@@ -206,7 +206,7 @@ def database(client: TestClient) -> Any:
 def in_the_middle(service: Service) -> str:
     """A job whose loop is on trial gains."""
     service.tune.hold.clear()
-    job_id = service.jobs.start(TAG, RetuneRequest()).id
+    job_id = service.jobs.start(TAG, FastRetune()).id
     assert service.tune.inside.wait(20)
     until(lambda: service.controller.state.on_trial)
     return job_id

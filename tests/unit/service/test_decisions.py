@@ -13,7 +13,7 @@ from sqlalchemy.exc import OperationalError
 from loopwright.service.errors import Conflict
 from loopwright.service.job_states import IllegalMove, JobState
 from loopwright.service.loop_state import LoopState
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import FastRetune
 from loopwright.service.store import audit
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Failed, Reason
@@ -28,7 +28,7 @@ def full(*_: Any, **__: Any) -> None:
 
 
 def proposed(service: Service) -> str:
-    row = service.jobs.start(TAG, RetuneRequest())
+    row = service.jobs.start(TAG, FastRetune())
     service.wait(row.id)
     assert service.store.get(row.id).state == "proposed"
     return row.id

@@ -15,9 +15,10 @@ from loopwright.service.api.metrics import exposition, registry
 from loopwright.service.cli import job_tables
 from loopwright.service.execution.procedures import Hooks, rehearse
 from loopwright.service.job_states import JobState
+from loopwright.service.model_json import TransferFunctionModel
 from loopwright.service.planning.found_model import DISPROVED
 from loopwright.service.planning.ground import GainsSource, Ground, LastModel, PlantSource, rehearsal_spec
-from loopwright.service.request import PlantModel, RetuneRequest, TransferModel
+from loopwright.service.request import FastRetune, PlantModel, retune_request
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT
@@ -37,7 +38,7 @@ def ground_with(service: Service, **changes: Any) -> Ground:
 def dry_run(service: Service, **options: Any) -> JobView:
     """A dry run of the real procedure, to its end."""
     jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
-    row = jobs.start(TAG, RetuneRequest(**QUICK | options))
+    row = jobs.start(TAG, retune_request(**QUICK | options))
     service.wait(row.id, 60)
     jobs.stop()
     return shown(service, row.id)
@@ -49,7 +50,7 @@ def shown(service: Service, job_id: str) -> JobView:
 
 def proposed(service: Service) -> str:
     """The id of a live job that has proposed."""
-    row = service.jobs.start(TAG, RetuneRequest())
+    row = service.jobs.start(TAG, FastRetune())
     service.wait(row.id)
     assert service.store.get(row.id).state == "proposed"
     return row.id
@@ -57,12 +58,12 @@ def proposed(service: Service) -> str:
 
 def test_the_plant_given_comes_before_the_last_model_and_that_before_a_guess(service: Service) -> None:
     config, known = service.loops[TAG], ground_with(service)
-    model = TransferModel(num=[3.0], den=[5.0, 1.0], dead_time_s=2.0)
+    model = TransferFunctionModel(num=[3.0], den=[5.0, 1.0], dead_time_s=2.0)
     for request, ground, source, num in (
-        (RetuneRequest(dry_run=True, plant=PLANT), known, PlantSource.GIVEN, (0.2,)),
-        (RetuneRequest(dry_run=True, model=model), known, PlantSource.GIVEN, (3.0,)),
-        (RetuneRequest(dry_run=True), known, PlantSource.LAST_MODEL, (2.0,)),
-        (RetuneRequest(dry_run=True), Ground(), PlantSource.GUESSED, (0.2,)),
+        (retune_request(dry_run=True, plant=PLANT), known, PlantSource.GIVEN, (0.2,)),
+        (retune_request(dry_run=True, model=model), known, PlantSource.GIVEN, (3.0,)),
+        (retune_request(dry_run=True), known, PlantSource.LAST_MODEL, (2.0,)),
+        (retune_request(dry_run=True), Ground(), PlantSource.GUESSED, (0.2,)),
     ):
         spec, on = rehearsal_spec(config, request, ground)
         assert (on.plant_source, on.num, tuple(spec["num"])) == (source, num, num)
@@ -73,7 +74,7 @@ def test_the_plant_given_comes_before_the_last_model_and_that_before_a_guess(ser
 
 def test_a_guess_fits_the_configuration_of_the_loop(service: Service) -> None:
     config = service.loops[TAG]
-    spec, on = rehearsal_spec(config, RetuneRequest(dry_run=True), Ground())
+    spec, on = rehearsal_spec(config, retune_request(dry_run=True), Ground())
     time_constant, dead_time = spec["den"][0], spec["dead_time_s"]
     assert dead_time + 3 * time_constant == pytest.approx(config.t95_s)
     assert spec["num"][0] * 10.0 == pytest.approx(config.sp_deviation)
@@ -84,7 +85,7 @@ def test_a_guess_fits_the_configuration_of_the_loop(service: Service) -> None:
 
 def test_the_controller_gives_gains_sample_time_limits_and_action(service: Service) -> None:
     ground = ground_with(service, gains=Gains(0.4, 3.0, 0.5, 0.1, 0.7), sample_time_s=0.05, mv_low=20.0, mv_high=80.0)
-    spec, on = rehearsal_spec(service.loops[TAG], RetuneRequest(dry_run=True), ground)
+    spec, on = rehearsal_spec(service.loops[TAG], retune_request(dry_run=True), ground)
     assert spec["gains"] == {"Kp": 0.4, "Ti": 3.0, "Td": 0.5, "Tf": 0.1, "b": 0.7, "c": 0.0}
     assert (spec["sample_time_s"], spec["mv_limits"], spec["reverse_acting"]) == (0.05, [-30.0, 30.0], True)
     assert on.gains_source is GainsSource.CONTROLLER
@@ -93,7 +94,7 @@ def test_the_controller_gives_gains_sample_time_limits_and_action(service: Servi
 @pytest.mark.parametrize("reverse", [True, False])
 def test_a_guessed_plant_is_one_on_which_the_present_gains_work(service: Service, reverse: bool) -> None:
     ground = replace(ground_with(service, gains=Gains(400.0, 2.0), reverse_acting=reverse), last_model=None)
-    spec, on = rehearsal_spec(service.loops[TAG], RetuneRequest(dry_run=True), ground)
+    spec, on = rehearsal_spec(service.loops[TAG], retune_request(dry_run=True), ground)
     plant = FOPDT(spec["num"][0], spec["den"][0], spec["dead_time_s"])
     assert margins(plant, Gains(400.0, 2.0)).stable and (plant.K > 0.0) == reverse
     assert "the present gains are stable on it" in on.plant_text
@@ -117,7 +118,7 @@ def test_a_dry_run_takes_the_model_that_the_last_job_found_and_the_gains_of_the_
 def test_neither_a_dry_run_nor_a_model_that_was_disproved_or_typed_in_is_the_last_model(service: Service) -> None:
     dry_run(service, plant=PLANT)
     service.tune.ends = Refused(DISPROVED[1], "made up")
-    service.wait(service.jobs.start(TAG, RetuneRequest()).id)
+    service.wait(service.jobs.start(TAG, FastRetune()).id)
     typed_in = service.store.create(TAG, {}, "me", False)
     result = RESULT | {"model": {"structure": "typed in", "num": [9.0], "den": [1.0, 1.0], "dead_time_s": 1.0}}
     service.store.move(typed_in.id, JobState.RUNNING)
@@ -152,10 +153,10 @@ def test_then_the_gains_are_those_that_the_last_job_left(service: Service) -> No
 def test_beside_a_test_the_gains_are_those_from_before_it(tmp_path: Path) -> None:
     service = Service(tmp_path, rehearse=rehearse)  # one service: another one's start would go on with the test
     service.tune.hold.clear()
-    live = service.jobs.start(TAG, RetuneRequest())
+    live = service.jobs.start(TAG, FastRetune())
     assert service.tune.inside.wait(60)
     assert service.controller.state.gains == NEW and service.controller.state.on_trial
-    row = service.jobs.start(TAG, RetuneRequest(**QUICK))
+    row = service.jobs.start(TAG, retune_request(**QUICK))
     service.wait(row.id, 60)
     view = shown(service, row.id)
     assert view.old_gains is not None and view.old_gains.Kp == OLD.Kp
@@ -189,7 +190,7 @@ def test_an_extreme_one_is_refused_by_name(
 ) -> None:
     """What the request itself shows is refused at the edge (test_plausible); this is what shows later."""
     config = service.loops[TAG].model_copy(update=changes)
-    request = RetuneRequest(dry_run=True, plant=PlantModel(**options) if options else None)
+    request = retune_request(dry_run=True, plant=PlantModel(**options) if options else None)
     quiet = Hooks(lambda event: None, lambda samples: None, lambda: None)
     ended = rehearse(config, request, quiet).ended
     assert ended is not None and ended.reason is Reason.BAD_INPUT and words in ended.detail, ended
@@ -197,7 +198,7 @@ def test_an_extreme_one_is_refused_by_name(
 
 def test_a_sample_time_too_short_for_a_rehearsal_is_replaced_and_that_is_said(service: Service) -> None:
     config = service.loops[TAG].model_copy(update={"t95_s": 30_000.0})
-    spec, on = rehearsal_spec(config, RetuneRequest(dry_run=True), ground_with(service))
+    spec, on = rehearsal_spec(config, retune_request(dry_run=True), ground_with(service))
     assert "sample_time_s" not in spec and "its sample time, 0.1 s, is too short beside T95" in on.gains_text
 
 

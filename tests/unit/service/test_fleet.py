@@ -15,9 +15,9 @@ from loopwright.service.api.app import create_app
 from loopwright.service.cli.client import Client
 from loopwright.service.config import BusConfig, parse_site
 from loopwright.service.job_states import JobState
-from loopwright.service.jobs.fleet import BadFleet, Fleet, FleetRequest
+from loopwright.service.jobs.fleet import BadFleet, Fleet, FleetRequest, fleet_request
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import FastRetune, retune_request
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store import audit
 from loopwright.service.store.retunes import NoSuchRetune, Part, RetuneOver
@@ -87,7 +87,7 @@ def plant(tmp_path: Path) -> Iterator[Plant]:
 
 
 def asked(**options: Any) -> FleetRequest:
-    return FleetRequest.model_validate(options)
+    return fleet_request(**options)
 
 
 def test_every_loop_gets_its_turn_and_no_bus_or_area_has_more_than_permitted(plant: Plant) -> None:
@@ -116,7 +116,7 @@ def test_every_loop_gets_its_turn_and_no_bus_or_area_has_more_than_permitted(pla
 
 def test_an_area_counts_over_its_buses_and_with_jobs_of_others(plant: Plant) -> None:
     plant.hold()
-    plant.jobs.start("B-3", RetuneRequest())
+    plant.jobs.start("B-3", FastRetune())
     plant.fleet.start(asked(pattern="B-*", at_once_per_area=2))
     plant.fleet.look()
     assert plant.running() == ["B-1", "B-3"]
@@ -141,7 +141,7 @@ def test_loops_are_begun_in_the_order_given_and_once(plant: Plant) -> None:
 
 def test_a_busy_loop_is_waited_for(plant: Plant) -> None:
     plant.hold()
-    other = plant.jobs.start("A-1", RetuneRequest())
+    other = plant.jobs.start("A-1", FastRetune())
     retune = plant.fleet.start(asked(loops=["A-1", "A-2"])).id
     plant.fleet.look()
     assert plant.parts(retune)["A-1"].waiting and plant.running() == ["A-1", "A-2"]
@@ -284,7 +284,7 @@ def test_a_loop_that_is_gone_at_the_next_start_is_said_so_and_counts_as_failed(p
 
 def test_a_dry_run_of_many(plant: Plant) -> None:
     plant.hold()
-    plant.jobs.start("A-1", RetuneRequest())
+    plant.jobs.start("A-1", FastRetune())
     retune = plant.fleet.start(asked(pattern="A-*", dry_run=True)).id
     for _ in range(5):
         plant.fleet.look()
@@ -382,13 +382,13 @@ def test_loops_by_state(plant: Plant, client: TestClient) -> None:
     def tags(state: str) -> list[str]:
         return [loop["tag"] for loop in client.get("/loops", params={"state": state}).json()]
 
-    plant.wait(plant.jobs.start("A-1", RetuneRequest()).id)
+    plant.wait(plant.jobs.start("A-1", FastRetune()).id)
     plant.tune.ends = Failed(Reason.NODE_LOST, "silent")
-    plant.wait(plant.jobs.start("A-2", RetuneRequest()).id)
-    plant.wait(plant.jobs.start("A-2", RetuneRequest(dry_run=True)).id)  # does not count
+    plant.wait(plant.jobs.start("A-2", FastRetune()).id)
+    plant.wait(plant.jobs.start("A-2", retune_request(dry_run=True)).id)  # does not count
     plant.hold()
     plant.tune.inside.clear()
-    plant.jobs.start("A-3", RetuneRequest())
+    plant.jobs.start("A-3", FastRetune())
     assert plant.tune.inside.wait(60)
     assert tags("proposed") == ["A-1"] and tags("failed") == ["A-2"]
     assert tags("busy") == tags("running") == ["A-3"]
@@ -414,11 +414,11 @@ def test_pages_hold_everything_once_also_while_new_jobs_come(plant: Plant, clien
     assert [len(page) for page in pages(client, "/loops", limit=4, state="idle")] == [4, 4]
     ids = []
     for n in range(7):
-        job = plant.jobs.start("A-1" if n % 2 else "A-2", RetuneRequest()).id
+        job = plant.jobs.start("A-1" if n % 2 else "A-2", FastRetune()).id
         plant.wait(job)
         ids.insert(0, job)
     first = client.get("/jobs", params={"limit": 3, "state": "proposed"})
-    newer = plant.jobs.start("A-3", RetuneRequest()).id
+    newer = plant.jobs.start("A-3", FastRetune()).id
     plant.wait(newer)
     rest = pages(client, first.links["next"]["url"])
     assert [job["id"] for page in [first.json(), *rest] for job in page] == ids

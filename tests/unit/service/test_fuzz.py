@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.api.gate.limits import RequestLimits
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import FastRetune
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.keyring import Keyring
 from loopwright.tuning.reasons import Failed, Reason
@@ -62,13 +62,15 @@ BOUNDED = settings(
 )
 ABORT = "POST /jobs/{job_id}/abort"
 _NUMBER = st.floats(allow_nan=False, allow_infinity=False) | st.floats(0.01, 100.0)
-# A model is any object to the document; nearly all that could be made up would be refused at once.
+# Of the models that the document allows nearly all are no plant's, and would be refused at once.
 BODIES = {
     "POST /tunings": st.fixed_dictionaries(
         {
-            "model": st.fixed_dictionaries({"K": _NUMBER, "T": _NUMBER, "L": _NUMBER})
-            | st.fixed_dictionaries({"K": st.floats(0.1, 10.0), "T": st.floats(0.1, 10.0), "L": st.floats(0.1, 10.0)})
-            | st.fixed_dictionaries({"K": _NUMBER, "L": _NUMBER, "integrating": st.just(True)}),
+            "model": st.fixed_dictionaries({"K": _NUMBER, "T_s": _NUMBER, "L_s": _NUMBER})
+            | st.fixed_dictionaries(
+                {"K": st.floats(0.1, 10.0), "T_s": st.floats(0.1, 10.0), "L_s": st.floats(0.1, 10.0)}
+            )
+            | st.fixed_dictionaries({"K": _NUMBER, "L_s": _NUMBER, "integrating": st.just(True)}),
             "method": st.sampled_from(["simc", "amigo", "lambda", "kappa-tau", "direct-synthesis", "robust"]),
         }
     ),
@@ -98,7 +100,7 @@ class Site:
 
     def ended(self, how: Exception | None) -> str:
         self.service.tune.ends = how
-        job = self.service.jobs.start(TAG, RetuneRequest()).id
+        job = self.service.jobs.start(TAG, FastRetune()).id
         self.service.wait(job)
         self.service.tune.ends = None
         return job
@@ -110,7 +112,7 @@ class Site:
             self.service.wait(row.id)
         self.service.tune.inside.clear()
         self.service.tune.hold.clear()
-        job = self.service.jobs.start("FIC-2", RetuneRequest()).id
+        job = self.service.jobs.start("FIC-2", FastRetune()).id
         assert self.service.tune.inside.wait(60)
         return job
 

@@ -18,7 +18,7 @@ from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.api.gate.limits import RequestLimits
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import FastRetune
 from loopwright.service.security.keys import Scope
 from loopwright.service.store import audit, claims
 from loopwright.service.store.claims import Claim, StillAnswering
@@ -32,7 +32,7 @@ from tests.unit.service.test_api import GOLDEN, assert_problem
 
 KEY = {"Idempotency-Key": "7f1c4f5e-2b8f-4a36-9f3a-5d0b3c1e8a77"}
 RETUNE = f"/loops/{TAG}/retune"
-MODEL = {"model": {"K": 1.0, "T": 3.0, "L": 1.0}, "method": "simc"}
+MODEL = {"model": {"K": 1.0, "T_s": 3.0, "L_s": 1.0}, "method": "simc"}
 YES = Answer(200, {"content-type": "application/json"}, b'{"yes": true}')
 AT = datetime(2026, 1, 31, 12, tzinfo=UTC)
 
@@ -53,7 +53,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 def proposed(service: Service) -> str:
-    job = service.jobs.start(TAG, RetuneRequest()).id
+    job = service.jobs.start(TAG, FastRetune()).id
     service.wait(job)
     assert service.store.get(job).state == "proposed"
     return job
@@ -61,7 +61,7 @@ def proposed(service: Service) -> str:
 
 def running(service: Service) -> str:
     service.tune.hold.clear()
-    job = service.jobs.start(TAG, RetuneRequest()).id
+    job = service.jobs.start(TAG, FastRetune()).id
     assert service.tune.inside.wait(10)
     return job
 

@@ -18,7 +18,7 @@ from loopwright.service.jobs.until_answered import STOP_PATIENCE_S
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_restore import RESTORE_PATIENCE_S
 from loopwright.service.loops.loop import Restored
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import FastRetune, retune_request
 from loopwright.service.store import audit
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow
@@ -29,7 +29,7 @@ from tests.unit.service.fakes import OLD, TAG, FakeLoop, Service
 
 def test_stopping_ends_the_jobs_and_waits_for_their_loops(service: Service) -> None:
     service.tune.hold.clear()
-    row = service.jobs.start(TAG, RetuneRequest())
+    row = service.jobs.start(TAG, FastRetune())
     service.tune.inside.wait(60)
     service.jobs.stop()
     row = service.store.get(row.id)
@@ -49,7 +49,7 @@ def test_a_job_that_does_not_end_holds_the_stop_up_for_a_while_only(
         return Restored(home, "at last")
 
     monkeypatch.setattr(FakeLoop, "restore", hangs)
-    row = service.jobs.start(TAG, RetuneRequest())
+    row = service.jobs.start(TAG, FastRetune())
     try:
         assert inside.wait(60)
         running = service.jobs.running(row.id)
@@ -85,7 +85,7 @@ def test_a_job_that_cannot_open_its_loop_fails_and_frees_it(service: Service) ->
         raise OSError("no such device")
 
     jobs = service.more_jobs(no_bus)
-    row = jobs.start(TAG, RetuneRequest())
+    row = jobs.start(TAG, FastRetune())
     service.wait(row.id)
     jobs.stop()
     row = service.store.get(row.id)
@@ -119,7 +119,7 @@ def test_who_reads_the_progress_changes_nothing() -> None:
 
 def test_a_job_that_is_looked_at_is_as_before(service: Service) -> None:
     service.tune.hold.clear()
-    row = service.jobs.start(TAG, RetuneRequest())
+    row = service.jobs.start(TAG, FastRetune())
     assert service.tune.inside.wait(60)
     running = service.jobs.running(row.id)
     assert running is not None and running.loop is not None
@@ -134,7 +134,7 @@ def test_a_job_that_is_looked_at_is_as_before(service: Service) -> None:
 @pytest.mark.parametrize("method", ["fast", "five-stage"])
 def test_a_real_rehearsal_through_a_job(service: Service, method: str) -> None:
     jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
-    row = jobs.start(TAG, RetuneRequest(dry_run=True, method=method))
+    row = jobs.start(TAG, retune_request(dry_run=True, method=method))
     service.wait(row.id, 60)
     jobs.stop()
     row = service.store.get(row.id)
@@ -164,7 +164,7 @@ def test_a_real_rehearsal_through_a_job(service: Service, method: str) -> None:
 
 def test_samples_of_a_rehearsal_are_kept(service: Service) -> None:
     jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
-    row = jobs.start(TAG, RetuneRequest(dry_run=True, ms=1.4))
+    row = jobs.start(TAG, retune_request(dry_run=True, ms=1.4))
     service.wait(row.id, 60)
     jobs.stop()
     stages = [stage for stage, _ in service.store.samples(row.id)]
@@ -178,7 +178,7 @@ def test_a_running_job_hears_of_an_abort_that_the_database_does_not_take(
         raise OperationalError("UPDATE", {}, Exception("database is locked"))
 
     service.tune.hold.clear()
-    row = service.jobs.start(TAG, RetuneRequest())
+    row = service.jobs.start(TAG, FastRetune())
     assert service.tune.inside.wait(60)
     monkeypatch.setattr(service.store, "request_stop", gone)
     with pytest.raises(OperationalError):
@@ -199,7 +199,7 @@ def test_a_job_that_ends_for_an_abort_before_it_is_written_down_was_aborted_by_i
         return write(job_id, *more)
 
     service.tune.hold.clear()
-    row = service.jobs.start(TAG, RetuneRequest())
+    row = service.jobs.start(TAG, FastRetune())
     assert service.tune.inside.wait(60)
     monkeypatch.setattr(service.store, "request_stop", slow)
     assert service.jobs.abort(row.id, "me").state == "aborted"

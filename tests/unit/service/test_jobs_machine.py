@@ -26,7 +26,7 @@ from loopwright.service.execution.procedures import Hooks, Outcome
 from loopwright.service.job_states import IllegalMove
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import RetuneRequest, retune_request
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store import database
 from loopwright.service.store.database import FILE
@@ -220,7 +220,7 @@ class JobsMachine(RuleBasedStateMachine):
         n = len(self.acts)
         name = f"wish {n}"
         self.acts[name] = act = Act(Gains(0.6 + 0.01 * n, 3.0))
-        request = RetuneRequest(requested_by=name, dry_run=dry, **options)
+        request = retune_request(requested_by=name, dry_run=dry, **options)
         other = None if dry else self.having(loop)
         if loop in self.locked and not dry:
             with pytest.raises(Locked):

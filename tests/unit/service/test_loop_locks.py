@@ -24,10 +24,10 @@ from loopwright.service.cli.client import Client
 from loopwright.service.config import parse_site
 from loopwright.service.errors import Locked, UnknownLoop
 from loopwright.service.job_states import JobState
-from loopwright.service.jobs.fleet import Fleet, FleetRequest
+from loopwright.service.jobs.fleet import Fleet, fleet_request
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.loop_state import LoopState, state_json
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import FastRetune
 from loopwright.service.security.keys import Scope
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store import audit, loop_locks
@@ -195,7 +195,7 @@ def test_a_running_test_may_be_aborted_and_the_loop_is_made_safe(service: Servic
 def test_a_job_that_waited_is_refused_at_its_turn(tmp_path: Path) -> None:
     engine = HandEngine()
     service = Service(tmp_path, engine=engine)
-    job = service.jobs.start(TAG, RetuneRequest()).id
+    job = service.jobs.start(TAG, FastRetune()).id
     assert service.jobs.locking.lock(TAG, WHY, "me")[1] is None  # nothing runs
     engine.begin(job)
     service.wait(job)
@@ -210,7 +210,7 @@ def test_killed_during_its_test_a_locked_loop_is_made_safe_and_not_tested_again(
     first = Service(tmp_path, engine=Deaf())
     rows = {}
     for tag in first.loops:
-        rows[tag] = first.jobs.start(tag, RetuneRequest()).id
+        rows[tag] = first.jobs.start(tag, FastRetune()).id
     first.jobs.stop_watching()
     state = state_json(first.controller.state)
     for job in rows.values():
@@ -235,7 +235,7 @@ def test_killed_during_its_test_a_locked_loop_is_made_safe_and_not_tested_again(
 
 def test_a_locked_loop_is_looked_after(service: Service, client: TestClient) -> None:
     """What a job could not bring home is brought home, lock or not; and a person may answer for it."""
-    job = service.jobs.start(TAG, RetuneRequest())
+    job = service.jobs.start(TAG, FastRetune())
     service.wait(job.id)
     service.store.note(job.id, look_after=True)
     locked(client)
@@ -262,7 +262,7 @@ def test_a_job_of_many_refused_at_its_turn_is_no_failure(tmp_path: Path) -> None
     engine = HandEngine()
     service = Service(tmp_path, engine=engine)
     fleet = Fleet(service.jobs)
-    retune = fleet.start(FleetRequest(loops=[TAG], stop_after_failures=1)).id
+    retune = fleet.start(fleet_request(loops=[TAG], stop_after_failures=1)).id
     fleet.look()
     service.jobs.locking.lock(TAG, WHY, "me")
     engine.begin(engine.queued[0])
@@ -283,7 +283,7 @@ def test_a_lock_outlives_the_service_and_a_back_up(tmp_path: Path) -> None:
         service = Service(tmp_path / folder)
         assert service.jobs.locking.locks()[TAG].reason == WHY
         with pytest.raises(Locked, match=WHY):
-            service.jobs.start(TAG, RetuneRequest())
+            service.jobs.start(TAG, FastRetune())
         service.close()
 
 
@@ -296,7 +296,7 @@ def test_from_another_gateway(tmp_path: Path, postgres: Server) -> None:
     there = idle_jobs(stores["b"], [loop_entry(tag="FIC-2")], Deaf())
     there.locking.lock(TAG, WHY, "gateway B")
     with pytest.raises(Locked, match="gateway B"):
-        here.start(TAG, RetuneRequest())
+        here.start(TAG, FastRetune())
     for jobs in (here, there):
         client = TestClient(create_app(jobs, checks={}))
         assert {x["tag"]: x["locked"] and x["locked"]["by"] for x in client.get("/loops").json()} == {
@@ -339,7 +339,7 @@ def test_locked_and_retuned_at_the_same_time(racing: tuple[Jobs, FakeTune]) -> N
             def ask(together: threading.Barrier = together) -> str | None:
                 together.wait(20)
                 try:
-                    return jobs.start(TAG, RetuneRequest()).id
+                    return jobs.start(TAG, FastRetune()).id
                 except Locked:
                     return None
 
@@ -391,12 +391,12 @@ def test_held_by_the_row_of_the_loop(tmp_path: Path, postgres: Server) -> None:
 
 def test_a_busy_loop_that_is_locked_is_said_to_be_locked(service: Service, client: TestClient) -> None:
     service.tune.hold.clear()
-    service.jobs.start(TAG, RetuneRequest())
+    service.jobs.start(TAG, FastRetune())
     with pytest.raises(Busy):
-        service.jobs.start(TAG, RetuneRequest())
+        service.jobs.start(TAG, FastRetune())
     locked(client)
     with pytest.raises(Locked):
-        service.jobs.start(TAG, RetuneRequest())
+        service.jobs.start(TAG, FastRetune())
 
 
 # the commands

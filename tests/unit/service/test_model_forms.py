@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loopwright.service.offline.model_json import BadModel, describe, dump_model, parse_model
+from loopwright.service.model_json import BadModel, describe, dump_model, form_shown, parse_model
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 
 FORMS: list[tuple[dict[str, Any], Model]] = [
-    ({"K": 2, "T": 10, "L": 3}, FOPDT(2.0, 10.0, 3.0)),
-    ({"K": -2.5, "T": 10, "L": 0}, FOPDT(-2.5, 10.0, 0.0)),
-    ({"K": 2, "T": 6, "zeta": 0.5, "L": 3}, SOPDT(2.0, 6.0, 0.5, 3.0)),
-    ({"K": 0.1, "L": 3, "integrating": True}, Integrating(0.1, 3.0)),
-    ({"K": 0.1, "L": 3, "integrating": True, "T": 5}, Integrating(0.1, 3.0, 5.0)),
+    ({"K": 2, "T_s": 10, "L_s": 3}, FOPDT(2.0, 10.0, 3.0)),
+    ({"K": -2.5, "T_s": 10, "L_s": 0}, FOPDT(-2.5, 10.0, 0.0)),
+    ({"K": 2, "T_s": 6, "zeta": 0.5, "L_s": 3}, SOPDT(2.0, 6.0, 0.5, 3.0)),
+    ({"K": 0.1, "L_s": 3, "integrating": True}, Integrating(0.1, 3.0)),
+    ({"K": 0.1, "L_s": 3, "integrating": True, "T_s": 5}, Integrating(0.1, 3.0, 5.0)),
     ({"num": [3, 2], "den": [3, 4, 1], "dead_time_s": 1}, TransferFunction((3.0, 2.0), (3.0, 4.0, 1.0), 1.0)),
     ({"num": [1], "den": [1, 0]}, TransferFunction((1.0,), (1.0, 0.0), 0.0)),
 ]
@@ -30,7 +30,7 @@ def test_each_form_and_back(data: dict[str, Any], model: Model) -> None:
 
 
 def test_two_real_lags() -> None:
-    model = parse_model({"K": 2, "T1": 4, "T2": 10, "L": 3})
+    model = parse_model({"K": 2, "T1_s": 4, "T2_s": 10, "L_s": 3})
     assert isinstance(model, SOPDT)
     w = np.array([0.01, 0.1, 1.0])
     direct = 2.0 * np.exp(-3j * w) / ((4j * w + 1.0) * (10j * w + 1.0))
@@ -50,28 +50,28 @@ def test_a_plant_file_of_rehearse() -> None:
     ("data", "words"),
     [
         ([1, 2], "must be a JSON object"),
-        ({}, "K, T, L: missing"),
-        ({"K": 2, "T": 10}, "L: missing"),
-        ({"K": 2, "T": 10, "L": 3, "tau": 1}, "tau: not a quantity"),
-        ({"K": 2, "T": 10, "T1": 10, "T2": 1, "L": 3}, "T: not a quantity"),
-        ({"K": 2, "T1": 10, "L": 3}, "T2: missing"),
-        ({"K": 2, "T": 10, "zeta": 1, "integrating": True, "L": 3}, "zeta: not a quantity"),
+        ({}, "K, T_s, L_s: missing"),
+        ({"K": 2, "T_s": 10}, "L_s: missing"),
+        ({"K": 2, "T_s": 10, "L_s": 3, "tau": 1}, "tau: not a quantity"),
+        ({"K": 2, "T_s": 10, "T1_s": 10, "T2_s": 1, "L_s": 3}, "T_s: not a quantity"),
+        ({"K": 2, "T1_s": 10, "L_s": 3}, "T2_s: missing"),
+        ({"K": 2, "T_s": 10, "zeta": 1, "integrating": True, "L_s": 3}, "zeta: not a quantity"),
         ({"num": [1], "den": [1, 1], "K": 2}, "K: not a quantity"),
-        ({"num": [1], "den": [1, 1], "L": 2}, "L: not a quantity"),
+        ({"num": [1], "den": [1, 1], "L_s": 2}, "L_s: not a quantity"),
         ({"num": [1]}, "den: missing"),
-        ({"K": 0, "T": 10, "L": 3}, "K must not be 0"),
-        ({"K": math.nan, "T": 10, "L": 3}, "K must be a finite number, not nan"),
-        ({"K": 2, "T": math.inf, "L": 3}, "T must be a finite number, not inf"),
-        ({"K": 10**400, "T": 1, "L": 3}, "K must be a finite number"),
-        ({"K": "2", "T": 10, "L": 3}, "K must be a finite number, not '2'"),
-        ({"K": True, "T": 10, "L": 3}, "K must be a finite number, not True"),
-        ({"K": 2, "T": -10, "L": 3}, "T must be a number > 0 (s), not -10"),
-        ({"K": 2, "T": 0, "L": 3}, "T must be a number > 0 (s), not 0"),
-        ({"K": 2, "T": 10, "L": -3}, "L must be a number >= 0 (s), not -3"),
-        ({"K": 2, "T": 10, "zeta": 0, "L": 3}, "zeta must be a number > 0, not 0"),
-        ({"K": 2, "L": 3, "integrating": False}, "integrating must be true"),
-        ({"K": 2, "L": 3, "integrating": 1}, "integrating must be true"),
-        ({"K": 2, "L": 3, "integrating": True, "T": -1}, "T must be a number >= 0 (s), not -1"),
+        ({"K": 0, "T_s": 10, "L_s": 3}, "K must not be 0"),
+        ({"K": math.nan, "T_s": 10, "L_s": 3}, "K must be a finite number, not nan"),
+        ({"K": 2, "T_s": math.inf, "L_s": 3}, "T_s must be a finite number, not inf"),
+        ({"K": 10**400, "T_s": 1, "L_s": 3}, "K must be a finite number"),
+        ({"K": "2", "T_s": 10, "L_s": 3}, "K must be a finite number, not '2'"),
+        ({"K": True, "T_s": 10, "L_s": 3}, "K must be a finite number, not True"),
+        ({"K": 2, "T_s": -10, "L_s": 3}, "T_s must be a number > 0 (s), not -10"),
+        ({"K": 2, "T_s": 0, "L_s": 3}, "T_s must be a number > 0 (s), not 0"),
+        ({"K": 2, "T_s": 10, "L_s": -3}, "L_s must be a number >= 0 (s), not -3"),
+        ({"K": 2, "T_s": 10, "zeta": 0, "L_s": 3}, "zeta must be a number > 0, not 0"),
+        ({"K": 2, "L_s": 3, "integrating": False}, "integrating must be true"),
+        ({"K": 2, "L_s": 3, "integrating": 1}, "integrating must be true"),
+        ({"K": 2, "L_s": 3, "integrating": True, "T_s": -1}, "T_s must be a number >= 0 (s), not -1"),
         ({"num": 1, "den": [1, 1]}, "num must be a list of 1 to 12 numbers, not 1"),
         ({"num": [], "den": [1, 1]}, "num must be a list"),
         ({"num": [1], "den": [1] * 13}, "den must be a list"),
@@ -91,7 +91,25 @@ def test_everything_else_is_named(data: object, words: str) -> None:
 
 
 def test_in_words() -> None:
-    assert describe({"K": 0.1, "L": 3.0, "integrating": True}) == "integrating, K 0.1, L 3 s"
+    assert describe({"K": 0.1, "L_s": 3.0, "integrating": True}) == "integrating, K 0.1, L 3 s"
     assert describe(dump_model(SOPDT.of_time_constants(2.0, 4.0, 10.0, 3.0))) == "K 2, T1 10 s, T2 4 s, L 3 s"
     assert describe(dump_model(SOPDT(2.0, 4.0, 0.5, 3.0))) == "K 2, T 4 s, zeta 0.5, L 3 s"
     assert describe({"num": [2.0], "den": [10.0, 1.0], "dead_time_s": 3.0}) == "num [2], den [10, 1], dead time 3 s"
+
+
+def test_what_a_fit_has_found_is_shown_also_where_nobody_could_type_it() -> None:
+    found = dump_model(TransferFunction((1e-12, 2.0), (1e-9, 10.0, 1.0), 3.0))
+    with pytest.raises(BadModel):
+        parse_model(found)
+    assert form_shown(found).model_dump() == found
+    integrating = dump_model(Integrating(1e-30, 1e12))
+    assert form_shown(integrating).model_dump() == integrating
+
+
+@pytest.mark.parametrize(
+    "data",
+    [{"K": 1, "T1_s": 1e300, "T2_s": 1e300, "L_s": 1}, {"K": 1, "T1_s": 1e-200, "T2_s": 1e-200, "L_s": 1}],
+)
+def test_times_whose_product_no_number_holds(data: dict[str, Any]) -> None:
+    with pytest.raises(BadModel, match=r"T1_s 1e.* s is no plant's; permitted are 1e-06 to 1e\+08 s"):
+        parse_model(data)

@@ -15,25 +15,25 @@ from pydantic import ValidationError
 from benchmarks.plants import plants
 from loopwright.service.config import ConfigError, parse_site
 from loopwright.service.execution.rehearsal import rehearse
-from loopwright.service.offline.model_json import BadModel, dump_model, parse_model
+from loopwright.service.model_json import BadModel, dump_model, parse_model
 from loopwright.service.offline.tunings import BadTuning, tune_model
 from loopwright.service.plausible import Implausible, check_model, check_sampling
-from loopwright.service.request import BadLimits, RetuneRequest, within
+from loopwright.service.request import BadLimits, retune_request, within
 from tests.unit.service.fakes import TAG, Service, loop_entry
 from validation.references import References, load
 
 FAR_OUTSIDE: list[tuple[dict[str, Any], str]] = [
-    ({"K": 1e-308, "T": 1.0, "L": 1.0}, "1e-308"),
-    ({"K": 1e300, "T": 1.0, "L": 1.0}, "1e+300"),
-    ({"K": 1e-10, "T": 1.0, "L": 1.0}, "a gain of 1e-10"),
-    ({"K": 1.0, "T": 1.0, "L": 1e-9}, "a dead time of 1e-09 s"),
-    ({"K": 1.0, "T": 1.0, "L": 2e-6}, "give 0"),
-    ({"K": 1.0, "T": 1.0, "L": 4e6}, "a dead time of 4e+06 s"),
-    ({"K": 1.0, "T": 1e-300, "L": 1.0}, "1e-300"),
-    ({"K": 1.0, "T1": 10.0, "T2": 1e-5, "L": 1.0}, "differ by a factor 1e+06"),
-    ({"K": 1.0, "T": 1.0, "zeta": 1e-5, "L": 1.0}, "zeta 1e-05"),
-    ({"K": 1.0, "T": 1.0, "zeta": 1e5, "L": 1.0}, "differ by a factor"),
-    ({"K": 1e-20, "L": 1.0, "integrating": True}, "a gain of"),
+    ({"K": 1e-308, "T_s": 1.0, "L_s": 1.0}, "1e-308"),
+    ({"K": 1e300, "T_s": 1.0, "L_s": 1.0}, "1e+300"),
+    ({"K": 1e-10, "T_s": 1.0, "L_s": 1.0}, "a gain of 1e-10"),
+    ({"K": 1.0, "T_s": 1.0, "L_s": 1e-9}, "a dead time of 1e-09 s"),
+    ({"K": 1.0, "T_s": 1.0, "L_s": 2e-6}, "give 0"),
+    ({"K": 1.0, "T_s": 1.0, "L_s": 4e6}, "a dead time of 4e+06 s"),
+    ({"K": 1.0, "T_s": 1e-300, "L_s": 1.0}, "1e-300"),
+    ({"K": 1.0, "T1_s": 10.0, "T2_s": 1e-5, "L_s": 1.0}, "differ by a factor 1e+06"),
+    ({"K": 1.0, "T_s": 1.0, "zeta": 1e-5, "L_s": 1.0}, "zeta 1e-05"),
+    ({"K": 1.0, "T_s": 1.0, "zeta": 1e5, "L_s": 1.0}, "differ by a factor"),
+    ({"K": 1e-20, "L_s": 1.0, "integrating": True}, "a gain of"),
     ({"num": [1.0], "den": [1e-300, 1.0, 1.0]}, "1e-300"),
     ({"num": [1.0], "den": [1e-6, 1.0, 1.0]}, "differ by a factor 1e+06"),
     ({"num": [1e7, 1.0], "den": [1.0, 1.0]}, "a zero of 1e+07 s"),
@@ -144,25 +144,25 @@ def test_a_dry_run_never_holds_more_than_its_limit_of_samples() -> None:
 
 
 def test_options_and_wishes_far_outside() -> None:
-    model = parse_model({"K": 1.0, "T": 3.0, "L": 1.0})
+    model = parse_model({"K": 1.0, "T_s": 3.0, "L_s": 1.0})
     for value in (1e300, 1e-300):
         with pytest.raises(BadTuning, match="tau_c_s"):
             tune_model(model, "simc", {"tau_c_s": value})
         with pytest.raises(ValidationError, match="tau_c_s"):
-            RetuneRequest(method="simc", method_options={"tau_c_s": value})
+            retune_request(method="simc", method_options={"tau_c_s": value})
     loop = parse_site({"loops": [loop_entry()]}, "test").loops[TAG]
     for wish in ({"sp_deviation": 1e-12}, {"amplitude_pct": 1e-9}):
         with pytest.raises(BadLimits, match=next(iter(wish))):
-            within(loop, RetuneRequest(**wish))
+            within(loop, retune_request(**wish))
 
 
 _TIME = st.floats(-6.0, 8.0).map(lambda power: 10.0**power)
 _GAIN = st.floats(-9.0, 9.0).map(lambda power: 10.0**power)
 _MODEL = (
-    st.fixed_dictionaries({"K": _GAIN, "T": _TIME, "L": _TIME | st.just(0.0)})
-    | st.fixed_dictionaries({"K": _GAIN, "T1": _TIME, "T2": _TIME, "L": _TIME | st.just(0.0)})
-    | st.fixed_dictionaries({"K": _GAIN, "T": _TIME, "zeta": st.floats(1e-3, 10.0), "L": _TIME})
-    | st.fixed_dictionaries({"K": _GAIN, "L": _TIME, "integrating": st.just(True)})
+    st.fixed_dictionaries({"K": _GAIN, "T_s": _TIME, "L_s": _TIME | st.just(0.0)})
+    | st.fixed_dictionaries({"K": _GAIN, "T1_s": _TIME, "T2_s": _TIME, "L_s": _TIME | st.just(0.0)})
+    | st.fixed_dictionaries({"K": _GAIN, "T_s": _TIME, "zeta": st.floats(1e-3, 10.0), "L_s": _TIME})
+    | st.fixed_dictionaries({"K": _GAIN, "L_s": _TIME, "integrating": st.just(True)})
 )
 
 

@@ -15,7 +15,7 @@ from loopwright.service.loop_state import LoopState
 from loopwright.service.planning.moves import broken_limits
 from loopwright.service.planning.obstacles import Now
 from loopwright.service.planning.preview import LastProposal, Preview, duration_text, preview
-from loopwright.service.request import RetuneRequest, within
+from loopwright.service.request import FastRetune, retune_request, within
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.store import Store
 from loopwright.tuning.plan import Mode
@@ -28,7 +28,7 @@ NARROW = {"pv_limits": {"low": 49.0, "high": 53.0}}
 
 def told(state: LoopState | None = STATE, config: dict[str, Any] | None = None, **options: Any) -> Preview:
     loop = LoopConfig.model_validate(loop_entry(**(config or {})))
-    return preview(loop, RetuneRequest(**options), Now(state), None)
+    return preview(loop, retune_request(**options), Now(state), None)
 
 
 def reasons(found: Preview) -> list[str]:
@@ -97,7 +97,7 @@ class TestTime:
     def test_the_last_model_narrows_the_estimate(self) -> None:
         loop = LoopConfig.model_validate(loop_entry())
         last = LastProposal.of("abc", "2026-01-31T12:00:00.000Z", 30.0, RESULT)
-        one, other = (preview(loop, RetuneRequest(), Now(STATE), known) for known in (None, last))
+        one, other = (preview(loop, FastRetune(), Now(STATE), known) for known in (None, last))
         assert "T95 9 s" in one.duration_basis and "abc" in other.duration_basis
         ratios = [each.duration_high_s / each.duration_low_s for each in (one, other)]
         assert ratios[1] < ratios[0]
@@ -109,7 +109,7 @@ class TestTime:
         loop = LoopConfig.model_validate(loop_entry())
         result = RESULT | {"ultimate": {"Ku": 200.0, "Pu_s": 3.32}}
         last = LastProposal.of("abc", None, 30.0, result)
-        five, fast = (preview(loop, RetuneRequest(method=m), Now(STATE), last) for m in ("five-stage", "fast"))
+        five, fast = (preview(loop, retune_request(method=m), Now(STATE), last) for m in ("five-stage", "fast"))
         assert five.stages[2].pv_move == pytest.approx(0.2546, abs=1e-4) and five.largest_pv_move is not None
         assert fast.stages[1].pv_move == pytest.approx(0.75 * 60.0 * 4.0 / (3.1416 * 200.0), rel=1e-3)
 
@@ -189,33 +189,33 @@ class TestBrokenLimits:
         ],
     )
     def test_a_step_over_the_limit(self, method: str, sp: float, pv_high: float, words: str) -> None:
-        request = RetuneRequest(method=method, pv_high=pv_high)
+        request = retune_request(method=method, pv_high=pv_high)
         config = within(LoopConfig.model_validate(loop_entry()), request)
         (text,) = broken_limits(config, request, sp)
         assert words in text
 
     def test_five_stage_needs_room_for_its_overshoot(self) -> None:
         config = LoopConfig.model_validate(loop_entry(pv_limits={"low": 0.0, "high": 52.1}))
-        assert broken_limits(config, RetuneRequest(), 50.0) == []
-        (text,) = broken_limits(config, RetuneRequest(method="five-stage"), 50.0)
+        assert broken_limits(config, FastRetune(), 50.0) == []
+        (text,) = broken_limits(config, retune_request(method="five-stage"), 50.0)
         assert "overshoot of 10 %" in text and "52.2" in text and "at most 1.909 degC" in text
 
     def test_the_relay_of_fast_may_move_pv_to_either_side(self) -> None:
         config = LoopConfig.model_validate(loop_entry(pv_limits={"low": 49.0, "high": 60.0}))
-        (text,) = broken_limits(config, RetuneRequest(), 50.0)
+        (text,) = broken_limits(config, FastRetune(), 50.0)
         assert "below the PV limit 49: ask for an sp_deviation of at most 1 degC" in text
-        assert broken_limits(config, RetuneRequest(amplitude_pct=5), 50.0) == [], "its size has nothing to do with it"
-        known = RetuneRequest.model_validate({"start": "design", "model": {"K": 1, "T_s": 3, "L_s": 1}})
+        assert broken_limits(config, retune_request(amplitude_pct=5), 50.0) == [], "its size has nothing to do with it"
+        known = retune_request(**{"start": "design", "model": {"K": 1, "T_s": 3, "L_s": 1}})
         assert broken_limits(config, known, 50.0) == [], "a trial only steps the set-point up"
 
     def test_a_set_point_as_float32_is_not_over_the_limit(self) -> None:
         config = LoopConfig.model_validate(loop_entry(pv_limits={"low": 0.0, "high": 50.1}, sp_deviation=0.1))
-        assert broken_limits(config, RetuneRequest(), 50.000000745) == []
+        assert broken_limits(config, FastRetune(), 50.000000745) == []
 
     @pytest.mark.parametrize("method", ["fast", "five-stage", "simc"])
     def test_the_work_refuses_before_it_touches_the_loop(self, method: str) -> None:
         controller = FakeController()
-        request = RetuneRequest(method=method, pv_high=51.0)
+        request = retune_request(method=method, pv_high=51.0)
         config = within(LoopConfig.model_validate(loop_entry()), request)
         hooks = Hooks(lambda event: None, lambda samples: None, lambda: None)
         with pytest.raises(Refused, match=r"52(\.2)?, above the PV limit 51") as refused:

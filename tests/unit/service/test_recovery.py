@@ -18,7 +18,7 @@ from loopwright.service.jobs.engine import WORKFLOW_VERSION
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.recovery import MAX_ATTEMPTS
 from loopwright.service.loop_state import LoopState, state_json
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import FastRetune
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow
@@ -298,7 +298,7 @@ class Forgetful(ThreadEngine):
 def test_a_job_that_the_engine_has_lost_is_given_to_it_again(started: list[Service], tmp_path: Path) -> None:
     engine = Forgetful()
     service = again(started, tmp_path, engine=engine)
-    row = service.jobs.start(TAG, RetuneRequest())
+    row = service.jobs.start(TAG, FastRetune())
     service.jobs.reconcile()
     assert service.store.get(row.id).state == "queued"  # at first sight it may still be on its way
     service.jobs.reconcile()
@@ -315,7 +315,7 @@ class Broken(ThreadEngine):
 def test_what_could_not_be_queued_is_over_and_does_not_begin_later(started: list[Service], tmp_path: Path) -> None:
     service = again(started, tmp_path, engine=Broken())
     with pytest.raises(OperationalError):
-        service.jobs.start(TAG, RetuneRequest())
+        service.jobs.start(TAG, FastRetune())
     (row,) = service.store.recent()
     assert (row.state, row.reason) == ("failed", "internal") and service.store.active(TAG) is None
 
@@ -334,7 +334,7 @@ def test_what_could_neither_be_queued_nor_ended_does_not_begin_later(
         patch.setattr(jobs.engine, "enqueue", full)
         patch.setattr(service.store, "move", full)
         with pytest.raises(OperationalError):
-            jobs.start(TAG, RetuneRequest())
+            jobs.start(TAG, FastRetune())
         (row,) = service.store.unfinished()
         patch.setattr(jobs.engine, "enqueue", ThreadEngine.enqueue.__get__(jobs.engine))
         for _ in range(3):
@@ -344,7 +344,7 @@ def test_what_could_neither_be_queued_nor_ended_does_not_begin_later(
     jobs.reconcile()
     row = service.store.get(row.id)
     assert (row.state, row.reason, row.detail) == ("failed", "internal", "it could not be queued")
-    again_asked = jobs.start(TAG, RetuneRequest())
+    again_asked = jobs.start(TAG, FastRetune())
     service.wait(again_asked.id)
     assert service.store.get(again_asked.id).state == "proposed"
 
@@ -360,7 +360,7 @@ def test_what_could_not_be_queued_but_has_begun_is_stopped(service: Service, mon
 
     monkeypatch.setattr(service.jobs.engine, "enqueue", taken_all_the_same)
     with pytest.raises(OperationalError):
-        service.jobs.start(TAG, RetuneRequest())
+        service.jobs.start(TAG, FastRetune())
     (row,) = service.store.recent()
     service.wait(row.id)
     row = service.store.get(row.id)
@@ -372,7 +372,7 @@ def test_what_could_not_be_queued_elsewhere_is_stopped_there(service: Service, m
     monkeypatch.setattr(service.jobs.directory, "owner", lambda tag: (service.loops[TAG], "gateway B"))
     monkeypatch.setattr(service.jobs.engine, "enqueue", Broken().enqueue)
     with pytest.raises(OperationalError):
-        service.jobs.start(TAG, RetuneRequest())
+        service.jobs.start(TAG, FastRetune())
     (row,) = service.store.recent()
     assert (row.state, row.stop_reason, row.host) == ("queued", "internal", "gateway B")
 
@@ -411,7 +411,7 @@ def test_a_service_told_to_end_before_it_has_begun_leaves_the_jobs(tmp_path: Pat
 
 def test_a_job_that_waits_for_its_turn_ends_at_once_when_aborted(started: list[Service], tmp_path: Path) -> None:
     service = again(started, tmp_path, engine=Forgetful())
-    row = service.jobs.start(TAG, RetuneRequest())
+    row = service.jobs.start(TAG, FastRetune())
     row = service.jobs.abort(row.id, "me")
     assert (row.state, row.reason) == ("aborted", "operator")
     assert [event.kind for event in service.store.events(row.id)] == ["state", "abort_requested", "state"]
@@ -466,14 +466,14 @@ def test_a_job_that_is_over_is_not_resumed(store: Store) -> None:
 
 def test_a_job_that_waits_when_the_service_stops_ends_as_such(started: list[Service], tmp_path: Path) -> None:
     service = again(started, tmp_path, engine=Forgetful())
-    row = service.jobs.start(TAG, RetuneRequest())
+    row = service.jobs.start(TAG, FastRetune())
     service.jobs.stop()
     assert (service.store.get(row.id).state, service.store.get(row.id).reason) == ("aborted", "service_stopped")
 
 
 def test_an_abort_written_by_another_host_is_heard(service: Service) -> None:
     service.tune.hold.clear()
-    row = service.jobs.start(TAG, RetuneRequest())
+    row = service.jobs.start(TAG, FastRetune())
     service.tune.inside.wait(60)
     service.store.request_stop(row.id, Reason.OPERATOR.value, "gateway B")
     service.wait(row.id)
@@ -482,7 +482,7 @@ def test_an_abort_written_by_another_host_is_heard(service: Service) -> None:
 
 def test_no_loop_is_read_while_a_decision_is_carried_out(service: Service) -> None:
     """A job begins with what the controller holds: not in the middle of an exchange of gains."""
-    first = service.jobs.start(TAG, RetuneRequest())
+    first = service.jobs.start(TAG, FastRetune())
     service.wait(first.id)
     seen: list[Any] = []
 

@@ -18,14 +18,14 @@ from loopwright.service.execution.procedures import Hooks, Outcome, rehearse
 from loopwright.service.execution.rehearsals import apart
 from loopwright.service.execution.runner import run
 from loopwright.service.job_states import JobState
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import RetuneRequest, retune_request
 from loopwright.tuning.plan import Event, Mode, Plan, Sample, StageStarted
 from loopwright.tuning.reasons import Aborted, Failed, Reason
 from tests.unit.service.fakes import TAG, FakeController, FakeLoop, Service, loop_entry
 from tests.unit.service.processes import until
 
 CONFIG = parse_site({"loops": [loop_entry()]}, "test").loops[TAG]
-ASKED = RetuneRequest(dry_run=True)
+ASKED = retune_request(dry_run=True)
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy, is_loopback
 from loopwright.service.api.gate.limits import Buckets, RequestLimits
 from loopwright.service.cli import main as cli
-from loopwright.service.request import RetuneRequest
+from loopwright.service.request import FastRetune
 from loopwright.service.security.keys import Scope, hash_key, matches, new_key
 from loopwright.service.server.serving import NotSafe, Setup, serve
 from loopwright.service.store import audit
@@ -437,7 +437,7 @@ def test_a_stream_ends_with_the_key_that_it_was_opened_with(
     keyring = Watched(service.store.engine)
     row, key = keyring.create("a", Scope.READ, timedelta(days=1))
     service.tune.hold.clear()
-    job = service.jobs.start(TAG, RetuneRequest()).id
+    job = service.jobs.start(TAG, FastRetune()).id
     client = open_client(keyring, key=key)
     with ThreadPoolExecutor(1) as beside:
         answer = beside.submit(client.get, f"/jobs/{job}/events")

@@ -24,12 +24,12 @@ from tests.unit.service.fakes import TAG, loop_entry
 from tests.unit.service.processes import descendants, gone, until
 
 pytestmark = pytest.mark.timeout(300)  # processes that start slowly on a busy machine
-ENDLESS = {"model": {"K": 2, "T": 10, "L": 3e3}, "method": "me-pso", "options": {"horizon_s": 1e8}}
+ENDLESS = {"model": {"K": 2, "T_s": 10, "L_s": 3e3}, "method": "me-pso", "options": {"horizon_s": 1e8}}
 """More than 60 s of processor time; and some 500 MB, so that the limit of memory would be met first."""
 
 MUCH_MEMORY = "--computation-memory-mb=4096"
 
-SHORT = {"model": {"K": 2, "T": 10, "L": 2}, "method": "simc"}
+SHORT = {"model": {"K": 2, "T_s": 10, "L_s": 2}, "method": "simc"}
 LONG = {"dry_run": True, "plant": {"num": [2.0], "den": [3.0, 1.0], "dead_time_s": 1.0, "sample_time_s": 0.005}}
 """Of seconds."""
 
@@ -166,8 +166,8 @@ def test_what_costs_too_much_is_refused_by_name(tmp_path: Path, stack: ExitStack
     assert (problem.status_code, problem.json()["reason"]) == (422, "computation_limit"), problem.text
     assert "1 s of processor time" in problem.json()["detail"] and "--tuning-cpu-s" in problem.json()["detail"]
     for model, method in (
-        ({"K": 1e-308, "T": 10, "L": 2}, "all"),
-        ({"K": 2, "T": 10, "L": 1e-9}, "me-pso"),
+        ({"K": 1e-308, "T_s": 10, "L_s": 2}, "all"),
+        ({"K": 2, "T_s": 10, "L_s": 1e-9}, "me-pso"),
         ({"num": [1], "den": [1e-12, 1, 1e12, 1]}, "all"),
     ):
         answer = served.asked({"model": model, "method": method}).result(200)
