@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from loopwright.service.api.job_views import GainsView
+from loopwright.service.results import GainsView
 from loopwright.tuning.reasons import Reason
 from loopwright.tuning.rules.design import MIN_GM, MAX_Ms
 
