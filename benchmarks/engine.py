@@ -18,6 +18,7 @@ from loopwright.service.jobs.dbos_engine import DurableEngine
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.service.request import FastRetune, RetuneRequest
+from loopwright.service.results import empty_result
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.tuning.plan import StageDone, StageStarted
@@ -30,7 +31,7 @@ SHORTEST_STAGE_S = 5.0
 
 def empty(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks) -> Outcome:
     """A retune that does nothing: what is left is the engine and the store."""
-    return Outcome({}, None, state, {})
+    return Outcome(empty_result("fast"), None, state, {})
 
 
 def cost(folder: Path) -> dict[str, float]:

@@ -36,8 +36,8 @@ def run() -> dict[str, float]:
             },
             "five-stage",
         )
-        plant_s += answer["plant_time_s"]["total"]
-        proposed += answer["outcome"] == "proposed"
+        plant_s += sum(answer.plant_time_s.values())
+        proposed += answer.ended is None
     wall_s, processor_s = time.perf_counter() - wall, time.process_time() - processor
     unit = 1 if sys.platform == "darwin" else 1024
     return {

@@ -7,9 +7,17 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from loopwright.service.api.result_views import (
+from loopwright.service.config import Limits, LoopConfig
+from loopwright.service.job_states import ACTIVE, JobState, shown
+from loopwright.service.jobs.active_job import Running
+from loopwright.service.jobs.aftercare import NotHome
+from loopwright.service.loop_state import LoopState, gains_of
+from loopwright.service.results import (
     ComparisonView,
     EvidenceView,
+    FastResult,
+    FiveStageResult,
+    GainsView,
     ModelView,
     PredictedView,
     RehearsedOnView,
@@ -17,32 +25,11 @@ from loopwright.service.api.result_views import (
     TransferModelView,
     UltimateView,
     VerificationView,
-    known,
-    model_view,
-    rehearsed_on_view,
-    verification_view,
+    empty_result,
 )
-from loopwright.service.config import Limits, LoopConfig
-from loopwright.service.job_states import ACTIVE, JobState, shown
-from loopwright.service.jobs.active_job import Running
-from loopwright.service.jobs.aftercare import NotHome
-from loopwright.service.loop_state import LoopState
 from loopwright.service.store.tables import EventRow, JobRow, LoopLockRow
 from loopwright.tuning.five_stage.procedure import PROCEDURE
-from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import ADVICE, Reason
-
-
-class GainsView(BaseModel):
-    """ISA (standard) form: u = Kp (b SP - PV + 1/Ti int(SP - PV) + Td d/dt(c SP - PV) / (1 + Tf s))."""
-
-    form: str = Field(default="ISA", description="Form of the controller")
-    Kp: float = Field(description="Proportional gain, MV percent per PV unit", examples=[0.75])
-    Ti: float = Field(description="Integral time, s; 0 means none", examples=[19.17])
-    Td: float = Field(description="Derivative time, s", examples=[0.0])
-    Tf: float = Field(description="Derivative filter time, s", examples=[0.0])
-    b: float = Field(description="Set-point weight of the proportional path", examples=[1.0])
-    c: float = Field(description="Set-point weight of the derivative path", examples=[0.0])
 
 
 class LockView(BaseModel):
@@ -229,7 +216,7 @@ def live_view(state: LoopState) -> LiveView:
         pv=_finite(state.pv),
         mv=_finite(state.mv),
         mode=state.mode.name.lower(),
-        gains=gains_view(state.gains),
+        gains=GainsView.of(state.gains),
         on_trial=state.on_trial,
         mv_low=state.mv_low,
         mv_high=state.mv_high,
@@ -240,16 +227,12 @@ def live_view(state: LoopState) -> LiveView:
     )
 
 
-def gains_view(gains: Gains) -> GainsView:
-    return GainsView(Kp=gains.Kp, Ti=gains.Ti, Td=gains.Td, Tf=gains.Tf, b=gains.b, c=gains.c)
-
-
 def job_view(row: JobRow, events: Sequence[EventRow], running: Running | None) -> JobView:
     """The job from the store, and from its live part while it runs."""
     state = shown(row.state, row.dry_run)
-    result = row.result or {}
+    method = row.request.get("method", PROCEDURE)
+    result = row.result or empty_result(method)
     progress, remaining, plant_time = _progress(state, row, events, running)
-    new = result.get("gains")
     return JobView(
         id=row.id,
         url=f"/jobs/{row.id}",
@@ -268,21 +251,21 @@ def job_view(row: JobRow, events: Sequence[EventRow], running: Running | None) -
         remaining_plant_time_s=remaining,
         plant_time_s=plant_time,
         stages=_stages(events, row),
-        method=row.request.get("method", PROCEDURE),
-        chosen=result.get("chosen") or {},
-        ultimate=known(UltimateView, result.get("ultimate")),
-        model=model_view(result.get("model")),
-        old_gains=_stored_gains(row.old_gains or result.get("old_gains")),
-        new_gains=_stored_gains(new),
-        comparison=known(ComparisonView, result.get("comparison")),
-        rehearsed_on=rehearsed_on_view(result.get("rehearsed_on")),
-        predicted=known(PredictedView, result.get("predicted")),
-        predicted_before=known(PredictedView, result.get("predicted_before")),
-        evidence=known(EvidenceView, result.get("found") or _told(events, ("redesign", "design"), "reason")),
-        verification=verification_view(result.get("verified") or _told(events, ("verify",), "tested")),
-        before=known(StepView, result.get("baseline")),
-        after=known(StepView, result.get("verification")),
-        notes=[e.data["text"] for e in events if e.kind == "note"] + list(result.get("notes") or ()),
+        method=method,
+        chosen=result.chosen,
+        ultimate=result.ultimate,
+        model=result.model,
+        old_gains=_stored_gains(row.old_gains) or result.old_gains,
+        new_gains=result.new_gains,
+        comparison=result.comparison,
+        rehearsed_on=result.rehearsed_on,
+        predicted=result.predicted,
+        predicted_before=result.predicted_before if isinstance(result, FastResult) else None,
+        evidence=_evidence(result, events),
+        verification=_verification(result, events),
+        before=result.before if isinstance(result, FiveStageResult) else None,
+        after=result.after,
+        notes=[e.data["text"] for e in events if e.kind == "note"] + result.notes,
         reason=row.reason,
         detail=row.detail,
         advice=ADVICE[Reason(row.reason)] if row.reason else None,
@@ -322,6 +305,21 @@ def _stages(events: Sequence[EventRow], row: JobRow) -> list[StageView]:
     return list(stages.values())
 
 
+def _evidence(result: FastResult | FiveStageResult, events: Sequence[EventRow]) -> EvidenceView | None:
+    """Of a refused job, which has none in its result, as its stages came to it."""
+    if isinstance(result, FastResult) and result.evidence is not None:
+        return result.evidence
+    told = _told(events, ("redesign", "design"), "reason")
+    return None if told is None else EvidenceView.model_validate(told)
+
+
+def _verification(result: FastResult | FiveStageResult, events: Sequence[EventRow]) -> VerificationView | None:
+    if isinstance(result, FastResult) and result.verification is not None:
+        return result.verification
+    told = _told(events, ("verify",), "tested")
+    return None if told is None else VerificationView.of_stage(told)
+
+
 def _told(events: Sequence[EventRow], stages: Sequence[str], sign: str) -> dict[str, Any] | None:
     """The last result of the first of these stages that has one; `sign` is a field that others' results lack."""
     for stage in stages:
@@ -334,10 +332,7 @@ def _told(events: Sequence[EventRow], stages: Sequence[str], sign: str) -> dict[
 
 
 def _stored_gains(data: dict[str, Any] | None) -> GainsView | None:
-    if not data:
-        return None
-    known = {name: value for name, value in data.items() if name in Gains.__dataclass_fields__ and value is not None}
-    return gains_view(Gains(**known))
+    return GainsView.of(gains_of(data)) if data else None
 
 
 def _finite(value: float) -> float | None:

@@ -78,6 +78,6 @@ def _locked(jobs: Jobs) -> dict[str, str]:
 
 
 def _last(row: JobRow | None) -> LastProposal | None:
-    if row is None or not row.result:
+    if row is None or row.result is None:
         return None
     return LastProposal.of(row.id, row.ended_at, row.plant_time_s, row.result)

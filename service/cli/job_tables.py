@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from loopwright.service.api.result_views import ComparisonView
 from loopwright.service.cli.client import Client
+from loopwright.service.results import ComparisonView
 
 console = Console()
 _MARGINS = (("GM", "GM", ""), ("PM", "PM_deg", "deg"), ("Ms", "Ms", ""))

@@ -415,7 +415,7 @@ def rehearse_file(
     options: dict[str, Any] = {name: value for name, value in wishes.items() if value is not None}
     if options and method != "fast":
         die(f"--ms and --derivative are of the method fast, not of {method}", 2)
-    answer = rehearse(spec, method=method, on_event=listener, propose_anyway=propose_anyway, **options)
+    answer = rehearse(spec, method=method, on_event=listener, propose_anyway=propose_anyway, **options).as_json()
     if as_json:
         print_json(answer)
     else:

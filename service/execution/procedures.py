@@ -7,26 +7,24 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from loopwright.service.config import LoopConfig
-from loopwright.service.jsonable import to_json_object
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.service.planning.facts import facts_of, time_budget_s
 from loopwright.service.planning.ground import Ground, rehearsal_spec
 from loopwright.service.planning.moves import broken_limits
 from loopwright.service.request import FastRetune, RetuneRequest
+from loopwright.service.results import Result, empty_result
 from loopwright.service.store.tables import EventRow
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.settle import after_settling
-from loopwright.tuning.fast.procedure import FAST
 from loopwright.tuning.models import Model
 from loopwright.tuning.plan import Event, Note, Plan, Sample
-from loopwright.tuning.reasons import Aborted, Ended, Failed, NoGain, Reason, Refused
+from loopwright.tuning.reasons import Ended, NoGain, Reason, Refused
 
 if TYPE_CHECKING:
     from loopwright.service.execution.beside import Workers
 
 FROZEN_T95 = 3.0
-_STOPPED = (Reason.OPERATOR, Reason.SERVICE_STOPPED)
 
 
 @dataclass(frozen=True)
@@ -50,9 +48,9 @@ class Hooks:
 @dataclass(frozen=True)
 class Outcome:
     """How work ended: a result, or the reason why not; both where the figures are the reason (NoGain), and where a
-    rehearsal tells what it was done on. Plain JSON values; plant times in s per stage."""
+    rehearsal tells what it was done on. Plant times in s per stage."""
 
-    result: dict[str, Any] | None
+    result: Result | None
     ended: Ended | None
     restored: LoopState | None
     plant_time_s: dict[str, float]
@@ -83,6 +81,7 @@ def tune(
     """The procedure asked for on the live loop. workers: who computes, by default a thread."""
     from loopwright.service.execution.beside import Computing
     from loopwright.service.execution.guard import Watch
+    from loopwright.service.execution.result import result_of
     from loopwright.service.execution.runner import run
 
     facts = facts_of(config, state)
@@ -112,7 +111,7 @@ def tune(
     ended = ran.ended
     if ran.value is not None and not ran.value.comparison.gain and not request.propose_anyway:
         ended = NoGain(Reason.NO_GAIN, ran.value.comparison.verdict)
-    return Outcome(to_json_object(ran.value), ended, ran.restored, dict(ran.plant_time_s))
+    return Outcome(None if ran.value is None else result_of(ran.value), ended, ran.restored, dict(ran.plant_time_s))
 
 
 def plan(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow] = ()) -> Plan[Any]:
@@ -143,19 +142,15 @@ def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcom
     from loopwright.service.execution.rehearsal import rehearse as rehearse_spec
 
     spec, on = rehearsal_spec(config, request, hooks.ground)
-    told = to_json_object(on)
     hooks.on_event(Note(f"rehearsed on {on.plant_text}; {on.gains_text}; nothing is tested on the loop"))
     known = _known_model(request) if isinstance(request, FastRetune) else None
     # A model typed in for a dry run is the plant itself; the procedure still starts where the request says.
-    answer = rehearse_spec(
-        spec, on_event=hooks.on_event, on_samples=hooks.on_samples, model=known, asked=request.options
+    found = rehearse_spec(
+        spec, request.method, hooks.on_event, hooks.on_samples, model=known, asked=request.options
     )
-    times = {name: float(value) for name, value in (answer.get("plant_time_s") or {}).items() if name != "total"}
-    if answer["outcome"] in ("proposed", "no_gain"):
-        return Outcome(_as_proposal(answer) | {"rehearsed_on": told}, None, None, times)
-    reason = _reason(answer.get("reason"))
-    kind = Aborted if reason in _STOPPED else Refused if answer["outcome"] == "refused" else Failed
-    return Outcome({"rehearsed_on": told}, kind(reason, str(answer.get("detail") or "")), None, times)
+    if found.ended is None or isinstance(found.ended, NoGain):
+        return Outcome(found.result.model_copy(update={"rehearsed_on": on}), None, None, found.plant_time_s)
+    return Outcome(empty_result(request.method, on), found.ended, None, found.plant_time_s)
 
 
 def _known_model(request: FastRetune) -> Model | None:
@@ -163,27 +158,3 @@ def _known_model(request: FastRetune) -> Model | None:
     return request.model.plant() if request.start == "design" and request.model else None
 
 
-def _as_proposal(answer: dict[str, Any]) -> dict[str, Any]:
-    """A rehearsal's answer under the names of a live job's result."""
-    ultimate, model, measured = (answer.get(key) or {} for key in ("ultimate", "model", "measured"))
-    told = {
-        "ultimate": {"Ku": ultimate["Ku"], "Pu_s": ultimate["Pu"]} if ultimate else None,
-        "method": answer.get("method"),
-        "chosen": answer.get("chosen") or {},
-        "old_gains": (answer.get("input") or {}).get("gains"),
-        "gains": answer.get("gains"),
-        "predicted": answer.get("predicted"),
-        "comparison": answer.get("comparison"),
-        "baseline": measured.get("before"),
-        "verification": measured.get("after"),
-        "notes": answer.get("notes") or [],
-        "input": answer.get("input"),
-    }
-    if answer["method"] == FAST:
-        return told | {name: answer.get(name) for name in ("model", "predicted_before", "found", "verified")}
-    known = {"K": model["K"], "T_s": model["T"], "L_s": model["L"]}
-    return told | {"model": known | {key: model.get(key) for key in ("zeta", "k_source", "fit_pct")}}
-
-
-def _reason(text: object) -> Reason:
-    return Reason(text) if isinstance(text, str) and text in set(Reason) else Reason.INTERNAL

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from loopwright.controller.channel import Channel, RelaySettings, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant, SimulatedProcess
 from loopwright.service.execution.guard import Watch
+from loopwright.service.execution.result import result_of
 from loopwright.service.execution.runner import RunResult, run
 from loopwright.service.jsonable import to_jsonable
 from loopwright.service.loop_state import LoopState
@@ -32,11 +33,13 @@ from loopwright.service.plausible import (
     check_model,
     check_sampling,
 )
+from loopwright.service.results import FastResult, FiveStageResult, UltimateView, empty_result
 from loopwright.service.validation import lines
 from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.fast.design_trial import trial
 from loopwright.tuning.fast.procedure import FAST, FAST_STAGES, FastOptions, FastProposal, fast
 from loopwright.tuning.five_stage.procedure import STAGES, Facts, Options, Proposal, five_stage
+from loopwright.tuning.five_stage.ultimate_gain import UltimateResult
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, SOPDT, Model, TransferFunction
 from loopwright.tuning.plan import (
@@ -186,6 +189,38 @@ class PlantFile(BaseModel):
         return self
 
 
+@dataclass(frozen=True)
+class Rehearsal:
+    """How a rehearsal ended.
+
+    result: as far as it came.  ended: why there is no proposal, None where there is one.
+    plant_time_s: the plant time of each stage, s.  stages: what each stage found.
+    plant: the plant as completed, None for one that cannot be used.
+    """
+
+    result: FastResult | FiveStageResult
+    ended: Ended | None
+    plant_time_s: dict[str, float] = field(default_factory=dict)
+    stages: dict[str, object] = field(default_factory=dict)
+    plant: PlantFile | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """The object of `loopwright rehearse --json`: the result under the names of `GET /jobs/{id}`, and how it came
+        about. What is not known is null."""
+        ended = self.ended
+        return {
+            "name": None if self.plant is None else self.plant.name,
+            "outcome": _outcome(ended),
+            "reason": ended.reason.value if ended else None,
+            "detail": ended.detail if ended else None,
+            "advice": ended.advice if ended else None,
+            **self.result.model_dump(mode="json"),
+            "plant_time_s": {**self.plant_time_s, "total": sum(self.plant_time_s.values())},
+            "stages": to_jsonable(self.stages),
+            "input": None if self.plant is None else self.plant.model_dump(mode="json"),
+        }
+
+
 def _nice(x: float) -> float:
     """The largest 1, 2 or 5 times a power of ten that is not above x."""
     power = 10.0 ** math.floor(math.log10(x))
@@ -242,8 +277,8 @@ def rehearse(
     model: Model | None = None,
     asked: FastOptions | Options | None = None,
     **options: Any,
-) -> dict[str, Any]:
-    """Preflight to verification on a model in memory. Returns the JSON object of `loopwright rehearse`.
+) -> Rehearsal:
+    """Preflight to verification on a model in memory.
 
     spec: the fields of `PlantFile`.  method: "fast", "five-stage", or a rule of `tuning.rules.registry` in place of the
     fifth stage.  model: what to design for; fast then needs no relay.  options: those of
@@ -272,10 +307,10 @@ def rehearse(
         else:
             outcome = run(five_stage(facts, asked), loop, watch=watch, on_event=listen, on_samples=hear)
     except ValidationError as error:
-        return _answer(None, RunResult(ended=Refused(Reason.BAD_INPUT, lines(error))), results)
+        return Rehearsal(empty_result(method), Refused(Reason.BAD_INPUT, lines(error)))
     except Ended as ended:
-        return _answer(None, RunResult(ended=ended), results)
-    return _answer(file, outcome, results, anyway=asked.propose_anyway)
+        return Rehearsal(empty_result(method), ended)
+    return _rehearsal(file, method, outcome, results, anyway=asked.propose_anyway)
 
 
 def _asked(method: str, model: Model | None, options: dict[str, Any]) -> FastOptions | Options:
@@ -320,71 +355,28 @@ def _reach(file: PlantFile) -> float:
     return abs(file.num[-1] / file.den[-1]) * max(map(abs, file.mv_limits)) if file.den[-1] else 0.0
 
 
-def _answer(
-    file: PlantFile | None,
+def _rehearsal(
+    file: PlantFile,
+    method: str,
     outcome: RunResult[Proposal] | RunResult[FastProposal],
     results: dict[str, object],
-    anyway: bool = False,
-) -> dict[str, Any]:
-    """The JSON object; what is not known is null. anyway: a proposal is made also where there is no gain."""
+    anyway: bool,
+) -> Rehearsal:
+    """anyway: a proposal is made also where there is no gain."""
     proposal, ended = outcome.value, outcome.ended
     if proposal is not None and not proposal.comparison.gain and not anyway:
         ended = NoGain(Reason.NO_GAIN, proposal.comparison.verdict)
     stages = dict.fromkeys((*STAGES, *FAST_STAGES))
     times = {stage: outcome.plant_time_s[stage] for stage in stages if stage in outcome.plant_time_s}
-    answer: dict[str, Any] = {
-        "name": file.name if file else None,
-        "method": proposal.method if proposal else None,
-        "chosen": dict(proposal.chosen) if proposal else None,
-        "outcome": _outcome(ended),
-        "reason": ended.reason.value if ended else None,
-        "detail": ended.detail if ended else None,
-        "advice": ended.advice if ended else None,
-        "ultimate": None,
-        "model": None,
-        "gains": None,
-        "predicted": None,
-        "comparison": None,
-        "measured": None,
-        "plant_time_s": {**times, "total": sum(times.values())},
-        "stages": results,
-        "input": file.model_dump() if file else None,
-        "form": "ISA: u = Kp*(e + integral(e)/Ti + Td*de/dt); Kp in MV per PV unit, times in s",
-    }
-    ultimate = results.get("ultimate") or (proposal and proposal.ultimate)
-    if ultimate is not None:
-        answer["ultimate"] = {"Ku": ultimate.Ku, "Pu": ultimate.Pu_s}  # type: ignore[attr-defined]
-    if proposal:
-        answer["model"] = _model(proposal)
-        gains = proposal.gains
-        answer["gains"] = {"Kp": gains.Kp, "Ti": gains.Ti, "Td": gains.Td, "Tf": gains.Tf}
-        answer["predicted"] = asdict(proposal.predicted)
-        answer["comparison"] = asdict(proposal.comparison)
-        baseline = proposal.baseline if isinstance(proposal, Proposal) else None
-        answer["measured"] = {"before": baseline, "after": proposal.verification}
-        if isinstance(proposal, FastProposal):
-            answer |= {name: getattr(proposal, name) for name in ("predicted_before", "found", "verified")}
-        answer["notes"] = list(proposal.notes)
-    clean: dict[str, Any] = to_jsonable(answer)
-    return clean
+    if proposal is not None:
+        return Rehearsal(result_of(proposal), ended, times, results, file)
+    found, result = results.get("ultimate"), empty_result(method)
+    if isinstance(found, UltimateResult):
+        result = result.model_copy(update={"ultimate": UltimateView(Ku=found.Ku, Pu_s=found.Pu_s)})
+    return Rehearsal(result, ended, times, results, file)
 
 
 def _outcome(ended: Ended | None) -> str:
     if ended is None:
         return "proposed"
     return "no_gain" if isinstance(ended, NoGain) else "failed" if isinstance(ended, Failed) else "refused"
-
-
-def _model(proposal: Proposal | FastProposal) -> object:
-    """What the gains were made on."""
-    if isinstance(proposal, FastProposal):
-        return proposal.model
-    model = proposal.model
-    return {
-        "K": model.K,
-        "T": model.T_s,
-        "L": model.L_s,
-        "k_source": model.k_source,
-        "zeta": model.zeta,
-        "fit_pct": model.fit_pct,
-    }

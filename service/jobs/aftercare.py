@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.service.jobs.loop_directory import LoopDirectory
+from loopwright.service.jobs.machine import Machine
 from loopwright.service.loop_state import state_json
 from loopwright.service.loops.restoration import Restoration, look
-from loopwright.service.machine import Machine
 from loopwright.service.store import looked_after
 from loopwright.service.store.store import Busy, Store
 from loopwright.service.store.tables import JobRow

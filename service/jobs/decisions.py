@@ -7,12 +7,13 @@ import threading
 from loopwright.service.errors import Conflict, Locked
 from loopwright.service.job_states import IllegalMove, JobState, shown
 from loopwright.service.jobs.loop_directory import LoopDirectory
+from loopwright.service.jobs.machine import Machine
 from loopwright.service.loop_state import gains_of, state_json
 from loopwright.service.loops.gain_change import ForeignGains, replace_accepted
-from loopwright.service.machine import Machine
 from loopwright.service.store import loop_locks
 from loopwright.service.store.store import Busy, Store
 from loopwright.service.store.tables import JobRow
+from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Ended, Reason
 
 WRITES_S = 10.0
@@ -60,7 +61,7 @@ class Decisions:
             config, host = self._directory.owner(row.loop)
             if host != self.store.host:
                 raise Conflict(f"loop {row.loop} is on the bus of host {host}: only the service there can write to it")
-            old, new = gains_of(row.old_gains), gains_of((row.result or {}).get("gains"))
+            old, new = gains_of(row.old_gains), new_gains(row)
             before, after = (old, new) if wanted is JobState.ACCEPTED else (new, old)
             begun = self.store.decision_begun(job_id)
             over = self._machine.event()
@@ -98,3 +99,10 @@ class Decisions:
         WRITES_S."""
         writes = self._writes.get(tag)
         return writes is None or writes.wait(WRITES_S)
+
+
+def new_gains(row: JobRow) -> Gains:
+    """Raises Conflict for a job without new gains."""
+    if row.result is None or row.result.new_gains is None:
+        raise Conflict("the job has no gains to put")
+    return row.result.new_gains.gains()

@@ -9,10 +9,10 @@ from typing import Any
 
 from loopwright.service.config import BusConfig, LoopConfig
 from loopwright.service.errors import UnknownLoop
+from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.loop_state import LoopState, gains_of, loop_state
 from loopwright.service.loops.loop import Loop
-from loopwright.service.machine import Machine
 from loopwright.service.store.store import Store
 
 LoopFactory = Callable[[LoopConfig], Loop]

@@ -22,11 +22,11 @@ from loopwright.service.jobs.engine import WORKFLOW_VERSION, Engine
 from loopwright.service.jobs.journal import Journal
 from loopwright.service.jobs.locking import Locking
 from loopwright.service.jobs.loop_directory import LoopDirectory
+from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.recovery import Recovery
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.until_answered import STOP_PATIENCE_S, UntilAnswered
 from loopwright.service.jobs.worker import Worker
-from loopwright.service.machine import Machine
 from loopwright.service.request import RetuneRequest, within
 from loopwright.service.store.lock import CHECK_S
 from loopwright.service.store.store import FolderInUse, Store, WithJob

@@ -8,8 +8,8 @@ from typing import TypeVar
 from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.service.jobs.journal import temporary
+from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.registry import Registry
-from loopwright.service.machine import Machine
 
 T = TypeVar("T")
 

@@ -17,13 +17,13 @@ from loopwright.service.job_states import ACTIVE, GOOD, JobState, state_after
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.journal import Journal
 from loopwright.service.jobs.loop_directory import LoopDirectory
+from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.until_answered import STOP_PATIENCE_S, UntilAnswered
 from loopwright.service.loop_state import LoopState, differences, loop_state, same_gains, state_json
 from loopwright.service.loops.loop import Loop
 from loopwright.service.loops.observed_loop import ObservedLoop
 from loopwright.service.loops.restoration import restore_abandoned
-from loopwright.service.machine import Machine
 from loopwright.service.planning.known_loop import known
 from loopwright.service.request import BadLimits, RetuneRequest, retune_request, within
 from loopwright.service.store import looked_after

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from loopwright.service.results import TYPED_IN
 from loopwright.service.store.tables import EventRow, JobRow
 from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
 from loopwright.tuning.reasons import Reason
@@ -12,13 +13,13 @@ from loopwright.tuning.reasons import Reason
 FoundModel = FOPDT | SOPDT | TransferFunction
 DISPROVED = (Reason.WRONG_SIGN, Reason.MODEL_MISMATCH, Reason.DIVERGES, Reason.UNEXPLAINED, Reason.DISTURBED)
 """How a job ends whose own record speaks against the model that an earlier stage had found."""
-TYPED_IN = "typed in"
 
 
 def found_model(row: JobRow, events: Sequence[EventRow]) -> FoundModel | None:
     """The model of the job's result, else the last that a stage found; none that was typed in."""
-    results = [event.data.get("result") for event in reversed(events) if event.kind == "stage_done"]
-    for data in [(row.result or {}).get("model"), *results]:
+    if row.result is not None and row.result.model is not None and not row.result.model.typed_in:
+        return row.result.model.process_model()
+    for data in (event.data.get("result") for event in reversed(events) if event.kind == "stage_done"):
         if data and TYPED_IN not in (data.get("structure"), data.get("k_source")):
             model = model_of(data)
             if model is not None:
@@ -27,7 +28,7 @@ def found_model(row: JobRow, events: Sequence[EventRow]) -> FoundModel | None:
 
 
 def model_of(data: Mapping[str, Any]) -> FoundModel | None:
-    """The model of a stored result or request; None where it has none, or one that is not to be trusted."""
+    """The model of a stage's result or of a request; None where it has none, or one that is not to be trusted."""
     if all(isinstance(data.get(name), int | float) for name in ("K", "T_s", "L_s")):
         K, T, L, zeta = data["K"], data["T_s"], data["L_s"], data.get("zeta")
         return FOPDT(K, T, L) if zeta is None else SOPDT(K, T, zeta, L)

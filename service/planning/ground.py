@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from typing import Any
 
 from numpy.linalg import LinAlgError
@@ -12,6 +11,7 @@ from loopwright.service.config import LoopConfig
 from loopwright.service.loop_state import LoopState
 from loopwright.service.planning.found_model import FoundModel
 from loopwright.service.request import RetuneRequest
+from loopwright.service.results import GainsSource, PlantSource, RehearsedOnView
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, Model
@@ -23,22 +23,6 @@ LOWER, MAX_LOWERED = 0.5, 20
 """The gain of a guess is lowered by so much, so often at most."""
 MAX_SAMPLES_IN_T95 = 20_000
 """Samples: of more, a rehearsal takes long, and shows nothing else."""
-
-
-class PlantSource(StrEnum):
-    """The value is what the API shows."""
-
-    GIVEN = "given"
-    LAST_MODEL = "last_model"
-    GUESSED = "guessed"
-
-
-class GainsSource(StrEnum):
-    """The value is what the API shows."""
-
-    CONTROLLER = "controller"
-    LAST_JOB = "last_job"
-    ASSUMED = "assumed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,26 +54,9 @@ class Ground:
         return GainsSource.LAST_JOB if self.silence else GainsSource.CONTROLLER
 
 
-@dataclass(frozen=True, slots=True)
-class RehearsedOn:
-    """What a rehearsal was done on. num, den, dead_time_s: the plant.
-
-    plant_job, plant_job_ended_at: the job that found the last model.  gains_job: the job that had found the gains.
-    """
-
-    plant_source: PlantSource
-    plant_job: str | None
-    plant_job_ended_at: str | None
-    num: tuple[float, ...]
-    den: tuple[float, ...]
-    dead_time_s: float
-    gains_source: GainsSource
-    gains_job: str | None
-    plant_text: str
-    gains_text: str
-
-
-def rehearsal_spec(config: LoopConfig, request: RetuneRequest, ground: Ground) -> tuple[dict[str, Any], RehearsedOn]:
+def rehearsal_spec(
+    config: LoopConfig, request: RetuneRequest, ground: Ground
+) -> tuple[dict[str, Any], RehearsedOnView]:
     """The fields of `service.execution.rehearsal.PlantFile`: the plant given, else the last model found, else a guess;
     with the gains, the sample time, the limits and the action of the loop's own controller, where these are known."""
     state, low, high = ground.state, config.mv_limits.low, config.mv_limits.high
@@ -126,16 +93,16 @@ def rehearsal_spec(config: LoopConfig, request: RetuneRequest, ground: Ground) -
         spec |= _plant(guess)
         text = f"a guessed plant (from T95 {config.t95_s:g} s, MV {low:g} to {high:g} %, step {config.sp_deviation:g}"
         text += ", and such that the present gains are stable on it)" if lowered else ")"
-    num, den = (tuple(float(c) for c in spec[name]) for name in ("num", "den"))
-    on = RehearsedOn(
+    num, den = ([float(c) for c in spec[name]] for name in ("num", "den"))
+    on = RehearsedOnView(
         plant_source=source,
-        plant_job=job,
+        plant_job=None if job is None else f"/jobs/{job}",
         plant_job_ended_at=ended_at,
         num=num,
         den=den,
         dead_time_s=spec["dead_time_s"],
         gains_source=ground.gains_source,
-        gains_job=ground.state_job,
+        gains_job=None if ground.state_job is None else f"/jobs/{ground.state_job}",
         plant_text=text,
         gains_text=_gains_text(ground, spec.get("sample_time_s")),
     )

@@ -28,8 +28,8 @@ def known(store: Store, tag: str, read: Callable[[], LoopState]) -> Ground:
     row = next((row for row in rows if row.found), None)
     if row is None or row.found is None:
         return Ground(last, silence=words)
-    accepted = JobState(row.state) is JobState.ACCEPTED and row.result
-    gains = gains_of(row.result["gains"] if accepted and row.result else row.old_gains or row.found["gains"])
+    accepted = row.result.new_gains if JobState(row.state) is JobState.ACCEPTED and row.result is not None else None
+    gains = gains_of(row.old_gains or row.found["gains"]) if accepted is None else accepted.gains()
     return Ground(last, replace(loop_state(row.found), gains=gains), row.id, words)
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from pydantic import BaseModel, Field
 
@@ -16,6 +15,7 @@ from loopwright.service.planning.facts import time_budget_s
 from loopwright.service.planning.moves import Before, Moves, moves
 from loopwright.service.planning.obstacles import Now, Obstacle, Occupied, obstacles
 from loopwright.service.request import FiveStages, RetuneRequest, narrow
+from loopwright.service.results import Result, TransferModelView
 from loopwright.tuning.gains import Gains
 
 
@@ -35,14 +35,15 @@ class LastProposal:
     plant_time_s: float
 
     @classmethod
-    def of(cls, job_id: str, ended_at: str | None, plant_time_s: float, result: Mapping[str, Any]) -> LastProposal:
+    def of(cls, job_id: str, ended_at: str | None, plant_time_s: float, result: Result) -> LastProposal:
         """From the result of a job that ended in a proposal."""
-        ultimate, model = result.get("ultimate") or {}, result.get("model") or {}
-        order = "sopdt" if model.get("zeta") is not None else "fopdt"
-        return cls(
-            job_id, ended_at, str(result.get("method")), str(model.get("structure") or order),
-            ultimate.get("Ku"), ultimate.get("Pu_s"), plant_time_s,
-        )  # fmt: skip
+        if isinstance(result.model, TransferModelView):
+            structure = result.model.structure
+        else:
+            structure = "fopdt" if result.model is None or result.model.zeta is None else "sopdt"
+        point = result.ultimate
+        Ku, Pu_s = (None, None) if point is None else (point.Ku, point.Pu_s)
+        return cls(job_id, ended_at, result.method, structure, Ku, Pu_s, plant_time_s)
 
 
 class ObstacleView(BaseModel):

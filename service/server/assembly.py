@@ -12,11 +12,11 @@ from loopwright.service.jobs.engine import Engine
 from loopwright.service.jobs.journal import Journal
 from loopwright.service.jobs.locking import Locking
 from loopwright.service.jobs.loop_directory import LoopDirectory, LoopFactory
+from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.recovery import Recovery
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.worker import Worker
-from loopwright.service.machine import Machine
 from loopwright.service.store.store import Store
 
 

@@ -6,6 +6,7 @@ import secrets
 import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -577,7 +578,8 @@ def _audit_decision(
     session: Session, row: JobRow, previous: JobState, wanted: JobState, by: str, held: dict[str, Any] | None
 ) -> None:
     """held: the gains read back after the decision, where it went to the controller."""
-    old, new = row.old_gains, (row.result or {}).get("gains")
+    proposed = None if row.result is None else row.result.new_gains
+    old, new = row.old_gains, None if proposed is None else asdict(proposed.gains())
     has = new if wanted is JobState.ACCEPTED else old
     # A rollback that had to write found the new gains, of an acceptance that had ended in an error too.
     had = new if wanted is JobState.ROLLED_BACK and _last_begun(session, row.id) == DECISIONS[wanted] else old

@@ -4,8 +4,23 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import JSON, BigInteger, ForeignKey, Index, LargeBinary, text
+from sqlalchemy import JSON, BigInteger, Dialect, ForeignKey, Index, LargeBinary, TypeDecorator, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+from loopwright.service.results import RESULT, FastResult, FiveStageResult
+
+
+class ResultColumn(TypeDecorator[FastResult | FiveStageResult]):
+    """The result of a job, as JSON."""
+
+    impl = JSON
+    cache_ok = True
+
+    def process_bind_param(self, value: FastResult | FiveStageResult | None, dialect: Dialect) -> Any:
+        return None if value is None else value.model_dump(mode="json")
+
+    def process_result_value(self, value: Any, dialect: Dialect) -> FastResult | FiveStageResult | None:
+        return None if value is None else RESULT.validate_python(value)
 
 
 class Base(DeclarativeBase):
@@ -45,7 +60,7 @@ class JobRow(Base):
     detail: Mapped[str | None]
     old_gains: Mapped[dict[str, Any] | None]
     restored: Mapped[dict[str, Any] | None]
-    result: Mapped[dict[str, Any] | None]
+    result: Mapped[FastResult | FiveStageResult | None] = mapped_column(ResultColumn)
     # The host that runs it, the version of the workflow it was started under, how often it was started.
     host: Mapped[str] = mapped_column(server_default="local")
     version: Mapped[str] = mapped_column(server_default="0")

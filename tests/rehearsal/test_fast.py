@@ -9,10 +9,10 @@ import pytest
 from benchmarks.cases import ASKED, FURTHER
 from benchmarks.plants import plants
 from benchmarks.tuning import fast_run
-from loopwright.service.execution.rehearsal import rehearse
 from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction
+from tests.rehearsed import rehearse
 
 PLANTS: dict[str, dict[str, Any]] = {
     "first order": {"num": [2.0], "den": [10.0, 1.0], "dead_time_s": 2.03},
@@ -45,7 +45,7 @@ def test_the_loop_gets_the_Ms_asked_in_a_few_periods(name: str) -> None:
     answer = rehearse(plant, method="fast")
     assert answer["outcome"] == "proposed", answer["detail"]
     assert answer["method"] == "fast"
-    assert abs(true_Ms(plant, answer["gains"]) - 1.6) < 0.05
+    assert abs(true_Ms(plant, answer["new_gains"]) - 1.6) < 0.05
     times = answer["plant_time_s"]
     model = TransferFunction(tuple(plant["num"]), tuple(plant["den"]), plant["dead_time_s"])
     assert times["total"] - times["preflight"] < 8.0 * ultimate_point(model)[1]
@@ -58,8 +58,8 @@ def test_the_robustness_asked_is_the_one_got(Ms: float, derivative: bool) -> Non
     plant = spec("three lags")
     answer = rehearse(plant, method="fast", Ms=Ms, derivative=derivative)
     assert answer["outcome"] == "proposed", answer["detail"]
-    assert (answer["gains"]["Td"] > 0.0) == derivative
-    assert abs(true_Ms(plant, answer["gains"]) - Ms) < 0.05
+    assert (answer["new_gains"]["Td"] > 0.0) == derivative
+    assert abs(true_Ms(plant, answer["new_gains"]) - Ms) < 0.05
 
 
 def test_without_the_step_it_switches_six_times_at_least() -> None:
@@ -87,8 +87,8 @@ REFUSED = {
 def test_what_cannot_be_tuned_is_refused_with_its_cause(case: str) -> None:
     plant, options, reason = REFUSED[case]
     answer = rehearse(spec("first order") | plant, method="fast", **options)
-    assert answer["outcome"] in ("refused", "failed"), answer["gains"]
-    assert answer["gains"] is None
+    assert answer["outcome"] in ("refused", "failed"), answer["new_gains"]
+    assert answer["new_gains"] is None
     assert answer["advice"] and answer["detail"]
     assert answer["reason"] != "internal", answer["detail"]
     if reason is not None:

@@ -17,7 +17,7 @@ from loopwright.service.cli.job_tables import job_report, title
 from loopwright.service.config import LoopConfig, parse_site
 from loopwright.service.execution.procedures import rehearse as dry_run
 from loopwright.service.execution.procedures import tune
-from loopwright.service.execution.rehearsal import RehearsedLoop, rehearse
+from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.job_states import JobState
 from loopwright.service.request import retune_request
 from loopwright.service.server.assembly import make_jobs
@@ -27,6 +27,7 @@ from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT
 from loopwright.tuning.plan import Mode
+from tests.rehearsed import rehearse
 from tests.unit.service.fakes import ThreadEngine
 
 TAG = "TIC-1"
@@ -63,7 +64,7 @@ def own(method: str) -> Gains:
             "t95_s": 20.0, "sp_deviation": 2.0, "gains": {"Kp": SLUGGISH.Kp, "Ti": SLUGGISH.Ti}}  # fmt: skip
     answer = rehearse(spec, method)
     assert answer["outcome"] == "proposed", answer["detail"]
-    return Gains(answer["gains"]["Kp"], answer["gains"]["Ti"])
+    return Gains(answer["new_gains"]["Kp"], answer["new_gains"]["Ti"])
 
 
 @pytest.mark.parametrize("method", ["fast", "five-stage", "simc"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from random import Random
 from typing import Any
 
@@ -211,7 +211,8 @@ class World:
 
     def permit(self, row: JobRow) -> None:
         """A person decides: either set of the job may be the accepted one from now on."""
-        for gains in (row.old_gains, (row.result or {}).get("gains")):
+        proposed = None if row.result is None or row.result.new_gains is None else asdict(row.result.new_gains.gains())
+        for gains in (row.old_gains, proposed):
             if gains:
                 names = ("Kp", "Ti", "Td", "Tf", "b", "c")
                 self.invariants.permitted.append(Parameters(*(real32(float(gains[name])) for name in names)))

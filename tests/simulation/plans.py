@@ -13,10 +13,10 @@ from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.guard import Watch
 from loopwright.service.execution.procedures import Hooks, Outcome, Tune, tune
 from loopwright.service.execution.runner import run
-from loopwright.service.jsonable import to_json_object
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.service.request import RetuneRequest
+from loopwright.service.results import FiveStageResult, GainsView
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import (
     Mode,
@@ -128,7 +128,10 @@ def tunes(actions: tuple[Action, ...]) -> Tune:
             made_up(actions, state), loop, watch=watch, on_event=hooks.on_event, on_samples=hooks.on_samples,
             stop=hooks.stop, remember=hooks.remember, on_home=hooks.on_home,
         )  # fmt: skip
-        return Outcome(to_json_object(ran.value), ran.ended, ran.restored, dict(ran.plant_time_s))
+        made = None
+        if ran.value is not None:
+            made = FiveStageResult(method="five-stage", new_gains=GainsView.of(ran.value.gains))
+        return Outcome(made, ran.ended, ran.restored, dict(ran.plant_time_s))
 
     return work
 

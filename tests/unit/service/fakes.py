@@ -19,6 +19,14 @@ from loopwright.service.jobs.manager import Jobs
 from loopwright.service.loop_state import OPERATIONAL, LoopState, differences, same_gains
 from loopwright.service.loops.loop import Loop, Restored
 from loopwright.service.request import RetuneRequest
+from loopwright.service.results import (
+    FiveStageResult,
+    GainsView,
+    ModelView,
+    PredictedView,
+    StepView,
+    UltimateView,
+)
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.tuning.analysis.comparison import Predicted
@@ -166,13 +174,17 @@ class Found:
     Pu_s: float
 
 
-RESULT = {
-    "ultimate": asdict(Found(2.05, 3.32)), "model": {"K": 2.0, "T_s": 3.0, "L_s": 1.0},
-    "old_gains": asdict(OLD), "gains": asdict(NEW), "predicted": asdict(Predicted(1.6, 3.0, 60.0, 4.0, 8.0, 2.0)),
-    "baseline": asdict(StepResult(2.0, 40.0, 9.0, 20.0, 2.0, 3.0, 0.0, True, 30.0)),
-    "verification": asdict(StepResult(2.0, 5.0, 4.0, 9.0, 2.0, 2.0, 0.0, True, 30.0)),
-    "notes": ["all quiet"],
-}  # fmt: skip
+RESULT = FiveStageResult(
+    method="five-stage",
+    ultimate=UltimateView(Ku=2.05, Pu_s=3.32),
+    model=ModelView(K=2.0, T_s=3.0, L_s=1.0),
+    old_gains=GainsView.of(OLD),
+    new_gains=GainsView.of(NEW),
+    predicted=PredictedView.model_validate(asdict(Predicted(1.6, 3.0, 60.0, 4.0, 8.0, 2.0))),
+    before=StepView.model_validate(asdict(StepResult(2.0, 40.0, 9.0, 20.0, 2.0, 3.0, 0.0, True, 30.0))),
+    after=StepView.model_validate(asdict(StepResult(2.0, 5.0, 4.0, 9.0, 2.0, 2.0, 0.0, True, 30.0))),
+    notes=["all quiet"],
+)
 
 
 class FakeTune:

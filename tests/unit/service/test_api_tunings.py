@@ -14,12 +14,14 @@ from loopwright.service.model_json import parse_model
 from loopwright.service.offline.tunings import tunings
 from loopwright.service.planning.found_model import DISPROVED
 from loopwright.service.request import PlantModel, retune_request
+from loopwright.service.results import ModelView
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.design import design
 from loopwright.tuning.rules.registry import METHODS
+from tests.unit.service import fakes
 from tests.unit.service.fakes import RESULT, TAG, FakeLoop, Service
 from tests.unit.service.test_api import assert_problem, finished, start
 
@@ -140,7 +142,8 @@ def test_unstable_gains_are_not_to_be_tried(
 
 
 def test_a_second_order_model(service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(RESULT, "model", {"K": 2.0, "T_s": 6.0, "L_s": 3.0, "zeta": 0.5, "k_source": "fit"})
+    model = ModelView(K=2.0, T_s=6.0, L_s=3.0, zeta=0.5, k_source="fit")
+    monkeypatch.setattr(fakes, "RESULT", RESULT.model_copy(update={"model": model}))
     job = finished(service, client)
     found = client.get(f"{job['url']}/alternatives?method=direct-synthesis").json()
     assert parse_model(found["model"]) == SOPDT(2.0, 6.0, 0.5, 3.0)

@@ -17,8 +17,9 @@ from loopwright.service.execution.procedures import Hooks, rehearse
 from loopwright.service.job_states import JobState
 from loopwright.service.model_json import TransferFunctionModel
 from loopwright.service.planning.found_model import DISPROVED
-from loopwright.service.planning.ground import GainsSource, Ground, LastModel, PlantSource, rehearsal_spec
+from loopwright.service.planning.ground import Ground, LastModel, rehearsal_spec
 from loopwright.service.request import FastRetune, PlantModel, retune_request
+from loopwright.service.results import FastResult, GainsSource, PlantSource, TransferModelView
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT
@@ -60,15 +61,15 @@ def test_the_plant_given_comes_before_the_last_model_and_that_before_a_guess(ser
     config, known = service.loops[TAG], ground_with(service)
     model = TransferFunctionModel(num=[3.0], den=[5.0, 1.0], dead_time_s=2.0)
     for request, ground, source, num in (
-        (retune_request(dry_run=True, plant=PLANT), known, PlantSource.GIVEN, (0.2,)),
-        (retune_request(dry_run=True, model=model), known, PlantSource.GIVEN, (3.0,)),
-        (retune_request(dry_run=True), known, PlantSource.LAST_MODEL, (2.0,)),
-        (retune_request(dry_run=True), Ground(), PlantSource.GUESSED, (0.2,)),
+        (retune_request(dry_run=True, plant=PLANT), known, PlantSource.GIVEN, [0.2]),
+        (retune_request(dry_run=True, model=model), known, PlantSource.GIVEN, [3.0]),
+        (retune_request(dry_run=True), known, PlantSource.LAST_MODEL, [2.0]),
+        (retune_request(dry_run=True), Ground(), PlantSource.GUESSED, [0.2]),
     ):
         spec, on = rehearsal_spec(config, request, ground)
-        assert (on.plant_source, on.num, tuple(spec["num"])) == (source, num, num)
+        assert (on.plant_source, on.num, spec["num"]) == (source, num, num)
         assert (on.plant_job, on.plant_job_ended_at) == (
-            (FOUND.job, FOUND.ended_at) if source is PlantSource.LAST_MODEL else (None, None)
+            (f"/jobs/{FOUND.job}", FOUND.ended_at) if source is PlantSource.LAST_MODEL else (None, None)
         )
 
 
@@ -120,7 +121,8 @@ def test_neither_a_dry_run_nor_a_model_that_was_disproved_or_typed_in_is_the_las
     service.tune.ends = Refused(DISPROVED[1], "made up")
     service.wait(service.jobs.start(TAG, FastRetune()).id)
     typed_in = service.store.create(TAG, {}, "me", False)
-    result = RESULT | {"model": {"structure": "typed in", "num": [9.0], "den": [1.0, 1.0], "dead_time_s": 1.0}}
+    model = TransferModelView(structure="typed in", num=[9.0], den=[1.0, 1.0], dead_time_s=1.0)
+    result = FastResult(method="fast", model=model, new_gains=RESULT.new_gains)
     service.store.move(typed_in.id, JobState.RUNNING)
     service.store.move(typed_in.id, JobState.PROPOSED, result=result)
     view = dry_run(service)
@@ -206,8 +208,8 @@ def test_dry_runs_of_earlier_versions_are_shown_as_rehearsed(service: Service, c
     row = service.store.create(TAG, {"start": "relay"}, "me", True)
     with service.store.engine.begin() as connection:
         connection.execute(text("UPDATE jobs SET state = 'proposed' WHERE id = :id"), {"id": row.id})
-    old = {name: value for name, value in RESULT.items() if name != "comparison"}
-    service.store.note(row.id, result=old, old_gains=asdict(OLD))
+    assert RESULT.comparison is None
+    service.store.note(row.id, result=RESULT, old_gains=asdict(OLD))
     live = proposed(service)
     job = client.get(f"/jobs/{row.id}").json()
     assert (job["state"], job["comparison"], job["rehearsed_on"]) == ("rehearsed", None, None)

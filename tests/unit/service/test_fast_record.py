@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loopwright.service.execution.rehearsal import rehearse
 from loopwright.service.jobs.relay_record import relay_record
 from loopwright.tuning.fast.structure_choice import choose_structure
 from loopwright.tuning.identification.output_error import Fit
 from loopwright.tuning.plan import Event, Mode, Sample, StageStarted
+from tests.rehearsed import rehearse
 
 SPEC = {"num": [-1.5], "den": [8.0, 1.0], "dead_time_s": 2.0, "sample_time_s": 0.1, "noise_std": 0.002, "t95_s": 26.0}
 
@@ -57,7 +57,7 @@ def test_the_same_model_comes_out_of_it_again(
     assert record.Ts == pytest.approx(0.1) and record.t[record.listened] == 0.0
     evidence = record.experiment_record()
     assert evidence is not None
-    assert len(evidence.switches) == answer["found"]["switches"]
+    assert len(evidence.switches) == answer["evidence"]["switches"]
     assert evidence.direction == -1.0  # the plant's gain is negative
     fit = Fit(evidence)
     model = fit.model(choose_structure(fit).best)

@@ -9,7 +9,6 @@ import pytest
 from sqlalchemy.exc import OperationalError
 
 from loopwright.service.api.job_views import job_view
-from loopwright.service.api.result_views import ModelView, TransferModelView
 from loopwright.service.execution.procedures import rehearse
 from loopwright.service.job_states import IllegalMove, JobState
 from loopwright.service.jobs import manager as jobs_module
@@ -19,6 +18,7 @@ from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_restore import RESTORE_PATIENCE_S
 from loopwright.service.loops.loop import Restored
 from loopwright.service.request import FastRetune, retune_request
+from loopwright.service.results import ModelView, TransferModelView
 from loopwright.service.store import audit
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow

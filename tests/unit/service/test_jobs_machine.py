@@ -11,7 +11,7 @@ import tempfile
 import threading
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from loopwright.service.job_states import IllegalMove
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.service.request import RetuneRequest, retune_request
+from loopwright.service.results import FiveStageResult, GainsView
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store import database
 from loopwright.service.store.database import FILE
@@ -79,7 +80,7 @@ class Act:
     end: Ended | None = None
     killed: bool = False
 
-    def play(self, hooks: Hooks) -> tuple[dict[str, Any] | None, Ended | None]:
+    def play(self, hooks: Hooks) -> tuple[FiveStageResult | None, Ended | None]:
         ended = None
         hooks.on_event(StageStarted("relay", 1.0, 1.0))
         self.inside.set()
@@ -89,7 +90,7 @@ class Act:
         if self.killed:
             raise Killed
         ended = self.end
-        return (None, ended) if ended else (RESULT | {"gains": asdict(self.new)}, None)
+        return (None, ended) if ended else (RESULT.model_copy(update={"new_gains": GainsView.of(self.new)}), None)
 
 
 class HandEngine:

@@ -5,7 +5,7 @@ from typing import Any
 
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.registry import Registry
-from loopwright.service.machine import Machine
+from loopwright.service.jobs.machine import Machine
 from tests.unit.service.fakes import TAG, FakeLoop, Service
 
 

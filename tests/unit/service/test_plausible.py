@@ -14,11 +14,11 @@ from pydantic import ValidationError
 
 from benchmarks.plants import plants
 from loopwright.service.config import ConfigError, parse_site
-from loopwright.service.execution.rehearsal import rehearse
 from loopwright.service.model_json import BadModel, dump_model, parse_model
 from loopwright.service.offline.tunings import BadTuning, tune_model
 from loopwright.service.plausible import Implausible, check_model, check_sampling
 from loopwright.service.request import BadLimits, retune_request, within
+from tests.rehearsed import rehearse
 from tests.unit.service.fakes import TAG, Service, loop_entry
 from validation.references import References, load
 

@@ -16,6 +16,7 @@ from loopwright.service.planning.moves import broken_limits
 from loopwright.service.planning.obstacles import Now
 from loopwright.service.planning.preview import LastProposal, Preview, duration_text, preview
 from loopwright.service.request import FastRetune, retune_request, within
+from loopwright.service.results import UltimateView
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.store import Store
 from loopwright.tuning.plan import Mode
@@ -107,7 +108,7 @@ class TestTime:
     def test_the_last_model_tells_how_far_pv_goes(self) -> None:
         """A relay of 40 % on a loop of Ku 200 % per degC: 4 * 40 / (pi * 200)."""
         loop = LoopConfig.model_validate(loop_entry())
-        result = RESULT | {"ultimate": {"Ku": 200.0, "Pu_s": 3.32}}
+        result = RESULT.model_copy(update={"ultimate": UltimateView(Ku=200.0, Pu_s=3.32)})
         last = LastProposal.of("abc", None, 30.0, result)
         five, fast = (preview(loop, retune_request(method=m), Now(STATE), last) for m in ("five-stage", "fast"))
         assert five.stages[2].pv_move == pytest.approx(0.2546, abs=1e-4) and five.largest_pv_move is not None

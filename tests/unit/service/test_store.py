@@ -14,10 +14,12 @@ from sqlalchemy import Connection, inspect, text
 from sqlalchemy.exc import IntegrityError
 
 from loopwright.service.job_states import MOVES, IllegalMove, JobState, check
+from loopwright.service.results import FiveStageResult, GainsView
 from loopwright.service.store import lock
 from loopwright.service.store.database import USUAL, BadDatabase, urgent
 from loopwright.service.store.store import Busy, FolderInUse, ForeignLoop, NoSuchJob, Store
 from loopwright.service.store.tables import Base
+from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Sample
 from tests.unit.service.postgres import Server
 
@@ -55,7 +57,8 @@ def test_a_store_of_the_revision_before_is_taken_over_with_its_data(store: Store
         migrate(connection, "head")
     row = store.get("old")
     assert (row.state, row.host, row.version, row.attempt) == ("proposed", "local", "0", 0)
-    assert (row.plant_time_s, row.request, row.result) == (12.5, {"start": "relay"}, {"gains": {"Kp": 2.0}})
+    assert (row.plant_time_s, row.request) == (12.5, {"start": "relay"})
+    assert row.result == FiveStageResult(method="five-stage", new_gains=GainsView.of(Gains(2.0)))
     assert [event.data for event in store.events("old")] == [{"text": "hm"}]
     assert [job.id for job in store.unfinished()] == ["cut"]
     with pytest.raises(Busy):  # the index that holds it has come through

@@ -1,22 +1,70 @@
-"""The numbers of a result, as the API shows them."""
+"""The result of a retune: stored with its job, shown by the API, and printed by `loopwright rehearse --json`."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
-from loopwright.service.planning.ground import GainsSource, PlantSource
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
+
+TYPED_IN = "typed in"
+"""The structure, or the source of the gain, of a model that a person has given."""
 
 
-class UltimateView(BaseModel):
+class Figures(BaseModel):
+    """A part of a result. Nothing changes it once it is made."""
+
+    model_config = ConfigDict(frozen=True)
+
+
+class PlantSource(StrEnum):
+    """The value is what the API shows."""
+
+    GIVEN = "given"
+    LAST_MODEL = "last_model"
+    GUESSED = "guessed"
+
+
+class GainsSource(StrEnum):
+    """The value is what the API shows."""
+
+    CONTROLLER = "controller"
+    LAST_JOB = "last_job"
+    ASSUMED = "assumed"
+
+
+class GainsView(Figures):
+    """ISA (standard) form: u = Kp (b SP - PV + 1/Ti int(SP - PV) + Td d/dt(c SP - PV) / (1 + Tf s))."""
+
+    form: str = Field(default="ISA", description="Form of the controller")
+    Kp: float = Field(description="Proportional gain, MV percent per PV unit", examples=[0.75])
+    Ti: float = Field(description="Integral time, s; 0 means none", examples=[19.17])
+    Td: float = Field(description="Derivative time, s", examples=[0.0])
+    Tf: float = Field(description="Derivative filter time, s", examples=[0.0])
+    b: float = Field(description="Set-point weight of the proportional path", examples=[1.0])
+    c: float = Field(description="Set-point weight of the derivative path", examples=[0.0])
+
+    def gains(self) -> Gains:
+        """The same gains as those of the library."""
+        return Gains(self.Kp, self.Ti, self.Td, self.Tf, self.b, self.c)
+
+    @classmethod
+    def of(cls, gains: Gains) -> GainsView:
+        return cls(Kp=gains.Kp, Ti=gains.Ti, Td=gains.Td, Tf=gains.Tf, b=gains.b, c=gains.c)
+
+
+class UltimateView(Figures):
     """The ultimate point as measured, or typed in."""
 
     Ku: float = Field(description="MV percent per PV unit")
     Pu_s: float = Field(description="s")
 
 
-class ModelView(BaseModel):
+class ModelView(Figures):
     """K exp(-L s)/(T s + 1), or with zeta K exp(-L s)/(T^2 s^2 + 2 zeta T s + 1)."""
 
     K: float = Field(description="PV units per MV percent")
@@ -28,8 +76,18 @@ class ModelView(BaseModel):
     ke: float | None = Field(default=None, description="Gain as measured")
     fit_pct: float | None = Field(default=None, description="Fit of an identified model to its record, NRMSE, percent")
 
+    @property
+    def typed_in(self) -> bool:
+        return self.k_source == TYPED_IN
 
-class TransferModelView(BaseModel):
+    def process_model(self) -> FOPDT | SOPDT:
+        """The same model as a process model of the library."""
+        if self.zeta is None:
+            return FOPDT(self.K, self.T_s, self.L_s)
+        return SOPDT(self.K, self.T_s, self.zeta, self.L_s)
+
+
+class TransferModelView(Figures):
     """num(s)/den(s) exp(-dead_time_s s), highest power of s first, as method fast finds it; den begins with 1.
 
     Static gain and time constants are not given: a short record of a slow plant hardly shows them, and the gains do
@@ -44,15 +102,23 @@ class TransferModelView(BaseModel):
     den_errors: list[float] | None = Field(default=None, description="Standard errors; null: typed in")
     dead_time_error_s: float | None = Field(default=None, description="Standard error, s; null: typed in")
 
+    @property
+    def typed_in(self) -> bool:
+        return self.structure == TYPED_IN
 
-class LoadStepView(BaseModel):
+    def process_model(self) -> TransferFunction:
+        """The same model as a process model of the library."""
+        return TransferFunction(tuple(self.num), tuple(self.den), self.dead_time_s)
+
+
+class LoadStepView(Figures):
     """A step of the load during the test, found in the record and allowed for."""
 
     t_s: float = Field(description="Since the relay's start, s")
     size: float = Field(description="At the plant's input, MV percent")
 
 
-class EvidenceView(BaseModel):
+class EvidenceView(Figures):
     """What the record of method fast says, and how sure it is."""
 
     structure: str = Field(description="Of the model", examples=["sopdt"])
@@ -72,7 +138,7 @@ class EvidenceView(BaseModel):
     detail: str = Field(description="The numbers behind that reason")
 
 
-class VerificationView(BaseModel):
+class VerificationView(Figures):
     """The set-point step of method fast under the gains of the first design. It begins while PV still swings; the gains
     proposed are designed on this record too."""
 
@@ -85,8 +151,13 @@ class VerificationView(BaseModel):
     fit_pct: float = Field(description="How much of the measured step the model explains, NRMSE, percent")
     rms: float = Field(description="What it leaves, PV units")
 
+    @classmethod
+    def of_stage(cls, result: Mapping[str, Any]) -> VerificationView:
+        """From the JSON of a `VerifiedStep`, which is the result of the stage verify."""
+        return cls.model_validate({**result, **result["tested"]})
 
-class PredictedView(BaseModel):
+
+class PredictedView(Figures):
     """Gains on the model: computed, not measured."""
 
     Ms: float
@@ -97,7 +168,7 @@ class PredictedView(BaseModel):
     IAE_per_unit: float | None = Field(description="Of a unit step, s; null: an offset stays")
 
 
-class StepWorthView(BaseModel):
+class StepWorthView(Figures):
     """The answer to a unit step of the set-point (PV units), or of the load at the plant's input (percent of MV)."""
 
     IAE: float | None = Field(
@@ -108,7 +179,7 @@ class StepWorthView(BaseModel):
     TV: float = Field(description="Total variation of MV, the effort. Set-point: percent per PV unit. Load: 1 at least")
 
 
-class WorthView(BaseModel):
+class WorthView(Figures):
     """What gains are worth on the model found: computed, not measured. All figures are null for an unstable loop."""
 
     stable: bool
@@ -122,7 +193,7 @@ class WorthView(BaseModel):
     load: StepWorthView | None
 
 
-class ComparisonView(BaseModel):
+class ComparisonView(Figures):
     """The present and the new gains on the model found, and whether what was asked for gets better."""
 
     before: WorthView = Field(description="The present gains")
@@ -138,7 +209,7 @@ class ComparisonView(BaseModel):
     verdict: str = Field(description="The same in a sentence")
 
 
-class RehearsedOnView(BaseModel):
+class RehearsedOnView(Figures):
     """What a dry run was done on."""
 
     plant_source: PlantSource = Field(
@@ -159,7 +230,7 @@ class RehearsedOnView(BaseModel):
     gains_text: str = Field(description="The gains in words; why the controller did not answer, where it did not")
 
 
-class StepView(BaseModel):
+class StepView(Figures):
     """A set-point step measured on the loop."""
 
     step: float = Field(description="PV units")
@@ -173,26 +244,51 @@ class StepView(BaseModel):
     duration_s: float
 
 
-def model_view(stored: dict[str, Any] | None) -> ModelView | TransferModelView | None:
-    """Of either procedure."""
-    found: ModelView | TransferModelView | None = known(
-        TransferModelView if stored and "num" in stored else ModelView, stored
+class _Result(Figures):
+    """What the results of both procedures have. Everything is null that the retune did not come to."""
+
+    method: str = Field(description="What gives the gains", examples=["fast"])
+    chosen: dict[str, float] = Field(
+        default_factory=dict, description="The method's design parameters in effect, by name with unit"
     )
-    return found
+    ultimate: UltimateView | None = None
+    old_gains: GainsView | None = Field(default=None, description="The gains before the test")
+    new_gains: GainsView | None = Field(default=None, description="Proposed, rehearsed, or not worth a proposal")
+    comparison: ComparisonView | None = Field(
+        default=None, description="Present and new gains side by side on the model, with the verdict"
+    )
+    rehearsed_on: RehearsedOnView | None = Field(default=None, description="Of a dry run: which plant and which gains")
+    predicted: PredictedView | None = Field(default=None, description="The new gains on the model")
+    after: StepView | None = Field(default=None, description="A set-point step with the new gains, measured from rest")
+    notes: list[str] = Field(default_factory=list, description="What the operator should know")
 
 
-def verification_view(stored: dict[str, Any] | None) -> VerificationView | None:
-    found: VerificationView | None = known(VerificationView, stored and stored | stored["tested"])
-    return found
+class FastResult(_Result):
+    """The result of the procedure fast."""
+
+    procedure: Literal["fast"] = "fast"
+    model: TransferModelView | None = None
+    predicted_before: PredictedView | None = Field(
+        default=None, description="The old gains on the same model; null: not stable there"
+    )
+    evidence: EvidenceView | None = Field(default=None, description="What the record says")
+    verification: VerificationView | None = Field(default=None, description="The measured step that proves the model")
 
 
-def rehearsed_on_view(stored: dict[str, Any] | None) -> RehearsedOnView | None:
-    if not stored:
-        return None
-    urls = {name: f"/jobs/{stored[name]}" for name in ("plant_job", "gains_job") if stored[name] is not None}
-    return RehearsedOnView.model_validate(stored | urls)
+class FiveStageResult(_Result):
+    """The result of the procedure five-stage, in which the rules of `loopwright methods` run too."""
+
+    procedure: Literal["five-stage"] = "five-stage"
+    model: ModelView | None = None
+    before: StepView | None = Field(default=None, description="A set-point step with the old gains, measured")
 
 
-def known(kind: type[BaseModel], stored: dict[str, Any] | None) -> Any:
-    """The view of a stored result, None when there is none."""
-    return kind.model_validate(stored) if stored else None
+Result = Annotated[FastResult | FiveStageResult, Field(discriminator="procedure")]
+RESULT: TypeAdapter[FastResult | FiveStageResult] = TypeAdapter(Result)
+"""Reads a result from JSON."""
+
+
+def empty_result(method: str, rehearsed_on: RehearsedOnView | None = None) -> FastResult | FiveStageResult:
+    """The result of a retune that came to no gains."""
+    kind = FastResult if method == "fast" else FiveStageResult
+    return kind(method=method, rehearsed_on=rehearsed_on)
