@@ -37,5 +37,5 @@ def _line(connection: socket.socket) -> str:
     with connection.makefile("r", encoding="ascii") as lines:
         url = lines.readline().strip()
     if not url:
-        raise ConnectionResetError("the bus has gone")
+        raise ConnectionResetError("the bus has ended")
     return url

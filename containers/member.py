@@ -85,7 +85,7 @@ def _run(command: list[str], connection: socket.socket) -> int:
     threading.Thread(target=watch, daemon=True).start()
     status = process.wait()
     if gone.is_set():
-        print("member: the bus has gone: ended, to join the next one", file=sys.stderr, flush=True)
+        print("member: the bus has ended; this container ends too, to join the next bus", file=sys.stderr, flush=True)
         time.sleep(_BUS_RESTARTS_S)
         return BUS_GONE
     return status if status >= 0 else 128 - status
