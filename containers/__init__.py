@@ -1,2 +1,1 @@
-"""What runs inside the containers of docker-compose.yml beside the processes themselves: the bus they share, what keeps
-them on it, their health, and the demo that uses them."""
+"""The programs of the containers of docker-compose.yml beside the processes themselves: bus, health checks and demo."""

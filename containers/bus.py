@@ -1,7 +1,7 @@
-"""The bus container: vcan0 in the network namespace that the others join, or the loopback hub where no vcan can be had.
+"""The bus container: vcan0 in the network namespace that the others join, or the loopback hub where there is no vcan.
 
-It also hands connections from outside on to the service, which listens on the loopback address of this namespace: no
-port of it is reachable but the one that docker-compose.yml publishes.
+It also forwards connections from outside to the service, which listens on the loopback address of this namespace: only
+the port that docker-compose.yml publishes is reachable.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m loopwright.containers.bus", description="The bus of docker-compose.yml."
     )
-    parser.add_argument("--kind", choices=("auto", "vcan", "hub"), default="auto", help="auto: vcan if it can be had")
+    parser.add_argument("--kind", choices=("auto", "vcan", "hub"), default="auto", help="auto: vcan if it is available")
     try:
         with _bus(parser.parse_args(argv).kind) as url:
             asyncio.run(_keep(url))
@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _bus(kind: str) -> Iterator[str]:
-    """The bus's address, for as long as there is a bus."""
+    """Yields the address of the bus, which exists until the context ends."""
     if kind != "hub":
         try:
             make(INTERFACE)
@@ -60,7 +60,7 @@ def _bus(kind: str) -> Iterator[str]:
 
 
 async def _keep(url: str) -> None:
-    """Until SIGTERM or SIGINT."""
+    """Holds the bus until SIGTERM or SIGINT."""
     end = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, end.set)
@@ -72,14 +72,14 @@ async def _keep(url: str) -> None:
         writer.close()
 
     host, port = keeper.ADDRESS
-    # Not closed in order: a server that is closed waits for its connections, and these last as long as this process.
+    # The servers are not closed: closing waits for the connections, and these last as long as this process.
     _servers = await asyncio.start_server(tell, host, port), await asyncio.start_server(_forward, "0.0.0.0", DOOR)
     print(f"ready {url}", flush=True)
     await end.wait()
 
 
 async def _forward(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """One connection from outside, to the service and back."""
+    """Forwards one connection from outside to the service and back."""
     try:
         inner_reader, inner_writer = await asyncio.open_connection("127.0.0.1", SERVICE)
     except OSError:  # the service is starting
@@ -89,7 +89,7 @@ async def _forward(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -
 
 
 async def _copy(source: asyncio.StreamReader, target: asyncio.StreamWriter) -> None:
-    """Ends the other side when one side ends: a browser that closes an event stream must not leave it open inside."""
+    """Ends the other side when one side ends: an event stream that a browser closes must not stay open inside."""
     with suppress(ConnectionError):
         while data := await source.read(_CHUNK):
             target.write(data)

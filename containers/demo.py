@@ -1,7 +1,7 @@
 """The demo of docker-compose.yml: one HTTP call retunes the loop; what happens is shown live, then the proof.
 
-Exit status 0: proposed, 3: the retune ended otherwise, 1: no answer. A retune that is on its way already, one that went
-on after a restart for example, is followed instead of starting another.
+The exit status is 0 for a proposal, 3 if the retune ended otherwise, 1 if there was no answer. A retune that is running
+already, for example one that was resumed after a restart, is followed instead of starting another.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def _demonstrate(client: Client) -> int:
 
 def _proof(job: dict[str, Any], loop: dict[str, Any], seconds: float) -> list[str]:
     live = loop["live"]
-    # fast measures one step, under the new gains, to prove the model that tells of both
+    # fast measures one step under the new gains, to verify the model that predicts both responses
     how, names = "measured", (("overshoot", "overshoot_pct", " %"), ("IAE", "IAE", f" {loop['pv_unit']} s"))
     before, after = job["before"], job["after"]
     if before is None:

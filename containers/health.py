@@ -1,6 +1,6 @@
-"""Health checks of docker-compose.yml: exit status 0, or 1 and what is wrong. Light enough to run every few seconds.
+"""Health checks of docker-compose.yml: exit status 0, or 1 with a message. They are cheap enough to run often.
 
-python -m loopwright.containers.health bus             the bus is kept
+python -m loopwright.containers.health bus             the bus exists
 python -m loopwright.containers.health node 0x20       a heartbeat of this node within 2 s
 python -m loopwright.containers.health service [URL]   the service answers
 """
@@ -41,8 +41,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def answers(url: str) -> None:
-    """Raises OSError when the service does not answer, or says that it is not well."""
-    import urllib.error  # half of the time that the others take
+    """Raises OSError when the service does not answer, or reports that it is not well."""
+    import urllib.error  # takes half of the time of the other checks
     import urllib.request
 
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
@@ -55,7 +55,7 @@ def answers(url: str) -> None:
 
 
 def hear(bus: str, can_id: int) -> None:
-    """Waits for one frame of this identifier. Raises OSError when none came in time."""
+    """Waits for one frame with this identifier. Raises OSError when none came in time."""
     kind, _, address = bus.partition(":")
     heard = _on_socketcan(address, can_id) if kind == "socketcan" else _on_hub(address, can_id)
     if not heard:
@@ -74,7 +74,7 @@ def _on_socketcan(interface: str, can_id: int) -> bool:
 
 
 def _on_hub(address: str, can_id: int) -> bool:
-    """The raw mode of socketcand, see protocol/hub.py."""
+    """Waits for the frame in the raw mode of socketcand, see protocol/hub.py."""
     host, _, port = address.rpartition(":")
     wanted = f"< frame {can_id:03x} ".encode()
     with socket.create_connection((host, int(port)), timeout=_WAIT_S) as hub:

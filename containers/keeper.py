@@ -1,7 +1,7 @@
-"""How the other containers know the bus: who connects is told its address, and the connection lasts as long as the bus.
+"""How the other containers find the bus: a connection returns its address, and lasts as long as the bus.
 
-A container that shares another's network namespace stays in the old one when that container starts anew. The broken
-connection is how it learns that it has to follow.
+A container that shares another's network namespace stays in the old one when that container is restarted. From the
+broken connection it learns that it has to restart too.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ _BETWEEN_S = 0.1
 
 
 class NoBus(Exception):
-    """Nobody keeps a bus in this network namespace."""
+    """Raised when no bus exists in this network namespace."""
 
 
 def join(patience_s: float, address: tuple[str, int] = ADDRESS) -> tuple[str, socket.socket]:
-    """The bus's address, and the connection that ends with the bus. Raises NoBus after `patience_s` of wall time."""
+    """Returns the address of the bus, and the connection that ends with the bus. Raises NoBus after `patience_s` of
+    wall time."""
     give_up = time.monotonic() + patience_s
     while True:
         try:
@@ -36,5 +37,5 @@ def _line(connection: socket.socket) -> str:
     with connection.makefile("r", encoding="ascii") as lines:
         url = lines.readline().strip()
     if not url:
-        raise ConnectionResetError("the bus has gone")
+        raise ConnectionResetError("the bus has ended")
     return url

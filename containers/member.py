@@ -2,8 +2,9 @@
 
     python -m loopwright.containers.member [--set NAME=VALUE] [--write TEMPLATE FILE] -- COMMAND...
 
-{bus} in an argument, and in TEMPLATE, which is written to FILE, stands for the bus's address, {NAME} for VALUE. When
-the bus goes, the command is ended as by `docker stop`, and this container with it: started anew, it joins the new bus.
+{bus} in an argument, and in TEMPLATE, which is written to FILE, stands for the address of the bus, {NAME} for VALUE.
+When the bus ends, the command is ended as by `docker stop`, and this container with it; restarted, it joins the new
+bus.
 """
 
 from __future__ import annotations
@@ -23,19 +24,22 @@ from types import FrameType
 from loopwright.containers import keeper
 
 BUS_GONE = 75
-"""Exit status, "try again" (EX_TEMPFAIL)."""
+"""Exit status when the bus has ended: "try again" (EX_TEMPFAIL)."""
 _JOIN_S = 20.0
 _STOP_S = 9.0
-"""What the command has to make its loops safe, before the engine's 10 s are over."""
+"""Time that the command has to restore its loops, s, before the engine's 10 s are over."""
 _BUS_RESTARTS_S = 3.0
-"""The bus has to be there before the engine starts this container again: it does not try a second time."""
+"""Time for which the bus must have restarted before the engine restarts this container, s: the engine does not try
+twice."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m loopwright.containers.member", description=__doc__.split("\n")[0])
-    parser.add_argument("--need", metavar="VARIABLE", help="of the environment, without which nothing is started")
-    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="{NAME} filled in too")
-    parser.add_argument("--write", nargs=2, type=Path, metavar=("TEMPLATE", "FILE"), help="with all of them filled in")
+    parser.add_argument("--need", metavar="VARIABLE", help="environment variable without which nothing is started")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="fills in {NAME} too")
+    parser.add_argument(
+        "--write", nargs=2, type=Path, metavar=("TEMPLATE", "FILE"), help="file to write, with all names filled in"
+    )
     parser.add_argument("command", nargs="+")
     options = parser.parse_args(argv)
     if options.need and not os.environ.get(options.need):
@@ -81,7 +85,7 @@ def _run(command: list[str], connection: socket.socket) -> int:
     threading.Thread(target=watch, daemon=True).start()
     status = process.wait()
     if gone.is_set():
-        print("member: the bus has gone: ended, to join the next one", file=sys.stderr, flush=True)
+        print("member: the bus has ended; this container ends too, to join the next bus", file=sys.stderr, flush=True)
         time.sleep(_BUS_RESTARTS_S)
         return BUS_GONE
     return status if status >= 0 else 128 - status

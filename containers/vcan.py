@@ -1,4 +1,4 @@
-"""A virtual CAN interface by three netlink messages: an image then needs no `ip`."""
+"""Creates a virtual CAN interface by three netlink messages, so that an image needs no `ip`."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _LINK = struct.Struct("=BxHiII")
 
 
 class NoVcan(Exception):
-    """The interface cannot be had; the text says why."""
+    """Raised when the interface cannot be created or used; the text says why."""
 
 
 def make(name: str = "vcan0") -> None:
-    """Creates a vcan interface in this network namespace and brings it up; one that is there is used. Raises NoVcan."""
+    """Creates a vcan interface in this network namespace and brings it up; an existing one is used. Raises NoVcan."""
     try:
         _ask(_NEWLINK, _REQUEST | _ACKNOWLEDGE | _CREATE | _EXCLUSIVE, 0, _named(name) + _kind("vcan"))
     except OSError as error:
@@ -29,7 +29,7 @@ def make(name: str = "vcan0") -> None:
             raise NoVcan(_why(name, error)) from error
     try:
         _ask(_NEWLINK, _REQUEST | _ACKNOWLEDGE, _UP, _named(name))
-        # A kernel may have the interface and not the sockets.
+        # A kernel may have the interface but no CAN sockets.
         with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
             probe.bind((name,))
     except OSError as error:
@@ -50,7 +50,7 @@ def _why(name: str, error: OSError) -> str:
 
 
 def _ask(kind: int, flags: int, link_flags: int, attributes: bytes) -> None:
-    """One request about a link and the kernel's answer. Raises OSError."""
+    """Sends one request about a link and reads the kernel's answer. Raises OSError."""
     body = _LINK.pack(socket.AF_UNSPEC, 0, 0, link_flags, link_flags) + attributes
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as link:
         link.bind((0, 0))
@@ -71,5 +71,5 @@ def _kind(kind: str) -> bytes:
 
 
 def _attribute(number: int, value: bytes) -> bytes:
-    """Length and number, then the value filled up to a multiple of four."""
+    """Returns length and number, then the value padded to a multiple of four bytes."""
     return struct.pack("=HH", 4 + len(value), number) + value + bytes(-len(value) % 4)

@@ -1,7 +1,7 @@
-"""The control of one loop: modes, limits, the relay, gains on trial, and the way home.
+"""The control of one loop: modes, limits, the relay, gains on trial, and the return to the state before a test.
 
-Changing the law or the mode never moves the output (OFF and MANUAL go to the output they stand for). Who may command
-what, and when a test ends, is the session's business (`controller.session`).
+A change of the control law or the mode never moves the output (except to OFF and MANUAL, which have outputs of their
+own). `controller.session` decides who may command what, and when a test ends.
 """
 
 from __future__ import annotations
@@ -18,9 +18,14 @@ __all__ = ["Channel", "Home", "Mode", "Parameters", "RelaySettings", "RelayState
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Limits in MV units (rate: per s, 0 = none) and the PV span; reverse: MV falls as PV rises.
+    """Limits and PV span of a channel.
 
-    A PV that is farther outside its span than the span is wide is no measurement.
+    mv_low, mv_high, safe_output: limits of MV, and MV in mode OFF, in MV units.
+    rate_limit_per_s: largest rate of MV, MV units per s; 0 for none.
+    pv_low, pv_high: the PV span, PV units. A PV that lies farther outside than the span is wide is not a valid
+    measurement.
+    reverse: whether MV falls as PV rises.
+    Raises ValueError.
     """
 
     mv_low: float = 0.0
@@ -41,13 +46,14 @@ class Settings:
             raise ValueError("the rate limit must not be negative")
 
     def measured(self, pv: float) -> bool:
+        """Returns whether this PV is a valid measurement."""
         width = self.pv_high - self.pv_low
         return self.pv_low - width <= pv <= self.pv_high + width
 
 
 @dataclass(frozen=True, slots=True)
 class Home:
-    """What a channel comes back to at the end of a test; PV and MV units."""
+    """The state to which a channel returns at the end of a test; PV and MV units."""
 
     mode: Mode
     setpoint: float
@@ -56,10 +62,10 @@ class Home:
 
 
 class Channel:
-    """Call `step` once per sample with the PV; it answers with the MV that holds until the next one.
+    """A control channel: `step`, called once per sample with the PV, returns the MV that holds until the next sample.
 
-    A PV that is not finite, or far outside its span, holds the MV of AUTOMATIC and of the relay, and counts in
-    `bad_samples`; nothing of it is remembered. MANUAL and OFF need no PV.
+    A PV that is not finite, or far outside its span, is counted in `bad_samples` and otherwise ignored; AUTOMATIC and
+    the relay then hold MV. MANUAL and OFF need no PV.
     """
 
     def __init__(
@@ -82,7 +88,7 @@ class Channel:
         self.bad_samples = 0
         self.good_samples = 0
         self.measuring = False
-        """The last PV was valid."""
+        """Whether the last PV was valid."""
         self.relay_state = RelayState.IDLE
         self._sample_time_s = sample_time_s
         self._settings = settings
@@ -94,7 +100,7 @@ class Channel:
         self._pid = Pid(sample_time_s, parameters, settings.reverse)
         self._mv = self._limited(settings.safe_output if self._mode is Mode.OFF else manual_output)
         self._takes_over = self._mv
-        """The output from which the next law, or MANUAL, goes on."""
+        """The output from which the next control law, or MANUAL, continues, MV units."""
 
     @property
     def mode(self) -> Mode:
@@ -136,7 +142,7 @@ class Channel:
         self._use(self.in_effect)
 
     def step(self, pv: float) -> float:
-        """MV for this sample."""
+        """Returns the MV for this sample."""
         self.measuring = self._settings.measured(pv)
         if self.measuring:
             self.good_samples += 1
@@ -151,7 +157,10 @@ class Channel:
         return self._mv
 
     def command_mode(self, mode: Mode | int) -> None:
-        """OFF, MANUAL (at the present output) or AUTOMATIC; an experiment starts by `start_relay` only."""
+        """Changes to OFF, MANUAL (at the present output) or AUTOMATIC; only `start_relay` starts an experiment.
+
+        Raises ValueError.
+        """
         mode = Mode(mode)
         if mode is self._mode:
             return
@@ -167,13 +176,13 @@ class Channel:
         self.staged = parameters
 
     def try_gains(self, parameters: Parameters) -> None:
-        """These go on trial, all of them in one sample."""
+        """Puts these gains on trial, all of them in one sample."""
         self.on_trial = True
         if parameters != self.in_effect:
             self._use(parameters)
 
     def accept(self, parameters: Parameters) -> None:
-        """These are in effect, and are the set to come back to."""
+        """Makes these gains the accepted set, and puts them in effect."""
         if parameters != self.in_effect:
             self._use(parameters)
         self.accepted = parameters
@@ -181,12 +190,12 @@ class Channel:
         self.accept_count += 1
 
     def go_back(self) -> None:
-        """Ends the trial: the accepted set, from the present output on."""
+        """Ends the trial and returns to the accepted set without a bump."""
         self.on_trial = False
         self._use(self.accepted)
 
     def start_relay(self, settings: RelaySettings) -> None:
-        """Mode EXPERIMENT until something ends it; a running relay takes new settings on the side it is on."""
+        """Starts mode EXPERIMENT. A running relay takes the new settings and stays on its present side."""
         error = 0.0 if self._pv is None else self._error(self._pv)
         self._relay = Relay(settings, error, self._relay)
         self._mode = Mode.EXPERIMENT
@@ -194,13 +203,14 @@ class Channel:
 
     @property
     def home(self) -> Home:
-        """The channel as it is, to come back to; where a relay has just ended, MV is its working output already."""
+        """Returns the present state, to return to later; directly after a relay, its MV is the relay's working
+        output."""
         return Home(self._mode, self._setpoint, self._manual_output, self._takes_over)
 
     def go_home(self, home: Home, relay_state: RelayState = RelayState.DONE) -> None:
-        """Ends trial and relay: accepted gains, and mode, set-point and manual output of `home`.
+        """Ends trial and relay; restores the accepted gains, and mode, set-point and manual output of `home`.
 
-        The law goes on from the present output, from the working output where a relay ran.
+        The control law continues from the present output, or from the working output if a relay ran.
         """
         self._end_relay(relay_state)
         self.on_trial = False
@@ -208,8 +218,9 @@ class Channel:
         self._use(self.accepted)
 
     def without_pv(self, mv: float) -> None:
-        """The output at once where no PV comes: manual or safe output, in automatic `mv`, from which the law goes on
-        when PV is back. The rate limit does not hold here: there is no next sample to go on with."""
+        """Sets the output at once where no PV arrives: the manual or safe output, or in AUTOMATIC `mv`, from which the
+        control law continues when PV returns. The rate limit is not applied, because no next sample would continue
+        it."""
         outputs = {Mode.MANUAL: self._manual_output, Mode.OFF: self._settings.safe_output}
         self._mv = self._takes_over = self._limited(outputs.get(self._mode, mv))
         self._pv = None
@@ -221,7 +232,7 @@ class Channel:
             self.relay_state = state
 
     def _use(self, parameters: Parameters) -> None:
-        """This law from the present output on."""
+        """Switches to these parameters without a bump."""
         self.in_effect = parameters
         self._pid = Pid(self._sample_time_s, parameters, self._settings.reverse)
         if self._pv is not None:
@@ -234,12 +245,12 @@ class Channel:
         return min(max(output, self._settings.mv_low), self._settings.mv_high)
 
     def _answer(self, pv: float) -> float:
-        """The output this mode wants for this PV, within limits and rate."""
+        """Returns the output of the present mode for this PV, within limits and rate."""
         settings = self._settings
         low, high = settings.mv_low, settings.mv_high
         if settings.rate_limit_per_s and self._mode is not Mode.OFF:
             reach = settings.rate_limit_per_s * self._sample_time_s
-            # The limits win over the rate when they have been moved away from the present output.
+            # Limits that have been moved away from the present output take precedence over the rate.
             low, high = min(max(low, self._mv - reach), high), max(min(high, self._mv + reach), low)
         if self._mode is Mode.AUTOMATIC:
             return self._pid.step(self._setpoint, pv, low, high)

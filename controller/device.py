@@ -1,4 +1,4 @@
-"""The controller device: each PV that arrives is answered with the MV of its sample; everything else is SDO."""
+"""The controller device: it answers each PV with the MV of its sample; all other access is by SDO."""
 
 from __future__ import annotations
 
@@ -48,7 +48,8 @@ _PV_TIMEOUT_SAMPLES = 3
 
 _DRIVEN_S = 2.0
 _DRIVEN_SAMPLES = 10
-"""A set-point that an RPDO has moved within this time is driven by somebody: an outer loop, a ramp."""
+"""A set-point that an RPDO has changed within the longer of these times (s, samples) is driven by an outer loop or a
+ramp."""
 
 _GAINS = dict(zip(GAINS, ("Kp", "Ti", "Td", "Tf", "b", "c"), strict=True))
 _SETTINGS = {
@@ -64,7 +65,11 @@ _ENDED_BY = {Cause.LEASE: Emcy.LEASE_USED_UP, Cause.PV_LIMIT: Emcy.PV_LIMIT, Cau
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """What outlives a restart of one channel: the accepted gains, and home or the last choice of the rest."""
+    """The state of one channel that outlives a restart.
+
+    accepted: the accepted gains.
+    mode, setpoint, manual_output: the state before the test within a session, else the last commanded values.
+    """
 
     accepted: Parameters
     mode: Mode
@@ -74,7 +79,11 @@ class Kept:
 
 @dataclass(frozen=True, slots=True)
 class ControllerChannel:
-    """What a channel starts with. setpoint in PV units, manual_output (the first MV) in percent."""
+    """The initial state of a channel.
+
+    setpoint: in PV units.
+    manual_output: the first MV, in percent.
+    """
 
     parameters: Parameters
     setpoint: float
@@ -96,18 +105,21 @@ class ControllerChannel:
 
 
 class Keeper(Protocol):
-    """Where the channels are kept over a restart."""
+    """The storage of the channels' state over a restart."""
 
     def now(self, channels: Sequence[Kept]) -> None:
-        """Returns when they are on the disk. Raises OSError; what is to hold then has to be given again, by `soon`."""
+        """Returns when the state is on the disk. Raises OSError; the state that is to be stored then has to be passed
+        again, to `soon`."""
         ...
 
     def soon(self, channels: Sequence[Kept]) -> None:
-        """Returns at once, and has them written within seconds."""
+        """Returns at once; the state is written within seconds."""
         ...
 
 
 class KeepNothing:
+    """Storage that stores nothing."""
+
     def now(self, channels: Sequence[Kept]) -> None:
         pass
 
@@ -120,7 +132,11 @@ _Status = tuple[Mode, bool, float, bool, Cause]
 
 @dataclass(slots=True)
 class _PdoSetpoint:
-    """What the set-point's RPDO has brought. changed_at: of the controller's clock, s."""
+    """The last set-point received by RPDO.
+
+    value: the set-point, PV units; None before the first one.
+    changed_at: when it last changed, s of the controller's clock.
+    """
 
     value: float | None = None
     changed_at: float = -math.inf
@@ -135,10 +151,12 @@ def _random_number() -> int:
 
 
 class ControllerDevice:
-    """pv_timeout_s: wall time without a valid PV after which EMCY 8250h is sent; default 3 samples, at least 1 s.
+    """The controller on its bus.
 
-    keeper: where accepted gains, mode, set-point and manual output outlive a restart; gains it cannot keep are not
-    accepted.  draw: numbers of sessions.
+    pv_timeout_s: wall time without a valid PV after which EMCY 8250h is sent; by default 3 samples, at least 1 s.
+    keeper: storage of accepted gains, mode, set-point and manual output over a restart; gains that cannot be stored are
+    not accepted.
+    draw: returns random numbers for sessions.
     """
 
     def __init__(
@@ -193,7 +211,7 @@ class ControllerDevice:
         self.runtime.start()
 
     def _power_on(self) -> None:
-        """Every channel, and what is staged, as the program was started."""
+        """Restores every channel, and the staged values, to their state at the start of the program."""
         count = len(self._started_with)
         self._numbers = [0] * count
         self._pvs = [0.0] * count
@@ -216,7 +234,7 @@ class ControllerDevice:
 
     def _on_pv(self, at: int, data: bytes) -> None:
         pv, number = PV_FRAME.unpack(data)
-        if number == self._numbers[at] and number:  # a frame that came twice is one sample
+        if number == self._numbers[at] and number:  # a repeated frame is the same sample
             return
         self._numbers[at] = number
         self._pvs[at] = pv
@@ -229,14 +247,14 @@ class ControllerDevice:
         self._send(self._mv_ids[at], MV_FRAME.pack(mv, number))
 
     def _on_command(self, at: int, data: bytes) -> None:
-        """The set-point by RPDO. A value that is repeated says nothing new: within a session it is passed over, and
-        after it it is nobody's hand while it is the set-point."""
+        """Takes a set-point by RPDO. A repeated value is no new command: it is ignored within a session, and after a
+        session as long as it equals the set-point."""
         setpoint = COMMAND_FRAME.unpack(data)[0]
         if not math.isfinite(setpoint):
             return
         session, driven = self.sessions[at], self._driven[at]
         before = driven.value
-        if before is None:  # as an RPDO would carry it
+        if before is None:  # rounded as in an RPDO
             before = c_float(session.home.setpoint if session.is_open else session.channel.setpoint).value
         driven.value = setpoint
         if setpoint != before:
@@ -278,7 +296,7 @@ class ControllerDevice:
     def _order(self, order: Order, sub: int, value: Value) -> None:
         session, now = self.sessions[sub - 1], self.runtime.clock()
         if order is Order.OPEN and not session.is_open:
-            if self.runtime.state is not NmtState.OPERATIONAL:  # no time would end it there
+            if self.runtime.state is not NmtState.OPERATIONAL:  # no time-out would end it there
                 raise SdoAbort(Abort.DEVICE_STATE)
             if self._is_driven(sub - 1, now):
                 raise SdoAbort(Abort.LOCAL_CONTROL)
@@ -299,8 +317,8 @@ class ControllerDevice:
         self.sessions[sub - 1].renew(int(value), self.runtime.clock())
 
     def _on_renewal(self, data: bytes) -> None:
-        """A renewal by RPDO waits for no turn and no answer. One of a session that is over is answered with the status,
-        which the tuner must have missed."""
+        """Renews a lease by RPDO, which needs no lock and no answer. A renewal of a session that is over is answered
+        with the status, which the tuner must have missed."""
         number, sub = RENEWAL_FRAME.unpack(data)
         if not 1 <= sub <= len(self.sessions):
             return
@@ -312,7 +330,7 @@ class ControllerDevice:
 
     @contextmanager
     def _another_hand(self, sub: int, what: Hand) -> Iterator[Channel]:
-        """The channel, for what somebody commands by the ordinary objects: a test on it is over."""
+        """Yields the channel to a command through the ordinary objects, which ends a test on it."""
         session = self.sessions[sub - 1]
         session.another_hand(what)
         try:
@@ -327,7 +345,7 @@ class ControllerDevice:
             self.runtime.raise_error(code, bytes((at + 1,)))
 
     def _send_unasked(self, at: int) -> None:
-        """No PV asks for this output: the plant takes it as it comes."""
+        """Sends an output that answers no PV: the plant applies it at once."""
         session = self.sessions[at]
         if session.unasked:
             session.unasked = False
@@ -345,13 +363,13 @@ class ControllerDevice:
             self._send_unasked(at)
 
     def _on_reset(self) -> None:
-        """As at power-on: what is kept comes back, and else what the program was started with."""
+        """Restores the state at power-on: the stored state, or else that of the start of the program."""
         if self._keeps:
             pairs = zip(self._started_with, self._to_keep(), strict=True)
             self._started_with = [each.with_kept(kept) for each, kept in pairs]
         self._power_on()
 
-    # What outlives a restart
+    # State that outlives a restart
 
     def _to_keep(self) -> list[Kept]:
         return [self._kept_of(session, session.channel.accepted) for session in self.sessions]
@@ -370,7 +388,7 @@ class ControllerDevice:
             self._keeper.soon(kept)
 
     def _store(self, sub: int, parameters: Parameters) -> None:
-        """Before they are accepted: what is confirmed is on the disk."""
+        """Writes gains to the disk before they are accepted, so that a confirmed acceptance outlives a power cut."""
         kept = self._to_keep()
         kept[sub - 1] = self._kept_of(self.sessions[sub - 1], parameters)
         try:
@@ -472,7 +490,7 @@ class ControllerDevice:
             channel.command_mode(int(value))
 
     def _write_parameter_command(self, sub: int, value: Value) -> None:
-        """Gains by hand, without a session."""
+        """Carries out a gain command that is given without a session."""
         with self._another_hand(sub, Hand.GAINS) as channel:
             if value == ParameterCommand.GO_BACK:
                 channel.go_back()
@@ -483,14 +501,14 @@ class ControllerDevice:
                 channel.accept(channel.in_effect)
 
     def _proportional_band(self, sub: int) -> float:
-        """Percent of span."""
+        """Returns the proportional band in percent of the PV span."""
         channel = self.channels[sub - 1]
         limits = channel.settings
         span = channel.in_effect.Kp * (limits.pv_high - limits.pv_low)
         return 100.0 * (limits.mv_high - limits.mv_low) / span if span else 0.0
 
     def _write_sample_time(self, sub: int, value: Value) -> None:
-        """A new cycle time starts every channel anew on its accepted set, at its present output."""
+        """Restarts every channel with the new cycle time, on its accepted gains and at its present output."""
         if self.runtime.state is not NmtState.PRE_OPERATIONAL:
             raise SdoAbort(Abort.DEVICE_STATE)
         sample_time_s = int(value) / 1e6

@@ -3,9 +3,9 @@
     e = SP - PV (reverse action) or PV - SP (direct action: both terms change sign)
     u = Kp*(b*SP - PV) + I + D,   I' = Kp*e/Ti,   D = Kp*Td*s/(1 + Tf*s) * (c*SP - PV)
 
-I is summed forwards (the present error acts from the next sample on), D differs backwards, so Tf = 0 is allowed.
-With Ti = 0 nothing is summed and I is the bias of a P controller. Every change of the law re-bases I so that the output
-stays where it is; D starts anew then, for its history belongs to another law.
+I is a forward difference (the present error acts from the next sample on), D a backward one, so Tf = 0 is allowed.
+With Ti = 0, I is the constant bias of a P controller. Every change of the law re-bases I so that the output stays where
+it is, and restarts D, because its history belongs to the previous law.
 """
 
 from __future__ import annotations
@@ -16,7 +16,13 @@ from dataclasses import astuple, dataclass
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """Kp > 0 in MV units per PV unit; Ti (0: no integral action), Td, Tf in s; set-point weights b and c."""
+    """The parameters of the control law in the ISA form.
+
+    Kp: gain, MV units per PV unit; positive.
+    Ti, Td, Tf: integral, derivative and filter time, s; Ti = 0 for no integral action.
+    b, c: set-point weights of P and D.
+    Raises ValueError.
+    """
 
     Kp: float
     Ti: float = 0.0
@@ -35,7 +41,7 @@ class Parameters:
 
 
 class Pid:
-    """One control law and its memory. `rebase` before the first `step`."""
+    """One control law with its state. Call `rebase` before the first `step`."""
 
     __slots__ = ("_b", "_c", "_decay", "_derivative", "_gain", "_integral", "_kick", "_last", "_per_sample", "_track")
 
@@ -47,8 +53,8 @@ class Pid:
         self._b = p.b
         self._c = p.c
         self._per_sample = gain * Ts / p.Ti if p.Ti else 0.0
-        # Back-calculation empties the integral with Ti, or the usual sqrt(Ti*Td) when there is a derivative; never
-        # faster than one sample. A bias is not an integral and cannot wind up: it is left alone.
+        # Back-calculation discharges the integral with Ti, or with the usual sqrt(Ti*Td) when there is a derivative,
+        # but never faster than one sample. The bias of a P controller cannot wind up, so it is not changed.
         tracking = math.sqrt(p.Ti * p.Td) if p.Td else p.Ti
         self._track = Ts / max(tracking, Ts) if p.Ti else 0.0
         self._decay = p.Tf / (p.Tf + Ts)
@@ -58,13 +64,14 @@ class Pid:
         self._last = 0.0
 
     def rebase(self, setpoint: float, pv: float, output: float) -> None:
-        """From here on the law continues at `output`."""
+        """Makes the control law continue at `output`."""
         self._integral = output - self._gain * (self._b * setpoint - pv)
         self._derivative = 0.0
         self._last = self._c * setpoint - pv
 
     def step(self, setpoint: float, pv: float, low: float, high: float) -> float:
-        """One sample: the output within low..high, which also keep the integral from winding up."""
+        """Computes one sample. Returns the output within low..high; the limits also keep the integral from winding
+        up."""
         wanted = self._integral + self._gain * (self._b * setpoint - pv)
         if self._kick:
             moved = self._c * setpoint - pv

@@ -1,4 +1,4 @@
-"""The relay of the experiment: two outputs around a working output, switched by the error."""
+"""The relay of the experiment: it switches between two outputs around a working output, by the control error."""
 
 from __future__ import annotations
 
@@ -7,14 +7,18 @@ from collections import deque
 from dataclasses import astuple, dataclass
 
 MAX_AVERAGED = 100
+"""Largest number of samples whose mean switches the relay."""
 
 
 @dataclass(frozen=True, slots=True)
 class RelaySettings:
-    """MV = working_output + amplitude or - amplitude_low (0: the same); MV units, hysteresis in PV units.
+    """The settings of a relay: MV = working_output + amplitude or working_output - amplitude_low.
 
-    average: the mean error of so many samples switches the relay, up at e >= hysteresis and down at e <= -hysteresis
-    (below 0 without hysteresis).  It ends by itself when PV leaves pv_low..pv_high or after max_samples.
+    amplitude, amplitude_low, working_output: in MV units; an amplitude_low of 0 means that it equals amplitude.
+    hysteresis: in PV units; the relay switches up at e >= hysteresis and down at e <= -hysteresis (below 0 for 0).
+    average: number of samples whose mean error switches the relay.
+    pv_low, pv_high, max_samples: the relay ends when PV leaves these limits (PV units) or after so many samples.
+    Raises ValueError.
     """
 
     amplitude: float
@@ -36,7 +40,8 @@ class RelaySettings:
 
 
 class Relay:
-    """A running relay. It begins high unless that would switch it, after another relay on the side that one was on."""
+    """A running relay. It begins on the high side unless the error would switch it; after another relay it begins on
+    that relay's side."""
 
     def __init__(self, settings: RelaySettings, error: float, before: Relay | None = None) -> None:
         self.settings = settings
@@ -47,7 +52,7 @@ class Relay:
             self._high, self._errors = before._high, deque(before._errors, settings.average)
 
     def output(self, error: float) -> float:
-        """MV for this error (action-signed), before the limits."""
+        """Returns the MV for this error (sign by the controller's action), before the limits."""
         settings, errors = self.settings, self._errors
         errors.append(error)
         mean = sum(errors) / len(errors)

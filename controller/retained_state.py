@@ -1,7 +1,8 @@
-"""What the controller keeps over a restart, in one JSON file: accepted gains, mode, set-point, manual output.
+"""The state that the controller stores over a restart, in one JSON file: accepted gains, mode, set-point, manual
+output.
 
-The file is replaced whole, and file and folder are synced before an acceptance is confirmed: a set is never half
-written, and none is called accepted that a power cut would lose.
+The file is replaced as a whole, and file and folder are synced before an acceptance is confirmed: a set is never half
+written, and a confirmed set is never lost by a power cut.
 """
 
 from __future__ import annotations
@@ -21,19 +22,22 @@ from loopwright.protocol.durable import put_in_place
 from loopwright.protocol.profile import Mode
 
 FORM = "loopwright controller 2"
+"""Form of the file."""
 FORM_1 = "loopwright controller 1"
-"""Accepted gains only."""
+"""Earlier form of the file, with accepted gains only."""
 AGAIN_S = 5.0
+"""Wall time after which a failed write is repeated, s."""
 
 
 class KeptError(Exception):
-    """The file is there but cannot be used; the text says what to do."""
+    """Raised when the file exists but cannot be used; the text says what to do."""
 
 
 def remembered(path: Path, start: Sequence[Kept]) -> list[Kept] | None:
-    """What was kept, None when nothing has been yet. Raises KeptError rather than guess.
+    """Returns the stored state of the channels, None when nothing has been stored yet. Raises KeptError rather than
+    guess.
 
-    start: what the channels start with; from there comes what a file of an earlier form does not hold.
+    start: the initial state of the channels, which fills in what a file of an earlier form does not hold.
     """
     advice = "correct it, or remove it to start with the values of the options"
     try:
@@ -63,8 +67,11 @@ def _kept(row: dict[str, Any], start: Kept) -> Kept:
 
 
 def write(path: Path, channels: Sequence[Kept]) -> None:
-    """Returns when it is on the disk. Raises OSError; the file is then the one of before, or this one where the disk
-    refused the very last step: who wrote it writes again what is to hold."""
+    """Writes the file; returns when it is on the disk.
+
+    Raises OSError; the file then holds the previous state, or the new one where only the very last step failed, so the
+    caller has to write the wanted state again.
+    """
     rows = [
         {
             "accepted": asdict(each.accepted),
@@ -81,8 +88,8 @@ def write(path: Path, channels: Sequence[Kept]) -> None:
 
 
 class FileKeeper:
-    """Writes at once where somebody waits for it, and in a thread of its own where nobody does: no sample waits for a
-    disk. What cannot be written then is tried again, every `again_s` and with the next change."""
+    """Writes the file, either at once or in a thread of its own, so that no sample waits for a disk. A failed write is
+    repeated every `again_s` and with the next change."""
 
     def __init__(
         self, path: Path, write: Callable[[Path, Sequence[Kept]], None] = write, again_s: float = AGAIN_S
@@ -93,7 +100,7 @@ class FileKeeper:
         self._disk = threading.Lock()
         self._changed = threading.Condition()
         self._wanted: Sequence[Kept] | None = None
-        """What was asked for last: nothing older is written after it."""
+        """The state requested last; nothing older is written after it."""
         self._waiting: Sequence[Kept] | None = None
         threading.Thread(target=self._run, name="keeper", daemon=True).start()
 

@@ -1,10 +1,10 @@
-"""The session of one channel: who tunes it, until when, what it comes back to, and which orders are in force.
+"""The session of one channel: which tuner holds it, until when, the state it returns to, and its orders in force.
 
 A tuner opens a session with a number that the controller has given out, and commands by orders whose check covers that
 number and a running count (`protocol.session`). The session ends when the tuner closes it, when the lease or the
-tuner's heartbeat runs out, when PV is lost, when the node leaves operational, or when another hand commands something;
-mode, set-point and gains then go home by the controller's own doing. Time is an argument: seconds of the controller's
-clock.
+tuner's heartbeat runs out, when PV is lost, when the node leaves operational, or when an operator or another master
+commands something; the controller itself then restores mode, set-point and gains. Time is an argument: seconds of the
+controller's clock.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from loopwright.protocol.sdo import SdoAbort
 from loopwright.protocol.session import check_of
 
 AGAIN_S = 1.0
-"""An output that no PV has asked for is sent again after this time while PV stays away: the bus may have been too."""
+"""Time after which an output that answers no PV is sent again while PV stays away, s: the bus may have failed too."""
 
 HELD_UP_S, CATCH_UP_S, CATCH_UP_AGAIN_S = 0.25, 0.5, 3.0
-"""Where more than HELD_UP_S lie between two looks at the clock, usually 20 ms, the controller itself has stood still.
-It then has CATCH_UP_S to read what has come meanwhile before it takes anybody for silent, once in CATCH_UP_AGAIN_S."""
+"""Where more than HELD_UP_S lie between two calls of `tick`, usually 20 ms, the controller itself was held up. It then
+has CATCH_UP_S to read the frames received meanwhile before it treats any node as silent, once in CATCH_UP_AGAIN_S."""
 
 _NO_HOME = Home(Mode.OFF, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Terms:
-    """What a session is opened with: tuner's node-ID, samples, and times in s of the controller's clock."""
+    """The terms of a session: the tuner's node-ID, the lease in samples, and times in s of the controller's clock."""
 
     tuner: int
     lease_samples: int
@@ -41,13 +41,17 @@ class Terms:
 
 
 class Session:
-    """A channel and what a tuner does with it. draw: a number that has not been given out lately, never 0."""
+    """A channel and its session with a tuner.
+
+    draw: returns a number that was not given out recently, never 0.
+    pv_timeout_s: time without a valid PV after which PV counts as silent, s.
+    """
 
     def __init__(self, channel: Channel, draw: Callable[[], int], pv_timeout_s: float) -> None:
         self.channel = channel
         self.next = draw()
         self.number = 0
-        """The number of the open session; 0: there is none."""
+        """The number of the open session; 0 for none."""
         self.last = 0
         self.count = 0
         self.cause = Cause.NONE
@@ -63,13 +67,13 @@ class Session:
         self._ticked_at, self._caught_up_at = math.inf, -math.inf
         self._good_samples = -1
         self.silent = True
-        """No valid PV for too long."""
+        """Whether there has been no valid PV for too long."""
         self._unsettled = False
-        """A session has ended, and no sample has carried the output that this asks for to the plant yet."""
+        """Whether a session has ended and no sample has yet carried the resulting output to the plant."""
         self.unasked = False
-        """The output has moved although no PV has asked for it: the device sends it and resets this."""
+        """Whether the output has moved without a PV; the device sends the output and resets this."""
         self._without_pv = False
-        """The output is one that no PV has asked for, and none has come since."""
+        """Whether the present output answers no PV, and no PV has arrived since."""
         self._again_at = 0.0
 
     @property
@@ -78,7 +82,7 @@ class Session:
 
     @property
     def holder(self) -> int:
-        """Node-ID of the tuner; 0 without a session."""
+        """Returns the node-ID of the tuner; 0 without a session."""
         return self.terms.tuner if self.terms is not None else 0
 
     @property
@@ -87,17 +91,19 @@ class Session:
 
     @property
     def kept(self) -> Home:
-        """What a restart must come back to: home within a session, else the last choice."""
+        """Returns the state that a restart must restore: that before the test within a session, else the present
+        one."""
         return self.home if self.is_open else self.channel.home
 
-    # -- what the tuner does
+    # -- actions of the tuner
 
     def give(
         self, order: Order, check: int, values: Sequence[Value], now: float, store: Callable[[Parameters], None]
     ) -> None:
-        """Puts the order in force. The last one repeated is answered as done. Raises SdoAbort.
+        """Puts an order in force. A repetition of the last order is answered as done. Raises SdoAbort.
 
-        values: as staged, in the order of `protocol.session.STAGED`.  store: keeps gains before they are accepted.
+        values: as staged, in the order of `protocol.session.STAGED`.
+        store: stores gains on the disk before they are accepted.
         """
         if self._answered == (order, check):
             return
@@ -145,7 +151,7 @@ class Session:
                     channel.accept(gains)
 
     def _open(self, terms: Terms, now: float) -> None:
-        if self.channel.on_trial:  # somebody tries gains by hand; a session would end that
+        if self.channel.on_trial:  # an operator has gains on trial, which a session would end
             raise SdoAbort(Abort.DEVICE_STATE)
         self.number, self.terms, self.home = self.next, terms, self.channel.home
         self.home_gains = self.channel.accepted
@@ -154,20 +160,21 @@ class Session:
         self._lease_until, self._heard_at, self._valid_at = now + terms.lease_s, now, max(now, self._valid_at)
 
     def renew(self, number: int, now: float) -> None:
-        """Pays for as much as the opening did. Raises SdoAbort when this session is not open (any more)."""
+        """Renews the lease by as much as the opening granted. Raises SdoAbort when this session is not open."""
         if not number or number != self.number or self.terms is None:
             raise SdoAbort(Abort.DEVICE_STATE)
         self._samples_left, self._lease_until = self.terms.lease_samples, now + self.terms.lease_s
 
     def heard(self, node: int, now: float) -> None:
-        """A heartbeat of that node."""
+        """Notes a heartbeat of this node."""
         if node == self.holder:
             self._heard_at = now
 
-    # -- what time and others do
+    # -- effects of time and of others
 
     def step(self, pv: float) -> float:
-        """One sample: MV, with the ends that are counted in samples or seen in PV."""
+        """Takes one sample and returns MV; ends the session on the conditions that are counted in samples or seen in
+        PV."""
         if self.is_open:
             if self.channel.relay is not None:
                 self._watch_relay(pv)
@@ -182,7 +189,7 @@ class Session:
         return mv
 
     def _watch_relay(self, pv: float) -> None:
-        """A PV that is no number is not out of bounds."""
+        """Ends a relay at its limits. A PV that is not a number does not violate the PV limits."""
         relay = self.channel.relay
         assert relay is not None
         if relay.samples_left == 0:
@@ -193,7 +200,7 @@ class Session:
             relay.samples_left -= 1
 
     def tick(self, now: float) -> None:
-        """The ends that are counted in time. To be called every 20 ms or so."""
+        """Ends the session on the conditions that depend on time. Call it about every 20 ms."""
         if now - self._ticked_at > HELD_UP_S and now - self._caught_up_at > CATCH_UP_AGAIN_S:
             self._caught_up_at = now + CATCH_UP_S
         self._ticked_at = now
@@ -208,7 +215,7 @@ class Session:
             if self._unsettled:
                 self.settle()
             elif self._without_pv and now >= self._again_at:
-                # For the first time it was said a moment ago, by `settle`, which knows no time.
+                # `settle`, which knows no time, has sent it for the first time.
                 self.unasked |= self._again_at > 0.0
                 self._again_at = now + AGAIN_S
             return
@@ -220,17 +227,17 @@ class Session:
             self.end(Cause.NO_PV)
 
     def another_hand(self, what: Hand) -> None:
-        """Somebody commands something by the ordinary objects: the test is over, and what they command is theirs.
+        """Ends the test because of a command through the ordinary objects; the commanded value stays.
 
-        To be called before it is carried out, `settle` after it.
+        Call it before the command is carried out, and `settle` after it.
         """
         self.hand |= what
         self._end(Cause.HAND)
 
     def end(self, cause: Cause, operational: bool = True) -> None:
-        """Everything goes home; without a session nothing does.
+        """Ends an open session and restores the state before the test.
 
-        operational: False when the node leaves that state and no PV will be heard any more.
+        operational: False when the node leaves that state and will receive no more PV.
         """
         self._end(cause)
         self.settle(operational)
@@ -243,9 +250,9 @@ class Session:
             self._unsettled = True
 
     def settle(self, operational: bool = True) -> None:
-        """Where no PV will ask for the output that the end of a session left, it is moved at once: to what the mode
-        stands for, in automatic to that of home."""
+        """Where no PV will ask for the output that results from the end of a session, sets it at once: to the output of
+        the mode, in AUTOMATIC to the MV before the test."""
         if (self._unsettled or self._without_pv) and not (operational and self.pv_is_valid):
-            # A hand that comes later goes on from the output that the end has left.
+            # A later command continues from the output that the end of the session has left.
             self.channel.without_pv(self.home.mv if self._unsettled else self.channel.mv)
             self._unsettled, self._without_pv, self.unasked, self._again_at = False, True, True, 0.0

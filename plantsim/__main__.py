@@ -25,7 +25,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"plantsim: {error.args[0]}", file=sys.stderr)
         return 2
     if options.speed == 0.0:
-        os.nice(10)  # at full speed it would starve whoever shares its processor
+        os.nice(10)  # at full speed the process would starve others on its processor
     return run_device(
         "plantsim",
         options.bus,
@@ -48,7 +48,7 @@ def _channel(model: str, noise_std: float) -> PlantChannel:
 
 
 def _speed(text: str) -> float:
-    """The pace object's value: 0 stands for "max"."""
+    """Returns the value of the pace object; 0 stands for "max"."""
     if text == "max":
         return 0.0
     factor = float(text)

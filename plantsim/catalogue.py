@@ -1,7 +1,8 @@
-"""Plants by name, with what is known of each: what the I/O device, the rehearsal and the benchmark pick from.
+"""The catalogue of plants, with known facts of each, for the I/O device, rehearsals and benchmarks.
 
 model-1 .. model-50 are the test plants of Stopakevych et al. (Problemele Energeticii Regionale). Where a coefficient
-or the dead time is illegible in the print, the entry's confidence says so: a fixture then, not the paper's model.
+or the dead time is illegible in the print, the entry's `confidence` says so; it is then a fixture, not the paper's
+model.
 All linear plants work around 50 % and PV 50 with 100 % per unit of model input, so 0..100 % is u = -0.5..+0.5 and a
 gain on the bus is 100 times the gain of the model.
 """
@@ -21,10 +22,13 @@ Build = Callable[[float, float, int], Plant]
 
 @dataclass(frozen=True, slots=True)
 class PlantFacts:
-    """Ku, Pu_s: ultimate point of the continuous plant under P control, Ku in model units (None: there is none).
+    """Known facts of a plant.
 
-    T95_s: time after which an open-loop step response stays within 5 % (None: the plant integrates).
-    reverse: the action its controller needs (False for a plant with negative gain).
+    Ku, Pu_s: ultimate gain in model units and ultimate period in s, of the continuous plant under P control; None where
+    there is none.
+    T95_s: time after which an open-loop step response stays within 5 %, s; None for an integrating plant.
+    reverse: the action that its controller needs (False for a plant with negative gain).
+    confidence: how well the source is legible.
     """
 
     description: str
@@ -41,13 +45,13 @@ class PlantFacts:
 
     @property
     def Ku_on_bus(self) -> float | None:
-        """Percent of MV per PV unit."""
+        """Returns Ku in percent of MV per PV unit."""
         return None if self.Ku is None else self.Ku * self.mv_per_unit
 
 
 @dataclass(frozen=True, slots=True)
 class CatalogueModel:
-    """Coefficients from the highest power down, time in s."""
+    """A transfer function: coefficients from the highest power down, time in s."""
 
     num: tuple[float, ...]
     den: tuple[float, ...]
@@ -56,7 +60,7 @@ class CatalogueModel:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """`model` is None for plants that are not linear."""
+    """One plant; `model` is None for plants that are not linear."""
 
     name: str
     facts: PlantFacts
@@ -81,7 +85,7 @@ class Entry:
 
 
 def find(name: str) -> Entry:
-    """The entry of this name; KeyError with the names there are."""
+    """Returns the entry of this name. Raises KeyError, which lists the names."""
     if name not in CATALOGUE:
         others = ", ".join(other for other in CATALOGUE if not other.startswith("model-"))
         raise KeyError(f"no plant named {name!r}; there are model-1 to model-50, {others}")

@@ -1,4 +1,4 @@
-"""The plant I/O device: owner of time. It sends SYNC and PV, waits for the MV of that sample, and steps the plants."""
+"""The plant I/O device: it drives the samples by SYNC and PV, waits for the answering MV, and steps the plants."""
 
 from __future__ import annotations
 
@@ -31,12 +31,13 @@ from loopwright.protocol.profile import (
 from loopwright.protocol.sdo import SdoAbort
 
 _MAX_CATCH_UP = 5
-"""Periods the pace may lag behind the wall clock before it gives the lost time up."""
+"""Number of sampling periods by which the pace may lag behind the wall clock before the lost time is given up."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlantChannel:
-    """How to make a plant: build(sample_time_s, noise_std, seed). mv_nominal in percent; noise_std in PV units."""
+    """Describes how to make a plant: build(sample_time_s, noise_std, seed). mv_nominal in percent; noise_std in PV
+    units."""
 
     build: Callable[[float, float, int], Plant]
     mv_nominal: float = 50.0
@@ -44,7 +45,11 @@ class PlantChannel:
 
 
 class PlantDevice:
-    """pace: 0 as fast as the answers come, 1 real time, x = x times as fast. run: samples to run at once (2011h)."""
+    """The plant I/O on its bus.
+
+    pace: 0 for as fast as the answers come, 1 for real time, x for x times as fast.
+    run: samples to run at once (2011h).
+    """
 
     def __init__(
         self,
@@ -90,7 +95,7 @@ class PlantDevice:
         self._schedule()
 
     def _on_reset(self) -> None:
-        """All as the program was started, what was written since is gone."""
+        """Restores the state at the start of the program; all later writes are lost."""
         self.dictionary.restore(0x2000, 0xFFFF)
         self._pace = float(self.dictionary.get("plant_pace"))
         self._remaining = self._run
@@ -99,7 +104,7 @@ class PlantDevice:
         self._schedule()
 
     def _initialise(self) -> None:
-        """Every plant at rest, sample number 0; equal seeds give equal runs."""
+        """Puts every plant at rest, with sample number 0; equal seeds give equal runs."""
         seed = int(self.dictionary.get("plant_seed"))
         self._plants = [
             channel.build(self._sample_time_s, float(self.dictionary.get("plant_noise", at + 1)), seed + at)
@@ -118,7 +123,7 @@ class PlantDevice:
     # The sample
 
     def _sample(self) -> None:
-        """Latch the outputs, integrate one step, SYNC, PV with its number."""
+        """Latches the outputs, integrates one step, and sends SYNC and the PV with its number."""
         if self._remaining != FOREVER:
             self._remaining -= 1
         self._number = number = self._number % 0xFFFFFFFF + 1  # 0 is UNASKED
@@ -132,7 +137,7 @@ class PlantDevice:
     def _on_mv(self, at: int, data: bytes) -> None:
         mv, number = MV_FRAME.unpack(data)
         if (number != self._number and number != UNASKED) or mv - mv != 0.0:
-            return  # an answer to another sample, or no number: this sample stays unanswered
+            return  # an answer to another sample, or MV is not a number: this sample stays unanswered
         self._mv[at] = 0.0 if mv < 0.0 else 100.0 if mv > 100.0 else mv
         if number == UNASKED:
             return
@@ -144,7 +149,7 @@ class PlantDevice:
             self._advance()
 
     def _advance(self) -> None:
-        """The sample is over: the next one at once, at its time, or not at all."""
+        """Ends the sample; the next one follows at once, at its time, or not at all."""
         if self._pace == 0.0:
             if self._remaining and self.runtime.state is NmtState.OPERATIONAL:
                 self._sample()
@@ -152,7 +157,8 @@ class PlantDevice:
             self._schedule()
 
     def _schedule(self) -> None:
-        """Due times follow the pace, not the end of the last sample, so that the mean rate is right."""
+        """Sets the next due time. Due times follow the pace, not the end of the last sample, so the mean rate is
+        right."""
         if not self._remaining:
             self.runtime.due = None
             return

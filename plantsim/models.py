@@ -6,7 +6,7 @@ u[n-q-1] for the first f*Ts and u[n-q] for the rest, so
     x[n+1] = A x[n] + B1 u[n-q-1] + B0 u[n-q]
     y[n+1] = C x[n+1] + D u[n-q]
 
-The output is the value just before the sampling instant: what the controller answers to a sample cannot show in it.
+The output is the value just before the sampling instant, so it cannot depend on the controller's answer to that sample.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from scipy.linalg import expm, matrix_balance
 
 Matrix = npt.NDArray[Any]
 
-# A dead time this close to a whole number of samples (in samples) is one: 0.3 / 0.1 is not exactly 3 in binary.
+# A dead time this close (in samples) to a whole number of samples is rounded: 0.3 / 0.1 is not exactly 3 in binary.
 _WHOLE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class Sampled:
-    """The matrices above; `delay` is q, the whole samples of dead time."""
+    """The matrices of the equations at the top of this module; `delay` is q, the whole samples of dead time."""
 
     A: Matrix
     B1: Matrix
@@ -39,7 +39,10 @@ class Sampled:
 
 
 def state_space(num: Sequence[float], den: Sequence[float]) -> tuple[Matrix, Matrix, Matrix, float]:
-    """Balanced controllable form A, B, C, D of num(s)/den(s), coefficients from the highest power down."""
+    """Returns the balanced controllable form A, B, C, D of num(s)/den(s), coefficients from the highest power down.
+
+    Raises ValueError.
+    """
     if not all(math.isfinite(c) for c in (*num, *den)):
         raise ValueError("coefficients of a transfer function must be finite")
     top = np.trim_zeros(np.asarray(num, dtype=float), "f")
@@ -68,7 +71,7 @@ def state_space(num: Sequence[float], den: Sequence[float]) -> tuple[Matrix, Mat
 
 
 def held(A: Matrix, B: Matrix, duration: float) -> tuple[Matrix, Matrix]:
-    """State transition over `duration` s and its response to a constant unit input; singular A is fine."""
+    """Returns the state transition over `duration` s and its response to a constant unit input; A may be singular."""
     order = len(B)
     block = np.zeros((order + 1, order + 1))
     block[:order, :order] = A
@@ -78,7 +81,7 @@ def held(A: Matrix, B: Matrix, duration: float) -> tuple[Matrix, Matrix]:
 
 
 def split_dead_time(dead_time_s: float, sample_time_s: float) -> tuple[int, float]:
-    """Whole samples, and the rest in s."""
+    """Splits a dead time into whole samples and a rest in s. Raises ValueError."""
     if not (dead_time_s >= 0 and math.isfinite(dead_time_s)):
         raise ValueError("dead time must be finite and not negative")
     if not (sample_time_s > 0 and math.isfinite(sample_time_s)):
@@ -90,7 +93,11 @@ def split_dead_time(dead_time_s: float, sample_time_s: float) -> tuple[int, floa
 
 
 def sampled(num: Sequence[float], den: Sequence[float], dead_time_s: float, sample_time_s: float) -> Sampled:
-    """Zero-order-hold equivalent of num(s)/den(s) * exp(-s*dead_time_s), exact also for a fraction of a sample."""
+    """Returns the zero-order-hold equivalent of num(s)/den(s) * exp(-s*dead_time_s), exact also for a fraction of a
+    sample.
+
+    Raises ValueError.
+    """
     whole, rest = split_dead_time(dead_time_s, sample_time_s)
     A, B, C, D = state_space(num, den)
     after, B0 = held(A, B, sample_time_s - rest)

@@ -1,6 +1,6 @@
 """A plant as the I/O device sees it: one MV in, one PV out, one sampling period at a time.
 
-Left out on purpose: sticking valves, quantised sensors, drift.
+Sticking valves, quantised sensors and drift are left out on purpose.
 """
 
 from __future__ import annotations
@@ -17,30 +17,33 @@ from loopwright.plantsim.models import sampled
 
 
 class SimulatedProcess(Protocol):
+    """A process that is simulated sample by sample."""
+
     @property
     def pv(self) -> float:
-        """The present measured value, PV units, noise included."""
+        """Returns the present measured value, PV units, noise included."""
         ...
 
     def step(self, mv: float) -> float:
-        """Holds `mv` for one sampling period; the PV at its end."""
+        """Holds `mv` for one sampling period; returns the PV at its end."""
         ...
 
 
 class Plant(SimulatedProcess, Protocol):
-    """What can be disturbed."""
+    """A simulated process with a load disturbance and measurement noise."""
 
     disturbance: float
-    """Load at the plant's input, behind the actuator's limits; MV units."""
+    """Load disturbance at the plant's input, added after the actuator's limits, MV units."""
     noise_std: float
-    """Standard deviation of the white measurement noise; PV units."""
+    """Standard deviation of the white measurement noise, PV units."""
 
 
 class LinearPlant:
-    """pv = pv_nominal + G(s) exp(-L s) * (mv - mv_nominal) / mv_per_unit, starting at rest.
+    """A linear plant that starts at rest: pv = pv_nominal + G(s) exp(-L s) * (mv - mv_nominal) / mv_per_unit.
 
     num, den: coefficients of G from the highest power down, time in s.
-    mv_low, mv_high: what the actuator can do, MV units. A MV that is not a number leaves the actuator where it is.
+    mv_low, mv_high: limits of the actuator, MV units. A MV that is not a number leaves the actuator where it is.
+    Raises ValueError.
     """
 
     def __init__(
@@ -63,7 +66,7 @@ class LinearPlant:
             raise ValueError("mv_per_unit must not be zero")
         model = sampled(num, den, dead_time_s, sample_time_s)
         order = len(model.C)
-        # The vector is [x, y, u_old, u_new]; one product moves the whole of it one sample on.
+        # The vector is [x, y, u_old, u_new]; one product advances it by one sample.
         matrix = np.zeros((order + 3, order + 3))
         into_x = matrix[:order]
         into_x[:, :order] = model.A

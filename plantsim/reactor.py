@@ -1,8 +1,8 @@
 """A stirred reactor with free outflow, A + B -> C, exothermic; MV opens both feeds, PV is the concentration of C.
 
-Source: Stopakevych et al., Problemele Energeticii Regionale. The print is damaged in four places; the values here are
-those that close the steady-state balance (heat of reaction, feed reference temperature) and give the printed
-ultimate point (actuator lag 4 s, sensor delay 10 s).
+Source: Stopakevych et al., Problemele Energeticii Regionale. The print is damaged in four places; the values used here
+close the steady-state balance (heat of reaction, feed reference temperature) and give the printed ultimate point
+(actuator lag 4 s, sensor delay 10 s).
 
     m = (rhoA*FA + rhoB*FB) / (S*rhow)              inflow as a rate of level, m/s
     n = k0*exp(-(E/R)/T)*CA*CB                      rate of reaction, mol/(m3 s)
@@ -35,7 +35,7 @@ FLOW_A, FLOW_B = 0.01, 0.004  # m3/s per percent of MV
 ACTUATOR_LAG_S = 4.0
 SENSOR_DELAY_S = 10.0
 MV_NOMINAL = 50.0  # percent
-# Below this opening (percent) the vessel all but empties and the equations lose their meaning: the valves leak.
+# Below this opening (percent) the vessel nearly empties and the equations are not valid, so the valves leak.
 LEAK = 2.0
 
 STEADY_STATE = (
@@ -45,7 +45,7 @@ STEADY_STATE = (
     0.5833268771676953,
     350.6083211506618795,
 )
-"""CA, CB, CC in mol/m3, h in m, T in K at 50 %."""
+"""Steady state at 50 %: CA, CB, CC in mol/m3, h in m, T in K."""
 
 _MAX_SUBSTEP_S = 0.25  # RK4 is exact to 1e-6 mol/m3 here, and stable down to the leak (fastest rate 7 1/s)
 
@@ -60,7 +60,11 @@ _LEVEL_OUT = OUTFLOW / AREA
 
 
 def derivative(state: State, opening: float, inlet_K: float) -> State:
-    """d/dt of CA, CB, CC, h, T; opening: what the feeds get, percent (behind the actuator's lag)."""
+    """Returns the time derivatives of CA, CB, CC, h, T.
+
+    opening: MV behind the actuator's lag, percent.
+    inlet_K: temperature of both feeds, K.
+    """
     CA, CB, CC, h, T = state
     m = _M * opening
     n = RATE * math.exp(-ACTIVATION / T) * CA * CB
@@ -81,11 +85,12 @@ def _ahead(state: State, slope: State, dt: float) -> State:
 
 
 class Reactor:
-    """MV in percent, PV in mol/m3, starting at rest at 50 %.
+    """The simulated reactor: MV in percent, PV in mol/m3, at rest at 50 % initially.
 
-    The sensor's delay is applied to what enters instead (a delay commutes with a process that does not change with
-    time), which makes it exact for any sample time; so `state` is what the sensor shows now.
-    `inlet_offset_K`: a disturbance, added to the temperature of both feeds. `disturbance`: percent, behind the limits.
+    The sensor's delay is applied to the inputs instead (a delay commutes with a time-invariant process), which makes it
+    exact for any sample time; so `state` is the state that the sensor shows now.
+    inlet_offset_K: a disturbance, added to the temperature of both feeds, K.
+    disturbance: a load disturbance, percent, added after the limits of MV.
     """
 
     def __init__(
@@ -135,7 +140,8 @@ class Reactor:
         return self.state[2] + (self._random.gauss(0.0, self.noise_std) if self.noise_std else 0.0)
 
     def _run(self, command: float, inlet_K: float, duration: float) -> None:
-        """Constant input for `duration` s: the actuator's lag in closed form, the vessel by Runge-Kutta 4."""
+        """Integrates over `duration` s with constant inputs: the actuator's lag in closed form, the vessel by
+        Runge-Kutta 4."""
         substeps = math.ceil(duration / _MAX_SUBSTEP_S)
         dt = duration / substeps
         half_decay = math.exp(-0.5 * dt / ACTUATOR_LAG_S)

@@ -1,4 +1,4 @@
-"""Opening a CAN bus: SocketCAN by a raw socket (two system calls per frame hop), the rest through python-can."""
+"""Opens CAN buses: SocketCAN by a raw socket (two system calls per frame and hop), all others through python-can."""
 
 from __future__ import annotations
 
@@ -21,35 +21,37 @@ Frame = tuple[int, bytes]
 _CAN_FRAME = struct.Struct("=IB3x8s")
 _ID_MASK = 0x1FFFFFFF
 _NOT_DATA = 0x60000000  # remote or error frame
-_RECEIVE_BUFFER = 4 << 20  # the default holds about 275 frames, then frames vanish without an error
-_SHORTEST_ARMED_S = 0.02  # SO_RCVTIMEO counts in kernel ticks (up to 10 ms): shorter waits go through poll
+_RECEIVE_BUFFER = 4 << 20  # bytes; the default holds about 275 frames, and further ones are lost without an error
+_SHORTEST_ARMED_S = 0.02  # SO_RCVTIMEO counts in kernel ticks (up to 10 ms): shorter waits use poll
 _SEND_PATIENCE_S = 1.0
 SO_RCVBUFFORCE = 33
 _CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h
-_PASSED_OVER_S = 0.05  # how long frames that nobody wants may keep us beyond a time-out
+_PASSED_OVER_S = 0.05  # how long filtered-out frames may prolong a wait beyond its time-out
 
 
 class BusError(Exception):
-    """The bus is not there, not up, or bus-off. The text says what to do."""
+    """Raised when the bus does not exist, is down or is bus-off. The text says what to do."""
 
 
 class Bus(Protocol):
-    """One opening of a bus: standard identifiers, own frames are not returned. Not for use by two threads."""
+    """One open connection to a bus, for one thread. It carries standard identifiers and does not return its own
+    frames."""
 
     @property
     def state(self) -> BusState:
-        """What the CAN controller has said of itself since the opening. While it is bus-off, `send` raises BusError,
-        and so does `recv` once there is nothing left to receive."""
+        """Returns the state that the CAN controller has reported since the opening. While it is bus-off, `send` raises
+        BusError, and so does `recv` once no received frame is left."""
         ...
 
     def send(self, can_id: int, data: bytes) -> None: ...
 
     def recv(self, timeout: float | None) -> Frame | None:
-        """Next frame; None after `timeout` seconds of wall time (None = wait for ever, 0 = do not wait)."""
+        """Returns the next frame, or None after `timeout` seconds of wall time (None waits for ever, 0 does not
+        wait)."""
         ...
 
     def set_filters(self, ids: Collection[int]) -> None:
-        """Only frames with these identifiers are received from now on; none given = none received."""
+        """Restricts reception to frames with these identifiers; an empty collection excludes all frames."""
         ...
 
     def fileno(self) -> int: ...
@@ -58,7 +60,10 @@ class Bus(Protocol):
 
 
 def open_bus(url: str) -> Bus:
-    """Opens `socketcan:vcan0`, `socketcand:HOST:PORT`, `virtual:NAME` or any `INTERFACE:CHANNEL` of python-can."""
+    """Opens `socketcan:vcan0`, `socketcand:HOST:PORT`, `virtual:NAME` or any `INTERFACE:CHANNEL` of python-can.
+
+    Raises BusError.
+    """
     interface, separator, rest = url.partition(":")
     if not (interface and separator and rest):
         raise BusError(f"{url!r} is not a bus; examples: socketcan:can0, socketcand:127.0.0.1:29536, virtual:demo")
@@ -68,7 +73,7 @@ def open_bus(url: str) -> Bus:
 
 
 class RawBus:
-    """Linux SocketCAN without a library in between."""
+    """A bus on Linux SocketCAN, without a library in between."""
 
     def __init__(self, interface: str) -> None:
         self._socket = _opened(interface)
@@ -77,7 +82,7 @@ class RawBus:
         self._armed: float | None = None
         self._poll = select.poll()
         self._poll.register(self._socket, select.POLLIN)
-        # Bound once: looked up twice per frame otherwise.
+        # The bound methods are stored: otherwise they would be looked up twice per frame.
         self._recv = self._socket.recv
         self._send: Callable[[bytes], int] = self._socket.send
 
@@ -89,7 +94,8 @@ class RawBus:
             self._send_patiently(frame, error)
 
     def _send_patiently(self, frame: bytes, error: OSError) -> None:
-        """A full transmit queue (ENOBUFS) empties by itself; poll does not wait for it, so we look again."""
+        """Repeats a send while the transmit queue is full (ENOBUFS); poll does not wait for that queue, so it is
+        retried."""
         give_up = time.monotonic() + _SEND_PATIENCE_S
         while error.errno in (errno.ENOBUFS, errno.EAGAIN) and time.monotonic() < give_up:
             time.sleep(0.001)
@@ -115,7 +121,7 @@ class RawBus:
             return self._nothing()
         except OSError as error:
             if error.errno == errno.ENETDOWN:
-                self._become(BusState.ACTIVE)  # as it is when it comes up again, which no frame tells
+                self._become(BusState.ACTIVE)  # its state when it comes up again, which no frame reports
             raise BusError(f"cannot receive on {self._interface!r}: {error.strerror}") from error
         can_id, length, data = _CAN_FRAME.unpack(raw)
         if can_id & _NOT_DATA:
@@ -130,8 +136,8 @@ class RawBus:
         return None
 
     def _become(self, state: BusState) -> None:
-        """The kernel takes frames for an interface that is bus-off, and drops them without a word. To say so costs
-        nothing where the bus works: what sends is changed, and does not look."""
+        """Notes the state. The kernel accepts frames for an interface that is bus-off and drops them silently, so
+        `_send` is replaced by a method that raises: a working bus then pays for no check."""
         self.state = state
         self._send = self._refuse if state is BusState.BUS_OFF else self._socket.send
 
@@ -139,7 +145,7 @@ class RawBus:
         raise BusError(what_to_do(self._interface))
 
     def _arm(self, timeout: float | None) -> None:
-        """The kernel keeps the time-out, so that a receive with the same one as last time is one system call."""
+        """Sets the time-out in the kernel, so that a receive with the same time-out as before takes one system call."""
         seconds = 0.0 if timeout is None else timeout
         whole = int(seconds)
         value = struct.pack("@ll", whole, int((seconds - whole) * 1e6))
@@ -159,7 +165,7 @@ class RawBus:
 
 
 def _opened(interface: str) -> socket.socket:
-    """A raw socket that hears all data frames, and the error frames that tell of the controller's state."""
+    """Returns a raw socket that receives all data frames, and the error frames that report the controller's state."""
     if not hasattr(socket, "AF_CAN"):
         raise BusError("this system has no SocketCAN; use the loopback hub (socketcand:HOST:PORT)")
     try:
@@ -177,7 +183,7 @@ def _opened(interface: str) -> socket.socket:
 
 
 def _enlarge(sock: socket.socket) -> None:
-    """Beyond the system's limit when we may (CAP_NET_ADMIN), else up to it."""
+    """Enlarges the receive buffer, beyond the system's limit where that is permitted (CAP_NET_ADMIN), else up to it."""
     try:
         sock.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, _RECEIVE_BUFFER)
     except OSError:
@@ -185,17 +191,17 @@ def _enlarge(sock: socket.socket) -> None:
 
 
 _GREETED_S = 5.0
-"""Within which a server of socketcand answers."""
+"""Wall time within which a socketcand server has to answer, s."""
 
 
 class _Socketcand(SocketCanDaemonBus):
-    """Takes the server's greetings one by one. The library expects "< ok >" alone in one read; on a busy machine the
-    first frames are behind it by then, and the bus would be told to be gone."""
+    """Reads the server's greetings one by one. The library expects "< ok >" alone in one read; on a busy machine the
+    first frames follow it in the same read, and the library would report a closed bus."""
 
     def _expect_msg(self, msg: str) -> None:
         server: socket.socket = vars(self)["_SocketCanDaemonBus__socket"]
         found, usual = b"", server.gettimeout()
-        server.settimeout(_GREETED_S)  # the kernel accepts for a server that has stopped
+        server.settimeout(_GREETED_S)  # the kernel accepts connections for a stopped server
         try:
             while len(found) < len(msg) and (part := server.recv(len(msg) - len(found))):
                 found += part
@@ -213,7 +219,7 @@ _OPENED_BY: dict[str, Callable[..., can.BusABC]] = {"socketcand": _Socketcand}
 
 
 class LibraryBus:
-    """Any interface of python-can; its message objects make it about four times slower than the raw socket."""
+    """A bus on any interface of python-can; its message objects make it about four times slower than the raw socket."""
 
     def __init__(self, url: str, interface: str, rest: str) -> None:
         try:
@@ -246,7 +252,7 @@ class LibraryBus:
             if message is not None and self._wants(message):
                 return message.arbitration_id, bytes(message.data)
             if give_up is not None:
-                # Behind a frame that nobody wants there may be one that is here already.
+                # A wanted frame may already wait behind one that is filtered out.
                 over = time.monotonic() - give_up
                 if over > _PASSED_OVER_S:
                     return None
@@ -254,7 +260,7 @@ class LibraryBus:
 
     @property
     def state(self) -> BusState:
-        """As far as python-can offers it for the adapter; it does not tell WARNING."""
+        """Returns the state as far as python-can reports it for the adapter; WARNING is never reported."""
         return _LIBRARY_STATES.get(self._bus.state, BusState.ACTIVE)
 
     def _raise_if_off(self) -> None:
@@ -269,14 +275,14 @@ class LibraryBus:
     def set_filters(self, ids: Collection[int]) -> None:
         self._wanted = frozenset(ids)
         if isinstance(self._bus, _Socketcand):
-            # It filters in software, and takes a frame that is filtered out for a time-out that has passed.
+            # python-can filters socketcand in software, and treats a filtered-out frame as an expired time-out.
             return
         # An empty list means "everything" to python-can: an identifier that cannot occur stands for "nothing".
         wanted = sorted(ids) or [0x20000000]
         self._bus.set_filters([{"can_id": can_id, "can_mask": 0x3FFFFFFF, "extended": False} for can_id in wanted])
 
     def fileno(self) -> int:
-        """-1 when the interface has no file descriptor."""
+        """Returns the file descriptor, or -1 when the interface has none."""
         try:
             return int(self._bus.fileno())
         except NotImplementedError:
@@ -293,7 +299,7 @@ def _library_arguments(interface: str, rest: str) -> dict[str, Any]:
     host, _, port = address.rpartition(":")
     if not host or not port.isdigit():
         raise ValueError("socketcand needs HOST:PORT or HOST:PORT/CHANNEL")
-    # The library asks again and again for 10 s when nobody listens; asking once first says so at once.
+    # The library retries for 10 s when no server listens; one connection attempt beforehand fails at once.
     socket.create_connection((host, int(port)), timeout=5.0).close()
     # Without tcp_tune, Nagle's algorithm holds back every second small frame until the first is acknowledged.
     return {"channel": channel or "vcan0", "host": host, "port": int(port), "tcp_tune": True}

@@ -1,4 +1,5 @@
-"""What plant and controller share as processes: the bus, signals, the line that says "ready", the config file."""
+"""The parts that the plant and controller processes share: bus, signals, the "ready" line and the configuration
+file."""
 
 from __future__ import annotations
 
@@ -18,17 +19,19 @@ from loopwright.protocol.device_runtime import Runtime
 
 
 class DeviceConfigError(Exception):
-    """The file or the options make no sense; the text says where."""
+    """Raised when the configuration file or the options are not valid; the text says where."""
 
 
 class DeviceProcess(Protocol):
+    """A device that `run_device` can start: it has a runtime."""
+
     runtime: Runtime
 
     def start(self) -> None: ...
 
 
 def node_id(text: str) -> int:
-    """1..127, decimal or 0x.."""
+    """Parses a node-ID, 1..127, written in decimal or as 0x..; raises argparse.ArgumentTypeError."""
     node = int(text, 0)
     if not 1 <= node <= 127:
         raise argparse.ArgumentTypeError("a node-ID is 1..127")
@@ -36,7 +39,10 @@ def node_id(text: str) -> int:
 
 
 def read_channels(path: str, keys: Iterable[str]) -> list[dict[str, Any]]:
-    """The list of channels of a YAML file; what is not a known key is refused rather than ignored."""
+    """Reads the list of channels of a YAML file; an unknown key is refused rather than ignored.
+
+    Raises DeviceConfigError.
+    """
     try:
         rows = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     except (OSError, yaml.YAMLError) as error:
@@ -54,8 +60,8 @@ def read_channels(path: str, keys: Iterable[str]) -> list[dict[str, Any]]:
 
 
 def run_device(name: str, bus_url: str, make: Callable[[Bus], DeviceProcess], description: str) -> int:
-    """Runs a device until SIGTERM or SIGINT. Exit status 0, or 1 when there is no bus."""
-    # python-can's socketcand client warns of every frame that TCP splits, which is what TCP does.
+    """Runs a device until SIGTERM or SIGINT. Returns exit status 0, or 1 when the bus cannot be used."""
+    # python-can's socketcand client warns about every frame that TCP splits, although TCP may split any.
     logging.getLogger("can").setLevel(logging.ERROR)
     try:
         bus = open_bus(bus_url)

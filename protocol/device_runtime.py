@@ -1,7 +1,7 @@
-"""What every device does beside its work: NMT with gating, heartbeats, EMCY, SDO. One thread, one bus, no timers.
+"""The tasks that every device has beside its own: NMT with gating, heartbeats, EMCY, SDO; one thread, no timers.
 
-Heartbeats go out from the loop that does the work, so a device that hangs falls silent. Nothing here is on the path of
-a sample but one dictionary look-up per frame.
+Heartbeats are sent from the loop that does the work, so a device that hangs falls silent. On the path of a sample this
+module adds only one dictionary look-up per frame.
 """
 
 from __future__ import annotations
@@ -37,13 +37,17 @@ Handler = Callable[[bytes], None]
 _IDLE_S = 0.02
 _MAX_FRAMES_BETWEEN_TICKS = 64  # reading the clock is a system call in some virtual machines
 _PAUSE_AFTER_BUS_ERROR_S = 0.05
-_TOLD_AGAIN_AFTER_S = 5.0  # without an error: then it is another one
+_REPORTED_AGAIN_AFTER_S = 5.0  # time without an error after which the next one is reported as new
 _COMMUNICATION = (0x1000, 0x1FFF)
-_LENGTH_DETAIL = struct.Struct("<HBB")  # of EMCY 8210h: COB-ID, bytes that came, bytes mapped
+_LENGTH_DETAIL = struct.Struct("<HBB")  # detail of EMCY 8210h: COB-ID, bytes received, bytes mapped
 
 
 class Runtime:
-    """`handlers` take PDOs and SYNC by COB-ID, in operational only. The other attributes are the device's hooks."""
+    """Serves one device on the bus.
+
+    handlers: functions for PDOs and SYNC by COB-ID; they are called only in the state operational.
+    The other public attributes are hooks of the device.
+    """
 
     def __init__(
         self, bus: Bus, node: int, dictionary: Dictionary, clock: Callable[[], float] = time.monotonic
@@ -54,19 +58,21 @@ class Runtime:
         self.state = NmtState.BOOT_UP
         self.handlers: dict[int, Handler] = {}
         self.lengths: dict[int, int] = {}
-        """Bytes mapped to a received PDO, by COB-ID. Its handler gets just as many: a longer frame is cut, a shorter
-        one is not processed, which EMCY 8210h says. Without an entry here every frame is handed over as it came."""
+        """Bytes mapped to a received PDO, by COB-ID. Its handler gets exactly that many: a longer frame is cut, a
+        shorter one is not processed but reported by EMCY 8210h. Without an entry, every frame is handed over as
+        received."""
         self.on_tick: Callable[[float], None] = lambda now: None
-        """Called with the wall time about every 20 ms, and at least every 64 frames."""
+        """Hook called with the wall time about every 20 ms, and at least every 64 frames."""
         self.on_leave_operational: Callable[[], None] = lambda: None
         self.on_reset: Callable[[], None] = lambda: None
-        """Reset node: 1000h-1FFFh are back at their start values already, everything else is the device's to do."""
+        """Hook for Reset node: 1000h-1FFFh have their start values already; the device resets everything else."""
         self.on_heartbeat_lost: Callable[[int], bytes | None] = lambda node: b""
-        """Node lost; returns what EMCY 8130h carries behind the node, None when nothing hung on it: no emergency."""
+        """Hook called with the node that was lost; returns the detail that EMCY 8130h carries after the node, or None
+        when nothing depends on that node and no EMCY is sent."""
         self.on_heartbeat: Callable[[int], None] = lambda node: None
-        """A heartbeat of a node that is listened to."""
+        """Hook called for each heartbeat of a node that is listened to."""
         self.due: float | None = None
-        """Wall time at which `on_due` is to be called next."""
+        """Wall time at which `on_due` is to be called next, s; None for never."""
         self.on_due: Callable[[], None] = lambda: None
         self._bus = bus
         self.send = bus.send
@@ -76,7 +82,7 @@ class Runtime:
         self.clear_error = self._emergencies.clear_error
         self._always: dict[int, Handler] = {}
         self._active: dict[int, tuple[Handler, int | None]] = {}
-        """Handler and length of each frame that is for us in the present state."""
+        """Handler and length of each frame that this device processes in its present state, by COB-ID."""
         self._too_short: set[int] = set()
         """COB-IDs whose last frame was too short."""
         self._watches = Consumer(clock)
@@ -90,15 +96,16 @@ class Runtime:
         dictionary.on_write["heartbeat_producer"] = self._write_producer
         dictionary.on_read["node_state"] = lambda sub: self.state
 
-    # Life
+    # Start and end
 
     def start(self) -> None:
-        """What the dictionary holds now is what a reset goes back to."""
+        """Boots the device; the present values of the dictionary become those that a reset restores."""
         self.dictionary.remember()
         self._boot()
 
     def _boot(self) -> None:
-        """Boot-up, pre-operational, and on to operational by itself: control must not wait for a tuner."""
+        """Sends the boot-up frame and goes through pre-operational to operational: control must not wait for a
+        tuner."""
         for sub in (1, 2):
             self._watches.watch(sub, int(self.dictionary.get("heartbeat_consumer", sub)))
         self._collect_handlers()
@@ -107,11 +114,11 @@ class Runtime:
         self._enter(NmtState.OPERATIONAL)
 
     def stop(self) -> None:
-        """Ends `run`; may be called from a signal handler."""
+        """Ends `run`; it may be called from a signal handler."""
         self._stopping = True
 
     def run(self) -> None:
-        """Works until `stop`. A bus that goes down and comes back is lived through."""
+        """Works until `stop` is called, also when the bus goes down and comes back."""
         while not self._stopping:
             try:
                 self.poll()
@@ -122,14 +129,14 @@ class Runtime:
                     self._tick()
 
     def _tell(self, error: BusError) -> None:
-        """Once, while it stays the same."""
+        """Prints a bus error once, as long as it stays the same."""
         now = self.clock()
-        if str(error) != self._told or now - self._told_at > _TOLD_AGAIN_AFTER_S:
+        if str(error) != self._told or now - self._told_at > _REPORTED_AGAIN_AFTER_S:
             print(f"node {self.node:02X}h: {error}", file=sys.stderr, flush=True)
         self._told, self._told_at = str(error), now
 
     def poll(self, idle_s: float = _IDLE_S) -> bool:
-        """One frame, or whatever time has made due. False when no frame came within `idle_s`."""
+        """Processes one frame, or what is due. Returns False when no frame came within `idle_s` of wall time."""
         wait = idle_s
         if self.due is not None:
             wait = self.due - self.clock()
@@ -172,13 +179,13 @@ class Runtime:
         if state is self.state:
             return
         if self.state is NmtState.OPERATIONAL:
-            self.on_leave_operational()  # first: it may have a last PDO to send
+            self.on_leave_operational()  # first, because it may send a last PDO
         self.state = state
         self._gate()
         self._own_beat.restart()
 
     def _gate(self) -> None:
-        """PDOs in operational only; SDO not in stopped."""
+        """Activates PDOs in operational only, and SDO in every state but stopped."""
         self._active = {can_id: (handler, None) for can_id, handler in self._always.items()}
         if self.state is NmtState.OPERATIONAL:
             for can_id, handler in self.handlers.items():
@@ -211,9 +218,9 @@ class Runtime:
             self._reset(command == NmtCommand.RESET_NODE)
 
     def _reset(self, node: bool) -> None:
-        """Resets the communication, or the whole node: both have 1000h-1FFFh as at power-on.
+        """Resets the communication, or the whole node: both restore 1000h-1FFFh as at power-on.
 
-        What hangs on an object is told as by an SDO, in the state in which it may be written.
+        The writers of changed objects are called as by an SDO, in the state in which these objects may be written.
         """
         self._enter(NmtState.PRE_OPERATIONAL)
         self._sdo.end()
@@ -240,7 +247,7 @@ class Runtime:
         self._gate()
 
     def _after_too_short(self, can_id: int, data: bytes) -> None:
-        """Stands in for the handler until a frame is long enough, so that no other frame pays for the question."""
+        """Replaces the handler until a frame is long enough, so that no other frame pays for the check."""
         length = self.lengths[can_id]
         if len(data) >= length:
             self._too_short.discard(can_id)
@@ -271,7 +278,7 @@ class Runtime:
                 self.raise_error(Emcy.HEARTBEAT_LOST, bytes((watch.node,)) + detail)
 
     def listen(self, nodes: Iterable[int]) -> None:
-        """The nodes whose heartbeats `on_heartbeat` is told of, besides those of 1016h; 0 stands for none."""
+        """Sets the nodes whose heartbeats are passed to `on_heartbeat`, besides those of 1016h; 0 stands for none."""
         listened = frozenset(nodes) - {0}
         if listened != self._listened:
             self._listened = listened

@@ -1,4 +1,4 @@
-"""EDS files (CiA 306) of both devices, written from the object table. The committed ones describe one channel.
+"""EDS files (CiA 306) of both devices, written from the object table. The committed files describe one channel.
 
     python -m loopwright.protocol.eds plant [CHANNELS]          prints one
     python -m loopwright.protocol.eds --write                   writes protocol/eds_files/
@@ -22,12 +22,13 @@ _NODE = {Device.PLANT: PLANT_NODE, Device.CONTROLLER: CONTROLLER_NODE}
 _VAR, _ARRAY, _RECORD = 0x7, 0x8, 0x9
 _MANDATORY = (0x1000, 0x1001, 0x1018)
 _MODIFIED = "11-22-2026"
-"""Month first. Set by hand with the revision: a date of generation would make every file differ."""
+"""Date of the last change, month first. It is edited together with the revision: a date of generation would make every
+file differ."""
 _BIT_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
 
 
 def eds(device: Device, channels: int = 1) -> str:
-    """The file's text; equal tables give equal texts (no date of generation)."""
+    """Returns the text of the EDS file; equal tables give equal texts (no date of generation)."""
     table = sorted(chain(objects_of(device), pdo_objects(device, channels)), key=lambda entry: entry.index)
     mandatory = [entry for entry in table if entry.index in _MANDATORY]
     manufacturer = [entry for entry in table if 0x2000 <= entry.index < 0x6000]
@@ -103,8 +104,8 @@ def _object(entry: Object, device: Device, channels: int) -> Iterator[str]:
 
 
 def _variable(entry: Object, section: str, name: str, sub: int, device: Device) -> Iterator[str]:
-    """What is only written has no default, nor has an entry that is there at times. A REAL32 has neither default nor
-    limits: readers of EDS files disagree on whether such a number is a decimal or the bits of one, and some refuse
+    """Yields the lines of one entry. Write-only and optional entries get no default. A REAL32 gets neither default nor
+    limits: readers of EDS files disagree on whether such a number is a decimal or the bits of a float, and some refuse
     writes for it. The device enforces its limits all the same."""
     data_type = entry.type_of(sub)
     limits = ("LowLimit", entry.low), ("HighLimit", entry.high)
@@ -119,12 +120,13 @@ def _variable(entry: Object, section: str, name: str, sub: int, device: Device) 
 
 
 def _count_of(entry: Object, count: int) -> tuple[str, str]:
-    """Access and default of sub-index 0."""
+    """Returns access and default of sub-index 0."""
     return ("AccessType=rw", "DefaultValue=0") if entry.counted else ("AccessType=const", f"DefaultValue={count}")
 
 
 def _access(entry: Object) -> str:
-    """`rww` and `rwr` say which PDOs a rw object may be mapped to, where that is only one kind."""
+    """Returns the access type; `rww` and `rwr` say which kind of PDO a rw object may be mapped to, where it is only
+    one."""
     if entry.access == "rw" and entry.pdo == "R":
         return "rww"
     if entry.access == "rw" and entry.pdo == "T":

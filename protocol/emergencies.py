@@ -1,4 +1,4 @@
-"""What is wrong with a device, said by EMCY, in the error register (1001h) and in the error history (1003h)."""
+"""The errors of a device, reported by EMCY, in the error register (1001h) and in the error history (1003h)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ _MAX_REMEMBERED = len(lookup("error_field").names)
 
 
 class Emergencies:
-    """`send` takes the frame of an EMCY. Each error is known with its source: two sources may have the same."""
+    """Keeps the present errors of a device, each with its source: two sources may have the same error.
+
+    send: function that sends an EMCY frame.
+    """
 
     def __init__(self, dictionary: Dictionary, send: Callable[[bytes], None]) -> None:
         self._send = send
@@ -24,11 +27,11 @@ class Emergencies:
         dictionary.on_write["error_field"] = self._write_history
 
     def raise_error(self, code: Emcy, detail: bytes = b"", source: bytes | None = None) -> None:
-        """Says it once per occurrence; an error that stays is not repeated until `clear_error`.
+        """Reports an error once per occurrence; a lasting error is not repeated until `clear_error`.
 
         The source is the first byte of `detail`, a channel or a node, unless another is given. The same error of
-        another source is said too: whoever holds channel 2 must not miss what happens to it because channel 1 has the
-        same error.
+        another source is reported too: the tuner of channel 2 must not miss its error because channel 1 has the same
+        one.
         """
         error = code, detail[:1] if source is None else source
         if error in self._errors:
@@ -38,18 +41,19 @@ class Emergencies:
         self._send(EMCY_FRAME.pack(code, EMCY_REGISTER[code], detail[:5]))
 
     def clear_error(self, code: Emcy, source: bytes | None = None) -> None:
-        """Ends the error of one source, or of all. EMCY 0000h says it, with the register of what is left."""
+        """Ends the error of one source, or of all, and reports it by EMCY 0000h with the register of the remaining
+        errors."""
         left = [error for error in self._errors if error[0] != code or source not in (None, error[1])]
         if len(left) < len(self._errors):
             self._errors = left
             self._send(EMCY_FRAME.pack(Emcy.ERROR_GONE, self._register(), b""))
 
     def sources(self, code: Emcy) -> list[bytes]:
-        """The sources of the errors with this code that are not cleared."""
+        """Returns the sources of the errors with this code that are not cleared."""
         return [source for each, source in self._errors if each is code]
 
     def forget(self) -> None:
-        """As at power-on, in silence."""
+        """Drops all errors as at power-on, without sending an EMCY."""
         self._errors.clear()
         self._history.clear()
 

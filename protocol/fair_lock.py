@@ -1,7 +1,7 @@
-"""A lock that is had in the order in which it was asked for, what is urgent first.
+"""A lock that is granted in the order of the requests, urgent ones first.
 
-Python's locks are not fair: who gives one back and asks again at once has it again. Of fifty loops that begin together
-some would not be heard for seconds, and lose their lease for it.
+Python's locks are not fair: a thread that releases one and requests it again at once gets it again. Of fifty loops that
+begin together, some would wait for seconds and lose their leases.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 _SLICE_S = 0.05
-"""Of a wait: short enough to beat in time."""
+"""Longest single wait, s: short enough to send heartbeats in time."""
 
 
 class FairLock:
-    """Is held by `with lock.take(): ...`; whoever holds it must not take it again."""
+    """A lock that is held by `with lock.take(): ...`; its holder must not take it again."""
 
     def __init__(self) -> None:
         self._guard = threading.Lock()
@@ -28,7 +28,8 @@ class FairLock:
     def take(self, urgent: bool = False, meanwhile: Callable[[], object] = lambda: None) -> Iterator[None]:
         """Waits for the lock and holds it.
 
-        meanwhile: called again and again while others have their turn.
+        urgent: whether this request goes before those that are not urgent.
+        meanwhile: called again and again while other threads hold the lock.
         """
         self._enter(self._urgent if urgent else self._waiting, meanwhile)
         try:
@@ -45,7 +46,7 @@ class FairLock:
             mine.acquire()
             queue.append(mine)
         try:
-            while not mine.acquire(timeout=_SLICE_S):  # until who was before us hands its turn on
+            while not mine.acquire(timeout=_SLICE_S):  # until the previous holder releases it to this thread
                 meanwhile()
         except BaseException:
             with self._guard:

@@ -1,7 +1,8 @@
 """A CAN bus without CAN: a hub on 127.0.0.1 for systems that have no SocketCAN.
 
-Speaks the raw mode of the socketcand protocol, so python-can's own `socketcand` interface joins it
-(`open_bus("socketcand:127.0.0.1:29536")`). What one member sends, all others get, in one order, and TCP loses nothing.
+It speaks the raw mode of the socketcand protocol, so python-can's own `socketcand` interface can connect to it
+(`open_bus("socketcand:127.0.0.1:29536")`). All others receive what one member sends, in one order, and TCP loses no
+frame.
 
     server: < hi >      client: < open vcan0 >  server: < ok >     client: < rawmode >   server: < ok >
     client: < send 190 8 0 0 48 42 1 0 0 0 >                       others get: < frame 190 12.345678 0000484201000000 >
@@ -18,11 +19,11 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 DEFAULT_PORT = 29536
-"""The port socketcand is known by."""
+"""The TCP port that socketcand uses by default."""
 
-_LONGEST_QUEUE = 32 << 20  # bytes waiting for one member; one that is hung must not take the hub's memory
+_LONGEST_QUEUE = 32 << 20  # bytes waiting for one member; a member that hangs must not use up the hub's memory
 _LONGEST_MESSAGE = 200
-# python-can's client expects "< ok >" alone in one read; frames that come this soon after it wait.
+# python-can's client expects "< ok >" alone in one read; frames within this time after it are delayed.
 _JOINING_S = 0.05
 
 
@@ -31,11 +32,12 @@ class _Member:
         self.connection = connection
         self.received = b""
         self.queue = bytearray()
-        self.raw_from: float | None = None  # monotonic time from which frames may follow; None: not in raw mode
+        self.raw_from: float | None = None  # monotonic time from which frames may be sent; None: not in raw mode
 
 
 class Hub:
-    """One thread serves all members. `serve` returns after `stop`, which any thread or signal handler may call."""
+    """A hub that serves all members in one thread. `serve` returns after `stop`, which any thread or signal handler may
+    call."""
 
     def __init__(self, port: int = DEFAULT_PORT) -> None:
         self._listener = socket.create_server(("127.0.0.1", port))
@@ -85,7 +87,7 @@ class Hub:
     def _read(self, member: _Member) -> None:
         try:
             data = member.connection.recv(65536)
-            # Else the member's second small frame waits for our late acknowledgement.
+            # Otherwise the member's second small frame waits for the hub's delayed acknowledgement.
             if hasattr(socket, "TCP_QUICKACK"):
                 member.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
         except BlockingIOError:
@@ -103,7 +105,10 @@ class Hub:
             self._answer(member, message.split()[1:])
 
     def _answer(self, member: _Member, words: list[bytes]) -> None:
-        """`words`: a message without its brackets."""
+        """Answers one message.
+
+        words: the message without its brackets.
+        """
         if not words:
             return
         if words[0] == b"send" and member.raw_from is not None:
@@ -141,7 +146,7 @@ class Hub:
         if len(member.queue) > _LONGEST_QUEUE:
             self._leave(member)
             return
-        # A full connection wakes us when it has room again.
+        # A full connection is selected again when it has room.
         events = selectors.EVENT_READ | (selectors.EVENT_WRITE if member.queue else 0)
         if self._selector.get_key(member.connection).events != events:
             self._selector.modify(member.connection, events, member)
@@ -160,7 +165,7 @@ class Hub:
 
 
 def _frame(words: list[bytes]) -> bytes | None:
-    """`send ID LENGTH BYTE...` as others receive it; None when it is no CAN frame."""
+    """Returns `send ID LENGTH BYTE...` as the other members receive it; None when it is not a CAN frame."""
     try:
         can_id, length, values = words[1], int(words[2], 16), [int(word, 16) for word in words[3:]]
         if len(can_id) not in (3, 8) or length != len(values) or length > 8:
@@ -175,7 +180,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m loopwright.protocol.hub", description="A CAN bus on 127.0.0.1, without CAN."
     )
-    parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="0: any free one (default: %(default)s)")
+    parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="0 takes any free one (default: %(default)s)")
     try:
         hub = Hub(parser.parse_args(argv).port)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The values behind a device's object dictionary, with the checks an SDO write must pass."""
+"""The values of a device's object dictionary, with the checks of SDO writes."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, Abort
 from loopwright.protocol.sdo import SdoAbort
 
 Reader = Callable[[int], Value]
-"""Sub-index (the channel, for objects of a channel) to value."""
+"""Function from a sub-index (the channel, for objects of a channel) to its value."""
 Writer = Callable[[int, Value], None]
-"""Sub-index and checked value; raises SdoAbort to refuse. The value is stored afterwards."""
+"""Function that takes a sub-index and a checked value; it raises SdoAbort to refuse. The value is stored afterwards."""
 
 
 class Dictionary:
-    """Values by name and sub-index. `on_read` and `on_write` connect an object with what the device really does."""
+    """Holds values by name and sub-index. `on_read` and `on_write` connect an object with the device's functions."""
 
     def __init__(
         self, device: Device, channels: int, plant_node: int = PLANT_NODE, controller_node: int = CONTROLLER_NODE
@@ -42,16 +42,16 @@ class Dictionary:
         return self._values[name, sub]
 
     def set(self, name: str, value: Value, sub: int = 0) -> None:
-        """From inside the device: no checks, no `on_write`."""
+        """Sets a value from inside the device, without checks and without calling `on_write`."""
         self._values[name, sub] = value
 
     def remember(self) -> None:
-        """The values there are now are those to `restore`."""
+        """Notes the present values as those that `restore` sets."""
         self._start = dict(self._values)
 
     def restore(self, first: int, last: int) -> list[tuple[str, int]]:
-        """Sets the objects from index `first` to `last` back to what was remembered; name and sub-index of those that
-        were different. As `set`, it asks nobody."""
+        """Restores the objects with index `first` to `last`; returns name and sub-index of those that were different.
+        It makes no checks and calls no `on_write`, as `set`."""
         names = {entry.name for index, entry in self._by_index.items() if first <= index <= last}
         changed = [key for key, value in self._start.items() if key[0] in names and self._values[key] != value]
         for key in changed:
@@ -59,7 +59,7 @@ class Dictionary:
         return changed
 
     def read(self, index: int, sub: int) -> bytes:
-        """As an SDO upload sees it."""
+        """Returns the bytes of an SDO upload. Raises SdoAbort."""
         entry = self._entry(index, sub)
         if entry.shape is not Shape.VAR and sub == 0 and not entry.counted:
             return Type.U8.encode(entry.count(self.channels))
@@ -73,11 +73,13 @@ class Dictionary:
             return entry.type_of(sub).encode(math.copysign(math.inf, float(value)))
 
     def room(self, index: int, sub: int) -> int:
-        """Bytes that an SDO download must have, 0 for any number; refuses where nothing may be written."""
+        """Returns how many bytes an SDO download must have, 0 for any number. Raises SdoAbort where nothing may be
+        written."""
         return self._writable(index, sub).type_of(sub).size
 
     def write(self, index: int, sub: int, data: bytes) -> None:
-        """As an SDO download does it: access, length, finite, limits, then what the device itself says."""
+        """Carries out an SDO download; checks access, length, finiteness and limits, then asks the device. Raises
+        SdoAbort."""
         entry = self._writable(index, sub)
         try:
             value = entry.type_of(sub).decode(data)
@@ -110,7 +112,7 @@ class Dictionary:
 
 
 def check_value(entry: Object, value: Value) -> None:
-    """Refuses what is not finite or beyond the limits of the table."""
+    """Raises SdoAbort for a value that is not finite or outside the limits of the table."""
     if isinstance(value, str):
         return
     if not math.isfinite(value) or (entry.type is Type.BOOLEAN and value > 1):

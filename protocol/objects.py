@@ -1,7 +1,7 @@
 """The object dictionary of both devices as one table: EDS files, checks on writes and every look-up come from it.
 
-Own objects (2000h-5FFFh) are the manufacturer area; nothing there is claimed to be standard. 1000h-1FFFh follow
-CiA 301, 6000h-9FFFh carry the index and meaning publicly known of CiA 404.
+Objects 2000h-5FFFh are manufacturer-specific and not claimed to be standard. 1000h-1FFFh follow CiA 301;
+6000h-9FFFh have the index and meaning that are publicly known of CiA 404.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Value = int | float | str
 
 
 class Type(Enum):
-    """Data types by their CANopen number (CiA 301) and struct format."""
+    """The data types by their CANopen number (CiA 301) and struct format."""
 
     BOOLEAN = (0x1, "<B")
     U8 = (0x5, "<B")
@@ -36,7 +36,7 @@ class Type(Enum):
 
     @property
     def size(self) -> int:
-        """Bytes; 0 for strings."""
+        """Returns the number of bytes; 0 for strings."""
         return struct.calcsize(self.value[1])
 
     def encode(self, value: Value) -> bytes:
@@ -45,7 +45,7 @@ class Type(Enum):
         return struct.pack(self.format, value if self is Type.REAL32 else int(value))
 
     def decode(self, data: bytes) -> Value:
-        """Raises struct.error when the length does not fit."""
+        """Returns the value of these bytes. Raises struct.error when the length does not fit."""
         if self is Type.STRING:
             return data.decode("ascii", "replace")
         value: int | float = struct.unpack(self.format, data)[0]
@@ -53,23 +53,29 @@ class Type(Enum):
 
 
 class Device(Enum):
+    """The device, or devices, that have an object."""
     PLANT = "plant"
     CONTROLLER = "controller"
     BOTH = "both"
 
 
 class Shape(Enum):
+    """The arrangement of an object's sub-indices."""
     VAR = "var"
-    """One value at sub-index 0."""
+    """The object has one value, at sub-index 0."""
     CHANNELS = "channels"
-    """Sub-index k is channel k."""
+    """Sub-index k belongs to channel k."""
     ENTRIES = "entries"
-    """A fixed number of entries, `names` gives them."""
+    """The object has a fixed number of entries, listed in `names`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Object:
-    """One object. `low`, `high`: EDS limits, enforced by the devices. `pdo`: T may be sent, R received in a PDO."""
+    """One entry of the object dictionary.
+
+    low, high: EDS limits, enforced by the devices; None for no limit.
+    pdo: T where the object may be sent in a PDO, R where it may be received in one.
+    """
 
     name: str
     index: int
@@ -83,20 +89,20 @@ class Object:
     low: float | None = None
     high: float | None = None
     unit: str = ""
-    """For who reads this table: EDS files have no place for it."""
+    """Unit of the value, for readers of this table: EDS files have no field for it."""
     held: bool = False
-    """Written only while the plant does not run (2011h = 0)."""
+    """Whether the object can be written only while the plant does not run (2011h = 0)."""
     names: tuple[str, ...] = ()
-    """Names of the entries; the count is what sub-index 0 reads."""
+    """Names of the entries; sub-index 0 returns their number."""
     types: tuple[Type, ...] = ()
     """Types of the entries where they differ."""
     defaults: tuple[Value, ...] = ()
     by_pdo: bool = False
-    """Written by PDOs alone: an SDO write is refused as not possible in the present state."""
+    """Whether only PDOs write the object; an SDO write is refused as not possible in the present state."""
     counted: bool = False
-    """Sub-index 0 says how many entries there are at present, and may be written."""
+    """Whether sub-index 0 holds the present number of entries, and may be written."""
     relative: tuple[int, ...] = ()
-    """Sub-indices whose default moves with the node-ID (COB-IDs); the EDS says so."""
+    """Sub-indices whose default depends on the node-ID (COB-IDs); the EDS marks them."""
     is_record: bool = False
 
     def type_of(self, sub: int) -> Type:
@@ -108,7 +114,7 @@ class Object:
         return self.defaults[sub - 1] if self.defaults and sub > 0 else self.default
 
     def count(self, channels: int) -> int:
-        """Highest sub-index of a device with that many channels."""
+        """Returns the highest sub-index on a device with this number of channels."""
         return {Shape.VAR: 0, Shape.CHANNELS: channels, Shape.ENTRIES: len(self.names)}[self.shape]
 
     @property
@@ -128,7 +134,7 @@ DEGREE_CELSIUS = 0x002D0000
 SECOND = 0x00030000
 _IDENTITY = ("Vendor-ID", "Product code", "Revision number", "Serial number")
 
-# Vendor-ID 0 is for tests; a real one is given out by CiA.
+# Vendor-ID 0 is for tests; CiA assigns real ones.
 _COMMUNICATION = (
     Object("device_type", 0x1000, U32, "ro", "Device type", BOTH),
     Object("error_register", 0x1001, U8, "ro", "Error register", BOTH, pdo="T"),
@@ -149,10 +155,10 @@ _COMMUNICATION = (
            defaults=(0, 0, REVISION, 0), is_record=True),
     Object("sync_counter_overflow", 0x1019, U8, "ro", "Synchronous counter overflow value", BOTH,
            default=SYNC_COUNTER_OVERFLOW),
-    # 1: no change of the NMT state. Control goes on when a node that is watched falls silent.
+    # 1: no change of the NMT state. Control goes on when a supervised node falls silent.
     Object("error_behaviour", 0x1029, U8, "const", "Error behaviour", BOTH, ENTRIES, names=("Communication error",),
            default=1),
-    # 0: operational by itself. Control does not wait for a master.
+    # 0: the device becomes operational by itself. Control does not wait for a master.
     Object("nmt_startup", 0x1F80, U32, "ro", "NMT startup", BOTH),
     Object("sample_number", 0x2000, U32, "rw", "Sample number", BOTH, pdo="TR", by_pdo=True),
     Object("node_state", 0x2002, U8, "ro", "NMT state, as the heartbeat carries it", BOTH, default=5),
@@ -180,11 +186,11 @@ _PLANT = (
     Object("plant_mv", 0x6300, REAL32, "rw", "AO output PV", PLANT, CHANNELS, pdo="R", low=0, high=100, unit="%"),
 )
 
-_SMALLEST_KP = 1e-9  # Kp is positive; the direction of action is an object of its own
+_SMALLEST_KP = 1e-9  # Kp is positive; the action of the controller is a separate object
 
 
 def _gains(first_index: int, access: str, prefix: str, text: str) -> tuple[Object, ...]:
-    """Kp, Ti, Td, Tf, b, c in the ISA form. Ti = 0 means no integral action."""
+    """Returns the objects of Kp, Ti, Td, Tf, b, c in the ISA form. Ti = 0 means no integral action."""
     rows = (
         ("kp", "Kp", "%", _SMALLEST_KP, 1.0),
         ("ti", "Ti", "s", 0, 0.0),
@@ -213,7 +219,7 @@ _ORDERS = {
 
 
 def _session() -> tuple[Object, ...]:
-    """What is known of the session of a channel, and what the next one is opened with."""
+    """Returns the objects that describe a channel's session, and those that hold the terms of the next one."""
     rows: tuple[tuple[str, Type, str, str, dict[str, Any]], ...] = (
         ("session_next", U32, "ro", "Number to open the next session with", {}),
         ("session", U32, "ro", "Number of the open session (0 none)", {}),
@@ -337,22 +343,22 @@ BY_NAME: dict[str, Object] = {entry.name: entry for entry in OBJECTS}
 
 
 def lookup(name: str) -> Object:
-    """The object called `name`, for example "controller_mode_command". KeyError when there is none."""
+    """Returns the object called `name`, for example "controller_mode_command". Raises KeyError."""
     return BY_NAME[name]
 
 
 _OWN_OBJECTS: dict[tuple[Device, str], Object] = {
     (PLANT, "sample_number"): replace(BY_NAME["sample_number"], access="ro", pdo="T", by_pdo=False),
 }
-"""Where both devices have an object and not in the same way: the plant gives the number, the controller is told."""
+"""Objects that the two devices have in different ways: the plant sets the sample number, the controller receives it."""
 
 
 def default_of(entry: Object, sub: int, device: Device) -> Value:
-    """Where both devices have an object, its default may be the device's own."""
+    """Returns the default of an object on this device; the two devices may have different defaults."""
     return _OWN_DEFAULTS.get((device, entry.name, sub), entry.default_of(sub))
 
 
 def objects_of(device: Device) -> tuple[Object, ...]:
-    """What the plant or the controller has, by index."""
+    """Returns the objects of the plant or the controller, sorted by index."""
     own = (_OWN_OBJECTS.get((device, entry.name), entry) for entry in OBJECTS if entry.device in (device, BOTH))
     return tuple(sorted(own, key=lambda entry: entry.index))

@@ -1,4 +1,4 @@
-"""PDO parameters (1400h ff.) of both devices, per channel. The mapping is fixed: frames are packed by struct."""
+"""PDO parameters (1400h ff.) of both devices, per channel. The mapping is fixed, because struct packs the frames."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ _ON_SYNC = 1
 _ON_ARRIVAL_OR_CHANGE = 255
 _RPDO, _TPDO = 0x1400, 0x1800
 _RENEWAL_SLOT = 0x1FF
-"""Behind the PDOs of the last channel."""
+"""Slot of the renewal's RPDO, after the PDOs of the last channel."""
 _NO_REMOTE_REQUEST = 1 << 30
-"""In the COB-ID of a transmitted PDO: who asks for it by a remote frame is not answered."""
+"""Bit of the COB-ID of a transmitted PDO: remote requests for it are not answered."""
 
 
 def pdo_objects(
     device: Device, channels: int, plant_node: int = PLANT_NODE, controller_node: int = CONTROLLER_NODE
 ) -> Iterator[Object]:
-    """Communication and mapping parameters of every PDO of the device.
+    """Yields communication and mapping parameters of every PDO of the device.
 
     Channel 1 of the controller has RPDO1 PV, RPDO2 command, TPDO2 MV, TPDO3 status (TPDO1, analogue inputs in CiA 404,
     is left out: the device measures nothing); channel k has RPDO 2k-1, 2k and TPDO 2k, 2k+1. Channel k of the plant has
-    RPDO k and TPDO k. RPDO512 of the controller renews the lease of a session, of whichever channel.
+    RPDO k and TPDO k. RPDO512 of the controller renews the lease of a session on any channel.
     """
     if device is Device.CONTROLLER:
         renewal = ("controller_renewal_session", "controller_renewal_channel")
@@ -82,6 +82,6 @@ def _pdo(index: int, cob_id: int, kind: int, channel: int, mapped: tuple[str, ..
 
 
 def _mapping(entry: Object, channel: int) -> int:
-    """Index, sub-index and length in bits as CiA 301 packs them."""
+    """Returns index, sub-index and length in bits, packed as in CiA 301."""
     sub = channel if entry.shape is Shape.CHANNELS else 0
     return entry.index << 16 | sub << 8 | 8 * entry.type.size

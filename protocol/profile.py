@@ -1,6 +1,6 @@
 """The fieldbus profile: node-IDs, COB-IDs, frame layouts and code lists shared by plant, controller and tuner.
 
-Little-endian as CANopen always is. PV in engineering units, MV in percent of the output range (0..100).
+All values are little-endian. PV is in engineering units, MV in percent of the output range (0..100).
 Plant time is `sample number * sample time`; a PV and the MV that answers it carry the same sample number.
 """
 
@@ -14,10 +14,11 @@ from typing import NamedTuple
 PLANT_NODE = 0x10
 CONTROLLER_NODE = 0x20
 TUNER_NODE = 0x7D
-"""Node-ID of a gateway that is given no other."""
+"""Node-ID of a gateway unless another one is configured."""
 MAX_CHANNELS = 199
 REVISION = 0x00030000
-"""1018h:3 of both devices. The upper half counts what they do differently on the bus, the lower half the rest."""
+"""Object 1018h:3 of both devices. The upper half counts changes of the behaviour on the bus, the lower half the
+rest."""
 
 NMT_ID = 0x000
 SYNC_ID = 0x080
@@ -26,25 +27,29 @@ FOREVER = 0xFFFFFFFF
 """Value of 2011h (samples to run) that means "without end"."""
 
 PV_FRAME = Struct("<fI")
-"""PV REAL32, sample number U32."""
+"""Layout of a PV frame: PV REAL32, sample number U32."""
 MV_FRAME = Struct("<fI")
-"""MV REAL32 (percent), number U32 of the sample it answers; UNASKED: it answers none, and takes effect at once."""
+"""Layout of a MV frame: MV REAL32 (percent), number U32 of the sample that it answers; with UNASKED it answers none,
+and takes effect at once."""
 UNASKED = 0
 STATUS_FRAME = Struct("<BBfBB")
-"""Mode U8, set in effect U8 (0 accepted, 1 on trial), set-point REAL32, session U8 (0 none, 1 open), cause U8."""
+"""Layout of a status frame: mode U8, gain set in effect U8 (0 accepted, 1 on trial), set-point REAL32, session U8 (0
+none, 1 open), cause U8."""
 COMMAND_FRAME = Struct("<f")
-"""Set point REAL32."""
+"""Layout of a command frame: set-point REAL32."""
 RENEWAL_FRAME = Struct("<IB")
-"""Number U32 of the session whose lease is renewed, channel U8."""
+"""Layout of a renewal frame: number U32 of the session whose lease is renewed, channel U8."""
 SYNC_FRAME = Struct("<B")
 NMT_FRAME = Struct("<BB")
-"""Command U8, node-ID U8 (0 = all)."""
+"""Layout of an NMT frame: command U8, node-ID U8 (0 = all)."""
 HEARTBEAT_FRAME = Struct("<B")
 EMCY_FRAME = Struct("<HB5s")
-"""Error code U16, error register U8, five bytes of our own."""
+"""Layout of an EMCY frame: error code U16, error register U8, five manufacturer-specific bytes."""
 
 
 class Mode(IntEnum):
+    """The modes of a controller channel (2101h)."""
+
     OFF = 0
     MANUAL = 1
     AUTOMATIC = 2
@@ -66,7 +71,7 @@ class Cause(IntEnum):
 
 
 class Hand(IntFlag):
-    """What another hand has moved since the opening (2134h)."""
+    """The settings that an operator or another master has changed since the session was opened (2134h)."""
 
     NONE = 0
     SETPOINT = 1
@@ -77,7 +82,7 @@ class Hand(IntFlag):
 
 
 class Order(IntEnum):
-    """What a tuner commands within its session: one object each, 2170h + the number."""
+    """The orders of a tuner within its session; each has an object, 2170h + its number."""
 
     OPEN = 0
     CLOSE = 1
@@ -90,7 +95,7 @@ class Order(IntEnum):
 
 
 class ParameterCommand(IntEnum):
-    """2120h."""
+    """The commands of 2120h."""
 
     TRY = 1
     ACCEPT = 2
@@ -98,7 +103,7 @@ class ParameterCommand(IntEnum):
 
 
 class RelayState(IntEnum):
-    """2159h."""
+    """The states of a relay (2159h)."""
 
     IDLE = 0
     RUNNING = 1
@@ -107,7 +112,7 @@ class RelayState(IntEnum):
 
 
 class OnMissingAnswer(IntEnum):
-    """2014h: what the plant does with a sample nobody answered."""
+    """The plant's action on a sample that the controller has not answered (2014h)."""
 
     HOLD_OUTPUT = 0
     STOP_RUN = 1
@@ -115,6 +120,8 @@ class OnMissingAnswer(IntEnum):
 
 
 class NmtCommand(IntEnum):
+    """The NMT commands of CiA 301."""
+
     START = 1
     STOP = 2
     PRE_OPERATIONAL = 128
@@ -123,7 +130,7 @@ class NmtCommand(IntEnum):
 
 
 class NmtState(IntEnum):
-    """As the heartbeat carries it."""
+    """The NMT states as a heartbeat carries them."""
 
     BOOT_UP = 0
     STOPPED = 4
@@ -132,6 +139,8 @@ class NmtState(IntEnum):
 
 
 class Emcy(IntEnum):
+    """The EMCY error codes that the devices send."""
+
     ERROR_GONE = 0x0000
     HEARTBEAT_LOST = 0x8130
     PDO_LENGTH = 0x8210
@@ -152,11 +161,11 @@ EMCY_REGISTER = {
     Emcy.NO_ANSWER: 0x81,
     Emcy.TUNER_LOST: 0x91,
 }
-"""Error register (1001h): bit 0 generic, bit 4 communication, bit 7 manufacturer."""
+"""Error register (1001h) by error code: bit 0 generic, bit 4 communication, bit 7 manufacturer."""
 
 
 class Abort(IntEnum):
-    """SDO abort codes the devices use."""
+    """The SDO abort codes that the devices use."""
 
     TOGGLE = 0x05030000
     COMMAND = 0x05040001
@@ -181,9 +190,9 @@ class Abort(IntEnum):
 
 
 def samples_between(earlier: int, later: int) -> int:
-    """How many samples `later` comes after `earlier`: numbers go from FFFFFFFFh on to 1, for 0 is UNASKED.
+    """Returns how many samples `later` comes after `earlier`; numbers wrap from FFFFFFFFh to 1, because 0 is UNASKED.
 
-    A number that lies far behind (a plant that has started anew) gives a negative count.
+    A number that lies far behind (a plant that has restarted) gives a negative count.
     """
     passed = (later - earlier) % 0xFFFFFFFF
     return passed if passed < 0x80000000 else passed - 0xFFFFFFFF
@@ -206,12 +215,13 @@ def heartbeat_id(node: int) -> int:
 
 
 def renewal_id(controller_node: int) -> int:
-    """COB-ID of the renewals of all channels: of the default RPDO4, which no channel of `channel_ids` comes up to."""
+    """Returns the COB-ID of the renewals of all channels: that of the default RPDO4, which `channel_ids` never
+    reaches."""
     return 0x500 + controller_node
 
 
 class ChannelIds(NamedTuple):
-    """COB-IDs of one loop."""
+    """The COB-IDs of one loop."""
 
     pv: int
     mv: int
@@ -221,11 +231,12 @@ class ChannelIds(NamedTuple):
 
 @cache
 def channel_ids(channel: int, plant_node: int = PLANT_NODE, controller_node: int = CONTROLLER_NODE) -> ChannelIds:
-    """COB-IDs of channel 1..199.
+    """Returns the COB-IDs of channel 1..199.
 
-    Channel 1 has the default PDOs of its two nodes. The others are taken in channel order from 181h..57Fh without
-    those four: first all PV, then all MV, status, command, so that an ID depends on the channel alone and not on
-    how many there are, and a measurement wins arbitration over an output.
+    Channel 1 has the default PDOs of its two nodes. The other channels take 181h..57Fh without those four, in channel
+    order: first all PV, then all MV, status, command. So an ID depends on the channel alone and not on the number of
+    channels, and a measurement wins arbitration over an output.
+    Raises ValueError.
     """
     if not 1 <= channel <= MAX_CHANNELS:
         raise ValueError(f"channel must be 1..{MAX_CHANNELS}, not {channel}")

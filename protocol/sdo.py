@@ -1,8 +1,8 @@
 """SDO server of CiA 301 as a pure function of requests: expedited and segmented transfers, and uploads by the block.
 
-Written here because the server of the `canopen` library needs its Network (a thread) and answers neither a missing
-sub-index nor a value beyond its limits with the code the profile asks for. A block download is refused: nothing
-that can be written is longer than one frame.
+The server of the `canopen` library is not used: it needs its Network (a thread) and answers neither a missing
+sub-index nor a value beyond its limits with the abort code of the profile. A block download is refused, because
+nothing that can be written is longer than one frame.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from loopwright.protocol.sdo_block import LONGEST, BlockUpload
 _HEADER = struct.Struct("<BHB")
 _ABORT = struct.Struct("<BHBI")
 _SIZE = struct.Struct("<I")
-_LARGEST_DOWNLOAD = 1024  # nothing in the table is longer; a client cannot fill the memory
+_LARGEST_DOWNLOAD = 1024  # bytes; no object is longer, and a client cannot fill the memory
 
 _SEGMENT_DOWNLOAD, _DOWNLOAD, _UPLOAD, _SEGMENT_UPLOAD, _ABORTED, _BLOCK_UPLOAD = range(6)
 _INITIATE, _END, _CONFIRM, _START = range(4)  # steps of a block upload
 
 
 class SdoAbort(Exception):
-    """Ends a transfer with this abort code."""
+    """Raised to end a transfer with this abort code."""
 
     def __init__(self, code: Abort) -> None:
         super().__init__(f"{code:#010x}")
@@ -31,8 +31,9 @@ class SdoAbort(Exception):
 
 
 class SdoServer:
-    """One client at a time, as a default SDO channel has it.
+    """Serves one client at a time, as a default SDO channel does.
 
+    read, write: carry out an upload and a download by index and sub-index.
     room: how many bytes an object takes, 0 for any number. All three raise SdoAbort to refuse.
     """
 
@@ -54,7 +55,7 @@ class SdoServer:
         self._toggle = 0
 
     def answer(self, request: bytes) -> bytes | None:
-        """The response, 8 bytes; several frames one behind the other for a block; None when there is nothing to say."""
+        """Returns the response of 8 bytes, several frames in a row for a block, or None when none is due."""
         if len(request) < 8:
             return None
         specifier = request[0] >> 5
@@ -79,7 +80,7 @@ class SdoServer:
             return _ABORT.pack(0x80, self._index, self._sub, abort.code)
 
     def end(self) -> None:
-        """Forgets the transfer that is under way, in silence."""
+        """Drops the transfer in progress without a response."""
         self._outgoing = self._incoming = self._block = None
         self._toggle = 0
 
@@ -116,7 +117,7 @@ class SdoServer:
         raise SdoAbort(Abort.COMMAND)
 
     def _begin_block_upload(self, request: bytes) -> bytes:
-        """Answered with an ordinary upload where the value is no longer than the client asks a block for (pst)."""
+        """Begins a block upload, or an ordinary one where the value is no longer than the client's threshold (pst)."""
         self._begin(request)
         length, threshold = _length_of_block(request[4]), request[5]
         data = self._read(self._index, self._sub)

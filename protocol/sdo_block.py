@@ -1,4 +1,4 @@
-"""A block upload of CiA 301 from the server's side: segments by the block, a confirmation for each, CRC at the end."""
+"""The server's side of a CiA 301 block upload: blocks of segments, a confirmation for each block, a CRC at the end."""
 
 from __future__ import annotations
 
@@ -6,26 +6,29 @@ import struct
 from binascii import crc_hqx
 
 LONGEST = 127
-"""Segments in a block."""
+"""Largest number of segments in a block."""
 _PART = 7
 _LAST = 0x80
 _END = struct.Struct("<BH5x")
 
 
 class BlockUpload:
-    """One transfer. Frames are handed out one behind the other, 8 bytes each."""
+    """One block upload. Its methods return frames of 8 bytes each, one after the other."""
 
     def __init__(self, data: bytes, length: int) -> None:
-        """length: of the first block, in segments."""
+        """Begins an upload.
+
+        length: segments of the first block.
+        """
         self._data = self._left = data
         self._length = length
         self.sent = 0
-        """Segments of the block that is under way."""
+        """Number of segments of the present block."""
         self.over = False
-        """All has arrived; the client has only to say goodbye."""
+        """Whether everything is confirmed; only the client's end frame is still to come."""
 
     def segments(self) -> bytes:
-        """The next block, which begins with what the client has not confirmed yet."""
+        """Returns the next block, which begins with the first byte that the client has not confirmed."""
         starts = range(0, max(len(self._left), 1), _PART)
         parts = [self._left[at : at + _PART] for at in starts[: self._length]]
         self.sent = len(parts)
@@ -36,7 +39,11 @@ class BlockUpload:
         return bytes(frames)
 
     def after(self, confirmed: int, length: int) -> bytes:
-        """What follows the confirmation of that many segments of the block; length: of the next one."""
+        """Returns the frames that follow a confirmation.
+
+        confirmed: number of segments of the block that the client confirms.
+        length: segments of the next block.
+        """
         self._left = self._left[_PART * confirmed :]
         self._length = length
         if self._left or not confirmed:

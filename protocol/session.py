@@ -1,4 +1,4 @@
-"""What an order within a session consists of, and the check that puts it in force: shared by controller and tuner."""
+"""The values of each order within a session, and the check that puts it in force, for controller and tuner."""
 
 from __future__ import annotations
 
@@ -28,19 +28,20 @@ STAGED: dict[Order, tuple[str, ...]] = {
     Order.TRY: tuple(f"controller_session_{name}" for name in GAINS),
     Order.ACCEPT: tuple(f"controller_session_{name}" for name in GAINS),
 }  # fmt: skip
-"""The objects an order takes its values from, in the order in which the check covers them."""
+"""The objects that hold the values of an order, in the order in which the check covers them."""
 
 
 def object_of(order: Order) -> str:
-    """The object to which the check of the order is written."""
+    """Returns the object to which the check of the order is written."""
     return f"controller_order_{order.name.lower()}"
 
 
 def check_of(number: int, count: int, order: Order, values: Sequence[Value]) -> int:
-    """CRC-32 (that of zlib and Ethernet) over profile revision, session number, running count (U32 each,
-    little-endian), order (U8) and the values as an SDO carries them.
+    """Returns the check of an order: CRC-32 (that of zlib and Ethernet) over profile revision, session number and
+    running count (U32 each, little-endian), order (U8) and the values as an SDO carries them.
 
-    number: of the session; of an opening the one read from 2130h.  count: orders given in the session before this one.
+    number: number of the session; for an opening, the number read from 2130h.
+    count: orders given in the session before this one.
     """
     text = struct.pack("<IIIB", REVISION, number, count & 0xFFFFFFFF, order)
     for name, value in zip(STAGED[order], values, strict=True):

@@ -1,7 +1,7 @@
-"""The tuner's side of the bus: parameters by SDO, samples from the PDOs of one loop, and our heartbeat.
+"""The tuner's side of the bus: parameters by SDO, samples from the PDOs of one loop, and the tuner's heartbeat.
 
-Blocking, one thread: whoever waits for an answer or a sample also sends the heartbeat meanwhile, so that a hung tuner
-falls silent. What arrives while an SDO waits is taken in order and handed out later.
+All calls block in one thread: a wait for an answer or a sample also sends the heartbeat, so a tuner that hangs falls
+silent. Frames that arrive during an SDO are taken in order and returned later.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from loopwright.protocol.profile import (
 from loopwright.protocol.real32 import shortest
 from loopwright.protocol.station import Station
 
-_WAIT_S = 0.05  # one wait on the bus: short enough to beat in time; always the same, which RawBus makes cheap
+_WAIT_S = 0.05  # one wait on the bus: short enough for the heartbeat, and always the same, which is cheap in RawBus
 _TAKE_IN_S = 0.1
 _ABORT = 0x80
 _URGENT = ("controller_session_renewal", "controller_order_close")
 RENEWAL_S = 0.5
-"""How often the lease of a session is renewed, by frames that nobody answers: some may be lost."""
+"""Wall time between two renewals of a session's lease, s. They are not answered, and some may be lost."""
 TURN_S = 10.0
-"""A loop that waits longer for its turn with a node renews nothing any more: whoever has the turn hangs."""
+"""Longest wait for a node's lock, s. After it the loop renews no lease any more, because the lock's holder hangs."""
 
 ABORT_TEXT = {
     Abort.TOGGLE: "toggle bit not alternated",
@@ -68,12 +68,14 @@ ABORT_TEXT = {
 
 
 class FailureKind(StrEnum):
+    """The ways in which an SDO fails."""
+
     TIMEOUT = "timeout"
     ABORT = "abort"
 
 
 class TunerError(Exception):
-    """An SDO without success: no answer (TIMEOUT), or refused by the device with `code` (ABORT)."""
+    """Raised for an SDO that failed: without an answer (TIMEOUT), or refused by the device with `code` (ABORT)."""
 
     def __init__(self, kind: FailureKind, text: str, code: int = 0) -> None:
         super().__init__(text)
@@ -106,9 +108,11 @@ class Tuner:
         sdo_timeout_s: float = 0.25,
         sdo_tries: int = 3,
     ) -> None:
-        """plant_node None: a plant that offers no SDO; its PV frames are still expected from node 10h.
+        """Opens the bus.
 
-        station: what this process shares; by default one of its own, for who only reads.
+        plant_node: node-ID of the plant I/O; None for a plant without SDO, whose PV frames are still expected from node
+        10h.
+        station: state that this process shares; by default a new one, for a client that only reads.
         """
         self.station = station or Station()
         ids = channel_ids(channel, plant_node or PLANT_NODE, controller_node)
@@ -127,17 +131,18 @@ class Tuner:
         self._samples: deque[BusSample] = deque()
         self._pv = (0.0, -1)
         self.beating = False
-        """Only who holds the loop beats: a mere reader must not keep alive the trial of a tuner that died."""
+        """Whether this tuner sends heartbeats. A client that only reads must not keep alive the trial of a tuner that
+        died."""
         self.session = 0
-        """The number of the session whose lease is renewed in every wait in here; 0: none."""
+        """Number of the session whose lease is renewed during every wait; 0 for none."""
         self._renewed_at = 0.0
         self._check_stop_request: Callable[[], None] = lambda: None
         self.mode, self.on_trial, self.sp = 0, False, 0.0
         self.session_is_open = False
         self.node_states: dict[int, int] = {}
-        """NMT states of controller and plant by node-ID, as their heartbeats have said last."""
+        """NMT states of controller and plant from their latest heartbeats, by node-ID."""
         self.restarted = False
-        """The controller sent a boot-up frame."""
+        """Whether the controller has sent a boot-up frame."""
 
     def close(self) -> None:
         self._bus.close()
@@ -145,21 +150,21 @@ class Tuner:
     # -- heartbeat and frames
 
     def hold(self) -> None:
-        """We beat from now on, and at once. Raises NodeTaken."""
+        """Starts the heartbeat, and sends the first one at once. Raises NodeTaken."""
         self.station.join(self._url)
         self.beating = True
         self.station.beat(self._url, self._bus, self.station.monotonic())
 
     def keep(self, session: int, check_stop_request: Callable[[], None] = lambda: None) -> None:
-        """The lease of that session, just paid for, is renewed from now on; 0: no lease is any more.
+        """Renews the lease of this session, which was just granted, from now on; 0 ends the renewals.
 
-        check_stop_request: called while the loop waits for its turn with a node; raises where somebody wants an end.
+        check_stop_request: called while the loop waits for a node's lock; it raises when the job is asked to stop.
         """
         self.session, self._renewed_at, self._check_stop_request = session, self.station.monotonic(), check_stop_request
 
     def heartbeat(self) -> float:
-        """Sends our heartbeat when it is due and no other loop on this bus has sent it, and the renewal of our session.
-        The time on the clock, which it takes a system call to read in some virtual machines."""
+        """Sends the heartbeat when it is due and no other loop on this bus has sent it, and the renewal of the session.
+        Returns the time on the clock, whose reading is a system call in some virtual machines."""
         if not self.beating:
             return self.station.monotonic()
         now = self.station.beat_if_due(self._url, self._bus)
@@ -169,8 +174,8 @@ class Tuner:
         return now
 
     def sample(self, timeout_s: float) -> BusSample | None:
-        """The next sample in order; None when none came within `timeout_s` of wall time."""
-        now = self.heartbeat()  # also while there are samples at hand: who catches up is alive
+        """Returns the next sample in order, or None when none came within `timeout_s` of wall time."""
+        now = self.heartbeat()  # also while samples are queued: a tuner that catches up is alive
         give_up = now + timeout_s
         while not self._samples:
             wait = _WAIT_S if now < give_up else 0.0  # then only what is here already
@@ -180,13 +185,13 @@ class Tuner:
         return self._samples.popleft()
 
     def drain(self) -> None:
-        """Takes what has arrived and forgets its samples: the next sample is one from now on."""
+        """Receives all waiting frames and drops their samples, so that the next sample is a new one."""
         self._take_in()
         self._samples.clear()
 
     def _take_in(self) -> None:
-        """What has arrived, in its order. Where more arrives than we can take, that is no reason to stay here for
-        ever or to fall silent: the rest is taken later."""
+        """Receives the waiting frames in order, for a limited time: on an overloaded bus the rest is received later, so
+        that the heartbeat continues."""
         give_up = self.station.monotonic() + _TAKE_IN_S
         while self._receive(0.0) and self.heartbeat() < give_up:
             pass
@@ -216,13 +221,13 @@ class Tuner:
             else:
                 self._answers.append(frame)
         except struct.error:
-            pass  # somebody else's frame with our identifier: it carries no sample
+            pass  # a foreign frame with this identifier: it carries no sample
         return True
 
     # -- SDO
 
     def read(self, name: str, sub: int | None = None, node: int | None = None) -> Value:
-        """The value of an object by name, of our channel unless `sub` says otherwise."""
+        """Returns the value of an object by name, of this tuner's channel unless `sub` is given. Raises TunerError."""
         entry, node, sub = self._address(name, sub, node)
         with self._turn(node, name):
             data = self._request(entry, node, sub, 0x40, b"\0\0\0\0")
@@ -239,10 +244,11 @@ class Tuner:
         return shortest(float(value)) if entry.type is Type.REAL32 else value
 
     def number(self, name: str, sub: int | None = None, node: int | None = None) -> float:
+        """Returns the value of a numeric object. Raises TunerError."""
         return float(self.read(name, sub, node))
 
     def write(self, name: str, value: float, sub: int | None = None, node: int | None = None) -> None:
-        """Writes a number; every object the profile lets us write fits one frame."""
+        """Writes a number; every object that the profile lets a tuner write fits one frame. Raises TunerError."""
         entry, node, sub = self._address(name, sub, node)
         raw = entry.type.encode(value if entry.type is Type.REAL32 else int(value))
         with self._turn(node, name):
@@ -260,10 +266,9 @@ class Tuner:
 
     @contextmanager
     def _turn(self, node: int, name: str) -> Iterator[None]:
-        """Our turn with the node, and its answers heard. What keeps a loop in our hands goes before what others want.
-
-        Outside of it the answers, which are to others then, are not received: of fifty loops each would wake for all.
-        """
+        """Holds the lock of the node and receives its answers; requests that keep the session alive go first. Outside
+        of it the answers are not received: they belong to other loops, and each of fifty loops would wake for all of
+        them."""
         waits_since = self.station.monotonic()
 
         def meanwhile() -> None:
@@ -279,7 +284,7 @@ class Tuner:
                 self._bus.set_filters(self._heard)
 
     def _request(self, entry: Object, node: int, sub: int, command: int, payload: bytes) -> bytes:
-        """The answer's 8 bytes. An answer names its object, so a late one to another request is passed over."""
+        """Returns the answer's 8 bytes. An answer names its object, so a late answer to another request is skipped."""
         address = struct.pack("<HB", entry.index, sub)
         request = bytes([command]) + address + payload
         expected = 0x40 if command == 0x40 else 0x60
@@ -300,7 +305,7 @@ class Tuner:
         raise TunerError(FailureKind.TIMEOUT, f"node {node:02X}h does not answer ({entry.name})")
 
     def _segments(self, entry: Object, node: int) -> bytes:
-        """The rest of a value longer than one frame: strings."""
+        """Returns the rest of a value that is longer than one frame, such as a string."""
         value, toggle = b"", 0
         while True:
             self._bus.send(sdo_request_id(node), bytes([0x60 | toggle, 0, 0, 0, 0, 0, 0, 0]))

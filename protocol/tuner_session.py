@@ -1,4 +1,4 @@
-"""The tuner's side of a session: opening it, giving orders that only it can give, renewing and closing it."""
+"""The tuner's side of a session: opening it, giving its orders, renewing and closing it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from loopwright.protocol.tuner import Tuner, TunerError
 
 @dataclass(frozen=True, slots=True)
 class Lease:
-    """What a session is opened with, in samples and in ms of the controller's clock (`controller.session.Terms`)."""
+    """The terms of a session, in samples and in ms of the controller's clock (`controller.session.Terms`)."""
 
     samples: int
     ms: int
@@ -22,17 +22,22 @@ class Lease:
 
 
 class TunerSession:
-    """A session on the channel of one tuner. Every call raises TunerError, an abort where the controller refuses."""
+    """A session on the channel of one tuner. Every method raises TunerError, of kind ABORT where the controller
+    refuses."""
 
     def __init__(self, tuner: Tuner) -> None:
         self.number = 0
-        """The number of the session opened or taken up last; 0: none yet."""
+        """The number of the session opened or taken up last; 0 for none yet."""
         self._tuner = tuner
         self._count = 0
         self._staged: dict[str, Value] = {}
 
     def open(self, lease: Lease, remember: Callable[[int], None]) -> None:
-        """remember: writes the number down before the opening is sent, so that who comes after us can close it."""
+        """Opens a session.
+
+        lease: its terms.
+        remember: stores the number before the opening is sent, so that a later process can close the session.
+        """
         for last_try in (False, False, True):
             number = int(self._tuner.number("controller_session_next"))
             remember(number)
@@ -41,24 +46,24 @@ class TunerSession:
             try:
                 self.give(Order.OPEN, (self._tuner.station.node, *astuple(lease)))
                 return
-            except TunerError as error:  # another tuner has opened, or staged, at the same time
+            except TunerError as error:  # another tuner has opened a session or staged values at the same time
                 if last_try or error.code != Abort.INVALID_VALUE:
                     raise
 
     def take_up(self, number: int) -> None:
-        """The session is one that was opened before, by us or by a process that has died."""
+        """Continues a session that was opened before, by this process or by one that has died."""
         self.number = number
         self._count = int(self._tuner.number("controller_session_count"))
         self._staged.clear()
 
     def give(self, order: Order, values: Sequence[Value] = ()) -> None:
-        """Stages what is not staged so already and puts it in force."""
+        """Stages the values that are not staged yet and puts the order in force."""
         try:
             self._give(order, values)
         except TunerError as error:
             if error.code != Abort.INVALID_VALUE or order is Order.OPEN:
                 raise
-            # Somebody has staged other values, or an order was put in force whose answer was lost.
+            # Another master has staged other values, or the answer to an order in force was lost.
             self.take_up(self.number)
             self._give(order, values)
 
@@ -81,5 +86,5 @@ class TunerSession:
 
     @property
     def is_open(self) -> bool:
-        """Asked of the controller."""
+        """Returns whether the controller says that the session is open."""
         return self.number != 0 and int(self._tuner.number("controller_session")) == self.number

@@ -1,1 +1,1 @@
-"""A procedure carried out: pumped through a loop, guarded at every sample, computing in processes of its own."""
+"""Execution of a procedure: it is run on a loop, each sample is checked, and computations run in other processes."""

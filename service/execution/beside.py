@@ -1,4 +1,4 @@
-"""Long computations beside a loop that is pumped meanwhile."""
+"""Long computations that run while a loop is stepped."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from loopwright.tuning.plan import Command, Sample, Work
 from loopwright.tuning.reasons import Reason
 
 HELD_S = 0.3
-"""Wall time for which a step may be held up: a part of the heartbeat time."""
+"""Longest wall time for which a computation may delay a step, s: a fraction of the heartbeat time."""
 
 _SWITCH_S = 0.0005
-"""How long a computation keeps the interpreter from a thread that has an answer of the bus: Python's 5 ms, twice for
-each SDO, are seconds where many loops are under test. Only meanwhile, for threads that wait look as often, and of fifty
-that takes more than it brings."""
+"""Interpreter switch interval during a computation, s. Python's 5 ms, twice for each SDO, would add up to seconds where
+many loops are under test. It is set during computations only: waiting threads wake as often, and with fifty of them
+that costs more than it saves."""
 
 _log = logging.getLogger(__name__)
 _turn = threading.Lock()
@@ -33,8 +33,8 @@ _turn = threading.Lock()
 
 @contextmanager
 def _alone() -> Iterator[None]:
-    """One computation at a time: side by side they would not be ready sooner, and each would keep the interpreter from
-    loops that have a sample or an answer."""
+    """Admits one computation at a time: in parallel they would not finish sooner, and each would keep the interpreter
+    from loops that have a sample or an answer."""
     with _turn:
         usual = sys.getswitchinterval()
         sys.setswitchinterval(_SWITCH_S)
@@ -45,17 +45,17 @@ def _alone() -> Iterator[None]:
 
 
 class Workers(Protocol):
-    """Who computes in other processes: a `Pool`."""
+    """Computes in other processes, as a `Pool` does."""
 
     def submit(self, kind: ComputationKind, work: Callable[[], Any], unwanted: Callable[[], bool]) -> Future[Any]: ...
 
 
 class Computing:
-    """A loop, and what is being computed for it: steps of the loop go through here, all else to the loop itself.
+    """A loop with the computation that runs for it; calls other than `step` are passed on to the loop.
 
-    A real plant goes on while we compute. One that waits for us, in memory or run in blocks, is held from sample to
-    sample: at full speed a second of arithmetic would be minutes of its time under the relay.
-    workers: who computes; None: a thread of this process.
+    A real plant continues during a computation. A plant that waits for the service, in memory or run in blocks, is held
+    from sample to sample: at full speed a second of arithmetic would be minutes of its time under the relay.
+    workers: other processes that compute; None for a thread of this process.
     """
 
     def __init__(self, loop: Loop, workers: Workers | None = None) -> None:
@@ -65,7 +65,7 @@ class Computing:
         self._over = False
 
     def start(self, work: Work[Any]) -> None:
-        """For `start_work` of the runner."""
+        """Starts a computation; it is the `start_work` of the runner."""
         self._idle.clear()
         if self._workers is None:
             self._beside(work)
@@ -93,7 +93,7 @@ class Computing:
         return self._loop.begin(stop, remember)
 
     def restore(self, home: LoopState, session: int | None = None) -> Restored:
-        self._over = True  # what is being computed, or waits for its turn, nobody wants any more
+        self._over = True  # a computation that runs or waits is not needed any more
         return self._loop.restore(home, session)
 
     def accept(self, gains: Gains, instead_of: Gains) -> LoopState:
@@ -103,10 +103,10 @@ class Computing:
         self._loop.close()
 
     def _came(self, work: Work[Any], future: Future[Any]) -> None:
-        """From the workers; called in a thread of theirs."""
+        """Takes the result of the workers; it is called in one of their threads."""
         error = future.exception()
         if isinstance(error, NoProcess):
-            _log.warning("%s; the service computes by itself", error.detail)
+            _log.warning("%s; the service computes in its own process", error.detail)
             self._beside(work)
             return
         if error is None:

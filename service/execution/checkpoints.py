@@ -1,4 +1,4 @@
-"""What a job's stored events say was finished, as the results the procedure goes on from."""
+"""The results of the stages that a job's stored events report as finished, from which the procedure continues."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from loopwright.tuning.five_stage.procedure import Finished
 
 
 def finished(results: Iterable[tuple[str, Mapping[str, Any] | None]]) -> Finished:
-    """results: of each `stage_done` event the stage and its stored result, in their order; the last of a stage counts.
+    """Returns the results of the finished stages.
 
-    A result that is not of this version's form is left out: its stage runs again.
+    results: stage and stored result of each `stage_done` event, in order; the last one of a stage counts.
+    A result that is not in the form of this version is left out, so its stage runs again.
     """
     kinds = {field.name: get_type_hints(Finished)[field.name] for field in fields(Finished)}
     found: dict[str, Any] = {}
@@ -29,6 +30,6 @@ def finished(results: Iterable[tuple[str, Mapping[str, Any] | None]]) -> Finishe
 
 
 def _numbers(result: Mapping[str, Any], kind: Any) -> dict[str, Any]:
-    """JSON has no nan: a number that was none comes back as null."""
+    """Returns the numbers of a stored result; a null stands for nan, which JSON lacks."""
     hints = get_type_hints(kind.__args__[0])
     return {name: math.nan if value is None and hints.get(name) is float else value for name, value in result.items()}

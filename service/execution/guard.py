@@ -1,4 +1,4 @@
-"""The limits of a run, and the guard that checks every sample against them: the second net of docs/safety.md."""
+"""The limits of a run, and the guard that checks every sample against them: the second safety net of docs/safety.md."""
 
 from __future__ import annotations
 
@@ -12,9 +12,15 @@ from loopwright.tuning.reasons import Failed, Reason
 
 @dataclass(frozen=True, slots=True)
 class Watch:
-    """Holds the limits of a run: PV limits (PV units), permitted MV (MV units, held from the first command on), time
-    budget (plant s), how many samples in a row may be missing, and for how long PV may stay exactly the same while MV
-    is away from where it was (plant s; longer than any dead time)."""
+    """The limits of a run.
+
+    pv_low, pv_high: limits of PV, PV units.
+    mv_low, mv_high: limits of MV from the first command on, MV units.
+    max_time_s: time budget, s of plant time.
+    max_gap_samples: number of samples in a row that may be missing.
+    max_frozen_s: how long PV may stay exactly constant while MV differs from its initial value, s of plant time; longer
+    than any dead time.
+    """
 
     pv_low: float = -math.inf
     pv_high: float = math.inf
@@ -26,7 +32,8 @@ class Watch:
 
 
 class Guard:
-    """Checks each sample against the watch. Another's hand on the loop is the controller's to see."""
+    """Checks each sample against the limits. Commands of an operator or another master are detected by the
+    controller."""
 
     def __init__(self, watch: Watch, state: LoopState) -> None:
         self._watch = watch
@@ -45,6 +52,7 @@ class Guard:
         self._acting = True
 
     def check(self, sample: Sample) -> None:
+        """Raises Failed when the sample violates a limit."""
         t, _, pv, mv, _ = sample
         watch = self._watch
         if not (math.isfinite(pv) and math.isfinite(mv)):

@@ -1,4 +1,4 @@
-"""The two kinds of work a job can be: tuning the live loop, and rehearsing in memory. Injected into the jobs."""
+"""The two procedures of a job: tuning the live loop, and rehearsing in memory. They are passed to the jobs."""
 
 from __future__ import annotations
 
@@ -25,15 +25,19 @@ if TYPE_CHECKING:
     from loopwright.service.execution.beside import Workers
 
 FROZEN_T95 = 3.0
+"""Longest time for which PV may be exactly constant, in T95 of the loop."""
 
 
 @dataclass(frozen=True)
 class Hooks:
-    """How work reports, and how it learns that it should stop.
+    """The connections of a running procedure to its job.
 
-    remember: told the number of a session before it is opened.  on_home: told what the loop must come back to.
-    earlier: what the earlier attempts of a job that is resumed have stored; a stage done there is not run again.
-    ground: what is known of the loop, for a rehearsal.
+    on_event, on_samples: receive events and samples.
+    stop: returns the reason why the procedure should end, or None.
+    earlier: events that earlier attempts of a resumed job have stored; a stage finished there is not run again.
+    remember: receives the number of a session before it is opened.
+    on_home: receives the state of the loop before the test.
+    ground: known facts of the loop, for a rehearsal.
     """
 
     on_event: Callable[[Event], None]
@@ -47,8 +51,13 @@ class Hooks:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How work ended: a result, or the reason why not; both where the figures are the reason (NoGain), and where a
-    rehearsal tells what it was done on. Plant times in s per stage."""
+    """The end of a procedure.
+
+    result, ended: the result, or the reason why there is none; both where the figures are the reason (NoGain), and
+    where a rehearsal reports its plant.
+    restored: the loop as read back; None where it could not be.
+    plant_time_s: plant time by stage, s.
+    """
 
     result: Result | None
     ended: Ended | None
@@ -57,7 +66,7 @@ class Outcome:
 
 
 class Tune(Protocol):
-    """Tunes a live loop whose present state is `state`; restores it on every way out."""
+    """Tunes a live loop whose present state is `state`, and restores it however the procedure ends."""
 
     def __call__(
         self, config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks
@@ -78,7 +87,10 @@ def tune(
     hooks: Hooks,
     workers: Workers | None = None,
 ) -> Outcome:
-    """The procedure asked for on the live loop. workers: who computes, by default a thread."""
+    """Runs the requested procedure on the live loop.
+
+    workers: processes that compute; None for a thread.
+    """
     from loopwright.service.execution.beside import Computing
     from loopwright.service.execution.guard import Watch
     from loopwright.service.execution.result import result_of
@@ -115,8 +127,10 @@ def tune(
 
 
 def plan(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow] = ()) -> Plan[Any]:
-    """earlier: events of attempts that were cut off, after which the loop gets time to come to rest. What fast had
-    recorded by then is not gone on with: relay and set-point step are one record, of a loop not touched in between.
+    """Returns the plan of the requested procedure.
+
+    earlier: events of interrupted attempts, after which the loop gets time to come to rest. The record of an
+    interrupted fast procedure is not continued: relay and set-point step are one record of an otherwise untouched loop.
     """
     procedure = _procedure(request, facts, earlier)
     return after_settling(facts, procedure) if earlier else procedure
@@ -137,24 +151,20 @@ def _procedure(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow]
 
 
 def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:
-    """The same on a model in memory. Gains that bring no gain are an answer, too: whether a proposal would be made of
-    them is a question for the loop."""
+    """Runs the requested procedure on a model in memory. Gains without a benefit are returned too: whether they would
+    be proposed is a question for the live loop."""
     from loopwright.service.execution.rehearsal import rehearse as rehearse_spec
 
     spec, on = rehearsal_spec(config, request, hooks.ground)
     hooks.on_event(Note(f"rehearsed on {on.plant_text}; {on.gains_text}; nothing is tested on the loop"))
     known = _known_model(request) if isinstance(request, FastRetune) else None
-    # A model typed in for a dry run is the plant itself; the procedure still starts where the request says.
-    found = rehearse_spec(
-        spec, request.method, hooks.on_event, hooks.on_samples, model=known, asked=request.options
-    )
+    # A model entered for a dry run is the plant itself; the procedure still starts where the request says.
+    found = rehearse_spec(spec, request.method, hooks.on_event, hooks.on_samples, model=known, asked=request.options)
     if found.ended is None or isinstance(found.ended, NoGain):
         return Outcome(found.result.model_copy(update={"rehearsed_on": on}), None, None, found.plant_time_s)
     return Outcome(empty_result(request.method, on), found.ended, None, found.plant_time_s)
 
 
 def _known_model(request: FastRetune) -> Model | None:
-    """What fast designs for without a relay."""
+    """Returns the model for which fast designs without a relay, None where it needs one."""
     return request.model.plant() if request.start == "design" and request.model else None
-
-

@@ -1,6 +1,6 @@
-"""The whole procedure in memory: the pure plant model and the pure controller algorithm behind the same `Loop`.
+"""The whole procedure in memory: the pure plant model and the pure controller algorithm behind the interface `Loop`.
 
-This is the one module of the service that knows plantsim and controller, and only their pure parts.
+This is the only module of the service that imports plantsim and controller, and only their pure parts.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ from loopwright.tuning.reasons import Ended, Failed, NoGain, Reason, Refused
 
 
 class RehearsedLoop:
-    """A `Loop` in memory, as fast as the machine goes. Commands act on the next sample."""
+    """A `Loop` in memory, which runs as fast as the machine permits. Commands act on the next sample."""
 
     waits = True
 
@@ -131,7 +131,7 @@ class RehearsedLoop:
         return self.read()
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Does nothing: a loop in memory holds no resources."""
 
 
 def _parameters(gains: Gains) -> Parameters:
@@ -143,7 +143,7 @@ def _gains(p: Parameters) -> Gains:
 
 
 class PresentGains(BaseModel):
-    """Of the loop before the test, in ISA form."""
+    """The gains of the loop before the test, in ISA form."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -222,13 +222,13 @@ class Rehearsal:
 
 
 def _nice(x: float) -> float:
-    """The largest 1, 2 or 5 times a power of ten that is not above x."""
+    """Returns the largest 1, 2 or 5 times a power of ten that is not above x."""
     power = 10.0 ** math.floor(math.log10(x))
     return next(m * power for m in (5.0, 2.0, 1.0) if m * power <= x * (1 + 1e-9))
 
 
 def _complete(file: PlantFile) -> PlantFile:
-    """Chooses what was left out, from the model: T95, Ts (a 300th of Pu or less), step, present gains."""
+    """Fills in what was left out, from the model: T95, Ts (at most Pu / 300), step and present gains."""
     poles = np.roots(file.den)
     gain = file.num[-1] / file.den[-1] if file.den[-1] else math.inf
     t95 = file.t95_s
@@ -250,7 +250,7 @@ def _complete(file: PlantFile) -> PlantFile:
 
 
 def _period(file: PlantFile, t95: float) -> float:
-    """The ultimate period, s; for a plant without one, something short beside T95."""
+    """Returns the ultimate period, s; for a plant without one, a time that is short compared with T95."""
     try:
         period = ultimate_point(TransferFunction(tuple(file.num), tuple(file.den), file.dead_time_s))[1]
     except (Ended, ValueError, ArithmeticError):
@@ -259,7 +259,7 @@ def _period(file: PlantFile, t95: float) -> float:
 
 
 def _t95(file: PlantFile) -> float:
-    """When the plant's own step response has come within 5 % of its end for good, s."""
+    """Returns the time after which the plant's step response stays within 5 % of its end, s."""
     slowest = max((1 / abs(p.real) for p in np.roots(file.den)), default=1.0)
     dt = max(slowest, file.dead_time_s) / 200
     plant = LinearPlant(file.num, file.den, file.dead_time_s, dt)
@@ -278,13 +278,13 @@ def rehearse(
     asked: FastOptions | Options | None = None,
     **options: Any,
 ) -> Rehearsal:
-    """Preflight to verification on a model in memory.
+    """Runs preflight to verification on a model in memory.
 
-    spec: the fields of `PlantFile`.  method: "fast", "five-stage", or a rule of `tuning.rules.registry` in place of the
-    fifth stage.  model: what to design for; fast then needs no relay.  options: those of
-    `tuning.fast.procedure.FastOptions`, or of `tuning.five_stage.procedure.Options`.  asked: the options as they are
-    then made; in place of method and options.
-    A spec that cannot be used gives outcome "refused", reason "bad_input".
+    spec: the fields of `PlantFile`. A spec that cannot be used is refused with the reason "bad_input".
+    method: "fast", "five-stage", or a rule of `tuning.rules.registry` in place of the fifth stage.
+    model: the model to design for; fast then needs no relay.
+    options: those of `tuning.fast.procedure.FastOptions`, or of `tuning.five_stage.procedure.Options`.
+    asked: the options as one of these two; in place of the options by name.
     """
     results: dict[str, object] = {}
 
@@ -344,14 +344,15 @@ def _loop(file: PlantFile) -> tuple[RehearsedLoop, Facts]:
 
 
 def _watch(facts: Facts, reach: float) -> Watch:
-    """Wide PV limits: an unstable plant must end, but the test takes PV to several steps on purpose."""
+    """Returns the limits of a rehearsal. They are wide: an unstable plant must end, but the test moves PV by several
+    steps."""
     far = max(100 * facts.sp_deviation, 10 * reach)
     low, high = facts.mv_low, facts.mv_high
     return Watch(-far, far, low, high, max_time_s=500 * facts.T95_s, max_frozen_s=3 * facts.T95_s)
 
 
 def _reach(file: PlantFile) -> float:
-    """How far PV goes when MV stays at a limit (0 for an integrating plant), PV units."""
+    """Returns how far PV moves when MV stays at a limit (0 for an integrating plant), PV units."""
     return abs(file.num[-1] / file.den[-1]) * max(map(abs, file.mv_limits)) if file.den[-1] else 0.0
 
 
@@ -362,7 +363,10 @@ def _rehearsal(
     results: dict[str, object],
     anyway: bool,
 ) -> Rehearsal:
-    """anyway: a proposal is made also where there is no gain."""
+    """Returns how a run of the procedure ended.
+
+    anyway: whether a proposal is made also where there is no benefit.
+    """
     proposal, ended = outcome.value, outcome.ended
     if proposal is not None and not proposal.comparison.gain and not anyway:
         ended = NoGain(Reason.NO_GAIN, proposal.comparison.verdict)

@@ -1,4 +1,4 @@
-"""Dry runs in processes of their own: what they report on their way comes to the hooks of the job, in order."""
+"""Dry runs in processes of their own; their reports reach the hooks of the job in order."""
 
 from __future__ import annotations
 
@@ -18,11 +18,14 @@ from loopwright.tuning.reasons import Aborted, Reason
 
 SAMPLES_AT_ONCE = 1000
 TOLD_AFTER_S = 0.2
-"""Wall time after which what has come together is reported."""
+"""Wall time after which gathered samples are reported, s."""
 
 
 def apart(rehearse: Rehearse, pool: Pool) -> Rehearse:
-    """The same rehearsal, computed by the pool. rehearse: what can be pickled."""
+    """Returns the same rehearsal, computed by the pool.
+
+    rehearse: a function that can be pickled.
+    """
 
     def rehearse_apart(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:
         def hear(reports: list[Event | list[Sample]]) -> None:
@@ -47,17 +50,17 @@ def apart(rehearse: Rehearse, pool: Pool) -> Rehearse:
 def _rehearsed(
     rehearse: Rehearse, config: LoopConfig, request: RetuneRequest, ground: Ground, report: Callable[[Any], None]
 ) -> Outcome:
-    """In the process of the computation."""
+    """Runs the rehearsal in the process of the computation."""
     reports = _Reports(report)
     outcome = rehearse(config, request, Hooks(reports.event, reports.samples, lambda: None, ground=ground))
     if outcome.ended is not None and outcome.ended.reason is Reason.COMPUTATION_LIMIT:
-        raise MemoryError  # the runner has named it; the limit is known to the pool
+        raise MemoryError  # the runner has reported it; the pool knows the limit
     reports.hand_on()
     return outcome
 
 
 class _Reports:
-    """Gathers what a rehearsal reports, which may come sample by sample, into messages."""
+    """Gathers the reports of a rehearsal, which may come sample by sample, into messages."""
 
     def __init__(self, report: Callable[[Any], None]) -> None:
         self._report = report

@@ -1,7 +1,7 @@
-"""Pumps a plan through a loop, guards every sample, and always restores the loop: the safety contract's second clause.
+"""Runs a plan on a loop, checks every sample, and always restores the loop: the second clause of the safety contract.
 
-Whatever ends the run - the plan's result, a refusal, a limit, a lost node, an operator, a defect - the way out is one:
-the session is closed, the controller brings the loop home, and what it came to is read back.
+Whatever ends the run - the plan's result, a refusal, a limit, a lost node, an operator, a defect - the end is the same:
+the session is closed, the controller restores the loop, and its state is read back.
 """
 
 from __future__ import annotations
@@ -33,13 +33,17 @@ from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
 T = TypeVar("T")
 CHUNK = 200
 CHUNK_S = 1.0
-"""Samples are handed on by so many, or by so much plant time: what a service that dies takes with it."""
+"""Plant time after which samples are passed on, s, if there are fewer than CHUNK: a service that dies loses no more."""
 
 
 @dataclass(slots=True)
 class RunResult(Generic[T]):
-    """value: the plan's result, or ended: why there is none.  restored: the loop as read back, None if it could not
-    be.
+    """The end of a run.
+
+    value: the plan's result; None where there is none.
+    ended: why there is no result; None where there is one.
+    restored: the loop as read back; None if it could not be read.
+    plant_time_s: plant time by stage, s.
     """
 
     value: T | None = None
@@ -60,12 +64,14 @@ def run(
     remember: Callable[[int], None] = lambda session: None,
     on_home: Callable[[LoopState], None] = lambda home: None,
 ) -> RunResult[T]:
-    """Runs the plan to its end and restores the loop. Raises nothing that a loop or plan can cause; see `ended`.
+    """Runs the plan to its end and restores the loop. Raises no error of the loop or plan; see `ended`.
 
-    stop is asked once a sample and in every wait; what it returns ends the run as Aborted.
-    start_work starts a plan's long computation: in a thread for a live loop, which must be pumped meanwhile; at
-    once, as here, where nobody waits.
-    remember: told the number of the session before it is opened.  on_home: told what the loop must come back to.
+    watch: the limits of the run.
+    stop: asked once a sample and in every wait; a reason that it returns ends the run as Aborted.
+    start_work: starts a plan's long computation: for a live loop in a thread, because the loop must be stepped
+    meanwhile; by default at once, where no loop waits.
+    remember: receives the number of the session before it is opened.
+    on_home: receives the state of the loop before the test.
     """
     return _Run(plan, loop, watch, on_event, on_samples, stop, start_work, remember, on_home).to_the_end()
 
@@ -102,7 +108,8 @@ class _Run(Generic[T]):
         return self._result
 
     def _until_something_ends_it(self) -> None:
-        """Notes in the result what has ended the plan; only what is no Exception passes through."""
+        """Steps the loop until the run ends, and notes the reason in the result; errors that are no Exception pass
+        through."""
         result = self._result
         try:
             self._pump(self._begin())
@@ -119,7 +126,7 @@ class _Run(Generic[T]):
             self._plan.close()
 
     def _begin(self) -> LoopState:
-        """Opens the session. From here on the loop has to be restored."""
+        """Opens the session. From now on the loop has to be restored."""
         home = self._home = self._loop.begin(self._stop, self._remember)
         self._on_home(home)
         if home.when_silent:
@@ -127,7 +134,7 @@ class _Run(Generic[T]):
         return home
 
     def _pump(self, home: LoopState) -> None:
-        """Goes from sample to sample until the plan, the guard, the loop or somebody ends it, each by an exception."""
+        """Steps the loop until the plan, the guard, the loop or a stop request ends it, each by an exception."""
         guard = Guard(self._watch, home)
         chunk = min(CHUNK, max(1, round(CHUNK_S / home.sample_time_s)))
         answer = next(self._plan)
@@ -149,7 +156,8 @@ class _Run(Generic[T]):
             answer = self._plan.send(sample)
 
     def _take(self, answer: Sequence[Command | Event | Work[Any]]) -> list[Command]:
-        """Starts the work and passes on the events of the plan's answer; its commands are for the next step."""
+        """Starts the computation and passes on the events of the plan's answer; returns its commands for the next
+        step."""
         commands: list[Command] = []
         for item in answer:
             if isinstance(item, SetMode | SetGains | SetSetpoint | SetOutput | SetRelay):
@@ -160,14 +168,14 @@ class _Run(Generic[T]):
                 if isinstance(item, StageStarted):
                     self._enter(item.stage)
                 elif isinstance(item, StageDone):
-                    self._hand_on()  # a stage that is done never runs again: its samples go before the word
+                    self._hand_on()  # a finished stage never runs again, so its samples are passed on first
                 self._on_event(item)
         return commands
 
     def _enter(self, stage: str) -> None:
-        """Enters a stage and adds the plant time of the one that ends here.
+        """Enters a stage and adds up the plant time of the previous one.
 
-        stage: "" where there is none after it.
+        stage: "" where no stage follows.
         """
         if self._stage:
             times = self._result.plant_time_s
@@ -183,7 +191,7 @@ class _Run(Generic[T]):
         return f"at {self._now:.3f} s of plant time, in stage {self._stage or 'start'}"
 
     def _restore(self, home: LoopState) -> None:
-        """Restores the loop, the one way out. A loop that is not confirmed home leaves no proposal."""
+        """Restores the loop. A loop whose restoration is not confirmed leaves no proposal."""
         result = self._result
         try:
             restored = self._loop.restore(home)

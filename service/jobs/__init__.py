@@ -1,1 +1,1 @@
-"""Jobs: started by a durable engine, pumped, looked after when they end, and what becomes of their results."""
+"""The jobs: they are started by a durable engine, run, supervised after their end, and decided."""

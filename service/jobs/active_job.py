@@ -1,4 +1,4 @@
-"""The live part of an active job: how far it is, what it reports, and whether somebody wants it to stop."""
+"""The live state of a running job: its progress, its reports, and whether it is asked to stop."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _BLOCK_WALL_S = 1.0
 
 
 class Running:
-    """Holds the live part of one job. The thread of the job feeds it; other threads read `progress_now` and may set
+    """Holds the live state of one job. The thread of the job updates it; other threads read `progress_now` and may set
     `stop_reason`.
 
-    before_s: plant time that earlier attempts took, s: the samples of this one are counted on from there.
+    before_s: plant time of the earlier attempts, s; the time of this attempt is added to it.
     """
 
     def __init__(
@@ -42,7 +42,7 @@ class Running:
         self.loop: ObservedLoop | None = None
         self.stop_reason: Reason | None = None
         self.over = threading.Event()
-        """Set when the loop is given up and the end is written."""
+        """Set when the loop is released and the end is written."""
         self.before_s = before_s
         self._journal = journal
         self._buffer: list[Sample] = []
@@ -62,8 +62,8 @@ class Running:
             }  # fmt: skip
             self.tell("stage_started", data, stage=event.stage)
         elif isinstance(event, StageDone):
-            self.flush()  # what is done never runs again: its samples are stored before that is
-            if self.loop is not None:  # a rehearsal has no plant whose time it takes
+            self.flush()  # a finished stage never runs again, so its samples are stored first
+            if self.loop is not None:  # a rehearsal takes no time of a real plant
                 STAGE_SECONDS.labels(event.stage).observe(self.progress.stage_time_s)
             took = {"stage_time_s": self.progress.stage_time_s}
             self.tell("stage_done", {"stage": event.stage, "result": to_json_object(event.result), **took})
@@ -71,7 +71,7 @@ class Running:
             self.tell("note", {"stage": self.progress.stage, "text": event.text})
 
     def on_samples(self, samples: list[Sample]) -> None:
-        """Splits samples by the times of the stages: the runner's blocks do not end where a stage does."""
+        """Splits samples at the times of the stages: the runner's blocks do not end where a stage does."""
         self._keep_time()
         for sample in samples:
             while self._boundaries and sample.t > self._boundaries[0][0]:
@@ -82,18 +82,18 @@ class Running:
             self.flush()
 
     def flush(self) -> None:
-        """Hands the gathered samples on as one block of their stage."""
+        """Passes the gathered samples on as one block of their stage."""
         if self._buffer:
             self._journal.put(block_of(self.job_id, self._stage, self._buffer))
             self._buffer = []
         self._flushed = self._monotonic()
 
     def progress_now(self) -> Progress:
-        """Returns the progress at the latest sample; reading it changes nothing here."""
+        """Returns the progress at the latest sample, without changing any state."""
         return self.progress.seen_at(self.loop.t_s if self.loop else None)
 
     def _keep_time(self) -> None:
-        """Brings the progress up to the latest sample."""
+        """Advances the progress to the latest sample."""
         t = self.loop.t_s if self.loop else None
         if t is not None:
             self._last_t = t

@@ -1,6 +1,7 @@
-"""Loops looked after: what a job could not bring home is looked at again, until it is home or a person answers for it.
+"""Supervision of loops that a job could not restore: each is read again until it is restored or an operator takes it
+over.
 
-A thread of its own: a loop whose node is away takes seconds to say so, and aborts must be heard meanwhile.
+It has a thread of its own: an unreachable node takes seconds to time out, and aborts must be processed meanwhile.
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ from loopwright.tuning.reasons import ADVICE, Reason
 log = logging.getLogger(__name__)
 
 EVERY_S = 2.0
+"""Wall time between two rounds, s."""
 LONGEST_S = 30.0
-"""Between two looks at a loop that stays away: twice as long each time, up to this."""
+"""Longest wall time between two readings of a loop that stays unreachable, s; the time doubles up to this."""
 _AT_ONCE = 8
 _STOP_S = 10.0
 _UNREACHED = (Reason.NODE_LOST, Reason.BUS_LOST, Reason.NODE_NOT_OPERATIONAL)
@@ -32,7 +34,8 @@ _UNREACHED = (Reason.NODE_LOST, Reason.BUS_LOST, Reason.NODE_NOT_OPERATIONAL)
 
 @dataclass(frozen=True)
 class NotHome:
-    """A loop that is not confirmed home: since which job, and why, as last looked."""
+    """A loop that is not confirmed to be in its state before a job, with that job and the reason at the last
+    reading."""
 
     loop: str
     job_id: str
@@ -41,7 +44,7 @@ class NotHome:
 
     @property
     def words(self) -> str:
-        """Says what is the matter, and what to do."""
+        """Returns what is wrong and what to do."""
         if self.reason in _UNREACHED:
             advice = ADVICE[self.reason]
         else:
@@ -54,7 +57,7 @@ class NotHome:
 
 @dataclass
 class _Again:
-    """When a job's loop is looked at again, and what was found last."""
+    """The next time to read a job's loop, monotonic s, and the last result."""
 
     at: float
     wait_s: float
@@ -62,9 +65,10 @@ class _Again:
 
 
 class Aftercare:
-    """Looks after the loops of one host.
+    """Supervises the unrestored loops of one host.
 
-    directory: its loops; each look at one is made alone with it.  machine: its clock and threads.
+    directory: the loops of the host; its lock of a loop is held during each reading.
+    machine: clock and threads.
     """
 
     def __init__(self, store: Store, directory: LoopDirectory, machine: Machine) -> None:
@@ -72,7 +76,7 @@ class Aftercare:
         self._machine = machine
         self._clock = self._machine.monotonic
         self._again: dict[str, _Again] = {}
-        # Apart from the event: a signal handler sets it.
+        # Kept apart from the event, because a signal handler sets it.
         self._stopping = False
         self._over = self._machine.event()
         self._thread = self._machine.thread(self._run, "aftercare")
@@ -81,20 +85,20 @@ class Aftercare:
         self._thread.start()
 
     def request_stop(self) -> None:
-        """Looks at nothing more; what is not home is looked at after the next start. Returns at once."""
+        """Stops further readings; loops that are not restored are read after the next start. Returns at once."""
         self._stopping = True
 
     def close(self) -> None:
-        """Looks at nothing more, and waits for the look in progress."""
+        """Stops further readings, and waits for the one in progress."""
         self._stopping = True
         self._over.set()
         if self._thread.is_alive():
             self._thread.join(_STOP_S)
             if self._thread.is_alive():
-                log.error("a loop that is looked after has not answered in %.0f s, the service ends", _STOP_S)
+                log.error("a supervised loop has not answered in %.0f s, the service ends", _STOP_S)
 
     def not_home(self, loop: str | None = None) -> list[NotHome]:
-        """Returns this host's loops that are looked after, or whether one is, on whatever host; a loop once."""
+        """Returns this host's supervised loops, each once; with `loop`, that loop if it is supervised, on any host."""
         found: dict[str, NotHome] = {}
         for row in looked_after.rows(self._store, loop):
             found.setdefault(row.loop, self._not_home(row))
@@ -108,8 +112,8 @@ class Aftercare:
         return NotHome(row.loop, row.id, reason, row.detail or "it was not read back")
 
     def dismiss(self, tag: str, by: str) -> list[str]:
-        """Lets a person answer for a loop that is looked after: it is not looked at any more. Returns the jobs it was
-        looked after for, none when it was not. Raises UnknownLoop, Busy."""
+        """Ends the supervision of a loop, for which an operator now answers. Returns the jobs for which it was
+        supervised, none when it was not. Raises UnknownLoop, Busy."""
         if not looked_after.rows(self._store, tag):
             self._directory.owner(tag)
             return []
@@ -119,7 +123,7 @@ class Aftercare:
         return looked_after.dismissed(self._store, tag, by)
 
     def look(self) -> None:
-        """Looks at every loop whose time has come."""
+        """Reads every loop whose time has come."""
         rows = looked_after.rows(self._store)
         for gone in self._again.keys() - {row.id for row in rows}:
             del self._again[gone]
@@ -135,25 +139,25 @@ class Aftercare:
         with about(job=row.id, loop=row.loop):
             try:
                 self._look_at(row)
-            except Exception:  # one loop must not keep the others from being looked at
-                log.exception("looking after loop %s", row.loop)
+            except Exception:  # one loop must not keep the others from being read
+                log.exception("defect in the supervision of loop %s", row.loop)
 
     def _look_at(self, row: JobRow) -> None:
         with self._directory.alone_with(row.loop):
-            # The job that has it answers for it: the row may be older than its beginning.
+            # A running job answers for its loop: this row may have been read before that job began.
             if self._stopping or self._store.active(row.loop) is not None:
                 return
             found = look(row, self._directory.loops, self._directory.open_loop)
         if found.state is None:
             self._not_yet(row, found)
         elif looked_after.home_again(self._store, row.id, state_json(found.state), found.text):
-            log.info("looked after no more: %s", found.text)
+            log.info("the loop is not supervised any more: %s", found.text)
 
     def _not_yet(self, row: JobRow, found: Restoration) -> None:
         before = self._again.get(row.id)
         wait_s = EVERY_S if before is None else min(LONGEST_S, 2.0 * before.wait_s)
         if before is None or before.found.reason is not found.reason:
-            log.warning("%s; it is looked at again", found.text)
+            log.warning("%s; the loop will be read again", found.text)
         self._again[row.id] = _Again(self._clock() + wait_s, wait_s, found)
 
     def _run(self) -> None:
@@ -161,7 +165,7 @@ class Aftercare:
             try:
                 self.look()
             except SQLAlchemyError as error:
-                log.warning("the database does not say which loops are to be looked after: %s", error)
+                log.warning("the loops to be supervised could not be read from the database: %s", error)
             except Exception:
-                log.exception("looking after loops")
+                log.exception("defect in the supervision of loops")
             self._over.wait(EVERY_S)

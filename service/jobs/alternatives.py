@@ -1,4 +1,5 @@
-"""What other methods, or another Ms, would make of what a job found, each with the wish that tries it on the loop."""
+"""The gains of other methods, or for another Ms, from a job's model, each with the request that tries them on the
+loop."""
 
 from __future__ import annotations
 
@@ -31,7 +32,7 @@ def _rule(model: Model, Ms: float = 1.6, derivative: bool = False) -> Setting:
 
 
 ANYWAY = {"propose_anyway": True}
-"""Who chooses one of several has seen what it is worth."""
+"""Option of such a request: the operator who chooses the gains has seen their figures."""
 FAST_DESIGN = Method(
     name=FAST,
     title="The design of fast",
@@ -44,7 +45,7 @@ FAST_DESIGN = Method(
 
 
 def alternatives(row: JobRow, events: Sequence[EventRow], method: str | None = None) -> dict[str, Any]:
-    """The JSON object of GET /jobs/{id}/alternatives: by the method named, else by all that are not slow.
+    """Returns the JSON object of GET /jobs/{id}/alternatives, for the named method, else for all that are not slow.
 
     Raises Conflict for a job that has no model (yet) or has disproved it, BadTuning for an unknown method.
     """
@@ -61,10 +62,11 @@ def alternatives(row: JobRow, events: Sequence[EventRow], method: str | None = N
 def redesigned(
     row: JobRow, events: Sequence[EventRow], record: RelayRecord | None, ms: float, derivative: bool
 ) -> dict[str, Any]:
-    """The same object with the gains of fast for another Ms: no new experiment.
+    """Returns the same object with the gains of fast for another Ms, without a new experiment.
 
-    record: the job's, if it is kept; else, and for a job of another method, the model that it found is designed on.
-    Raises Conflict as `alternatives` does; a record is judged anew.
+    record: the job's record, if it is stored; without it, and for a job of another method, the gains are designed for
+    the job's model.
+    Raises Conflict as `alternatives` does; a record is evaluated again.
     """
     model = job_model(row, events)
     doubt: dict[str, float | None] = {"uncertainty": None, "ambiguity": None}
@@ -100,7 +102,7 @@ def _tuned(gains: Gains, ms: float, assessed: Assessment) -> MethodResult:
 
 
 def job_model(row: JobRow, events: Sequence[EventRow]) -> FoundModel:
-    """The model of the job's result, else the last that a stage found, else the one typed in; or Conflict."""
+    """Returns the model of the job's result, else the last one of a stage, else the one entered. Raises Conflict."""
     if JobState(row.state) in ACTIVE:
         raise Conflict(f"job {row.id} is not over: it has no model to compare methods on yet")
     model = found_model(row, events) or _typed_in(row)
@@ -122,8 +124,8 @@ def _not_disproved(row: JobRow, reasons: Sequence[Reason]) -> None:
 
 
 def _retune(found: MethodResult, model: FoundModel) -> dict[str, Any] | None:
-    """None for gains that the service would not try on a loop (see `tuning.rules.design`), and for those of a rule on a
-    model that the five stages do not take."""
+    """Returns the request that tries the gains on the loop; None for gains that the service would not try (see
+    `tuning.rules.design`), and for those of a rule on a model that the five stages do not take."""
     if found.assessment is None or isinstance(model, TransferFunction):
         return None
     m = found.assessment.margins

@@ -1,7 +1,7 @@
-"""DBOS as the engine: one workflow per job, its id that of the job, its one argument too.
+"""DBOS as the engine: each job is one workflow, whose id and only argument are the job's id.
 
-It has no steps: a workflow cut off is started anew, and what its stages had found is in our own tables.
-DBOS is one per process.
+The workflow has no steps: an interrupted one is started again, and the results of its stages are in the service's own
+tables. A process has only one DBOS.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ log = logging.getLogger(__name__)
 
 """Nothing in it that our own tables would not restore: it may be deleted while the service is stopped."""
 POLL_S = 0.5
+"""Wall time between two queries of each queue, s."""
 _ALIVE = ("PENDING", "ENQUEUED", "DELAYED")
 _OVER = ("SUCCESS", "ERROR", "CANCELLED", "MAX_RECOVERY_ATTEMPTS_EXCEEDED")
 
@@ -31,8 +32,8 @@ _run: Callable[[str], None] | None = None
 
 
 class _Left(BaseException):
-    """A workflow that is another's by now ends with it. After a result, or an Exception, DBOS would wait in this thread
-    until the other one's is recorded, and so would the end of the process."""
+    """Ends a workflow that another host has taken over. After a result, or an Exception, DBOS would wait in this thread
+    until the other host has recorded its result, and so would the end of the process."""
 
 
 @DBOS.workflow(name="job", max_recovery_attempts=None)
@@ -45,9 +46,10 @@ def _job(job_id: str) -> None:
 
 
 class DurableEngine:
-    """database: the PostgreSQL engine shared with the other hosts, or None for a file of its own in the folder.
+    """The engine on DBOS.
 
-    poll_s: how often each queue is looked at, s of wall time.
+    database: the PostgreSQL engine shared with the other hosts, or None for a file in the folder.
+    poll_s: wall time between two queries of each queue, s.
     """
 
     def __init__(self, folder: Path, database: Database | None, host: str, poll_s: float = POLL_S) -> None:
@@ -67,7 +69,7 @@ class DurableEngine:
     def launch(self, run: Callable[[str], None], queues: Mapping[str, int]) -> None:
         global _run
         _run = run
-        # Said here, so that no variable of the environment sends anything anywhere.
+        # Set here, so that no environment variable makes DBOS send data anywhere.
         for name in ("DBOS__CLOUD", "DBOS__APPVERSION", "DBOS__VMID"):
             os.environ.pop(name, None)
         config: DBOSConfig = {
@@ -104,7 +106,7 @@ class DurableEngine:
         return {one.workflow_id for one in found if one.queue_name in self._queues}
 
     def over(self, limit: int) -> list[str]:
-        # A file has one host, whatever it was called before.
+        # A file belongs to one host, even if the host had another name before.
         host = None if self._own is not None else self._host
         found = DBOS.list_workflows(
             status=list(_OVER), executor_id=host, limit=limit, load_input=False, load_output=False
@@ -132,7 +134,8 @@ class DurableEngine:
 
 
 def _set_aside(folder: Path) -> None:
-    """The start finds the jobs that are not over in our own tables, and makes the file anew."""
+    """Moves a damaged file away. The start finds unfinished jobs in the service's own tables, and creates the file
+    anew."""
     aside = folder / f"damaged-{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}"
     aside.mkdir(mode=0o700)
     for path in folder.glob(f"{ENGINE_FILE}*"):

@@ -1,4 +1,4 @@
-"""What becomes of a proposal: accepted, declined or taken back, and the writes to the controller that this takes."""
+"""The decision about a proposal: accept, decline or roll back, with the writes to the controller that this takes."""
 
 from __future__ import annotations
 
@@ -17,31 +17,32 @@ from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Ended, Reason
 
 WRITES_S = 10.0
-"""Wall time for which a lock waits for a decision that has begun to write to the loop: each of its few answers comes
-within a second or two."""
+"""Wall time for which a lock waits for a decision that writes to the loop, s: each of its few answers comes within a
+second or two."""
 
 
 class Decisions:
-    """Decides the jobs of the loops of the directory, as far as they are this host's."""
+    """Decides the jobs of the loops of this host."""
 
     def __init__(self, store: Store, directory: LoopDirectory, machine: Machine) -> None:
         self.store = store
         self._directory = directory
         self._machine = machine
-        # By loop: set once a decision that writes to its controller has ended.
+        # By loop: an event that is set when a decision that writes to its controller has ended.
         self._writes: dict[str, threading.Event] = {}
 
     def accept(self, job_id: str, by: str) -> JobRow:
-        """Makes the proposed gains the accepted ones of the controller, and reads them back.
+        """Makes the proposed gains the accepted ones of the controller, and reads them back. Returns the job.
 
-        After an error the decision can be asked for again, which finishes what was begun, or be rolled back.
+        After an error the decision can be repeated, which completes it, or be rolled back.
+        Raises Conflict, and Failed or Refused as the loop does.
         """
         return self._decide(job_id, JobState.ACCEPTED, by)
 
     def rollback(self, job_id: str, by: str) -> JobRow:
-        """Declines a proposal (the loop has its old gains already), or takes back a change that is accepted or was
-        begun to be. Gains that somebody else has put in since stay: a proposal is declined, an accepted change is not
-        taken back (Conflict)."""
+        """Declines a proposal (the loop has its old gains already), or takes back an accepted or begun change. Gains
+        that were changed by others since then stay: a proposal is declined, but an accepted change is not taken back
+        (Conflict)."""
         return self._decide(job_id, JobState.ROLLED_BACK, by)
 
     def _decide(self, job_id: str, wanted: JobState, by: str) -> JobRow:
@@ -67,7 +68,7 @@ class Decisions:
             over = self._machine.event()
 
             def begin() -> None:
-                self._writes[row.loop] = over  # a lock that finds the decision begun waits for its end
+                self._writes[row.loop] = over  # a lock request that finds a decision begun waits for its end
                 self.store.begin_decision(job_id, wanted, by)
 
             try:
@@ -77,7 +78,7 @@ class Decisions:
                 finally:
                     loop.close()
             except ForeignGains as foreign:
-                # An acceptance that broke off, and then other gains by hand: there is nothing left to take back.
+                # After an interrupted acceptance somebody set other gains by hand: nothing is left to take back.
                 if not (begun and now is JobState.PROPOSED and wanted is JobState.ROLLED_BACK):
                     raise
                 detail = f"declined; the controller holds {foreign.found.gains}: somebody else's, left as they are"
@@ -95,8 +96,7 @@ class Decisions:
             return self.store.move(job_id, wanted, by=by, restored=state_json(state))
 
     def wait_for_writes(self, tag: str) -> bool:
-        """Waits until a decision that has begun to write to the loop has ended; returns False where it has not in
-        WRITES_S."""
+        """Waits until a decision that writes to the loop has ended; returns False where it has not in WRITES_S."""
         writes = self._writes.get(tag)
         return writes is None or writes.wait(WRITES_S)
 

@@ -1,6 +1,6 @@
-"""Retunes of many loops: begins their jobs, so many at once per bus and per area, and stops when too many fail.
+"""Retunes of many loops: jobs are started with limits per bus and per area, and no more when too many fail.
 
-What is asked and what has become of it is in the store: a service that is started again goes on where it was.
+Requests and their states are in the store: a restarted service continues where the previous one stopped.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from loopwright.tuning.reasons import Reason
 log = logging.getLogger(__name__)
 
 LOOK_S = 0.5
-"""Wall time between two looks at what runs."""
+"""Wall time between two rounds, s."""
 _OWN = ("loops", "pattern", "at_once_per_bus", "at_once_per_area", "stop_after_failures")
 AtOnce = Annotated[int, Field(ge=1, le=1000)]
 
@@ -76,7 +76,7 @@ class _Loops(BaseModel):
         return self
 
     def each(self) -> AnyRetune:
-        """What is asked of each loop."""
+        """Returns the request for each loop."""
         return retune_request(**self.model_dump(exclude=set(_OWN), exclude_none=True))
 
 
@@ -102,16 +102,19 @@ _ADAPTER: TypeAdapter[FastRetunes | FiveStageRetunes | RuleRetunes] = TypeAdapte
 
 
 def fleet_request(**options: Any) -> FleetRequest:
-    """The request with these options, in the names and values of its JSON object. Raises pydantic.ValidationError."""
+    """Returns the request with these options, in the names and values of its JSON object.
+
+    Raises pydantic.ValidationError.
+    """
     return _ADAPTER.validate_python(options)
 
 
 class BadFleet(ValueError):
-    """What is asked cannot be begun on all of its loops; the text names them."""
+    """Raised when the request cannot be started on all of its loops; the text names them."""
 
 
 class Fleet:
-    """Drives the retunes that were asked of this host."""
+    """Runs the retunes of many loops that were requested from this host."""
 
     def __init__(self, jobs: Jobs) -> None:
         self._jobs = jobs
@@ -122,15 +125,15 @@ class Fleet:
         self._looking = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="fleet", daemon=True)
 
-    # life
+    # start and end
     def boot(self) -> None:
-        """Goes on with what a service before has left, in a thread, unless jobs are not to be resumed."""
+        """Continues the retunes of a previous service, in a thread, unless jobs are not to be resumed."""
         if not self._jobs.resumes:
             self._end_all("the service was started with --no-resume")
         self._thread.start()
 
     def close(self) -> None:
-        """Begins no more; what is not begun waits for the next start."""
+        """Starts no more jobs; waiting loops are started after the next start of the service."""
         self._over.set()
         self._wake.set()
         if self._thread.is_alive():
@@ -146,7 +149,7 @@ class Fleet:
             try:
                 self.look()
             except FolderInUse as error:
-                log.error("retunes of many loops are another's to drive: %s", error)
+                log.error("another host runs the retunes of many loops: %s", error)
                 return
             except SQLAlchemyError as error:
                 log.warning("retunes of many loops wait for the database: %s", error)
@@ -155,9 +158,10 @@ class Fleet:
             self._wake.wait(LOOK_S)
             self._wake.clear()
 
-    # wishes
+    # requests
     def start(self, request: FleetRequest) -> RetuneRow:
-        """Begins it. Raises BadFleet when one of the loops is unknown or does not permit what is asked, Stopping."""
+        """Starts a retune of many loops. Raises BadFleet when one of the loops is unknown or does not permit the
+        request, Stopping."""
         if self._jobs.stopping:
             raise Stopping(self._jobs.why_stopping)
         known = self._known()
@@ -178,7 +182,7 @@ class Fleet:
         return row
 
     def asked(self, request: FleetRequest) -> list[LoopConfig]:
-        """The loops that it would begin, in their order. Raises BadFleet when one of them is unknown."""
+        """Returns the loops of the request, in their order. Raises BadFleet when one of them is unknown."""
         known = self._known()
         tags = _tags(request, known)
         wrong = [str(UnknownLoop(tag)) for tag in tags if tag not in known]
@@ -187,7 +191,7 @@ class Fleet:
         return [known[tag][0] for tag in tags]
 
     def abort(self, retune_id: str, by: str) -> RetuneRow:
-        """Begins no more, and asks the jobs that run to stop. Raises NoSuchRetune, RetuneOver."""
+        """Starts no more jobs, and asks the running jobs to stop. Raises NoSuchRetune, RetuneOver."""
         with self._store.writing() as session:
             retunes.stop(session, retune_id, StopReason.OPERATOR, f"aborted by {by}", by)
         row, parts = self.get(retune_id)
@@ -195,9 +199,9 @@ class Fleet:
         self._wake.set()
         return row
 
-    # what there is
+    # queries
     def get(self, retune_id: str) -> tuple[RetuneRow, list[Part]]:
-        """Raises NoSuchRetune."""
+        """Returns a retune with its parts. Raises NoSuchRetune."""
         with self._store.reading() as session:
             return retunes.find(session, retune_id), retunes.parts(session, retune_id)
 
@@ -207,7 +211,7 @@ class Fleet:
 
     # the work
     def look(self) -> None:
-        """One look at every retune of this host: begins what may begin, and ends what is over."""
+        """Makes one round over the retunes of this host: starts jobs where possible, and ends retunes that are over."""
         with self._looking:
             with self._store.reading() as session:
                 rows = retunes.unfinished(session, self._store.host)
@@ -232,7 +236,7 @@ class Fleet:
                 retunes.end(session, row.id)
 
     def _begin(self, row: RetuneRow, request: FleetRequest, parts: Sequence[Part]) -> None:
-        """Begins the loops that wait, in order, as far as bus and area have room for more under test, by whomever."""
+        """Starts jobs on the waiting loops, in order, as bus and area permit; tests of other requests count too."""
         known, options = self._known(), request.each()
         under_test = {part.loop for part in parts if part.active}
         if not request.dry_run:
@@ -250,7 +254,7 @@ class Fleet:
             try:
                 self._jobs.start(part.loop, options, retunes.begins(row.id, part.position))
             except Busy:
-                continue  # somebody was faster
+                continue  # another request started a job on this loop first
             except (BadLimits, UnknownLoop) as error:
                 self._give_up(row, part, str(error))
                 continue
@@ -267,13 +271,13 @@ class Fleet:
 
     def _abort(self, row: RetuneRow, parts: Sequence[Part]) -> None:
         active = [part.job_id for part in parts if part.active and part.job_id is not None]
-        for job_id in active:  # all of them, before the first is written down
+        for job_id in active:  # all jobs are asked before the first abort is stored
             self._jobs.tell_to_stop(job_id)
         for job_id in active:
             try:
                 self._jobs.abort(job_id, f"retune {row.id}")
             except IllegalMove:
-                continue  # it has just ended
+                continue  # the job has just ended
 
     def _known(self) -> dict[str, tuple[LoopConfig, str]]:
         return {config.tag: (config, host) for config, host in self._directory.everywhere()}
@@ -287,7 +291,7 @@ class Fleet:
 
 
 def _tags(request: FleetRequest, known: Collection[str]) -> list[str]:
-    """Raises BadFleet where no loop is like the pattern."""
+    """Returns the requested tags. Raises BadFleet where no loop matches the pattern."""
     if request.pattern is None:
         return list(dict.fromkeys(request.loops or ()))
     tags = sorted(tag for tag in known if fnmatchcase(tag, request.pattern))
@@ -301,6 +305,7 @@ _AREA, _BUS = "area", "bus"
 
 
 def _places(config: LoopConfig, host: str) -> list[tuple[str, ...]]:
-    """Where room is limited: the loop's bus and, if it has one, its area. An area may span hosts."""
+    """Returns the places whose capacity is limited: the loop's bus and, if it has one, its area. An area may span
+    hosts."""
     bus: tuple[str, ...] = (_BUS, host, config.bus)
     return [bus] if config.area is None else [bus, (_AREA, config.area)]

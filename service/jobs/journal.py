@@ -1,7 +1,7 @@
-"""What jobs report, written in order by a thread of its own: a loop is pumped on whatever the database does.
+"""Writes the reports of jobs to the database in order, in a thread of its own, so that no loop waits for the database.
 
-While the database is locked, full or away, reports wait in memory (samples packed, about 10 bytes each) and are tried
-again until they are written.
+While the database is locked, full or unreachable, reports wait in memory (samples packed, about 10 bytes each) and are
+retried until they are written.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ _RETRY_S = (0.1, 2.0)
 
 
 class Journal:
-    """One per service, for all of its jobs: what many jobs report at the same time is one transaction.
+    """The journal of all jobs of a service: reports of many jobs at the same time are written in one transaction.
 
-    beside: written by a thread of its own; else by who reports, which is for a simulation.
+    beside: whether a thread of its own writes; else the reporting thread writes, which is for a simulation.
     """
 
     def __init__(self, store: Store, beside: bool = True) -> None:
@@ -39,7 +39,7 @@ class Journal:
             self._thread.start()
 
     def put(self, write: Write) -> None:
-        """Returns at once."""
+        """Queues a report, and returns at once."""
         if self._thread is None:
             self._write([write])
             return
@@ -49,19 +49,19 @@ class Journal:
             self._changed.notify_all()
 
     def flush(self, timeout_s: float | None = None) -> bool:
-        """Waits until everything put before is written; False when it is not in that time."""
+        """Waits until all earlier reports are written; returns False when they are not within that time."""
         with self._changed:
             wanted = self._put
             return self._changed.wait_for(lambda: self._written >= wanted, timeout_s)
 
     @property
     def behind_s(self) -> float:
-        """For how long the database has taken nothing although something waits, s; 0 when all is well."""
+        """Returns for how long the database has accepted nothing although reports wait, s; 0 when it accepts them."""
         since = self._since
         return 0.0 if since is None else time.monotonic() - since
 
     def close(self, timeout_s: float) -> None:
-        """Writes what waits, as far as the database takes it in that time."""
+        """Writes the waiting reports, as far as the database accepts them in that time."""
         self.flush(timeout_s)
         with self._changed:
             self._closing = True
@@ -92,8 +92,8 @@ class Journal:
                 pause = min(2 * pause, longest)
 
     def _write(self, batch: list[Write]) -> int:
-        """How many of the batch are dealt with. What the database will never take is left out, with a word in the
-        log; it must not keep the rest from being written."""
+        """Returns how many reports of the batch are done. A report that the database will never accept is logged and
+        left out, so that the others are written."""
         try:
             with self._store.writing() as session:
                 for write in batch:
@@ -102,13 +102,13 @@ class Journal:
         except SQLAlchemyError as error:
             if temporary(error):
                 if self._since is None:
-                    log.warning("the database takes nothing, %d reports wait: %s", len(batch), error)
+                    log.warning("the database accepts nothing, %d reports wait: %s", len(batch), error)
                 return 0
             if len(batch) == 1:
                 log.exception("a report could not be written")
                 return 1
         except FolderInUse as error:
-            log.error("%d reports are another's to write: %s", len(batch), error)
+            log.error("another host writes %d reports: %s", len(batch), error)
             return len(batch)
         except Exception:
             if len(batch) == 1:
@@ -118,7 +118,7 @@ class Journal:
 
 
 def temporary(error: SQLAlchemyError) -> bool:
-    """True for what time may heal: a locked file, a full disk, a server that is away."""
+    """Returns whether an error may pass with time: a locked file, a full disk, an unreachable server."""
     if isinstance(error, OperationalError | InterfaceError | InternalError | TimeoutError):
         return True
     return isinstance(error, DBAPIError) and error.connection_invalidated

@@ -1,4 +1,4 @@
-"""Loops that a person has locked: no test begins on them, and no decision writes to them."""
+"""Locks on loops, set by operators: no test starts on a locked loop, and no decision writes to it."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from loopwright.service.store.tables import JobRow, LoopLockRow
 
 
 class Locking:
-    """Locks and unlocks loops, of whatever host.
+    """Locks and unlocks loops of any host.
 
-    decisions: what may be writing to a loop of ours.
+    decisions: decisions that may be writing to a loop of this host.
     """
 
     def __init__(self, store: Store, directory: LoopDirectory, decisions: Decisions) -> None:
@@ -23,8 +23,8 @@ class Locking:
         self._decisions = decisions
 
     def lock(self, tag: str, reason: str, by: str) -> tuple[LoopLockRow, JobRow | None]:
-        """Locks a loop: from now on no test begins on it, whatever host it is on, and no decision writes to it. Returns
-        the lock, and the job whose test was running already and goes on. Raises UnknownLoop, LockedOtherwise."""
+        """Locks a loop: from now on no test starts on it, on any host, and no decision writes to it. Returns the lock,
+        and the job whose test was running already and continues. Raises UnknownLoop, LockedOtherwise."""
         self._directory.owner(tag)
         with self.store.writing() as session:
             row = loop_locks.lock(session, tag, reason, by)
@@ -37,12 +37,12 @@ class Locking:
         return row, active if active is not None and active.state == JobState.RUNNING else None
 
     def unlock(self, tag: str, by: str) -> LoopLockRow | None:
-        """Unlocks a loop. Returns what it was locked for, or None where it was not locked. Raises UnknownLoop."""
+        """Unlocks a loop. Returns the lock that was removed, or None where there was none. Raises UnknownLoop."""
         self._directory.owner(tag)
         with self.store.writing() as session:
             return loop_locks.unlock(session, tag, by)
 
     def locks(self) -> dict[str, LoopLockRow]:
-        """Returns the locks by loop, of every host."""
+        """Returns the locks of every host, by loop."""
         with self.store.reading() as session:
             return loop_locks.every(session)

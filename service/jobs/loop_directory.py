@@ -1,4 +1,4 @@
-"""The loops that there are: their configuration, the host that has them, their present state, and who acts on one."""
+"""The configured loops: configuration, host, present state, and a lock for those that act on a loop."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ LoopFactory = Callable[[LoopConfig], Loop]
 class LoopDirectory:
     """Knows the loops of every host, and opens those of this one.
 
-    loops: those of this host.  open_loop: opens one of them.  buses: what is configured for their buses.
+    loops: the loops of this host.
+    open_loop: opens one of them.
+    buses: the configuration of their buses.
     machine: makes the locks of the loops.
     """
 
@@ -40,15 +42,15 @@ class LoopDirectory:
         self._registry = registry
         self._buses = buses or {}
         self._machine = machine
-        # By loop: who is about to begin a job on it, to decide one, or to look after it.
+        # By loop: held while a job on it is started or decided, or while it is restored.
         self._loop_locks: dict[str, AbstractContextManager[Any]] = {}
 
     def alone_with(self, tag: str) -> AbstractContextManager[Any]:
-        """Returns the lock that is held while a job on the loop begins or is decided, or the loop is looked after."""
+        """Returns the lock that is held while a job on the loop is started or decided, or the loop is restored."""
         return self._loop_locks.setdefault(tag, self._machine.lock())  # one, also for two who ask at the same time
 
     def at_once(self, bus: str) -> int:
-        """Returns how many loops of one of our buses may be under test at the same time."""
+        """Returns how many loops of a bus of this host may be under test at the same time."""
         return self._buses.get(bus, BusConfig()).at_once
 
     def config(self, tag: str) -> LoopConfig:
@@ -64,12 +66,12 @@ class LoopDirectory:
         return LoopConfig.model_validate(row.config), row.host
 
     def everywhere(self) -> list[tuple[LoopConfig, str]]:
-        """Returns every loop of every host: ours first."""
+        """Returns every loop of every host, those of this host first."""
         ours = [(config, self.store.host) for config in self.loops.values()]
         return ours + [(LoopConfig.model_validate(row.config), row.host) for row in self.store.foreign_loops()]
 
     def live(self, tag: str) -> LoopState | None:
-        """Returns the present state of a loop: from the job if one runs, else from the bus; None on another host."""
+        """Returns the present state of a loop, from the running job or else from the bus; None on another host."""
         if tag not in self.loops:
             self.owner(tag)
             return None
@@ -81,7 +83,7 @@ class LoopDirectory:
         return self.read(tag)
 
     def read(self, tag: str) -> LoopState:
-        """Reads a loop of ours from the bus. Raises Ended."""
+        """Reads a loop of this host from the bus. Raises Ended."""
         loop = self.open_loop(self.loops[tag])
         try:
             return loop.read()
@@ -89,7 +91,7 @@ class LoopDirectory:
             loop.close()
 
     def present(self, tag: str) -> LoopState:
-        """Returns the loop as its controller has it, or as the job that has the loop now found it. Raises Ended."""
+        """Returns the loop as its controller has it, or as it was at the start of the running job. Raises Ended."""
         active = self.store.active(tag)
         if active is not None and active.found is not None:
             return replace(loop_state(active.found), gains=gains_of(active.old_gains))

@@ -1,7 +1,7 @@
-"""Jobs: the engine starts them, a thread pumps each, the store is the memory, the table of moves the law.
+"""The manager of the jobs: it starts, stops and aborts them, and finds those that the engine has lost.
 
-This is their manager: it starts, stops and aborts them, and finds what the engine has lost. What runs one is `worker`,
-what decides one `decisions`; `service.server.assembly` puts them together.
+The engine starts each job in a thread, the store holds its state, and the table of job states decides which changes are
+legal. `worker` runs a job, `decisions` decides one; `service.server.assembly` connects the parts.
 """
 
 from __future__ import annotations
@@ -36,19 +36,20 @@ from loopwright.tuning.reasons import Reason
 log = logging.getLogger(__name__)
 
 REHEARSALS_AT_ONCE = 4
+"""Number of dry runs that one host runs at once."""
 _WATCH_S = 0.2
 _RECONCILE_S = 15.0
 _AT_BOOT = 16
 ENDS_S = 75.0
-"""Wall time in which a job that is told to stop has ended: its loop restored (tried for 4 s, and every answer of the
-last try may be late, 25 s in all), its reports and its end written or given up (twice STOP_PATIENCE_S and a wait of
-the database). Shorter than TimeoutStopSec of the unit, which would end the service without a word."""
+"""Wall time in which a job that is asked to stop has ended, s: its loop restored (retried for 4 s, and every answer of
+the last try may be late, 25 s in all), its reports and its end written or given up (twice STOP_PATIENCE_S and a wait
+for the database). It is shorter than TimeoutStopSec of the unit, after which systemd kills the service."""
 
 
 class Jobs:
-    """Starts and stops jobs of this host's loops; shows, starts and aborts those of the others.
+    """Starts and stops jobs of this host's loops; shows, starts and aborts those of the other hosts.
 
-    decisions, locking: parts that the manager does not use itself; the API is given them with the jobs.
+    decisions, locking: parts that the manager does not use itself; the API gets them together with the jobs.
     machine: clock and threads.
     """
 
@@ -90,23 +91,23 @@ class Jobs:
 
     @property
     def why_stopping(self) -> str:
-        """Says why no more jobs are taken, as readiness shows it."""
+        """Returns why no more jobs are accepted, in the words of the readiness check."""
         return self.registry.why_stopping
 
     @property
     def resumes(self) -> bool:
-        """Says whether jobs that a dead service left go on at the next start."""
+        """Returns whether jobs of a dead service are resumed at the next start."""
         return self._recovery.resumes
 
     # at the start of the service
     def boot(self) -> None:
-        """Takes this host's loops, makes those of its active jobs safe, then lets the engine go on with the jobs.
+        """Registers this host's loops, restores those of its active jobs, then lets the engine continue the jobs.
 
         Raises ForeignLoop.
         """
         self.store.own_loops({tag: config.model_dump(mode="json") for tag, config in self.directory.loops.items()})
         self._machine.side_by_side(self._recovery.recover, self.store.unfinished(), _AT_BOOT)
-        if self.stopping:  # told to end meanwhile: what is left of the jobs is left to the next start
+        if self.stopping:  # asked to end meanwhile: the remaining jobs are left to the next start
             return
         queues = {self._queue(config): self.directory.at_once(config.bus) for config in self.directory.loops.values()}
         self.engine.launch(self.worker.work, queues | {self._rehearsals(self.store.host): REHEARSALS_AT_ONCE})
@@ -118,9 +119,10 @@ class Jobs:
             self.aftercare.start()
 
     def reconcile(self, at_once: bool = False) -> None:
-        """Hands the engine what it has lost (an enqueue that failed, a file that was deleted or is older than ours).
+        """Queues the jobs that the engine has lost (an enqueue that failed, a file that was deleted or is older than
+        the store).
 
-        at_once: without waiting for a second look, which keeps a job that is just being started from being lost.
+        at_once: without waiting for a second round, which keeps a job that is just being started from counting as lost.
         """
         self._end_unqueued()
         with self.registry.lock:
@@ -137,14 +139,14 @@ class Jobs:
         return self._rehearsals(row.host) if row.dry_run else self._queue(self.directory.loops[row.loop])
 
     def _queue(self, config: LoopConfig, host: str | None = None) -> str:
-        """Returns the queue of the loop's bus. A bus has its name from its host: two hosts may both have a vcan0."""
+        """Returns the queue of the loop's bus. The name includes the host, because two hosts may both have a vcan0."""
         return f"{host or self.store.host}:{config.bus}"
 
     @staticmethod
     def _rehearsals(host: str) -> str:
         return f"{host}:rehearsals"
 
-    # what there is
+    # queries
     def running(self, job_id: str) -> Running | None:
         return self.registry.running.get(job_id)
 
@@ -156,7 +158,7 @@ class Jobs:
     def start(self, tag: str, request: RetuneRequest, also: WithJob | None = None) -> JobRow:
         """Queues a job on the host that has the loop. Raises UnknownLoop, BadLimits, Busy, Locked, Stopping.
 
-        also: what is written in the same transaction; when it raises, there is no job.
+        also: writes in the same transaction; when it raises, there is no job.
         """
         config, host = self.directory.owner(tag)
         within(config, request)
@@ -167,25 +169,25 @@ class Jobs:
         try:
             self.engine.enqueue(row.id, self._rehearsals(host) if row.dry_run else self._queue(config, host))
         except Exception:
-            # Whoever asked is told that it failed: it must not begin later.
+            # The caller is told that the start failed, so the job must not begin later.
             self.registry.unqueued[row.id] = row
             self._end_unqueued()
             raise
         return row
 
     def _end_unqueued(self) -> None:
-        """Ends the jobs that could not be queued, as far as the database takes it."""
+        """Ends the jobs that could not be queued, as far as the database accepts it."""
         for job_id, row in list(self.registry.unqueued.items()):
             try:
                 if row.host == self.store.host:
                     self._request_stop_of(job_id, Reason.INTERNAL, JobState.FAILED, "it could not be queued")
-                else:  # its own host may have found and begun it: only that one can tell
+                else:  # its own host may have found and begun it; only that host knows
                     with suppress(IllegalMove):
                         self.store.request_stop(job_id, Reason.INTERNAL.value, "service")
             except SQLAlchemyError as error:
                 log.error(
-                    "job %s of loop %s could not be queued, and its end not be written: it does not begin, and holds "
-                    "the loop until the database takes its end, which is tried every %.0f s: %s",
+                    "job %s of loop %s could not be queued, and its end could not be written: it does not begin, "
+                    "and holds the loop until the database takes its end, which is tried every %.0f s: %s",
                     job_id, row.loop, _RECONCILE_S, error,
                 )  # fmt: skip
             else:
@@ -194,7 +196,7 @@ class Jobs:
     def abort(self, job_id: str, by: str) -> JobRow:
         """Asks an active job to stop; it ends as aborted once the loop is restored. Raises IllegalMove.
 
-        A job that runs here hears of it before it is written down: the loop does not wait for the database.
+        A job that runs here is asked before the abort is stored, so the loop does not wait for the database.
         """
         heard = self.tell_to_stop(job_id)
         row = self.store.request_stop(job_id, Reason.OPERATOR.value, by, heard)
@@ -203,8 +205,8 @@ class Jobs:
         return self.store.get(job_id)
 
     def tell_to_stop(self, job_id: str) -> bool:
-        """Lets a job that runs here hear that an operator wants it to end; returns at once, and writes nothing down.
-        Returns False where no job hears of it."""
+        """Asks a job that runs here to stop for an operator; returns at once, and stores nothing. Returns False where
+        no such job runs here."""
         running = self.registry.running.get(job_id)
         if running is None:
             return False
@@ -218,8 +220,8 @@ class Jobs:
         state: JobState = JobState.ABORTED,
         detail: str = "stopped while it waited for its turn",
     ) -> None:
-        """Asks one job to stop. A job that runs hears of it at its next sample; one that waits for its turn has nothing
-        to restore, and ends in that state."""
+        """Asks one job to stop. A running job sees it at its next sample; a waiting one has nothing to restore, and
+        ends in that state."""
         with self.registry.lock:
             running = self.registry.running.get(job_id)
             if running is not None:
@@ -230,23 +232,26 @@ class Jobs:
                 self.store.move(job_id, state, reason=reason.value, detail=detail)
 
     def request_stop(self) -> None:
-        """Tells every job to end; returns at once."""
+        """Asks every job to stop; returns at once."""
         self.registry.stopping = True
         self.aftercare.request_stop()
         for running in list(self.registry.running.values()):
             running.stop_reason = running.stop_reason or Reason.SERVICE_STOPPED
 
     def give_up(self, why: str) -> None:
-        """Ends every job and takes no more, while requests go on being answered; why: as readiness says it."""
+        """Ends every job and accepts no more, while requests are still answered.
+
+        why: the reason, in the words of the readiness check.
+        """
         if not self.stopping:
-            log.critical("%s; every job is ended, no more are taken", why)
+            log.critical("%s; every job is ended, no more are accepted", why)
             self.registry.why_stopping = why
             self.request_stop()
 
     def stop(self) -> None:
-        """Ends every job, waits until each has restored its loop, and gives the engine up.
+        """Ends every job, waits until each has restored its loop, and closes the engine.
 
-        A job whose thread hangs does not hold up the others' ends for ever.
+        A job whose thread hangs does not delay the end of the others for ever.
         """
         if self._ended.is_set():
             return
@@ -257,13 +262,13 @@ class Jobs:
             if not running.over.wait(max(0.0, give_up - self._machine.monotonic())):
                 log.error(
                     "job %s of loop %s has not ended in %.0f s: whether its loop is restored is unknown, and its end "
-                    "is not written; look at the controller, which goes back by itself when it hears no more of the "
-                    "service; the next start looks at the loop again",
+                    "is not written; check the controller, which restores the loop by itself when the service falls "
+                    "silent; the next start checks the loop again",
                     running.job_id, running.tag, ENDS_S,
                 )  # fmt: skip
         self.aftercare.close()
         self.stop_watching()
-        if self._watcher.ident is not None:  # a service that did not come to its start leaves the jobs as they are
+        if self._watcher.ident is not None:  # a service that never started leaves the jobs as they are
             try:
                 for row in self._lasting(self.store.unfinished):
                     self._request_stop_of(row.id, Reason.SERVICE_STOPPED)
@@ -275,14 +280,14 @@ class Jobs:
         self.journal.close(STOP_PATIENCE_S)
 
     def stop_watching(self) -> None:
-        """Ends the thread that hears of jobs to stop, and leaves jobs and loops as they are; a `stop` after it does
+        """Ends the thread that watches for stop requests, and leaves jobs and loops as they are; a later `stop` does
         nothing."""
         self._ended.set()
         if self._watcher.ident is not None:
             self._watcher.join()
 
     def _watch(self) -> None:
-        """Hears of jobs to stop, from whatever host, and finds what the engine has lost."""
+        """Watches for stop requests from any host, and finds jobs that the engine has lost."""
         reconciled = self._machine.monotonic()
         while not self._ended.wait(_WATCH_S):
             self._watched = self._machine.monotonic()
@@ -299,16 +304,16 @@ class Jobs:
                 self.give_up(str(error))
             except SQLAlchemyError as error:
                 log.warning("the database does not answer: %s", error)
-            except Exception:  # whatever it is, aborts from other hosts must go on being heard
-                log.exception("watching the jobs")
+            except Exception:  # after any error, aborts from other hosts must still be processed
+                log.exception("defect while watching the jobs")
 
     def unwatched_s(self) -> float:
-        """Returns for how long nobody has heard of jobs to stop, s of wall time."""
+        """Returns for how long no stop requests have been read, s of wall time."""
         return self._machine.monotonic() - self._watched
 
     def _hold_name(self) -> None:
-        """Keeps the lock on our host name. Nothing else in this thread waits for anything: another service waits only
-        so long for us to come for it."""
+        """Holds the lock on the host's name. Nothing else in this thread may block: another service waits only a
+        limited time for the renewal."""
         while not self._ended.wait(CHECK_S):
             try:
                 self.store.check_lock()
@@ -316,4 +321,4 @@ class Jobs:
                 self.give_up(str(error))
                 return
             except Exception:
-                log.exception("holding the name of the host")
+                log.exception("defect while holding the name of the host")

@@ -1,4 +1,4 @@
-"""A job that a dead service left: its loop made safe, and whether the job may go on."""
+"""The recovery of a job after the death of its service: the loop is restored, and the job resumed or ended."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ from loopwright.tuning.reasons import Reason
 log = logging.getLogger(__name__)
 
 MAX_ATTEMPTS = 10
+"""Number of attempts after which a job is not resumed again."""
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """Recovers the jobs that a dead service left.
+    """Recovers the jobs of a dead service.
 
-    resumes: whether such jobs go on.  stopping: whether this service is to end before it has begun: what it has not
-    looked at yet is left to the next start.
+    resumes: whether such jobs are resumed.
+    stopping: whether this service is to end before it has started; the remaining jobs are then left to the next start.
     """
 
     loops: Mapping[str, LoopConfig]
@@ -40,11 +41,11 @@ class Recovery:
     stopping: Callable[[], bool] = lambda: False
 
     def recover(self, row: JobRow) -> None:
-        """Makes the loop of the job safe, and ends the job if it is not to go on."""
+        """Restores the loop of the job, and ends the job if it is not to be resumed."""
         if self.stopping():
             return
         safe: Restoration | None = None
-        # A job of the code before has no session, and may have touched its loop all the same.
+        # A job of an earlier version has no session, but may have touched its loop.
         if row.found is not None and (row.session is not None or row.version != WORKFLOW_VERSION):
             safe = look(row, self.loops, self.open_loop)
             self.store.append(row.id, "loop_found", {"text": safe.text}, row.plant_time_s)
@@ -85,7 +86,8 @@ class Recovery:
         return None
 
     def _locked(self, loop: str) -> str | None:
-        """Says who has locked the loop, None where nobody has. A job that has not begun yet is refused at its turn."""
+        """Returns who has locked the loop, None where it is not locked. A job that has not begun is refused at its
+        turn."""
         try:
             with self.store.reading() as session:
                 loop_locks.check(session, loop)

@@ -1,4 +1,4 @@
-"""The jobs that run in this service, and whether it is to end: what manager, worker and loop directory share."""
+"""The jobs that run in this service, and whether it is to end: state shared by manager, worker and loop directory."""
 
 from __future__ import annotations
 
@@ -9,22 +9,23 @@ from loopwright.service.store.tables import JobRow
 
 
 class Registry:
-    """Holds the jobs that run, by id, and whether the service is to end.
+    """Holds the running jobs by id, and whether the service is to end.
 
-    stopping: set once, when the service is to end.  why_stopping: as readiness says it.
+    stopping: set once, when the service is to end.
+    why_stopping: the reason, in the words of the readiness check.
     """
 
     def __init__(self) -> None:
         self.stopping = False
         self.why_stopping = "the service is shutting down"
         self.running: dict[str, Running] = {}
-        # By id: jobs whose asker was told that they could not be queued, and whose end could not be written either.
+        # By id: jobs that could not be queued, as the caller was told, and whose end could not be stored either.
         self.unqueued: dict[str, JobRow] = {}
         # Guards the registry of running jobs and `stopping`.
         self.lock = threading.Lock()
 
     def enter(self, running: Running) -> bool:
-        """Adds a job that begins. Returns False where it is not to begin: it runs already, was given up, or the service
+        """Adds a job that begins. Returns False where it must not begin: it runs already, was given up, or the service
         is to end."""
         with self.lock:
             if self.stopping or running.job_id in self.running or running.job_id in self.unqueued:
@@ -33,7 +34,7 @@ class Registry:
             return True
 
     def leave(self, running: Running) -> None:
-        """Removes a job whose loop is given up and whose end is written."""
+        """Removes a job whose loop is released and whose end is stored."""
         with self.lock:
             self.running.pop(running.job_id, None)
         running.over.set()

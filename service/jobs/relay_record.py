@@ -1,4 +1,4 @@
-"""The record of a fast experiment, read again from the samples of its job: for another Ms, or for a picture."""
+"""The record of a fast experiment, rebuilt from the stored samples of its job: for another Ms, or for a plot."""
 
 from __future__ import annotations
 
@@ -13,14 +13,18 @@ from loopwright.tuning.models import Reals
 from loopwright.tuning.plan import Mode
 
 Columns = Mapping[str, Sequence[Any] | Reals]
-"""By the names of GET /jobs/{id}/samples."""
+"""Columns by their names in GET /jobs/{id}/samples."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelayRecord:
-    """Columns of the last attempt of a job. t: s since the relay began.  sp, pv, mv: as they were.
+    """The samples of the last attempt of a job.
 
-    listened: samples before the relay.  relayed: up to its end.  switches: samples at which it switched.
+    Ts: the sample time, s.
+    t: time since the relay began, s.
+    sp, pv, mv: as recorded, in PV and MV units.
+    listened, relayed: number of samples before the relay, and up to its end.
+    switches: the samples at which the relay switched.
     """
 
     Ts: float
@@ -34,11 +38,11 @@ class RelayRecord:
 
     @property
     def rest(self) -> tuple[float, float]:
-        """MV and PV at rest."""
+        """Returns MV and PV at rest."""
         return float(np.mean(self.mv[: self.listened])), float(np.mean(self.pv[: self.listened]))
 
     def experiment_record(self) -> ExperimentRecord | None:
-        """None where the relay did not come far enough for a fit."""
+        """Returns the record for a fit; None where the relay has not switched often enough."""
         if len(self.switches) < MIN_SWITCHES or self.listened < MIN_LISTENED:
             return None
         mv, pv = self.rest
@@ -47,7 +51,7 @@ class RelayRecord:
             Ts=self.Ts,
             u=self.mv - mv,
             y=y,
-            # the relay begins high, and switches where PV has gone the way that MV drives it
+            # the relay begins high, and switches after PV has moved in the direction in which MV drives it
             direction=1.0 if y[self.switches[0]] > 0.0 else -1.0,
             listened=self.listened,
             relayed=self.relayed,
@@ -57,14 +61,14 @@ class RelayRecord:
 
 
 def relay_record(columns: Columns) -> RelayRecord | None:
-    """None where no relay was run."""
+    """Returns the record of these columns; None where no relay was run."""
     stage = columns["stage"]
     first = max((i for i, name in enumerate(stage) if name == "preflight" and stage[max(i - 1, 0)] != name), default=0)
     t, sp, pv, mv, mode = (np.asarray(columns[name][first:], dtype=float) for name in ("t_s", "sp", "pv", "mv", "mode"))
     if len(t) < 2 or not np.any(mode == Mode.EXPERIMENT):
         return None
     Ts = float(np.median(np.diff(t)))
-    # samples lost on the way are made up: PV in between, all else as it was
+    # missing samples are filled: PV interpolated, the rest held
     number = np.round((t - t[0]) / Ts).astype(np.int64)
     whole = np.arange(number[-1] + 1)
     before = np.searchsorted(number, whole, side="right") - 1

@@ -1,8 +1,7 @@
-"""What need not be kept is deleted, at the start of the service and once an hour: the samples of old jobs, as it is
-told, and what the engine still knows of jobs that are over, always.
+"""Deletes old samples and finished engine records, at the start of the service and once an hour.
 
-Jobs, their events and results stay. Which samples are deleted is in the audit log, and each job has an event of it.
-A clock that has jumped deletes nothing: service/store/clock_watch.py.
+Jobs, their events and results stay. The audit log lists the jobs whose samples are deleted, and each job gets an event.
+After a jump of the clock nothing is deleted for its age: service/store/clock_watch.py.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ log = logging.getLogger(__name__)
 
 EVERY_S = 3600.0
 LOOK_S = 60.0
-"""Wall time between two looks at the clock."""
+"""Wall time between two checks of the clock, s."""
 _AT_ONCE = 50
 _FORGOTTEN_AT_ONCE = 500
 _STOP_S = 5.0
@@ -38,8 +37,11 @@ _KEPT = [state.value for state in (*ACTIVE, JobState.PROPOSED)]
 
 @dataclass(frozen=True)
 class Keep:
-    """Which jobs keep their samples: the newest `jobs` of each loop, and those that ended in the last `days`; None:
-    that is no reason. Where both are None, all. Active and proposed jobs always do."""
+    """Which jobs keep their samples; active and proposed jobs always do.
+
+    jobs: the newest `jobs` of each loop keep them; None disables the criterion.
+    days: jobs that ended in the last `days` keep them; None disables the criterion. With both None, all jobs keep them.
+    """
 
     jobs: int | None = None
     days: float | None = None
@@ -49,11 +51,14 @@ class Keep:
 
 
 def tidy(store: Store, keep: Keep, at: datetime | None = None, ages_from: datetime | None = None) -> int:
-    """Deletes what need not be kept of this host's jobs. Returns of how many jobs. at: the present.  ages_from: nothing
-    counts as older than this."""
+    """Deletes the old samples of this host's jobs. Returns the number of jobs.
+
+    at: the present time; by default that of the clock.
+    ages_from: no sample counts as older than this time.
+    """
     at = at or datetime.now(UTC)
     if keep.days is not None and ages_from is not None and ages_from > at - timedelta(days=keep.days):
-        return 0  # each job has a reason to be kept: as far as was seen, it is not old enough
+        return 0  # no job is known to be old enough
     count = 0
     while keep and (jobs := _some(store, keep, at)):
         count += len(jobs)
@@ -61,10 +66,11 @@ def tidy(store: Store, keep: Keep, at: datetime | None = None, ages_from: dateti
 
 
 def forget(store: Store, engine: Engine) -> int:
-    """Has the engine forget the jobs that are over: our own tables have all of them. Returns how many."""
+    """Deletes the engine's records of jobs that are over, whose state is in the service's own tables. Returns their
+    number."""
     count = 0
     while ids := engine.over(_FORGOTTEN_AT_ONCE):
-        # What it takes for over while we do not is given to it anew (Jobs.reconcile), under the same id.
+        # A job that is over for the engine alone is queued again (Jobs.reconcile) under the same id.
         active = store.active_among(ids)
         over = [job_id for job_id in ids if job_id not in active]
         if not over:
@@ -72,12 +78,12 @@ def forget(store: Store, engine: Engine) -> int:
         engine.forget(over)
         count += len(over)
     if count:
-        log.info("the engine has forgotten %d jobs that are over", count)
+        log.info("the engine's records of %d finished jobs are deleted", count)
     return count
 
 
 def _some(store: Store, keep: Keep, at: datetime) -> list[JobRow]:
-    """The first few: a transaction is short, others want to write, too."""
+    """Returns the first few jobs: the transaction has to be short, because others write too."""
     with store.writing() as session:
         old = select(JobRow).where(*_old(store.host, keep, at)).order_by(JobRow.number).limit(_AT_ONCE)
         rows = list(session.scalars(old))
@@ -99,7 +105,7 @@ def _old(host: str, keep: Keep, at: datetime) -> list[ColumnElement[bool]]:
     with_samples = select(ChunkRow.job_id).where(ChunkRow.job_id == JobRow.id).exists()
     found = [JobRow.host == host, JobRow.state.not_in(_KEPT), with_samples]
     if keep.jobs is not None:
-        # Rehearsals are counted apart: they must not push the experiments out.
+        # Rehearsals are counted separately: they must not displace the experiments.
         of_loop = (JobRow.loop, JobRow.dry_run)
         number = func.row_number().over(partition_by=of_loop, order_by=JobRow.number.desc())
         rank = select(JobRow.id, number).subquery()
@@ -116,7 +122,7 @@ def _why(keep: Keep) -> str:
 
 
 class Retention:
-    """Tidies now and then, in a thread, by a clock that it looks at more often."""
+    """Deletes from time to time, in a thread; the clock is checked more often."""
 
     def __init__(
         self,
@@ -138,10 +144,10 @@ class Retention:
     def close(self) -> None:
         self._over.set()
         if self._thread.is_alive():
-            self._thread.join(_STOP_S)  # the engine waits for a database that is away
+            self._thread.join(_STOP_S)  # the engine may be waiting for an unreachable database
 
     def note(self) -> str | None:
-        """Why no samples are deleted for their age at present; None: nothing keeps them."""
+        """Returns why no samples are deleted for their age at present; None where they are."""
         seen, days = self._watch.seen, self._keep.days
         if seen is None or seen.ages_from is None or days is None:
             return None
@@ -154,7 +160,7 @@ class Retention:
         )
 
     def look(self) -> None:
-        """Looks at the clock, and writes down what it says."""
+        """Checks the clock, and stores the result."""
         before = None if self._watch.seen is not None else hosts.last_seen(self._store)
         jump = self._watch.look(before, longest_stop(self._keep.days))
         if jump is not None:
@@ -171,12 +177,12 @@ class Retention:
                 if tidied is None or time.monotonic() - tidied >= self._every_s:
                     self._tidy()
                     tidied = time.monotonic()
-            except FolderInUse:  # another service has our name, and looks after what is to be kept
+            except FolderInUse:  # another service has this host's name, and deletes instead
                 return
             except SQLAlchemyError as error:
-                log.warning("what need not be kept could not be deleted, it will be later: %s", error)
-            except Exception:  # whatever it is, it must be tried again
-                log.exception("what need not be kept could not be deleted")
+                log.warning("old samples could not be deleted, this is tried again later: %s", error)
+            except Exception:  # after any error, it must be tried again
+                log.exception("old samples could not be deleted")
             self._over.wait(self._look_s)
 
     def _tidy(self) -> None:

@@ -1,4 +1,4 @@
-"""Asking a database that may be away for a while."""
+"""Calls of a database that may be unreachable for some time."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from loopwright.service.jobs.registry import Registry
 T = TypeVar("T")
 
 STOP_PATIENCE_S = 20.0
+"""Wall time for which a call is repeated while the service stops, s."""
 _AGAIN_S = 0.5
 
 
 class UntilAnswered:
-    """Repeats a call of the database until there is an answer; while the service stops, for a while only."""
+    """Repeats a call of the database until it answers; while the service stops, only for STOP_PATIENCE_S."""
 
     def __init__(self, machine: Machine, registry: Registry) -> None:
         self._machine = machine

@@ -1,7 +1,7 @@
-"""The thread of a job: it runs one to its end, and writes down what came of it.
+"""Runs one job to its end, in the thread of the job, and stores its result.
 
-It is the thread that pumps the loop (heartbeat and lease go out from `step`), so what it does between two samples is
-kept short: what it has to tell goes into the journal, which another thread writes.
+This thread steps the loop (heartbeat and lease renewals are sent in `step`), so its work between two samples is short:
+reports go to the journal, which another thread writes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,11 @@ log = logging.getLogger(__name__)
 
 
 class Worker:
-    """Runs jobs on the loops of the directory: `tune` on the loop itself, `rehearse` for a dry run."""
+    """Runs jobs on the loops of the directory.
+
+    tune: runs a job on the loop itself.
+    rehearse: runs a dry run.
+    """
 
     def __init__(
         self,
@@ -60,9 +64,9 @@ class Worker:
         self._lasting = UntilAnswered(machine, registry)
 
     def work(self, job_id: str) -> None:
-        """Runs a job to its end, or its rest after a crash. Called by the engine; a job that is over is left alone.
+        """Runs a job to its end, or resumes it after a crash. The engine calls it; a job that is over is left alone.
 
-        Raises FolderInUse: the job is another's by now.
+        Raises FolderInUse when the job belongs to another host.
         """
         try:
             row = self._lasting(lambda: self.store.get(job_id))
@@ -79,7 +83,7 @@ class Worker:
         if not self._registry.enter(running):
             return
         try:
-            # Read anew: until it was among those that run, an abort ended it as one that waits for its turn.
+            # Read again: before the job was registered as running, an abort would have ended it as a waiting one.
             row = self._lasting(lambda: self.store.get(job_id))
             if JobState(row.state) not in ACTIVE:
                 return
@@ -95,7 +99,7 @@ class Worker:
         try:
             self._finish(running, self._run(running, row), row.dry_run)
         except FolderInUse as error:
-            log.error("the end of the job is another's to write: %s", error)
+            log.error("another host writes the end of the job: %s", error)
             raise
         except Exception:
             log.exception("the end of the job could not be written")
@@ -122,7 +126,7 @@ class Worker:
             with self._directory.alone_with(row.loop):
                 try:
                     state = self._begun(loop, row)
-                except Locked as locked:  # what an attempt before has left is home already
+                except Locked as locked:  # an earlier attempt is restored already
                     return Outcome(None, locked, None if row.session is None else loop.read(), {})
             earlier = self.store.events(row.id) if row.found is not None else ()
             hooks = Hooks(
@@ -135,21 +139,19 @@ class Worker:
             loop.close()
 
     def _note_home(self, job_id: str, read: LoopState, home: LoopState) -> None:
-        """Notes home as the controller has it since it opened the session, where a hand was faster than our reading.
-
-        The note goes through the journal: the session is open, and waits for no database.
-        """
+        """Stores the state before the test as the controller noted it at the opening, where it changed after the
+        service's reading. The note goes through the journal: the session is open, and waits for no database."""
         columns: dict[str, Any] = {}
         if differences(home, read):
             columns = {"found": state_json(home), "old_gains": asdict(home.gains)}
         self.journal.put(looked_after.opened(job_id, columns))
-        if not same_gains(home.gains, read.gains):  # the plan reckons with those that were read
+        if not same_gains(home.gains, read.gains):  # the plan is based on the gains that were read
             raise Aborted(Reason.GAINS_CHANGED, "other gains were accepted as the test was about to begin")
 
     def _begun(self, loop: Loop, row: JobRow) -> LoopState:
-        """Returns the state of the loop as an attempt begins, written down before anything is touched."""
+        """Returns the state of the loop at the start of an attempt, stored before the loop is touched."""
         if row.found is None or row.session is None:
-            # No attempt has touched it. What an earlier one had read may have been another tuner's test.
+            # No attempt has touched the loop; the state that an earlier one read may have been another tuner's test.
             state = loop.read(beside_tests=True)
             columns: dict[str, Any] = {"old_gains": asdict(state.gains), "found": state_json(state)}
             if row.found is None:
@@ -193,7 +195,7 @@ class Worker:
         running.flush()
         while not self.journal.flush(1.0):
             if self._registry.stopping and self.journal.behind_s > STOP_PATIENCE_S:
-                log.error("the database takes nothing, the last reports of the job are lost")
+                log.error("the database accepts nothing, the last reports of the job are lost")
                 break
         times = self._earlier_times(running.job_id) | outcome.plant_time_s
         columns: dict[str, Any] = {
@@ -217,6 +219,6 @@ class Worker:
             log.log(level, "job %s, %s: %s", state.value, outcome.ended.reason.value, outcome.ended.detail)
 
     def _earlier_times(self, job_id: str) -> dict[str, float]:
-        """Returns the plant time of the stages that any attempt has finished, s."""
+        """Returns the plant time by stage that any attempt has finished, s."""
         events = self._lasting(lambda: self.store.events(job_id))
         return {e.data["stage"]: e.data["stage_time_s"] for e in events if e.kind == "stage_done"}

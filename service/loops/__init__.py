@@ -1,1 +1,1 @@
-"""A loop as a plan sees it, on the bus or in memory, and how it comes home."""
+"""The loop that a plan acts on, on the bus or in memory, and its restoration after a test."""

@@ -1,4 +1,4 @@
-"""The way to one loop on a bus: its tuner, opened when it is needed, and what goes wrong there as a reason."""
+"""The connection to one loop on a bus: it opens the tuner when needed, and turns bus errors into reasons."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from loopwright.service.loops.bus_reading import BusReading, not_operational
 from loopwright.tuning.reasons import Failed, Reason, Refused
 
 AGAIN_S = 0.05
-"""Wall time between two tries of what a controller does not do at once."""
+"""Wall time between two tries of a request that a controller does not fulfil at once, s."""
 
 _NOT_OURS = (Abort.NO_OBJECT, Abort.NO_SUBINDEX, Abort.LENGTH, Abort.READ_ONLY, Abort.WRITE_ONLY)
 
@@ -21,10 +21,11 @@ Read = Callable[[Tuner, int, int | None, int], BusReading]
 
 
 class BusConnection:
-    """Reaches one channel of a controller node.
+    """Connects to one channel of a controller node.
 
-    plant: the plant I/O, if it offers one to ask.  station: this process on the bus.
-    read: makes the readings; a simulation notes them.
+    plant: node-ID of the plant I/O; None where it cannot be asked.
+    station: this process on the bus.
+    read: makes the readings; a simulation records them.
     """
 
     def __init__(
@@ -40,7 +41,7 @@ class BusConnection:
 
     @contextmanager
     def tuner(self) -> Iterator[Tuner]:
-        """Opens the tuner when it is needed; what goes wrong on the bus becomes a reason of the closed list."""
+        """Yields the tuner, opened when it is needed; errors of the bus are raised as Failed or Refused."""
         try:
             if self._tuner is None:
                 self._tuner = Tuner(self.url, self.controller, self.plant, self.channel, station=self.station)
@@ -50,7 +51,7 @@ class BusConnection:
         except BusError as error:
             self.close()
             raise Failed(Reason.BUS_LOST, str(error)) from error
-        except OSError as error:  # an interface that disappears between two calls
+        except OSError as error:  # an interface may disappear between two calls
             self.close()
             text = f"bus {self.url!r} is lost ({error.strerror or error}): see that its interface is there and up"
             raise Failed(Reason.BUS_LOST, text) from error
@@ -65,19 +66,20 @@ class BusConnection:
         return self._read(tuner, self.controller, self.plant, self.channel)
 
     def stop_beating(self) -> None:
-        """Ends our heartbeat and the renewals of the lease."""
+        """Ends this process's heartbeat for the loop and the renewals of the lease."""
         if self._tuner is not None:
             self._tuner.beating = False
             self._tuner.keep(0)
 
     def close(self) -> None:
-        """Gives the tuner up; it is opened anew when it is needed again."""
+        """Closes the tuner; it is opened again when needed."""
         if self._tuner is not None:
             self._tuner.close()
             self._tuner = None
 
     def _no_answer(self, error: TunerError) -> Failed:
-        """Tells a node that is stopped, which beats and answers no SDO, from one that is gone."""
+        """Distinguishes a node in the state stopped, which sends heartbeats and answers no SDO, from one that is
+        gone."""
         states = self._tuner.node_states if self._tuner is not None else {}
         for node in (self.controller, self.plant):
             if node is not None and states.get(node) == NmtState.STOPPED:

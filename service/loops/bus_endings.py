@@ -1,4 +1,4 @@
-"""How a session has ended, as the controller tells it, and whether the loop is home after it."""
+"""The end of a session, as the controller reports it, and whether the loop is in its state before the test."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ _HANDS = {
     Hand.GAINS: (Reason.GAINS_CHANGED, "gains", {"gains", "trial"}),
     Hand.LIMITS: (Reason.LIMITS_CHANGED, "limits", set[str]()),
 }
-"""By what a hand has moved: the reason, its name, and in what the loop may differ from home for it."""
+"""For each kind of change by an operator or another master: the reason, its name, and in what the loop may differ from
+its state before the test because of it."""
 
 
 def cause_of(tuner: Tuner) -> Cause:
@@ -29,12 +30,12 @@ def words_of(cause: Cause) -> str:
 
 
 def hand_of(tuner: Tuner) -> Hand:
-    """What another hand has moved since the opening."""
+    """Returns what an operator or another master has changed since the opening."""
     return Hand(int(tuner.number("controller_hand")))
 
 
 def why_over(reading: BusReading, number: int, pv_silence_s: float) -> Ended:
-    """Why the session of that number has ended without its tuner. Raises Failed(NODE_NOT_OPERATIONAL)."""
+    """Returns why the session of that number has ended without its tuner. Raises Failed(NODE_NOT_OPERATIONAL)."""
     tuner = reading.tuner
     if int(tuner.number("controller_session_last")) != number:
         return Failed(Reason.NODE_LOST, f"controller node {reading.controller:02X}h restarted")
@@ -44,7 +45,7 @@ def why_over(reading: BusReading, number: int, pv_silence_s: float) -> Ended:
             hand = hand_of(tuner)
             moved = [entry for bit, entry in _HANDS.items() if bit in hand]
             reason = moved[0][0] if moved else Reason.MODE_CHANGED
-            return Aborted(reason, f"another hand on the loop: {', '.join(name for _, name, _ in moved)}")
+            return Aborted(reason, f"an operator or another master changed: {', '.join(name for _, name, _ in moved)}")
         case Cause.PV_LIMIT:
             return Failed(Reason.PV_LIMIT, "PV left its limits during the relay; the controller ended the test")
         case Cause.NO_PV:
@@ -53,15 +54,17 @@ def why_over(reading: BusReading, number: int, pv_silence_s: float) -> Ended:
             return Failed(Reason.BAD_SAMPLE, f"{text}; it ended the test and holds the MV of before")
         case Cause.NMT:
             node = f"controller node {reading.controller:02X}h"
-            return Failed(Reason.NODE_NOT_OPERATIONAL, f"{node} has left the operational state, by another's command")
+            return Failed(Reason.NODE_NOT_OPERATIONAL, f"{node} has left the operational state, by an NMT command")
     return Failed(Reason.DEVICE_WENT_BACK, f"the controller ended the test by itself ({words_of(cause)})")
 
 
 def read_back(reading: BusReading, home: LoopState, number: int, how: str) -> Restored:
-    """The loop after the session of that number (0: none was opened). What differs from home is another's doing, or is
-    not confirmed: Failed(RESTORE_UNCONFIRMED | NODE_NOT_OPERATIONAL).
+    """Reads the loop back after the session of that number (0: none was opened). Differences from `home` are either
+    changes by an operator or another master, which are reported, or not confirmed.
 
-    home: as the tuner knows it.  how: what has ended the session, in words.
+    home: the state before the test, as the tuner knows it.
+    how: the end of the session, in words.
+    Raises Failed(RESTORE_UNCONFIRMED | NODE_NOT_OPERATIONAL).
     """
     tuner = reading.tuner
     reading.identify_controller()
@@ -70,9 +73,9 @@ def read_back(reading: BusReading, home: LoopState, number: int, how: str) -> Re
         raise Failed(Reason.NODE_NOT_OPERATIONAL, f"{state.node_state}: nothing controls, MV stays where it is")
     holder = int(tuner.number("controller_session_holder"))
     ours = bool(number) and int(tuner.number("controller_session_last")) == number and not holder
-    if ours:  # the controller noted it in the moment of the opening
+    if ours:  # the controller noted the state at the moment of the opening
         home = reading.home()
-    hand = hand_of(tuner)  # last: what has moved by now is in it
+    hand = hand_of(tuner)  # read last, so that it includes every change so far
     found = differences(state, home)
     if holder:
         found["session"] = f"the tuner with node-ID {holder:02X}h holds the loop"
@@ -88,6 +91,6 @@ def read_back(reading: BusReading, home: LoopState, number: int, how: str) -> Re
 
 
 def _ended_without_pv(tuner: Tuner) -> bool:
-    """PV was away as the session ended, and is: the output is to be that of home. Where PV goes away later, MV stays
-    where the law has brought it."""
+    """Returns whether PV was away when the session ended, and still is: MV then has to be that of `home`. Where PV goes
+    away later, MV stays where the control law has brought it."""
     return cause_of(tuner) in (Cause.NO_PV, Cause.NMT) and not tuner.number("controller_pv_valid")

@@ -1,8 +1,8 @@
-"""The live loop: a controller and its plant on a CAN bus, as a plan sees it.
+"""The live loop: a controller and its plant on a CAN bus.
 
-The session (`bus_session`) belongs to the controller: here it is opened and closed, and what it left is read back
-(`bus_restore`). Every wait in here, for a sample (`bus_samples`) or an answer, also sends our heartbeat and renews the
-lease: a service that hangs or dies loses the loop, and the controller brings it home by itself.
+The session (`bus_session`) belongs to the controller: this module opens and closes it, and `bus_restore` reads the loop
+back. Every wait for a sample (`bus_samples`) or an answer also sends the heartbeat and renews the lease: a service that
+hangs or dies loses the session, and the controller itself restores the loop.
 """
 
 from __future__ import annotations
@@ -29,10 +29,13 @@ RELAY_LONGEST = 1_000_000  # samples; plans end their relays, and so does the le
 
 
 class BusLoop:
-    """One channel of a controller node. plant_node: the plant I/O, if it offers one to ask (a simulated one does).
+    """One channel of a controller node.
 
-    station: this process on the bus.  pv_limits: at which the relay ends in the controller; None: the PV span.
-    block: samples per block of a plant at pace 0.  max_gap: samples in a row that may be missing.
+    plant_node: node-ID of the plant I/O, if it can be asked (a simulated one can).
+    station: this process on the bus.
+    pv_limits: limits at which the controller ends the relay, PV units; None for the PV span.
+    block: samples per block of a plant at pace 0.
+    max_gap: samples in a row that may be missing.
     read: makes the readings of the controller.
     """
 
@@ -84,7 +87,7 @@ class BusLoop:
                 self._commands.clear()
                 return home
         except BaseException:
-            if self.session.number:  # the answer to the opening may have been lost
+            if self.session.number:  # the session may be open although the answer was lost
                 with suppress(Ended), self._connection.tuner() as tuner:
                     close_session(tuner, self.session.number)
             self._release()
@@ -112,7 +115,8 @@ class BusLoop:
             self._release()
 
     def accept(self, gains: Gains, instead_of: Gains) -> LoopState:
-        """Accepts in a short session of its own, so that an acceptance that is cut off leaves one set or the other."""
+        """Accepts the gains in a short session of its own, so that an interrupted acceptance leaves one set or the
+        other."""
         why: Ended | None = None
         self.session.number = 0
         try:
@@ -142,8 +146,7 @@ class BusLoop:
         self._connection.close()
 
     def _carry_out(self, tuner: Tuner, command: Command) -> None:
-        """Gives the orders of a command. What an order has brought about is known from its answer: a status frame may
-        be lost."""
+        """Gives the orders of a command. Their effect is known from the answers, because a status frame may be lost."""
         order = self.session.order
         match command:
             case SetSetpoint(value):
@@ -168,15 +171,15 @@ class BusLoop:
                 tuner.mode = Mode.EXPERIMENT
 
     def _check_stop_request(self, when: str) -> None:
-        """Raises Aborted where somebody wants an end.
+        """Raises Aborted when the job is asked to stop.
 
-        when: what is waited for, in words.
+        when: the present wait, in words.
         """
         reason = self._stop()
         if reason is not None:
             raise Aborted(reason, when)
 
     def _release(self) -> None:
-        """Ends our heartbeat, and gives the plant back."""
+        """Ends the heartbeat, and releases the plant."""
         self._connection.stop_beating()
         self._samples.release()

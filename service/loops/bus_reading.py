@@ -1,4 +1,4 @@
-"""What controller and plant of a loop say of themselves over the bus: who they are, what they control, and home."""
+"""Readings of a loop over the bus: the identity and state of its controller and plant."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ _WHEN_SILENT: dict[int, str] = {
 
 @dataclass(frozen=True, slots=True)
 class BusReading:
-    """What can be read of one channel. controller, plant: node-IDs; plant None: a plant that offers nothing to ask.
+    """Reads one channel.
 
-    Every method raises TunerError beside what it names.
+    controller, plant: node-IDs; plant None for a plant that cannot be asked.
+    Every method raises TunerError besides the errors that it names.
     """
 
     tuner: Tuner
@@ -34,7 +35,8 @@ class BusReading:
     channel: int
 
     def identify(self) -> None:
-        """Raises Refused(DEVICE_MISMATCH), Failed(NODE_NOT_OPERATIONAL)."""
+        """Checks that both nodes are the expected devices. Raises Refused(DEVICE_MISMATCH),
+        Failed(NODE_NOT_OPERATIONAL)."""
         self.identify_controller()
         if self.plant is not None:
             self._identify(self.plant, Device.PLANT)
@@ -58,7 +60,8 @@ class BusReading:
         self._check_operational(node)
 
     def compare_times(self) -> None:
-        """A controller that reckons with another sample time than the plant's has other gains than it shows."""
+        """Compares the sample times: with another sample time than the plant's, the gains that a controller shows are
+        not those that it applies. Raises Refused(DEVICE_MISMATCH)."""
         if self.plant is None:
             return
         ours, theirs = (self.tuner.number("sample_time", node=node) / 1e6 for node in (self.controller, self.plant))
@@ -67,11 +70,11 @@ class BusReading:
             raise Refused(Reason.DEVICE_MISMATCH, f"{text}, plant node {self.plant:02X}h one of {theirs:g} s")
 
     def check_controller_operational(self) -> None:
-        """Raises Failed(NODE_NOT_OPERATIONAL)."""
+        """Raises Failed(NODE_NOT_OPERATIONAL) unless the controller is operational."""
         self._check_operational(self.controller)
 
     def check_plant_operational(self) -> None:
-        """The same of a plant that can be asked."""
+        """Raises Failed(NODE_NOT_OPERATIONAL) when the plant can be asked and is not operational."""
         if self.plant is not None:
             self._check_operational(self.plant)
 
@@ -81,7 +84,7 @@ class BusReading:
             raise not_operational(node, state)
 
     def state(self) -> LoopState:
-        """The gains are the accepted ones, in or out of a trial: those that it ends with."""
+        """Returns the present state, with the accepted gains: a trial ends with these."""
         number = self.tuner.number
         plant_state, when_silent = self._plant_state()
         own = int(number("node_state", node=self.controller))
@@ -105,7 +108,7 @@ class BusReading:
         )
 
     def beside_the_test(self) -> LoopState:
-        """The present state, but for what an open session comes back to."""
+        """Returns the present state, but while a session is open the state to which it returns."""
         return replace(
             self.state(),
             on_trial=False,
@@ -116,11 +119,12 @@ class BusReading:
         )
 
     def home(self) -> LoopState:
-        """The same, with the gains that were the accepted ones at the opening."""
+        """Returns the state before the test, with the gains that were accepted at the opening."""
         return replace(self.beside_the_test(), gains=self._gains("home"))
 
     def controls(self, state: LoopState) -> bool:
-        """A plant that is away keeps the controller from nothing; one that is there must be operational."""
+        """Returns whether the loop is controlled. A plant that is away does not prevent it; one that answers must be
+        operational."""
         return state.node_state in (OPERATIONAL, self._plant_is(SILENT))
 
     def _gains(self, which: str) -> Gains:
@@ -130,8 +134,8 @@ class BusReading:
         return f"node {self.plant or 0:02X}h is {state}"
 
     def _plant_state(self) -> tuple[str, str]:
-        """Its NMT state, and what it does when the controller is silent. A plant that is away keeps nobody from reading
-        the controller."""
+        """Returns the plant's NMT state, and its action when the controller is silent. A plant that is away must not
+        prevent a reading of the controller."""
         if self.plant is None:
             return OPERATIONAL, ""
         try:

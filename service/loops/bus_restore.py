@@ -1,4 +1,4 @@
-"""The way out of a test, and of an acceptance: the session is closed, and what the controller came to is read back."""
+"""The end of a test or an acceptance: it closes the session and reads the loop back."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from loopwright.service.loops.loop import Restored
 from loopwright.tuning.reasons import Ended, Failed, Reason
 
 RESTORE_PATIENCE_S = 4.0
-"""Wall time for which the way out is tried again."""
+"""Wall time for which the restoration is retried, s."""
 
 
 def restore(connection: BusConnection, home: LoopState, number: int) -> Restored:
@@ -38,10 +38,10 @@ def restore(connection: BusConnection, home: LoopState, number: int) -> Restored
 
 
 def end_acceptance(connection: BusConnection, number: int, why: Ended | None) -> LoopState:
-    """Closes the session of an acceptance and reads what is accepted now.
+    """Closes the session of an acceptance and reads the accepted gains.
 
-    why: the error that has cut the acceptance off, if one has; where the end of the session is not confirmed, it is
-    raised with what that means added.
+    why: the error that has interrupted the acceptance, if any. Where the end of the session is not confirmed, it is
+    raised with an addition that says so.
     """
     station = connection.station
     give_up = station.monotonic() + RESTORE_PATIENCE_S
@@ -59,12 +59,12 @@ def end_acceptance(connection: BusConnection, number: int, why: Ended | None) ->
 
 
 def close_session(tuner: Tuner, number: int) -> str:
-    """Closes the session of that number where it is still open, and says how it has ended."""
+    """Closes the session of that number where it is still open, and returns in words how it has ended."""
     tuner.keep(0)
     if int(tuner.number("controller_session")) == number:
         session = TunerSession(tuner)
         session.take_up(number)
-        with suppress(TunerError):  # a hand may be faster; what is read next counts
+        with suppress(TunerError):  # the session may just have ended; the next reading decides
             session.close()
         if int(tuner.number("controller_session")) == number:
             raise Failed(Reason.RESTORE_UNCONFIRMED, f"session {number:08X}h could not be closed")

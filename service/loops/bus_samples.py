@@ -1,7 +1,7 @@
-"""The samples of a loop on the bus: who drives them, which of them have come, and what time that makes.
+"""The samples of a loop on the bus: it drives, counts and times them.
 
 A simulated plant that runs as fast as the answers come (pace 0) is run in blocks of samples: no sample is lost however
-slow we are, and commands act between two blocks, so that equal seeds give equal runs.
+slow the service is, and commands act between two blocks, so equal seeds give equal runs.
 """
 
 from __future__ import annotations
@@ -20,19 +20,23 @@ from loopwright.tuning.plan import Sample
 from loopwright.tuning.reasons import Ended, Failed, Reason
 
 HALT_S, HALT_AGAIN_S = 5.0, 0.5
-"""How long a plant that is run in blocks may take to halt, and when it is told once more."""
+"""Longest time that a plant run in blocks may take to halt, and the time after which the order to halt is repeated,
+s."""
 SILENCE_S = 1.0
-"""Wall time without a sample (at least three sampling periods) after which the nodes are asked whether they live."""
+"""Wall time without a sample (at least three sampling periods) after which the nodes are asked for an answer, s."""
 MAX_GAP = 5
+"""Largest number of samples in a row that may be missing."""
 BLOCK = 10
-_SLICE_S = 0.05  # of a wait: after each, lease and stop are looked at
-_HALTED_S = 0.03  # without a sample: the plant has halted
+"""Samples per block of a plant at pace 0."""
+_SLICE_S = 0.05  # longest single wait; lease and stop requests are checked after each
+_HALTED_S = 0.03  # time without a sample after which the plant has halted
 
 
 class BusSamples:
     """Counts the samples of the channel of a connection from the beginning of a test.
 
-    check_stop_request: as for the session.  block: samples per block of a plant at pace 0.
+    check_stop_request: as for the session.
+    block: samples per block of a plant at pace 0.
     max_gap: samples in a row that may be missing.
     """
 
@@ -69,7 +73,7 @@ class BusSamples:
         self.sample_time_s = tuner.number("sample_time", node=self._connection.controller) / 1e6
 
     def take_plant(self, tuner: Tuner) -> None:
-        """Waits for its turn on a plant that is run in blocks; before anything of ours is armed in the controller."""
+        """Waits for the lock of a plant that is run in blocks, before the controller is commanded."""
         self.read_sample_time(tuner)
         self.read_pace(tuner)
         self.in_blocks = self.pace == 0.0
@@ -82,8 +86,8 @@ class BusSamples:
         self._plant_lock = lock
 
     def begin(self, tuner: Tuner) -> None:
-        """Settles who drives the samples, the plant by its clock or we in blocks, and counts them from now on. Nobody
-        else's test may be on the plant any more."""
+        """Determines whether the plant's clock or this service (in blocks) drives the samples, and starts counting
+        them. No other test may still use the plant."""
         self._silence_s = max(SILENCE_S, 3.0 * self.sample_time_s / (self.pace or math.inf))
         if self.in_blocks:
             self._halted = True
@@ -94,7 +98,7 @@ class BusSamples:
         self._first_n, self._left, self._passed = None, 0, 0
 
     def _halt(self, tuner: Tuner) -> None:
-        """Halts the plant. It is told more than once: one that is reset meanwhile runs again as it was started."""
+        """Halts the plant. The order is repeated, because a plant that is reset meanwhile runs again."""
         give_up = self._station.monotonic() + HALT_S
         again_at = 0.0
         while True:
@@ -111,7 +115,7 @@ class BusSamples:
                 raise Failed(Reason.SAMPLES_LOST, text)
 
     def release(self) -> None:
-        """Lets a plant that we ran in blocks run on by itself, and others take it."""
+        """Lets a plant that was run in blocks run on by itself, and releases its lock."""
         if self._halted:
             with suppress(Ended), self._connection.tuner() as tuner:
                 tuner.write("plant_samples_to_run", FOREVER)
@@ -124,7 +128,7 @@ class BusSamples:
 
     @property
     def block_is_over(self) -> bool:
-        """Says whether commands act now; they always do where the plant drives the samples by its clock."""
+        """Returns whether commands act now; they always do where the plant's clock drives the samples."""
         return self._left <= 0
 
     def start_block(self, tuner: Tuner) -> None:
@@ -133,8 +137,8 @@ class BusSamples:
             self._left = self._block
 
     def next(self, tuner: Tuner) -> Sample:
-        """Waits for the next sample and counts it. Raises Failed(SAMPLES_LOST | NODE_NOT_OPERATIONAL), why the session
-        is over, and what a stop request raises."""
+        """Waits for the next sample and counts it. Raises Failed(SAMPLES_LOST | NODE_NOT_OPERATIONAL), the reason why
+        the session is over, and the error of a stop request."""
         return self._count(self._wait_for_next(tuner))
 
     def _wait_for_next(self, tuner: Tuner) -> BusSample:
@@ -152,7 +156,7 @@ class BusSamples:
             self._check_stop_request("while waiting for a sample")
 
     def _silent(self, tuner: Tuner) -> Ended:
-        """Finds out who is silent. A node that is gone raises by its time-out."""
+        """Returns the error to raise when no sample comes. A node that is gone raises by its time-out."""
         reading = self._connection.reading(tuner)
         reading.check_controller_operational()
         reading.check_plant_operational()

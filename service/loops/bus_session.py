@@ -1,7 +1,7 @@
-"""Our session on a channel: the way in, its terms, and how it is kept; `bus_restore` is the way out.
+"""This service's session on a channel: its opening, its terms and its supervision; `bus_restore` ends it.
 
-The session belongs to the controller (`controller.session`, decision 8). A service that hangs or dies keeps nothing:
-the session ends, and the controller brings the loop home by itself.
+The session belongs to the controller (`controller.session`, decision 8). When the service hangs or dies, the session
+ends, and the controller itself restores the loop.
 """
 
 from __future__ import annotations
@@ -18,21 +18,26 @@ from loopwright.service.loops.bus_endings import why_over
 from loopwright.tuning.reasons import Ended, Reason, Refused
 
 WATCH_S = 1.5
-"""Time of the controller's clock without our heartbeat, or without PV (at least three sampling periods), after which it
-ends the session. Virtual machines were seen to stand still for 1.3 s."""
+"""Time of the controller's clock without a heartbeat of this service, or without PV (at least three sampling periods),
+after which the controller ends the session, s. Virtual machines were seen to stand still for 1.3 s."""
 LEASE_WALL_S = 3.0
+"""Lease where the plant's clock drives the samples, s of the controller's clock."""
 LEASE_IN_BLOCKS_S = 30.0
+"""Lease where the plant is run in blocks, s of the controller's clock."""
 CONFIRM_S = 10.0
-"""How often the controller is asked whether the session is still open: an SDO, which waits for its turn with others."""
+"""Wall time between two questions to the controller whether the session is still open, s: each is an SDO, which has to
+wait for the node's lock."""
 PV_SILENCE_IN_BLOCKS_S = 60.0
-"""A plant that we hold sends no PV, and a block may wait for a computation."""
+"""Permitted time without PV where the plant is run in blocks, s: a held plant sends none, and a block may wait for a
+computation."""
 OTHERS_S = LEASE_WALL_S + 1.0
-"""How long a session of another tuner may take to end before we begin."""
+"""Longest wait for the end of another tuner's session before the opening, s."""
 SHORTEST_LEASE = 20
+"""Shortest lease, in samples."""
 
 
 def terms(pace: float, sample_time_s: float) -> Lease:
-    """Returns what we pay for at a time. At pace 0 samples say nothing of time."""
+    """Returns the terms of a session. At pace 0 the number of samples says nothing about time."""
     if not pace:
         samples, lease_s, silence_s = FOREVER, LEASE_IN_BLOCKS_S, PV_SILENCE_IN_BLOCKS_S
     else:
@@ -43,23 +48,23 @@ def terms(pace: float, sample_time_s: float) -> Lease:
 
 
 class BusSession:
-    """Opens and keeps the session that this service has on the channel of a connection.
+    """Opens and supervises this service's session on the channel of a connection.
 
-    check_stop_request: called in every wait with what is waited for; raises where somebody wants an end.
+    check_stop_request: called in every wait with its description; raises when the job is asked to stop.
     """
 
     def __init__(self, connection: BusConnection, check_stop_request: Callable[[str], None]) -> None:
         self.number = 0
-        """The number of the session that we have opened last; 0: there is none."""
+        """The number of the session opened last; 0 for none."""
         self.confirmed_at = 0.0
-        """When the controller has last said that the session is open, on the station's clock."""
+        """Time on the station's clock at which the controller last confirmed that the session is open, s."""
         self._connection = connection
         self._station = connection.station
         self._check_stop_request = check_stop_request
         self._session: TunerSession | None = None
         self._lease = Lease(SHORTEST_LEASE, 1, 1, 1)
 
-    # -- the way in
+    # -- the opening
 
     def open(
         self,
@@ -68,20 +73,23 @@ class BusSession:
         sample_time_s: float,
         remember: Callable[[int], None] = lambda session: None,
     ) -> LoopState:
-        """Opens our session and returns home."""
+        """Opens the session and returns the state before the test.
+
+        remember: stores the session's number before it is opened.
+        """
 
         def note(number: int) -> None:
             remember(number)
             self.number = number
 
         self._wait_for_others(tuner)
-        tuner.hold()  # not before: a process before us may have had our node-ID, and its session would hear our beats
+        tuner.hold()  # only now: a dead process may have had this node-ID, and heartbeats would keep its session alive
         self._session = TunerSession(tuner)
         self._lease = terms(pace, sample_time_s)
         try:
             self._session.open(self._lease, note)
         except TunerError as error:
-            if error.kind is FailureKind.ABORT:  # there is no session: nothing to close, nothing to look after
+            if error.kind is FailureKind.ABORT:  # no session was opened, so none has to be closed
                 note(0)
             if error.code == Abort.LOCAL_CONTROL:
                 text = "an RPDO has just moved the set-point: an outer loop, a ramp or a recipe drives it"
@@ -93,12 +101,13 @@ class BusSession:
         tuner.keep(self.number, lambda: self._check_stop_request("while other loops had their turn with the node"))
         tuner.restarted, tuner.session_is_open = False, True
         home = self._connection.reading(tuner).home()
-        if tuner.session_is_open:  # else a hand was on the loop meanwhile, and the status has said so
+        if tuner.session_is_open:  # else the session has ended already, as the status has reported
             tuner.mode, tuner.on_trial, tuner.sp = home.mode, False, home.sp
         return home
 
     def _wait_for_others(self, tuner: Tuner) -> None:
-        """The session of a tuner that has died ends within its lease; that of one that lives is not ours to end."""
+        """Waits for the end of another tuner's session: that of a dead tuner ends within its lease, that of a live one
+        is not to be ended here. Raises Refused(LOOP_IN_USE)."""
         give_up = self._station.monotonic() + OTHERS_S
         while tuner.number("controller_session"):
             if self._station.monotonic() > give_up:
@@ -114,9 +123,9 @@ class BusSession:
         if tuner.number("controller_on_trial"):
             text = "somebody tries other gains by hand: accept them or take them back (2120h), then repeat"
             return Refused(Reason.GAINS_CHANGED, text)
-        return Refused(Reason.LOOP_IN_USE, "another tuner had this loop in the moment of the opening")
+        return Refused(Reason.LOOP_IN_USE, "another tuner had this loop at the moment of the opening")
 
-    # -- on the way
+    # -- during the session
 
     def order(self, tuner: Tuner, order: Order, *values: float) -> None:
         assert self._session is not None
@@ -128,8 +137,8 @@ class BusSession:
             raise
 
     def confirm_if_due(self, tuner: Tuner) -> None:
-        """Asks whether the session is still ours: the tuner renews its lease by frames without an answer, and a status
-        frame that tells of its end may be lost."""
+        """Asks whether the session is still open: renewals are not answered, and a status frame that reports its end
+        may be lost."""
         if self._station.monotonic() - self.confirmed_at < CONFIRM_S:
             return
         assert self._session is not None
@@ -142,18 +151,18 @@ class BusSession:
         self.confirmed_at = self._station.monotonic()
 
     def check_status(self, tuner: Tuner) -> None:
-        """Raises why the session is over, where the tuner has heard so and the controller says so: a status frame from
-        before the opening may come late."""
+        """Raises the reason why the session is over, where a status frame has reported it and the controller confirms
+        it: a status frame from before the opening may come late."""
         if tuner.restarted or not tuner.session_is_open:
             tuner.restarted, tuner.session_is_open = False, True
             if not self.is_open(tuner):
                 raise self.why_over(tuner)
 
     def is_open(self, tuner: Tuner) -> bool:
-        """Asks the controller whether our session is open."""
+        """Asks the controller whether the session is open."""
         return int(tuner.number("controller_session")) == self.number
 
     def why_over(self, tuner: Tuner) -> Ended:
-        """Returns why our session has ended without us."""
+        """Returns why the session has ended without a request of this service."""
         tuner.keep(0)
         return why_over(self._connection.reading(tuner), self.number, self._lease.pv_silence_ms / 1000.0)

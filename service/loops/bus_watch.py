@@ -1,4 +1,4 @@
-"""Whether a bus works: it can be opened, and its CAN controller has not withdrawn from it."""
+"""The check that a bus works: it can be opened, and its CAN controller takes part in the traffic."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ from loopwright.protocol.bus import Bus, BusError, open_bus
 from loopwright.protocol.bus_state import BusState
 
 _LISTENED_TO = "socketcan:"
-"""Its error frames reach who is open when they are sent; a hub has none."""
+"""Kind of bus whose error frames are received: they reach only sockets that are open when they are sent; a hub has
+none."""
 _MAX_FRAMES = 1000
 
 
 class BusWatch:
-    """`check` may be called from any thread. open_bus: the machine's, or a test's."""
+    """Checks one bus; `check` may be called from any thread.
+
+    open_bus: opens the bus; a test replaces it.
+    """
 
     def __init__(self, url: str, open_bus: Callable[[str], Bus] = open_bus) -> None:
         self._url = url
@@ -34,7 +38,9 @@ class BusWatch:
                 self._forget()
                 raise BusError(f"{self._url}: {error.strerror or error}") from error
             except BusError:
-                if self._ear is not None and self._ear.state is not BusState.BUS_OFF:  # only its ear hears the restart
+                if (
+                    self._ear is not None and self._ear.state is not BusState.BUS_OFF
+                ):  # only the open socket receives the restart
                     self._forget()
                 raise
             if self._ear is not None and self._ear.state is BusState.PASSIVE:

@@ -1,4 +1,4 @@
-"""The accepted gains of a controller exchanged for others, if they still are those the decision is about."""
+"""Replacing the accepted gains of a controller, provided that they are still those the decision is about."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from loopwright.tuning.reasons import Failed, Reason
 
 
 class ForeignGains(Conflict):
-    """The controller holds gains that the decision knows nothing of. found: the loop as read, and left."""
+    """Raised when the controller holds gains other than the decision's.
+
+    found: the state of the loop as read; it was not changed.
+    """
 
     def __init__(self, found: LoopState, before: Gains) -> None:
         super().__init__(
@@ -23,11 +26,12 @@ class ForeignGains(Conflict):
 
 
 def replace_accepted(loop: Loop, before: Gains, after: Gains, begun: bool, begin: Callable[[], None]) -> LoopState:
-    """The loop's state, read back with the new gains. Raises ForeignGains, and Failed or Refused as the loop does.
+    """Replaces the accepted gains and returns the state of the loop, read back with the new ones.
 
-    begun: a decision on the same gains was cut off. A controller that holds the new ones then has them from it, and
-    keeps them; with others on trial they are given again.
-    begin: called once, before anything is written; what it raises leaves the loop untouched.
+    begun: an earlier attempt may already have written the gains. A controller that holds the new gains then keeps them;
+    where they are on trial only, they are written again.
+    begin: called once, before anything is written; when it raises, the loop is not changed.
+    Raises ForeignGains, and Failed or Refused as the loop does.
     """
     found = loop.read()
     there = begun and same_gains(found.gains, after)

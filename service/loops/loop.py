@@ -1,4 +1,4 @@
-"""A loop as a plan sees it. Two fillings: `BusLoop` (live, over CANopen) and `RehearsedLoop` (in memory)."""
+"""The interface of a loop. It is implemented by `BusLoop` (live, over CANopen) and `RehearsedLoop` (in memory)."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from loopwright.tuning.reasons import Reason
 
 @dataclass(frozen=True, slots=True)
 class Restored:
-    """A loop after a test, as read back. how: what has ended the test, in words.
+    """A loop after a test, as read back.
 
-    changed: in what it is not as it was found, because of another's hand: each by its name, in words.
+    how: the end of the test, in words.
+    changed: what an operator or another master has changed since the test began: by name, in words.
     """
 
     state: LoopState
@@ -25,17 +26,18 @@ class Restored:
 
 
 class Loop(Protocol):
-    """Pumped by one thread: heartbeat and lease go out while it waits in here, so a hung service loses the loop."""
+    """A loop for one thread: its waits send heartbeat and lease renewals, so a service that hangs loses the loop."""
 
     @property
     def waits(self) -> bool:
-        """The plant stands still between two steps, as a simulated one at full speed does."""
+        """Returns whether the plant stands still between two steps, as a simulated one at full speed does."""
         ...
 
     def read(self, beside_tests: bool = False) -> LoopState:
-        """The present state, read from the controller. Raises Failed(NODE_LOST | BUS_LOST | NODE_NOT_OPERATIONAL).
+        """Returns the present state, read from the controller. Raises Failed(NODE_LOST | BUS_LOST |
+        NODE_NOT_OPERATIONAL).
 
-        beside_tests: while another tuner's session is open, what that comes back to: its test is nobody's choice.
+        beside_tests: while another tuner's session is open, return the state to which it returns, not that of its test.
         """
         ...
 
@@ -44,30 +46,31 @@ class Loop(Protocol):
         stop: Callable[[], Reason | None] = lambda: None,
         remember: Callable[[int], None] = lambda session: None,
     ) -> LoopState:
-        """Opens a session: from here on the controller brings the loop home by itself when we fall silent.
+        """Opens a session: from now on the controller restores the loop by itself when this service falls silent.
 
-        stop: asked while we wait, here and in `step`; what it returns ends the wait as Aborted.
-        remember: writes the number of the session down before it is opened; 0 where it was refused.
-        Returns home, as the controller has noted it.
+        stop: asked during every wait, here and in `step`; a reason that it returns ends the wait as Aborted.
+        remember: stores the number of the session before it is opened; called with 0 where the opening was refused.
+        Returns the state before the test, as the controller has noted it.
         """
         ...
 
     def step(self, commands: Sequence[Command]) -> Sample:
         """Carries out the commands, then returns the next sample. Raises Failed when node, bus or samples are lost, and
-        Aborted when another's hand is on the loop."""
+        Aborted when an operator or another master commands the loop."""
         ...
 
     def restore(self, home: LoopState, session: int | None = None) -> Restored:
-        """Closes the session (ours, or the one that a process before us has opened) and reads the loop back.
+        """Closes the session (of this process, or of an earlier one) and reads the loop back.
 
-        Raises Failed(RESTORE_UNCONFIRMED | NODE_NOT_OPERATIONAL) where it is not home, and nobody else's hand is why.
+        Raises Failed(RESTORE_UNCONFIRMED | NODE_NOT_OPERATIONAL) where the loop differs from its state before the test,
+        and no operator or other master has changed it.
         """
         ...
 
     def accept(self, gains: Gains, instead_of: Gains) -> LoopState:
-        """Makes these gains the accepted set, bumplessly, and reads them back.
+        """Makes these gains the accepted set without a bump, and reads them back.
 
-        Raises Refused(GAINS_CHANGED) where neither these nor `instead_of` are the accepted ones.
+        Raises Refused(GAINS_CHANGED) where neither these gains nor `instead_of` are the accepted ones.
         """
         ...
 

@@ -1,4 +1,4 @@
-"""A loop that remembers what it last showed, so that the API can answer about a loop that a job is using."""
+"""A loop that stores its latest state, so that the API can show a loop that a job is using."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from loopwright.tuning.reasons import Reason
 
 
 class ObservedLoop:
-    """Passes everything on. `latest` is read by other threads: it is replaced whole, never changed."""
+    """Passes all calls on to a loop. Other threads read `latest`: it is replaced as a whole, never changed."""
 
     def __init__(self, loop: Loop) -> None:
         self._loop = loop
@@ -23,7 +23,7 @@ class ObservedLoop:
 
     @property
     def latest(self) -> LoopState | None:
-        """The last known state: read at the start, then kept up with every sample."""
+        """Returns the last known state: read at the start, then updated by every sample."""
         state, sample, trial = self._state, self._sample, self._trial
         if state is None or sample is None:
             return state
@@ -35,7 +35,7 @@ class ObservedLoop:
 
     @property
     def t_s(self) -> float | None:
-        """Plant time of the latest sample, s."""
+        """Returns the plant time of the latest sample, s; None before the first one."""
         return None if self._sample is None else self._sample.t
 
     @property

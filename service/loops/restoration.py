@@ -1,4 +1,5 @@
-"""A loop that a job has left unconfirmed: its session closed, and compared with how the job had found it."""
+"""The restoration of a loop that a job has left unconfirmed: it closes the session and compares the loop with its state
+before the job."""
 
 from __future__ import annotations
 
@@ -26,9 +27,11 @@ _REASONS = {
 
 @dataclass(frozen=True)
 class Restoration:
-    """The loop as read at the end, and what was done and found about it, in words.
+    """The result of a restoration.
 
-    state: None when it could not be read, or is not confirmed to be home.  reason: why a job on it should not go on.
+    state: the loop as read at the end; None when it could not be read, or is not confirmed to be as before the job.
+    text: what was done and found, in words.
+    reason: why a job on this loop should not go on; None where it may.
     """
 
     state: LoopState | None
@@ -37,10 +40,10 @@ class Restoration:
 
 
 def restore_abandoned(loop: Loop, home: LoopState, session: int | None) -> Restoration:
-    """Closes the session of the job if it is still open, and reads the loop back. Raises nothing of the loop's.
+    """Closes the session of the job if it is still open, and reads the loop back. Raises no error of the loop.
 
-    session: its number; None where none was opened, and the job has touched nothing.
-    What another's hand has moved since stays so, and is told.
+    session: its number; None where none was opened, so the job has not touched the loop.
+    Later changes by an operator or another master are reported and stay.
     """
     try:
         restored = loop.restore(home, session or 0)
@@ -56,7 +59,7 @@ def restore_abandoned(loop: Loop, home: LoopState, session: int | None) -> Resto
 
 
 def look(row: JobRow, loops: Mapping[str, LoopConfig], open_loop: Callable[[LoopConfig], Loop]) -> Restoration:
-    """The loop of a job, opened and made safe. Raises nothing: one loop must not keep others from being looked at."""
+    """Opens the loop of a job and restores it. Raises nothing: one loop must not keep others from being restored."""
     config = loops.get(row.loop)
     if config is None:
         return Restoration(None, "the loop is no longer configured here", Reason.SERVICE_STOPPED)

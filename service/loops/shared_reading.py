@@ -1,5 +1,5 @@
-"""One reading of a loop for all who asked before it began: of sixty who ask at once for a node that is silent, each
-would wait for its time-outs behind the others."""
+"""One reading of a loop, shared by all requests that arrived before it began: otherwise sixty requests for a silent
+node would each wait for its time-outs, one after the other."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from loopwright.tuning.reasons import Ended
 T = TypeVar("T")
 
 asked_at: ContextVar[float | None] = ContextVar("asked_at", default=None)
-"""When the request that is answered had arrived, monotonic seconds; None: it has just now."""
+"""Arrival time of the request being answered, monotonic seconds; None for just now."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class _Reading(Generic[T]):
 
 
 class SharedReading(Generic[T]):
-    """`read` of a name, which may take long and raises Ended; may be called from any thread."""
+    """Shares the results of `read`, which takes a name, may take long and raises Ended; for use from any thread."""
 
     def __init__(self, read: Callable[[str], T], wall: Callable[[], float] = time.monotonic) -> None:
         self._read, self._wall = read, wall
@@ -34,7 +34,7 @@ class SharedReading(Generic[T]):
         self._changed = threading.Condition()
 
     def of(self, name: str) -> T:
-        """What was read after the asking, by whomever. Raises what `read` does."""
+        """Returns a reading that was begun after this call, by any thread. Raises what `read` raises."""
         asked = asked_at.get()
         asked = self._wall() if asked is None else asked
         with self._changed:

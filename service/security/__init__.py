@@ -1,1 +1,1 @@
-"""Who may do what over HTTP, how much of it, and the record of what was done."""
+"""API keys, and the identity of the caller of a request."""

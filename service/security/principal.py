@@ -1,4 +1,4 @@
-"""Who is asking, for the whole of a request: set at the door, read where a change is written down."""
+"""The caller of a request: set when the request arrives, read where a change is stored."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ from loopwright.service.security.keys import Scope
 
 @dataclass(frozen=True)
 class Principal:
-    """name: the key's, or what stands for callers without one.  address: of the network, where there is one."""
+    """A caller.
+
+    name: the name of the key, or a general name for callers without one.
+    address: the network address, where there is one.
+    """
 
     name: str
     scope: Scope
@@ -19,8 +23,8 @@ class Principal:
 
 
 SERVICE = Principal("service", Scope.ADMIN)
-"""What the service does by itself, and what is done in its threads."""
+"""The principal of actions of the service itself and of its threads."""
 LOCAL = "local"
-"""Name of callers on this machine where no keys are asked for."""
+"""The name of callers on this machine where no keys are required."""
 
 current: ContextVar[Principal] = ContextVar("principal", default=SERVICE)

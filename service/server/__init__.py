@@ -1,1 +1,1 @@
-"""The live service as a process: put together, started and ended."""
+"""The live service as a process: its assembly, start and end."""

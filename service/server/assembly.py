@@ -1,4 +1,4 @@
-"""The composition root of the jobs: every part is made here, once, and is given what it needs of the others."""
+"""The composition root of the jobs: it makes every part once, and passes each the parts that it needs."""
 
 from __future__ import annotations
 
@@ -32,9 +32,10 @@ def make_jobs(
     resume: bool = True,
     machine: Machine | None = None,
 ) -> Jobs:
-    """Makes the jobs of this host's loops, not started yet.
+    """Makes the jobs of this host's loops, without starting them.
 
-    buses: what is configured for them.  resume: whether jobs that a dead service left go on at the next start.
+    buses: the configuration of their buses.
+    resume: whether jobs of a dead service are resumed at the next start.
     machine: clock and threads.
     """
     machine = machine or Machine()

@@ -1,4 +1,4 @@
-"""The live service put together: configuration, store, jobs on the bus, HTTP server."""
+"""The live service: configuration, store, jobs on the bus, and HTTP server together."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ _log = logging.getLogger(__name__)
 
 
 class _Server(uvicorn.Server):
-    """Says when it is ready. Signals are not its own: it would raise each of them again after its shutdown, and take a
-    second SIGINT for leave to break off."""
+    """An HTTP server that prints when it is ready. It does not handle signals: uvicorn would raise each signal again
+    after its shutdown, and take a second SIGINT as permission to abort."""
 
     def __init__(self, config: uvicorn.Config, jobs: Jobs) -> None:
         super().__init__(config)
@@ -80,7 +80,7 @@ class _Server(uvicorn.Server):
 
 
 def tell_systemd(state: str) -> None:
-    """sd_notify: says where we are to a unit of Type=notify; nothing where there is none."""
+    """Reports a state to systemd by sd_notify, for a unit of Type=notify; does nothing without one."""
     address = os.environ.get("NOTIFY_SOCKET")
     if address:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify, suppress(OSError):
@@ -88,8 +88,8 @@ def tell_systemd(state: str) -> None:
 
 
 def _load() -> None:
-    """Has the jobs find everything there: one that imports what it needs, and a full collection of all that is loaded,
-    which lets no thread run, hold up the loops of the others (seconds, and 0.1 s of processor each time)."""
+    """Imports all modules that jobs need and runs a full garbage collection beforehand: done in a job, either would
+    block all threads and delay the loops of the others (by seconds, and by 0.1 s of processor time each)."""
     import loopwright.service.loops.bus_loop
     import loopwright.tuning.fast.design_trial
     import loopwright.tuning.five_stage.procedure  # noqa: F401
@@ -99,7 +99,7 @@ def _load() -> None:
 
 
 def open_bus_loop(station: Station, config: LoopConfig) -> Loop:
-    """The live loop of a configuration."""
+    """Returns the live loop of a configuration."""
     from loopwright.service.loops.bus_loop import BusLoop
 
     return BusLoop(
@@ -113,19 +113,23 @@ def open_bus_loop(station: Station, config: LoopConfig) -> Loop:
 
 
 class NotSafe(Exception):
-    """What was asked for would open the plant to the network; the text says what to do instead."""
+    """Raised when the options would open the plant to the network; the text says what to do instead."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """How the service is run. database: a PostgreSQL URL, or None for a file in the data folder.
+    """The options of the service.
 
-    bind: the address to listen on.  host: this host's name among those that share the database.
-    resume: jobs that a dead service left go on.  poll_s: how often the engine looks for jobs, s of wall time.
-    keep: whose samples are kept.  computing: what one computation may take.
-    node: our node-ID on every bus, another one than any other gateway's.
-    auth: whether keys are asked for; None: unless the address is this machine's own.
-    trusted_proxies: addresses and networks whose word on whom they ask for is taken (X-Forwarded-For, -Proto).
+    bind: the address to listen on.
+    database: a PostgreSQL URL, or None for a file in the data folder.
+    host: this host's name among those that share the database.
+    resume: whether jobs of a dead service are resumed.
+    poll_s: wall time between two queries of the engine for jobs, s.
+    node: this service's node-ID on every bus, different from every other gateway's.
+    auth: whether keys are required; None: unless the address is this machine's own.
+    keep: which samples are kept.
+    computing: the limits of one computation.
+    trusted_proxies: addresses and networks whose X-Forwarded-For and -Proto headers are trusted.
     """
 
     loops_file: Path
@@ -146,13 +150,14 @@ class Setup:
 
 
 def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None = None) -> None:
-    """Serves until SIGTERM or SIGINT; every loop is restored before it returns. tune: by default computed by a pool.
+    """Serves until SIGTERM or SIGINT; every loop is restored before it returns.
 
-    Raises ConfigError, FolderInUse, ForeignLoop, BadDatabase, NotSafe, OSError (the address cannot be had),
+    tune: runs the procedure on a loop; by default it computes in a pool.
+    Raises ConfigError, FolderInUse, ForeignLoop, BadDatabase, NotSafe, OSError (the address cannot be used),
     SQLAlchemyError (the database cannot be reached).
     """
     logs.configure(setup.log_format)
-    # python-can's socketcand client warns of every frame that TCP splits, which is what TCP does.
+    # python-can's socketcand client warns about every frame that TCP splits, although TCP may split any.
     logging.getLogger("can").setLevel(logging.ERROR)
     site = load_site(setup.loops_file)
     site.check_own_node(setup.node, str(setup.loops_file))
@@ -164,13 +169,13 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
     descriptors = raise_descriptor_limit()
     with ExitStack() as stack:
         signals = stack.enter_context(Signals())
-        # Bound before anything is started or opened: a port that is taken is one sentence and not half a service.
+        # Bound before anything is started or opened: a port in use then gives one sentence, not a half-started service.
         listener = stack.enter_context(listen(setup.bind, setup.port))
         pool = stack.enter_context(closing(Pool(setup.computing)))
         if tune is None:
             pool.submit(
                 ComputationKind.LIVE, os.getpid
-            )  # loads the fork server: the first computation of a loop is not to wait
+            )  # loads the fork server, so that the first computation of a loop does not wait
         store = stack.enter_context(closing(Store(setup.data, setup.database, setup.host or LOCAL)))
         keyring = Keyring(store.engine) if setup.auth or not local else None
         if keyring is not None and not keyring.any_valid():
@@ -199,7 +204,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         server = _Server(server_config(app, setup, listener, descriptors), jobs)
 
         def end() -> None:
-            """Open event streams end with their jobs: the server, which waits for its connections, waits for them."""
+            """Ends jobs and server: the server waits for its connections, and event streams end with their jobs."""
             tell_systemd("STOPPING=1")
             jobs.request_stop()
             server.should_exit = True
@@ -213,7 +218,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
 
 
 def _awaited(jobs: Jobs) -> str:
-    """What the end of the service waits for."""
+    """Returns what the end of the service waits for, in words."""
     under_test = [f"{tag} (job {job_id})" for job_id, tag in jobs.under_test().items()]
     if not under_test:
         return "no loop is under test, connections and the database are being closed"
@@ -221,9 +226,9 @@ def _awaited(jobs: Jobs) -> str:
 
 
 def server_config(app: FastAPI, setup: Setup, listener: Listener, descriptors: int) -> uvicorn.Config:
-    """The HTTP server: whose word it takes on whom it serves, and how many connections of which kind it keeps.
+    """Returns the configuration of the HTTP server: the proxies it trusts, and its limits of connections by kind.
 
-    descriptors: file descriptors of this process.
+    descriptors: number of file descriptors of this process.
     """
     logging.getLogger("uvicorn.error").addFilter(_ONCE_A_MINUTE)
     connections = Connections(setup.limits, descriptors, partial(_is_of, setup.trusted_proxies))
@@ -254,12 +259,12 @@ def _is_of(networks: Sequence[IPv4Network | IPv6Network], address: str) -> bool:
 
 
 def listen(bind: str, port: int) -> Listener:
-    """The listening socket. Raises OSError."""
+    """Returns the listening socket. Raises OSError."""
     family = socket.AF_INET6 if ":" in bind else socket.AF_INET
     listener = Listener(socket.create_server((bind, port), family=family, reuse_port=False).detach())
-    # asyncio sets it only where a socket names its protocol; without it an answer waits 40 ms for the client's ACK.
+    # asyncio sets this only for a socket with a protocol; otherwise an answer waits 40 ms for the client's ACK.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    # The kernel hands a connection over with what its client says, or after a second in silence: those that say nothing
-    # can be told from those that are about to.
+    # The kernel passes a connection on with the client's first data, or after a second of silence, so that silent
+    # connections can be distinguished from those that are about to send.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, 1)
     return listener

@@ -1,4 +1,4 @@
-"""SIGTERM and SIGINT, from the start of the service until all of it has ended."""
+"""The handling of SIGTERM and SIGINT, from the start of the service until all of it has ended."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ _log = logging.getLogger(__name__)
 
 
 class Signals:
-    """The first signal asks the service to end. A further one hurries nothing, for loops are being restored: the log
-    says what is waited for. Once everything has ended, a further one ends the process, which is a success still."""
+    """Handles the signals: the first asks the service to end. A further one does not shorten the end, because loops are
+    being restored; the log says what the service waits for. Once everything has ended, a further one ends the process,
+    with success."""
 
     def __init__(self) -> None:
         self._asked = False
         self._end: Callable[[], None] = lambda: None
-        # A signal comes in the middle of anything: a log has locks, this queue has none.
+        # A signal may interrupt any code: logging uses locks, this queue uses none.
         self._heard: SimpleQueue[int | None] = SimpleQueue()
         self._reporter: threading.Thread | None = None
 
@@ -39,7 +40,10 @@ class Signals:
             signal.signal(each, _leave if self._asked else handler)
 
     def tell(self, end: Callable[[], None], awaited: Callable[[], str]) -> None:
-        """Calls `end` when a signal comes, or has come. awaited: what the end of the service waits for, in words."""
+        """Calls `end` when a signal comes, or has come already.
+
+        awaited: returns what the end of the service waits for, in words.
+        """
         self._end = end
         self._reporter = threading.Thread(target=self._report, args=(awaited,), name="signals", daemon=True)
         self._reporter.start()
@@ -64,5 +68,5 @@ class Signals:
 
 
 def _leave(_signal: int, _frame: FrameType | None) -> None:
-    """Nothing of the service is left: whatever keeps the interpreter from its end, nobody has to wait for it."""
+    """Ends the process at once: the service has ended, whatever may still delay the interpreter."""
     os._exit(0)

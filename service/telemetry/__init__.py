@@ -1,1 +1,1 @@
-"""What the service tells of itself: logs, counters, how late it is."""
+"""The service's information about itself: logs, counters, delays."""

@@ -1,6 +1,6 @@
-"""How late the event loop is: whatever it is busy with, every other request and stream waits for.
+"""The lateness of the event loop: while it is busy, every other request and stream waits.
 
-A task asks to be woken every 10 ms and sees when it is. Nothing that a request does should hold the loop for 50 ms.
+A task asks to be woken every 10 ms and measures how late it is. No request should block the loop for 50 ms.
 """
 
 from __future__ import annotations
@@ -16,21 +16,22 @@ from loopwright.service.telemetry.metrics import LATE_SECONDS, LATEST_SECONDS
 log = logging.getLogger(__name__)
 
 EVERY_S = 0.01
+"""Wall time between two measurements, s."""
 MAX_S = 0.05
-"""Later than this is told, once a minute at most."""
+"""Lateness above which a warning is logged, at most once a minute, s."""
 _MINUTE_S = 60.0
 
 
 class Lateness:
-    """The worst of the last minute, and when it is time to tell of it. Times are monotonic seconds."""
+    """The largest lateness of the last minute, and when to log it. Times are monotonic seconds."""
 
     def __init__(self) -> None:
-        # Second by second: a minute has sixty entries, whatever happens in it.
+        # The worst of each second, so that a minute has sixty entries.
         self._worst: dict[int, float] = {}
         self._told: float | None = None
 
     def note(self, late_s: float, at_s: float) -> float | None:
-        """Takes a measurement. What is to be told now, s: the worst of the last minute, or None."""
+        """Takes a measurement, s. Returns the lateness to log now, the worst of the last minute in s, or None."""
         second = int(at_s)
         if second not in self._worst:
             for past in [past for past in self._worst if past <= at_s - _MINUTE_S]:
@@ -43,14 +44,14 @@ class Lateness:
         return self.worst_s(at_s)
 
     def worst_s(self, at_s: float) -> float:
-        """The worst of the last minute, s. For any thread: the numbers are copied first."""
+        """Returns the worst of the last minute, s. Any thread may call it, because the numbers are copied first."""
         recent = [late for second, late in list(self._worst.items()) if second > at_s - _MINUTE_S]
         return max(recent, default=0.0)
 
 
 @asynccontextmanager
 async def watched_event_loop() -> AsyncIterator[None]:
-    """Measures the running event loop, for /metrics and the log, as long as it is open."""
+    """Measures the running event loop, for /metrics and the log, until the context ends."""
     watch = asyncio.create_task(_watch(Lateness()), name="event loop watch")
     try:
         yield

@@ -1,6 +1,6 @@
 """Logs on standard error: lines for people, or one JSON object a line, with the job and loop they are about.
 
-No key gets in: headers are never logged, and what looks like a key is struck out of every line.
+No API key is logged: headers are never logged, and text that looks like a key is removed from every line.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from loopwright.service.store.clock import stamp
 
 LogFormat = Literal["text", "json"]
 FIELDS = ("job", "loop", "request", "who", "method", "path", "status", "ms", "address")
-"""What a line may carry besides its message: from `about`, or from `extra`."""
+"""The fields that a line may have besides its message: from `about`, or from `extra`."""
 
 _about: ContextVar[Mapping[str, Any]] = ContextVar("about", default=MappingProxyType({}))
 
 
 @contextmanager
 def about(**fields: Any) -> Iterator[None]:
-    """Every line logged inside carries these fields."""
+    """Adds these fields to every line logged in this context."""
     token = _about.set({**_about.get(), **fields})
     try:
         yield
@@ -36,7 +36,7 @@ def about(**fields: Any) -> Iterator[None]:
 
 
 def configure(log_format: LogFormat, level: int = logging.INFO) -> None:
-    """The whole process logs this way from now on."""
+    """Sets the form of the logs for the whole process."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonLines() if log_format == "json" else Lines())
     logging.basicConfig(level=level, handlers=[handler], force=True)
@@ -45,18 +45,18 @@ def configure(log_format: LogFormat, level: int = logging.INFO) -> None:
 
 
 def fields_of(record: logging.LogRecord) -> dict[str, Any]:
-    """The known fields of a record, its own first."""
+    """Returns the known fields of a record; its own ones take precedence."""
     found = {**_about.get(), **{name: getattr(record, name) for name in FIELDS if hasattr(record, name)}}
     return {name: found[name] for name in FIELDS if found.get(name) is not None}
 
 
 def without_keys(text: str) -> str:
-    """The text with the secret part of every API key struck out."""
+    """Returns the text without the secret part of any API key."""
     return KEY_PATTERN.sub(r"lw_\1_***", text)
 
 
 class JsonLines(logging.Formatter):
-    """One JSON object a line."""
+    """Formats a record as one JSON object on one line."""
 
     def format(self, record: logging.LogRecord) -> str:
         line = {
@@ -72,8 +72,8 @@ class JsonLines(logging.Formatter):
 
 
 class Lines(logging.Formatter):
-    """For people: time, level, message, then the fields as name=value. Lines of a traceback are indented: what begins
-    at the margin is an entry, whatever a caller has put into a path or a name."""
+    """Formats a record for people: time, level, message, then the fields as name=value. Lines of a traceback are
+    indented, so that every line without an indent is an entry, whatever text a caller has put into a path or a name."""
 
     def format(self, record: logging.LogRecord) -> str:
         at = stamp(datetime.fromtimestamp(record.created, UTC))
@@ -85,14 +85,14 @@ class Lines(logging.Formatter):
 
 
 def escaped(text: str) -> str:
-    """The text with every character that ends a line, is not seen or turns the direction of writing as its \\-sequence:
-    a name that somebody has chosen stays on its line of the log."""
+    """Returns the text with every character that ends a line, is invisible or changes the direction of writing as its
+    \\-sequence, so that a caller's text stays on its line of the log."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def _one_word(value: str) -> str:
-    """In quotes where it would otherwise read as several fields."""
+    """Returns the value in quotes where it would otherwise read as several fields."""
     value = escaped(value)
     return '"' + value.replace('"', r"\"") + '"' if any(c in value for c in ' "=') else value

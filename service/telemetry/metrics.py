@@ -1,4 +1,4 @@
-"""What is counted in this process. `api.metrics` shows it, with what the store knows."""
+"""The counters of this process. `api.metrics` shows them together with figures from the store."""
 
 from __future__ import annotations
 
@@ -25,12 +25,14 @@ REQUEST_SECONDS = Histogram(
 IN_FLIGHT = Gauge("loopwright_http_requests_in_flight", "Requests being answered", registry=None)
 LATE_SECONDS = Histogram(
     "loopwright_event_loop_late_seconds",
-    "How late the event loop came back to who had asked it to, s",
+    "Lateness of the event loop when it resumes a task, s",
     buckets=(0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 3),
     registry=None,
 )
 LATEST_SECONDS = Gauge(
-    "loopwright_event_loop_late_worst_seconds", "The worst of that in the last minute, s", registry=None
+    "loopwright_event_loop_late_worst_seconds",
+    "Largest lateness of the event loop in the last minute, s",
+    registry=None,
 )
 
 CLOCK_JUMPS = Counter(

@@ -1,7 +1,7 @@
-"""Long computations in processes of their own: the interpreter of the service is for the bus and the requests.
+"""Long computations in processes of their own, so that the service's interpreter is free for the bus and the requests.
 
-limits.py      what one computation may take
-child.py       what runs in the process of a computation
-preload.py     what every such process finds loaded
-pool.py        whose turn it is, and what becomes of a computation that ends otherwise
+limits.py      limits of one computation
+child.py       the program of a computation's process
+preload.py     modules that every such process finds loaded
+pool.py        the order of the computations, and the handling of failed ones
 """

@@ -1,6 +1,6 @@
-"""What runs in the process of one computation: it keeps to its limits, pauses when told to, and ends with the service.
+"""The program of one computation's process: it keeps to its limits, pauses on request, and ends with the service.
 
-Messages to the service are pairs of a `Said` and a value; messages from the service are one of PAUSE and GO_ON.
+Messages to the service are pairs of a `Said` and a value; messages from the service are PAUSE or GO_ON.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from loopwright.service.execution.computing.limits import MB
 
 PAUSE, GO_ON = b"pause", b"go on"
 _FIRST_TO_DIE = "500"
-"""Of the system when it has no memory left: rather a computation than the service."""
+"""Value of oom_score_adj: when the system has no memory left, it ends a computation before the service."""
 
 
 class Said(Enum):
-    """What a message of a computation says of its value."""
+    """The meaning of the value in a message of a computation."""
 
     REPORT = auto()
     RESULT = auto()
@@ -38,15 +38,19 @@ class Said(Enum):
 def compute(
     connection: Connection, work: Callable[..., Any], reports: bool, cpu_s: float, memory_mb: int, niceness: int
 ) -> None:
-    """The process. reports: `work` is called with a function that takes what it reports on its way."""
+    """Runs a computation; it is the main function of the process.
+
+    reports: whether `work` is called with a function that takes intermediate reports.
+    cpu_s, memory_mb, niceness: limits of processor time (s) and memory (MB), and the priority.
+    """
     _keep_to(cpu_s, memory_mb, niceness)
-    warnings.simplefilter("ignore")  # of overflows and the like: the result says what came of them
+    warnings.simplefilter("ignore")  # overflows and the like show in the result
     attendant = _Attendant(connection)
     attendant.start()
     try:
         value = work(lambda report: attendant.send(Said.REPORT, report)) if reports else work()
         message: tuple[Said, Any] = (Said.RESULT, value)
-    except (MemoryError, SystemError):  # SystemError: of the interpreter itself where memory was refused
+    except (MemoryError, SystemError):  # the interpreter raises SystemError where memory was refused
         message = (Said.NO_MEMORY, None)
     except BaseException as error:
         message = (Said.ERROR, error)
@@ -60,10 +64,11 @@ def compute(
 
 
 def _keep_to(cpu_s: float, memory_mb: int, niceness: int) -> None:
-    """The kernel ends the process by SIGXCPU at the end of its processor time, and refuses memory beyond the limit.
+    """Sets the limits: the kernel ends the process by SIGXCPU at the end of its processor time, and refuses memory
+    beyond the limit.
 
-    RLIMIT_DATA: all private memory that is asked for, whether it is in use yet or not. RLIMIT_AS would count what is
-    only mapped too (libraries, reserved stacks); a measured RSS would be looked at when the machine has none left.
+    RLIMIT_DATA counts all private memory that is requested, in use or not. RLIMIT_AS would also count memory that is
+    only mapped (libraries, reserved stacks); a measured RSS would be checked only when the machine has no memory left.
     """
     os.setpriority(os.PRIO_PROCESS, 0, max(niceness, os.getpriority(os.PRIO_PROCESS, 0)))
     _lower(resource.RLIMIT_CORE, 0)
@@ -80,15 +85,15 @@ def _lower(which: int, limit: int) -> None:
 
 
 def _data_bytes() -> int:
-    """What this process has of what RLIMIT_DATA counts."""
+    """Returns the memory of this process that RLIMIT_DATA counts, bytes."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmData:"))
 
 
 class _Attendant(threading.Thread):
-    """Hears the service beside the computation, which is in the main thread and is stopped there by a signal's handler.
+    """Listens to the service while the main thread computes; a signal handler pauses the main thread.
 
-    SIGSTOP would hold this thread, too: what is stopped could not end with a service that is killed.
+    SIGSTOP would stop this thread too, and a stopped process could not end with a service that is killed.
     """
 
     def __init__(self, connection: Connection) -> None:
@@ -100,7 +105,8 @@ class _Attendant(threading.Thread):
         signal.signal(signal.SIGUSR1, self._hold)
 
     def send(self, said: Said, value: object) -> None:
-        """In the main thread. It pauses before a message or behind it: who has half of one waits for the rest."""
+        """Sends a message, in the main thread. A pause falls before or after a message, never within one: the receiver
+        would wait for the rest."""
         self._sending = True
         try:
             self._connection.send((said, value))
@@ -117,7 +123,7 @@ class _Attendant(threading.Thread):
                 else:
                     self._may_run.set()
         except (EOFError, OSError):
-            os._exit(0)  # the service is gone, or wants no result any more
+            os._exit(0)  # the service is gone, or no longer needs the result
 
     def _hold(self, _signal: int, _frame: FrameType | None) -> None:
         if not self._sending:

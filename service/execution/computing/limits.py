@@ -1,4 +1,4 @@
-"""What one computation may take of the machine, by its kind."""
+"""Limits of one computation, by its kind."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 MAX_AT_ONCE = 4
+"""Largest number of computations that run at the same time."""
 MB = 1 << 20
 
 
 class ComputationKind(IntEnum):
-    """What is computed. The least goes first: the others pause while it needs a processor."""
+    """The kinds of computation. The lowest value goes first: the others pause while it needs a processor."""
 
     LIVE = 0
     TUNING = 1
@@ -33,10 +34,11 @@ MEMORY_OPTION = "--computation-memory-mb"
 
 @dataclass(frozen=True)
 class ComputingLimits:
-    """cpu_s: processor time of one computation, s. It is processor time, not wall time: a computation that pauses, or
-    that other programs of the machine hold up, is not nearer to its limit for that.
+    """The limits of one computation.
 
-    memory_mb: what one computation may ask of the system beyond the 100 MB or so that all of them share, MB (2^20 B).
+    live_cpu_s, tuning_cpu_s, dry_run_cpu_s: processor time by kind, s. Times in which a computation pauses or other
+    programs hold it up do not count.
+    memory_mb: memory beyond the 100 MB or so that all computations share, MB (2^20 bytes).
     """
 
     live_cpu_s: int = 120
@@ -53,6 +55,6 @@ class ComputingLimits:
 
 
 def at_once() -> int:
-    """How many computations this machine does at once: one processor is left for the bus and the requests."""
+    """Returns how many computations this machine runs at once: one processor is left for the bus and the requests."""
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min(MAX_AT_ONCE, usable - 1))

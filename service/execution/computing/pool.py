@@ -1,9 +1,9 @@
-"""Whose turn it is to compute, and what becomes of a computation that does not come to its end.
+"""The order of the computations, and the handling of a computation that fails.
 
-Each computation has a process of its own, forked from a fork server that has everything loaded (about 10 ms; a process
-made by spawn would load for more than a second, one forked from the service would have its sockets and database). What
-is kept elsewhere does not do: concurrent.futures cannot end one computation alone, pebble and loky know no reports on
-the way, no order of precedence, no pause and no limit of memory.
+Each computation has a process of its own, forked from a fork server that has everything loaded (about 10 ms; a spawned
+process would load for more than a second, and one forked from the service would inherit its sockets and database). The
+known libraries do not fit: concurrent.futures cannot end a single computation; pebble and loky have no intermediate
+reports, priorities, pauses or memory limits.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from loopwright.tuning.reasons import Failed, Reason
 
 NICE = {ComputationKind.LIVE: 5, ComputationKind.TUNING: 10, ComputationKind.DRY_RUN: 10}
 _LOOK_S, _LOOK_WAITING_S = 0.1, 0.5
-"""Wall time between two looks whether a computation is still wanted, one that runs and one that waits for its turn:
-fifty loops may wait at once, and each look takes the interpreter."""
+"""Wall time between two checks whether a running computation, or one that waits for its turn, is still wanted, s: fifty
+loops may wait at once, and each check takes the interpreter."""
 _TRIES = 2
 _AGAIN_S = 0.2
 _CLOSE_S = 30.0
@@ -44,26 +44,26 @@ _KEPT_AWAY = {signal.SIGINT, signal.SIGTERM}
 
 _log = logging.getLogger(__name__)
 _bookkeeping = threading.Lock()
-"""multiprocessing keeps its processes in a set of the module."""
+"""Guards multiprocessing's set of processes, which is a module variable."""
 
 
 class NotWanted(Exception):
-    """Nobody waits for the result any more: the computation was ended, or never begun."""
+    """Raised when the result is no longer wanted: the computation was ended, or not started."""
 
 
 class NoProcess(Failed):
-    """The system gives no process."""
+    """Raised when the system provides no process."""
 
 
 class _Died(Exception):
-    """The process ended without a word."""
+    """Raised when the process ended without a message."""
 
     def __init__(self, exitcode: int | None) -> None:
         self.exitcode = exitcode
 
 
 class _Place:
-    """The place of a computation in the order. Everything but `turn` is guarded by the pool."""
+    """The place of a computation in the order. The pool guards all of it except `turn`."""
 
     def __init__(self, rank: tuple[ComputationKind, int]) -> None:
         self.rank = rank
@@ -80,15 +80,16 @@ class _Place:
         self.tell()
 
     def tell(self) -> None:
-        """Lets the process know, if there is one."""
+        """Tells the process, if there is one, whether it may run."""
         if self.control is not None:
-            with suppress(OSError):  # it has just ended
+            with suppress(OSError):  # the process has just ended
                 self.control.send_bytes(GO_ON if self.turn.is_set() else PAUSE)
 
 
 class Pool:
-    """At most so many computations run at once: the best by kind, then by age. Others wait, or pause until then.
+    """Runs at most `max_workers` computations at once, ordered by kind, then by age. The others wait or pause.
 
+    limits: limits of one computation.
     max_workers: at_once() by default.
     """
 
@@ -110,10 +111,10 @@ class Pool:
         hear: Callable[[Any], None] | None = None,
         unwanted: Callable[[], bool] = lambda: False,
     ) -> Any:
-        """The result of the work, waited for here; raises what it raises.
+        """Waits for the work and returns its result, or raises its error.
 
-        hear: the work is called with a function, and what it gives that is given to this one, here.
-        unwanted: asked some times a second; once true, the computation is ended and NotWanted raised.
+        hear: receives, in this thread, each value that the work passes to the function it is called with.
+        unwanted: asked several times a second; when it returns True, the computation is ended and NotWanted raised.
         Raises Failed(COMPUTATION_LIMIT | COMPUTATION_LOST), NoProcess.
         """
         with self._place(kind) as place:
@@ -132,15 +133,15 @@ class Pool:
                     if last == _TRIES or heard.anything:
                         text = f"the process of {WORDS[kind]} was killed (exit {died.exitcode})"
                         raise Failed(Reason.COMPUTATION_LOST, text) from None
-                    _log.warning("the process of %s was killed, it is computed once more", WORDS[kind])
+                    _log.warning("the process of %s was killed, the computation is repeated", WORDS[kind])
         raise AssertionError("every try returns or raises")
 
     def submit(
         self, kind: ComputationKind, work: Callable[[], Any], unwanted: Callable[[], bool] = lambda: False
     ) -> Future[Any]:
-        """The same in a thread of its own, for who does not wait."""
+        """Runs the work as `run` does, in a thread of its own, and returns its future at once."""
         future: Future[Any] = Future()
-        future.set_running_or_notify_cancel()  # it is ended by `unwanted` alone
+        future.set_running_or_notify_cancel()  # only `unwanted` ends it
 
         def wait() -> None:
             try:
@@ -158,7 +159,7 @@ class Pool:
             if not self._changed.wait_for(lambda: not self._places, _CLOSE_S):
                 _log.error("%d computations have not ended in %.0f s", len(self._places), _CLOSE_S)
 
-    # -- whose turn it is
+    # -- the order
 
     @contextmanager
     def _place(self, kind: ComputationKind) -> Iterator[_Place]:
@@ -176,7 +177,7 @@ class Pool:
 
     def _arrange(self) -> None:
         self._places.sort(key=lambda place: place.rank)
-        for n, place in reversed(list(enumerate(self._places))):  # who has to pause is told first
+        for n, place in reversed(list(enumerate(self._places))):  # those that have to pause first
             place.set_turn(n < self._max_workers)
 
     def _check(self, unwanted: Callable[[], bool]) -> None:
@@ -219,7 +220,8 @@ class Pool:
     def _process(
         self, kind: ComputationKind, work: Callable[..., Any], place: _Place, reports: bool
     ) -> Iterator[tuple[ForkServerProcess, Connection]]:
-        """Whatever ends it in here, the process is gone behind it. Raises NoProcess, and what pickling raises."""
+        """Yields the process and its connection; the process is ended with the context. Raises NoProcess, and the
+        errors of pickling."""
         limits = self.limits.cpu_s(kind), self.limits.memory_mb, NICE[kind]
         try:
             connection, theirs = multiprocessing.Pipe()
@@ -237,7 +239,7 @@ class Pool:
             try:
                 with self._changed:
                     place.control = connection
-                    if not place.turn.is_set():  # it was lost while the process was made
+                    if not place.turn.is_set():  # the turn was lost while the process was started
                         place.tell()
                 yield process, connection
             finally:
@@ -251,7 +253,10 @@ class Pool:
 
 
 class _Heard:
-    """Reports on their way to who hears them. anything: there was one, so that the work cannot begin anew."""
+    """Passes reports on to `hear`.
+
+    anything: whether there was a report, so that the work cannot be repeated.
+    """
 
     def __init__(self, hear: Callable[[Any], None] | None) -> None:
         self.wanted = hear is not None
@@ -270,7 +275,8 @@ def _no_process(kind: ComputationKind, error: Exception) -> NoProcess:
 
 
 def _start(process: ForkServerProcess) -> None:
-    """Raises OSError, and EOFError where the fork server has died: it is made anew with the next process."""
+    """Starts a process. Raises OSError, and EOFError where the fork server has died: the next start creates a new
+    one."""
     for last_try in (False, False, True):
         try:
             with _bookkeeping, _signals_kept_away():
@@ -284,9 +290,9 @@ def _start(process: ForkServerProcess) -> None:
 
 @contextmanager
 def _signals_kept_away() -> Iterator[None]:
-    """The fork server and all that it forks never get a SIGINT or SIGTERM to the whole group: what these end, the
-    service ends. A process that is started has the mask of the thread that starts it."""
-    resource_tracker.ensure_running()  # it would lift the mask
+    """Blocks SIGINT and SIGTERM for the fork server and its children, so that a signal to the process group ends only
+    the service, which then ends them. A new process inherits the mask of the thread that starts it."""
+    resource_tracker.ensure_running()  # started here, because it would reset the mask
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _KEPT_AWAY)
     try:
         yield

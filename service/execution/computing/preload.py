@@ -1,11 +1,11 @@
-"""What the fork server loads before it forks: imported there, so that no computation has to wait for it."""
+"""The modules that the fork server imports before it forks, so that no computation has to wait for an import."""
 
 import gc
 import os
 from importlib import import_module
 
 LOADED = (
-    "scipy.signal",  # tuning imports it when it first needs it
+    "scipy.signal",  # tuning imports it at its first use
     "loopwright.service.jobs.alternatives",
     "loopwright.service.cli.main",  # the script `loopwright` imports it, and each process imports what the script does
     "loopwright.service.execution.rehearsals",
@@ -16,8 +16,8 @@ LOADED = (
     "loopwright.tuning.five_stage.procedure",
 )
 
-# Before numpy is loaded: a computation takes one processor, and a process with threads should not be forked.
+# Set before numpy is imported: a computation uses one processor, and a process with threads should not be forked.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 for name in LOADED:
     import_module(name)
-gc.freeze()  # what is here stays, and stays shared: no collection writes to it
+gc.freeze()  # the objects loaded so far stay shared, because no collection writes to them

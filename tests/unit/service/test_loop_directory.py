@@ -4,8 +4,8 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 from loopwright.service.jobs.loop_directory import LoopDirectory
-from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.machine import Machine
+from loopwright.service.jobs.registry import Registry
 from tests.unit.service.fakes import TAG, FakeLoop, Service
 
 
