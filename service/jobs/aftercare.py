@@ -70,7 +70,7 @@ class Aftercare:
     def __init__(self, directory: LoopDirectory, store: Store, machine: Machine) -> None:
         self._directory, self._store = directory, store
         self._machine = machine
-        self._clock = self._machine.monotonic
+        self.clock = self._machine.monotonic
         self._again: dict[str, _Again] = {}
         # Apart from the event: a signal handler sets it.
         self._stopping = False
@@ -79,6 +79,10 @@ class Aftercare:
 
     def start(self) -> None:
         self._thread.start()
+
+    @property
+    def is_running(self) -> bool:
+        return self._thread.is_alive()
 
     def request_stop(self) -> None:
         """Looks at nothing more; what is not home is looked at after the next start. Returns at once."""
@@ -123,7 +127,7 @@ class Aftercare:
         rows = looked_after.rows(self._store)
         for gone in self._again.keys() - {row.id for row in rows}:
             del self._again[gone]
-        now = self._clock()
+        now = self.clock()
         due = [row for row in rows if row.id not in self._again or self._again[row.id].at <= now]
         if len(due) < 2:
             for row in due:
@@ -154,7 +158,7 @@ class Aftercare:
         wait_s = EVERY_S if before is None else min(LONGEST_S, 2.0 * before.wait_s)
         if before is None or before.found.reason is not found.reason:
             log.warning("%s; it is looked at again", found.text)
-        self._again[row.id] = _Again(self._clock() + wait_s, wait_s, found)
+        self._again[row.id] = _Again(self.clock() + wait_s, wait_s, found)
 
     def _run(self) -> None:
         while not self._stopping:

@@ -186,7 +186,7 @@ class Fleet:
             with self._store.writing() as session:
                 retunes.stop(session, row.id, StopReason.FAILURES, f"{failures} ended without a proposal: {named}")
         elif row.stop_reason is None:
-            self._begin(row, request, parts)
+            self.begin(row, request, parts)
         elif row.stop_reason == StopReason.OPERATOR:
             self._abort(row, parts)
         row, parts = self.get(row.id)
@@ -195,7 +195,7 @@ class Fleet:
             with self._store.writing() as session:
                 retunes.end(session, row.id)
 
-    def _begin(self, row: RetuneRow, request: FleetRequest, parts: Sequence[Part]) -> None:
+    def begin(self, row: RetuneRow, request: FleetRequest, parts: Sequence[Part]) -> None:
         """Begins the loops that wait, in order, as far as bus and area have room for more under test, by whomever."""
         known, options = self._known(), request.options()
         under_test = {part.loop for part in parts if part.active}

@@ -42,7 +42,7 @@ class Progress:
         """A copy at that plant time, or as it is where it is later already; None: as it is."""
         found = copy(self)
         if t_s is not None:
-            found.at(max(t_s, found._now_s))
+            found.at(max(t_s, self._now_s))
         return found
 
     @property

@@ -26,17 +26,17 @@ class Lateness:
 
     def __init__(self) -> None:
         # Second by second: a minute has sixty entries, whatever happens in it.
-        self._worst: dict[int, float] = {}
+        self.by_second: dict[int, float] = {}
         self._told: float | None = None
 
     def note(self, late_s: float, at_s: float) -> float | None:
         """Takes a measurement. What is to be told now, s: the worst of the last minute, or None."""
         second = int(at_s)
-        if second not in self._worst:
-            for past in [past for past in self._worst if past <= at_s - _MINUTE_S]:
-                del self._worst[past]
-        if late_s > self._worst.get(second, -1.0):
-            self._worst[second] = late_s
+        if second not in self.by_second:
+            for past in [past for past in self.by_second if past <= at_s - _MINUTE_S]:
+                del self.by_second[past]
+        if late_s > self.by_second.get(second, -1.0):
+            self.by_second[second] = late_s
         if late_s <= MAX_S or (self._told is not None and at_s - self._told < _MINUTE_S):
             return None
         self._told = at_s
@@ -44,7 +44,7 @@ class Lateness:
 
     def worst_s(self, at_s: float) -> float:
         """The worst of the last minute, s. For any thread: the numbers are copied first."""
-        recent = [late for second, late in list(self._worst.items()) if second > at_s - _MINUTE_S]
+        recent = [late for second, late in list(self.by_second.items()) if second > at_s - _MINUTE_S]
         return max(recent, default=0.0)
 
 

@@ -65,7 +65,7 @@ class TestBesideALoop:
         aborted.start(Work(begun.set))
         aborted.restore(aborted.read())
         over.set()
-        assert aborted._idle.wait(5)
+        assert aborted.idle.wait(5)
         assert not begun.is_set()
 
     def test_computations_of_several_loops_take_turns(self) -> None:
@@ -86,7 +86,7 @@ class TestBesideALoop:
 def done(work: Work[Any], pool: Pool) -> Any:
     computing = Computing(FakeLoop(FakeController()), pool)
     computing.start(work)
-    assert computing._idle.wait(60) and work.done
+    assert computing.idle.wait(60) and work.done
     return work.result()
 
 
@@ -231,7 +231,7 @@ class TestOrder:
         computing.start(Work(partial(burn, mark)))
         until(lambda: mark.exists() and mark.read_text() != "")
         computing.restore(computing.read())
-        assert computing._idle.wait(60) and gone(int(mark.read_text()))
+        assert computing.idle.wait(60) and gone(int(mark.read_text()))
 
 
 class TestEnd:
@@ -295,15 +295,15 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
-from loopwright.service.execution.computing.limits import Kind
+from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.computing.pool import Pool
 from tests.unit.service.computations import burn
 pool = Pool(max_workers=1)
-pool.submit(Kind.DRY_RUN, partial(burn, Path(sys.argv[1])))
+pool.submit(ComputationKind.DRY_RUN, partial(burn, Path(sys.argv[1])))
 while not (Path(sys.argv[1]).exists() and Path(sys.argv[1]).read_text()):
     time.sleep(0.01)
 if len(sys.argv) > 2:
-    pool.submit(Kind.LIVE, partial(burn, Path(sys.argv[2])))
+    pool.submit(ComputationKind.LIVE, partial(burn, Path(sys.argv[2])))
 print("ready", flush=True)
 sys.stdin.read()
 """
