@@ -96,7 +96,7 @@ class Channel:
         self._setpoint = setpoint
         self._manual_output = manual_output
         self._relay: Relay | None = None
-        self._pv: float | None = None
+        self.pv: float | None = None
         self._pid = Pid(sample_time_s, parameters, settings.reverse)
         self._mv = self._limited(settings.safe_output if self._mode is Mode.OFF else manual_output)
         self._takes_over = self._mv
@@ -146,9 +146,9 @@ class Channel:
         self.measuring = self._settings.measured(pv)
         if self.measuring:
             self.good_samples += 1
-            if self._pv is None:
+            if self.pv is None:
                 self._pid.rebase(self._setpoint, pv, self._takes_over)
-            self._pv = pv
+            self.pv = pv
             self._mv = self._takes_over = self._answer(pv)
         else:
             self.bad_samples += 1
@@ -196,7 +196,7 @@ class Channel:
 
     def start_relay(self, settings: RelaySettings) -> None:
         """Starts mode EXPERIMENT. A running relay takes the new settings and stays on its present side."""
-        error = 0.0 if self._pv is None else self._error(self._pv)
+        error = 0.0 if self.pv is None else self._error(self.pv)
         self._relay = Relay(settings, error, self._relay)
         self._mode = Mode.EXPERIMENT
         self.relay_state = RelayState.RUNNING
@@ -223,7 +223,7 @@ class Channel:
         it."""
         outputs = {Mode.MANUAL: self._manual_output, Mode.OFF: self._settings.safe_output}
         self._mv = self._takes_over = self._limited(outputs.get(self._mode, mv))
-        self._pv = None
+        self.pv = None
 
     def _end_relay(self, state: RelayState) -> None:
         if self._relay is not None:
@@ -235,8 +235,8 @@ class Channel:
         """Switches to these parameters without a bump."""
         self.in_effect = parameters
         self._pid = Pid(self._sample_time_s, parameters, self._settings.reverse)
-        if self._pv is not None:
-            self._pid.rebase(self._setpoint, self._pv, self._takes_over)
+        if self.pv is not None:
+            self._pid.rebase(self._setpoint, self.pv, self._takes_over)
 
     def _error(self, pv: float) -> float:
         return self._setpoint - pv if self._settings.reverse else pv - self._setpoint

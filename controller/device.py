@@ -174,7 +174,7 @@ class ControllerDevice:
         self._started_with = list(channels)
         self._started_sample_time_s = sample_time_s
         self._asked_pv_timeout_s = pv_timeout_s
-        self._keeper: Keeper = keeper or KeepNothing()
+        self.keeper: Keeper = keeper or KeepNothing()
         self._keeps = keeper is not None
         self._draw = draw
         count = len(channels)
@@ -215,7 +215,7 @@ class ControllerDevice:
         count = len(self._started_with)
         self._numbers = [0] * count
         self._pvs = [0.0] * count
-        self._told: list[_Status | None] = [None] * count
+        self.told: list[_Status | None] = [None] * count
         self._driven = [_PdoSetpoint() for _ in range(count)]
         sample_time_s = self._started_sample_time_s
         self._set_up([each.make(sample_time_s) for each in self._started_with], sample_time_s)
@@ -268,8 +268,8 @@ class ControllerDevice:
         session = self.sessions[at]
         channel = session.channel
         status = channel.mode, channel.on_trial, channel.setpoint, session.is_open, session.cause
-        if status != self._told[at]:
-            self._told[at] = status
+        if status != self.told[at]:
+            self.told[at] = status
             self._send(self._status_ids[at], STATUS_FRAME.pack(*status))
 
     def _on_tick(self, now: float) -> None:
@@ -325,7 +325,7 @@ class ControllerDevice:
         try:
             self._renew(sub, number)
         except SdoAbort:
-            self._told[sub - 1] = None
+            self.told[sub - 1] = None
             self._report_if_new(sub - 1)
 
     @contextmanager
@@ -385,18 +385,18 @@ class ControllerDevice:
         kept = self._to_keep()
         if kept != self._kept:
             self._kept = kept
-            self._keeper.soon(kept)
+            self.keeper.soon(kept)
 
     def _store(self, sub: int, parameters: Parameters) -> None:
         """Writes gains to the disk before they are accepted, so that a confirmed acceptance outlives a power cut."""
         kept = self._to_keep()
         kept[sub - 1] = self._kept_of(self.sessions[sub - 1], parameters)
         try:
-            self._keeper.now(kept)
+            self.keeper.now(kept)
         except OSError as error:
             print(f"controller: channel {sub} not accepted, it could not be kept: {error}", file=sys.stderr)
             self._kept = self._to_keep()
-            self._keeper.soon(self._kept)
+            self.keeper.soon(self._kept)
             raise SdoAbort(Abort.NOT_STORED) from error
         self._kept = kept
 

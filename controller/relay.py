@@ -41,24 +41,27 @@ class RelaySettings:
 
 class Relay:
     """A running relay. It begins on the high side unless the error would switch it; after another relay it begins on
-    that relay's side."""
+    that relay's side.
+
+    high: whether MV is the upper output.  errors: the errors whose mean switches the relay.
+    """
 
     def __init__(self, settings: RelaySettings, error: float, before: Relay | None = None) -> None:
         self.settings = settings
         self.samples_left = settings.max_samples
-        self._high = error > -settings.hysteresis or error >= 0
-        self._errors = deque([error], settings.average)
+        self.high = error > -settings.hysteresis or error >= 0
+        self.errors = deque([error], settings.average)
         if before is not None:
-            self._high, self._errors = before._high, deque(before._errors, settings.average)
+            self.high, self.errors = before.high, deque(before.errors, settings.average)
 
     def output(self, error: float) -> float:
         """Returns the MV for this error (sign by the controller's action), before the limits."""
-        settings, errors = self.settings, self._errors
+        settings, errors = self.settings, self.errors
         errors.append(error)
         mean = sum(errors) / len(errors)
         if mean >= settings.hysteresis:
-            self._high = True
+            self.high = True
         elif mean <= -settings.hysteresis:
-            self._high = False
-        swing = settings.amplitude if self._high else -(settings.amplitude_low or settings.amplitude)
+            self.high = False
+        swing = settings.amplitude if self.high else -(settings.amplitude_low or settings.amplitude)
         return settings.working_output + swing

@@ -65,11 +65,11 @@ class PlantDevice:
     ) -> None:
         self._channels = channels
         self._count = count = len(channels)
-        self._sample_time_s = sample_time_s
+        self.sample_time_s = sample_time_s
         self.dictionary = dictionary = Dictionary(Device.PLANT, count, node, controller_node)
         self.runtime = runtime = Runtime(bus, node, dictionary, clock)
         self._send = bus.send
-        self._pace = pace
+        self.pace = pace
         self._remaining = self._run = run
         self._missing_in_all = 0
         self._next_at: float | None = None
@@ -97,7 +97,7 @@ class PlantDevice:
     def _on_reset(self) -> None:
         """Restores the state at the start of the program; all later writes are lost."""
         self.dictionary.restore(0x2000, 0xFFFF)
-        self._pace = float(self.dictionary.get("plant_pace"))
+        self.pace = float(self.dictionary.get("plant_pace"))
         self._remaining = self._run
         self._missing_in_all = 0
         self._initialise()
@@ -106,14 +106,14 @@ class PlantDevice:
     def _initialise(self) -> None:
         """Puts every plant at rest, with sample number 0; equal seeds give equal runs."""
         seed = int(self.dictionary.get("plant_seed"))
-        self._plants = [
-            channel.build(self._sample_time_s, float(self.dictionary.get("plant_noise", at + 1)), seed + at)
+        self.plants = [
+            channel.build(self.sample_time_s, float(self.dictionary.get("plant_noise", at + 1)), seed + at)
             for at, channel in enumerate(self._channels)
         ]
-        for at, plant in enumerate(self._plants):
+        for at, plant in enumerate(self.plants):
             plant.disturbance = float(self.dictionary.get("plant_disturbance", at + 1))
-        self._mv = [channel.mv_nominal for channel in self._channels]
-        self._number = 0
+        self.mv = [channel.mv_nominal for channel in self._channels]
+        self.number = 0
         self._sync_counter = 0
         self._unanswered: set[int] = set()
         self._waiting: tuple[int, float] = (0, 0.0)
@@ -126,19 +126,19 @@ class PlantDevice:
         """Latches the outputs, integrates one step, and sends SYNC and the PV with its number."""
         if self._remaining != FOREVER:
             self._remaining -= 1
-        self._number = number = self._number % 0xFFFFFFFF + 1  # 0 is UNASKED
+        self.number = number = self.number % 0xFFFFFFFF + 1  # 0 is UNASKED
         self._sync_counter = self._sync_counter % SYNC_COUNTER_OVERFLOW + 1
         self._unanswered.update(range(self._count))
-        values = [plant.step(mv) for plant, mv in zip(self._plants, self._mv, strict=True)]
+        values = [plant.step(mv) for plant, mv in zip(self.plants, self.mv, strict=True)]
         self._send(SYNC_ID, SYNC_FRAME.pack(self._sync_counter))
         for can_id, pv in zip(self._pv_ids, values, strict=True):
             self._send(can_id, PV_FRAME.pack(pv, number))
 
     def _on_mv(self, at: int, data: bytes) -> None:
         mv, number = MV_FRAME.unpack(data)
-        if (number != self._number and number != UNASKED) or mv - mv != 0.0:
+        if (number != self.number and number != UNASKED) or mv - mv != 0.0:
             return  # an answer to another sample, or MV is not a number: this sample stays unanswered
-        self._mv[at] = 0.0 if mv < 0.0 else 100.0 if mv > 100.0 else mv
+        self.mv[at] = 0.0 if mv < 0.0 else 100.0 if mv > 100.0 else mv
         if number == UNASKED:
             return
         self._unanswered.discard(at)
@@ -150,7 +150,7 @@ class PlantDevice:
 
     def _advance(self) -> None:
         """Ends the sample; the next one follows at once, at its time, or not at all."""
-        if self._pace == 0.0:
+        if self.pace == 0.0:
             if self._remaining and self.runtime.state is NmtState.OPERATIONAL:
                 self._sample()
         else:
@@ -163,10 +163,10 @@ class PlantDevice:
             self.runtime.due = None
             return
         now = self.runtime.clock()
-        if self._pace == 0.0 or self._next_at is None:
+        if self.pace == 0.0 or self._next_at is None:
             self._next_at = now
         else:
-            period = self._sample_time_s / self._pace
+            period = self.sample_time_s / self.pace
             self._next_at += period
             if self._next_at < now - _MAX_CATCH_UP * period:
                 self._next_at = now
@@ -186,8 +186,8 @@ class PlantDevice:
                 self._schedule()  # operational again after a pause
             return
         number, since = self._waiting
-        if number != self._number:
-            self._waiting = (self._number, now)
+        if number != self.number:
+            self._waiting = (self.number, now)
         elif now - since > int(self.dictionary.get("plant_answer_timeout")) / 1000.0:
             self._give_up_waiting()
 
@@ -201,19 +201,19 @@ class PlantDevice:
             self._remaining = 0
         elif reaction == OnMissingAnswer.SAFE_OUTPUT:
             for at in missing:
-                self._mv[at] = float(self.dictionary.get("plant_safe_output", at + 1))
+                self.mv[at] = float(self.dictionary.get("plant_safe_output", at + 1))
         self._advance()
 
     # The object dictionary
 
     def _connect(self, dictionary: Dictionary) -> None:
         dictionary.on_read.update({
-            "sample_number": lambda sub: self._number,
+            "sample_number": lambda sub: self.number,
             "plant_output_sample_number": lambda sub: self._answered_number,
             "plant_samples_to_run": lambda sub: self._remaining,
             "plant_missing_answers": lambda sub: self._missing_in_all,
-            "plant_pv": lambda sub: self._plants[sub - 1].pv,
-            "plant_mv": lambda sub: self._mv[sub - 1],
+            "plant_pv": lambda sub: self.plants[sub - 1].pv,
+            "plant_mv": lambda sub: self.mv[sub - 1],
         })
         dictionary.on_write.update({
             "sample_time": self._write_sample_time,
@@ -237,11 +237,11 @@ class PlantDevice:
     def _write_sample_time(self, sub: int, value: Value) -> None:
         if self.runtime.state is not NmtState.PRE_OPERATIONAL:
             raise SdoAbort(Abort.DEVICE_STATE)
-        self._sample_time_s = int(value) / 1e6
+        self.sample_time_s = int(value) / 1e6
         self._initialise()
 
     def _write_pace(self, sub: int, value: Value) -> None:
-        self._pace = float(value)
+        self.pace = float(value)
         self._next_at = None
         if not self._unanswered:
             self._schedule()
@@ -255,10 +255,10 @@ class PlantDevice:
                 self._schedule()
 
     def _write_disturbance(self, sub: int, value: Value) -> None:
-        self._plants[sub - 1].disturbance = float(value)
+        self.plants[sub - 1].disturbance = float(value)
 
     def _write_noise(self, sub: int, value: Value) -> None:
-        self._plants[sub - 1].noise_std = float(value)
+        self.plants[sub - 1].noise_std = float(value)
 
     def _write_mv(self, sub: int, value: Value) -> None:
-        self._mv[sub - 1] = float(value)
+        self.mv[sub - 1] = float(value)

@@ -215,7 +215,7 @@ class _Socketcand(SocketCanDaemonBus):
 
 _LIBRARY_STATES = {can.BusState.PASSIVE: BusState.PASSIVE, can.BusState.ERROR: BusState.BUS_OFF}
 
-_OPENED_BY: dict[str, Callable[..., can.BusABC]] = {"socketcand": _Socketcand}
+OPENED_BY: dict[str, Callable[..., can.BusABC]] = {"socketcand": _Socketcand}
 
 
 class LibraryBus:
@@ -224,7 +224,7 @@ class LibraryBus:
     def __init__(self, url: str, interface: str, rest: str) -> None:
         try:
             arguments = _library_arguments(interface, rest)
-            self._bus: can.BusABC = _OPENED_BY.get(interface, partial(can.Bus, interface=interface))(**arguments)
+            self._bus: can.BusABC = OPENED_BY.get(interface, partial(can.Bus, interface=interface))(**arguments)
         except (OSError, ValueError, can.CanError) as error:
             raise BusError(f"bus {url!r} cannot be opened: {error}") from error
         self._url = url

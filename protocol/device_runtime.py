@@ -76,7 +76,7 @@ class Runtime:
         self.on_due: Callable[[], None] = lambda: None
         self._bus = bus
         self.send = bus.send
-        self._sdo = SdoServer(dictionary.read, dictionary.write, dictionary.room)
+        self.sdo = SdoServer(dictionary.read, dictionary.write, dictionary.room)
         self._emergencies = Emergencies(dictionary, self._send_emcy)
         self.raise_error = self._emergencies.raise_error
         self.clear_error = self._emergencies.clear_error
@@ -126,7 +126,7 @@ class Runtime:
                 self._tell(error)
                 time.sleep(_PAUSE_AFTER_BUS_ERROR_S)
                 with contextlib.suppress(BusError):
-                    self._tick()
+                    self.tick()
 
     def _tell(self, error: BusError) -> None:
         """Prints a bus error once, as long as it stays the same."""
@@ -149,7 +149,7 @@ class Runtime:
         frame = self._bus.recv(wait)
         if frame is None:
             if wait:
-                self._tick()
+                self.tick()
             return False
         active = self._active.get(frame[0])
         if active is not None:
@@ -160,10 +160,11 @@ class Runtime:
                 self._on_other_length(frame[0], handler, length, frame[1])
         self._countdown -= 1
         if self._countdown <= 0:
-            self._tick()
+            self.tick()
         return True
 
-    def _tick(self) -> None:
+    def tick(self) -> None:
+        """Does what time has made due: heartbeats, nodes that have fallen silent, the device's own work."""
         now = self.clock()
         slow = now - self._last_tick > _IDLE_S
         between = self._between_ticks // 2 if slow else self._between_ticks * 2
@@ -181,10 +182,10 @@ class Runtime:
         if self.state is NmtState.OPERATIONAL:
             self.on_leave_operational()  # first, because it may send a last PDO
         self.state = state
-        self._gate()
+        self.gate()
         self._own_beat.restart()
 
-    def _gate(self) -> None:
+    def gate(self) -> None:
         """Activates PDOs in operational only, and SDO in every state but stopped."""
         self._active = {can_id: (handler, None) for can_id, handler in self._always.items()}
         if self.state is NmtState.OPERATIONAL:
@@ -199,7 +200,7 @@ class Runtime:
         self._always = {NMT_ID: self._on_nmt, sdo_request_id(self.node): self._on_sdo}
         for node in self._listened | {watch.node for watch in self._watches}:
             self._always[heartbeat_id(node)] = partial(self._on_heartbeat, node)
-        self._gate()
+        self.gate()
         self._bus.set_filters({*self._always, *self.handlers})
 
     def _on_nmt(self, data: bytes) -> None:
@@ -223,7 +224,7 @@ class Runtime:
         The writers of changed objects are called as by an SDO, in the state in which these objects may be written.
         """
         self._enter(NmtState.PRE_OPERATIONAL)
-        self._sdo.end()
+        self.sdo.end()
         self._emergencies.forget()
         self._too_short.clear()
         self._watches.clear()
@@ -244,21 +245,21 @@ class Runtime:
         detail = _LENGTH_DETAIL.pack(can_id, len(data), length)
         self.raise_error(Emcy.PDO_LENGTH, detail, source=detail[:2])
         self._too_short.add(can_id)
-        self._gate()
+        self.gate()
 
     def _after_too_short(self, can_id: int, data: bytes) -> None:
         """Replaces the handler until a frame is long enough, so that no other frame pays for the check."""
         length = self.lengths[can_id]
         if len(data) >= length:
             self._too_short.discard(can_id)
-            self._gate()
+            self.gate()
             self.clear_error(Emcy.PDO_LENGTH, _LENGTH_DETAIL.pack(can_id, 0, 0)[:2])
             self.handlers[can_id](data[:length])
 
     # SDO
 
     def _on_sdo(self, data: bytes) -> None:
-        answer = self._sdo.answer(data)
+        answer = self.sdo.answer(data)
         if answer is not None:
             for at in range(0, len(answer), 8):
                 self._bus.send(sdo_response_id(self.node), answer[at : at + 8])

@@ -24,6 +24,11 @@ class FairLock:
         self._waiting: deque[threading.Lock] = deque()
         self._urgent: deque[threading.Lock] = deque()
 
+    @property
+    def waiting(self) -> int:
+        """How many wait for the lock."""
+        return len(self._waiting) + len(self._urgent)
+
     @contextmanager
     def take(self, urgent: bool = False, meanwhile: Callable[[], object] = lambda: None) -> Iterator[None]:
         """Waits for the lock and holds it.

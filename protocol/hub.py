@@ -41,7 +41,9 @@ class Hub:
 
     def __init__(self, port: int = DEFAULT_PORT) -> None:
         self._listener = socket.create_server(("127.0.0.1", port))
-        self.port: int = self._listener.getsockname()[1]
+        self.address: str
+        self.port: int  # the one that was free where 0 was asked for
+        self.address, self.port = self._listener.getsockname()
         self._wake, self._woken = socket.socketpair()
         self._selector = selectors.DefaultSelector()
         self._members: set[_Member] = set()

@@ -26,13 +26,13 @@ class Dictionary:
     ) -> None:
         node = plant_node if device is Device.PLANT else controller_node
         table = chain(objects_of(device), pdo_objects(device, channels, plant_node, controller_node))
-        self._by_index = {entry.index: entry for entry in table}
+        self.by_index = {entry.index: entry for entry in table}
         self.channels = channels
         self.on_read: dict[str, Reader] = {}
         self.on_write: dict[str, Writer] = {}
         self._values: dict[tuple[str, int], Value] = {
             (entry.name, sub): default_of(entry, sub, device)
-            for entry in self._by_index.values()
+            for entry in self.by_index.values()
             for sub in range(0 if entry.shape is Shape.VAR else 1, entry.count(channels) + 1)
         }
         self.set("emcy_cob_id", 0x80 + node)
@@ -52,7 +52,7 @@ class Dictionary:
     def restore(self, first: int, last: int) -> list[tuple[str, int]]:
         """Restores the objects with index `first` to `last`; returns name and sub-index of those that were different.
         It makes no checks and calls no `on_write`, as `set`."""
-        names = {entry.name for index, entry in self._by_index.items() if first <= index <= last}
+        names = {entry.name for index, entry in self.by_index.items() if first <= index <= last}
         changed = [key for key, value in self._start.items() if key[0] in names and self._values[key] != value]
         for key in changed:
             self._values[key] = self._start[key]
@@ -103,7 +103,7 @@ class Dictionary:
         return entry
 
     def _entry(self, index: int, sub: int) -> Object:
-        entry = self._by_index.get(index)
+        entry = self.by_index.get(index)
         if entry is None:
             raise SdoAbort(Abort.NO_OBJECT)
         if sub > entry.count(self.channels):

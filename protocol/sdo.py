@@ -44,7 +44,7 @@ class SdoServer:
         room: Callable[[int, int], int],
     ) -> None:
         self._read = read
-        self._write = write
+        self.write = write
         self._room = room
         self._index = 0
         self._sub = 0
@@ -144,7 +144,7 @@ class SdoServer:
         room = self._room(self._index, self._sub)
         if command & 0x02:
             size = 4 - (command >> 2 & 3) if command & 0x01 else room or 4
-            self._write(self._index, self._sub, request[4 : 4 + size])
+            self.write(self._index, self._sub, request[4 : 4 + size])
         else:
             self._announced = _SIZE.unpack_from(request, 4)[0] if command & 0x01 else None
             if self._announced is not None and self._announced > _LARGEST_DOWNLOAD:
@@ -167,7 +167,7 @@ class SdoServer:
             self.end()
             if self._announced not in (None, len(data)):
                 raise SdoAbort(Abort.LENGTH)
-            self._write(self._index, self._sub, data)
+            self.write(self._index, self._sub, data)
         return bytes((answer,)) + bytes(7)
 
     def _check_toggle(self, command: int) -> None:

@@ -29,8 +29,8 @@ class TunerSession:
         self.number = 0
         """The number of the session opened or taken up last; 0 for none yet."""
         self._tuner = tuner
-        self._count = 0
-        self._staged: dict[str, Value] = {}
+        self.count = 0
+        self.staged: dict[str, Value] = {}
 
     def open(self, lease: Lease, remember: Callable[[int], None]) -> None:
         """Opens a session.
@@ -41,8 +41,8 @@ class TunerSession:
         for last_try in (False, False, True):
             number = int(self._tuner.number("controller_session_next"))
             remember(number)
-            self.number, self._count = number, 0
-            self._staged.clear()
+            self.number, self.count = number, 0
+            self.staged.clear()
             try:
                 self.give(Order.OPEN, (self._tuner.station.node, *astuple(lease)))
                 return
@@ -53,8 +53,8 @@ class TunerSession:
     def take_up(self, number: int) -> None:
         """Continues a session that was opened before, by this process or by one that has died."""
         self.number = number
-        self._count = int(self._tuner.number("controller_session_count"))
-        self._staged.clear()
+        self.count = int(self._tuner.number("controller_session_count"))
+        self.staged.clear()
 
     def give(self, order: Order, values: Sequence[Value] = ()) -> None:
         """Stages the values that are not staged yet and puts the order in force."""
@@ -72,11 +72,11 @@ class TunerSession:
         for name, value in zip(STAGED[order], values, strict=True):
             entry = lookup(name).type
             sent.append(entry.decode(entry.encode(value)))
-            if self._staged.get(name) != sent[-1]:
+            if self.staged.get(name) != sent[-1]:
                 self._tuner.write(name, float(value))
-                self._staged[name] = sent[-1]
-        self._tuner.write(object_of(order), check_of(self.number, self._count, order, sent))
-        self._count += 1
+                self.staged[name] = sent[-1]
+        self._tuner.write(object_of(order), check_of(self.number, self.count, order, sent))
+        self.count += 1
 
     def renew(self) -> None:
         self._tuner.write("controller_session_renewal", self.number)

@@ -60,13 +60,13 @@ class Computing:
 
     def __init__(self, loop: Loop, workers: Workers | None = None) -> None:
         self._loop, self._workers = loop, workers
-        self._idle = threading.Event()
-        self._idle.set()
+        self.idle = threading.Event()
+        self.idle.set()
         self._over = False
 
     def start(self, work: Work[Any]) -> None:
         """Starts a computation; it is the `start_work` of the runner."""
-        self._idle.clear()
+        self.idle.clear()
         if self._workers is None:
             self._beside(work)
             return
@@ -74,8 +74,8 @@ class Computing:
         future.add_done_callback(partial(self._came, work))
 
     def step(self, commands: Sequence[Command]) -> Sample:
-        if not self._idle.is_set() and self._loop.waits:
-            self._idle.wait(HELD_S)
+        if not self.idle.is_set() and self._loop.waits:
+            self.idle.wait(HELD_S)
         return self._loop.step(commands)
 
     @property
@@ -113,7 +113,7 @@ class Computing:
             work.finish(future.result())
         elif not isinstance(error, NotWanted):
             work.fail(error)
-        self._idle.set()
+        self.idle.set()
 
     def _beside(self, work: Work[Any]) -> None:
         threading.Thread(target=self._do, args=(work,), daemon=True, name="computation").start()
@@ -124,4 +124,4 @@ class Computing:
                 if not self._over:
                     work.run()
         finally:
-            self._idle.set()
+            self.idle.set()

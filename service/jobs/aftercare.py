@@ -74,7 +74,7 @@ class Aftercare:
     def __init__(self, store: Store, directory: LoopDirectory, machine: Machine) -> None:
         self._store, self._directory = store, directory
         self._machine = machine
-        self._clock = self._machine.monotonic
+        self.clock = self._machine.monotonic
         self._again: dict[str, _Again] = {}
         # Kept apart from the event, because a signal handler sets it.
         self._stopping = False
@@ -83,6 +83,10 @@ class Aftercare:
 
     def start(self) -> None:
         self._thread.start()
+
+    @property
+    def is_running(self) -> bool:
+        return self._thread.is_alive()
 
     def request_stop(self) -> None:
         """Stops further readings; loops that are not restored are read after the next start. Returns at once."""
@@ -127,7 +131,7 @@ class Aftercare:
         rows = looked_after.rows(self._store)
         for gone in self._again.keys() - {row.id for row in rows}:
             del self._again[gone]
-        now = self._clock()
+        now = self.clock()
         due = [row for row in rows if row.id not in self._again or self._again[row.id].at <= now]
         if len(due) < 2:
             for row in due:
@@ -158,7 +162,7 @@ class Aftercare:
         wait_s = EVERY_S if before is None else min(LONGEST_S, 2.0 * before.wait_s)
         if before is None or before.found.reason is not found.reason:
             log.warning("%s; the loop will be read again", found.text)
-        self._again[row.id] = _Again(self._clock() + wait_s, wait_s, found)
+        self._again[row.id] = _Again(self.clock() + wait_s, wait_s, found)
 
     def _run(self) -> None:
         while not self._stopping:

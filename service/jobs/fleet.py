@@ -226,7 +226,7 @@ class Fleet:
             with self._store.writing() as session:
                 retunes.stop(session, row.id, StopReason.FAILURES, f"{failures} ended without a proposal: {named}")
         elif row.stop_reason is None:
-            self._begin(row, request, parts)
+            self.begin(row, request, parts)
         elif row.stop_reason == StopReason.OPERATOR:
             self._abort(row, parts)
         row, parts = self.get(row.id)
@@ -235,7 +235,7 @@ class Fleet:
             with self._store.writing() as session:
                 retunes.end(session, row.id)
 
-    def _begin(self, row: RetuneRow, request: FleetRequest, parts: Sequence[Part]) -> None:
+    def begin(self, row: RetuneRow, request: FleetRequest, parts: Sequence[Part]) -> None:
         """Starts jobs on the waiting loops, in order, as bus and area permit; tests of other requests count too."""
         known, options = self._known(), request.each()
         under_test = {part.loop for part in parts if part.active}

@@ -46,7 +46,7 @@ class Progress:
         None."""
         found = copy(self)
         if t_s is not None:
-            found.at(max(t_s, found._now_s))
+            found.at(max(t_s, self._now_s))
         return found
 
     @property

@@ -175,7 +175,7 @@ class Retention:
             try:
                 self.look()
                 if tidied is None or time.monotonic() - tidied >= self._every_s:
-                    self._tidy()
+                    self.tidy()
                     tidied = time.monotonic()
             except FolderInUse:  # another service has this host's name, and deletes instead
                 return
@@ -185,7 +185,8 @@ class Retention:
                 log.exception("old samples could not be deleted")
             self._over.wait(self._look_s)
 
-    def _tidy(self) -> None:
+    def tidy(self) -> None:
+        """One turn of the thread, without a look at the clock."""
         seen = self._watch.seen
         if seen is not None:
             tidy(self._store, self._keep, seen.at, seen.ages_from)

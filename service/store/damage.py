@@ -133,7 +133,7 @@ class FileCheck:
         self._file = file
         # Read only: one that may write would bring the log into a damaged file as it is closed.
         self._connection = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False)
-        self._thread = threading.Thread(target=self._run, name="file check", daemon=True)
+        self._thread = threading.Thread(target=self.run, name="file check", daemon=True)
         self._thread.start()
 
     def wait(self, timeout_s: float) -> bool:
@@ -146,7 +146,7 @@ class FileCheck:
             self._connection.interrupt()
             self._through.wait(0.1)
 
-    def _run(self) -> None:
+    def run(self) -> None:
         with closing(self._connection) as connection:
             try:
                 self.found = [row[0] for row in connection.execute("PRAGMA quick_check(3)") if row[0] != "ok"]

@@ -93,7 +93,7 @@ def _server(name: str) -> dict[str, Any]:
 def sqlite(file: Path) -> Engine:
     """A file that keeps what was committed through a power cut, and whose readers never wait for its writer."""
     engine = create_engine(f"sqlite:///{file}", connect_args={"timeout": float(WAIT_S)})
-    event.listen(engine, "connect", _pragmas)
+    event.listen(engine, "connect", pragmas)
     return engine
 
 
@@ -131,7 +131,7 @@ def migrate(engine: Engine) -> None:
             ) from error
 
 
-def _pragmas(connection: Any, _record: object) -> None:
+def pragmas(connection: Any, _record: object) -> None:
     # A transaction that writes takes the lock as it begins: one that read first could not wait for it later.
     connection.isolation_level = "IMMEDIATE"
     cursor = connection.cursor()

@@ -117,7 +117,7 @@ class HostLock:
                 with suppress(SQLAlchemyError):
                     self._check_claim(self._connection)
                     return
-                self._drop()
+                self.drop()
             with suppress(SQLAlchemyError):
                 self._connection = self._engine.connect().execution_options(isolation_level="AUTOCOMMIT")
                 locked = self._locked(self._connection)
@@ -126,9 +126,9 @@ class HostLock:
                     return
             # Not had, and the claim still ours: the lock is with a broken connection of our own that the server still
             # believes in, or with somebody who is about to claim the name. The next look tells.
-            self._drop()
+            self.drop()
         except FolderInUse:
-            self._drop()
+            self.drop()
             raise
 
     def check_claim(self, session: Session) -> None:
@@ -140,7 +140,7 @@ class HostLock:
         if self._connection is not None:
             with suppress(SQLAlchemyError):
                 self._connection.execute(_GIVE_BACK, {"host": self._host, "claim": self._claim})
-        self._drop()
+        self.drop()
         self._engine.dispose()
 
     def _check_claim(self, connection: Connection | Session) -> None:
@@ -165,7 +165,8 @@ class HostLock:
         if holder is not None:
             raise FolderInUse(f"host {host!r} is served already: {holder}")
 
-    def _drop(self) -> None:
+    def drop(self) -> None:
+        """Ends the connection without giving the name back, as the end of the process does."""
         connection, self._connection = self._connection, None
         if connection is not None:
             connection.invalidate()

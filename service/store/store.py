@@ -85,8 +85,8 @@ class Store:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.host = host
         self.folder = folder
-        self._folder_lock = FolderLock(folder)
-        self._host_lock: HostLock | None = None
+        self.folder_lock = FolderLock(folder)
+        self.host_lock: HostLock | None = None
         self._damage = Damage(folder / FILE if database is None else None)
         try:
             if (damaged := self._damage.look()) is not None:
@@ -101,11 +101,11 @@ class Store:
             self._write_lock = None if self.shared else threading.Lock()
             self._session = sessions(self.engine, self._reserve)
             if database is not None:
-                self._host_lock = HostLock(postgresql(database, name, pool=None), host, folder)
-                self._host_lock.refuse()
+                self.host_lock = HostLock(postgresql(database, name, pool=None), host, folder)
+                self.host_lock.refuse()
             migrate(self.engine)
-            if self._host_lock is not None:
-                self._host_lock.take()
+            if self.host_lock is not None:
+                self.host_lock.take()
             else:
                 self._adopt()
         except BaseException as error:
@@ -126,18 +126,18 @@ class Store:
 
     def _let_go(self) -> None:
         self._damage.close()
-        if self._host_lock is not None:
-            self._host_lock.close()
+        if self.host_lock is not None:
+            self.host_lock.close()
         for engine in ("engine", "_reserve"):
             if hasattr(self, engine):
                 getattr(self, engine).dispose()
-        self._folder_lock.close()
+        self.folder_lock.close()
 
     def check_lock(self) -> None:
         """Takes the lock on our host name again after the database was away. Raises FolderInUse when another service
         has the name."""
-        if self._host_lock is not None:
-            self._host_lock.check()
+        if self.host_lock is not None:
+            self.host_lock.check()
 
     @contextmanager
     def writing(self) -> Iterator[Session]:
@@ -146,8 +146,8 @@ class Store:
             raise TimeoutError("another writer of this process waits for the database")
         try:
             with self._session.begin() as session:
-                if self._host_lock is not None:
-                    self._host_lock.check_claim(session)
+                if self.host_lock is not None:
+                    self.host_lock.check_claim(session)
                 yield session
         finally:
             if self._write_lock is not None:
@@ -179,10 +179,10 @@ class Store:
         its bus has moved. Raises ForeignLoop when the other host is running.
         """
         others_of = select(LoopRow).where(LoopRow.tag.in_(loops), LoopRow.host != self.host)
-        if self._host_lock is not None:
+        if self.host_lock is not None:
             with self._session() as session:
                 names = {row.host for row in session.scalars(others_of)}
-            self._host_lock.wait_for(names)
+            self.host_lock.wait_for(names)
         with self.writing() as session:
             foreign = session.scalars(others_of).all()
             free = {host: HostLock.free(session, host) for host in {row.host for row in foreign}}

@@ -27,17 +27,17 @@ class Lateness:
 
     def __init__(self) -> None:
         # The worst of each second, so that a minute has sixty entries.
-        self._worst: dict[int, float] = {}
+        self.by_second: dict[int, float] = {}
         self._told: float | None = None
 
     def note(self, late_s: float, at_s: float) -> float | None:
         """Takes a measurement, s. Returns the lateness to log now, the worst of the last minute in s, or None."""
         second = int(at_s)
-        if second not in self._worst:
-            for past in [past for past in self._worst if past <= at_s - _MINUTE_S]:
-                del self._worst[past]
-        if late_s > self._worst.get(second, -1.0):
-            self._worst[second] = late_s
+        if second not in self.by_second:
+            for past in [past for past in self.by_second if past <= at_s - _MINUTE_S]:
+                del self.by_second[past]
+        if late_s > self.by_second.get(second, -1.0):
+            self.by_second[second] = late_s
         if late_s <= MAX_S or (self._told is not None and at_s - self._told < _MINUTE_S):
             return None
         self._told = at_s
@@ -45,7 +45,7 @@ class Lateness:
 
     def worst_s(self, at_s: float) -> float:
         """Returns the worst of the last minute, s. Any thread may call it, because the numbers are copied first."""
-        recent = [late for second, late in list(self._worst.items()) if second > at_s - _MINUTE_S]
+        recent = [late for second, late in list(self.by_second.items()) if second > at_s - _MINUTE_S]
         return max(recent, default=0.0)
 
 

@@ -60,8 +60,7 @@ def proposal(folder: Path, size: float, at_s: float, **options: Any) -> tuple[di
     jobs = make_jobs(loops, store, open_loop, tune, rehearse, engine=engine)
     jobs.boot()
     row = jobs.start(TAG, retune_request(**{"amplitude_pct": AMPLITUDE, **options}))
-    for thread in list(engine._threads.values()):
-        thread.join(100)
+    engine.join(100)
     jobs.stop()
     job = job_view(store.get(row.id), store.events(row.id), None).model_dump(mode="json")
     samples = {name: list(column) for name, column in record_columns(store.blocks(row.id)).items()}

@@ -49,8 +49,7 @@ def retuned(folder: Path, present: Gains, **options: Any) -> dict[str, Any]:
     jobs = make_jobs(loops, store, open_loop, tune, dry_run, engine=engine)
     jobs.boot()
     row = jobs.start(TAG, retune_request(**options))
-    for thread in list(engine._threads.values()):
-        thread.join(100)
+    engine.join(100)
     jobs.stop()
     job = job_view(store.get(row.id), store.events(row.id), None).model_dump(mode="json")
     store.close()

@@ -78,8 +78,7 @@ def test_a_job_cut_off_in_a_stage_ends_as_one_that_was_not(tmp_path: Path, metho
         return store, jobs, engine
 
     def finish(store: Store, jobs: Jobs) -> Any:
-        for thread in list(jobs.engine._threads.values()):  # type: ignore[attr-defined]
-            thread.join(60)
+        jobs.engine.join(60)  # type: ignore[attr-defined]
         row = store.recent()[0]
         events = store.events(row.id)
         ran[:] = [event.data["stage"] for event in events if event.kind == "stage_started"]

@@ -160,7 +160,7 @@ class Node:
     def _tick_once(self, process: Process | None) -> None:
         if process is self.process and self.is_on and self._awake():
             with suppress(BusError):
-                self.runtime._tick()
+                self.runtime.tick()
             self.on_change()
             self._watch_due()
 
@@ -209,9 +209,9 @@ class Controller(Node):
             port, [channel], self._sample_time_s, self.node, self._plant_node, self._pv_timeout_s, self.clock,
             self.disk if self.keep else None, self._draw,
         )  # fmt: skip
-        server = device.runtime._sdo
-        write = server._write
-        by_index = device.dictionary._by_index
+        server = device.runtime.sdo
+        write = server.write
+        by_index = device.dictionary.by_index
 
         def written(index: int, sub: int, data: bytes) -> None:
             entry = by_index.get(index)
@@ -224,7 +224,7 @@ class Controller(Node):
                 value = math.nan
             self.on_write(entry.name, value, lambda: write(index, sub, data))
 
-        server._write = written
+        server.write = written
 
     def _start(self) -> None:
         self.device.start()
@@ -307,7 +307,7 @@ class PlantNode(Node):
 
     @property
     def mv(self) -> float:
-        return self.device._mv[0]
+        return self.device.mv[0]
 
 
 __all__ = ["Clock", "Controller", "Node", "PlantNode", "Sensor", "Settings"]

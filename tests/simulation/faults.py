@@ -224,7 +224,7 @@ def pv_gone(world: World) -> None:
         elif how == "far":
             world.plant.sensor.shows = 1e4
         elif how == "still":
-            world.plant.sensor.shows = struct.unpack("<f", struct.pack("<f", world.plant.device._plants[0].pv))[0]
+            world.plant.sensor.shows = struct.unpack("<f", struct.pack("<f", world.plant.device.plants[0].pv))[0]
         elif how == "silent":
             world.wire.blocked = frozenset({PV_ID})
         else:

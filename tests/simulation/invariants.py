@@ -240,7 +240,7 @@ class Invariants:
         can_id = channel_ids(1, 0x10, self.controller.node).command
         handler = runtime.handlers[can_id]
         runtime.handlers[can_id] = lambda data: self._on_command(data, handler)
-        runtime._gate()
+        runtime.gate()
         self._hooked = self.controller.device
 
     def look(self) -> None:
@@ -259,13 +259,13 @@ class Invariants:
             channel.on_trial, session.number,
         )  # fmt: skip
         last = self._last
-        if channel.good_samples != self._before[0] or channel._pv is None:
+        if channel.good_samples != self._before[0] or channel.pv is None:
             self._goes_on_from = channel.mv
         if self._relay is not None and channel.relay is None:  # until a sample comes, the present MV is its side
             self._goes_on_from = self._relay.settings.working_output
         if last is not None and last.session and not session.number:
             base = self._goes_on_from
-            self._bump = base, channel._pv, channel.good_samples
+            self._bump = base, channel.pv, channel.good_samples
             if self._before[0] != channel.good_samples:
                 # Within a sample, or right after it: of these it is known that they end within one.
                 in_sample = session.cause in (Cause.PV_LIMIT, Cause.RELAY_SAMPLES)
@@ -275,7 +275,7 @@ class Invariants:
         if self._bump is not None and (self._bump[2] != channel.good_samples or session.hand):
             self._no_bump(session, self._bump)
             self._bump = None
-        self._before = channel.good_samples, channel._pv, channel.mv
+        self._before = channel.good_samples, channel.pv, channel.mv
         self._relay = channel.relay
         if self._held_mv is not None and (channel.good_samples != self._good or session.number):
             self._held_mv = None
@@ -297,7 +297,7 @@ class Invariants:
                 words = f"session {session.number:08X}h of {session.holder:02X}h opens"
                 self.simulation.note(self.controller.name, words)
             home = session.home
-            pending = self._bump is not None and channel._pv is not None and channel.mode is Mode.AUTOMATIC
+            pending = self._bump is not None and channel.pv is not None and channel.mode is Mode.AUTOMATIC
             if pending and not _near(home.mv, self._bump[0]):
                 self.say(f"MV noted as home is {home.mv:g}, where {self._bump[0]:g} was to come after the last session")
             if (home.mode, home.setpoint, home.manual_output) != (truth.mode, truth.sp, truth.output):
@@ -349,7 +349,7 @@ class Invariants:
         if self._before[1] is None:  # PV had been away since
             base, pv = self._before[2], None
         base = min(max(base, settings.mv_low), settings.mv_high)
-        wanted = base if pv is None or channel._pv is None else base + channel.accepted.Kp * (pv - channel._pv)
+        wanted = base if pv is None or channel.pv is None else base + channel.accepted.Kp * (pv - channel.pv)
         wanted = min(max(wanted, settings.mv_low), settings.mv_high)
         if not settings.rate_limit_per_s and not _near(channel.mv, wanted):
             self.say(f"a bump after the session: MV {channel.mv:g}, not {wanted:g}")

@@ -94,7 +94,7 @@ class Disk:
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.syncs = 0
-        self._folder = folder
+        self.folder = folder
         self._contents: dict[int, bytes] = {}
         self._names: dict[str, int] = {}
         self._sync = os.fsync
@@ -104,14 +104,14 @@ class Disk:
         self.syncs += 1
         self._sync(descriptor)
         inode = os.fstat(descriptor).st_ino
-        if inode == self._folder.stat().st_ino:
-            self._names = {each.name: each.stat().st_ino for each in self._folder.iterdir()}
+        if inode == self.folder.stat().st_ino:
+            self._names = {each.name: each.stat().st_ino for each in self.folder.iterdir()}
         else:
             self._contents[inode] = Path(f"/proc/self/fd/{descriptor}").read_bytes()
 
     def after_power_cut(self) -> Path:
         """A copy of the folder as it is when the power is back."""
-        copy = self._folder.with_name("after")
+        copy = self.folder.with_name("after")
         shutil.rmtree(copy, ignore_errors=True)
         copy.mkdir()
         for name, inode in self._names.items():
@@ -128,7 +128,7 @@ def disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Disk:
 
 class TestPowerCut:
     def test_what_is_confirmed_survives_one(self, disk: Disk) -> None:
-        file = disk._folder / "kept.json"
+        file = disk.folder / "kept.json"
         for kept in (KEPT, OTHER):
             FileKeeper(file).now(kept)
             assert remembered(disk.after_power_cut() / "kept.json", START) == kept
@@ -137,9 +137,9 @@ class TestPowerCut:
     @pytest.mark.parametrize("missing", ["file", "folder"])
     def test_without_either_sync_it_would_not(self, disk: Disk, missing: str, monkeypatch: pytest.MonkeyPatch) -> None:
         """That the test above can fail."""
-        file, sync = disk._folder / "kept.json", os.fsync
+        file, sync = disk.folder / "kept.json", os.fsync
         write(file, KEPT)
-        is_folder = disk._folder.stat().st_ino
+        is_folder = disk.folder.stat().st_ino
 
         def forgetful(descriptor: int) -> None:
             if (os.fstat(descriptor).st_ino == is_folder) != (missing == "folder"):

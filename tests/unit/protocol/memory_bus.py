@@ -22,7 +22,7 @@ class Wire:
     def __init__(self) -> None:
         self.clock = Clock()
         self.frames: list[Frame] = []
-        self._buses: list[MemoryBus] = []
+        self.buses: list[MemoryBus] = []
 
     def open(self) -> MemoryBus:
         bus = MemoryBus(self)
@@ -30,11 +30,11 @@ class Wire:
         return bus
 
     def join(self, bus: MemoryBus) -> None:
-        self._buses.append(bus)
+        self.buses.append(bus)
 
     def carry(self, sender: MemoryBus, frame: Frame) -> None:
         self.frames.append(frame)
-        for bus in self._buses:
+        for bus in self.buses:
             if bus is not sender:
                 bus.take(frame)
 
@@ -45,20 +45,20 @@ class Wire:
 class MemoryBus:
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
-        self._queue: deque[Frame] = deque()
+        self.queue: deque[Frame] = deque()
         self._wanted: frozenset[int] | None = None
 
     def take(self, frame: Frame) -> None:
         if self._wanted is None or frame[0] in self._wanted:
-            self._queue.append(frame)
+            self.queue.append(frame)
 
     def send(self, can_id: int, data: bytes) -> None:
         self._wire.carry(self, (can_id, bytes(data)))
 
     def recv(self, timeout: float | None) -> Frame | None:
         """Waiting costs no wall time here, but moves the clock by the time-out."""
-        if self._queue:
-            return self._queue.popleft()
+        if self.queue:
+            return self.queue.popleft()
         self._wire.clock.now += timeout or 0.0
         return None
 
@@ -69,4 +69,4 @@ class MemoryBus:
         return -1
 
     def close(self) -> None:
-        self._queue.clear()
+        self.queue.clear()

@@ -127,7 +127,7 @@ class Adapter:
 @pytest.fixture
 def adapter(monkeypatch: pytest.MonkeyPatch) -> Adapter:
     adapter = Adapter()
-    monkeypatch.setitem(bus_module._OPENED_BY, "adapter", lambda **arguments: adapter)
+    monkeypatch.setitem(bus_module.OPENED_BY, "adapter", lambda **arguments: adapter)
     return adapter
 
 

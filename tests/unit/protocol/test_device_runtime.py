@@ -328,7 +328,7 @@ class TestPlant:
         rig.nmt(NmtCommand.PRE_OPERATIONAL)
         assert rig.write(0x1006, 0, struct.pack("<I", 50_000)) is None
         rig.nmt(NmtCommand.RESET_COMMUNICATION)
-        assert self.plant._sample_time_s == 0.2
+        assert self.plant.sample_time_s == 0.2
 
 
 def test_trouble_with_the_bus_is_said_once(

@@ -267,7 +267,7 @@ class TestEnds:
 class TestSilence:
     def test_a_silent_pv_brings_the_output_of_home_unasked_and_the_plant_takes_it(self, rig: Rig) -> None:
         rig.under_test()
-        home, number = rig.read("controller_home_mv"), rig.plant._number
+        home, number = rig.read("controller_home_mv"), rig.plant.number
         assert rig.read("plant_mv") != home
         rig.wire.frames.clear()
         rig.wait(0.9, alive=[TUNER_NODE])
@@ -275,7 +275,7 @@ class TestSilence:
         rig.wait(0.3, alive=[TUNER_NODE])
         assert rig.wire.sent(IDS.mv) == [MV_FRAME.pack(home, UNASKED)]
         assert rig.is_home() and rig.read("controller_cause") == Cause.NO_PV
-        assert (rig.read("plant_mv"), rig.plant._number) == (pytest.approx(home, rel=1e-6), number)
+        assert (rig.read("plant_mv"), rig.plant.number) == (pytest.approx(home, rel=1e-6), number)
         assert rig.read("controller_pv_valid") == 0 and Emcy.NO_PV in rig.emergencies(CONTROLLER)
 
     def test_a_session_closed_while_nothing_moves_brings_it_too(self, rig: Rig) -> None:

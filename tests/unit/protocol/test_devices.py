@@ -222,7 +222,7 @@ class TestUnasked:
 class TestWrap:
     def test_after_the_last_sample_number_comes_1(self, rig: Rig) -> None:
         rig.run(2)
-        rig.plant._number = 0xFFFFFFFD
+        rig.plant.number = 0xFFFFFFFD
         rig.wire.frames.clear()
         rig.run(5)
         numbers = [0xFFFFFFFE, 0xFFFFFFFF, 1, 2, 3]

@@ -20,7 +20,7 @@ def test_everybody_has_a_turn_in_the_order_of_asking() -> None:
     with lock.take():
         for waiting, thread in enumerate(threads, 1):
             thread.start()
-            until(lambda count=waiting: len(lock._waiting) >= count)
+            until(lambda count=waiting: lock.waiting >= count)
     for thread in threads:
         thread.join(60)
     assert order == list(range(8))
@@ -37,7 +37,7 @@ def test_who_asks_again_at_once_comes_after_who_waits() -> None:
     thread = threading.Thread(target=ask)
     with lock.take():
         thread.start()
-        until(lambda: lock._waiting)
+        until(lambda: lock.waiting)
     with lock.take():
         order.append("the same again")
     thread.join(60)
@@ -55,7 +55,7 @@ def test_what_is_urgent_goes_first() -> None:
     with lock.take():
         for waiting, thread in enumerate(threads, 1):
             thread.start()
-            until(lambda count=waiting: len(lock._waiting) + len(lock._urgent) >= count)
+            until(lambda count=waiting: lock.waiting >= count)
     for thread in threads:
         thread.join(60)
     assert order == [1, 3, 5, 0, 2, 4]
@@ -91,7 +91,7 @@ def test_who_gives_up_while_waiting_keeps_nobody_else_from_a_turn() -> None:
         thread = threading.Thread(target=ask)
         thread.start()
         thread.join(60)
-    assert seen == [0] and not lock._waiting
+    assert seen == [0] and not lock.waiting
     with lock.take():
         pass
 

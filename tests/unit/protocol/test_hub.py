@@ -98,7 +98,7 @@ def test_rubbish_harms_nobody_else(hub: Hub, members: list[can.BusABC], rubbish:
 
 
 def test_only_this_machine_can_reach_it(hub: Hub) -> None:
-    assert hub._listener.getsockname()[0] == "127.0.0.1"
+    assert hub.address == "127.0.0.1"
 
 
 def test_as_a_process_it_says_where_it_is_and_stops_when_asked() -> None:

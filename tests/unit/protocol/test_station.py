@@ -17,13 +17,13 @@ class Others(Wire):
 
     def __init__(self, *nodes: int, every_s: float = 0.1) -> None:
         super().__init__()
-        self._ids, self._every_s, self._next = [heartbeat_id(node) for node in nodes], every_s, self.clock.now
+        self.node_ids, self._every_s, self.next_at = [heartbeat_id(node) for node in nodes], every_s, self.clock.now
         self._other = self.open()
 
     def pass_time(self) -> None:
-        if self.clock.now >= self._next:
-            self._next = self.clock.now + self._every_s
-            for each in self._ids:
+        if self.clock.now >= self.next_at:
+            self.next_at = self.clock.now + self._every_s
+            for each in self.node_ids:
                 self._other.send(each, BEAT)
 
 
@@ -58,7 +58,7 @@ def test_a_node_id_that_beats_already_is_refused_and_named() -> None:
 def test_one_that_beats_seldom_is_heard_too() -> None:
     wire = Others(TUNER_NODE, every_s=1.9)
     wire.clock.now += 0.1
-    wire._next = wire.clock.now + 1.9
+    wire.next_at = wire.clock.now + 1.9
     with pytest.raises(NodeTaken):
         station_on(wire).join("wire")
 
@@ -108,7 +108,7 @@ def test_who_has_not_beaten_for_long_listens_again() -> None:
     wire = Others()
     station = station_on(wire)
     station.join("wire")
-    wire._ids = [heartbeat_id(TUNER_NODE)]
+    wire.node_ids = [heartbeat_id(TUNER_NODE)]
     wire.clock.now += 10.0
     with pytest.raises(NodeTaken):
         station.join("wire")

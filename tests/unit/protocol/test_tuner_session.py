@@ -100,7 +100,7 @@ def test_an_order_whose_answer_is_lost_is_given_once(site: Site, order: Order) -
     values = (51.0,) if order is Order.SETPOINT else ()
     if values:
         site.device.dictionary.set("controller_session_setpoint", 51.0, 1)
-        session._staged["controller_session_setpoint"] = 51.0
+        session.staged["controller_session_setpoint"] = 51.0
     site.lost_answers = 2
     session.give(order, values)
     assert (site.lost_answers, site.device.sessions[0].count) == (0, 2)
@@ -128,7 +128,7 @@ def test_what_another_has_staged_meanwhile_is_staged_again(site: Site) -> None:
 
 def test_an_order_that_was_carried_out_by_nobodys_knowledge_is_given_again_with_the_right_count(site: Site) -> None:
     session = opened(site)
-    session._count = 0
+    session.count = 0
     session.give(Order.SETPOINT, (51.0,))
     assert site.device.channels[0].setpoint == 51.0
 

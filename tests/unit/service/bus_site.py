@@ -107,7 +107,7 @@ class TunerBus(MemoryBus):
         give_up = clock.now + (timeout or 0.0)
         while True:
             self.site.pump()
-            if self._queue or clock.now >= give_up:
+            if self.queue or clock.now >= give_up:
                 return super().recv(0.0)
             clock.now = min(clock.now + STEP_S, give_up)
 
@@ -147,7 +147,7 @@ class Site:
     @property
     def mv(self) -> float:
         """At the plant."""
-        return self.plant._mv[0]
+        return self.plant.mv[0]
 
     def sleep(self, seconds: float) -> None:
         self.pass_time(seconds)
@@ -170,7 +170,7 @@ class Site:
 
     def let_run(self) -> None:
         self.plant.dictionary.write(lookup("plant_samples_to_run").index, 0, FOREVER.to_bytes(4, "little"))
-        self.pass_time(5.0 * self.plant._sample_time_s)
+        self.pass_time(5.0 * self.plant.sample_time_s)
 
     def hand(self, name: str, value: float) -> None:
         """Somebody else writes by SDO."""
@@ -190,7 +190,7 @@ class Site:
         self.pump()
 
     def transmitter(self, works: bool) -> None:
-        self.plant._plants[0].noise_std = 0.0 if works else math.nan
+        self.plant.plants[0].noise_std = 0.0 if works else math.nan
 
     def names(self) -> list[str]:
         """Of the objects written since this was asked last."""
@@ -199,7 +199,7 @@ class Site:
 
     def begun(self) -> tuple[LoopState, int]:
         """Home and the number of a session that has just been opened, on a plant that runs, or is run in blocks."""
-        if self.plant._pace:
+        if self.plant.pace:
             self.let_run()
         numbers: list[int] = []
         home = self.loop.begin(remember=numbers.append)

@@ -256,6 +256,11 @@ class ThreadEngine:
         thread = self._threads[job_id] = threading.Thread(target=self._run, args=(job_id,))
         thread.start()
 
+    def join(self, timeout_s: float, job_id: str | None = None) -> None:
+        """Waits for the end of this job, or of each one's that there is now."""
+        for thread in list(self._threads.values()) if job_id is None else [self._threads[job_id]]:
+            thread.join(timeout_s)
+
     def known(self, job_ids: Collection[str]) -> set[str]:
         return {job_id for job_id in job_ids if job_id in self._threads and self._threads[job_id].is_alive()}
 

@@ -50,7 +50,7 @@ class Clock:
 @pytest.fixture
 def clock(service: Service) -> Clock:
     clock = Clock()
-    service.jobs.aftercare._clock = clock
+    service.jobs.aftercare.clock = clock
     return clock
 
 
@@ -161,7 +161,7 @@ def test_the_thread_looks_by_itself_and_ends_with_the_service(tmp_path: Path, mo
         time.sleep(0.01)
     assert not service.store.get(row.id).look_after
     service.close()
-    assert not service.jobs.aftercare._thread.is_alive()
+    assert not service.jobs.aftercare.is_running
 
 
 def test_a_loop_with_an_active_job_is_that_jobs(service: Service, clock: Clock) -> None:

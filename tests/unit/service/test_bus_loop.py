@@ -216,7 +216,7 @@ class TestLease:
         """A renewal of a session that is over has an answer all the same."""
         site.begun()
         site.controller.sessions[0].end(Cause.LEASE)
-        site.controller._told[0] = site.controller._told[0] and (*site.controller._told[0][:3], False, Cause.LEASE)
+        site.controller.told[0] = site.controller.told[0] and (*site.controller.told[0][:3], False, Cause.LEASE)
         began_at = site.wire.clock.now
         with pytest.raises(Failed, match="cause: lease"):
             while True:
@@ -289,7 +289,7 @@ class TestWaiting:
         def samples(call: int) -> None:
             nonlocal number
             in_blocks.wire.clock.now += 0.001
-            if in_blocks.wire._buses[-1]._queue:
+            if in_blocks.wire.buses[-1].queue:
                 return
             number += 1
             in_blocks.replay((channel_ids(1).pv, PV_FRAME.pack(50.0, number)))
@@ -312,7 +312,7 @@ class TestWaiting:
         def samples(call: int) -> None:
             nonlocal number
             in_blocks.wire.clock.now += 0.001
-            if told != 1 or in_blocks.wire._buses[-1]._queue:
+            if told != 1 or in_blocks.wire.buses[-1].queue:
                 return
             number += 1
             in_blocks.replay((channel_ids(1).pv, PV_FRAME.pack(50.0, number)))
@@ -343,17 +343,17 @@ class TestSamples:
     def test_go_on_over_the_wrap_of_their_number(self, pace: float) -> None:
         site = Site(pace)
         site.let_run()
-        site.plant._number = 0xFFFFFFF0
+        site.plant.number = 0xFFFFFFF0
         site.loop.begin()
         samples = [site.loop.step(()) for _ in range(40)]
         assert [round(sample.t, 6) for sample in samples] == [round(0.1 * n, 6) for n in range(40)]
-        assert site.plant._number < 100
+        assert site.plant.number < 100
 
     def test_of_a_plant_that_has_started_anew_are_lost(self, site: Site) -> None:
         site.begun()
         for _ in range(20):
             site.loop.step(())
-        site.plant._number = 2
+        site.plant.number = 2
         with pytest.raises(Failed, match="started anew") as caught:
             site.loop.step(())
         assert caught.value.reason is Reason.SAMPLES_LOST
@@ -569,7 +569,7 @@ class TestAccepting:
 
     def test_what_the_controller_cannot_keep_does_not_stay(self, site: Site) -> None:
         site.let_run()
-        site.controller._keeper = Full(OSError(28, "No space left on device"))
+        site.controller.keeper = Full(OSError(28, "No space left on device"))
         with pytest.raises(Refused, match="could not store it"):
             site.loop.accept(NEW, self.OLD)
         assert site.channel.accepted == FOUND and site.is_home()
@@ -582,9 +582,9 @@ class TestAccepting:
             nonlocal number
             if "controller_order_accept" in [name for name, _ in site.written] and number < 3:
                 number += 1
-                for bus in site.wire._buses:
+                for bus in site.wire.buses:
                     if hasattr(bus, "gateway"):
-                        bus._queue.clear()
+                        bus.queue.clear()
 
         site.gateway.before = lose_answers
         assert site.loop.accept(NEW, self.OLD).gains == NEW
@@ -612,7 +612,7 @@ class TestAccepting:
         site.let_run()
         full = Full(OSError(28, "No space left on device"))
         full.on_now = lambda: setattr(site, "lost", OSError(19, "No such device"))
-        site.controller._keeper = full
+        site.controller.keeper = full
         sleep, tries = site.gateway.sleep, 0
 
         def soon_back(seconds: float) -> None:

@@ -65,7 +65,7 @@ class TestBesideALoop:
         aborted.start(Work(begun.set))
         aborted.restore(aborted.read())
         over.set()
-        assert aborted._idle.wait(5)
+        assert aborted.idle.wait(5)
         assert not begun.is_set()
 
     def test_computations_of_several_loops_take_turns(self) -> None:
@@ -86,7 +86,7 @@ class TestBesideALoop:
 def done(work: Work[Any], pool: Pool) -> Any:
     computing = Computing(FakeLoop(FakeController()), pool)
     computing.start(work)
-    assert computing._idle.wait(60) and work.done
+    assert computing.idle.wait(60) and work.done
     return work.result()
 
 
@@ -231,7 +231,7 @@ class TestOrder:
         computing.start(Work(partial(burn, mark)))
         until(lambda: mark.exists() and mark.read_text() != "")
         computing.restore(computing.read())
-        assert computing._idle.wait(60) and gone(int(mark.read_text()))
+        assert computing.idle.wait(60) and gone(int(mark.read_text()))
 
 
 class TestEnd:

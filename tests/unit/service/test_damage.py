@@ -141,13 +141,13 @@ def test_a_check_that_takes_long_goes_on_beside_the_service(tmp_path: Path, monk
     filled(tmp_path)
     # Where the start has nothing to read.
     overwrite(tmp_path / FILE, (pages_of(tmp_path, "sample_chunks")[1] - 1) * PAGE, PAGE)
-    opened, check = threading.Event(), FileCheck._run
+    opened, check = threading.Event(), FileCheck.run
 
     def beside(self: FileCheck) -> None:
         opened.wait(60)
         check(self)
 
-    monkeypatch.setattr(FileCheck, "_run", beside)
+    monkeypatch.setattr(FileCheck, "run", beside)
     monkeypatch.setattr(FileCheck, "wait", lambda *_: False)
     store = Store(tmp_path)
     assert store.damaged is None

@@ -201,7 +201,7 @@ def test_a_retune_stopped_while_its_next_job_is_made_has_no_such_job(plant: Plan
     retune = plant.fleet.start(asked(loops=["A-1"])).id
     row, parts = plant.fleet.get(retune)
     plant.fleet.abort(retune, "me")
-    plant.fleet._begin(row, asked(loops=["A-1"]), parts)  # it had looked before
+    plant.fleet.begin(row, asked(loops=["A-1"]), parts)  # it had looked before
     assert plant.running() == [] and plant.store.recent() == []
 
 

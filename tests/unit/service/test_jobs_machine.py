@@ -459,14 +459,14 @@ class JobsMachine(RuleBasedStateMachine):
 def test_jobs_do_what_the_model_says(
     tmp_path: Path, machine_count: Counter[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pragmas = database._pragmas
+    pragmas = database.pragmas
 
     def hasty(connection: Any, record: object) -> None:
         """These crashes are no power cuts: waiting for the disk would only take time."""
         pragmas(connection, record)
         connection.execute("PRAGMA synchronous=OFF")
 
-    monkeypatch.setattr(database, "_pragmas", hasty)
+    monkeypatch.setattr(database, "pragmas", hasty)
     Store(tmp_path).close()
     for round_number in range(4):  # threads decide too what happens: a rare outcome may want another round
         run_state_machine_as_test(  # type: ignore[no-untyped-call]

@@ -31,7 +31,7 @@ def test_it_is_told_once_a_minute_at_most() -> None:
     assert [lateness.note(0.5, at) for at in (1000.1, 1030.0, 1059.9)] == [None] * 3
     assert lateness.note(0.05, 1060.0) is None  # not late enough
     assert lateness.note(0.07, 1060.1) == 0.5
-    assert len(lateness._worst) <= 61
+    assert len(lateness.by_second) <= 61
 
 
 def test_a_handler_that_blocks_is_seen(service: Service, caplog: pytest.LogCaptureFixture) -> None:

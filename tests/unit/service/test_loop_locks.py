@@ -358,7 +358,7 @@ def test_locked_and_retuned_at_the_same_time(racing: tuple[Jobs, FakeTune]) -> N
             tune.hold.set()
             if job is not None:
                 engine: Any = jobs.engine
-                engine._threads[job].join(20)
+                engine.join(20, job)
                 row = jobs.store.get(job)
                 if running is None:
                     assert (row.state, row.reason) == ("refused", "locked"), row.detail

@@ -98,7 +98,7 @@ def test_the_same_on_a_postgresql_server(store: Store, postgres: Server, tmp_pat
         metadata = MetaData()
         metadata.reflect(source)
         for name in ("loops", "jobs", "events", "retunes", "retune_loops"):
-            rows = [dict(row._mapping) for row in source.execute(select(metadata.tables[name]))]
+            rows = [dict(row) for row in source.execute(select(metadata.tables[name])).mappings()]
             to.execute(insert(Table(name, MetaData(), autoload_with=to)), rows)
         migrate(to, "head")
     try:

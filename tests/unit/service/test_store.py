@@ -200,10 +200,10 @@ def test_nobody_waits_for_the_dead_nor_for_who_has_left(
     database = postgres.database()
     Store(tmp_path / "a", database, "a").close()
     killed = Store(tmp_path / "b", database, "a")
-    assert killed._host_lock is not None
-    killed._host_lock._drop()
+    assert killed.host_lock is not None
+    killed.host_lock.drop()
     killed.engine.dispose()
-    killed._folder_lock.close()
+    killed.folder_lock.close()
     Store(tmp_path / "b", database, "a").close()  # the same folder: its lock says that the one before is dead
 
 
