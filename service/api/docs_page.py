@@ -42,9 +42,7 @@ def _operation(path: str, method: str, operation: dict[str, Any], schemas: dict[
         for x in operation.get("parameters", ())
     ]
     body = operation.get("requestBody", {}).get("content", {}).get("application/json", {}).get("schema", {})
-    model = schemas.get(_name(body), {})
-    needed = model.get("required", ())
-    rows += [(f"{k} (body)", v.get("description", ""), k in needed) for k, v in model.get("properties", {}).items()]
+    rows += _body(_names(body), schemas)
     rows += [(str(k), v.get("description", ""), False) for k, v in operation.get("responses", {}).items()]
     cells = "".join(
         f"<tr><td><code>{escape(name)}</code>{' *' if required else ''}<td>{escape(text)}"
@@ -57,9 +55,23 @@ def _operation(path: str, method: str, operation: dict[str, Any], schemas: dict[
     )
 
 
-def _name(schema: dict[str, Any]) -> str:
-    """The schema referred to, also where it may be null."""
-    for choice in (schema, *schema.get("anyOf", ())):
-        if "$ref" in choice:
-            return str(choice["$ref"]).rpartition("/")[2]
-    return ""
+def _body(names: list[str], schemas: dict[str, Any]) -> list[tuple[str, str, bool]]:
+    """The fields of the schemas that a body may have: name, description, whether it is required. A field that not all
+    of the schemas have is followed by the names of those that do."""
+    having: dict[str, list[str]] = {}
+    for name in names:
+        for field in schemas[name].get("properties", {}):
+            having.setdefault(field, []).append(name)
+    rows = []
+    for field, those in having.items():
+        where = "body" if those == names else "body: " + ", ".join(those)
+        text = schemas[those[0]]["properties"][field].get("description", "")
+        rows.append((f"{field} ({where})", text, all(field in schemas[name].get("required", ()) for name in those)))
+    return rows
+
+
+def _names(schema: dict[str, Any]) -> list[str]:
+    """The schemas referred to, where the schema may also be null or is one of several."""
+    choices = (schema, *schema.get("anyOf", ()), *schema.get("oneOf", ()))
+    direct = [str(choice["$ref"]).rpartition("/")[2] for choice in choices if "$ref" in choice]
+    return direct + [name for choice in choices[1:] if "$ref" not in choice for name in _names(choice)]
