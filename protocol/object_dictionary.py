@@ -45,7 +45,7 @@ class Dictionary:
         """Sets a value from inside the device, without checks and without calling `on_write`."""
         self._values[name, sub] = value
 
-    def remember(self) -> None:
+    def set_restore_values(self) -> None:
         """Notes the present values as those that `restore` sets."""
         self._start = dict(self._values)
 

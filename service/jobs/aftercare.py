@@ -13,7 +13,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.loop_state import state_json
-from loopwright.service.loops.restoration import Restoration, look
+from loopwright.service.loops.restoration import Restoration, restore_loop_of
 from loopwright.service.machine import Machine
 from loopwright.service.store import looked_after
 from loopwright.service.store.store import Busy, Store
@@ -122,7 +122,7 @@ class Aftercare:
             raise Busy(tag, active.id)
         return looked_after.dismissed(self._store, tag, by)
 
-    def look(self) -> None:
+    def check_due_loops(self) -> None:
         """Reads every loop whose time has come."""
         rows = looked_after.rows(self._store)
         for gone in self._again.keys() - {row.id for row in rows}:
@@ -147,7 +147,7 @@ class Aftercare:
             # A running job answers for its loop: this row may have been read before that job began.
             if self._stopping or self._store.active(row.loop) is not None:
                 return
-            found = look(row, self._directory.loops, self._directory.open_loop)
+            found = restore_loop_of(row, self._directory.loops, self._directory.open_loop)
         if found.state is None:
             self._not_yet(row, found)
         elif looked_after.home_again(self._store, row.id, state_json(found.state), found.text):
@@ -163,7 +163,7 @@ class Aftercare:
     def _run(self) -> None:
         while not self._stopping:
             try:
-                self.look()
+                self.check_due_loops()
             except SQLAlchemyError as error:
                 log.warning("the loops to be supervised could not be read from the database: %s", error)
             except Exception:

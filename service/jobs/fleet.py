@@ -29,7 +29,7 @@ from loopwright.tuning.reasons import Reason
 
 log = logging.getLogger(__name__)
 
-LOOK_S = 0.5
+POLL_S = 0.5
 """Wall time between two rounds, s."""
 _OWN = ("loops", "pattern", "at_once_per_bus", "at_once_per_area", "stop_after_failures")
 AtOnce = Annotated[int, Field(ge=1, le=1000)]
@@ -108,7 +108,7 @@ class Fleet:
     def _run(self) -> None:
         while not self._over.is_set():
             try:
-                self.look()
+                self.poll()
             except FolderInUse as error:
                 log.error("another host runs the retunes of many loops: %s", error)
                 return
@@ -116,7 +116,7 @@ class Fleet:
                 log.warning("retunes of many loops wait for the database: %s", error)
             except Exception:
                 log.exception("a defect in a retune of many loops")
-            self._wake.wait(LOOK_S)
+            self._wake.wait(POLL_S)
             self._wake.clear()
 
     # requests
@@ -171,7 +171,7 @@ class Fleet:
             return [(row, retunes.parts(session, row.id)) for row in retunes.recent(session, limit, before)]
 
     # the work
-    def look(self) -> None:
+    def poll(self) -> None:
         """Makes one round over the retunes of this host: starts jobs where possible, and ends retunes that are over."""
         with self._looking:
             with self._store.reading() as session:

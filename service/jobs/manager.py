@@ -186,8 +186,8 @@ class Jobs:
                         self.store.request_stop(job_id, Reason.INTERNAL.value, "service")
             except SQLAlchemyError as error:
                 log.error(
-                    "job %s of loop %s could not be queued, and its end could not be written: it does not begin, and holds "
-                    "the loop until the database takes its end, which is tried every %.0f s: %s",
+                    "job %s of loop %s could not be queued, and its end could not be written: it does not begin, and "
+                    "holds the loop until the database accepts its end, which is tried every %.0f s: %s",
                     job_id, row.loop, _RECONCILE_S, error,
                 )  # fmt: skip
             else:

@@ -69,7 +69,7 @@ class BusConnection:
         """Ends this process's heartbeat for the loop and the renewals of the lease."""
         if self._tuner is not None:
             self._tuner.beating = False
-            self._tuner.keep(0)
+            self._tuner.set_renewed_session(0)
 
     def close(self) -> None:
         """Closes the tuner; it is opened again when needed."""

@@ -73,7 +73,7 @@ class BusLoop:
     def begin(
         self,
         stop: Callable[[], Reason | None] = lambda: None,
-        remember: Callable[[int], None] = lambda session: None,
+        note_session: Callable[[int], None] = lambda session: None,
     ) -> LoopState:
         self._stop = stop
         self.session.number = 0
@@ -82,7 +82,7 @@ class BusLoop:
                 self._connection.reading(tuner).identify()
                 self._connection.reading(tuner).compare_times()
                 self._samples.take_plant(tuner)
-                home = self.session.open(tuner, self._samples.pace, self._samples.sample_time_s, remember)
+                home = self.session.open(tuner, self._samples.pace, self._samples.sample_time_s, note_session)
                 self._samples.begin(tuner)
                 self._commands.clear()
                 return home

@@ -22,7 +22,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerProcess
 from typing import Any
 
-from loopwright.service.execution.computing.child import GO_ON, PAUSE, Said, compute
+from loopwright.service.execution.computing.child import GO_ON, PAUSE, MessageKind, compute
 from loopwright.service.execution.computing.limits import (
     MEMORY_OPTION,
     OPTIONS,
@@ -108,12 +108,12 @@ class Pool:
         kind: ComputationKind,
         work: Callable[..., Any],
         *,
-        hear: Callable[[Any], None] | None = None,
+        on_report: Callable[[Any], None] | None = None,
         unwanted: Callable[[], bool] = lambda: False,
     ) -> Any:
         """Waits for the work and returns its result, or raises its error.
 
-        hear: receives, in this thread, each value that the work passes to the function it is called with.
+        on_report: receives, in this thread, each value that the work passes to the function it is called with.
         unwanted: asked several times a second; when it returns True, the computation is ended and NotWanted raised.
         Raises Failed(COMPUTATION_LIMIT | COMPUTATION_LOST), NoProcess.
         """
@@ -122,7 +122,7 @@ class Pool:
                 while not place.turn.wait(_LOOK_WAITING_S):
                     self._check(unwanted)
                 self._check(unwanted)
-                heard = _Heard(hear)
+                heard = _Heard(on_report)
                 try:
                     return self._one(kind, work, place, heard, unwanted)
                 except _Died as died:
@@ -199,17 +199,17 @@ class Pool:
                 while not connection.poll(_LOOK_S):
                     self._check(unwanted)
                 try:
-                    said, value = connection.recv()
+                    message_kind, value = connection.recv()
                 except (EOFError, OSError):
                     with _bookkeeping:
                         process.join()
                     raise _Died(process.exitcode) from None
-                if said is Said.REPORT:
+                if message_kind is MessageKind.REPORT:
                     heard.report(value)
                     self._check(unwanted)
-                elif said is Said.RESULT:
+                elif message_kind is MessageKind.RESULT:
                     return value
-                elif said is Said.NO_MEMORY:
+                elif message_kind is MessageKind.NO_MEMORY:
                     memory = self.limits.memory_mb
                     text = f"{WORDS[kind]} asked for more than {memory} MB of memory ({MEMORY_OPTION})"
                     raise Failed(Reason.COMPUTATION_LIMIT, text)
@@ -253,20 +253,20 @@ class Pool:
 
 
 class _Heard:
-    """Passes reports on to `hear`.
+    """Passes reports on to `on_report`.
 
     anything: whether there was a report, so that the work cannot be repeated.
     """
 
-    def __init__(self, hear: Callable[[Any], None] | None) -> None:
-        self.wanted = hear is not None
+    def __init__(self, on_report: Callable[[Any], None] | None) -> None:
+        self.wanted = on_report is not None
         self.anything = False
-        self._hear = hear
+        self._on_report = on_report
 
     def report(self, value: object) -> None:
-        assert self._hear is not None
+        assert self._on_report is not None
         self.anything = True
-        self._hear(value)
+        self._on_report(value)
 
 
 def _no_process(kind: ComputationKind, error: Exception) -> NoProcess:

@@ -90,11 +90,11 @@ class FakeLoop:
     def begin(
         self,
         stop: Callable[[], Reason | None] = lambda: None,
-        remember: Callable[[int], None] = lambda session: None,
+        note_session: Callable[[int], None] = lambda session: None,
     ) -> LoopState:
         self._operational(self.read())
         number = self._controller.session_last + 1
-        remember(number)
+        note_session(number)
         self._number = number
         self._controller.begin_session(number)
         return self._controller.home
@@ -192,7 +192,7 @@ class FakeTune:
         times: dict[str, float] = {}
         done = {event.data["stage"] for event in hooks.earlier if event.kind == "stage_done"}
         try:
-            hooks.on_home(loop.begin(hooks.stop, hooks.remember))
+            hooks.on_home(loop.begin(hooks.stop, hooks.note_session))
         except Ended as error:
             return Outcome(None, error, None, {})
         try:
