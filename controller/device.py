@@ -398,7 +398,7 @@ class ControllerDevice:
         try:
             self._retained_store.write_now(retained)
         except OSError as error:
-            print(f"controller: channel {sub} not accepted, it could not be kept: {error}", file=sys.stderr)
+            print(f"controller: channel {sub} not accepted, it could not be stored: {error}", file=sys.stderr)
             self._retained = self._retained_now()
             self._retained_store.write_soon(self._retained)
             raise SdoAbort(Abort.NOT_STORED) from error

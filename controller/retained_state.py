@@ -128,7 +128,7 @@ class RetainedStateFile:
                     self._write(self._path, channels)
                     continue
                 except OSError as error:
-                    print(f"controller: mode and set-point could not be kept: {error}", file=sys.stderr)
+                    print(f"controller: mode and set-point could not be stored: {error}", file=sys.stderr)
             time.sleep(self._again_s)
             with self._changed:
                 if self._wanted is channels:

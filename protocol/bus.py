@@ -207,17 +207,17 @@ class _Socketcand(SocketCanDaemonBus):
 
     def _expect_msg(self, msg: str) -> None:
         server: socket.socket = vars(self)["_SocketCanDaemonBus__socket"]
-        found, usual = b"", server.gettimeout()
+        received, usual = b"", server.gettimeout()
         server.settimeout(_GREETED_S)  # the kernel accepts connections for a stopped server
         try:
-            while len(found) < len(msg) and (part := server.recv(len(msg) - len(found))):
-                found += part
+            while len(received) < len(msg) and (part := server.recv(len(msg) - len(received))):
+                received += part
         except OSError:
             server.close()
             raise
         server.settimeout(usual)
-        if found != msg.encode():
-            raise can.CanError(f"expected {msg!r}, got {found!r}")
+        if received != msg.encode():
+            raise can.CanError(f"expected {msg!r}, got {received!r}")
 
 
 _LIBRARY_STATES = {can.BusState.PASSIVE: BusState.PASSIVE, can.BusState.ERROR: BusState.BUS_OFF}

@@ -158,7 +158,7 @@ def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcom
     from loopwright.service.execution.rehearsal import rehearse as rehearse_spec
 
     spec, on = rehearsal_spec(config, request, hooks.ground)
-    told = to_json_object(on)
+    plant = to_json_object(on)
     hooks.on_event(Note(f"rehearsed on {on.plant_text}; {on.gains_text}; nothing is tested on the loop"))
     options = _options(request)
     if request.fast:
@@ -167,10 +167,10 @@ def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcom
     answer = rehearse_spec(spec, on_event=hooks.on_event, on_samples=hooks.on_samples, **options)
     times = {name: float(value) for name, value in (answer.get("plant_time_s") or {}).items() if name != "total"}
     if answer["outcome"] in ("proposed", "no_gain"):
-        return Outcome(_as_proposal(answer) | {"rehearsed_on": told}, None, None, times)
+        return Outcome(_as_proposal(answer) | {"rehearsed_on": plant}, None, None, times)
     reason = _reason(answer.get("reason"))
     kind = Aborted if reason in _STOPPED else Refused if answer["outcome"] == "refused" else Failed
-    return Outcome({"rehearsed_on": told}, kind(reason, str(answer.get("detail") or "")), None, times)
+    return Outcome({"rehearsed_on": plant}, kind(reason, str(answer.get("detail") or "")), None, times)
 
 
 def _known_model(request: RetuneRequest) -> Model | None:
@@ -213,7 +213,7 @@ def _options(request: RetuneRequest) -> dict[str, Any]:
 def _as_proposal(answer: dict[str, Any]) -> dict[str, Any]:
     """Returns a rehearsal's answer under the names of a live job's result."""
     ultimate, model, measured = (answer.get(key) or {} for key in ("ultimate", "model", "measured"))
-    told = {
+    common = {
         "ultimate": {"Ku": ultimate["Ku"], "Pu_s": ultimate["Pu"]} if ultimate else None,
         "method": answer.get("method"),
         "chosen": answer.get("chosen") or {},
@@ -227,9 +227,9 @@ def _as_proposal(answer: dict[str, Any]) -> dict[str, Any]:
         "input": answer.get("input"),
     }
     if answer["method"] == FAST:
-        return told | {name: answer.get(name) for name in ("model", "predicted_before", "found", "verified")}
+        return common | {name: answer.get(name) for name in ("model", "predicted_before", "found", "verified")}
     known = {"K": model["K"], "T_s": model["T"], "L_s": model["L"]}
-    return told | {"model": known | {key: model.get(key) for key in ("zeta", "k_source", "fit_pct")}}
+    return common | {"model": known | {key: model.get(key) for key in ("zeta", "k_source", "fit_pct")}}
 
 
 def _reason(text: object) -> Reason:

@@ -198,8 +198,8 @@ class Jobs:
 
         A job that runs here is asked before the abort is stored, so the loop does not wait for the database.
         """
-        heard = self.tell_to_stop(job_id)
-        row = self.store.request_stop(job_id, Reason.OPERATOR.value, by, heard)
+        is_running_here = self.tell_to_stop(job_id)
+        row = self.store.request_stop(job_id, Reason.OPERATOR.value, by, is_running_here)
         if row.host == self.store.host:
             self._request_stop_of(job_id, Reason.OPERATOR)
         return self.store.get(job_id)

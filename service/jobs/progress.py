@@ -44,10 +44,10 @@ class Progress:
     def seen_at(self, t_s: float | None) -> Progress:
         """Returns a copy at that plant time, or a plain copy where the progress is later already or the time is
         None."""
-        found = copy(self)
+        advanced = copy(self)
         if t_s is not None:
-            found.at(max(t_s, found._now_s))
-        return found
+            advanced.at(max(t_s, advanced._now_s))
+        return advanced
 
     @property
     def plant_time_s(self) -> float:

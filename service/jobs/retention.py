@@ -105,16 +105,16 @@ def _some(store: Store, policy: RetentionPolicy, at: datetime) -> list[JobRow]:
 
 def _old(host: str, policy: RetentionPolicy, at: datetime) -> list[ColumnElement[bool]]:
     with_samples = select(ChunkRow.job_id).where(ChunkRow.job_id == JobRow.id).exists()
-    found = [JobRow.host == host, JobRow.state.not_in(_KEPT), with_samples]
+    conditions = [JobRow.host == host, JobRow.state.not_in(_KEPT), with_samples]
     if policy.jobs is not None:
         # Rehearsals are counted separately: they must not displace the experiments.
         of_loop = (JobRow.loop, JobRow.dry_run)
         number = func.row_number().over(partition_by=of_loop, order_by=JobRow.number.desc())
         rank = select(JobRow.id, number).subquery()
-        found.append(JobRow.id.in_(select(rank.c[0]).where(rank.c[1] > policy.jobs)))
+        conditions.append(JobRow.id.in_(select(rank.c[0]).where(rank.c[1] > policy.jobs)))
     if policy.days is not None:
-        found.append(JobRow.ended_at < stamp(at - timedelta(days=policy.days)))
-    return found
+        conditions.append(JobRow.ended_at < stamp(at - timedelta(days=policy.days)))
+    return conditions
 
 
 def _why(policy: RetentionPolicy) -> str:

@@ -72,19 +72,19 @@ def read_back(reading: BusReading, home: LoopState, number: int, how: str) -> Re
     if not reading.controls(state):
         raise Failed(Reason.NODE_NOT_OPERATIONAL, f"{state.node_state}: nothing controls, MV stays where it is")
     holder = int(tuner.number("controller_session_holder"))
-    ours = bool(number) and int(tuner.number("controller_session_last")) == number and not holder
-    if ours:  # the controller noted the state at the moment of the opening
+    is_own = bool(number) and int(tuner.number("controller_session_last")) == number and not holder
+    if is_own:  # the controller noted the state at the moment of the opening
         home = reading.home()
     changes = outside_changes_of(tuner)  # read last, so that it includes every change so far
-    found = differences(state, home)
+    differing = differences(state, home)
     if holder:
-        found["session"] = f"the tuner with node-ID {holder:02X}h holds the loop"
-    theirs = set(found)
-    if ours:
-        theirs = set().union(*(may_differ for bit, (_, _, may_differ) in _OUTSIDE_CHANGES.items() if bit in changes))
-    unconfirmed = [words for name, words in found.items() if name not in theirs]
+        differing["session"] = f"the tuner with node-ID {holder:02X}h holds the loop"
+    explained = set(differing)
+    if is_own:
+        explained = set().union(*(may_differ for bit, (_, _, may_differ) in _OUTSIDE_CHANGES.items() if bit in changes))
+    unconfirmed = [words for name, words in differing.items() if name not in explained]
     if (
-        ours
+        is_own
         and not changes
         and state.mode is Mode.AUTOMATIC
         and _ended_without_pv(tuner)
@@ -93,7 +93,7 @@ def read_back(reading: BusReading, home: LoopState, number: int, how: str) -> Re
         unconfirmed.append(f"MV is {state.mv:.6g} without a valid PV, was {home.mv:.6g}")
     if unconfirmed:
         raise Failed(Reason.RESTORE_UNCONFIRMED, "; ".join(unconfirmed))
-    return Restored(state, how, found)
+    return Restored(state, how, differing)
 
 
 def _ended_without_pv(tuner: Tuner) -> bool:

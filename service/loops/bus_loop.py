@@ -127,7 +127,7 @@ class BusLoop:
                     self._samples.read_sample_time(tuner)
                     held = self.session.open(tuner, self._samples.pace, self._samples.sample_time_s).gains
                     if not same_gains(held, instead_of) and not same_gains(held, gains):
-                        text = f"the controller holds {held}, not {instead_of}: somebody has changed the gains"
+                        text = f"the controller holds {held}, not {instead_of}: the gains were changed meanwhile"
                         raise Refused(Reason.GAINS_CHANGED, text)
                     self.session.order(tuner, Order.ACCEPT, *astuple(gains))
             except Ended as ended:

@@ -124,7 +124,7 @@ class BusSession:
         if holder:
             return Refused(Reason.LOOP_IN_USE, f"the tuner with node-ID {holder:02X}h holds a session on this loop")
         if tuner.number("controller_on_trial"):
-            text = "somebody tries other gains by hand: accept them or take them back (2120h), then repeat"
+            text = "an operator tries other gains by hand: accept them or take them back (2120h), then repeat"
             return Refused(Reason.GAINS_CHANGED, text)
         return Refused(Reason.LOOP_IN_USE, "another tuner had this loop at the moment of the opening")
 

@@ -49,9 +49,9 @@ def hash_key(key: str) -> str:
     return f"scrypt${costs}${salt.hex()}${_scrypt(key, salt, **_SCRYPT).hex()}"
 
 
-def matches(key: str, kept: str) -> bool:
+def matches(key: str, stored: str) -> bool:
     """Returns whether the key belongs to this stored hash. It takes about 50 ms."""
-    parts = _HASH.fullmatch(kept)
+    parts = _HASH.fullmatch(stored)
     if parts is None:
         return False
     n, r, p = (int(parts[i]) for i in (1, 2, 3))

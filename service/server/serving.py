@@ -252,10 +252,10 @@ def _is_of(networks: Sequence[IPv4Network | IPv6Network], address: str) -> bool:
     if not networks:
         return False
     try:
-        found = ip_address(address)
+        parsed = ip_address(address)
     except ValueError:
         return False
-    return any(found in network for network in networks)
+    return any(parsed in network for network in networks)
 
 
 def listen(bind: str, port: int) -> Listener:

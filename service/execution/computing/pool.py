@@ -70,10 +70,10 @@ class _Place:
         self.turn = threading.Event()
         self.control: Connection | None = None
 
-    def set_turn(self, mine: bool) -> None:
-        if mine == self.turn.is_set():
+    def set_turn(self, has_turn: bool) -> None:
+        if has_turn == self.turn.is_set():
             return
-        if mine:
+        if has_turn:
             self.turn.set()
         else:
             self.turn.clear()
@@ -122,15 +122,15 @@ class Pool:
                 while not place.turn.wait(_LOOK_WAITING_S):
                     self._check(unwanted)
                 self._check(unwanted)
-                heard = _Heard(on_report)
+                forwarder = _ReportForwarder(on_report)
                 try:
-                    return self._one(kind, work, place, heard, unwanted)
+                    return self._one(kind, work, place, forwarder, unwanted)
                 except _Died as died:
                     if died.exitcode == -signal.SIGXCPU:
                         cpu_s = self.limits.cpu_s(kind)
                         text = f"{WORDS[kind]} was ended after {cpu_s:g} s of processor time ({OPTIONS[kind]})"
                         raise Failed(Reason.COMPUTATION_LIMIT, text) from None
-                    if last == _TRIES or heard.anything:
+                    if last == _TRIES or forwarder.anything:
                         text = f"the process of {WORDS[kind]} was killed (exit {died.exitcode})"
                         raise Failed(Reason.COMPUTATION_LOST, text) from None
                     _log.warning("the process of %s was killed, the computation is repeated", WORDS[kind])
@@ -191,10 +191,10 @@ class Pool:
         kind: ComputationKind,
         work: Callable[..., Any],
         place: _Place,
-        heard: _Heard,
+        forwarder: _ReportForwarder,
         unwanted: Callable[[], bool],
     ) -> Any:
-        with self._process(kind, work, place, heard.wanted) as (process, connection):
+        with self._process(kind, work, place, forwarder.wanted) as (process, connection):
             while True:
                 while not connection.poll(_LOOK_S):
                     self._check(unwanted)
@@ -205,7 +205,7 @@ class Pool:
                         process.join()
                     raise _Died(process.exitcode) from None
                 if message_kind is MessageKind.REPORT:
-                    heard.report(value)
+                    forwarder.report(value)
                     self._check(unwanted)
                 elif message_kind is MessageKind.RESULT:
                     return value
@@ -224,13 +224,13 @@ class Pool:
         errors of pickling."""
         limits = self.limits.cpu_s(kind), self.limits.memory_mb, NICE[kind]
         try:
-            connection, theirs = multiprocessing.Pipe()
+            connection, child_end = multiprocessing.Pipe()
         except OSError as error:
             raise _no_process(kind, error) from error
         with connection:
-            with theirs:
+            with child_end:
                 process = self._context.Process(
-                    target=compute, args=(theirs, work, reports, *limits), name="computation", daemon=True
+                    target=compute, args=(child_end, work, reports, *limits), name="computation", daemon=True
                 )
                 try:
                     _start(process)
@@ -252,7 +252,7 @@ class Pool:
                     process.close()
 
 
-class _Heard:
+class _ReportForwarder:
     """Passes reports on to `on_report`.
 
     anything: whether there was a report, so that the work cannot be repeated.

@@ -136,7 +136,7 @@ class FakeLoop:
     def accept(self, gains: Gains, instead_of: Gains) -> LoopState:
         held = self.read().gains
         if not same_gains(held, instead_of) and not same_gains(held, gains):
-            raise Refused(Reason.GAINS_CHANGED, f"the controller holds {held}: somebody has changed the gains")
+            raise Refused(Reason.GAINS_CHANGED, f"the controller holds {held}: the gains were changed meanwhile")
         self._controller.state = replace(self._controller.state, gains=gains)
         return self._controller.state
 

@@ -562,7 +562,7 @@ class TestAccepting:
     def test_refuses_where_somebody_has_changed_the_gains(self, site: Site) -> None:
         site.let_run()
         site.channel.accept(Parameters(99.0, 12.0))
-        with pytest.raises(Refused, match="somebody has changed the gains") as caught:
+        with pytest.raises(Refused, match="the gains were changed meanwhile") as caught:
             site.loop.accept(NEW, self.OLD)
         assert caught.value.reason is Reason.GAINS_CHANGED
         assert site.channel.accepted.Kp == 99.0 and site.is_home()

@@ -295,15 +295,15 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
-from loopwright.service.execution.computing.limits import Kind
+from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.computing.pool import Pool
 from tests.unit.service.computations import burn
 pool = Pool(max_workers=1)
-pool.submit(Kind.DRY_RUN, partial(burn, Path(sys.argv[1])))
+pool.submit(ComputationKind.DRY_RUN, partial(burn, Path(sys.argv[1])))
 while not (Path(sys.argv[1]).exists() and Path(sys.argv[1]).read_text()):
     time.sleep(0.01)
 if len(sys.argv) > 2:
-    pool.submit(Kind.LIVE, partial(burn, Path(sys.argv[2])))
+    pool.submit(ComputationKind.LIVE, partial(burn, Path(sys.argv[2])))
 print("ready", flush=True)
 sys.stdin.read()
 """
