@@ -93,9 +93,11 @@ class ControllerChannel:
 
     @property
     def retained(self) -> RetainedState:
+        """Returns the part of this state that is stored over a restart."""
         return RetainedState(self.parameters, self.mode, self.setpoint, self.manual_output)
 
     def with_retained(self, retained: RetainedState) -> ControllerChannel:
+        """Returns this channel with a stored state."""
         return replace(
             self,
             parameters=retained.accepted,
@@ -105,6 +107,7 @@ class ControllerChannel:
         )
 
     def make(self, sample_time_s: float) -> Channel:
+        """Returns the control channel in this state."""
         return Channel(sample_time_s, self.settings, self.parameters, self.setpoint, self.mode, self.manual_output)
 
 
@@ -212,6 +215,7 @@ class ControllerDevice:
         return [session.channel for session in self.sessions]
 
     def start(self) -> None:
+        """Boots the device on its bus."""
         self.runtime.start()
 
     def _power_on(self) -> None:

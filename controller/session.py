@@ -78,6 +78,7 @@ class Session:
 
     @property
     def is_open(self) -> bool:
+        """Returns whether a session is open."""
         return self.number != 0
 
     @property
@@ -87,6 +88,7 @@ class Session:
 
     @property
     def pv_is_valid(self) -> bool:
+        """Returns whether the last PV was valid and is not silent."""
         return self.channel.measuring and not self.silent
 
     @property

@@ -39,6 +39,7 @@ class Dictionary:
         self._start: dict[tuple[str, int], Value] = {}
 
     def get(self, name: str, sub: int = 0) -> Value:
+        """Returns a value from inside the device, without calling `on_read`."""
         return self._values[name, sub]
 
     def set(self, name: str, value: Value, sub: int = 0) -> None:

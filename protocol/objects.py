@@ -40,6 +40,7 @@ class Type(Enum):
         return struct.calcsize(self.value[1])
 
     def encode(self, value: Value) -> bytes:
+        """Returns the bytes of a value, little-endian."""
         if isinstance(value, str):
             return value.encode("ascii")
         return struct.pack(self.format, value if self is Type.REAL32 else int(value))

@@ -79,9 +79,11 @@ class TunerSession:
         self._count += 1
 
     def renew(self) -> None:
+        """Renews the lease."""
         self._tuner.write("controller_session_renewal", self.number)
 
     def close(self) -> None:
+        """Closes the session."""
         self.give(Order.CLOSE)
 
     @property

@@ -167,6 +167,7 @@ class Fleet:
             return retunes.find(session, retune_id), retunes.parts(session, retune_id)
 
     def recent(self, limit: int, before: int | None = None) -> list[tuple[RetuneRow, list[Part]]]:
+        """Returns the latest retunes of many loops with their parts, newest first."""
         with self._store.reading() as session:
             return [(row, retunes.parts(session, row.id)) for row in retunes.recent(session, limit, before)]
 

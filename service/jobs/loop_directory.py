@@ -54,6 +54,7 @@ class LoopDirectory:
         return self._buses.get(bus, BusConfig()).at_once
 
     def config(self, tag: str) -> LoopConfig:
+        """Returns the configuration of a loop of any host. Raises UnknownLoop."""
         return self.owner(tag)[0]
 
     def owner(self, tag: str) -> tuple[LoopConfig, str]:

@@ -29,6 +29,7 @@ class Progress:
         self._known = False
 
     def stage_started(self, event: StageStarted) -> None:
+        """Begins a stage with its expected plant time."""
         self._reached = self.fraction
         self.stage = event.stage
         self._stage_start_s = self._now_s

@@ -63,6 +63,7 @@ class BusConnection:
             raise Refused(Reason.BAD_INPUT, f"the controller refused: {error}") from error
 
     def reading(self, tuner: Tuner) -> BusReading:
+        """Returns a reading of the channel through this tuner."""
         return self._read(tuner, self.controller, self.plant, self.channel)
 
     def stop_beating(self) -> None:

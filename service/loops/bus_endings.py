@@ -22,10 +22,12 @@ its state before the test because of it."""
 
 
 def cause_of(tuner: Tuner) -> Cause:
+    """Returns why the last session ended, as the controller says."""
     return Cause(int(tuner.number("controller_cause")))
 
 
 def words_of(cause: Cause) -> str:
+    """Returns the cause in words."""
     return f"cause: {cause.name.lower().replace('_', ' ')}"
 
 

@@ -152,6 +152,7 @@ class BusReading:
 
 
 def not_operational(node: int, state: int) -> Failed:
+    """Returns the error for a node that is not operational."""
     text = f"node {node:02X}h is {_state_name(state)}: it controls nothing, MV stays where it is"
     return Failed(Reason.NODE_NOT_OPERATIONAL, text)
 

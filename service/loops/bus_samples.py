@@ -132,6 +132,7 @@ class BusSamples:
         return self._left <= 0
 
     def start_block(self, tuner: Tuner) -> None:
+        """Lets a plant at pace 0 run the next block."""
         if self.in_blocks:
             tuner.write("plant_samples_to_run", self._block)
             self._left = self._block

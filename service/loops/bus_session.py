@@ -131,6 +131,8 @@ class BusSession:
     # -- during the session
 
     def order(self, tuner: Tuner, order: Order, *values: float) -> None:
+        """Gives an order. Raises the reason why the session is over where that is why it is refused, else
+        TunerError."""
         assert self._session is not None
         try:
             self._session.give(order, values)
