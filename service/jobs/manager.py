@@ -262,7 +262,7 @@ class Jobs:
             if not running.over.wait(max(0.0, give_up - self._machine.monotonic())):
                 log.error(
                     "job %s of loop %s has not ended in %.0f s: whether its loop is restored is unknown, and its end "
-                    "is not written; check the controller, which restores the loop by itself when the service falls "
+                    "is not written; look at the controller, which restores the loop by itself when the service falls "
                     "silent; the next start checks the loop again",
                     running.job_id, running.tag, ENDS_S,
                 )  # fmt: skip

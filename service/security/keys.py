@@ -26,6 +26,7 @@ class Scope(StrEnum):
     ADMIN = "admin"
 
     def includes(self, other: Scope) -> bool:
+        """Returns whether this scope permits what the other one permits."""
         order = list(Scope)
         return order.index(self) >= order.index(other)
 
