@@ -110,7 +110,7 @@ class Fleet:
             try:
                 self.poll()
             except FolderInUse as error:
-                log.error("another host runs the retunes of many loops: %s", error)
+                log.error("another service runs the retunes of many loops: %s", error)
                 return
             except SQLAlchemyError as error:
                 log.warning("retunes of many loops wait for the database: %s", error)
