@@ -40,7 +40,7 @@ from benchmarks.tuning import (
     spread,
 )
 from loopwright.plantsim.plant import LinearPlant
-from loopwright.service.execution.guard import Watch
+from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.runner import run
 from loopwright.tuning.experiments.preflight import PREFLIGHT, SETTLE, preflight
 from loopwright.tuning.experiments.primitives import Facts
@@ -109,7 +109,7 @@ def rehearsed(plan: Callable[[Facts], Plan[Gains]], limits: float, plant: Plant,
     known = settled_s(plant, T95) / (T95_PERIODS * plant.Pu)
     case = replace(case, known=known, limits=limits)
     loop, facts = loop_of(plant, 1.0, 0.5 * span_of(plant), case.noise * span_of(plant), seed, case)
-    result = run(plan(facts), loop, watch=Watch(max_time_s=500.0 * facts.T95_s))
+    result = run(plan(facts), loop, limits=RunLimits(max_time_s=500.0 * facts.T95_s))
     passed = sum(value for stage, value in result.plant_time_s.items() if stage not in (PREFLIGHT, SETTLE))
     answer = result.value or result.ended
     assert answer is not None

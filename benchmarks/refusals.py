@@ -16,7 +16,7 @@ from PIL import Image
 from benchmarks.command import check_names, parser_of
 from loopwright.controller.channel import Channel, Settings
 from loopwright.plantsim.plant import LinearPlant
-from loopwright.service.execution.guard import Watch
+from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.rehearsal import RehearsedLoop, _parameters
 from loopwright.service.execution.runner import run
 from loopwright.service.jobs.relay_record import relay_record
@@ -146,7 +146,7 @@ def rehearsed(reason: str, case: Case) -> dict[str, Any]:
             return samples[-1]
 
     facts = Facts(TS, T95, 0.0, 100.0, 2.0, case.gains, case.reverse)
-    ran = run(fast(facts, FastOptions(**case.options, propose_anyway=True)), Heard(), watch=Watch(), on_event=hear)
+    ran = run(fast(facts, FastOptions(**case.options, propose_anyway=True)), Heard(), limits=RunLimits(), on_event=hear)
     names = [next(name for first, name in reversed(stages) if first <= i) for i in range(len(samples))]
     ended = ran.ended
     return {

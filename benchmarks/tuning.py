@@ -36,7 +36,7 @@ from loopwright.plantsim import reactor
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.plantsim.plant import Plant as Simulated
 from loopwright.plantsim.reactor import Reactor
-from loopwright.service.execution.guard import Watch
+from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.execution.runner import RunResult, run
 from loopwright.service.jobs.relay_record import relay_record
@@ -135,7 +135,7 @@ def relay_span(plant: Plant) -> float:
         return experiment.experiment_record().output_range
 
     loop, facts = loop_of(plant, 1.0, 1.0 / plant.Ku, 0.0, 1)
-    result = run(plan(facts), loop, watch=Watch())
+    result = run(plan(facts), loop, limits=RunLimits())
     assert result.value is not None, result.ended
     return result.value
 
@@ -194,7 +194,7 @@ def _run(plant: Plant, case: Case, seed: int) -> tuple[RunResult[FastProposal], 
     amplitude = None if case.adapted else case.amplitude
     # what is judged is the design, whatever it is worth beside the gains that the loop has to begin with
     options = FastOptions(spec.Ms, spec.derivative, spec.Mt, spec.noise_gain, amplitude, propose_anyway=True)
-    result = run(fast(facts, options), loop, watch=Watch(max_time_s=100.0 * plant.Pu), on_event=loop.hear)
+    result = run(fast(facts, options), loop, limits=RunLimits(max_time_s=100.0 * plant.Pu), on_event=loop.hear)
     passed = sum(value for stage, value in result.plant_time_s.items() if stage not in (PREFLIGHT, SETTLE))
     return result, passed / plant.Pu, loop
 

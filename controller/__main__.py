@@ -11,7 +11,7 @@ from typing import Any
 from loopwright.controller.channel import Settings
 from loopwright.controller.device import ControllerChannel, ControllerDevice
 from loopwright.controller.pid import Parameters
-from loopwright.controller.retained_state import FileKeeper, KeptError, remembered
+from loopwright.controller.retained_state import RetainedStateError, RetainedStateFile, read_retained_state
 from loopwright.protocol.device_process import DeviceConfigError, node_id, read_channels, run_device
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, Mode
 
@@ -40,10 +40,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         rows = read_channels(options.config, common) if options.config else [{}] * options.channels
         channels = [_channel({**common, **row}) for row in rows]
-        kept = remembered(options.keep, [one.kept for one in channels]) if options.keep else None
-        if kept:
-            channels = [one.with_kept(own) for one, own in zip(channels, kept, strict=True)]
-    except (DeviceConfigError, KeptError, KeyError, TypeError, ValueError) as error:
+        retained = read_retained_state(options.keep, [one.retained for one in channels]) if options.keep else None
+        if retained:
+            channels = [one.with_retained(own) for one, own in zip(channels, retained, strict=True)]
+    except (DeviceConfigError, RetainedStateError, KeyError, TypeError, ValueError) as error:
         print(f"controller: {error.args[0]}", file=sys.stderr)
         return 2
     return run_device(
@@ -55,10 +55,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             options.ts,
             options.node,
             options.plant_node,
-            keeper=FileKeeper(options.keep) if options.keep else None,
+            retained_state=RetainedStateFile(options.keep) if options.keep else None,
         ),
         f"node {options.node:#04x} on {options.bus}: {len(channels)} channel(s), Ts {options.ts:g} s"
-        + (f", as kept in {options.keep}" if kept else ""),
+        + (f", as stored in {options.keep}" if retained else ""),
     )
 
 

@@ -173,6 +173,7 @@ class Channel:
             self._manual_output = self._takes_over
 
     def stage(self, parameters: Parameters) -> None:
+        """Stores gains that are not in effect yet."""
         self.staged = parameters
 
     def try_gains(self, parameters: Parameters) -> None:

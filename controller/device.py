@@ -32,10 +32,10 @@ from loopwright.protocol.profile import (
     Abort,
     Cause,
     Emcy,
-    Hand,
     Mode,
     NmtState,
     Order,
+    OutsideChange,
     ParameterCommand,
     channel_ids,
     renewal_id,
@@ -64,7 +64,7 @@ _ENDED_BY = {Cause.LEASE: Emcy.LEASE_USED_UP, Cause.PV_LIMIT: Emcy.PV_LIMIT, Cau
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class RetainedState:
     """The state of one channel that outlives a restart.
 
     accepted: the accepted gains.
@@ -92,38 +92,45 @@ class ControllerChannel:
     manual_output: float = 50.0
 
     @property
-    def kept(self) -> Kept:
-        return Kept(self.parameters, self.mode, self.setpoint, self.manual_output)
+    def retained(self) -> RetainedState:
+        """Returns the part of this state that is stored over a restart."""
+        return RetainedState(self.parameters, self.mode, self.setpoint, self.manual_output)
 
-    def with_kept(self, kept: Kept) -> ControllerChannel:
+    def with_retained(self, retained: RetainedState) -> ControllerChannel:
+        """Returns this channel with a stored state."""
         return replace(
-            self, parameters=kept.accepted, mode=kept.mode, setpoint=kept.setpoint, manual_output=kept.manual_output
+            self,
+            parameters=retained.accepted,
+            mode=retained.mode,
+            setpoint=retained.setpoint,
+            manual_output=retained.manual_output,
         )
 
     def make(self, sample_time_s: float) -> Channel:
+        """Returns the control channel in this state."""
         return Channel(sample_time_s, self.settings, self.parameters, self.setpoint, self.mode, self.manual_output)
 
 
-class Keeper(Protocol):
+class RetainedStateStore(Protocol):
     """The storage of the channels' state over a restart."""
 
-    def now(self, channels: Sequence[Kept]) -> None:
+    def write_now(self, channels: Sequence[RetainedState]) -> None:
         """Returns when the state is on the disk. Raises OSError; the state that is to be stored then has to be passed
         again, to `soon`."""
         ...
 
-    def soon(self, channels: Sequence[Kept]) -> None:
+    def write_soon(self, channels: Sequence[RetainedState]) -> None:
         """Returns at once; the state is written within seconds."""
         ...
 
 
-class KeepNothing:
+class NoRetainedState:
     """Storage that stores nothing."""
 
-    def now(self, channels: Sequence[Kept]) -> None:
+    def write_now(self, channels: Sequence[RetainedState]) -> None:
         pass
 
-    def soon(self, channels: Sequence[Kept]) -> None:
+    def write_soon(self, channels: Sequence[RetainedState]) -> None:
         pass
 
 
@@ -154,8 +161,8 @@ class ControllerDevice:
     """The controller on its bus.
 
     pv_timeout_s: wall time without a valid PV after which EMCY 8250h is sent; by default 3 samples, at least 1 s.
-    keeper: storage of accepted gains, mode, set-point and manual output over a restart; gains that cannot be stored are
-    not accepted.
+    retained_state: storage of accepted gains, mode, set-point and manual output over a restart; gains that cannot be
+    stored are not accepted.
     draw: returns random numbers for sessions.
     """
 
@@ -168,14 +175,14 @@ class ControllerDevice:
         plant_node: int = PLANT_NODE,
         pv_timeout_s: float | None = None,
         clock: Callable[[], float] = time.monotonic,
-        keeper: Keeper | None = None,
+        retained_state: RetainedStateStore | None = None,
         draw: Callable[[], int] = _random_number,
     ) -> None:
         self._started_with = list(channels)
         self._started_sample_time_s = sample_time_s
         self._asked_pv_timeout_s = pv_timeout_s
-        self.keeper: Keeper = keeper or KeepNothing()
-        self._keeps = keeper is not None
+        self.retained_store: RetainedStateStore = retained_state or NoRetainedState()
+        self._is_retained = retained_state is not None
         self._draw = draw
         count = len(channels)
         self._sample_time_s = sample_time_s
@@ -201,13 +208,14 @@ class ControllerDevice:
         runtime.on_reset = self._on_reset
         self._connect(dictionary)
         self._power_on()
-        self._kept = self._to_keep()
+        self._retained = self._retained_now()
 
     @property
     def channels(self) -> list[Channel]:
         return [session.channel for session in self.sessions]
 
     def start(self) -> None:
+        """Boots the device on its bus."""
         self.runtime.start()
 
     def _power_on(self) -> None:
@@ -261,7 +269,7 @@ class ControllerDevice:
             driven.changed_at = self.runtime.clock()
         elif session.is_open or setpoint == c_float(session.channel.setpoint).value:
             return
-        with self._another_hand(at + 1, Hand.SETPOINT) as channel:
+        with self._outside_change(at + 1, OutsideChange.SETPOINT) as channel:
             channel.setpoint = setpoint
 
     def _report_if_new(self, at: int) -> None:
@@ -289,7 +297,7 @@ class ControllerDevice:
             self.runtime.raise_error(Emcy.NO_PV, bytes(silent[:1]))
         else:
             self.runtime.clear_error(Emcy.NO_PV)
-        self._keep_soon()
+        self._write_soon()
 
     # Sessions
 
@@ -329,10 +337,10 @@ class ControllerDevice:
             self._report_if_new(sub - 1)
 
     @contextmanager
-    def _another_hand(self, sub: int, what: Hand) -> Iterator[Channel]:
+    def _outside_change(self, sub: int, what: OutsideChange) -> Iterator[Channel]:
         """Yields the channel to a command through the ordinary objects, which ends a test on it."""
         session = self.sessions[sub - 1]
-        session.another_hand(what)
+        session.on_outside_change(what)
         try:
             yield session.channel
         finally:
@@ -364,41 +372,41 @@ class ControllerDevice:
 
     def _on_reset(self) -> None:
         """Restores the state at power-on: the stored state, or else that of the start of the program."""
-        if self._keeps:
-            pairs = zip(self._started_with, self._to_keep(), strict=True)
-            self._started_with = [each.with_kept(kept) for each, kept in pairs]
+        if self._is_retained:
+            pairs = zip(self._started_with, self._retained_now(), strict=True)
+            self._started_with = [each.with_retained(retained) for each, retained in pairs]
         self._power_on()
 
     # State that outlives a restart
 
-    def _to_keep(self) -> list[Kept]:
-        return [self._kept_of(session, session.channel.accepted) for session in self.sessions]
+    def _retained_now(self) -> list[RetainedState]:
+        return [self._retained_of(session, session.channel.accepted) for session in self.sessions]
 
     @staticmethod
-    def _kept_of(session: Session, accepted: Parameters) -> Kept:
-        home: Home = session.kept
-        return Kept(accepted, home.mode, home.setpoint, home.manual_output)
+    def _retained_of(session: Session, accepted: Parameters) -> RetainedState:
+        home: Home = session.retained
+        return RetainedState(accepted, home.mode, home.setpoint, home.manual_output)
 
-    def _keep_soon(self) -> None:
-        if not self._keeps:
+    def _write_soon(self) -> None:
+        if not self._is_retained:
             return
-        kept = self._to_keep()
-        if kept != self._kept:
-            self._kept = kept
-            self.keeper.soon(kept)
+        retained = self._retained_now()
+        if retained != self._retained:
+            self._retained = retained
+            self.retained_store.write_soon(retained)
 
     def _store(self, sub: int, parameters: Parameters) -> None:
         """Writes gains to the disk before they are accepted, so that a confirmed acceptance outlives a power cut."""
-        kept = self._to_keep()
-        kept[sub - 1] = self._kept_of(self.sessions[sub - 1], parameters)
+        retained = self._retained_now()
+        retained[sub - 1] = self._retained_of(self.sessions[sub - 1], parameters)
         try:
-            self.keeper.now(kept)
+            self.retained_store.write_now(retained)
         except OSError as error:
-            print(f"controller: channel {sub} not accepted, it could not be kept: {error}", file=sys.stderr)
-            self._kept = self._to_keep()
-            self.keeper.soon(self._kept)
+            print(f"controller: channel {sub} not accepted, it could not be stored: {error}", file=sys.stderr)
+            self._retained = self._retained_now()
+            self.retained_store.write_soon(self._retained)
             raise SdoAbort(Abort.NOT_STORED) from error
-        self._kept = kept
+        self._retained = retained
 
     # The object dictionary
 
@@ -437,7 +445,7 @@ class ControllerDevice:
         self._reads("controller_session_holder", lambda session: session.holder)
         self._reads("controller_session_is_open", lambda session: session.is_open)
         self._reads("controller_cause", lambda session: session.cause)
-        self._reads("controller_hand", lambda session: session.hand)
+        self._reads("controller_outside_changes", lambda session: session.outside_changes)
         self._reads("controller_home_mode", lambda session: session.home.mode)
         self._reads("controller_home_setpoint", lambda session: session.home.setpoint)
         self._reads("controller_home_manual_output", lambda session: session.home.manual_output)
@@ -464,7 +472,7 @@ class ControllerDevice:
             settings = replace(self.channels[sub - 1].settings, **changed)
         except ValueError:
             raise SdoAbort(Abort.MAXIMUM_BELOW_MINIMUM) from None
-        with self._another_hand(sub, Hand.LIMITS) as channel:
+        with self._outside_change(sub, OutsideChange.LIMITS) as channel:
             channel.settings = settings
 
     def _read_gain(self, parameter_set: str, attribute: str, sub: int) -> float:
@@ -478,20 +486,20 @@ class ControllerDevice:
         return write
 
     def _write_setpoint(self, sub: int, value: Value) -> None:
-        with self._another_hand(sub, Hand.SETPOINT) as channel:
+        with self._outside_change(sub, OutsideChange.SETPOINT) as channel:
             channel.setpoint = float(value)
 
     def _write_manual_output(self, sub: int, value: Value) -> None:
-        with self._another_hand(sub, Hand.OUTPUT) as channel:
+        with self._outside_change(sub, OutsideChange.OUTPUT) as channel:
             channel.manual_output = float(value)
 
     def _write_mode(self, sub: int, value: Value) -> None:
-        with self._another_hand(sub, Hand.MODE) as channel:
+        with self._outside_change(sub, OutsideChange.MODE) as channel:
             channel.command_mode(int(value))
 
     def _write_parameter_command(self, sub: int, value: Value) -> None:
         """Carries out a gain command that is given without a session."""
-        with self._another_hand(sub, Hand.GAINS) as channel:
+        with self._outside_change(sub, OutsideChange.GAINS) as channel:
             if value == ParameterCommand.GO_BACK:
                 channel.go_back()
             elif value == ParameterCommand.TRY:

@@ -16,7 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from loopwright.controller.device import Kept
+from loopwright.controller.device import RetainedState
 from loopwright.controller.pid import Parameters
 from loopwright.protocol.durable import put_in_place
 from loopwright.protocol.profile import Mode
@@ -29,13 +29,13 @@ AGAIN_S = 5.0
 """Wall time after which a failed write is repeated, s."""
 
 
-class KeptError(Exception):
+class RetainedStateError(Exception):
     """Raised when the file exists but cannot be used; the text says what to do."""
 
 
-def remembered(path: Path, start: Sequence[Kept]) -> list[Kept] | None:
-    """Returns the stored state of the channels, None when nothing has been stored yet. Raises KeptError rather than
-    guess.
+def read_retained_state(path: Path, start: Sequence[RetainedState]) -> list[RetainedState] | None:
+    """Returns the stored state of the channels, None when nothing has been stored yet. Raises RetainedStateError rather
+    than guess.
 
     start: the initial state of the channels, which fills in what a file of an earlier form does not hold.
     """
@@ -49,24 +49,24 @@ def remembered(path: Path, start: Sequence[Kept]) -> list[Kept] | None:
         else:
             raise ValueError(f"its form is {text['form']!r}, not {FORM!r}")
         if len(rows) != len(start):
-            raise KeptError(f"{path}: it keeps {len(rows)} channel(s), there are {len(start)}; {advice}")
-        return [_kept(row, each) for row, each in zip(rows, start, strict=True)]
+            raise RetainedStateError(f"{path}: it keeps {len(rows)} channel(s), there are {len(start)}; {advice}")
+        return [_retained(row, each) for row, each in zip(rows, start, strict=True)]
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise KeptError(f"{path}: {error or type(error).__name__}; {advice}") from error
+        raise RetainedStateError(f"{path}: {error or type(error).__name__}; {advice}") from error
 
 
-def _kept(row: dict[str, Any], start: Kept) -> Kept:
+def _retained(row: dict[str, Any], start: RetainedState) -> RetainedState:
     accepted = Parameters(**{name: float(value) for name, value in row["accepted"].items()})
     mode = Mode[row["mode"].upper()] if "mode" in row else start.mode
     setpoint, output = float(row.get("setpoint", start.setpoint)), float(row.get("manual_output", start.manual_output))
     if mode is Mode.EXPERIMENT or setpoint - setpoint != 0.0 or output - output != 0.0:
         raise ValueError(f"no start with mode {mode.name.lower()}, set-point {setpoint}, manual output {output}")
-    return Kept(accepted, mode, setpoint, output)
+    return RetainedState(accepted, mode, setpoint, output)
 
 
-def write(path: Path, channels: Sequence[Kept]) -> None:
+def write(path: Path, channels: Sequence[RetainedState]) -> None:
     """Writes the file; returns when it is on the disk.
 
     Raises OSError; the file then holds the previous state, or the new one where only the very last step failed, so the
@@ -87,30 +87,30 @@ def write(path: Path, channels: Sequence[Kept]) -> None:
     put_in_place(new, path)
 
 
-class FileKeeper:
+class RetainedStateFile:
     """Writes the file, either at once or in a thread of its own, so that no sample waits for a disk. A failed write is
     repeated every `again_s` and with the next change."""
 
     def __init__(
-        self, path: Path, write: Callable[[Path, Sequence[Kept]], None] = write, again_s: float = AGAIN_S
+        self, path: Path, write: Callable[[Path, Sequence[RetainedState]], None] = write, again_s: float = AGAIN_S
     ) -> None:
         self._path = path
         self._write = write
         self._again_s = again_s
         self._disk = threading.Lock()
         self._changed = threading.Condition()
-        self._wanted: Sequence[Kept] | None = None
+        self._wanted: Sequence[RetainedState] | None = None
         """The state requested last; nothing older is written after it."""
-        self._waiting: Sequence[Kept] | None = None
-        threading.Thread(target=self._run, name="keeper", daemon=True).start()
+        self._waiting: Sequence[RetainedState] | None = None
+        threading.Thread(target=self._run, name="retained state", daemon=True).start()
 
-    def now(self, channels: Sequence[Kept]) -> None:
+    def write_now(self, channels: Sequence[RetainedState]) -> None:
         with self._changed:
             self._wanted, self._waiting = channels, None
         with self._disk:
             self._write(self._path, channels)
 
-    def soon(self, channels: Sequence[Kept]) -> None:
+    def write_soon(self, channels: Sequence[RetainedState]) -> None:
         with self._changed:
             self._wanted = self._waiting = channels
             self._changed.notify()
@@ -128,7 +128,7 @@ class FileKeeper:
                     self._write(self._path, channels)
                     continue
                 except OSError as error:
-                    print(f"controller: mode and set-point could not be kept: {error}", file=sys.stderr)
+                    print(f"controller: mode and set-point could not be stored: {error}", file=sys.stderr)
             time.sleep(self._again_s)
             with self._changed:
                 if self._wanted is channels:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from loopwright.controller.channel import Channel, Home, Parameters, RelaySettings
 from loopwright.protocol.objects import Value
-from loopwright.protocol.profile import Abort, Cause, Hand, Mode, Order, RelayState
+from loopwright.protocol.profile import Abort, Cause, Mode, Order, OutsideChange, RelayState
 from loopwright.protocol.sdo import SdoAbort
 from loopwright.protocol.session import check_of
 
@@ -55,7 +55,7 @@ class Session:
         self.last = 0
         self.count = 0
         self.cause = Cause.NONE
-        self.hand = Hand.NONE
+        self.outside_changes = OutsideChange.NONE
         self.home = _NO_HOME
         self.home_gains = channel.accepted
         self.terms: Terms | None = None
@@ -78,6 +78,7 @@ class Session:
 
     @property
     def is_open(self) -> bool:
+        """Returns whether a session is open."""
         return self.number != 0
 
     @property
@@ -87,10 +88,11 @@ class Session:
 
     @property
     def pv_is_valid(self) -> bool:
+        """Returns whether the last PV was valid and is not silent."""
         return self.channel.measuring and not self.silent
 
     @property
-    def kept(self) -> Home:
+    def retained(self) -> Home:
         """Returns the state that a restart must restore: that before the test within a session, else the present
         one."""
         return self.home if self.is_open else self.channel.home
@@ -155,7 +157,7 @@ class Session:
             raise SdoAbort(Abort.DEVICE_STATE)
         self.number, self.terms, self.home = self.next, terms, self.channel.home
         self.home_gains = self.channel.accepted
-        self.next, self.count, self.hand = self._draw(), 0, Hand.NONE
+        self.next, self.count, self.outside_changes = self._draw(), 0, OutsideChange.NONE
         self._samples_left = terms.lease_samples
         self._lease_until, self._heard_at, self._valid_at = now + terms.lease_s, now, max(now, self._valid_at)
 
@@ -226,13 +228,13 @@ class Session:
         elif self.silent:
             self.end(Cause.NO_PV)
 
-    def another_hand(self, what: Hand) -> None:
+    def on_outside_change(self, what: OutsideChange) -> None:
         """Ends the test because of a command through the ordinary objects; the commanded value stays.
 
         Call it before the command is carried out, and `settle` after it.
         """
-        self.hand |= what
-        self._end(Cause.HAND)
+        self.outside_changes |= what
+        self._end(Cause.OUTSIDE_CHANGE)
 
     def end(self, cause: Cause, operational: bool = True) -> None:
         """Ends an open session and restores the state before the test.

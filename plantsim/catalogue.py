@@ -67,6 +67,7 @@ class Entry:
     model: CatalogueModel | None
 
     def build(self, sample_time_s: float, noise_std: float = 0.0, seed: int = 1) -> Plant:
+        """Returns the plant, at rest, with this sample time (s), noise (PV units) and seed."""
         if self.model is None:
             return Reactor(sample_time_s, noise_std=noise_std, seed=seed)
         return LinearPlant(

@@ -14,7 +14,14 @@ from typing import Any, Protocol
 import can
 from can.interfaces.socketcand import SocketCanDaemonBus
 
-from loopwright.protocol.bus_state import ERROR_FRAME, TOLD, BusState, state_after, what_to_do, what_to_do_elsewhere
+from loopwright.protocol.bus_state import (
+    ERROR_FRAME,
+    STATE_FRAMES,
+    BusState,
+    adapter_bus_off_advice,
+    bus_off_advice,
+    state_after,
+)
 
 Frame = tuple[int, bytes]
 
@@ -132,7 +139,7 @@ class RawBus:
 
     def _nothing(self) -> Frame | None:
         if self.state is BusState.BUS_OFF:
-            raise BusError(what_to_do(self._interface))
+            raise BusError(bus_off_advice(self._interface))
         return None
 
     def _become(self, state: BusState) -> None:
@@ -142,7 +149,7 @@ class RawBus:
         self._send = self._refuse if state is BusState.BUS_OFF else self._socket.send
 
     def _refuse(self, frame: bytes) -> int:
-        raise BusError(what_to_do(self._interface))
+        raise BusError(bus_off_advice(self._interface))
 
     def _arm(self, timeout: float | None) -> None:
         """Sets the time-out in the kernel, so that a receive with the same time-out as before takes one system call."""
@@ -174,7 +181,7 @@ def _opened(interface: str) -> socket.socket:
         raise BusError(f"this kernel has no SocketCAN ({error.strerror})") from error
     try:
         _enlarge(sock)
-        sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, TOLD)
+        sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, STATE_FRAMES)
         sock.bind((interface,))
     except OSError as error:
         sock.close()
@@ -200,17 +207,17 @@ class _Socketcand(SocketCanDaemonBus):
 
     def _expect_msg(self, msg: str) -> None:
         server: socket.socket = vars(self)["_SocketCanDaemonBus__socket"]
-        found, usual = b"", server.gettimeout()
+        received, usual = b"", server.gettimeout()
         server.settimeout(_GREETED_S)  # the kernel accepts connections for a stopped server
         try:
-            while len(found) < len(msg) and (part := server.recv(len(msg) - len(found))):
-                found += part
+            while len(received) < len(msg) and (part := server.recv(len(msg) - len(received))):
+                received += part
         except OSError:
             server.close()
             raise
         server.settimeout(usual)
-        if found != msg.encode():
-            raise can.CanError(f"expected {msg!r}, got {found!r}")
+        if received != msg.encode():
+            raise can.CanError(f"expected {msg!r}, got {received!r}")
 
 
 _LIBRARY_STATES = {can.BusState.PASSIVE: BusState.PASSIVE, can.BusState.ERROR: BusState.BUS_OFF}
@@ -265,7 +272,7 @@ class LibraryBus:
 
     def _raise_if_off(self) -> None:
         if self.state is BusState.BUS_OFF:
-            raise BusError(what_to_do_elsewhere(self._url))
+            raise BusError(adapter_bus_off_advice(self._url))
 
     def _wants(self, message: can.Message) -> bool:
         if message.is_error_frame or message.is_remote_frame or message.is_extended_id:

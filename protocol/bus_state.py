@@ -7,7 +7,7 @@ from enum import Enum
 ERROR_FRAME = 0x20000000
 """Bit of the identifier that marks an error frame of the driver; no other node has sent such a frame."""
 _CONTROLLER, _BUS_OFF, _RESTARTED = 0x004, 0x040, 0x100
-TOLD = _CONTROLLER | _BUS_OFF | _RESTARTED
+STATE_FRAMES = _CONTROLLER | _BUS_OFF | _RESTARTED
 """The error frames to subscribe to: changes of state. Single errors, which may flood the bus, are left out."""
 _ACTIVE, _WARNING, _PASSIVE = 0x40, 0x0C, 0x30  # in data[1], the latter two for both directions
 
@@ -39,7 +39,7 @@ def state_after(before: BusState, can_id: int, data: bytes) -> BusState:
 _CHECK = "Check termination (120 ohms at both ends), bit rate and wiring"
 
 
-def what_to_do(interface: str) -> str:
+def bus_off_advice(interface: str) -> str:
     """Returns the advice for a Linux interface that is bus-off."""
     return (
         f"CAN interface {interface!r} is bus-off: after too many errors it has left the bus. {_CHECK}; then "
@@ -48,6 +48,6 @@ def what_to_do(interface: str) -> str:
     )
 
 
-def what_to_do_elsewhere(url: str) -> str:
+def adapter_bus_off_advice(url: str) -> str:
     """Returns the advice for a bus-off adapter that is not a Linux interface."""
     return f"bus {url!r} is bus-off: after too many errors its adapter has left the bus. {_CHECK}; then open it again"

@@ -100,7 +100,7 @@ class Runtime:
 
     def start(self) -> None:
         """Boots the device; the present values of the dictionary become those that a reset restores."""
-        self.dictionary.remember()
+        self.dictionary.set_restore_values()
         self._boot()
 
     def _boot(self) -> None:

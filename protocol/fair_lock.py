@@ -47,17 +47,17 @@ class FairLock:
             if not self._taken:
                 self._taken = True
                 return
-            mine = threading.Lock()
-            mine.acquire()
-            queue.append(mine)
+            own = threading.Lock()
+            own.acquire()
+            queue.append(own)
         try:
-            while not mine.acquire(timeout=_SLICE_S):  # until the previous holder releases it to this thread
+            while not own.acquire(timeout=_SLICE_S):  # until the previous holder releases it to this thread
                 meanwhile()
         except BaseException:
             with self._guard:
-                has_turn = mine not in queue
+                has_turn = own not in queue
                 if not has_turn:
-                    queue.remove(mine)
+                    queue.remove(own)
             if has_turn:
                 self._leave()
             raise

@@ -57,6 +57,7 @@ class Hub:
             self._wake.send(b"x")
 
     def serve(self) -> None:
+        """Serves all members until `stop` is called."""
         for sock in (self._listener, self._woken):
             sock.setblocking(False)
             self._selector.register(sock, selectors.EVENT_READ)

@@ -39,13 +39,14 @@ class Dictionary:
         self._start: dict[tuple[str, int], Value] = {}
 
     def get(self, name: str, sub: int = 0) -> Value:
+        """Returns a value from inside the device, without calling `on_read`."""
         return self._values[name, sub]
 
     def set(self, name: str, value: Value, sub: int = 0) -> None:
         """Sets a value from inside the device, without checks and without calling `on_write`."""
         self._values[name, sub] = value
 
-    def remember(self) -> None:
+    def set_restore_values(self) -> None:
         """Notes the present values as those that `restore` sets."""
         self._start = dict(self._values)
 

@@ -40,6 +40,7 @@ class Type(Enum):
         return struct.calcsize(self.value[1])
 
     def encode(self, value: Value) -> bytes:
+        """Returns the bytes of a value, little-endian."""
         if isinstance(value, str):
             return value.encode("ascii")
         return struct.pack(self.format, value if self is Type.REAL32 else int(value))
@@ -225,7 +226,8 @@ def _session() -> tuple[Object, ...]:
         ("session", U32, "ro", "Number of the open session (0 none)", {}),
         ("session_last", U32, "ro", "Number of the session that ended last (0 none)", {}),
         ("cause", U8, "ro", "Why it ended", {"pdo": "T"}),
-        ("hand", U8, "ro", "Moved by another hand since the opening (1 SP, 2 mode, 4 output, 8 gains, 16 limits)", {}),
+        ("outside_changes", U8, "ro",
+         "Changed outside the session since the opening (1 SP, 2 mode, 4 output, 8 gains, 16 limits)", {}),
         ("session_count", U32, "ro", "Orders put in force in the session", {}),
         ("session_renewal", U32, "wo", "Renewal of the lease (number of the session)", {}),
         ("session_holder", U8, "ro", "Node-ID of the tuner that holds the session (0 none)", {}),

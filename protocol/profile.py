@@ -67,11 +67,12 @@ class Cause(IntEnum):
     NMT = 5
     NO_PV = 6
     RELAY_SAMPLES = 7
-    HAND = 8
+    OUTSIDE_CHANGE = 8
 
 
-class Hand(IntFlag):
-    """The settings that an operator or another master has changed since the session was opened (2134h)."""
+class OutsideChange(IntFlag):
+    """The settings that were changed outside the session, by an operator or another master, since it was opened
+    (2134h)."""
 
     NONE = 0
     SETPOINT = 1

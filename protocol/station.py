@@ -74,6 +74,7 @@ class Station:
         return now
 
     def beat(self, url: str, bus: Bus, now: float) -> None:
+        """Sends the heartbeat at this time on the clock, s."""
         self._beats[url] = now  # noted before it is sent: `_listen` must recognise it as this process's own
         bus.send(heartbeat_id(self.node), HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL))
 

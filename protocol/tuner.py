@@ -149,13 +149,13 @@ class Tuner:
 
     # -- heartbeat and frames
 
-    def hold(self) -> None:
+    def start_heartbeat(self) -> None:
         """Starts the heartbeat, and sends the first one at once. Raises NodeTaken."""
         self.station.join(self._url)
         self.beating = True
         self.station.beat(self._url, self._bus, self.station.monotonic())
 
-    def keep(self, session: int, check_stop_request: Callable[[], None] = lambda: None) -> None:
+    def set_renewed_session(self, session: int, check_stop_request: Callable[[], None] = lambda: None) -> None:
         """Renews the lease of this session, which was just granted, from now on; 0 ends the renewals.
 
         check_stop_request: called while the loop waits for a node's lock; it raises when the job is asked to stop.

@@ -32,15 +32,15 @@ class TunerSession:
         self.count = 0
         self.staged: dict[str, Value] = {}
 
-    def open(self, lease: Lease, remember: Callable[[int], None]) -> None:
+    def open(self, lease: Lease, note_session: Callable[[int], None]) -> None:
         """Opens a session.
 
         lease: its terms.
-        remember: stores the number before the opening is sent, so that a later process can close the session.
+        note_session: stores the number before the opening is sent, so that a later process can close the session.
         """
         for last_try in (False, False, True):
             number = int(self._tuner.number("controller_session_next"))
-            remember(number)
+            note_session(number)
             self.number, self.count = number, 0
             self.staged.clear()
             try:
@@ -79,9 +79,11 @@ class TunerSession:
         self.count += 1
 
     def renew(self) -> None:
+        """Renews the lease."""
         self._tuner.write("controller_session_renewal", self.number)
 
     def close(self) -> None:
+        """Closes the session."""
         self.give(Order.CLOSE)
 
     @property

@@ -139,7 +139,7 @@ def serve(
     from loopwright.service.api.gate.limits import RequestLimits
     from loopwright.service.config import ConfigError
     from loopwright.service.execution.computing.limits import ComputingLimits
-    from loopwright.service.jobs.retention import Keep
+    from loopwright.service.jobs.retention import RetentionPolicy
     from loopwright.service.server.serving import NotSafe, Setup
     from loopwright.service.server.serving import serve as run
     from loopwright.service.store.database import BadDatabase
@@ -168,7 +168,7 @@ def serve(
     setup = Setup(
         loops, data, bind, port, database, host, resume,
         node=own_node, auth=auth, limits=limits, log_format="json" if log_format == "json" else "text",
-        keep=Keep(keep_jobs, keep_days), trusted_proxies=proxies,
+        keep=RetentionPolicy(keep_jobs, keep_days), trusted_proxies=proxies,
         computing=ComputingLimits(live_cpu_s, tuning_cpu_s, dry_run_cpu_s, computation_memory_mb),
     )  # fmt: skip
     try:

@@ -50,7 +50,7 @@ class Workers(Protocol):
     def submit(self, kind: ComputationKind, work: Callable[[], Any], unwanted: Callable[[], bool]) -> Future[Any]: ...
 
 
-class Computing:
+class ComputingLoop:
     """A loop with the computation that runs for it; calls other than `step` are passed on to the loop.
 
     A real plant continues during a computation. A plant that waits for the service, in memory or run in blocks, is held
@@ -88,9 +88,9 @@ class Computing:
     def begin(
         self,
         stop: Callable[[], Reason | None] = lambda: None,
-        remember: Callable[[int], None] = lambda session: None,
+        note_session: Callable[[int], None] = lambda session: None,
     ) -> LoopState:
-        return self._loop.begin(stop, remember)
+        return self._loop.begin(stop, note_session)
 
     def restore(self, home: LoopState, session: int | None = None) -> Restored:
         self._over = True  # a computation that runs or waits is not needed any more

@@ -19,14 +19,14 @@ def finished(results: Iterable[tuple[str, Mapping[str, Any] | None]]) -> Finishe
     A result that is not in the form of this version is left out, so its stage runs again.
     """
     kinds = {field.name: get_type_hints(Finished)[field.name] for field in fields(Finished)}
-    found: dict[str, Any] = {}
+    by_stage: dict[str, Any] = {}
     for stage, result in results:
         if stage in kinds and result is not None:
             try:
-                found[stage] = TypeAdapter(kinds[stage]).validate_python(_numbers(result, kinds[stage]))
+                by_stage[stage] = TypeAdapter(kinds[stage]).validate_python(_numbers(result, kinds[stage]))
             except ValidationError:
-                found.pop(stage, None)
-    return Finished(**found)
+                by_stage.pop(stage, None)
+    return Finished(**by_stage)
 
 
 def _numbers(result: Mapping[str, Any], kind: Any) -> dict[str, Any]:

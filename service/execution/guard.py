@@ -11,7 +11,7 @@ from loopwright.tuning.reasons import Failed, Reason
 
 
 @dataclass(frozen=True, slots=True)
-class Watch:
+class RunLimits:
     """The limits of a run.
 
     pv_low, pv_high: limits of PV, PV units.
@@ -35,13 +35,13 @@ class Guard:
     """Checks each sample against the limits. Commands of an operator or another master are detected by the
     controller."""
 
-    def __init__(self, watch: Watch, state: LoopState) -> None:
-        self._watch = watch
+    def __init__(self, limits: RunLimits, state: LoopState) -> None:
+        self._limits = limits
         self._dt = state.sample_time_s
         self._start: float | None = None
         self._last = 0.0
         self._acting = False
-        self._slack = 0.01 * min(watch.mv_high - watch.mv_low, 1e300)
+        self._slack = 0.01 * min(limits.mv_high - limits.mv_low, 1e300)
         self._pv = math.nan
         self._mv = math.nan
         self._frozen_at = 0.0
@@ -54,23 +54,23 @@ class Guard:
     def check(self, sample: Sample) -> None:
         """Raises Failed when the sample violates a limit."""
         t, _, pv, mv, _ = sample
-        watch = self._watch
+        limits = self._limits
         if not (math.isfinite(pv) and math.isfinite(mv)):
             raise Failed(Reason.BAD_SAMPLE, f"at {t:.3f} s PV is {pv}, MV is {mv}")
         if self._start is None:
             self._start = t
-        elif t - self._last > (watch.max_gap_samples + 1.5) * self._dt:
+        elif t - self._last > (limits.max_gap_samples + 1.5) * self._dt:
             raise Failed(Reason.SAMPLES_LOST, f"{(t - self._last) / self._dt - 1:.0f} samples missing before {t:.3f} s")
         self._last = t
-        if not watch.pv_low <= pv <= watch.pv_high:
-            raise Failed(Reason.PV_LIMIT, f"PV {pv:.5g} left {watch.pv_low:.5g} .. {watch.pv_high:.5g} at {t:.3f} s")
-        if self._acting and not watch.mv_low - self._slack <= mv <= watch.mv_high + self._slack:
-            raise Failed(Reason.MV_LIMIT, f"MV {mv:.5g} left {watch.mv_low:.5g} .. {watch.mv_high:.5g} at {t:.3f} s")
-        if t - self._start > watch.max_time_s:
+        if not limits.pv_low <= pv <= limits.pv_high:
+            raise Failed(Reason.PV_LIMIT, f"PV {pv:.5g} left {limits.pv_low:.5g} .. {limits.pv_high:.5g} at {t:.3f} s")
+        if self._acting and not limits.mv_low - self._slack <= mv <= limits.mv_high + self._slack:
+            raise Failed(Reason.MV_LIMIT, f"MV {mv:.5g} left {limits.mv_low:.5g} .. {limits.mv_high:.5g} at {t:.3f} s")
+        if t - self._start > limits.max_time_s:
             raise Failed(Reason.TIME_BUDGET, f"{t - self._start:.0f} s of plant time are over the budget")
         if pv != self._pv:
             self._frozen_at, self._pv, self._mv = t, pv, mv
         elif abs(mv - self._mv) < self._notable:
             self._frozen_at = t
-        elif t - self._frozen_at > watch.max_frozen_s:
+        elif t - self._frozen_at > limits.max_frozen_s:
             raise Failed(Reason.PV_FROZEN, f"PV is exactly {pv:.6g} for {t - self._frozen_at:.3g} s while MV moved")

@@ -35,7 +35,7 @@ class Hooks:
     on_event, on_samples: receive events and samples.
     stop: returns the reason why the procedure should end, or None.
     earlier: events that earlier attempts of a resumed job have stored; a stage finished there is not run again.
-    remember: receives the number of a session before it is opened.
+    note_session: receives the number of a session before it is opened.
     on_home: receives the state of the loop before the test.
     ground: known facts of the loop, for a rehearsal.
     """
@@ -44,7 +44,7 @@ class Hooks:
     on_samples: Callable[[list[Sample]], None]
     stop: Callable[[], Reason | None]
     earlier: Sequence[EventRow] = ()
-    remember: Callable[[int], None] = lambda session: None
+    note_session: Callable[[int], None] = lambda session: None
     on_home: Callable[[LoopState], None] = lambda home: None
     ground: Ground = field(default_factory=Ground)
 
@@ -91,8 +91,8 @@ def tune(
 
     workers: processes that compute; None for a thread.
     """
-    from loopwright.service.execution.beside import Computing
-    from loopwright.service.execution.guard import Watch
+    from loopwright.service.execution.beside import ComputingLoop
+    from loopwright.service.execution.guard import RunLimits
     from loopwright.service.execution.result import result_of
     from loopwright.service.execution.runner import run
 
@@ -100,7 +100,7 @@ def tune(
     broken = broken_limits(config, request, state.sp)
     if broken:
         raise Refused(Reason.BAD_LIMITS, "; ".join(broken))
-    watch = Watch(
+    limits = RunLimits(
         pv_low=config.pv_limits.low,
         pv_high=config.pv_limits.high,
         mv_low=facts.mv_low,
@@ -108,16 +108,16 @@ def tune(
         max_time_s=request.max_time_s or time_budget_s(request.method, facts.T95_s, facts.sample_time_s),
         max_frozen_s=FROZEN_T95 * config.t95_s,
     )
-    computing = Computing(loop, workers)
+    computing = ComputingLoop(loop, workers)
     ran = run(
         plan(request, facts, hooks.earlier),
         computing,
-        watch=watch,
+        limits=limits,
         on_event=hooks.on_event,
         on_samples=hooks.on_samples,
         stop=hooks.stop,
         start_work=computing.start,
-        remember=hooks.remember,
+        note_session=hooks.note_session,
         on_home=hooks.on_home,
     )
     ended = ran.ended

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from loopwright.controller.channel import Channel, RelaySettings, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant, SimulatedProcess
-from loopwright.service.execution.guard import Watch
+from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.result import result_of
 from loopwright.service.execution.runner import RunResult, run
 from loopwright.service.jsonable import to_jsonable
@@ -89,7 +89,7 @@ class RehearsedLoop:
     def begin(
         self,
         stop: Callable[[], Reason | None] = lambda: None,
-        remember: Callable[[int], None] = lambda session: None,
+        note_session: Callable[[int], None] = lambda session: None,
     ) -> LoopState:
         self._home = self._channel.home
         return self.read()
@@ -298,14 +298,14 @@ def rehearse(
         file = _complete(PlantFile.model_validate(spec))
         loop, facts = _loop(file)
         outcome: RunResult[Proposal] | RunResult[FastProposal]
-        watch = _watch(facts, _reach(file))
+        limits = _limits(facts, _reach(file))
         hear = on_samples or (lambda samples: None)
         asked = asked or _asked(method, model, options)
         if isinstance(asked, FastOptions):
             plan = fast(facts, asked) if model is None else trial(facts, asked, model)
-            outcome = run(plan, loop, watch=watch, on_event=listen, on_samples=hear)
+            outcome = run(plan, loop, limits=limits, on_event=listen, on_samples=hear)
         else:
-            outcome = run(five_stage(facts, asked), loop, watch=watch, on_event=listen, on_samples=hear)
+            outcome = run(five_stage(facts, asked), loop, limits=limits, on_event=listen, on_samples=hear)
     except ValidationError as error:
         return Rehearsal(empty_result(method), Refused(Reason.BAD_INPUT, lines(error)))
     except Ended as ended:
@@ -343,12 +343,12 @@ def _loop(file: PlantFile) -> tuple[RehearsedLoop, Facts]:
     return RehearsedLoop(plant, channel, ts), facts
 
 
-def _watch(facts: Facts, reach: float) -> Watch:
+def _limits(facts: Facts, reach: float) -> RunLimits:
     """Returns the limits of a rehearsal. They are wide: an unstable plant must end, but the test moves PV by several
     steps."""
     far = max(100 * facts.sp_deviation, 10 * reach)
     low, high = facts.mv_low, facts.mv_high
-    return Watch(-far, far, low, high, max_time_s=500 * facts.T95_s, max_frozen_s=3 * facts.T95_s)
+    return RunLimits(-far, far, low, high, max_time_s=500 * facts.T95_s, max_frozen_s=3 * facts.T95_s)
 
 
 def _reach(file: PlantFile) -> float:

@@ -17,11 +17,11 @@ from loopwright.tuning.plan import Event, Sample
 from loopwright.tuning.reasons import Aborted, Reason
 
 SAMPLES_AT_ONCE = 1000
-TOLD_AFTER_S = 0.2
+REPORT_AFTER_S = 0.2
 """Wall time after which gathered samples are reported, s."""
 
 
-def apart(rehearse: Rehearse, pool: Pool) -> Rehearse:
+def rehearsed_in_pool(rehearse: Rehearse, pool: Pool) -> Rehearse:
     """Returns the same rehearsal, computed by the pool.
 
     rehearse: a function that can be pickled.
@@ -37,7 +37,7 @@ def apart(rehearse: Rehearse, pool: Pool) -> Rehearse:
 
         work = partial(_rehearsed, rehearse, config, request, hooks.ground)
         try:
-            outcome = pool.run(ComputationKind.DRY_RUN, work, hear=hear, unwanted=lambda: hooks.stop() is not None)
+            outcome = pool.run(ComputationKind.DRY_RUN, work, on_report=hear, unwanted=lambda: hooks.stop() is not None)
         except NotWanted:
             reason = hooks.stop() or Reason.SERVICE_STOPPED
             return Outcome(None, Aborted(reason, "the dry run was stopped"), None, {})
@@ -77,7 +77,7 @@ class _Reports:
             last.extend(samples)
         else:
             self._gathered.append(last := list(samples))
-        if len(last) >= SAMPLES_AT_ONCE or time.monotonic() - self._handed_on_at > TOLD_AFTER_S:
+        if len(last) >= SAMPLES_AT_ONCE or time.monotonic() - self._handed_on_at > REPORT_AFTER_S:
             self.hand_on()
 
     def hand_on(self) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
-from loopwright.service.execution.guard import Guard, Watch
+from loopwright.service.execution.guard import Guard, RunLimits
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.tuning.plan import (
@@ -56,24 +56,24 @@ def run(
     plan: Plan[T],
     loop: Loop,
     *,
-    watch: Watch,
+    limits: RunLimits,
     on_event: Callable[[Event], None] = lambda event: None,
     on_samples: Callable[[list[Sample]], None] = lambda samples: None,
     stop: Callable[[], Reason | None] = lambda: None,
     start_work: Callable[[Work[Any]], None] = Work.run,
-    remember: Callable[[int], None] = lambda session: None,
+    note_session: Callable[[int], None] = lambda session: None,
     on_home: Callable[[LoopState], None] = lambda home: None,
 ) -> RunResult[T]:
     """Runs the plan to its end and restores the loop. Raises no error of the loop or plan; see `ended`.
 
-    watch: the limits of the run.
+    limits: the limits of the run.
     stop: asked once a sample and in every wait; a reason that it returns ends the run as Aborted.
     start_work: starts a plan's long computation: for a live loop in a thread, because the loop must be stepped
     meanwhile; by default at once, where no loop waits.
-    remember: receives the number of the session before it is opened.
+    note_session: receives the number of the session before it is opened.
     on_home: receives the state of the loop before the test.
     """
-    return _Run(plan, loop, watch, on_event, on_samples, stop, start_work, remember, on_home).to_the_end()
+    return _Run(plan, loop, limits, on_event, on_samples, stop, start_work, note_session, on_home).to_the_end()
 
 
 class _Run(Generic[T]):
@@ -83,17 +83,17 @@ class _Run(Generic[T]):
         self,
         plan: Plan[T],
         loop: Loop,
-        watch: Watch,
+        limits: RunLimits,
         on_event: Callable[[Event], None],
         on_samples: Callable[[list[Sample]], None],
         stop: Callable[[], Reason | None],
         start_work: Callable[[Work[Any]], None],
-        remember: Callable[[int], None],
+        note_session: Callable[[int], None],
         on_home: Callable[[LoopState], None],
     ) -> None:
-        self._plan, self._loop, self._watch = plan, loop, watch
+        self._plan, self._loop, self._limits = plan, loop, limits
         self._on_event, self._on_samples, self._on_home = on_event, on_samples, on_home
-        self._stop, self._start_work, self._remember = stop, start_work, remember
+        self._stop, self._start_work, self._note_session = stop, start_work, note_session
         self._result: RunResult[T] = RunResult()
         self._samples: list[Sample] = []
         self._home: LoopState | None = None
@@ -127,7 +127,7 @@ class _Run(Generic[T]):
 
     def _begin(self) -> LoopState:
         """Opens the session. From now on the loop has to be restored."""
-        home = self._home = self._loop.begin(self._stop, self._remember)
+        home = self._home = self._loop.begin(self._stop, self._note_session)
         self._on_home(home)
         if home.when_silent:
             self._on_event(Note(f"if the controller falls silent, the plant's I/O {home.when_silent}"))
@@ -135,7 +135,7 @@ class _Run(Generic[T]):
 
     def _pump(self, home: LoopState) -> None:
         """Steps the loop until the plan, the guard, the loop or a stop request ends it, each by an exception."""
-        guard = Guard(self._watch, home)
+        guard = Guard(self._limits, home)
         chunk = min(CHUNK, max(1, round(CHUNK_S / home.sample_time_s)))
         answer = next(self._plan)
         while True:

@@ -53,6 +53,7 @@ class Running:
         self._flushed = monotonic()
 
     def on_event(self, event: Event) -> None:
+        """Takes an event of the procedure, which updates the progress and is stored."""
         self._keep_time()
         if isinstance(event, StageStarted):
             self.progress.stage_started(event)
@@ -100,4 +101,5 @@ class Running:
             self.progress.at(t)
 
     def tell(self, kind: str, data: dict[str, Any], **columns: Any) -> None:
+        """Stores an event of the job, and columns of its row, through the journal."""
         self._journal.put(event_of(self.job_id, kind, data, self.progress.plant_time_s, **columns))

@@ -14,7 +14,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.loop_state import state_json
-from loopwright.service.loops.restoration import Restoration, look
+from loopwright.service.loops.restoration import Restoration, restore_loop_of
 from loopwright.service.store import looked_after
 from loopwright.service.store.store import Busy, Store
 from loopwright.service.store.tables import JobRow
@@ -61,7 +61,7 @@ class _Again:
 
     at: float
     wait_s: float
-    found: Restoration
+    restoration: Restoration
 
 
 class Aftercare:
@@ -103,15 +103,15 @@ class Aftercare:
 
     def not_home(self, loop: str | None = None) -> list[NotHome]:
         """Returns this host's supervised loops, each once; with `loop`, that loop if it is supervised, on any host."""
-        found: dict[str, NotHome] = {}
+        by_loop: dict[str, NotHome] = {}
         for row in looked_after.rows(self._store, loop):
-            found.setdefault(row.loop, self._not_home(row))
-        return list(found.values())
+            by_loop.setdefault(row.loop, self._not_home(row))
+        return list(by_loop.values())
 
     def _not_home(self, row: JobRow) -> NotHome:
         again = self._again.get(row.id)
         if again is not None:
-            return NotHome(row.loop, row.id, again.found.reason, again.found.text)
+            return NotHome(row.loop, row.id, again.restoration.reason, again.restoration.text)
         reason = Reason(row.reason) if row.reason else None
         return NotHome(row.loop, row.id, reason, row.detail or "it was not read back")
 
@@ -126,7 +126,7 @@ class Aftercare:
             raise Busy(tag, active.id)
         return looked_after.dismissed(self._store, tag, by)
 
-    def look(self) -> None:
+    def check_due_loops(self) -> None:
         """Reads every loop whose time has come."""
         rows = looked_after.rows(self._store)
         for gone in self._again.keys() - {row.id for row in rows}:
@@ -151,23 +151,23 @@ class Aftercare:
             # A running job answers for its loop: this row may have been read before that job began.
             if self._stopping or self._store.active(row.loop) is not None:
                 return
-            found = look(row, self._directory.loops, self._directory.open_loop)
-        if found.state is None:
-            self._not_yet(row, found)
-        elif looked_after.home_again(self._store, row.id, state_json(found.state), found.text):
-            log.info("the loop is not supervised any more: %s", found.text)
+            restoration = restore_loop_of(row, self._directory.loops, self._directory.open_loop)
+        if restoration.state is None:
+            self._not_yet(row, restoration)
+        elif looked_after.home_again(self._store, row.id, state_json(restoration.state), restoration.text):
+            log.info("the loop is not supervised any more: %s", restoration.text)
 
-    def _not_yet(self, row: JobRow, found: Restoration) -> None:
+    def _not_yet(self, row: JobRow, restoration: Restoration) -> None:
         before = self._again.get(row.id)
         wait_s = EVERY_S if before is None else min(LONGEST_S, 2.0 * before.wait_s)
-        if before is None or before.found.reason is not found.reason:
-            log.warning("%s; the loop will be read again", found.text)
-        self._again[row.id] = _Again(self.clock() + wait_s, wait_s, found)
+        if before is None or before.restoration.reason is not restoration.reason:
+            log.warning("%s; the loop will be read again", restoration.text)
+        self._again[row.id] = _Again(self.clock() + wait_s, wait_s, restoration)
 
     def _run(self) -> None:
         while not self._stopping:
             try:
-                self.look()
+                self.check_due_loops()
             except SQLAlchemyError as error:
                 log.warning("the loops to be supervised could not be read from the database: %s", error)
             except Exception:

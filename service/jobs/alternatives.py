@@ -52,11 +52,11 @@ def alternatives(row: JobRow, events: Sequence[EventRow], method: str | None = N
     model = job_model(row, events)
     _not_disproved(row, DISPROVED)
     names = [method] if method else [name for name, each in METHODS.items() if not each.slow]
-    found = tune_each(model, names)
-    told = answer(model, found)
-    for each, shown in zip(found, told["methods"], strict=True):
+    results = tune_each(model, names)
+    body = answer(model, results)
+    for each, shown in zip(results, body["methods"], strict=True):
         shown |= {"retune": _retune(each, model), "uncertainty": None, "ambiguity": None}
-    return {"job": row.id, "loop": row.loop, **told}
+    return {"job": row.id, "loop": row.loop, **body}
 
 
 def redesigned(
@@ -84,16 +84,16 @@ def redesigned(
             Ts = (row.found or {}).get("sample_time_s") or 0.0
             sampled = delayed(model, 0.5 * Ts)
             gains = designed_on(model, FastOptions(Ms=ms, derivative=derivative), Ts).gains
-        found = _tuned(gains, ms, assess(sampled, gains))
+        result = _tuned(gains, ms, assess(sampled, gains))
     except Ended as refusal:
-        found = MethodResult(FAST_DESIGN, refusal=refusal)
-    told = answer(model, [found])
+        result = MethodResult(FAST_DESIGN, refusal=refusal)
+    body = answer(model, [result])
     retune = None
-    if found.gains is not None:
+    if result.gains is not None:
         asked = {"num": list(model.num), "den": list(model.den), "dead_time_s": model.L}
         retune = {"method": FAST, "start": "design", "ms": ms, "derivative": derivative, "model": asked} | ANYWAY
-    told["methods"][0] |= {"retune": retune, **doubt}
-    return {"job": row.id, "loop": row.loop, **told}
+    body["methods"][0] |= {"retune": retune, **doubt}
+    return {"job": row.id, "loop": row.loop, **body}
 
 
 def _tuned(gains: Gains, ms: float, assessed: Assessment) -> MethodResult:
@@ -123,12 +123,12 @@ def _not_disproved(row: JobRow, reasons: Sequence[Reason]) -> None:
         raise Conflict(f"{text}: retune instead")
 
 
-def _retune(found: MethodResult, model: FoundModel) -> dict[str, Any] | None:
+def _retune(result: MethodResult, model: FoundModel) -> dict[str, Any] | None:
     """Returns the request that tries the gains on the loop; None for gains that the service would not try (see
     `tuning.rules.design`), and for those of a rule on a model that the five stages do not take."""
-    if found.assessment is None or isinstance(model, TransferFunction):
+    if result.assessment is None or isinstance(model, TransferFunction):
         return None
-    m = found.assessment.margins
+    m = result.assessment.margins
     if not (m.stable and m.Ms <= MAX_Ms and (m.GM is None or m.GM >= MIN_GM)):
         return None
-    return {"start": "optimise", "method": found.method.name, "model": dump_model(model)} | ANYWAY
+    return {"start": "optimise", "method": result.method.name, "model": dump_model(model)} | ANYWAY

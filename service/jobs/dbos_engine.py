@@ -22,7 +22,6 @@ from loopwright.service.store.lock import FolderInUse
 
 log = logging.getLogger(__name__)
 
-"""Nothing in it that our own tables would not restore: it may be deleted while the service is stopped."""
 POLL_S = 0.5
 """Wall time between two queries of each queue, s."""
 _ALIVE = ("PENDING", "ENQUEUED", "DELAYED")
@@ -100,18 +99,18 @@ class DurableEngine:
     def known(self, job_ids: Collection[str]) -> set[str]:
         if not job_ids:
             return set()
-        found = DBOS.list_workflows(
+        workflows = DBOS.list_workflows(
             workflow_ids=list(job_ids), status=list(_ALIVE), load_input=False, load_output=False
         )
-        return {one.workflow_id for one in found if one.queue_name in self._queues}
+        return {one.workflow_id for one in workflows if one.queue_name in self._queues}
 
     def over(self, limit: int) -> list[str]:
         # A file belongs to one host, even if the host had another name before.
         host = None if self._own is not None else self._host
-        found = DBOS.list_workflows(
+        workflows = DBOS.list_workflows(
             status=list(_OVER), executor_id=host, limit=limit, load_input=False, load_output=False
         )
-        return [one.workflow_id for one in found]
+        return [one.workflow_id for one in workflows]
 
     def forget(self, job_ids: Collection[str]) -> None:
         if job_ids:

@@ -78,11 +78,11 @@ class Decisions:
                 finally:
                     loop.close()
             except ForeignGains as foreign:
-                # After an interrupted acceptance somebody set other gains by hand: nothing is left to take back.
+                # After an interrupted acceptance an operator set other gains: nothing is left to take back.
                 if not (begun and now is JobState.PROPOSED and wanted is JobState.ROLLED_BACK):
                     raise
-                detail = f"declined; the controller holds {foreign.found.gains}: somebody else's, left as they are"
-                return self.store.move(job_id, wanted, by=by, restored=state_json(foreign.found), detail=detail)
+                detail = f"declined; the controller holds {foreign.state.gains}: set by others, left as they are"
+                return self.store.move(job_id, wanted, by=by, restored=state_json(foreign.state), detail=detail)
             except Locked:  # before anything was written
                 raise
             except Ended as ended:

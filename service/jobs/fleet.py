@@ -39,7 +39,7 @@ from loopwright.tuning.reasons import Reason
 
 log = logging.getLogger(__name__)
 
-LOOK_S = 0.5
+POLL_S = 0.5
 """Wall time between two rounds, s."""
 _OWN = ("loops", "pattern", "at_once_per_bus", "at_once_per_area", "stop_after_failures")
 AtOnce = Annotated[int, Field(ge=1, le=1000)]
@@ -147,15 +147,15 @@ class Fleet:
     def _run(self) -> None:
         while not self._over.is_set():
             try:
-                self.look()
+                self.poll()
             except FolderInUse as error:
-                log.error("another host runs the retunes of many loops: %s", error)
+                log.error("another service runs the retunes of many loops: %s", error)
                 return
             except SQLAlchemyError as error:
                 log.warning("retunes of many loops wait for the database: %s", error)
             except Exception:
                 log.exception("a defect in a retune of many loops")
-            self._wake.wait(LOOK_S)
+            self._wake.wait(POLL_S)
             self._wake.clear()
 
     # requests
@@ -206,11 +206,12 @@ class Fleet:
             return retunes.find(session, retune_id), retunes.parts(session, retune_id)
 
     def recent(self, limit: int, before: int | None = None) -> list[tuple[RetuneRow, list[Part]]]:
+        """Returns the latest retunes of many loops with their parts, newest first."""
         with self._store.reading() as session:
             return [(row, retunes.parts(session, row.id)) for row in retunes.recent(session, limit, before)]
 
     # the work
-    def look(self) -> None:
+    def poll(self) -> None:
         """Makes one round over the retunes of this host: starts jobs where possible, and ends retunes that are over."""
         with self._looking:
             with self._store.reading() as session:

@@ -108,7 +108,7 @@ class Journal:
                 log.exception("a report could not be written")
                 return 1
         except FolderInUse as error:
-            log.error("another host writes %d reports: %s", len(batch), error)
+            log.error("another service writes %d reports: %s", len(batch), error)
             return len(batch)
         except Exception:
             if len(batch) == 1:

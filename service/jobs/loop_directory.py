@@ -54,6 +54,7 @@ class LoopDirectory:
         return self._buses.get(bus, BusConfig()).at_once
 
     def config(self, tag: str) -> LoopConfig:
+        """Returns the configuration of a loop of any host. Raises UnknownLoop."""
         return self.owner(tag)[0]
 
     def owner(self, tag: str) -> tuple[LoopConfig, str]:
@@ -67,8 +68,8 @@ class LoopDirectory:
 
     def everywhere(self) -> list[tuple[LoopConfig, str]]:
         """Returns every loop of every host, those of this host first."""
-        ours = [(config, self.store.host) for config in self.loops.values()]
-        return ours + [(LoopConfig.model_validate(row.config), row.host) for row in self.store.foreign_loops()]
+        own = [(config, self.store.host) for config in self.loops.values()]
+        return own + [(LoopConfig.model_validate(row.config), row.host) for row in self.store.foreign_loops()]
 
     def live(self, tag: str) -> LoopState | None:
         """Returns the present state of a loop, from the running job or else from the bus; None on another host."""

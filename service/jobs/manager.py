@@ -186,8 +186,8 @@ class Jobs:
                         self.store.request_stop(job_id, Reason.INTERNAL.value, "service")
             except SQLAlchemyError as error:
                 log.error(
-                    "job %s of loop %s could not be queued, and its end could not be written: it does not begin, "
-                    "and holds the loop until the database takes its end, which is tried every %.0f s: %s",
+                    "job %s of loop %s could not be queued, and its end could not be written: it does not begin, and "
+                    "holds the loop until the database accepts its end, which is tried every %.0f s: %s",
                     job_id, row.loop, _RECONCILE_S, error,
                 )  # fmt: skip
             else:
@@ -198,8 +198,8 @@ class Jobs:
 
         A job that runs here is asked before the abort is stored, so the loop does not wait for the database.
         """
-        heard = self.tell_to_stop(job_id)
-        row = self.store.request_stop(job_id, Reason.OPERATOR.value, by, heard)
+        is_running_here = self.tell_to_stop(job_id)
+        row = self.store.request_stop(job_id, Reason.OPERATOR.value, by, is_running_here)
         if row.host == self.store.host:
             self._request_stop_of(job_id, Reason.OPERATOR)
         return self.store.get(job_id)
@@ -262,7 +262,7 @@ class Jobs:
             if not running.over.wait(max(0.0, give_up - self._machine.monotonic())):
                 log.error(
                     "job %s of loop %s has not ended in %.0f s: whether its loop is restored is unknown, and its end "
-                    "is not written; check the controller, which restores the loop by itself when the service falls "
+                    "is not written; look at the controller, which restores the loop by itself when the service falls "
                     "silent; the next start checks the loop again",
                     running.job_id, running.tag, ENDS_S,
                 )  # fmt: skip

@@ -29,6 +29,7 @@ class Progress:
         self._known = False
 
     def stage_started(self, event: StageStarted) -> None:
+        """Begins a stage with its expected plant time."""
         self._reached = self.fraction
         self.stage = event.stage
         self._stage_start_s = self._now_s
@@ -44,10 +45,10 @@ class Progress:
     def seen_at(self, t_s: float | None) -> Progress:
         """Returns a copy at that plant time, or a plain copy where the progress is later already or the time is
         None."""
-        found = copy(self)
+        advanced = copy(self)
         if t_s is not None:
-            found.at(max(t_s, self._now_s))
-        return found
+            advanced.at(max(t_s, self._now_s))
+        return advanced
 
     @property
     def plant_time_s(self) -> float:

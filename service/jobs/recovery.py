@@ -13,7 +13,7 @@ from loopwright.service.job_states import JobState
 from loopwright.service.jobs.engine import WORKFLOW_VERSION
 from loopwright.service.loop_state import state_json
 from loopwright.service.loops.loop import Loop
-from loopwright.service.loops.restoration import Restoration, look
+from loopwright.service.loops.restoration import Restoration, restore_loop_of
 from loopwright.service.request import retune_request, within
 from loopwright.service.store import loop_locks
 from loopwright.service.store.store import Store
@@ -47,7 +47,7 @@ class Recovery:
         safe: Restoration | None = None
         # A job of an earlier version has no session, but may have touched its loop.
         if row.found is not None and (row.session is not None or row.version != WORKFLOW_VERSION):
-            safe = look(row, self.loops, self.open_loop)
+            safe = restore_loop_of(row, self.loops, self.open_loop)
             self.store.append(row.id, "loop_found", {"text": safe.text}, row.plant_time_s)
         restored: dict[str, Any] = {}
         if safe is not None and safe.state is not None:

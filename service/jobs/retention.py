@@ -27,7 +27,7 @@ from loopwright.service.telemetry.metrics import CLOCK_JUMPS
 log = logging.getLogger(__name__)
 
 EVERY_S = 3600.0
-LOOK_S = 60.0
+CLOCK_CHECK_S = 60.0
 """Wall time between two checks of the clock, s."""
 _AT_ONCE = 50
 _FORGOTTEN_AT_ONCE = 500
@@ -36,7 +36,7 @@ _KEPT = [state.value for state in (*ACTIVE, JobState.PROPOSED)]
 
 
 @dataclass(frozen=True)
-class Keep:
+class RetentionPolicy:
     """Which jobs keep their samples; active and proposed jobs always do.
 
     jobs: the newest `jobs` of each loop keep them; None disables the criterion.
@@ -50,22 +50,24 @@ class Keep:
         return self.jobs is not None or self.days is not None
 
 
-def tidy(store: Store, keep: Keep, at: datetime | None = None, ages_from: datetime | None = None) -> int:
+def delete_old_samples(
+    store: Store, policy: RetentionPolicy, at: datetime | None = None, ages_from: datetime | None = None
+) -> int:
     """Deletes the old samples of this host's jobs. Returns the number of jobs.
 
     at: the present time; by default that of the clock.
     ages_from: no sample counts as older than this time.
     """
     at = at or datetime.now(UTC)
-    if keep.days is not None and ages_from is not None and ages_from > at - timedelta(days=keep.days):
+    if policy.days is not None and ages_from is not None and ages_from > at - timedelta(days=policy.days):
         return 0  # no job is known to be old enough
     count = 0
-    while keep and (jobs := _some(store, keep, at)):
+    while policy and (jobs := _some(store, policy, at)):
         count += len(jobs)
     return count
 
 
-def forget(store: Store, engine: Engine) -> int:
+def forget_finished(store: Store, engine: Engine) -> int:
     """Deletes the engine's records of jobs that are over, whose state is in the service's own tables. Returns their
     number."""
     count = 0
@@ -82,10 +84,10 @@ def forget(store: Store, engine: Engine) -> int:
     return count
 
 
-def _some(store: Store, keep: Keep, at: datetime) -> list[JobRow]:
+def _some(store: Store, policy: RetentionPolicy, at: datetime) -> list[JobRow]:
     """Returns the first few jobs: the transaction has to be short, because others write too."""
     with store.writing() as session:
-        old = select(JobRow).where(*_old(store.host, keep, at)).order_by(JobRow.number).limit(_AT_ONCE)
+        old = select(JobRow).where(*_old(store.host, policy, at)).order_by(JobRow.number).limit(_AT_ONCE)
         rows = list(session.scalars(old))
         ids = [row.id for row in rows]
         if rows:
@@ -93,31 +95,31 @@ def _some(store: Store, keep: Keep, at: datetime) -> list[JobRow]:
             samples = session.scalar(select(func.sum(ChunkRow.count)).where(of_them))
             session.execute(delete(ChunkRow).where(of_them))
             for row in rows:
-                append(session, row.id, "samples_deleted", {"text": _why(keep)}, row.plant_time_s)
+                append(session, row.id, "samples_deleted", {"text": _why(policy)}, row.plant_time_s)
             before = {"jobs": ids, "samples": samples}
-            audit.record(session, "samples_delete", "retention", before=before, after={"kept": _why(keep)})
+            audit.record(session, "samples_delete", "retention", before=before, after={"kept": _why(policy)})
     if ids:
         log.info("samples of %d old jobs deleted: %s", len(ids), ", ".join(ids))
     return rows
 
 
-def _old(host: str, keep: Keep, at: datetime) -> list[ColumnElement[bool]]:
+def _old(host: str, policy: RetentionPolicy, at: datetime) -> list[ColumnElement[bool]]:
     with_samples = select(ChunkRow.job_id).where(ChunkRow.job_id == JobRow.id).exists()
-    found = [JobRow.host == host, JobRow.state.not_in(_KEPT), with_samples]
-    if keep.jobs is not None:
+    conditions = [JobRow.host == host, JobRow.state.not_in(_KEPT), with_samples]
+    if policy.jobs is not None:
         # Rehearsals are counted separately: they must not displace the experiments.
         of_loop = (JobRow.loop, JobRow.dry_run)
         number = func.row_number().over(partition_by=of_loop, order_by=JobRow.number.desc())
         rank = select(JobRow.id, number).subquery()
-        found.append(JobRow.id.in_(select(rank.c[0]).where(rank.c[1] > keep.jobs)))
-    if keep.days is not None:
-        found.append(JobRow.ended_at < stamp(at - timedelta(days=keep.days)))
-    return found
+        conditions.append(JobRow.id.in_(select(rank.c[0]).where(rank.c[1] > policy.jobs)))
+    if policy.days is not None:
+        conditions.append(JobRow.ended_at < stamp(at - timedelta(days=policy.days)))
+    return conditions
 
 
-def _why(keep: Keep) -> str:
-    parts = [] if keep.jobs is None else [f"of the newest {keep.jobs} jobs of each loop"]
-    parts += [] if keep.days is None else [f"of the last {keep.days:g} days"]
+def _why(policy: RetentionPolicy) -> str:
+    parts = [] if policy.jobs is None else [f"of the newest {policy.jobs} jobs of each loop"]
+    parts += [] if policy.days is None else [f"of the last {policy.days:g} days"]
     return "samples are kept " + " and ".join(parts)
 
 
@@ -128,12 +130,13 @@ class Retention:
         self,
         store: Store,
         engine: Engine,
-        keep: Keep,
+        policy: RetentionPolicy,
         every_s: float = EVERY_S,
-        look_s: float = LOOK_S,
+        clock_check_s: float = CLOCK_CHECK_S,
         watch: ClockWatch | None = None,
     ) -> None:
-        self._store, self._engine, self._keep, self._every_s, self._look_s = store, engine, keep, every_s, look_s
+        self._store, self._engine, self._policy = store, engine, policy
+        self._every_s, self._clock_check_s = every_s, clock_check_s
         self._watch = watch or ClockWatch()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="retention", daemon=True)
@@ -148,7 +151,7 @@ class Retention:
 
     def note(self) -> str | None:
         """Returns why no samples are deleted for their age at present; None where they are."""
-        seen, days = self._watch.seen, self._keep.days
+        seen, days = self._watch.seen, self._policy.days
         if seen is None or seen.ages_from is None or days is None:
             return None
         until = seen.ages_from + timedelta(days=days)
@@ -159,10 +162,10 @@ class Retention:
             f"none are deleted for their age before {stamp(until)}"
         )
 
-    def look(self) -> None:
+    def check_clock(self) -> None:
         """Checks the clock, and stores the result."""
         before = None if self._watch.seen is not None else hosts.last_seen(self._store)
-        jump = self._watch.look(before, longest_stop(self._keep.days))
+        jump = self._watch.look(before, longest_stop(self._policy.days))
         if jump is not None:
             CLOCK_JUMPS.inc()
             log.warning("%s", jump.text)
@@ -173,7 +176,7 @@ class Retention:
         tidied: float | None = None
         while not self._over.is_set():
             try:
-                self.look()
+                self.check_clock()
                 if tidied is None or time.monotonic() - tidied >= self._every_s:
                     self.tidy()
                     tidied = time.monotonic()
@@ -183,11 +186,11 @@ class Retention:
                 log.warning("old samples could not be deleted, this is tried again later: %s", error)
             except Exception:  # after any error, it must be tried again
                 log.exception("old samples could not be deleted")
-            self._over.wait(self._look_s)
+            self._over.wait(self._clock_check_s)
 
     def tidy(self) -> None:
         """One turn of the thread, without a look at the clock."""
         seen = self._watch.seen
         if seen is not None:
-            tidy(self._store, self._keep, seen.at, seen.ages_from)
-        forget(self._store, self._engine)
+            delete_old_samples(self._store, self._policy, seen.at, seen.ages_from)
+        forget_finished(self._store, self._engine)

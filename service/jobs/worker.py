@@ -99,7 +99,7 @@ class Worker:
         try:
             self._finish(running, self._run(running, row), row.dry_run)
         except FolderInUse as error:
-            log.error("another host writes the end of the job: %s", error)
+            log.error("another service writes the end of the job: %s", error)
             raise
         except Exception:
             log.exception("the end of the job could not be written")

@@ -63,13 +63,14 @@ class BusConnection:
             raise Refused(Reason.BAD_INPUT, f"the controller refused: {error}") from error
 
     def reading(self, tuner: Tuner) -> BusReading:
+        """Returns a reading of the channel through this tuner."""
         return self._read(tuner, self.controller, self.plant, self.channel)
 
     def stop_beating(self) -> None:
         """Ends this process's heartbeat for the loop and the renewals of the lease."""
         if self._tuner is not None:
             self._tuner.beating = False
-            self._tuner.keep(0)
+            self._tuner.set_renewed_session(0)
 
     def close(self) -> None:
         """Closes the tuner; it is opened again when needed."""

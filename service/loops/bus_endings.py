@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from loopwright.protocol.profile import Cause, Hand
+from loopwright.protocol.profile import Cause, OutsideChange
 from loopwright.protocol.tuner import Tuner
 from loopwright.service.loop_state import LoopState, differences, same
 from loopwright.service.loops.bus_reading import BusReading
@@ -10,28 +10,30 @@ from loopwright.service.loops.loop import Restored
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
 
-_HANDS = {
-    Hand.SETPOINT: (Reason.SETPOINT_CHANGED, "set-point", {"set-point"}),
-    Hand.MODE: (Reason.MODE_CHANGED, "mode", {"mode", "output"}),
-    Hand.OUTPUT: (Reason.OUTPUT_CHANGED, "output", {"output"}),
-    Hand.GAINS: (Reason.GAINS_CHANGED, "gains", {"gains", "trial"}),
-    Hand.LIMITS: (Reason.LIMITS_CHANGED, "limits", set[str]()),
+_OUTSIDE_CHANGES = {
+    OutsideChange.SETPOINT: (Reason.SETPOINT_CHANGED, "set-point", {"set-point"}),
+    OutsideChange.MODE: (Reason.MODE_CHANGED, "mode", {"mode", "output"}),
+    OutsideChange.OUTPUT: (Reason.OUTPUT_CHANGED, "output", {"output"}),
+    OutsideChange.GAINS: (Reason.GAINS_CHANGED, "gains", {"gains", "trial"}),
+    OutsideChange.LIMITS: (Reason.LIMITS_CHANGED, "limits", set[str]()),
 }
 """For each kind of change by an operator or another master: the reason, its name, and in what the loop may differ from
 its state before the test because of it."""
 
 
 def cause_of(tuner: Tuner) -> Cause:
+    """Returns why the last session ended, as the controller says."""
     return Cause(int(tuner.number("controller_cause")))
 
 
 def words_of(cause: Cause) -> str:
+    """Returns the cause in words."""
     return f"cause: {cause.name.lower().replace('_', ' ')}"
 
 
-def hand_of(tuner: Tuner) -> Hand:
+def outside_changes_of(tuner: Tuner) -> OutsideChange:
     """Returns what an operator or another master has changed since the opening."""
-    return Hand(int(tuner.number("controller_hand")))
+    return OutsideChange(int(tuner.number("controller_outside_changes")))
 
 
 def why_over(reading: BusReading, number: int, pv_silence_s: float) -> Ended:
@@ -41,9 +43,9 @@ def why_over(reading: BusReading, number: int, pv_silence_s: float) -> Ended:
         return Failed(Reason.NODE_LOST, f"controller node {reading.controller:02X}h restarted")
     cause = cause_of(tuner)
     match cause:
-        case Cause.HAND:
-            hand = hand_of(tuner)
-            moved = [entry for bit, entry in _HANDS.items() if bit in hand]
+        case Cause.OUTSIDE_CHANGE:
+            changes = outside_changes_of(tuner)
+            moved = [entry for bit, entry in _OUTSIDE_CHANGES.items() if bit in changes]
             reason = moved[0][0] if moved else Reason.MODE_CHANGED
             return Aborted(reason, f"an operator or another master changed: {', '.join(name for _, name, _ in moved)}")
         case Cause.PV_LIMIT:
@@ -72,22 +74,28 @@ def read_back(reading: BusReading, home: LoopState, number: int, how: str) -> Re
     if not reading.controls(state):
         raise Failed(Reason.NODE_NOT_OPERATIONAL, f"{state.node_state}: nothing controls, MV stays where it is")
     holder = int(tuner.number("controller_session_holder"))
-    ours = bool(number) and int(tuner.number("controller_session_last")) == number and not holder
-    if ours:  # the controller noted the state at the moment of the opening
+    is_own = bool(number) and int(tuner.number("controller_session_last")) == number and not holder
+    if is_own:  # the controller noted the state at the moment of the opening
         home = reading.home()
-    hand = hand_of(tuner)  # read last, so that it includes every change so far
-    found = differences(state, home)
+    changes = outside_changes_of(tuner)  # read last, so that it includes every change so far
+    differing = differences(state, home)
     if holder:
-        found["session"] = f"the tuner with node-ID {holder:02X}h holds the loop"
-    theirs = set(found)
-    if ours:
-        theirs = set().union(*(may_differ for bit, (_, _, may_differ) in _HANDS.items() if bit in hand))
-    unconfirmed = [words for name, words in found.items() if name not in theirs]
-    if ours and not hand and state.mode is Mode.AUTOMATIC and _ended_without_pv(tuner) and not same(state.mv, home.mv):
+        differing["session"] = f"the tuner with node-ID {holder:02X}h holds the loop"
+    explained = set(differing)
+    if is_own:
+        explained = set().union(*(may_differ for bit, (_, _, may_differ) in _OUTSIDE_CHANGES.items() if bit in changes))
+    unconfirmed = [words for name, words in differing.items() if name not in explained]
+    if (
+        is_own
+        and not changes
+        and state.mode is Mode.AUTOMATIC
+        and _ended_without_pv(tuner)
+        and not same(state.mv, home.mv)
+    ):
         unconfirmed.append(f"MV is {state.mv:.6g} without a valid PV, was {home.mv:.6g}")
     if unconfirmed:
         raise Failed(Reason.RESTORE_UNCONFIRMED, "; ".join(unconfirmed))
-    return Restored(state, how, found)
+    return Restored(state, how, differing)
 
 
 def _ended_without_pv(tuner: Tuner) -> bool:

@@ -73,7 +73,7 @@ class BusLoop:
     def begin(
         self,
         stop: Callable[[], Reason | None] = lambda: None,
-        remember: Callable[[int], None] = lambda session: None,
+        note_session: Callable[[int], None] = lambda session: None,
     ) -> LoopState:
         self._stop = stop
         self.session.number = 0
@@ -82,7 +82,7 @@ class BusLoop:
                 self._connection.reading(tuner).identify()
                 self._connection.reading(tuner).compare_times()
                 self._samples.take_plant(tuner)
-                home = self.session.open(tuner, self._samples.pace, self._samples.sample_time_s, remember)
+                home = self.session.open(tuner, self._samples.pace, self._samples.sample_time_s, note_session)
                 self._samples.begin(tuner)
                 self._commands.clear()
                 return home
@@ -127,7 +127,7 @@ class BusLoop:
                     self._samples.read_sample_time(tuner)
                     held = self.session.open(tuner, self._samples.pace, self._samples.sample_time_s).gains
                     if not same_gains(held, instead_of) and not same_gains(held, gains):
-                        text = f"the controller holds {held}, not {instead_of}: somebody has changed the gains"
+                        text = f"the controller holds {held}, not {instead_of}: the gains were changed meanwhile"
                         raise Refused(Reason.GAINS_CHANGED, text)
                     self.session.order(tuner, Order.ACCEPT, *astuple(gains))
             except Ended as ended:

@@ -45,10 +45,10 @@ class BusReading:
         self._identify(self.controller, Device.CONTROLLER)
 
     def _identify(self, node: int, device: Device) -> None:
-        found = int(self.tuner.number("device_type", node=node))
+        device_type = int(self.tuner.number("device_type", node=node))
         expected = int(default_of(lookup("device_type"), 0, device))
-        if found != expected:
-            text = f"node {node:02X}h is of type {found:08X}h, not a {device.value} ({expected:08X}h)"
+        if device_type != expected:
+            text = f"node {node:02X}h is of type {device_type:08X}h, not a {device.value} ({expected:08X}h)"
             raise Refused(Reason.DEVICE_MISMATCH, text)
         revision = int(self.tuner.number("identity", 3, node=node))
         if revision >> 16 != REVISION >> 16:
@@ -64,10 +64,12 @@ class BusReading:
         not those that it applies. Raises Refused(DEVICE_MISMATCH)."""
         if self.plant is None:
             return
-        ours, theirs = (self.tuner.number("sample_time", node=node) / 1e6 for node in (self.controller, self.plant))
-        if ours != theirs:
-            text = f"controller node {self.controller:02X}h has a sample time of {ours:g} s"
-            raise Refused(Reason.DEVICE_MISMATCH, f"{text}, plant node {self.plant:02X}h one of {theirs:g} s")
+        controller_s, plant_s = (
+            self.tuner.number("sample_time", node=node) / 1e6 for node in (self.controller, self.plant)
+        )
+        if controller_s != plant_s:
+            text = f"controller node {self.controller:02X}h has a sample time of {controller_s:g} s"
+            raise Refused(Reason.DEVICE_MISMATCH, f"{text}, plant node {self.plant:02X}h one of {plant_s:g} s")
 
     def check_controller_operational(self) -> None:
         """Raises Failed(NODE_NOT_OPERATIONAL) unless the controller is operational."""
@@ -150,6 +152,7 @@ class BusReading:
 
 
 def not_operational(node: int, state: int) -> Failed:
+    """Returns the error for a node that is not operational."""
     text = f"node {node:02X}h is {_state_name(state)}: it controls nothing, MV stays where it is"
     return Failed(Reason.NODE_NOT_OPERATIONAL, text)
 

@@ -60,7 +60,7 @@ def end_acceptance(connection: BusConnection, number: int, why: Ended | None) ->
 
 def close_session(tuner: Tuner, number: int) -> str:
     """Closes the session of that number where it is still open, and returns in words how it has ended."""
-    tuner.keep(0)
+    tuner.set_renewed_session(0)
     if int(tuner.number("controller_session")) == number:
         session = TunerSession(tuner)
         session.take_up(number)

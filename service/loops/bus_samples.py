@@ -132,6 +132,7 @@ class BusSamples:
         return self._left <= 0
 
     def start_block(self, tuner: Tuner) -> None:
+        """Lets a plant at pace 0 run the next block."""
         if self.in_blocks:
             tuner.write("plant_samples_to_run", self._block)
             self._left = self._block
@@ -144,10 +145,10 @@ class BusSamples:
     def _wait_for_next(self, tuner: Tuner) -> BusSample:
         give_up: float | None = None
         while True:
-            found = tuner.sample(_SLICE_S)
+            sample = tuner.sample(_SLICE_S)
             self._session.check_status(tuner)
-            if found is not None and (self._first_n is None or found.n != self._last_n):  # a frame may come twice
-                return found
+            if sample is not None and (self._first_n is None or sample.n != self._last_n):  # a frame may come twice
+                return sample
             now = self._station.monotonic()
             give_up = give_up or now + self._silence_s
             if now > give_up:
@@ -164,18 +165,18 @@ class BusSamples:
             return self._session.why_over(tuner)
         return Failed(Reason.SAMPLES_LOST, f"no sample for {self._silence_s:g} s although the nodes answer")
 
-    def _count(self, found: BusSample) -> Sample:
+    def _count(self, sample: BusSample) -> Sample:
         first = self._first_n is None
         if first:
-            self._first_n = found.n
-        passed = 1 if first else samples_between(self._last_n, found.n)
-        self._last_n = found.n
+            self._first_n = sample.n
+        passed = 1 if first else samples_between(self._last_n, sample.n)
+        self._last_n = sample.n
         if passed < 1:
-            raise Failed(Reason.SAMPLES_LOST, f"the plant started anew: sample {found.n} after {found.n - passed}")
+            raise Failed(Reason.SAMPLES_LOST, f"the plant started anew: sample {sample.n} after {sample.n - passed}")
         if passed > 1:
             SAMPLES_LOST.labels(self._connection.url).inc(passed - 1)
         if passed > self._max_gap + 1:
-            raise Failed(Reason.SAMPLES_LOST, f"{passed - 1} samples missing before sample {found.n}")
+            raise Failed(Reason.SAMPLES_LOST, f"{passed - 1} samples missing before sample {sample.n}")
         self._left -= passed if self.in_blocks else 0
         self._passed += passed
-        return Sample((self._passed - 1) * self.sample_time_s, found.sp, found.pv, found.mv, found.mode)
+        return Sample((self._passed - 1) * self.sample_time_s, sample.sp, sample.pv, sample.mv, sample.mode)

@@ -71,19 +71,20 @@ class BusSession:
         tuner: Tuner,
         pace: float,
         sample_time_s: float,
-        remember: Callable[[int], None] = lambda session: None,
+        note_session: Callable[[int], None] = lambda session: None,
     ) -> LoopState:
         """Opens the session and returns the state before the test.
 
-        remember: stores the session's number before it is opened.
+        note_session: stores the session's number before it is opened.
         """
 
         def note(number: int) -> None:
-            remember(number)
+            note_session(number)
             self.number = number
 
         self._wait_for_others(tuner)
-        tuner.hold()  # only now: a dead process may have had this node-ID, and heartbeats would keep its session alive
+        # The heartbeat starts only now: it would keep the session of a dead process with this node-ID alive.
+        tuner.start_heartbeat()
         self._session = TunerSession(tuner)
         self._lease = terms(pace, sample_time_s)
         try:
@@ -98,7 +99,9 @@ class BusSession:
                 raise self._in_use(tuner) from error
             raise
         self.confirmed_at = self._station.monotonic()
-        tuner.keep(self.number, lambda: self._check_stop_request("while other loops had their turn with the node"))
+        tuner.set_renewed_session(
+            self.number, lambda: self._check_stop_request("while other loops had their turn with the node")
+        )
         tuner.restarted, tuner.session_is_open = False, True
         home = self._connection.reading(tuner).home()
         if tuner.session_is_open:  # else the session has ended already, as the status has reported
@@ -121,13 +124,15 @@ class BusSession:
         if holder:
             return Refused(Reason.LOOP_IN_USE, f"the tuner with node-ID {holder:02X}h holds a session on this loop")
         if tuner.number("controller_on_trial"):
-            text = "somebody tries other gains by hand: accept them or take them back (2120h), then repeat"
+            text = "an operator tries other gains by hand: accept them or take them back (2120h), then repeat"
             return Refused(Reason.GAINS_CHANGED, text)
         return Refused(Reason.LOOP_IN_USE, "another tuner had this loop at the moment of the opening")
 
     # -- during the session
 
     def order(self, tuner: Tuner, order: Order, *values: float) -> None:
+        """Gives an order. Raises the reason why the session is over where that is why it is refused, else
+        TunerError."""
         assert self._session is not None
         try:
             self._session.give(order, values)
@@ -164,5 +169,5 @@ class BusSession:
 
     def why_over(self, tuner: Tuner) -> Ended:
         """Returns why the session has ended without a request of this service."""
-        tuner.keep(0)
+        tuner.set_renewed_session(0)
         return why_over(self._connection.reading(tuner), self.number, self._lease.pv_silence_ms / 1000.0)

@@ -14,15 +14,15 @@ from loopwright.tuning.reasons import Failed, Reason
 class ForeignGains(Conflict):
     """Raised when the controller holds gains other than the decision's.
 
-    found: the state of the loop as read; it was not changed.
+    state: the state of the loop as read; it was not changed.
     """
 
-    def __init__(self, found: LoopState, before: Gains) -> None:
+    def __init__(self, state: LoopState, before: Gains) -> None:
         super().__init__(
-            f"the controller holds {found.gains}, not the {before} this decision is about: "
-            "somebody changed the gains in between; retune instead"
+            f"the controller holds {state.gains}, not the {before} this decision is about: "
+            "the gains were changed in between; retune instead"
         )
-        self.found = found
+        self.state = state
 
 
 def replace_accepted(loop: Loop, before: Gains, after: Gains, begun: bool, begin: Callable[[], None]) -> LoopState:
@@ -33,12 +33,12 @@ def replace_accepted(loop: Loop, before: Gains, after: Gains, begun: bool, begin
     begin: called once, before anything is written; when it raises, the loop is not changed.
     Raises ForeignGains, and Failed or Refused as the loop does.
     """
-    found = loop.read()
-    there = begun and same_gains(found.gains, after)
-    if there and not found.on_trial:
-        return found
-    if not there and not same_gains(found.gains, before):
-        raise ForeignGains(found, before)
+    state = loop.read()
+    there = begun and same_gains(state.gains, after)
+    if there and not state.on_trial:
+        return state
+    if not there and not same_gains(state.gains, before):
+        raise ForeignGains(state, before)
     begin()
     state = loop.accept(after, before)
     if not same_gains(state.gains, after):

@@ -44,12 +44,12 @@ class Loop(Protocol):
     def begin(
         self,
         stop: Callable[[], Reason | None] = lambda: None,
-        remember: Callable[[int], None] = lambda session: None,
+        note_session: Callable[[int], None] = lambda session: None,
     ) -> LoopState:
         """Opens a session: from now on the controller restores the loop by itself when this service falls silent.
 
         stop: asked during every wait, here and in `step`; a reason that it returns ends the wait as Aborted.
-        remember: stores the number of the session before it is opened; called with 0 where the opening was refused.
+        note_session: stores the number of the session before it is opened; called with 0 where the opening was refused.
         Returns the state before the test, as the controller has noted it.
         """
         ...

@@ -49,9 +49,9 @@ class ObservedLoop:
     def begin(
         self,
         stop: Callable[[], Reason | None] = lambda: None,
-        remember: Callable[[int], None] = lambda session: None,
+        note_session: Callable[[int], None] = lambda session: None,
     ) -> LoopState:
-        self._state = self._loop.begin(stop, remember)
+        self._state = self._loop.begin(stop, note_session)
         return self._state
 
     def step(self, commands: Sequence[Command]) -> Sample:

@@ -58,7 +58,9 @@ def restore_abandoned(loop: Loop, home: LoopState, session: int | None) -> Resto
     return Restoration(restored.state, text, reason)
 
 
-def look(row: JobRow, loops: Mapping[str, LoopConfig], open_loop: Callable[[LoopConfig], Loop]) -> Restoration:
+def restore_loop_of(
+    row: JobRow, loops: Mapping[str, LoopConfig], open_loop: Callable[[LoopConfig], Loop]
+) -> Restoration:
     """Opens the loop of a job and restores it. Raises nothing: one loop must not keep others from being restored."""
     config = loops.get(row.loop)
     if config is None:

@@ -21,7 +21,7 @@ asked_at: ContextVar[float | None] = ContextVar("asked_at", default=None)
 @dataclass(frozen=True)
 class _Reading(Generic[T]):
     began: float
-    found: T | Ended
+    outcome: T | Ended
 
 
 class SharedReading(Generic[T]):
@@ -44,9 +44,9 @@ class SharedReading(Generic[T]):
                 self._under_way.add(name)
         if last is None:
             last = self._anew(name)
-        if isinstance(last.found, Ended):
-            raise type(last.found)(last.found.reason, last.found.detail)
-        return last.found
+        if isinstance(last.outcome, Ended):
+            raise type(last.outcome)(last.outcome.reason, last.outcome.detail)
+        return last.outcome
 
     def _fresh(self, name: str, asked: float) -> _Reading[T] | None:
         last = self._last.get(name)

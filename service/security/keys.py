@@ -26,6 +26,7 @@ class Scope(StrEnum):
     ADMIN = "admin"
 
     def includes(self, other: Scope) -> bool:
+        """Returns whether this scope permits what the other one permits."""
         order = list(Scope)
         return order.index(self) >= order.index(other)
 
@@ -49,9 +50,9 @@ def hash_key(key: str) -> str:
     return f"scrypt${costs}${salt.hex()}${_scrypt(key, salt, **_SCRYPT).hex()}"
 
 
-def matches(key: str, kept: str) -> bool:
+def matches(key: str, stored: str) -> bool:
     """Returns whether the key belongs to this stored hash. It takes about 50 ms."""
-    parts = _HASH.fullmatch(kept)
+    parts = _HASH.fullmatch(stored)
     if parts is None:
         return False
     n, r, p = (int(parts[i]) for i in (1, 2, 3))

@@ -36,11 +36,11 @@ from loopwright.service.execution.computing.limits import ComputationKind, Compu
 from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.execution.procedures import Tune, rehearse
 from loopwright.service.execution.procedures import tune as live
-from loopwright.service.execution.rehearsals import apart
+from loopwright.service.execution.rehearsals import rehearsed_in_pool
 from loopwright.service.jobs.dbos_engine import POLL_S, DurableEngine
 from loopwright.service.jobs.loop_directory import LoopFactory
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.jobs.retention import Keep, Retention
+from loopwright.service.jobs.retention import Retention, RetentionPolicy
 from loopwright.service.loops.loop import Loop
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.server.signals import Signals
@@ -144,7 +144,7 @@ class Setup:
     auth: bool | None = None
     limits: RequestLimits = field(default_factory=RequestLimits)
     log_format: LogFormat = "text"
-    keep: Keep = field(default_factory=Keep)
+    keep: RetentionPolicy = field(default_factory=RetentionPolicy)
     computing: ComputingLimits = field(default_factory=ComputingLimits)
     trusted_proxies: tuple[IPv4Network | IPv6Network, ...] = ()
 
@@ -192,7 +192,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
             store,
             open_loop or partial(open_bus_loop, station),
             tune or partial(live, workers=pool),
-            apart(rehearse, pool),
+            rehearsed_in_pool(rehearse, pool),
             engine=engine,
             buses=site.buses,
             resume=setup.resume,
@@ -252,10 +252,10 @@ def _is_of(networks: Sequence[IPv4Network | IPv6Network], address: str) -> bool:
     if not networks:
         return False
     try:
-        found = ip_address(address)
+        parsed = ip_address(address)
     except ValueError:
         return False
-    return any(found in network for network in networks)
+    return any(parsed in network for network in networks)
 
 
 def listen(bind: str, port: int) -> Listener:

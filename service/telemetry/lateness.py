@@ -69,6 +69,8 @@ async def _watch(lateness: Lateness) -> None:
         now = time.monotonic()
         late = max(0.0, now - due)
         LATE_SECONDS.observe(late)
-        told = lateness.note(late, now)
-        if told is not None:
-            log.warning("the event loop was held up for %.0f ms: every request and stream waited for that", 1e3 * told)
+        worst_s = lateness.note(late, now)
+        if worst_s is not None:
+            log.warning(
+                "the event loop was held up for %.0f ms: every request and stream waited for that", 1e3 * worst_s
+            )

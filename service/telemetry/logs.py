@@ -46,8 +46,8 @@ def configure(log_format: LogFormat, level: int = logging.INFO) -> None:
 
 def fields_of(record: logging.LogRecord) -> dict[str, Any]:
     """Returns the known fields of a record; its own ones take precedence."""
-    found = {**_about.get(), **{name: getattr(record, name) for name in FIELDS if hasattr(record, name)}}
-    return {name: found[name] for name in FIELDS if found.get(name) is not None}
+    values = {**_about.get(), **{name: getattr(record, name) for name in FIELDS if hasattr(record, name)}}
+    return {name: values[name] for name in FIELDS if values.get(name) is not None}
 
 
 def without_keys(text: str) -> str:

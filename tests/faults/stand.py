@@ -18,7 +18,7 @@ import httpx
 from sqlalchemy import create_engine, select
 from sqlalchemy.orm import Session
 
-from loopwright.controller.device import Kept
+from loopwright.controller.device import RetainedState
 from loopwright.controller.pid import Parameters
 from loopwright.controller.retained_state import write
 from loopwright.protocol.profile import Mode
@@ -82,7 +82,7 @@ class Stand:
         stack.callback(self.eye.close)
         self.stalls = Stalls()
         stack.callback(self.stalls.close)
-        write(folder / "kept.json", [Kept(Parameters(LOOP.kp, LOOP.ti), Mode.AUTOMATIC, LOOP.sp, 50.0)])
+        write(folder / "kept.json", [RetainedState(Parameters(LOOP.kp, LOOP.ti), Mode.AUTOMATIC, LOOP.sp, 50.0)])
         others = replace(LOOP, kp=LOOP.kp / 2, ti=2 * LOOP.ti)
         self.site = Plantsite(
             stack, folder, others, bus=self.hub.url, launcher=launcher, served_with=served_with, speed=str(PACE),

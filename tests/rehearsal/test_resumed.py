@@ -11,7 +11,7 @@ import pytest
 from loopwright.controller.channel import Channel, Settings
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.execution.checkpoints import finished
-from loopwright.service.execution.guard import Watch
+from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.rehearsal import RehearsedLoop, _parameters
 from loopwright.service.execution.runner import run
 from loopwright.service.jsonable import to_json_object
@@ -59,7 +59,7 @@ def test_what_was_finished_is_not_run_again(cut: str, method: str) -> None:
         started[0] = isinstance(event, StageStarted) and event.stage == cut
 
     stopped = run(
-        five_stage(FACTS, options), here, watch=Watch(), on_event=hear,
+        five_stage(FACTS, options), here, limits=RunLimits(), on_event=hear,
         stop=lambda: Reason.SERVICE_STOPPED if started[0] else None,
     )  # fmt: skip
     if cut in ("estimate", "optimise"):  # they take no sample: the stop comes with the first of the next stage
@@ -72,8 +72,8 @@ def test_what_was_finished_is_not_run_again(cut: str, method: str) -> None:
     for _ in range(600):  # the loop comes to rest under its old gains
         here.step(())
     known = finished(stored(first))
-    resumed = run(five_stage(FACTS, options, known), here, watch=Watch(), on_event=second.append)
-    whole = run(five_stage(FACTS, options), loop(), watch=Watch())
+    resumed = run(five_stage(FACTS, options, known), here, limits=RunLimits(), on_event=second.append)
+    whole = run(five_stage(FACTS, options), loop(), limits=RunLimits())
     assert resumed.value is not None, resumed.ended
     assert whole.value is not None
     # the loop comes to each test from another side

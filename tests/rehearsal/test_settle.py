@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.rehearsed import entry, open_loop
 from loopwright.service.config import parse_site
-from loopwright.service.execution.guard import Watch
+from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.procedures import plan
 from loopwright.service.execution.runner import RunResult, run
 from loopwright.service.loops.loop import Loop
@@ -38,7 +38,7 @@ def swinging() -> tuple[Loop, Facts]:
         state.sample_time_s, config.t95_s, state.mv_low, state.mv_high, config.sp_deviation, state.gains,
         state.reverse_acting,
     )  # fmt: skip
-    run(_pushed(facts, state.mv), loop, watch=Watch())
+    run(_pushed(facts, state.mv), loop, limits=RunLimits())
     return loop, facts
 
 
@@ -49,7 +49,7 @@ def _attempt(loop: Loop, facts: Facts, earlier: list[EventRow], method: str) -> 
         if isinstance(event, StageStarted):
             stages.append(event.stage)
 
-    return run(plan(retune_request(method=method), facts, earlier), loop, watch=Watch(), on_event=hear), stages
+    return run(plan(retune_request(method=method), facts, earlier), loop, limits=RunLimits(), on_event=hear), stages
 
 
 @pytest.mark.parametrize("method", ["fast", "five-stage"])

@@ -204,7 +204,7 @@ class Controller(Node):
     def _make(self, port: Port) -> None:
         channel = self.start_values
         if self.keep and self.disk.kept is not None:
-            channel = channel.with_kept(self.disk.kept[0])
+            channel = channel.with_retained(self.disk.kept[0])
         self.device = device = ControllerDevice(
             port, [channel], self._sample_time_s, self.node, self._plant_node, self._pv_timeout_s, self.clock,
             self.disk if self.keep else None, self._draw,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from loopwright.controller.device import Kept
+from loopwright.controller.device import RetainedState
 from tests.simulation.scheduler import Simulation
 
 SOON_S = 0.4
@@ -17,20 +17,20 @@ class PowerCut(BaseException):
 
 
 class Disk:
-    """What a `controller.device.Keeper` writes. cut_at: the write (counted from 1) in which the power fails."""
+    """A `controller.device.RetainedStateStore`. cut_at: the write (counted from 1) in which the power fails."""
 
     def __init__(self, simulation: Simulation) -> None:
-        self.kept: list[Kept] | None = None
+        self.kept: list[RetainedState] | None = None
         self.full = False
         self.full_at = -math.inf
         """When it was last found full."""
         self.writes = 0
         self.cut_at: int | None = None
         self._simulation = simulation
-        self._waiting: list[Kept] | None = None
+        self._waiting: list[RetainedState] | None = None
         self._power = 0
 
-    def now(self, channels: Sequence[Kept]) -> None:
+    def write_now(self, channels: Sequence[RetainedState]) -> None:
         self.writes += 1
         if self.full:
             self.full_at = self._simulation.now
@@ -42,7 +42,7 @@ class Disk:
             raise PowerCut
         self.kept, self._waiting = list(channels), None
 
-    def soon(self, channels: Sequence[Kept]) -> None:
+    def write_soon(self, channels: Sequence[RetainedState]) -> None:
         later = self._waiting is None
         self._waiting = list(channels)
         if later:

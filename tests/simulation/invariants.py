@@ -270,9 +270,9 @@ class Invariants:
                 # Within a sample, or right after it: of these it is known that they end within one.
                 in_sample = session.cause in (Cause.PV_LIMIT, Cause.RELAY_SAMPLES)
                 self._bump = (base, self._before[1], self._before[0]) if in_sample else None
-            if session.cause is Cause.HAND or session.hand:
+            if session.cause is Cause.OUTSIDE_CHANGE or session.outside_changes:
                 self._bump = None
-        if self._bump is not None and (self._bump[2] != channel.good_samples or session.hand):
+        if self._bump is not None and (self._bump[2] != channel.good_samples or session.outside_changes):
             self._no_bump(session, self._bump)
             self._bump = None
         self._before = channel.good_samples, channel.pv, channel.mv
@@ -344,7 +344,12 @@ class Invariants:
         """The first sample after a session goes on from where MV, or the relay's working output, was."""
         channel, (base, pv, good) = session.channel, bump
         settings = channel.settings
-        if channel.mode is not Mode.AUTOMATIC or session.number or session.hand or channel.good_samples != good + 1:
+        if (
+            channel.mode is not Mode.AUTOMATIC
+            or session.number
+            or session.outside_changes
+            or channel.good_samples != good + 1
+        ):
             return
         if self._before[1] is None:  # PV had been away since
             base, pv = self._before[2], None

@@ -10,7 +10,7 @@ from typing import Any
 
 from loopwright.service.config import LoopConfig
 from loopwright.service.execution.computing.limits import ComputationKind
-from loopwright.service.execution.guard import Watch
+from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.procedures import Hooks, Outcome, Tune, tune
 from loopwright.service.execution.runner import run
 from loopwright.service.loop_state import LoopState
@@ -123,10 +123,10 @@ def tunes(actions: tuple[Action, ...]) -> Tune:
     """The work of a job with that plan."""
 
     def work(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks) -> Outcome:
-        watch = Watch(config.pv_limits.low, config.pv_limits.high, max_time_s=1e9)
+        limits = RunLimits(config.pv_limits.low, config.pv_limits.high, max_time_s=1e9)
         ran = run(
-            made_up(actions, state), loop, watch=watch, on_event=hooks.on_event, on_samples=hooks.on_samples,
-            stop=hooks.stop, remember=hooks.remember, on_home=hooks.on_home,
+            made_up(actions, state), loop, limits=limits, on_event=hooks.on_event, on_samples=hooks.on_samples,
+            stop=hooks.stop, note_session=hooks.note_session, on_home=hooks.on_home,
         )  # fmt: skip
         made = None
         if ran.value is not None:

@@ -12,7 +12,7 @@ import pytest
 
 from loopwright.protocol.bus import open_bus
 from loopwright.protocol.profile import COMMAND_FRAME, channel_ids
-from loopwright.service.execution.guard import Watch
+from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.runner import run
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_loop import BusLoop
@@ -23,7 +23,7 @@ from loopwright.tuning.reasons import Ended, Failed, Reason, Refused
 CONTROLLER, PLANT = 0x20, 0x10
 GAINS = Gains(Kp=60.0, Ti=7.0)
 TRIED = Gains(Kp=80.0, Ti=6.0)
-WATCH = Watch()
+LIMITS = RunLimits()
 
 Start = Callable[..., "subprocess.Popen[str]"]
 
@@ -133,7 +133,7 @@ def tiny_plan() -> Plan[list[Sample]]:
 def test_a_plan_of_every_command_runs_and_leaves_the_loop_as_it_was(loop: BusLoop) -> None:
     before = loop.read()
     assert as_configured(before), before
-    result = run(tiny_plan(), loop, watch=WATCH)
+    result = run(tiny_plan(), loop, limits=LIMITS)
     assert result.ended is None
     assert result.value is not None
     stages = [result.value[k : k + 31] for k in range(0, len(result.value), 31)]
@@ -155,7 +155,7 @@ def test_equal_seeds_give_equal_runs(start: Start, url: str) -> None:
     for _ in range(2):
         processes = start_loop(start, url)
         loop = BusLoop(url, CONTROLLER, PLANT)
-        runs.append(run(tiny_plan(), loop, watch=WATCH).value)
+        runs.append(run(tiny_plan(), loop, limits=LIMITS).value)
         loop.close()
         for process in processes.values():
             process.terminate()
@@ -172,7 +172,7 @@ def test_equal_seeds_give_equal_runs(start: Start, url: str) -> None:
 def test_a_plant_with_its_own_clock_is_listened_to(start: Start, url: str) -> None:
     start_loop(start, url, speed="100")
     loop = BusLoop(url, CONTROLLER, PLANT)
-    result = run(tiny_plan(), loop, watch=WATCH)
+    result = run(tiny_plan(), loop, limits=LIMITS)
     loop.close()
     assert result.ended is None
     assert result.restored is not None
@@ -182,7 +182,7 @@ def test_a_plant_with_its_own_clock_is_listened_to(start: Start, url: str) -> No
 def test_gains_are_accepted_and_stay(loop: BusLoop) -> None:
     state = loop.accept(TRIED, GAINS)
     assert (state.gains, state.on_trial) == (TRIED, False)
-    run(wait(20), loop, watch=WATCH)
+    run(wait(20), loop, limits=LIMITS)
     assert loop.read().gains == TRIED
 
 
@@ -223,7 +223,7 @@ def test_a_tuner_that_dies_or_hangs_loses_the_loop(start: Start, url: str, speed
             time.sleep(0.05)
         tuner.kill()
     assert as_configured(observer.read()), observer.read()
-    result = run(wait(20), observer, watch=WATCH)
+    result = run(wait(20), observer, limits=LIMITS)
     assert result.ended is None, "the next job runs"
     observer.close()
 
@@ -277,7 +277,7 @@ def test_a_hand_on_the_set_point_shows_in_the_samples(loop: BusLoop, url: str) -
         bus.send(channel_ids(1).command, COMMAND_FRAME.pack(50.125))
         yield from wait(500)
 
-    result = run(plan(), loop, watch=WATCH)
+    result = run(plan(), loop, limits=LIMITS)
     bus.close()
     assert result.ended is not None
     assert result.ended.reason is Reason.SETPOINT_CHANGED

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.cases import ASKED
 from benchmarks.plants import Plant, plants
 from benchmarks.tuning import cost_over_best, loop_of, span_of
-from loopwright.service.execution.guard import Watch
+from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.runner import run
 from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.tuning.analysis.margins import margins
@@ -55,7 +55,7 @@ def test_the_bus_gives_what_the_rehearsal_gives(start: Start, url: str, number: 
     found = run(
         fast(facts, FastOptions(Ms=ASKED, amplitude=AMPLITUDE * PERCENT, propose_anyway=True)),
         loop,
-        watch=Watch(0.0, 100.0, 0.0, 100.0),
+        limits=RunLimits(0.0, 100.0, 0.0, 100.0),
         start_work=lambda work: threading.Thread(target=work.run, daemon=True).start(),
     )
     loop.close()
@@ -69,7 +69,7 @@ def test_the_bus_gives_what_the_rehearsal_gives(start: Start, url: str, number: 
 
     rehearsed, facts = loop_of(plant, AMPLITUDE, 0.5 * span, NOISE * span, seed=5)
     options = FastOptions(Ms=ASKED, amplitude=AMPLITUDE, propose_anyway=True)
-    expected = run(fast(facts, options), rehearsed, watch=Watch()).value
+    expected = run(fast(facts, options), rehearsed, limits=RunLimits()).value
     assert expected is not None
     # gains of the same robustness trade Kp for Ti where the criterion is flat: what counts is the loop they give
     assert cost_over_best(plant, in_model_units) == pytest.approx(cost_over_best(plant, expected.gains), abs=0.03)

@@ -27,7 +27,7 @@ from loopwright.protocol.profile import (
     sdo_request_id,
     sdo_response_id,
 )
-from loopwright.service.execution.guard import Watch
+from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.runner import run
 from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.service.loops.bus_session import WATCH_S
@@ -101,7 +101,7 @@ def plan() -> Plan[None]:
 def session() -> None:
     """A tuner's session, one that dies on the way, and a controller that is stopped and started by NMT."""
     loop = BusLoop(URL, CONTROLLER, PLANT)
-    result = run(plan(), loop, watch=Watch())
+    result = run(plan(), loop, limits=RunLimits())
     assert result.ended is None, result.ended
     loop.begin()
     loop.close()  # its heartbeat ends while its lease runs

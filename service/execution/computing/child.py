@@ -1,6 +1,6 @@
 """The program of one computation's process: it keeps to its limits, pauses on request, and ends with the service.
 
-Messages to the service are pairs of a `Said` and a value; messages from the service are PAUSE or GO_ON.
+Messages to the service are pairs of a `MessageKind` and a value; messages from the service are PAUSE or GO_ON.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _FIRST_TO_DIE = "500"
 """Value of oom_score_adj: when the system has no memory left, it ends a computation before the service."""
 
 
-class Said(Enum):
+class MessageKind(Enum):
     """The meaning of the value in a message of a computation."""
 
     REPORT = auto()
@@ -48,19 +48,19 @@ def compute(
     attendant = _Attendant(connection)
     attendant.start()
     try:
-        value = work(lambda report: attendant.send(Said.REPORT, report)) if reports else work()
-        message: tuple[Said, Any] = (Said.RESULT, value)
+        value = work(lambda report: attendant.send(MessageKind.REPORT, report)) if reports else work()
+        message: tuple[MessageKind, Any] = (MessageKind.RESULT, value)
     except (MemoryError, SystemError):  # the interpreter raises SystemError where memory was refused
-        message = (Said.NO_MEMORY, None)
+        message = (MessageKind.NO_MEMORY, None)
     except BaseException as error:
-        message = (Said.ERROR, error)
+        message = (MessageKind.ERROR, error)
     with suppress(BrokenPipeError):
         try:
             attendant.send(*message)
         except BrokenPipeError:
             raise
         except Exception as error:  # a result or an error that cannot be pickled
-            attendant.send(Said.ERROR, RuntimeError(f"{type(error).__name__}: {error}"))
+            attendant.send(MessageKind.ERROR, RuntimeError(f"{type(error).__name__}: {error}"))
 
 
 def _keep_to(cpu_s: float, memory_mb: int, niceness: int) -> None:
@@ -104,12 +104,12 @@ class _Attendant(threading.Thread):
         self._sending = False
         signal.signal(signal.SIGUSR1, self._hold)
 
-    def send(self, said: Said, value: object) -> None:
+    def send(self, message_kind: MessageKind, value: object) -> None:
         """Sends a message, in the main thread. A pause falls before or after a message, never within one: the receiver
         would wait for the rest."""
         self._sending = True
         try:
-            self._connection.send((said, value))
+            self._connection.send((message_kind, value))
         finally:
             self._sending = False
         self._may_run.wait()

@@ -22,7 +22,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerProcess
 from typing import Any
 
-from loopwright.service.execution.computing.child import GO_ON, PAUSE, Said, compute
+from loopwright.service.execution.computing.child import GO_ON, PAUSE, MessageKind, compute
 from loopwright.service.execution.computing.limits import (
     MEMORY_OPTION,
     OPTIONS,
@@ -70,10 +70,10 @@ class _Place:
         self.turn = threading.Event()
         self.control: Connection | None = None
 
-    def set_turn(self, mine: bool) -> None:
-        if mine == self.turn.is_set():
+    def set_turn(self, has_turn: bool) -> None:
+        if has_turn == self.turn.is_set():
             return
-        if mine:
+        if has_turn:
             self.turn.set()
         else:
             self.turn.clear()
@@ -108,12 +108,12 @@ class Pool:
         kind: ComputationKind,
         work: Callable[..., Any],
         *,
-        hear: Callable[[Any], None] | None = None,
+        on_report: Callable[[Any], None] | None = None,
         unwanted: Callable[[], bool] = lambda: False,
     ) -> Any:
         """Waits for the work and returns its result, or raises its error.
 
-        hear: receives, in this thread, each value that the work passes to the function it is called with.
+        on_report: receives, in this thread, each value that the work passes to the function it is called with.
         unwanted: asked several times a second; when it returns True, the computation is ended and NotWanted raised.
         Raises Failed(COMPUTATION_LIMIT | COMPUTATION_LOST), NoProcess.
         """
@@ -122,15 +122,15 @@ class Pool:
                 while not place.turn.wait(_LOOK_WAITING_S):
                     self._check(unwanted)
                 self._check(unwanted)
-                heard = _Heard(hear)
+                forwarder = _ReportForwarder(on_report)
                 try:
-                    return self._one(kind, work, place, heard, unwanted)
+                    return self._one(kind, work, place, forwarder, unwanted)
                 except _Died as died:
                     if died.exitcode == -signal.SIGXCPU:
                         cpu_s = self.limits.cpu_s(kind)
                         text = f"{WORDS[kind]} was ended after {cpu_s:g} s of processor time ({OPTIONS[kind]})"
                         raise Failed(Reason.COMPUTATION_LIMIT, text) from None
-                    if last == _TRIES or heard.anything:
+                    if last == _TRIES or forwarder.anything:
                         text = f"the process of {WORDS[kind]} was killed (exit {died.exitcode})"
                         raise Failed(Reason.COMPUTATION_LOST, text) from None
                     _log.warning("the process of %s was killed, the computation is repeated", WORDS[kind])
@@ -191,25 +191,25 @@ class Pool:
         kind: ComputationKind,
         work: Callable[..., Any],
         place: _Place,
-        heard: _Heard,
+        forwarder: _ReportForwarder,
         unwanted: Callable[[], bool],
     ) -> Any:
-        with self._process(kind, work, place, heard.wanted) as (process, connection):
+        with self._process(kind, work, place, forwarder.wanted) as (process, connection):
             while True:
                 while not connection.poll(_LOOK_S):
                     self._check(unwanted)
                 try:
-                    said, value = connection.recv()
+                    message_kind, value = connection.recv()
                 except (EOFError, OSError):
                     with _bookkeeping:
                         process.join()
                     raise _Died(process.exitcode) from None
-                if said is Said.REPORT:
-                    heard.report(value)
+                if message_kind is MessageKind.REPORT:
+                    forwarder.report(value)
                     self._check(unwanted)
-                elif said is Said.RESULT:
+                elif message_kind is MessageKind.RESULT:
                     return value
-                elif said is Said.NO_MEMORY:
+                elif message_kind is MessageKind.NO_MEMORY:
                     memory = self.limits.memory_mb
                     text = f"{WORDS[kind]} asked for more than {memory} MB of memory ({MEMORY_OPTION})"
                     raise Failed(Reason.COMPUTATION_LIMIT, text)
@@ -224,13 +224,13 @@ class Pool:
         errors of pickling."""
         limits = self.limits.cpu_s(kind), self.limits.memory_mb, NICE[kind]
         try:
-            connection, theirs = multiprocessing.Pipe()
+            connection, child_end = multiprocessing.Pipe()
         except OSError as error:
             raise _no_process(kind, error) from error
         with connection:
-            with theirs:
+            with child_end:
                 process = self._context.Process(
-                    target=compute, args=(theirs, work, reports, *limits), name="computation", daemon=True
+                    target=compute, args=(child_end, work, reports, *limits), name="computation", daemon=True
                 )
                 try:
                     _start(process)
@@ -252,21 +252,21 @@ class Pool:
                     process.close()
 
 
-class _Heard:
-    """Passes reports on to `hear`.
+class _ReportForwarder:
+    """Passes reports on to `on_report`.
 
     anything: whether there was a report, so that the work cannot be repeated.
     """
 
-    def __init__(self, hear: Callable[[Any], None] | None) -> None:
-        self.wanted = hear is not None
+    def __init__(self, on_report: Callable[[Any], None] | None) -> None:
+        self.wanted = on_report is not None
         self.anything = False
-        self._hear = hear
+        self._on_report = on_report
 
     def report(self, value: object) -> None:
-        assert self._hear is not None
+        assert self._on_report is not None
         self.anything = True
-        self._hear(value)
+        self._on_report(value)
 
 
 def _no_process(kind: ComputationKind, error: Exception) -> NoProcess:

@@ -86,7 +86,7 @@ def test_the_bus_goes_and_the_command_with_it(bus: Keeper) -> None:
     bus.let_go()
     _, errors = process.communicate(timeout=120)
     assert process.returncode == BUS_GONE
-    assert "made safe" in errors and "the bus has gone" in errors
+    assert "made safe" in errors and "the bus has ended" in errors
 
 
 def test_a_signal_is_passed_on(bus: Keeper) -> None:

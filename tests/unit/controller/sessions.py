@@ -10,7 +10,7 @@ import pytest
 
 from loopwright.controller.channel import Channel, Home, Mode, Parameters, RelayState, Settings
 from loopwright.controller.session import Session
-from loopwright.protocol.profile import Abort, Cause, Hand, Order
+from loopwright.protocol.profile import Abort, Cause, Order, OutsideChange
 from loopwright.protocol.sdo import SdoAbort
 from loopwright.protocol.session import check_of
 
@@ -77,9 +77,9 @@ class Bench:
         assert self.order(Order.OPEN, *(terms or TERMS)) is None
         return self.session.number
 
-    def hand(self, what: Hand) -> Channel:
+    def hand(self, what: OutsideChange) -> Channel:
         """Another hand begins; `settle` after what it does."""
-        self.session.another_hand(what)
+        self.session.on_outside_change(what)
         return self.channel
 
     def look(self) -> tuple[object, ...]:
@@ -119,8 +119,8 @@ class Bench:
             case Cause.RELAY_SAMPLES:
                 assert self.order(Order.RELAY, *RELAY[:3], 2, *RELAY[4:]) is None
                 self.samples(3)
-            case Cause.HAND:
-                self.hand(Hand.GAINS)
+            case Cause.OUTSIDE_CHANGE:
+                self.hand(OutsideChange.GAINS)
                 session.settle()
             case _:
                 raise AssertionError(cause)

@@ -14,16 +14,23 @@ import pytest
 
 from loopwright.controller.__main__ import main
 from loopwright.controller.channel import Mode
-from loopwright.controller.device import Kept
+from loopwright.controller.device import RetainedState
 from loopwright.controller.pid import Parameters
-from loopwright.controller.retained_state import FORM, FORM_1, FileKeeper, KeptError, remembered, write
+from loopwright.controller.retained_state import (
+    FORM,
+    FORM_1,
+    RetainedStateError,
+    RetainedStateFile,
+    read_retained_state,
+    write,
+)
 
 KEPT = [
-    Kept(Parameters(2.5, 10.0, 1.0, 0.1, 0.8, 0.0), Mode.MANUAL, 51.5, 40.0),
-    Kept(Parameters(0.7), Mode.OFF, 50.0, 0.0),
+    RetainedState(Parameters(2.5, 10.0, 1.0, 0.1, 0.8, 0.0), Mode.MANUAL, 51.5, 40.0),
+    RetainedState(Parameters(0.7), Mode.OFF, 50.0, 0.0),
 ]
-OTHER = [Kept(Parameters(3.0), Mode.AUTOMATIC, 49.0, 45.0), KEPT[1]]
-START = [Kept(Parameters(1.0), Mode.AUTOMATIC, 50.0, 50.0)] * 2
+OTHER = [RetainedState(Parameters(3.0), Mode.AUTOMATIC, 49.0, 45.0), KEPT[1]]
+START = [RetainedState(Parameters(1.0), Mode.AUTOMATIC, 50.0, 50.0)] * 2
 
 
 @pytest.fixture
@@ -40,17 +47,17 @@ def until(true: Callable[[], bool]) -> None:
 
 class TestFile:
     def test_what_was_kept_comes_back(self, file: Path) -> None:
-        assert remembered(file, START) is None
+        assert read_retained_state(file, START) is None
         write(file, OTHER)
         write(file, KEPT)
-        assert remembered(file, START) == KEPT
+        assert read_retained_state(file, START) == KEPT
         assert [each.name for each in file.parent.iterdir()] == ["kept.json"]
 
     def test_a_file_of_the_first_form_holds_the_gains(self, file: Path) -> None:
         file.write_text(json.dumps({"form": FORM_1, "accepted": [{"Kp": 2.0, "Ti": 9.0}, {"Kp": 3.0}]}))
-        assert remembered(file, START) == [
-            Kept(Parameters(2.0, 9.0), Mode.AUTOMATIC, 50.0, 50.0),
-            Kept(Parameters(3.0), Mode.AUTOMATIC, 50.0, 50.0),
+        assert read_retained_state(file, START) == [
+            RetainedState(Parameters(2.0, 9.0), Mode.AUTOMATIC, 50.0, 50.0),
+            RetainedState(Parameters(3.0), Mode.AUTOMATIC, 50.0, 50.0),
         ]
 
     @pytest.mark.parametrize(
@@ -76,8 +83,8 @@ class TestFile:
         self, text: str, file: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         file.write_text(text)
-        with pytest.raises(KeptError, match="remove it to start with the values of the options"):
-            remembered(file, START[:1])
+        with pytest.raises(RetainedStateError, match="remove it to start with the values of the options"):
+            read_retained_state(file, START[:1])
         assert main(["--bus", "virtual:x", "--keep", str(file)]) == 2
         assert str(file) in capsys.readouterr().err
 
@@ -86,7 +93,7 @@ class TestFile:
         (file.parent / "kept.json.new").mkdir()
         with pytest.raises(OSError):
             write(file, OTHER)
-        assert remembered(file, START) == KEPT
+        assert read_retained_state(file, START) == KEPT
 
 
 class Disk:
@@ -130,8 +137,8 @@ class TestPowerCut:
     def test_what_is_confirmed_survives_one(self, disk: Disk) -> None:
         file = disk.folder / "kept.json"
         for kept in (KEPT, OTHER):
-            FileKeeper(file).now(kept)
-            assert remembered(disk.after_power_cut() / "kept.json", START) == kept
+            RetainedStateFile(file).write_now(kept)
+            assert read_retained_state(disk.after_power_cut() / "kept.json", START) == kept
         assert disk.syncs == 4, "the file and its folder, each time"
 
     @pytest.mark.parametrize("missing", ["file", "folder"])
@@ -148,8 +155,8 @@ class TestPowerCut:
         monkeypatch.setattr(os, "fsync", forgetful)
         write(file, OTHER)
         try:
-            survived = remembered(disk.after_power_cut() / "kept.json", START)
-        except KeptError:
+            survived = read_retained_state(disk.after_power_cut() / "kept.json", START)
+        except RetainedStateError:
             survived = None
         assert survived != OTHER
 
@@ -160,10 +167,10 @@ class SlowDisk:
     def __init__(self) -> None:
         self.go = threading.Semaphore(0)
         self.begun = 0
-        self.written: list[Sequence[Kept]] = []
+        self.written: list[Sequence[RetainedState]] = []
         self.full = False
 
-    def __call__(self, path: Path, channels: Sequence[Kept]) -> None:
+    def __call__(self, path: Path, channels: Sequence[RetainedState]) -> None:
         self.begun += 1
         self.go.acquire()
         if self.full:
@@ -179,37 +186,37 @@ def slow() -> Iterator[SlowDisk]:
 
 
 @pytest.fixture
-def keeper(slow: SlowDisk, file: Path) -> FileKeeper:
-    return FileKeeper(file, slow, again_s=0.01)
+def keeper(slow: SlowDisk, file: Path) -> RetainedStateFile:
+    return RetainedStateFile(file, slow, again_s=0.01)
 
 
 class TestKeeper:
-    def test_soon_waits_for_no_disk_and_the_last_one_counts(self, keeper: FileKeeper, slow: SlowDisk) -> None:
-        keeper.soon(KEPT)
+    def test_soon_waits_for_no_disk_and_the_last_one_counts(self, keeper: RetainedStateFile, slow: SlowDisk) -> None:
+        keeper.write_soon(KEPT)
         until(lambda: slow.begun == 1)
         began = time.monotonic()
         for kept in (OTHER, KEPT, OTHER):
-            keeper.soon(kept)
+            keeper.write_soon(kept)
         assert time.monotonic() - began < 0.5
         slow.go.release(2)
         until(lambda: slow.written == [KEPT, OTHER])
 
     def test_now_is_written_when_it_returns_and_nothing_older_after_it(
-        self, keeper: FileKeeper, slow: SlowDisk
+        self, keeper: RetainedStateFile, slow: SlowDisk
     ) -> None:
-        keeper.soon(START)
+        keeper.write_soon(START)
         until(lambda: slow.begun == 1)
-        keeper.soon(KEPT)
+        keeper.write_soon(KEPT)
         slow.go.release(2)
-        keeper.now(OTHER)
+        keeper.write_now(OTHER)
         slow.go.release(10)
         assert slow.written == [START, OTHER]
 
     def test_what_a_full_disk_refused_is_written_when_there_is_room(
-        self, keeper: FileKeeper, slow: SlowDisk, capsys: pytest.CaptureFixture[str]
+        self, keeper: RetainedStateFile, slow: SlowDisk, capsys: pytest.CaptureFixture[str]
     ) -> None:
         slow.full = True
-        keeper.soon(KEPT)
+        keeper.write_soon(KEPT)
         slow.go.release(1)
         until(lambda: slow.begun == 2)
         assert "No space left" in capsys.readouterr().err
@@ -220,33 +227,33 @@ class TestKeeper:
     def test_what_a_full_disk_refused_is_not_written_over_a_later_acceptance(
         self, slow: SlowDisk, file: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        keeper = FileKeeper(file, slow, again_s=0.1)
+        keeper = RetainedStateFile(file, slow, again_s=0.1)
         slow.full = True
-        keeper.soon(KEPT)
+        keeper.write_soon(KEPT)
         slow.go.release(1)
         until(lambda: "No space" in capsys.readouterr().err)
         slow.full = False
         slow.go.release(10)
-        keeper.now(OTHER)
+        keeper.write_now(OTHER)
         time.sleep(0.3)
         assert slow.written == [OTHER]
 
     def test_an_acceptance_that_is_refused_loses_no_choice_of_before(self, slow: SlowDisk, file: Path) -> None:
-        keeper = FileKeeper(file, slow, again_s=0.01)
+        keeper = RetainedStateFile(file, slow, again_s=0.01)
         slow.full = True
-        keeper.soon(START)
+        keeper.write_soon(START)
         until(lambda: slow.begun == 1)
-        keeper.soon(KEPT)
+        keeper.write_soon(KEPT)
         slow.go.release(2)
         with pytest.raises(OSError):
-            keeper.now(OTHER)
-        keeper.soon(KEPT)  # as the device does: the disk may have refused the very last step only
+            keeper.write_now(OTHER)
+        keeper.write_soon(KEPT)  # as the device does: the disk may have refused the very last step only
         slow.full = False
         slow.go.release(10)
         until(lambda: bool(slow.written))
         assert slow.written[-1] == KEPT
 
     def test_what_it_writes_is_the_file(self, file: Path) -> None:
-        FileKeeper(file).soon(KEPT)
+        RetainedStateFile(file).write_soon(KEPT)
         until(file.exists)
-        assert remembered(file, START) == KEPT and json.loads(file.read_text())["form"] == FORM
+        assert read_retained_state(file, START) == KEPT and json.loads(file.read_text())["form"] == FORM

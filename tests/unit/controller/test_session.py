@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from loopwright.controller.channel import Home, Mode, Parameters, RelayState
-from loopwright.protocol.profile import Abort, Cause, Hand, Order
+from loopwright.protocol.profile import Abort, Cause, Order, OutsideChange
 from loopwright.protocol.sdo import SdoAbort
 from loopwright.protocol.session import check_of
 from tests.unit.controller.sessions import NO_NUMBERS, ORDERS, OTHER, PI, RELAY, TERMS, TRIED, TUNER, Bench
@@ -71,9 +71,9 @@ class TestOpening:
         assert bench.channel.in_effect == OTHER
 
     def test_forgets_the_hands_of_before(self, bench: Bench) -> None:
-        bench.hand(Hand.OUTPUT)
+        bench.hand(OutsideChange.OUTPUT)
         bench.open()
-        assert bench.session.hand is Hand.NONE
+        assert bench.session.outside_changes is OutsideChange.NONE
 
 
 class TestOrders:
@@ -165,7 +165,7 @@ class TestOrders:
         number = bench.open()
         check = check_of(number, 1, Order.SETPOINT, (53.0,))
         bench.give(Order.SETPOINT, check, 53.0)
-        bench.hand(Hand.SETPOINT).setpoint = 48.0
+        bench.hand(OutsideChange.SETPOINT).setpoint = 48.0
         bench.give(Order.SETPOINT, check, 53.0)
         assert bench.channel.setpoint == 48.0
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from loopwright.controller.channel import Channel, Mode
-from loopwright.protocol.profile import Cause, Hand, Order
+from loopwright.protocol.profile import Cause, Order, OutsideChange
 from tests.unit.controller.sessions import (
     CAUSES,
     HOMES,
@@ -51,7 +51,7 @@ def test_everything_goes_home(cause: Cause, mode: Mode, relay: bool) -> None:
     home = bench.session.home
     bench.end_by(cause)
     assert bench.is_home(home) and bench.channel.accepted == PI
-    assert bench.session.kept == bench.channel.home
+    assert bench.session.retained == bench.channel.home
 
 
 @EACH_CAUSE
@@ -138,7 +138,7 @@ def test_a_home_in_manual_is_reached_within_the_rate_limit_while_pv_comes_and_at
 
 def test_limits_hold_on_the_way_home() -> None:
     bench = in_test(Mode.AUTOMATIC)
-    bench.hand(Hand.LIMITS).settings = type(bench.channel.settings)(mv_low=60.0, mv_high=65.0)
+    bench.hand(OutsideChange.LIMITS).settings = type(bench.channel.settings)(mv_low=60.0, mv_high=65.0)
     bench.session.settle()
     assert bench.samples(1) in (60.0, 65.0)
 
@@ -155,12 +155,12 @@ def _set(name: str, value: float) -> Callable[[Channel], None]:
     return lambda channel: setattr(channel, name, value)
 
 
-HANDS: dict[str, tuple[Hand, Callable[[Channel], None], dict[str, object]]] = {
-    "off": (Hand.MODE, lambda channel: channel.command_mode(Mode.OFF), {"mode": Mode.OFF}),
-    "manual": (Hand.MODE, lambda channel: channel.command_mode(Mode.MANUAL), {"mode": Mode.MANUAL}),
-    "automatic": (Hand.MODE, lambda channel: channel.command_mode(Mode.AUTOMATIC), {"mode": Mode.AUTOMATIC}),
-    "set-point": (Hand.SETPOINT, _set("setpoint", 47.0), {"setpoint": 47.0}),
-    "output": (Hand.OUTPUT, _set("manual_output", 33.0), {"manual_output": 33.0}),
+HANDS: dict[str, tuple[OutsideChange, Callable[[Channel], None], dict[str, object]]] = {
+    "off": (OutsideChange.MODE, lambda channel: channel.command_mode(Mode.OFF), {"mode": Mode.OFF}),
+    "manual": (OutsideChange.MODE, lambda channel: channel.command_mode(Mode.MANUAL), {"mode": Mode.MANUAL}),
+    "automatic": (OutsideChange.MODE, lambda channel: channel.command_mode(Mode.AUTOMATIC), {"mode": Mode.AUTOMATIC}),
+    "set-point": (OutsideChange.SETPOINT, _set("setpoint", 47.0), {"setpoint": 47.0}),
+    "output": (OutsideChange.OUTPUT, _set("manual_output", 33.0), {"manual_output": 33.0}),
 }
 
 
@@ -174,7 +174,11 @@ def test_a_hands_choice_stands_and_all_else_goes_home(hand: str, relay: bool, mo
     act(bench.hand(what))
     bench.session.settle()
     channel = bench.channel
-    assert (bench.session.cause, bench.session.hand, bench.session.is_open) == (Cause.HAND, what, False)
+    assert (bench.session.cause, bench.session.outside_changes, bench.session.is_open) == (
+        Cause.OUTSIDE_CHANGE,
+        what,
+        False,
+    )
     assert {name: getattr(channel, name) for name in chosen} == chosen
     assert (channel.in_effect, channel.on_trial, channel.relay) == (PI, False, None)
     if "mode" not in chosen:
@@ -191,7 +195,7 @@ def test_a_hands_manual_during_a_relay_takes_the_working_output(home: Mode, pv: 
     bench = in_test(home, relay=True)
     assert bench.channel.mv in (40.0, 60.0)
     bench.samples(1, pv)
-    bench.hand(Hand.MODE).command_mode(Mode.MANUAL)
+    bench.hand(OutsideChange.MODE).command_mode(Mode.MANUAL)
     bench.session.settle()
     assert bench.channel.manual_output == 50.0
     assert bench.samples(1, pv) == 50.0
@@ -200,27 +204,31 @@ def test_a_hands_manual_during_a_relay_takes_the_working_output(home: Mode, pv: 
 def test_a_hands_off_is_the_safe_output_also_without_pv() -> None:
     bench = in_test(Mode.AUTOMATIC, relay=True)
     bench.samples(1, math.nan)
-    bench.hand(Hand.MODE).command_mode(Mode.OFF)
+    bench.hand(OutsideChange.MODE).command_mode(Mode.OFF)
     bench.session.settle()
     assert (bench.session.unasked, bench.channel.mv) == (True, 5.0)
 
 
 def test_hands_add_up_until_the_next_opening() -> None:
     bench = in_test(Mode.AUTOMATIC)
-    for what in (Hand.MODE, Hand.SETPOINT):
+    for what in (OutsideChange.MODE, OutsideChange.SETPOINT):
         bench.hand(what)
-    assert bench.session.hand == Hand.MODE | Hand.SETPOINT
+    assert bench.session.outside_changes == OutsideChange.MODE | OutsideChange.SETPOINT
     bench.session.settle()
     bench.open()
-    assert bench.session.hand is Hand.NONE
+    assert bench.session.outside_changes is OutsideChange.NONE
 
 
 def test_a_hand_after_the_end_is_noted_and_leaves_the_cause() -> None:
     bench = in_test(Mode.AUTOMATIC)
     bench.order(Order.CLOSE)
-    bench.hand(Hand.MODE).command_mode(Mode.OFF)
+    bench.hand(OutsideChange.MODE).command_mode(Mode.OFF)
     bench.session.settle()
-    assert (bench.session.cause, bench.session.hand, bench.channel.mode) == (Cause.CLOSED, Hand.MODE, Mode.OFF)
+    assert (bench.session.cause, bench.session.outside_changes, bench.channel.mode) == (
+        Cause.CLOSED,
+        OutsideChange.MODE,
+        Mode.OFF,
+    )
 
 
 ACTS: list[Callable[[Bench], object]] = [
@@ -233,9 +241,9 @@ ACTS: list[Callable[[Bench], object]] = [
     lambda bench: bench.silence(0.5),
     lambda bench: bench.silence(1.2, beating=False),
     lambda bench: bench.session.end(Cause.NMT, operational=False),
-    lambda bench: (bench.hand(Hand.MODE).command_mode(Mode.OFF), bench.session.settle()),
-    lambda bench: (bench.hand(Hand.MODE).command_mode(Mode.MANUAL), bench.session.settle()),
-    lambda bench: (setattr(bench.hand(Hand.SETPOINT), "setpoint", 47.0), bench.session.settle()),
+    lambda bench: (bench.hand(OutsideChange.MODE).command_mode(Mode.OFF), bench.session.settle()),
+    lambda bench: (bench.hand(OutsideChange.MODE).command_mode(Mode.MANUAL), bench.session.settle()),
+    lambda bench: (setattr(bench.hand(OutsideChange.SETPOINT), "setpoint", 47.0), bench.session.settle()),
 ]
 
 
@@ -272,7 +280,7 @@ def test_automatic_while_pv_is_away_goes_on_from_the_output_that_a_hand_has_left
     bench.silence(1.5)
     home = bench.channel.mv
     for mode, output in ((Mode.OFF, 5.0), (Mode.AUTOMATIC, 5.0)):
-        bench.session.another_hand(Hand.MODE)
+        bench.session.on_outside_change(OutsideChange.MODE)
         bench.channel.command_mode(mode)
         bench.session.settle()
         assert bench.channel.mv == output != home

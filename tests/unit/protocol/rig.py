@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from loopwright.controller.channel import Settings
-from loopwright.controller.device import ControllerChannel, ControllerDevice, Keeper
+from loopwright.controller.device import ControllerChannel, ControllerDevice, RetainedStateStore
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.catalogue import find
 from loopwright.plantsim.device import PlantChannel, PlantDevice
@@ -43,7 +43,11 @@ class Rig:
     """Both devices and a client, pumped in turns; the plant starts held."""
 
     def __init__(
-        self, channels: int = 1, pace: float = 0.0, keeper: Keeper | None = None, setpoint: float = 50.0
+        self,
+        channels: int = 1,
+        pace: float = 0.0,
+        retained_state: RetainedStateStore | None = None,
+        setpoint: float = 50.0,
     ) -> None:
         self.wire = Wire()
         self.client = self.wire.open()
@@ -56,7 +60,7 @@ class Rig:
             self.wire.open(),
             [ControllerChannel(Parameters(KP, TI), setpoint, settings)] * channels,
             clock=self.wire.clock,
-            keeper=keeper,
+            retained_state=retained_state,
         )
         self.controller.start()
         self.plant.start()

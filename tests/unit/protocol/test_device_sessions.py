@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from loopwright.controller.device import Kept
+from loopwright.controller.device import RetainedState
 from loopwright.protocol.objects import lookup
 from loopwright.protocol.profile import (
     COMMAND_FRAME,
@@ -140,16 +140,16 @@ class TestOrders:
         assert outputs == {48.0, 54.0} and rig.status()[0] == Mode.EXPERIMENT
 
     def test_what_cannot_be_kept_is_not_accepted(self, capsys: pytest.CaptureFixture[str]) -> None:
-        later: list[Sequence[Kept]] = []
+        later: list[Sequence[RetainedState]] = []
 
         class Full:
-            def now(self, channels: Sequence[Kept]) -> None:
+            def write_now(self, channels: Sequence[RetainedState]) -> None:
                 raise OSError("No space left on device")
 
-            def soon(self, channels: Sequence[Kept]) -> None:
+            def write_soon(self, channels: Sequence[RetainedState]) -> None:
                 later.append(channels)
 
-        rig = Rig(keeper=Full())
+        rig = Rig(retained_state=Full())
         rig.run(1)
         rig.open()
         assert rig.order(Order.ACCEPT, *NEW) is Abort.NOT_STORED

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from loopwright.controller.device import Kept
+from loopwright.controller.device import RetainedState
 from loopwright.protocol.objects import lookup
 from loopwright.protocol.profile import (
     MV_FRAME,
@@ -146,15 +146,15 @@ class TestSessionAndStates:
     def test_reset_node_keeps_what_outlives_a_restart(self) -> None:
         class Memory:
             def __init__(self) -> None:
-                self.kept: list[list[Kept]] = []
+                self.kept: list[list[RetainedState]] = []
 
-            def now(self, channels: Sequence[Kept]) -> None:
+            def write_now(self, channels: Sequence[RetainedState]) -> None:
                 self.kept.append(list(channels))
 
-            soon = now
+            write_soon = write_now
 
         memory = Memory()
-        rig = Rig(keeper=memory)
+        rig = Rig(retained_state=memory)
         rig.write("controller_setpoint", 50.5)
         rig.under_test()
         rig.order(Order.MODE, Mode.AUTOMATIC)

@@ -201,8 +201,8 @@ def test_only_who_holds_the_loop_beats(tuner: Tuner, bus: ListBus) -> None:
 def test_the_loops_of_a_process_send_one_heartbeat(tuner: Tuner, bus: ListBus) -> None:
     """The watch of the controller is on the process; the lease is of the loop."""
     other = tuner_on(bus, 2, tuner.station)
-    tuner.hold()
-    other.hold()
+    tuner.start_heartbeat()
+    other.start_heartbeat()
     assert len(bus.sent) == 2, "a watch that was just armed begins with the first beat"
     began = time.monotonic()
     while time.monotonic() - began < 0.35:
@@ -280,7 +280,7 @@ def test_an_mv_that_answers_no_sample_is_none(tuner: Tuner, bus: ListBus) -> Non
 
 
 def test_the_end_of_a_session_is_heard(tuner: Tuner, bus: ListBus) -> None:
-    for is_open, cause in ((1, 0), (0, Cause.HAND), (0, 99)):
+    for is_open, cause in ((1, 0), (0, Cause.OUTSIDE_CHANGE), (0, 99)):
         bus.incoming.append((IDS.status, STATUS_FRAME.pack(2, 0, 50.0, is_open, cause)))
         tuner.drain()
         assert tuner.session_is_open == bool(is_open)

@@ -202,7 +202,7 @@ class Site:
         if self.plant.pace:
             self.let_run()
         numbers: list[int] = []
-        home = self.loop.begin(remember=numbers.append)
+        home = self.loop.begin(note_session=numbers.append)
         return home, numbers[-1]
 
     def is_home(self, setpoint: float = 50.0, mode: Mode = Mode.AUTOMATIC) -> bool:

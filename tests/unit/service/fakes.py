@@ -98,11 +98,11 @@ class FakeLoop:
     def begin(
         self,
         stop: Callable[[], Reason | None] = lambda: None,
-        remember: Callable[[int], None] = lambda session: None,
+        note_session: Callable[[int], None] = lambda session: None,
     ) -> LoopState:
         self._operational(self.read())
         number = self._controller.session_last + 1
-        remember(number)
+        note_session(number)
         self._number = number
         self._controller.begin_session(number)
         return self._controller.home
@@ -144,7 +144,7 @@ class FakeLoop:
     def accept(self, gains: Gains, instead_of: Gains) -> LoopState:
         held = self.read().gains
         if not same_gains(held, instead_of) and not same_gains(held, gains):
-            raise Refused(Reason.GAINS_CHANGED, f"the controller holds {held}: somebody has changed the gains")
+            raise Refused(Reason.GAINS_CHANGED, f"the controller holds {held}: the gains were changed meanwhile")
         self._controller.state = replace(self._controller.state, gains=gains)
         return self._controller.state
 
@@ -204,7 +204,7 @@ class FakeTune:
         times: dict[str, float] = {}
         done = {event.data["stage"] for event in hooks.earlier if event.kind == "stage_done"}
         try:
-            hooks.on_home(loop.begin(hooks.stop, hooks.remember))
+            hooks.on_home(loop.begin(hooks.stop, hooks.note_session))
         except Ended as error:
             return Outcome(None, error, None, {})
         try:

@@ -74,10 +74,10 @@ class FileLoop:
     def begin(
         self,
         stop: Callable[[], Reason | None] = lambda: None,
-        remember: Callable[[int], None] = lambda session: None,
+        note_session: Callable[[int], None] = lambda session: None,
     ) -> LoopState:
         home, number = self.read(), time.time_ns() % 2**32
-        remember(number)
+        note_session(number)
         self._session.write_text(json.dumps({"number": number, "home": state_json(home)}))
         return home
 
@@ -115,7 +115,7 @@ def tune_in(folder: Path) -> Callable[[LoopConfig, RetuneRequest, Loop, LoopStat
     def tune(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks) -> Outcome:
         done = {event.data["stage"] for event in hooks.earlier if event.kind == "stage_done"}
         ended: Ended | None = None
-        hooks.on_home(loop.begin(hooks.stop, hooks.remember))
+        hooks.on_home(loop.begin(hooks.stop, hooks.note_session))
         try:
             for stage in STAGES:
                 if stage in done:

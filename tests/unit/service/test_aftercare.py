@@ -87,13 +87,13 @@ def told(service: Service, job_id: str) -> list[str]:
 def test_it_is_looked_at_again_until_the_node_is_back(service: Service, clock: Clock) -> None:
     row = left_by_a_job(service, stopped)
     assert (row.state, row.reason, row.look_after, row.restored) == ("failed", "node_not_operational", True, None)
-    service.jobs.aftercare.look()
+    service.jobs.aftercare.check_due_loops()
     assert service.store.get(row.id).look_after and told(service, row.id) == []
     started(service.controller)
-    service.jobs.aftercare.look()
+    service.jobs.aftercare.check_due_loops()
     assert service.store.get(row.id).look_after  # not so soon
     clock.now += EVERY_S
-    service.jobs.aftercare.look()
+    service.jobs.aftercare.check_due_loops()
     row = service.store.get(row.id)
     assert (row.look_after, row.state, row.reason) == (False, "failed", "node_not_operational")
     assert row.restored == state_json(HOME) and service.controller.open == 0
@@ -105,7 +105,7 @@ def test_a_session_that_is_still_open_is_closed(service: Service, clock: Clock) 
     row = left_by_a_job(service, silent)
     assert row.look_after and service.controller.session == row.session
     service.controller.absent = None
-    service.jobs.aftercare.look()
+    service.jobs.aftercare.check_due_loops()
     assert service.controller.session == 0 and service.controller.state == HOME
     assert told(service, row.id)[0].startswith("the session was closed")
 
@@ -114,7 +114,7 @@ def test_what_another_hand_has_changed_ends_it_too(service: Service, clock: Cloc
     row = left_by_a_job(service, silent)
     service.controller.absent = None
     service.controller.by_hand(mode=Mode.MANUAL)
-    service.jobs.aftercare.look()
+    service.jobs.aftercare.check_due_loops()
     row = service.store.get(row.id)
     assert not row.look_after and row.restored is not None and row.restored["mode"] == "manual"
     assert "not as before the job, left so: mode is manual" in told(service, row.id)[0]
@@ -133,7 +133,7 @@ def test_it_is_asked_less_often_the_longer_it_stays_away(service: Service, clock
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(FakeController, "answer", counted)
         for _ in range(240):
-            service.jobs.aftercare.look()
+            service.jobs.aftercare.check_due_loops()
             clock.now += 0.5
     gaps = [after - before for before, after in pairwise(reads)]
     assert gaps[:5] == [2.0, 4.0, 8.0, 16.0, LONGEST_S] and set(gaps[5:]) == {LONGEST_S}
@@ -145,7 +145,7 @@ def test_it_goes_on_after_a_restart(tmp_path: Path) -> None:
     first.close()
     second = Service(tmp_path)
     second.controller.session_last, second.controller.home = row.session or 0, HOME
-    second.jobs.aftercare.look()
+    second.jobs.aftercare.check_due_loops()
     assert not second.store.get(row.id).look_after and len(told(second, row.id)) == 1
     second.close()
 
@@ -173,7 +173,7 @@ def test_a_loop_with_an_active_job_is_that_jobs(service: Service, clock: Clock) 
         patch.setattr(looked_after, "opened", lambda job_id, columns: lambda session: None)
         second = service.jobs.start(TAG, FastRetune())
         assert service.tune.inside.wait(60)
-    service.jobs.aftercare.look()
+    service.jobs.aftercare.check_due_loops()
     assert service.store.get(row.id).look_after and service.controller.session
     service.tune.hold.set()
     service.wait(second.id)
@@ -199,14 +199,14 @@ def test_a_defect_with_one_loop_does_not_keep_the_others_from_being_looked_at(
     started(service.controller)
     other = service.store.create("FIC-2", {}, "me", False)
     service.store.note(other.id, state="failed", look_after=True, found={"no": "state"}, session=3)
-    service.jobs.aftercare.look()
+    service.jobs.aftercare.check_due_loops()
     assert not service.store.get(row.id).look_after and service.store.get(other.id).look_after
 
 
 def test_a_loop_that_is_configured_no_more_is_kept_and_can_be_dismissed(service: Service, clock: Clock) -> None:
     row = service.store.create("GONE", {}, "me", False)
     service.store.note(row.id, state="failed", look_after=True, session=3)
-    service.jobs.aftercare.look()
+    service.jobs.aftercare.check_due_loops()
     (found,) = service.jobs.aftercare.not_home()
     assert "no longer configured here" in found.words
     assert service.jobs.aftercare.dismiss("GONE", "me") == [row.id] and service.jobs.aftercare.not_home() == []
@@ -251,7 +251,7 @@ def test_who_asks_is_told(service: Service, clock: Clock, client: TestClient) ->
 
 def test_a_loop_that_is_away_is_shown_with_what_is_known(service: Service, clock: Clock, client: TestClient) -> None:
     left_by_a_job(service, silent)
-    service.jobs.aftercare.look()
+    service.jobs.aftercare.check_due_loops()
     answer = client.get(f"/loops/{TAG}")
     assert answer.status_code == 200 and answer.json()["live"] is None
     assert answer.json()["not_confirmed_home"]["reason"] == "node_lost"
@@ -262,7 +262,7 @@ def test_a_loop_that_is_away_is_shown_with_what_is_known(service: Service, clock
 def test_ready_again_once_it_is_home(service: Service, clock: Clock, client: TestClient) -> None:
     left_by_a_job(service, stopped)
     started(service.controller)
-    service.jobs.aftercare.look()
+    service.jobs.aftercare.check_due_loops()
     ready = client.get("/readyz")
     assert ready.status_code == 200 and ready.json()["parts"] == {}
     assert b"loopwright_loops_looked_after 0.0" in exposition(registry(service.loops, service.store, {}))

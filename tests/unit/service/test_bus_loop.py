@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from loopwright.controller.channel import Mode as ControllerMode
-from loopwright.controller.device import Kept
+from loopwright.controller.device import RetainedState
 from loopwright.controller.pid import Parameters
 from loopwright.protocol.objects import Value
 from loopwright.protocol.profile import (
@@ -62,7 +62,7 @@ class TestBeginning:
     def test_the_number_is_written_down_before_the_opening(self, site: Site) -> None:
         site.let_run()
         seen: list[tuple[int, bool]] = []
-        site.loop.begin(remember=lambda number: seen.append((number, site.controller.sessions[0].is_open)))
+        site.loop.begin(note_session=lambda number: seen.append((number, site.controller.sessions[0].is_open)))
         assert len(seen) == 1 and seen[0][0] and not seen[0][1]
 
     def test_tells_what_the_plant_does_when_the_controller_falls_silent(self, site: Site) -> None:
@@ -522,17 +522,17 @@ class TestTwoChannels:
 
 
 class Full:
-    """A keeper without room; `lose` does something besides."""
+    """A storage without room; `lose` does something besides."""
 
     def __init__(self, error: BaseException) -> None:
         self.error = error
         self.on_now = lambda: None
 
-    def now(self, channels: Sequence[Kept]) -> None:
+    def write_now(self, channels: Sequence[RetainedState]) -> None:
         self.on_now()
         raise self.error
 
-    def soon(self, channels: Sequence[Kept]) -> None: ...
+    def write_soon(self, channels: Sequence[RetainedState]) -> None: ...
 
 
 class TestAccepting:
@@ -562,14 +562,14 @@ class TestAccepting:
     def test_refuses_where_somebody_has_changed_the_gains(self, site: Site) -> None:
         site.let_run()
         site.channel.accept(Parameters(99.0, 12.0))
-        with pytest.raises(Refused, match="somebody has changed the gains") as caught:
+        with pytest.raises(Refused, match="the gains were changed meanwhile") as caught:
             site.loop.accept(NEW, self.OLD)
         assert caught.value.reason is Reason.GAINS_CHANGED
         assert site.channel.accepted.Kp == 99.0 and site.is_home()
 
     def test_what_the_controller_cannot_keep_does_not_stay(self, site: Site) -> None:
         site.let_run()
-        site.controller.keeper = Full(OSError(28, "No space left on device"))
+        site.controller.retained_store = Full(OSError(28, "No space left on device"))
         with pytest.raises(Refused, match="could not store it"):
             site.loop.accept(NEW, self.OLD)
         assert site.channel.accepted == FOUND and site.is_home()
@@ -612,7 +612,7 @@ class TestAccepting:
         site.let_run()
         full = Full(OSError(28, "No space left on device"))
         full.on_now = lambda: setattr(site, "lost", OSError(19, "No such device"))
-        site.controller.keeper = full
+        site.controller.retained_store = full
         sleep, tries = site.gateway.sleep, 0
 
         def soon_back(seconds: float) -> None:
@@ -645,6 +645,6 @@ class TestTelling:
         for value in (b"\x00\x00\x48\x42", b"\x00\x00\x4c\x42"):  # 50, 51
             site.replay((channel_ids(1).command, value))
         with pytest.raises(Refused) as caught:
-            site.loop.begin(remember=told.append)
+            site.loop.begin(note_session=told.append)
         assert caught.value.reason is Reason.SETPOINT_IS_DRIVEN
         assert told[0] > 0 and told[-1] == 0

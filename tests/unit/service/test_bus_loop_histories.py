@@ -147,7 +147,7 @@ class TestLateFrames:
         site.pass_time(OVER_S)
         _, loop = site.another()
         numbers: list[int] = []
-        home = loop.begin(remember=numbers.append)
+        home = loop.begin(note_session=numbers.append)
         for frame in late:
             site.replay(frame)
         c, session = site.channel, site.controller.sessions[0]

@@ -19,7 +19,7 @@ import pytest
 
 from loopwright.protocol.bus import open_bus
 from loopwright.protocol.hub import Hub
-from loopwright.service.execution.beside import Computing
+from loopwright.service.execution.beside import ComputingLoop
 from loopwright.service.execution.computing.limits import ComputationKind, ComputingLimits
 from loopwright.service.execution.computing.pool import NoProcess, NotWanted, Pool
 from loopwright.service.store.store import Store
@@ -59,9 +59,9 @@ class TestBesideALoop:
             running.set()
             assert over.wait(5)
 
-        Computing(FakeLoop(FakeController())).start(Work(first))
+        ComputingLoop(FakeLoop(FakeController())).start(Work(first))
         assert running.wait(5)
-        aborted = Computing(FakeLoop(FakeController()))
+        aborted = ComputingLoop(FakeLoop(FakeController()))
         aborted.start(Work(begun.set))
         aborted.restore(aborted.read())
         over.set()
@@ -75,16 +75,16 @@ class TestBesideALoop:
             running.set()
             assert over.wait(5)
 
-        Computing(FakeLoop(FakeController())).start(Work(first))
+        ComputingLoop(FakeLoop(FakeController())).start(Work(first))
         assert running.wait(5)
-        Computing(FakeLoop(FakeController())).start(Work(second_began.set))
+        ComputingLoop(FakeLoop(FakeController())).start(Work(second_began.set))
         assert not second_began.wait(0.1)
         over.set()
         assert second_began.wait(5)
 
 
 def done(work: Work[Any], pool: Pool) -> Any:
-    computing = Computing(FakeLoop(FakeController()), pool)
+    computing = ComputingLoop(FakeLoop(FakeController()), pool)
     computing.start(work)
     assert computing.idle.wait(60) and work.done
     return work.result()
@@ -119,7 +119,7 @@ class TestPool:
 
     def test_reports_come_in_order_before_the_result(self, pool: Pool) -> None:
         heard: list[int] = []
-        assert pool.run(ComputationKind.DRY_RUN, partial(tell_numbers, 1000), hear=heard.append) == "told"
+        assert pool.run(ComputationKind.DRY_RUN, partial(tell_numbers, 1000), on_report=heard.append) == "told"
         assert heard == list(range(1000))
 
     def test_who_hears_may_end_it(self, pool: Pool) -> None:
@@ -127,7 +127,7 @@ class TestPool:
             raise Refused(Reason.NOT_ROBUST, f"heard {n}")
 
         with pytest.raises(Refused, match="heard 0"):
-            pool.run(ComputationKind.DRY_RUN, partial(tell_numbers, 10**9), hear=hear)
+            pool.run(ComputationKind.DRY_RUN, partial(tell_numbers, 10**9), on_report=hear)
 
 
 class TestLimits:
@@ -162,7 +162,7 @@ class TestDeath:
     def test_what_has_told_something_does_not_begin_anew(self, pool: Pool) -> None:
         heard: list[int] = []
         with pytest.raises(Failed, match="was killed"):
-            pool.run(ComputationKind.DRY_RUN, tell_and_die, hear=heard.append)
+            pool.run(ComputationKind.DRY_RUN, tell_and_die, on_report=heard.append)
         assert heard == [1]
 
     def test_of_the_fork_server_too(self, pool: Pool) -> None:
@@ -182,7 +182,7 @@ class TestDeath:
 
         monkeypatch.setattr(ForkServerProcess, "start", full)
         assert done(Work(os.getpid), pool) == os.getpid()
-        assert "the service computes by itself" in caplog.text
+        assert "the service computes in its own process" in caplog.text
         with pytest.raises(NoProcess, match="no process can be made for the tuning"):
             pool.run(ComputationKind.TUNING, os.getpid)
 
@@ -227,7 +227,7 @@ class TestOrder:
 
     def test_so_does_the_computation_of_a_test_that_has_ended(self, pool: Pool, tmp_path: Path) -> None:
         mark = tmp_path / "mark"
-        computing = Computing(FakeLoop(FakeController()), pool)
+        computing = ComputingLoop(FakeLoop(FakeController()), pool)
         computing.start(Work(partial(burn, mark)))
         until(lambda: mark.exists() and mark.read_text() != "")
         computing.restore(computing.read())

@@ -97,13 +97,13 @@ def test_gains_put_in_by_hand_after_a_half_acceptance_stay_and_the_job_can_be_de
     service: Service, half_accepted: str
 ) -> None:
     service.controller.by_hand(gains=BY_HAND)
-    with pytest.raises(Conflict, match="somebody changed the gains"):
+    with pytest.raises(Conflict, match="the gains were changed"):
         service.jobs.decisions.accept(half_accepted, "me")
     assert service.store.get(half_accepted).state == "proposed"
     row = service.jobs.decisions.rollback(half_accepted, "me")
     assert row.state == "rolled_back" and holds(service, BY_HAND)
     assert row.restored is not None and row.restored["gains"]["Kp"] == BY_HAND.Kp
-    assert row.detail is not None and "somebody else's, left as they are" in row.detail
+    assert row.detail is not None and "set by others, left as they are" in row.detail
     last = audit.trail(service.store.engine, 1)[0]
     assert last.before is not None and last.after is not None
     assert (last.what, last.before["gains"]["Kp"], last.after["gains"]["Kp"]) == ("rollback", BY_HAND.Kp, BY_HAND.Kp)
@@ -113,7 +113,7 @@ def test_gains_put_in_by_hand_after_an_acceptance_stay_and_it_is_not_taken_back(
     job_id = proposed(service)
     service.jobs.decisions.accept(job_id, "me")
     service.controller.by_hand(gains=BY_HAND)
-    with pytest.raises(Conflict, match="somebody changed the gains in between; retune instead"):
+    with pytest.raises(Conflict, match="the gains were changed in between; retune instead"):
         service.jobs.decisions.rollback(job_id, "me")
     assert holds(service, BY_HAND) and service.store.get(job_id).state == "accepted"
 
@@ -132,7 +132,7 @@ def test_gains_that_come_in_while_an_acceptance_is_written_are_a_conflict(
     with monkeypatch.context() as patch:
         patch.setattr(FakeLoop, "accept", late)
         answer = client.post(f"/jobs/{job_id}/accept")
-    assert answer.status_code == 409 and "somebody has changed the gains" in answer.json()["detail"]
+    assert answer.status_code == 409 and "the gains were changed meanwhile" in answer.json()["detail"]
     assert holds(service, BY_HAND) and service.store.get(job_id).state == "proposed"
     assert audit.trail(service.store.engine, 1)[0].what == "accept_failed"
     assert client.post(f"/jobs/{job_id}/accept").status_code == 409

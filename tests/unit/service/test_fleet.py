@@ -67,7 +67,7 @@ class Plant(Service):
         self.tune.hold.set()
         for row in self.store.unfinished():
             self.wait(row.id)
-        self.fleet.look()
+        self.fleet.poll()
 
     def hold(self) -> None:
         self.tune.hold.clear()
@@ -96,7 +96,7 @@ def test_every_loop_gets_its_turn_and_no_bus_or_area_has_more_than_permitted(pla
     retune = plant.fleet.start(asked(pattern="*", at_once_per_bus=2, at_once_per_area=3)).id
     seen: list[str] = []
     for _ in range(20):
-        plant.fleet.look()
+        plant.fleet.poll()
         now = plant.running()
         on_x = [tag for tag in now if "Y" not in tag]
         in_b = [tag for tag in now if tag.startswith("B")]
@@ -118,7 +118,7 @@ def test_an_area_counts_over_its_buses_and_with_jobs_of_others(plant: Plant) -> 
     plant.hold()
     plant.jobs.start("B-3", FastRetune())
     plant.fleet.start(asked(pattern="B-*", at_once_per_area=2))
-    plant.fleet.look()
+    plant.fleet.poll()
     assert plant.running() == ["B-1", "B-3"]
 
 
@@ -126,7 +126,7 @@ def test_a_bus_takes_no_more_than_its_configuration_says(tmp_path: Path) -> None
     plant = Plant(tmp_path, buses={"virtual:x": BusConfig(at_once=1)})
     plant.hold()
     plant.fleet.start(asked(pattern="*", at_once_per_bus=5))
-    plant.fleet.look()
+    plant.fleet.poll()
     assert plant.running() == ["A-1", "B-Y1", "B-Y2"]
     plant.close()
 
@@ -134,8 +134,8 @@ def test_a_bus_takes_no_more_than_its_configuration_says(tmp_path: Path) -> None
 def test_loops_are_begun_in_the_order_given_and_once(plant: Plant) -> None:
     plant.hold()
     retune = plant.fleet.start(asked(loops=["B-1", "A-1", "B-1"], at_once_per_bus=1)).id
-    plant.fleet.look()
-    plant.fleet.look()
+    plant.fleet.poll()
+    plant.fleet.poll()
     assert plant.running() == ["B-1"] and list(plant.parts(retune)) == ["B-1", "A-1"]
 
 
@@ -143,7 +143,7 @@ def test_a_busy_loop_is_waited_for(plant: Plant) -> None:
     plant.hold()
     other = plant.jobs.start("A-1", FastRetune())
     retune = plant.fleet.start(asked(loops=["A-1", "A-2"])).id
-    plant.fleet.look()
+    plant.fleet.poll()
     assert plant.parts(retune)["A-1"].waiting and plant.running() == ["A-1", "A-2"]
     plant.settle()
     plant.settle()
@@ -181,12 +181,12 @@ def test_it_stops_after_so_many_failures_and_those_under_test_go_on(
 def test_abort_stops_what_runs_and_begins_nothing_more(plant: Plant) -> None:
     plant.hold()
     retune = plant.fleet.start(asked(pattern="A-*", at_once_per_bus=2)).id
-    plant.fleet.look()
+    plant.fleet.poll()
     assert plant.running() == ["A-1", "A-2"]
     assert plant.fleet.abort(retune, "me").state == "stopping"
     for row in plant.store.unfinished():
         plant.wait(row.id)
-    plant.fleet.look()
+    plant.fleet.poll()
     row, parts = plant.fleet.get(retune)
     assert (row.state, row.stop_reason) == ("aborted", "operator")
     assert [part.state(False) for part in parts] == ["aborted", "aborted", "skipped"]
@@ -215,7 +215,7 @@ class Deaf(ThreadEngine):
 def test_a_service_killed_in_between_goes_on_with_the_same_jobs(tmp_path: Path) -> None:
     first = Plant(tmp_path, engine=Deaf())
     retune = first.fleet.start(asked(pattern="A-*", at_once_per_bus=2)).id
-    first.fleet.look()
+    first.fleet.poll()
     begun = [row.id for row in first.store.unfinished()]
     first.jobs.stop_watching()
     first.store.close()
@@ -232,11 +232,11 @@ def test_a_service_stopped_in_between_goes_on_where_it_was(tmp_path: Path) -> No
     first = Plant(tmp_path)
     first.hold()
     retune = first.fleet.start(asked(pattern="A-*", at_once_per_bus=1, sp_deviation=1.5, requested_by="night")).id
-    first.fleet.look()
+    first.fleet.poll()
     (cut,) = first.store.unfinished()
     assert first.tune.inside.wait(60)
     first.jobs.stop()  # as SIGTERM does: the job is aborted, its loop restored
-    first.fleet.look()  # too late to begin anything
+    first.fleet.poll()  # too late to begin anything
     first.close()
     assert first.controllers["A-1"].state == FakeController().state
     again = Plant(tmp_path)
@@ -257,7 +257,7 @@ def test_a_service_that_is_not_to_resume_ends_it(tmp_path: Path) -> None:
     first.close()
     again = Plant(tmp_path, resume=False)
     again.fleet.boot()
-    again.fleet.look()
+    again.fleet.poll()
     again.fleet.close()
     row, parts = again.fleet.get(retune)
     assert (row.state, row.stop_reason) == ("stopped", "service_stopped") and "--no-resume" in (row.detail or "")
@@ -268,7 +268,7 @@ def test_a_service_that_is_not_to_resume_ends_it(tmp_path: Path) -> None:
 def test_a_restored_back_up_begins_nothing(plant: Plant) -> None:
     retune = plant.fleet.start(asked(pattern="*")).id
     plant.store.restored("backup.sqlite")
-    plant.fleet.look()
+    plant.fleet.poll()
     row, _ = plant.fleet.get(retune)
     assert (row.state, row.stop_reason) == ("stopped", "service_stopped") and plant.store.recent() == []
 
@@ -276,7 +276,7 @@ def test_a_restored_back_up_begins_nothing(plant: Plant) -> None:
 def test_a_loop_that_is_gone_at_the_next_start_is_said_so_and_counts_as_failed(plant: Plant) -> None:
     retune = plant.fleet.start(asked(loops=["A-1", "A-2"])).id
     del plant.loops["A-1"]
-    plant.fleet.look()
+    plant.fleet.poll()
     plant.settle()
     part = plant.parts(retune)["A-1"]
     assert part.failed and part.detail == "there is no loop A-1" and plant.state(retune) == "done"
@@ -287,7 +287,7 @@ def test_a_dry_run_of_many(plant: Plant) -> None:
     plant.jobs.start("A-1", FastRetune())
     retune = plant.fleet.start(asked(pattern="A-*", dry_run=True)).id
     for _ in range(5):
-        plant.fleet.look()
+        plant.fleet.poll()
         for part in plant.parts(retune).values():
             if part.job_id:
                 plant.wait(part.job_id)
@@ -332,15 +332,15 @@ def test_loops_of_another_host_are_begun_there_and_any_host_may_abort(tmp_path: 
     a, b = idle_jobs(stores["a"], ENTRIES[:6], engine), idle_jobs(stores["b"], ENTRIES[6:], Deaf())
     fleet = Fleet(a)
     retune = fleet.start(asked(pattern="B-*", at_once_per_area=4)).id
-    fleet.look()
+    fleet.poll()
     assert [queue for _, queue in engine.enqueued] == ["a:virtual:x"] * 3 + ["b:virtual:y"]
     there = Fleet(b)
-    there.look()  # not its own: nothing more is begun
+    there.poll()  # not its own: nothing more is begun
     assert there.abort(retune, "gateway B").state == "stopping" and len(engine.enqueued) == 4
     assert len(stores["a"].stop_requests()) == 3 and stores["b"].unfinished() == []
     for jobs in (a, b):
         jobs.stop()
-    fleet.look()
+    fleet.poll()
     assert there.get(retune)[0].state == "aborted"
     for store in stores.values():
         store.close()

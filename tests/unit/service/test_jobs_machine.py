@@ -186,7 +186,7 @@ class JobsMachine(RuleBasedStateMachine):
 
     def tune(self, config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks) -> Outcome:
         act = self.acts[request.requested_by]
-        hooks.on_home(loop.begin(hooks.stop, hooks.remember))
+        hooks.on_home(loop.begin(hooks.stop, hooks.note_session))
         loop.step((SetGains(act.new),))
         result, ended = act.play(hooks)
         return Outcome(result, ended, loop.restore(state).state, {})

@@ -239,7 +239,7 @@ def test_a_locked_loop_is_looked_after(service: Service, client: TestClient) -> 
     service.wait(job.id)
     service.store.note(job.id, look_after=True)
     locked(client)
-    service.jobs.aftercare.look()
+    service.jobs.aftercare.check_due_loops()
     assert not service.store.get(job.id).look_after
     service.store.note(job.id, look_after=True)
     assert client.post(f"/loops/{TAG}/dismiss").json()["jobs"] == [f"/jobs/{job.id}"]
@@ -263,11 +263,11 @@ def test_a_job_of_many_refused_at_its_turn_is_no_failure(tmp_path: Path) -> None
     service = Service(tmp_path, engine=engine)
     fleet = Fleet(service.jobs)
     retune = fleet.start(fleet_request(loops=[TAG], stop_after_failures=1)).id
-    fleet.look()
+    fleet.poll()
     service.jobs.locking.lock(TAG, WHY, "me")
     engine.begin(engine.queued[0])
     service.wait(service.store.recent()[0].id)
-    fleet.look()
+    fleet.poll()
     row, (part,) = fleet.get(retune)
     assert (row.state, part.reason, part.failed) == ("done", "locked", False)
     service.close()

@@ -13,9 +13,9 @@ import pytest
 from loopwright.service.config import LoopConfig, parse_site
 from loopwright.service.execution.computing.limits import ComputingLimits
 from loopwright.service.execution.computing.pool import Pool
-from loopwright.service.execution.guard import Watch
+from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.procedures import Hooks, Outcome, rehearse
-from loopwright.service.execution.rehearsals import apart
+from loopwright.service.execution.rehearsals import rehearsed_in_pool
 from loopwright.service.execution.runner import run
 from loopwright.service.job_states import JobState
 from loopwright.service.request import RetuneRequest, retune_request
@@ -43,7 +43,7 @@ def hungry(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:
             kept.append(bytearray(1 << 20))
             yield ()
 
-    ran = run(plan(), FakeLoop(FakeController()), watch=Watch())
+    ran = run(plan(), FakeLoop(FakeController()), limits=RunLimits())
     return Outcome(None, ran.ended, None, {})
 
 
@@ -66,7 +66,7 @@ class Told:
 
 def test_it_reports_and_ends_as_beside(pool: Pool) -> None:
     here, there = Told(), Told()
-    assert apart(rehearse, pool)(CONFIG, ASKED, there.hooks) == rehearse(CONFIG, ASKED, here.hooks)
+    assert rehearsed_in_pool(rehearse, pool)(CONFIG, ASKED, there.hooks) == rehearse(CONFIG, ASKED, here.hooks)
     assert there.all == here.all and len(there.all) > 1000
 
 
@@ -76,20 +76,20 @@ def test_it_is_stopped_in_the_middle(pool: Pool) -> None:
     def hear(samples: list[Sample]) -> None:
         told.reason = Reason.OPERATOR
 
-    outcome = apart(endless, pool)(CONFIG, ASKED, replace(told.hooks, on_samples=hear))
+    outcome = rehearsed_in_pool(endless, pool)(CONFIG, ASKED, replace(told.hooks, on_samples=hear))
     assert isinstance(outcome.ended, Aborted) and outcome.ended.reason is Reason.OPERATOR
     assert told.all == [StageStarted("relay", 1.0, 1.0)]
 
 
 def test_what_it_may_take_of_memory_is_named(pool: Pool) -> None:
     with pytest.raises(Failed, match="the dry run asked for more than 64 MB") as over:
-        apart(hungry, pool)(CONFIG, ASKED, Told().hooks)
+        rehearsed_in_pool(hungry, pool)(CONFIG, ASKED, Told().hooks)
     assert over.value.reason is Reason.COMPUTATION_LIMIT
 
 
 def test_a_job_is_aborted_while_it_computes_and_shows_how_far_it_is(tmp_path: Path, pool: Pool) -> None:
     service = Service(tmp_path)
-    jobs = service.more_jobs(lambda config: FakeLoop(service.controller), apart(endless, pool))
+    jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearsed_in_pool(endless, pool))
     try:
         row = jobs.start(TAG, ASKED)
         until(lambda: service.store.samples(row.id))
@@ -104,7 +104,7 @@ def test_a_job_is_aborted_while_it_computes_and_shows_how_far_it_is(tmp_path: Pa
 
 def test_a_job_that_asks_for_too_much_fails_by_name(tmp_path: Path, pool: Pool) -> None:
     service = Service(tmp_path)
-    jobs = service.more_jobs(lambda config: FakeLoop(service.controller), apart(hungry, pool))
+    jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearsed_in_pool(hungry, pool))
     try:
         row = jobs.start(TAG, ASKED)
         until(lambda: JobState(service.store.get(row.id).state) is JobState.FAILED)
@@ -116,7 +116,7 @@ def test_a_job_that_asks_for_too_much_fails_by_name(tmp_path: Path, pool: Pool) 
 
 def test_the_end_of_the_pool_ends_it(tmp_path: Path) -> None:
     pool, told, found = Pool(max_workers=1), Told(), []
-    thread = threading.Thread(target=lambda: found.append(apart(endless, pool)(CONFIG, ASKED, told.hooks)))
+    thread = threading.Thread(target=lambda: found.append(rehearsed_in_pool(endless, pool)(CONFIG, ASKED, told.hooks)))
     thread.start()
     until(lambda: told.all)
     pool.close()

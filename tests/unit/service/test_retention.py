@@ -10,7 +10,7 @@ from sqlalchemy import MetaData, Table, func, inspect, select
 
 from loopwright.service.job_states import JobState
 from loopwright.service.jobs.dbos_engine import DurableEngine
-from loopwright.service.jobs.retention import Keep, Retention, forget, tidy
+from loopwright.service.jobs.retention import Retention, RetentionPolicy, delete_old_samples, forget_finished
 from loopwright.service.store import audit
 from loopwright.service.store.clock_watch import ClockWatch
 from loopwright.service.store.store import Store
@@ -46,10 +46,10 @@ def test_the_newest_jobs_of_each_loop_keep_theirs(store: Store) -> None:
     b = [job(store, "B", R, X)]
     dry = [job(store, "A", R, X, dry=True) for _ in range(3)]  # do not push the experiments out
     foreign = [job(store, "C", R, X, host="other") for _ in range(3)]
-    assert tidy(store, Keep(jobs=2)) == 3
+    assert delete_old_samples(store, RetentionPolicy(jobs=2)) == 3
     assert kept(store, a) == [False, False, True, True] and kept(store, b) == [True]
     assert kept(store, dry) == [False, True, True] and all(kept(store, foreign))
-    assert tidy(store, Keep(jobs=2)) == 0
+    assert delete_old_samples(store, RetentionPolicy(jobs=2)) == 0
 
 
 def test_active_and_proposed_jobs_keep_theirs_always(store: Store) -> None:
@@ -57,19 +57,24 @@ def test_active_and_proposed_jobs_keep_theirs_always(store: Store) -> None:
     declined, queued = job(store, "A", R, P, JobState.ROLLED_BACK, days_ago=99), job(store, "B")
     running = job(store, "A", R)
     newer = job(store, "C", R, X, days_ago=0.5)
-    assert tidy(store, Keep(days=1.0), NOW) == 2
+    assert delete_old_samples(store, RetentionPolicy(days=1.0), NOW) == 2
     assert kept(store, [proposed, decided, declined, queued, running, newer]) == [True, False, False, True, True, True]
 
 
 def test_one_reason_is_enough_to_keep(store: Store) -> None:
     ids = [job(store, "A", R, X, days_ago=days) for days in (9, 8, 0.5, 0.4)]
-    assert tidy(store, Keep(jobs=1, days=1.0), NOW) == 2 and kept(store, ids) == [False, False, True, True]
-    assert tidy(store, Keep(), NOW + timedelta(days=1e4)) == 0
+    assert delete_old_samples(store, RetentionPolicy(jobs=1, days=1.0), NOW) == 2 and kept(store, ids) == [
+        False,
+        False,
+        True,
+        True,
+    ]
+    assert delete_old_samples(store, RetentionPolicy(), NOW + timedelta(days=1e4)) == 0
 
 
 def test_what_is_deleted_is_written_down_and_the_rest_of_the_job_stays(store: Store) -> None:
     ids = [job(store, "A", R, X) for _ in range(121)]
-    assert tidy(store, Keep(jobs=1)) == 120, "in several transactions"
+    assert delete_old_samples(store, RetentionPolicy(jobs=1)) == 120, "in several transactions"
     rows = [row for row in audit.trail(store.engine, 1000) if row.what == "samples_delete"]
     told = [(row.who, row.before, row.after) for row in reversed(rows)]
     assert [before and (len(before["jobs"]), before["samples"]) for _, before, _ in told] == [
@@ -119,15 +124,15 @@ def test_the_engine_forgets_jobs_that_are_over_and_no_others(store: Store, tmp_p
             time.sleep(0.01)
         before = rows_of_the_engine(engine)
         assert set(before) == {*over, running, lost, queued, foreign}
-        assert forget(store, engine) == 3
+        assert forget_finished(store, engine) == 3
         assert set(rows_of_the_engine(engine)) == {running, lost, queued, foreign}
         assert [store.get(job_id).state for job_id in over] == ["failed"] * 3, "ours stay"
         hold.set()
         while engine.known([running, lost, queued]) and time.monotonic() < deadline:
             time.sleep(0.01)
-        assert forget(store, engine) == 2, "the lost one is still active for us"
+        assert forget_finished(store, engine) == 2, "the lost one is still active for us"
         assert set(rows_of_the_engine(engine)) == {lost, foreign}
-        assert forget(store, engine) == 0
+        assert forget_finished(store, engine) == 0
     finally:
         hold.set()
         engine.close()
@@ -143,12 +148,12 @@ def test_it_is_done_at_the_start_and_again(tmp_path: Path, monkeypatch: pytest.M
             twice.set()
         return 0
 
-    monkeypatch.setattr("loopwright.service.jobs.retention.tidy", count)
-    retention = Retention(store, ThreadEngine(), Keep(jobs=1), every_s=0.001, look_s=0.001)
+    monkeypatch.setattr("loopwright.service.jobs.retention.delete_old_samples", count)
+    retention = Retention(store, ThreadEngine(), RetentionPolicy(jobs=1), every_s=0.001, clock_check_s=0.001)
     retention.start()
     assert twice.wait(60)
     retention.close()
-    for_ever = Retention(store, ThreadEngine(), Keep(), every_s=0.001, look_s=0.001)
+    for_ever = Retention(store, ThreadEngine(), RetentionPolicy(), every_s=0.001, clock_check_s=0.001)
     for_ever.start()
     for_ever.close()
     store.close()
@@ -166,7 +171,7 @@ class Clocks:
     def retention(self, store: Store, days: float = 30.0) -> Retention:
         """That of a service which is started now."""
         watch = ClockWatch(lambda: self.wall, lambda: self.passed_s)
-        return Retention(store, ThreadEngine(), Keep(days=days), watch=watch)
+        return Retention(store, ThreadEngine(), RetentionPolicy(days=days), watch=watch)
 
 
 def clock_jumps() -> float:
@@ -176,7 +181,7 @@ def clock_jumps() -> float:
 
 def once(retention: Retention) -> None:
     """One turn of its thread."""
-    retention.look()
+    retention.check_clock()
     retention.tidy()
 
 

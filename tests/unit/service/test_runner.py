@@ -13,7 +13,7 @@ import pytest
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
-from loopwright.service.execution.guard import Watch
+from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.execution.runner import RunResult, run
 from loopwright.service.loop_state import LoopState, differences
@@ -84,7 +84,7 @@ def assert_home(loop: Meddled, result: RunResult[Any]) -> None:
 
 def test_success_gives_the_value_and_the_stage_times() -> None:
     loop = Meddled()
-    result = run(trial(), loop, watch=Watch())
+    result = run(trial(), loop, limits=RunLimits())
     assert (result.value, result.ended) == ("done", None)
     assert result.plant_time_s == {"trial": pytest.approx(60.0, abs=3 * TS)}
     assert_home(loop, result)
@@ -104,7 +104,7 @@ def test_a_bad_sample_ends_the_run(
     change: Callable[[Sample], Sample], reason: Reason, plan: Callable[[], Plan[Any]]
 ) -> None:
     loop = Meddled(100, change)
-    result = run(plan(), loop, watch=Watch(pv_low=-4.0, pv_high=4.0))
+    result = run(plan(), loop, limits=RunLimits(pv_low=-4.0, pv_high=4.0))
     assert result.ended is not None
     assert result.ended.reason is reason
     assert_home(loop, result)
@@ -135,7 +135,9 @@ class Pressed(Meddled):
 def test_the_mode_that_somebody_else_chose_stays(mode: Mode, plan: Callable[[], Plan[Any]]) -> None:
     notes: list[str] = []
     loop = Pressed(100, mode)
-    result = run(plan(), loop, watch=Watch(), on_event=lambda e: notes.append(e.text) if isinstance(e, Note) else None)
+    result = run(
+        plan(), loop, limits=RunLimits(), on_event=lambda e: notes.append(e.text) if isinstance(e, Note) else None
+    )
     assert result.ended is not None
     assert result.ended.reason is Reason.MODE_CHANGED
     state = loop.read()
@@ -151,15 +153,15 @@ def test_what_is_opened_and_what_must_come_back_is_told() -> None:
         def begin(
             self,
             stop: Callable[[], Reason | None] = lambda: None,
-            remember: Callable[[int], None] = lambda session: None,
+            note_session: Callable[[int], None] = lambda session: None,
         ) -> LoopState:
-            remember(7)
+            note_session(7)
             return replace(super().begin(), when_silent="holds MV where it is")
 
     loop = Numbered()
     home = loop.read()
     run(
-        trial(), loop, watch=Watch(), remember=told.append, on_home=told.append,
+        trial(), loop, limits=RunLimits(), note_session=told.append, on_home=told.append,
         on_event=lambda e: told.append(e.text) if isinstance(e, Note) else None,
     )  # fmt: skip
     silent = "if the controller falls silent, the plant's I/O holds MV where it is"
@@ -171,18 +173,18 @@ def test_a_stop_ends_the_wait_for_the_loop() -> None:
         def begin(
             self,
             stop: Callable[[], Reason | None] = lambda: None,
-            remember: Callable[[int], None] = lambda session: None,
+            note_session: Callable[[int], None] = lambda session: None,
         ) -> LoopState:
             assert stop() is Reason.OPERATOR
             raise Aborted(Reason.OPERATOR, "while another tuner held the loop")
 
-    result = run(trial(), Busy(), watch=Watch(), stop=lambda: Reason.OPERATOR)
+    result = run(trial(), Busy(), limits=RunLimits(), stop=lambda: Reason.OPERATOR)
     assert result.ended is not None and result.restored is None
     assert (result.ended.reason, result.value) == (Reason.OPERATOR, None)
 
 
 def test_mv_beyond_what_the_job_permits_ends_the_run() -> None:
-    result = run(trial(), loop := Meddled(), watch=Watch(mv_low=-0.05, mv_high=0.08))
+    result = run(trial(), loop := Meddled(), limits=RunLimits(mv_low=-0.05, mv_high=0.08))
     assert result.ended is not None
     assert result.ended.reason is Reason.MV_LIMIT
     assert_home(loop, result)
@@ -193,7 +195,7 @@ def test_mv_is_not_judged_before_the_plan_has_commanded_anything() -> None:
         yield ()
         return "heard"
 
-    assert run(listen(), Meddled(), watch=Watch(mv_low=0.5, mv_high=0.6)).value == "heard"
+    assert run(listen(), Meddled(), limits=RunLimits(mv_low=0.5, mv_high=0.6)).value == "heard"
 
 
 class TestWorkBesideTheSamples:
@@ -213,7 +215,7 @@ class TestWorkBesideTheSamples:
                 enough.set()
 
         result = run(
-            worked(lambda: enough.wait(60)), Meddled(), watch=Watch(), on_samples=heard, start_work=self.beside
+            worked(lambda: enough.wait(60)), Meddled(), limits=RunLimits(), on_samples=heard, start_work=self.beside
         )
         assert result.value is True
 
@@ -226,7 +228,9 @@ class TestWorkBesideTheSamples:
             return (yield from worked(lambda: never.wait(30)))
 
         asked = iter([None] * 50)
-        result = run(plan(), loop, watch=Watch(), stop=lambda: next(asked, Reason.OPERATOR), start_work=self.beside)
+        result = run(
+            plan(), loop, limits=RunLimits(), stop=lambda: next(asked, Reason.OPERATOR), start_work=self.beside
+        )
         assert result.ended is not None
         assert result.ended.reason is Reason.OPERATOR
         assert_home(loop, result)
@@ -240,7 +244,7 @@ class TestWorkBesideTheSamples:
         def fail() -> None:
             raise error
 
-        result = run(worked(fail), loop := Meddled(), watch=Watch(), start_work=self.beside)
+        result = run(worked(fail), loop := Meddled(), limits=RunLimits(), start_work=self.beside)
         assert result.ended is not None
         assert result.ended.reason is reason
         assert_home(loop, result)
@@ -263,21 +267,23 @@ def test_the_samples_of_a_stage_are_told_before_its_end() -> None:
         if isinstance(event, StageDone):
             at_end.append(len(told))
 
-    run(two_stages(), Meddled(), watch=Watch(), on_event=on_event, on_samples=lambda s: told.extend(e.t for e in s))
+    run(
+        two_stages(), Meddled(), limits=RunLimits(), on_event=on_event, on_samples=lambda s: told.extend(e.t for e in s)
+    )
     # The end of a stage is told with the sample that it was found at; the next one belongs to the next stage.
     assert at_end == [47, 47 + 1 + 23]
     assert told == pytest.approx([TS * n for n in range(len(told))]) and len(told) == at_end[1] + 1
 
 
 def test_a_frozen_pv_is_noticed_once_mv_has_moved() -> None:
-    result = run(trial(), loop := Meddled(100, lambda s: s._replace(pv=0.0)), watch=Watch(max_frozen_s=10.0))
+    result = run(trial(), loop := Meddled(100, lambda s: s._replace(pv=0.0)), limits=RunLimits(max_frozen_s=10.0))
     assert result.ended is not None
     assert result.ended.reason is Reason.PV_FROZEN
     assert_home(loop, result)
 
 
 def test_the_time_budget_ends_the_run() -> None:
-    result = run(trial(), loop := Meddled(), watch=Watch(max_time_s=20.0))
+    result = run(trial(), loop := Meddled(), limits=RunLimits(max_time_s=20.0))
     assert result.ended is not None
     assert result.ended.reason is Reason.TIME_BUDGET
     assert_home(loop, result)
@@ -285,7 +291,7 @@ def test_the_time_budget_ends_the_run() -> None:
 
 def test_the_operator_ends_the_run_at_the_next_sample() -> None:
     asked = iter([None] * 50)
-    result = run(trial(), loop := Meddled(), watch=Watch(), stop=lambda: next(asked, Reason.OPERATOR))
+    result = run(trial(), loop := Meddled(), limits=RunLimits(), stop=lambda: next(asked, Reason.OPERATOR))
     assert result.ended is not None
     assert result.ended.reason is Reason.OPERATOR
     assert_home(loop, result)
@@ -297,7 +303,7 @@ def test_what_a_plan_or_loop_raises_ends_the_run(error: Exception) -> None:
         yield (SetSetpoint(0.2),)
         raise error
 
-    result = run(plan(), loop := Meddled(), watch=Watch())
+    result = run(plan(), loop := Meddled(), limits=RunLimits())
     assert result.ended is error
     assert_home(loop, result)
 
@@ -307,7 +313,7 @@ def test_a_defect_in_a_plan_is_told_as_one_and_the_loop_is_restored() -> None:
         yield (SetSetpoint(0.2),)
         return 1 / 0
 
-    result = run(plan(), loop := Meddled(), watch=Watch())
+    result = run(plan(), loop := Meddled(), limits=RunLimits())
     assert result.ended is not None
     assert (result.ended.reason, "ZeroDivisionError" in result.ended.detail) == (Reason.INTERNAL, True)
     assert_home(loop, result)
@@ -318,7 +324,7 @@ def test_a_result_without_a_confirmed_restore_is_no_result() -> None:
         def restore(self, home: LoopState, session: int | None = None) -> Restored:
             raise Failed(Reason.RESTORE_UNCONFIRMED, "mode reads manual")
 
-    result = run(trial(), Unrestorable(), watch=Watch())
+    result = run(trial(), Unrestorable(), limits=RunLimits())
     assert result.value is None
     assert result.ended is not None
     assert result.ended.reason is Reason.RESTORE_UNCONFIRMED
