@@ -20,7 +20,7 @@ from loopwright.service.loop_state import OPERATIONAL, LoopState, differences, s
 from loopwright.service.loops.loop import Loop, Restored
 from loopwright.service.request import RetuneRequest
 from loopwright.service.server.assembly import make_jobs
-from loopwright.service.store.store import Store
+from loopwright.service.store.store import Store, block_of
 from loopwright.tuning.analysis.comparison import Predicted
 from loopwright.tuning.experiments.step_test import StepResult
 from loopwright.tuning.gains import Gains
@@ -225,6 +225,11 @@ def fake_rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> O
     hooks.on_event(StageStarted("preflight", 1.0, 0.0))
     hooks.on_event(StageDone("preflight", Found(2.05, 3.32)))
     return Outcome(RESULT, None, None, {"preflight": 1.0})
+
+
+def add_samples(store: Store, job_id: str, stage: str, samples: Sequence[Sample]) -> None:
+    with store.writing() as session:
+        block_of(job_id, stage, samples)(session)
 
 
 class ThreadEngine:
