@@ -20,8 +20,8 @@ from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.design import design
 from loopwright.tuning.rules.registry import METHODS
+from tests.unit.service.api.test_api import assert_problem, finished, start
 from tests.unit.service.fakes import RESULT, TAG, FakeLoop, Service
-from tests.unit.service.test_api import assert_problem, finished, start
 
 FAST = [name for name, method in METHODS.items() if not method.slow]
 

@@ -37,7 +37,7 @@ from tests.unit.service.fakes import (
     fake_rehearse,
     loop_entry,
 )
-from tests.unit.service.test_store import migrate
+from tests.unit.service.store.test_store import migrate
 
 HOME = FakeController().state
 ON_TRIAL = replace(HOME, gains=NEW, on_trial=True, sp=52.0)
