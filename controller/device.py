@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from ctypes import c_float
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Protocol
@@ -40,6 +39,7 @@ from loopwright.protocol.profile import (
     channel_ids,
     renewal_id,
 )
+from loopwright.protocol.real32 import nearest
 from loopwright.protocol.sdo import SdoAbort
 from loopwright.protocol.session import GAINS, STAGED, object_of
 
@@ -263,11 +263,11 @@ class ControllerDevice:
         session, driven = self.sessions[at], self._driven[at]
         before = driven.value
         if before is None:  # rounded as in an RPDO
-            before = c_float(session.home.setpoint if session.is_open else session.channel.setpoint).value
+            before = nearest(session.home.setpoint if session.is_open else session.channel.setpoint)
         driven.value = setpoint
         if setpoint != before:
             driven.changed_at = self.runtime.clock()
-        elif session.is_open or setpoint == c_float(session.channel.setpoint).value:
+        elif session.is_open or setpoint == nearest(session.channel.setpoint):
             return
         with self._outside_change(at + 1, OutsideChange.SETPOINT) as channel:
             channel.setpoint = setpoint

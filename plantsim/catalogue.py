@@ -10,14 +10,11 @@ gain on the bus is 100 times the gain of the model.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.resources import files
 
 from loopwright.plantsim.plant import LinearPlant, Plant
 from loopwright.plantsim.reactor import MV_NOMINAL, STEADY_STATE, Reactor
-
-Build = Callable[[float, float, int], Plant]
 
 
 @dataclass(frozen=True, slots=True)

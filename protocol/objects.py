@@ -91,8 +91,6 @@ class Object:
     high: float | None = None
     unit: str = ""
     """Unit of the value, for readers of this table: EDS files have no field for it."""
-    held: bool = False
-    """Whether the object can be written only while the plant does not run (2011h = 0)."""
     names: tuple[str, ...] = ()
     """Names of the entries; sub-index 0 returns their number."""
     types: tuple[Type, ...] = ()
@@ -179,9 +177,9 @@ _PLANT = (
     Object("plant_disturbance", 0x2022, REAL32, "rw", "Load disturbance", PLANT, CHANNELS, pdo="R",
            low=-1000, high=1000, unit="%"),
     Object("plant_noise", 0x2023, REAL32, "rw", "Measurement noise, standard deviation", PLANT, CHANNELS, low=0),
-    Object("plant_seed", 0x2024, U32, "rw", "Random seed", PLANT, default=1, held=True),
+    Object("plant_seed", 0x2024, U32, "rw", "Random seed", PLANT, default=1),
     Object("plant_initialise", 0x2025, U8, "wo", "Initialise (1 = initial state, sample number 0)", PLANT,
-           low=1, high=1, held=True),
+           low=1, high=1),
     Object("plant_pv", 0x6130, REAL32, "ro", "AI input PV", PLANT, CHANNELS, pdo="T"),
     Object("plant_pv_unit", 0x6131, U32, "ro", "AI physical unit PV", PLANT, CHANNELS, default=DEGREE_CELSIUS),
     Object("plant_mv", 0x6300, REAL32, "rw", "AO output PV", PLANT, CHANNELS, pdo="R", low=0, high=100, unit="%"),

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from loopwright.protocol.real32 import same
 from loopwright.service.errors import Conflict
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode
@@ -49,11 +49,6 @@ def differences(state: LoopState, home: LoopState) -> dict[str, str]:
     if home.mode is Mode.MANUAL and not same(state.manual_output, home.manual_output):
         found["output"] = f"manual output is {state.manual_output:.6g}, was {home.manual_output:.6g}"
     return found
-
-
-def same(a: float, b: float) -> bool:
-    """Equal as far as the bus can tell: values travel as REAL32 (24 bits, 6e-8)."""
-    return math.isclose(a, b, rel_tol=1e-6, abs_tol=1e-9)
 
 
 def same_gains(one: Gains, other: Gains) -> bool:

@@ -1,7 +1,7 @@
 """Tests many times over beside a load, which is what finds those that count on a fast machine.
 
     python -m tests.repeat                                          # tests that start processes, 50 times, 4 busy ones
-    python -m tests.repeat --times 10 tests/unit/service/test_stop.py
+    python -m tests.repeat --times 10 tests/unit/service/server/test_stop.py
     python -m tests.repeat -- -m "not starts_processes" tests/unit
 
 What failed is told by name as it fails, with its output, and counted at the end; the exit status is 1 then.

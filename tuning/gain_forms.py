@@ -1,7 +1,7 @@
 """The forms in which PID settings are written down, and the ISA form from each.
 
     ISA          Kp (1 + 1/(Ti s) + Td s/(1 + Tf s))             `Gains`, used everywhere inside
-    parallel     Kp + Ki/s + Kd s/(1 + Tf s)                     the s-plane paper's C_i, see `of_ascending`
+    parallel     Kp + Ki/s + Kd s/(1 + Tf s)                     the s-plane paper's C_i, from the highest power of s
     series       Kp (1 + 1/(Ti s)) (1 + Td s)/(1 + Tf s)         interacting; exists while both its zeros are real
     reciprocal   Kp + 1/(Ti s)                                   the ME-PSO paper's PI: its Ti is 1/Ki, no time
 
@@ -75,16 +75,6 @@ def of_parallel(form: Parallel) -> Gains:
     return Gains(form.Kp, form.Kp / form.Ki if form.Ki > 0.0 else 0.0, form.Kd / form.Kp, form.Tf)
 
 
-def of_ascending(*C: float) -> Gains:
-    """The ISA gains of the s-plane paper's coefficients, which are those of the numerator over s: (C0, C1) = (Kp, Ki)
-    or (C0, C1, C2) = (Kd, Kp, Ki)."""
-    if len(C) == 2:
-        return of_parallel(Parallel(C[0], C[1]))
-    if len(C) == 3:
-        return of_parallel(Parallel(C[1], C[2], C[0]))
-    raise Refused(Reason.BAD_INPUT, f"C must have 2 (PI) or 3 (PID) coefficients, not {len(C)}")
-
-
 def to_reciprocal(gains: Gains) -> Reciprocal:
     """The reciprocal form of ISA gains: its Ti is Ti/Kp. Raises Refused for a controller with derivative or without
     integral action."""
@@ -94,13 +84,6 @@ def to_reciprocal(gains: Gains) -> Reciprocal:
             Reason.BAD_INPUT, f"the reciprocal form is a PI: Ti > 0 and Td = 0, not {gains.Ti} s, {gains.Td} s"
         )
     return Reciprocal(gains.Kp, gains.Ti / gains.Kp)
-
-
-def of_reciprocal(form: Reciprocal) -> Gains:
-    """The ISA gains of a reciprocal form: Ti is Kp times the form's Ti. Raises Refused for the pure integral controller
-    Kp = 0."""
-    _check(positive={"Kp": form.Kp, "Ti": form.Ti})
-    return Gains(form.Kp, form.Kp * form.Ti)
 
 
 def to_series(gains: Gains) -> Series:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from loopwright.protocol.real32 import TOLERANCE
 from loopwright.service.config import LoopConfig
 from loopwright.service.request import FastRetune, FiveStages, RetuneRequest
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
@@ -23,8 +24,6 @@ _COMPUTING = ("design", "redesign", "estimate", "optimise")
 _STEPPING = ("baseline", "ultimate", "zn_pi", "verify")
 _UNDER_PRESENT_GAINS, _UNDER_NEW_GAINS = 2.0, 1.4
 """Of a set-point step: as far as PV goes in a loop that is just stable, and as `verification` lets it go."""
-_HAIR = 1e-6
-"""Of a set-point: what a REAL32 on the bus cannot tell."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +58,7 @@ def broken_limits(config: LoopConfig, request: RetuneRequest, sp: float) -> list
     config: with the limits of the job.
     """
     low, high, step, unit = config.pv_limits.low, config.pv_limits.high, config.sp_deviation, config.pv_unit
-    hair = _HAIR * max(abs(sp), step)
+    hair = TOLERANCE * max(abs(sp), step)
     if not low - hair <= sp <= high + hair:
         return [f"the set-point {sp:.6g} {unit} is not within the PV limits {low:g} .. {high:g}"]
     stages, broken = stages_asked(request), []

@@ -442,10 +442,6 @@ class Store:
         return len(active)
 
     # samples
-    def add_samples(self, job_id: str, stage: str, samples: Sequence[Sample]) -> None:
-        with self.writing() as session:
-            block_of(job_id, stage, samples)(session)
-
     def last_sample_s(self, job_id: str) -> float:
         """Time of the last sample kept of a job, s; 0 when there is none."""
         last = select(ChunkRow).where(ChunkRow.job_id == job_id).order_by(ChunkRow.seq.desc()).limit(1)

@@ -62,11 +62,8 @@ def test_what_was_finished_is_not_run_again(cut: str, method: str) -> None:
         five_stage(FACTS, options), here, limits=RunLimits(), on_event=hear,
         stop=lambda: Reason.SERVICE_STOPPED if started[0] else None,
     )  # fmt: skip
-    if cut in ("estimate", "optimise"):  # they take no sample: the stop comes with the first of the next stage
-        assert stopped.ended is None or stopped.ended.reason is Reason.SERVICE_STOPPED
-    else:
-        assert stopped.ended is not None
-        assert stopped.ended.reason is Reason.SERVICE_STOPPED
+    assert stopped.ended is not None
+    assert stopped.ended.reason is Reason.SERVICE_STOPPED
 
     second: list[Event] = []
     for _ in range(600):  # the loop comes to rest under its old gains

@@ -1,8 +1,7 @@
-"""The figures that engineers read from a step response, simulated or recorded."""
+"""The figures that engineers read from a step response."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,48 +61,6 @@ def response_figures(
     reference: the set-point's change, PV units.
     band: the settling band, PV units.
     """
-    return _figures(t, y, y, u, final=final, reference=reference, band=band, final_u=final_u)
-
-
-def figures_of(t: Reals, y: Reals, step: float, y0: float, u: Reals | None = None, band: float = 0.02) -> StepFigures:
-    """The figures of a recorded set-point step made at t[0] from rest.
-
-    t, y: time (s) and PV (PV units), shape (N,).
-    step: the set-point step, PV units, either sign.
-    y0: PV at rest, PV units.
-    u: MV at the same times; its change is counted from u[0].
-    band: the settling band, as a fraction of the step.
-    Where measurement noise shows, overshoot, rise and settling are read from a moving mean over a tenth of the rise
-    time, and the settling band is at least three times the noise that remains in the mean.
-    """
-    time = np.asarray(t, dtype=float) - float(t[0])
-    change = (np.asarray(y, dtype=float) - y0) / step
-    # differences over one sample hardly contain the response, so their median size is the noise's (sqrt 2 * 0.6745)
-    noise = float(np.median(np.abs(np.diff(change, 2)))) / (math.sqrt(6.0) * 0.6745)
-    smooth = change
-    if noise > 0.002:
-        rough = _rise(time, _moving_mean(change, 5))
-        dt = (time[-1] - time[0]) / (len(time) - 1)
-        width = int(min(math.inf if rough is None else rough, float(time[-1]) / 5.0) / 10.0 / dt) | 1
-        smooth = _moving_mean(change, max(width, 5))
-        band = max(band, 3.0 * noise / math.sqrt(max(width, 5)))
-    moved = None if u is None else np.asarray(u, dtype=float) - float(u[0])
-    size = abs(step)
-    return _figures(
-        time,
-        size * smooth,
-        size * change,
-        moved,
-        final=size,
-        reference=size,
-        band=size * band,
-        final_u=0.0 if moved is None else float(np.mean(moved[-max(len(moved) // 20, 1) :])),
-    )
-
-
-def _figures(
-    t: Reals, smooth: Reals, y: Reals, u: Reals | None, *, final: float, reference: float, band: float, final_u: float
-) -> StepFigures:
     error = reference - y
     size, squared = np.abs(error), error * error
     # of the trapezoidal rule
@@ -111,14 +68,14 @@ def _figures(
     half = 0.5 * np.diff(t)
     weights[:-1] += half
     weights[1:] += half
-    settling = _settling(t, np.abs(smooth - final), band)
+    settling = _settling(t, np.abs(y - final), band)
     until = float(t[-1]) if settling is None or settling <= 0.0 else settling
-    peak = float(np.max(smooth))
+    peak = float(np.max(y))
     return StepFigures(
         overshoot_pct=max(0.0, 100.0 * (peak / final - 1.0)) if final else 0.0,
         settling_s=settling,
         band=band,
-        rise_s=_rise(t, smooth / final) if final else None,
+        rise_s=_rise(t, y / final) if final else None,
         IAE=float(np.sum(weights * size)),
         ISE=float(np.sum(weights * squared)),
         ITAE=float(np.sum(weights * t * size)),
@@ -164,10 +121,3 @@ def _mean_until(t: Reals, values: Reals, end: float) -> float:
         there = float(np.interp(end, t[last - 1 : last + 1], values[last - 1 : last + 1]))
         area += 0.5 * (float(kept[-1]) + there) * (end - float(at[-1]))
     return area / end
-
-
-def _moving_mean(y: Reals, width: int) -> Reals:
-    """The centred moving mean, with the end values held beyond the ends."""
-    half = width // 2
-    padded = np.pad(y, half, mode="edge")
-    return np.convolve(padded, np.full(2 * half + 1, 1.0 / (2 * half + 1)), "valid")

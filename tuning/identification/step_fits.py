@@ -1,4 +1,4 @@
-"""FOPDT models of recorded steps: areas, moments and least squares for an open-loop step, a fit for a closed loop.
+"""FOPDT models of recorded steps: least squares for an open-loop step and for a closed loop.
 
 Each function takes the record as arrays over t (s) that begin at the step. For records of other shapes see `identify`.
 """
@@ -14,46 +14,18 @@ from loopwright.tuning.analysis.step_response import step_response
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, Reals
 from loopwright.tuning.reasons import Reason, Refused
-from loopwright.tuning.reduction.moments_and_areas import fopdt_of_areas, fopdt_of_moments
 
 MIN_SAMPLES = 20
 FINE = 4000
-REST = 0.02
-"""Largest difference of the means of the last two twentieths of a record at rest, as a fraction of the largest
-change."""
-
-
-def two_areas_of(t: Reals, y: Reals, step: float, y0: float) -> FOPDT:
-    """The FOPDT model of an open-loop step by two areas; equations and source: `tuning.reduction.moments_and_areas`.
-
-    t: the times of the samples, s; the step is at t[0].
-    y: PV, PV units.
-    step: the step of MV, MV units.
-    y0: PV at rest before the step, PV units.
-    Raises Refused: BAD_INPUT for a record that cannot be used or does not end at rest; NO_RESPONSE.
-    """
-    time, share, K = _normalised(t, y, step, y0)
-    A0 = float(np.trapezoid(1.0 - share, time))
-    areas = np.diff(time) * (share[1:] + share[:-1]) / 2.0
-    below = np.interp(A0, time, np.concatenate(([0.0], np.cumsum(areas))))
-    return fopdt_of_areas(K, A0, float(below))
-
-
-def moments_of(t: Reals, y: Reals, step: float, y0: float) -> FOPDT:
-    """The FOPDT model of an open-loop step by its moments (see `tuning.reduction.moments_and_areas`).
-
-    Arguments and errors are those of `two_areas_of`. The moments are mean = integral of 1 - y/K and
-    variance = 2 * integral of t*(1 - y/K) - mean^2, so noise late in the record weighs most.
-    """
-    time, share, K = _normalised(t, y, step, y0)
-    mean = float(np.trapezoid(1.0 - share, time))
-    return fopdt_of_moments(K, mean, 2.0 * float(np.trapezoid(time * (1.0 - share), time)) - mean * mean)
 
 
 def fit_step(t: Reals, y: Reals, step: float, y0: float, K: float | None = None) -> FOPDT:
     """The FOPDT model of an open-loop step by least squares over time; the record need not end at rest.
 
-    t, y, step, y0: as for `two_areas_of`.
+    t: the times of the samples, s; the step is at t[0].
+    y: PV, PV units.
+    step: the step of MV, MV units.
+    y0: PV at rest before the step, PV units.
     K: a known gain, PV units per MV unit; by default the gain is fitted too.
     Raises Refused: BAD_INPUT, NO_RESPONSE.
     """
@@ -174,16 +146,3 @@ def _checked(t: Reals, y: Reals, step: float, y0: float) -> tuple[Reals, Reals]:
     if not np.ptp(change) > 0.0:
         raise Refused(Reason.NO_RESPONSE, "y does not change at all")
     return time - time[0], change
-
-
-def _normalised(t: Reals, y: Reals, step: float, y0: float) -> tuple[Reals, Reals, float]:
-    """The record as (t from 0, change of y as a fraction of its final value, gain)."""
-    time, change = _checked(t, y, step, y0)
-    part = max(len(time) // 20, 1)
-    last, before = float(np.mean(change[-part:])), float(np.mean(change[-2 * part : -part]))
-    if abs(last - before) > REST * float(np.max(np.abs(change))):
-        raise Refused(
-            Reason.BAD_INPUT,
-            f"y still moves at the end of the record ({before:.4g} to {last:.4g}): record longer or use least squares",
-        )
-    return time, change / last, last / step

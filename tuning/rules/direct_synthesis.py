@@ -18,7 +18,6 @@ The paper's bound (21), c = 2, is not safe: this rule refuses from pi/2 on. The 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 from loopwright.tuning.models import FOPDT, SOPDT
 from loopwright.tuning.reasons import Reason, Refused
@@ -28,29 +27,6 @@ from loopwright.tuning.rules.setting import Setting
 PAPER_C = 6.0 - 4.0 * math.sqrt(2.0)
 NO_OVERSHOOT_C = math.exp(-1.0)
 STABLE_C = 0.5 * math.pi
-PAPER_STABLE_C = 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class GainRange:
-    """The ranges of Kp, MV units per PV unit.
-
-    paper: Kp by rule (27).
-    no_overshoot, stable: the largest Kp without overshoot and with a stable loop, with the exact dead time.
-    paper_stable: the paper's bound (21), at which the loop is unstable.
-    """
-
-    paper: float
-    no_overshoot: float
-    stable: float
-    paper_stable: float
-
-
-def gain_range(model: SOPDT | FOPDT) -> GainRange:
-    """The ranges of Kp for the Ti and Td that cancel the poles. Raises Refused, OUTSIDE_RANGE, without dead time."""
-    needs_dead_time(model, "direct synthesis")
-    unit = _sums(model)[0] / model.L / abs(model.K)
-    return GainRange(PAPER_C * unit, NO_OVERSHOOT_C * unit, STABLE_C * unit, PAPER_STABLE_C * unit)
 
 
 def direct_synthesis(model: SOPDT | FOPDT, *, c: float = PAPER_C) -> Setting:

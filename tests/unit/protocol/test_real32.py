@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from loopwright.protocol.real32 import shortest
+from loopwright.protocol.real32 import nearest, same, shortest
 
 
 def travelled(value: float) -> float:
@@ -42,3 +42,17 @@ def test_examples(value: float) -> None:
 
 def test_what_is_no_number_stays() -> None:
     assert math.isnan(shortest(math.nan)) and shortest(-math.inf) == -math.inf
+
+
+@pytest.mark.parametrize("value", [0.05, -273.15, 1.0 / 3.0, 1e-30])
+def test_a_value_is_the_same_after_the_bus_and_not_after_a_change(value: float) -> None:
+    there = nearest(value)
+    assert struct.pack("<f", value) == struct.pack("<f", there) and there == nearest(there)
+    assert same(value, there) and same(there, value)
+    if abs(value) > 1e-9:
+        assert not same(value, there * (1.0 + 3e-6)) and not same(value, -value)
+
+
+def test_beyond_the_range_and_no_number_are_no_same_value() -> None:
+    assert nearest(1e39) == math.inf and nearest(-1e39) == -math.inf
+    assert not same(math.nan, math.nan) and not same(1e39, nearest(1e39))

@@ -28,7 +28,7 @@ from loopwright.service.results import (
     UltimateView,
 )
 from loopwright.service.server.assembly import make_jobs
-from loopwright.service.store.store import Store
+from loopwright.service.store.store import Store, block_of
 from loopwright.tuning.analysis.comparison import Predicted
 from loopwright.tuning.experiments.step_test import StepResult
 from loopwright.tuning.gains import Gains
@@ -237,6 +237,11 @@ def fake_rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> O
     hooks.on_event(StageStarted("preflight", 1.0, 0.0))
     hooks.on_event(StageDone("preflight", Found(2.05, 3.32)))
     return Outcome(RESULT, None, None, {"preflight": 1.0})
+
+
+def add_samples(store: Store, job_id: str, stage: str, samples: Sequence[Sample]) -> None:
+    with store.writing() as session:
+        block_of(job_id, stage, samples)(session)
 
 
 class ThreadEngine:

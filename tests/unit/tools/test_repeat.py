@@ -14,7 +14,8 @@ from tests.conftest import starts_processes
 from tests.repeat import once
 from tests.unit.containers import test_bus, test_data_volume
 from tests.unit.protocol import test_hub
-from tests.unit.service import test_computing, test_serving, test_start, test_stop, test_survival
+from tests.unit.service.execution import test_computing
+from tests.unit.service.server import test_serving, test_start, test_stop, test_survival
 from tests.unit.tuning.analysis import test_margins
 
 TESTS = """

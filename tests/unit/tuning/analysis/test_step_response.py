@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from loopwright.tuning.analysis.margins import ultimate_point
-from loopwright.tuning.analysis.step_figures import figures_of
 from loopwright.tuning.analysis.step_response import step_figures, step_response
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, TransferFunction
@@ -107,35 +106,3 @@ def test_derivative_with_dead_time_against_a_high_pade() -> None:
     # an approximant rings before the answer comes; after two dead times it has calmed down
     late = ours.t > 2.0
     assert ours.y[late] == pytest.approx(theirs[late], abs=2e-3)
-
-
-@pytest.mark.parametrize("step", [1.0, -4.0])
-def test_a_record_gives_the_figures_of_its_loop(step: float) -> None:
-    model, gains = FOPDT(2.0, 5.0, 2.5), Gains(0.9, 7.5)
-    response = step_response(model, gains, horizon=75.0, dt=0.1)
-    truth = step_figures(model, gains, horizon=75.0)
-    found = figures_of(response.t + 300.0, 50.0 + step * response.y, step, 50.0)
-    assert found.overshoot_pct == pytest.approx(truth.overshoot_pct, abs=0.2)
-    assert found.settling_s == pytest.approx(truth.settling_s, rel=0.01)
-    assert found.rise_s == pytest.approx(truth.rise_s, rel=0.01)
-    assert pytest.approx(abs(step) * truth.IAE, rel=0.01) == found.IAE
-    assert found.TV is None and found.MIC is None
-    assert truth.TV is not None
-    # MV's first sample is taken before the step
-    with_mv = figures_of(
-        np.append(299.9, response.t + 300.0),
-        np.append(50.0, 50.0 + step * response.y),
-        step,
-        50.0,
-        u=np.append(20.0, 20.0 - step * response.u),
-    )
-    assert pytest.approx(abs(step) * truth.TV, rel=0.01) == with_mv.TV
-
-
-def test_noise_does_not_pass_for_overshoot() -> None:
-    rng = np.random.default_rng(7)
-    response = step_response(FOPDT(2.0, 5.0, 2.5), Gains(0.9, 7.5), horizon=75.0, dt=0.1)
-    found = figures_of(response.t, response.y + 0.03 * rng.standard_normal(len(response.t)), 1.0, 0.0)
-    assert found.overshoot_pct == pytest.approx(21.4, abs=3.0)
-    assert found.rise_s == pytest.approx(2.43, rel=0.15)
-    assert found.settling_s is not None

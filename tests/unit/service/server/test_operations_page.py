@@ -20,10 +20,10 @@ import pytest
 
 from tests.unit.service.postgres import Server, binaries
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 PAGE = (ROOT / "docs" / "operations.md").read_text(encoding="utf-8")
 UNIT = ROOT / "tools" / "loopwright.service"
-STAND_INS = Path(__file__).parent / "stand-ins"
+STAND_INS = Path(__file__).parents[1] / "stand-ins"
 LOOPS = """
 loops:
 - {tag: TIC-101, bus: 'virtual:page', controller_node: 32, pv_unit: degC, pv_limits: {low: 0, high: 100}, t95_s: 9,

@@ -21,6 +21,7 @@ from loopwright.service.store.store import Busy, FolderInUse, ForeignLoop, NoSuc
 from loopwright.service.store.tables import Base
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Sample
+from tests.unit.service.fakes import add_samples
 from tests.unit.service.postgres import Server
 
 
@@ -293,8 +294,8 @@ def test_other_databases_are_refused_without_telling_the_password(tmp_path: Path
 def test_samples_come_back(store: Store) -> None:
     job = store.create("A", {}, "me", False)
     samples = [Sample(86400.0 + 0.02 * n, 50.0, 50.0 + 0.001 * n, 41.3, n % 4) for n in range(5000)]
-    store.add_samples(job.id, "relay", samples[:4096])
-    store.add_samples(job.id, "verify", samples[4096:])
+    add_samples(store, job.id, "relay", samples[:4096])
+    add_samples(store, job.id, "verify", samples[4096:])
     blocks = store.samples(job.id)
     assert [(stage, len(block)) for stage, block in blocks] == [("relay", 4096), ("verify", 904)]
     back = [sample for _, block in blocks for sample in block]

@@ -13,7 +13,7 @@ from loopwright.service.store.store import append
 from loopwright.tuning.reasons import ADVICE, Failed, Reason, Refused
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
 
-GOLDEN = Path(__file__).parents[2] / "golden" / "openapi.json"
+GOLDEN = Path(__file__).parents[3] / "golden" / "openapi.json"
 
 
 def start(client: TestClient, **options: Any) -> str:

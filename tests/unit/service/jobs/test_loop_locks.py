@@ -35,6 +35,7 @@ from loopwright.service.store.backup import back_up, restore
 from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Busy, Store
 from loopwright.tuning.reasons import Reason
+from tests.unit.service.api.test_api import assert_problem
 from tests.unit.service.fakes import (
     NEW,
     OLD,
@@ -48,11 +49,10 @@ from tests.unit.service.fakes import (
     held_acceptances,
     loop_entry,
 )
+from tests.unit.service.jobs.test_decisions import begun, proposed
+from tests.unit.service.jobs.test_fleet import Deaf, idle_jobs
+from tests.unit.service.jobs.test_jobs_machine import HandEngine
 from tests.unit.service.postgres import Server
-from tests.unit.service.test_api import assert_problem
-from tests.unit.service.test_decisions import begun, proposed
-from tests.unit.service.test_fleet import Deaf, idle_jobs
-from tests.unit.service.test_jobs_machine import HandEngine
 
 WHY = "valve is being overhauled"
 

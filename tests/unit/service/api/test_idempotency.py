@@ -26,9 +26,9 @@ from loopwright.service.store.idempotency import MAX_BYTES, Answer, IdempotencyK
 from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Store
 from loopwright.tuning.reasons import Reason
+from tests.unit.service.api.test_api import GOLDEN, assert_problem
 from tests.unit.service.fakes import NEW, TAG, Service, held_acceptances
 from tests.unit.service.postgres import Server
-from tests.unit.service.test_api import GOLDEN, assert_problem
 
 KEY = {"Idempotency-Key": "7f1c4f5e-2b8f-4a36-9f3a-5d0b3c1e8a77"}
 RETUNE = f"/loops/{TAG}/retune"

@@ -25,8 +25,8 @@ from loopwright.service.server.serving import listen, tell_systemd
 from loopwright.service.telemetry.logs import JsonLines, about
 from loopwright.service.telemetry.metrics import SAMPLES_LOST
 from loopwright.tuning.reasons import Failed, Reason
+from tests.unit.service.api.test_api import finished, start
 from tests.unit.service.fakes import TAG, Service
-from tests.unit.service.test_api import finished, start
 
 
 def test_alive(client: TestClient) -> None:

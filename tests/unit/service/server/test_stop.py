@@ -24,10 +24,10 @@ from loopwright.service.store.store import Store
 from tests.unit.service.fakes import NEW, TAG, loop_entry
 from tests.unit.service.gateway import HOME, read_loop
 from tests.unit.service.processes import until
-from tests.unit.service.test_survival import Gateway
+from tests.unit.service.server.test_survival import Gateway
 
 pytestmark = pytest.mark.timeout(600)  # processes that start slowly on a busy machine
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 

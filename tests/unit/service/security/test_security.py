@@ -30,9 +30,9 @@ from loopwright.service.store.store import Store
 from loopwright.service.store.tables import KeyRow
 from loopwright.service.telemetry.logs import JsonLines, Lines
 from loopwright.tuning.reasons import Failed, Reason
+from tests.unit.service.api.test_api import assert_problem
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
 from tests.unit.service.postgres import Server
-from tests.unit.service.test_api import assert_problem
 
 Open = Callable[..., TestClient]
 

@@ -20,7 +20,7 @@ from loopwright.service.store.backup import BackupProblem, back_up, restore
 from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import FolderInUse, Store
 from loopwright.tuning.plan import Sample
-from tests.unit.service.fakes import TAG, Service
+from tests.unit.service.fakes import TAG, Service, add_samples
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_a_back_up_of_a_service_that_writes_is_of_one_moment(data: Path, tmp_pat
         nonlocal written
         while not stop.is_set():
             row = store.create("L", {}, "me", False)
-            store.add_samples(row.id, "relay", [Sample(0.1 * n, 1.0, 2.0, 3.0, 2) for n in range(500)])
+            add_samples(store, row.id, "relay", [Sample(0.1 * n, 1.0, 2.0, 3.0, 2) for n in range(500)])
             store.move(row.id, JobState.FAILED, reason="internal")
             written += 1
             once_more.set()

@@ -37,7 +37,7 @@ with warnings.catch_warnings():
     from schemathesis.checks import not_a_server_error
     from schemathesis.specs.openapi import checks
 
-DOCUMENT = json.loads((Path(__file__).parents[2] / "golden" / "openapi.json").read_text())
+DOCUMENT = json.loads((Path(__file__).parents[3] / "golden" / "openapi.json").read_text())
 SCHEMA = schemathesis.openapi.from_dict(DOCUMENT)
 OPERATIONS = {found.ok().label: found.ok() for found in cast(Any, SCHEMA).get_all_operations()}
 WITH_INPUT = [

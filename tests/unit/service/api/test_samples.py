@@ -27,7 +27,7 @@ from loopwright.service.store import sample_blocks
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import ChunkRow
 from loopwright.tuning.plan import Sample
-from tests.unit.service.fakes import TAG, Service
+from tests.unit.service.fakes import TAG, Service, add_samples
 
 TS = 0.1
 LONG = 4096
@@ -45,7 +45,7 @@ def filled(store: Store, blocks: int) -> str:
     """A job with so many blocks, the first of another stage."""
     job = store.create(TAG, {}, "test", True).id
     for k in range(blocks):
-        store.add_samples(job, "preflight" if k == 0 else "relay", block_of_samples(k * PER_BLOCK))
+        add_samples(store, job, "preflight" if k == 0 else "relay", block_of_samples(k * PER_BLOCK))
     return job
 
 
@@ -77,7 +77,7 @@ def test_one_stage_and_none(client: TestClient, service: Service) -> None:
 def test_what_is_no_number_is_null(client: TestClient, service: Service) -> None:
     job = service.store.create(TAG, {}, "test", True).id
     values = (math.nan, math.inf, -math.inf, 0.1)
-    service.store.add_samples(job, "relay", [Sample(0.0, 50.0, pv, 1.0, 2) for pv in values])
+    add_samples(service.store, job, "relay", [Sample(0.0, 50.0, pv, 1.0, 2) for pv in values])
     assert client.get(f"/jobs/{job}/samples").json()["pv"] == [None, None, None, 0.1]
     assert "relay,0.0,50.0,nan,1.0,2\n" in client.get(f"/jobs/{job}/samples?format=csv").text
 
@@ -116,7 +116,7 @@ def test_samples_that_come_meanwhile_are_left_out(service: Service) -> None:
     job = filled(service.store, 2)
     text = json_text(Reading(service.store, job))
     begun = [next(text) for _ in range(4)]
-    service.store.add_samples(job, "relay", block_of_samples(2 * PER_BLOCK))
+    add_samples(service.store, job, "relay", block_of_samples(2 * PER_BLOCK))
     columns = json.loads("".join(begun) + "".join(text))
     assert {len(column) for name, column in columns.items() if name != "job"} == {2 * PER_BLOCK}
 

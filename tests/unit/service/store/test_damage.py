@@ -26,7 +26,7 @@ from loopwright.service.store.damage import FileCheck, Log, read_log
 from loopwright.service.store.database import ENGINE_FILE, FILE, BadDatabase
 from loopwright.service.store.store import Store, event_of
 from loopwright.tuning.plan import Sample
-from tests.unit.service.fakes import OLD, TAG, Service
+from tests.unit.service.fakes import OLD, TAG, Service, add_samples
 from tests.unit.service.processes import until
 
 
@@ -107,7 +107,7 @@ def filled(folder: Path) -> list[str]:
     store, ids = Store(folder), []
     for n in range(20):
         row = store.create(f"L{n}", {"text": "x" * 1000}, "me", False)
-        store.add_samples(row.id, "relay", [Sample(0.1 * k, 50.0, 50.0, 40.0 + k, 2) for k in range(1000)])
+        add_samples(store, row.id, "relay", [Sample(0.1 * k, 50.0, 50.0, 40.0 + k, 2) for k in range(1000)])
         ids.append(row.id)
     store.close()
     return ids

@@ -22,8 +22,8 @@ from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.design import design
 from loopwright.tuning.rules.registry import METHODS
 from tests.unit.service import fakes
+from tests.unit.service.api.test_api import assert_problem, finished, start
 from tests.unit.service.fakes import RESULT, TAG, FakeLoop, Service
-from tests.unit.service.test_api import assert_problem, finished, start
 
 FAST = [name for name, method in METHODS.items() if not method.slow]
 

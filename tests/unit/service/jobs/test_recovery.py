@@ -37,7 +37,7 @@ from tests.unit.service.fakes import (
     fake_rehearse,
     loop_entry,
 )
-from tests.unit.service.test_store import migrate
+from tests.unit.service.store.test_store import migrate
 
 HOME = FakeController().state
 ON_TRIAL = replace(HOME, gains=NEW, on_trial=True, sp=52.0)
@@ -191,21 +191,21 @@ def test_what_somebody_changed_meanwhile_stays_and_the_job_does_not_go_on(
 
 
 @pytest.mark.parametrize(
-    ("columns", "options", "words"),
+    ("columns", "options", "reason", "words"),
     [
-        ({"version": "0"}, {}, "another version"),
-        ({}, {"resume": False}, "--no-resume"),
-        ({"attempt": MAX_ATTEMPTS}, {}, f"attempt {MAX_ATTEMPTS}"),
-        ({"request": {"sp_deviation": 2.5}}, {}, "configuration has changed"),
+        ({"version": "0"}, {}, Reason.SERVICE_STOPPED, "another version"),
+        ({}, {"resume": False}, Reason.SERVICE_STOPPED, "--no-resume"),
+        ({"attempt": MAX_ATTEMPTS}, {}, Reason.SERVICE_STOPPED, f"attempt {MAX_ATTEMPTS}"),
+        ({"request": {"sp_deviation": 2.5}}, {}, Reason.BAD_LIMITS, "configuration has changed"),
     ],
 )
 def test_a_job_that_may_not_go_on_says_why_and_what_was_restored(
-    started: list[Service], tmp_path: Path, columns: dict[str, Any], options: dict[str, Any], words: str
+    started: list[Service], tmp_path: Path, columns: dict[str, Any], options: dict[str, Any], reason: Reason, words: str
 ) -> None:
     job_id = left(tmp_path, **columns)
     service = again(started, tmp_path, in_the_session, **options)
     row = service.store.get(job_id)
-    assert (row.state, row.reason) == ("interrupted", row.reason) and words in (row.detail or "")
+    assert (row.state, row.reason) == ("interrupted", reason.value) and words in (row.detail or "")
     assert "the session was closed" in (row.detail or "") and service.controller.session == 0
     assert row.restored == state_json(HOME) == state_json(service.controller.state)
     assert service.store.active(TAG) is None

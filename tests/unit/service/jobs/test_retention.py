@@ -16,7 +16,7 @@ from loopwright.service.store.clock_watch import ClockWatch
 from loopwright.service.store.store import Store
 from loopwright.service.telemetry.metrics import CLOCK_JUMPS
 from loopwright.tuning.plan import Sample
-from tests.unit.service.fakes import ThreadEngine
+from tests.unit.service.fakes import ThreadEngine, add_samples
 
 NOW = datetime.now(UTC)
 
@@ -24,7 +24,7 @@ NOW = datetime.now(UTC)
 def job(store: Store, loop: str, *states: JobState, dry: bool = False, days_ago: float = 0.0, host: str = "") -> str:
     """A job with ten samples that went through these states and ended so long ago."""
     row = store.create(loop, {}, "me", dry, host or None)
-    store.add_samples(row.id, "relay", [Sample(0.1 * n, 50.0, 50.0, 40.0, 2) for n in range(10)])
+    add_samples(store, row.id, "relay", [Sample(0.1 * n, 50.0, 50.0, 40.0, 2) for n in range(10)])
     for state in states:
         ended = (NOW - timedelta(days=days_ago)).isoformat(timespec="milliseconds").replace("+00:00", "Z")
         store.move(row.id, state)

@@ -22,7 +22,7 @@ from loopwright.service.store import retunes
 from loopwright.service.store.database import FILE
 from loopwright.service.store.store import Store
 from tests.unit.service.postgres import Server
-from tests.unit.service.test_store import migrate
+from tests.unit.service.store.test_store import migrate
 
 DATA = Path(__file__).parents[2] / "data"
 GOLDEN: dict[str, Any] = json.loads((DATA / "jobs-before-0009.json").read_text())

@@ -26,7 +26,7 @@ from tests.unit.service.fakes import NEW, TAG
 from tests.unit.service.gateway import HOME, STAGES, main, read_loop, write_loop
 
 pytestmark = pytest.mark.timeout(600)  # processes that start slowly on a busy machine
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 SESSION = 77
 
 BEFORE_IT_WORKS = (
@@ -68,7 +68,7 @@ def test_it_ends_cleanly_at_whatever_moment(tmp_path: Path) -> None:
     moments = dict(enumerate((*BEFORE_IT_WORKS, *AS_IT_WORKS)))
     for number in moments:
         shutil.copytree(tmp_path / "left", tmp_path / str(number))
-    command = [sys.executable, "-m", "tests.unit.service.test_start", str(tmp_path), *moments.values()]
+    command = [sys.executable, "-m", "tests.unit.service.server.test_start", str(tmp_path), *moments.values()]
     subprocess.run(command, cwd=ROOT, check=True, timeout=500)
     for number, when in moments.items():
         output = (tmp_path / f"{number}.log").read_text()
