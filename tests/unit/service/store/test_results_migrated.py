@@ -24,7 +24,7 @@ from loopwright.service.store.store import Store
 from tests.unit.service.postgres import Server
 from tests.unit.service.store.test_store import migrate
 
-DATA = Path(__file__).parents[2] / "data"
+DATA = Path(__file__).parents[3] / "data"
 GOLDEN: dict[str, Any] = json.loads((DATA / "jobs-before-0009.json").read_text())
 SQL = (DATA / "jobs-before-0009.sql").read_text()
 
