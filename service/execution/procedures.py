@@ -14,7 +14,7 @@ from loopwright.service.planning.ground import Ground, rehearsal_spec
 from loopwright.service.planning.moves import broken_limits
 from loopwright.service.request import ProcessModel, RetuneRequest
 from loopwright.service.results import Result, empty_result
-from loopwright.service.store.tables import EventRow
+from loopwright.service.store.jobs import JobEvent
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.settle import after_settling
 from loopwright.tuning.models import Model
@@ -39,7 +39,7 @@ class Hooks:
     on_event: Callable[[Event], None]
     on_samples: Callable[[list[Sample]], None]
     stop: Callable[[], Reason | None]
-    earlier: Sequence[EventRow] = ()
+    earlier: Sequence[JobEvent] = ()
     remember: Callable[[int], None] = lambda session: None
     on_home: Callable[[LoopState], None] = lambda home: None
     ground: Ground = field(default_factory=Ground)
@@ -114,7 +114,7 @@ def tune(
     return Outcome(None if ran.value is None else result_of(ran.value), ended, ran.restored, dict(ran.plant_time_s))
 
 
-def plan(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow] = ()) -> Plan[Any]:
+def plan(request: RetuneRequest, facts: Facts, earlier: Sequence[JobEvent] = ()) -> Plan[Any]:
     """earlier: events of attempts that were cut off, after which the loop gets time to come to rest. What fast had
     recorded by then is not gone on with: relay and set-point step are one record, of a loop not touched in between.
     """
@@ -122,7 +122,7 @@ def plan(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow] = ())
     return after_settling(facts, procedure) if earlier else procedure
 
 
-def _procedure(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow]) -> Plan[Any]:
+def _procedure(request: RetuneRequest, facts: Facts, earlier: Sequence[JobEvent]) -> Plan[Any]:
     if request.fast:
         from loopwright.tuning.fast.design_trial import trial
         from loopwright.tuning.fast.procedure import FastOptions, fast

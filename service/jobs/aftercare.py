@@ -15,8 +15,8 @@ from loopwright.service.jobs.machine import Machine
 from loopwright.service.loop_state import state_json
 from loopwright.service.loops.restoration import Restoration, look
 from loopwright.service.store import looked_after
+from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Busy, Store
-from loopwright.service.store.tables import JobRow
 from loopwright.service.telemetry.logs import about
 from loopwright.tuning.reasons import ADVICE, Reason
 
@@ -100,11 +100,11 @@ class Aftercare:
             found.setdefault(row.loop, self._not_home(row))
         return list(found.values())
 
-    def _not_home(self, row: JobRow) -> NotHome:
+    def _not_home(self, row: Job) -> NotHome:
         again = self._again.get(row.id)
         if again is not None:
             return NotHome(row.loop, row.id, again.found.reason, again.found.text)
-        reason = Reason(row.reason) if row.reason else None
+        reason = row.reason
         return NotHome(row.loop, row.id, reason, row.detail or "it was not read back")
 
     def dismiss(self, tag: str, by: str) -> list[str]:
@@ -131,14 +131,14 @@ class Aftercare:
             return
         self._machine.side_by_side(self._one, due, _AT_ONCE)
 
-    def _one(self, row: JobRow) -> None:
+    def _one(self, row: Job) -> None:
         with about(job=row.id, loop=row.loop):
             try:
                 self._look_at(row)
             except Exception:  # one loop must not keep the others from being looked at
                 log.exception("looking after loop %s", row.loop)
 
-    def _look_at(self, row: JobRow) -> None:
+    def _look_at(self, row: Job) -> None:
         with self._directory.alone_with(row.loop):
             # The job that has it answers for it: the row may be older than its beginning.
             if self._stopping or self._store.active(row.loop) is not None:
@@ -149,7 +149,7 @@ class Aftercare:
         elif looked_after.home_again(self._store, row.id, state_json(found.state), found.text):
             log.info("looked after no more: %s", found.text)
 
-    def _not_yet(self, row: JobRow, found: Restoration) -> None:
+    def _not_yet(self, row: Job, found: Restoration) -> None:
         before = self._again.get(row.id)
         wait_s = EVERY_S if before is None else min(LONGEST_S, 2.0 * before.wait_s)
         if before is None or before.found.reason is not found.reason:

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from typing import Any
 
 from loopwright.service.errors import Conflict
-from loopwright.service.job_states import ACTIVE, JobState
+from loopwright.service.job_states import ACTIVE
 from loopwright.service.jobs.relay_record import RelayRecord
 from loopwright.service.offline.tunings import MethodResult, answer, tune_each
 from loopwright.service.planning.found_model import DISPROVED, FoundModel, found_model, model_of
 from loopwright.service.request import ProcessModel
-from loopwright.service.store.tables import EventRow, JobRow
+from loopwright.service.store.jobs import Job, JobEvent
 from loopwright.tuning.analysis.assessment import Assessment, assess
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.design_trial import designed_on
@@ -43,7 +43,7 @@ FAST_DESIGN = Method(
 )
 
 
-def alternatives(row: JobRow, events: Sequence[EventRow], method: str | None = None) -> dict[str, Any]:
+def alternatives(row: Job, events: Sequence[JobEvent], method: str | None = None) -> dict[str, Any]:
     """The JSON object of GET /jobs/{id}/alternatives: by the method named, else by all that are not slow.
 
     Raises Conflict for a job that has no model (yet) or has disproved it, BadTuning for an unknown method.
@@ -59,7 +59,7 @@ def alternatives(row: JobRow, events: Sequence[EventRow], method: str | None = N
 
 
 def redesigned(
-    row: JobRow, events: Sequence[EventRow], record: RelayRecord | None, ms: float, derivative: bool
+    row: Job, events: Sequence[JobEvent], record: RelayRecord | None, ms: float, derivative: bool
 ) -> dict[str, Any]:
     """The same object with the gains of fast for another Ms: no new experiment.
 
@@ -99,9 +99,9 @@ def _tuned(gains: Gains, ms: float, assessed: Assessment) -> MethodResult:
     return MethodResult(FAST_DESIGN, gains, {"Ms": ms}, notes, assessed)
 
 
-def job_model(row: JobRow, events: Sequence[EventRow]) -> FoundModel:
+def job_model(row: Job, events: Sequence[JobEvent]) -> FoundModel:
     """The model of the job's result, else the last that a stage found, else the one typed in; or Conflict."""
-    if JobState(row.state) in ACTIVE:
+    if row.state in ACTIVE:
         raise Conflict(f"job {row.id} is not over: it has no model to compare methods on yet")
     model = found_model(row, events) or model_of(row.request.get("model") or {})
     if model is not None:
@@ -109,7 +109,7 @@ def job_model(row: JobRow, events: Sequence[EventRow]) -> FoundModel:
     raise Conflict(f"job {row.id} ended as {row.state} before it had a model")
 
 
-def _not_disproved(row: JobRow, reasons: Sequence[Reason]) -> None:
+def _not_disproved(row: Job, reasons: Sequence[Reason]) -> None:
     if row.reason in reasons:
         text = f"job {row.id} ended as {row.reason}, which speaks against its model ({row.detail})"
         raise Conflict(f"{text}: retune instead")

@@ -16,8 +16,8 @@ from loopwright.service.loops.loop import Loop
 from loopwright.service.loops.restoration import Restoration, look
 from loopwright.service.request import RetuneRequest, within
 from loopwright.service.store import loop_locks
+from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
-from loopwright.service.store.tables import JobRow
 from loopwright.tuning.reasons import Reason
 
 log = logging.getLogger(__name__)
@@ -39,7 +39,7 @@ class Recovery:
     resumes: bool
     stopping: Callable[[], bool] = lambda: False
 
-    def recover(self, row: JobRow) -> None:
+    def recover(self, row: Job) -> None:
         """Makes the loop of the job safe, and ends the job if it is not to go on."""
         if self.stopping():
             return
@@ -63,7 +63,7 @@ class Recovery:
             detail = f"cut off by the end of the service, and not resumed: {text}; {_loop_words(safe)}"
             self.store.move(row.id, JobState.INTERRUPTED, reason=reason.value, detail=detail, **restored)
 
-    def _why_not(self, row: JobRow, safe: Restoration | None) -> tuple[Reason, str] | None:
+    def _why_not(self, row: Job, safe: Restoration | None) -> tuple[Reason, str] | None:
         """Returns why a job is not to be resumed, None where it is."""
         config = self.loops.get(row.loop)
         if row.version != WORKFLOW_VERSION:

@@ -27,9 +27,9 @@ from loopwright.service.loops.restoration import restore_abandoned
 from loopwright.service.planning.known_loop import known
 from loopwright.service.request import BadLimits, RetuneRequest, within
 from loopwright.service.store import looked_after
+from loopwright.service.store.jobs import Job
 from loopwright.service.store.lock import FolderInUse
 from loopwright.service.store.store import NoSuchJob, Store
-from loopwright.service.store.tables import JobRow
 from loopwright.service.telemetry.logs import about
 from loopwright.tuning.plan import Event
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
@@ -81,16 +81,16 @@ class Worker:
         try:
             # Read anew: until it was among those that run, an abort ended it as one that waits for its turn.
             row = self._lasting(lambda: self.store.get(job_id))
-            if JobState(row.state) not in ACTIVE:
+            if row.state not in ACTIVE:
                 return
             if row.stop_reason is not None:
-                running.stop_reason = running.stop_reason or Reason(row.stop_reason)
+                running.stop_reason = running.stop_reason or row.stop_reason
             with about(job=job_id, loop=row.loop):
                 self._to_the_end(running, row)
         finally:
             self._registry.leave(running)
 
-    def _to_the_end(self, running: Running, row: JobRow) -> None:
+    def _to_the_end(self, running: Running, row: Job) -> None:
         log.info("job started, attempt %d", row.attempt + 1)
         try:
             self._finish(running, self._run(running, row), row.dry_run)
@@ -100,7 +100,7 @@ class Worker:
         except Exception:
             log.exception("the end of the job could not be written")
 
-    def _run(self, running: Running, row: JobRow) -> Outcome:
+    def _run(self, running: Running, row: Job) -> Outcome:
         try:
             request = RetuneRequest.model_validate(row.request)
             config = within(self._directory.config(row.loop), request)
@@ -114,7 +114,7 @@ class Worker:
             log.exception("a defect in the job")
             return Outcome(None, Failed(Reason.INTERNAL, f"{type(error).__name__}: {error}"), None, {})
 
-    def _live(self, running: Running, row: JobRow, config: LoopConfig, request: RetuneRequest) -> Outcome:
+    def _live(self, running: Running, row: Job, config: LoopConfig, request: RetuneRequest) -> Outcome:
         self._check_stop_request(running)
         loop = ObservedLoop(self._directory.open_loop(config))
         try:
@@ -146,7 +146,7 @@ class Worker:
         if not same_gains(home.gains, read.gains):  # the plan reckons with those that were read
             raise Aborted(Reason.GAINS_CHANGED, "other gains were accepted as the test was about to begin")
 
-    def _begun(self, loop: Loop, row: JobRow) -> LoopState:
+    def _begun(self, loop: Loop, row: Job) -> LoopState:
         """Returns the state of the loop as an attempt begins, written down before anything is touched."""
         if row.found is None or row.session is None:
             # No attempt has touched it. What an earlier one had read may have been another tuner's test.
@@ -166,8 +166,8 @@ class Worker:
         self._resumed(row, safe.text)
         return safe.state
 
-    def _dry(self, running: Running, row: JobRow, config: LoopConfig, request: RetuneRequest) -> Outcome:
-        if JobState(row.state) is JobState.QUEUED:
+    def _dry(self, running: Running, row: Job, config: LoopConfig, request: RetuneRequest) -> Outcome:
+        if row.state is JobState.QUEUED:
             self._lasting(lambda: self.store.move(row.id, JobState.RUNNING, attempt=1))
         else:
             self._resumed(row, "a rehearsal begins anew")
@@ -180,7 +180,7 @@ class Worker:
         hooks = Hooks(on_event, running.on_samples, lambda: running.stop_reason, ground=ground)
         return self._rehearse(config, request, hooks)
 
-    def _resumed(self, row: JobRow, text: str) -> None:
+    def _resumed(self, row: Job, text: str) -> None:
         details = {"attempt": row.attempt + 1, "text": text}
         self._lasting(lambda: self.store.resumed(row.id, details, attempt=row.attempt + 1))
 

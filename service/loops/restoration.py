@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from loopwright.service.config import LoopConfig
 from loopwright.service.loop_state import LoopState, loop_state
 from loopwright.service.loops.loop import Loop
-from loopwright.service.store.tables import JobRow
+from loopwright.service.store.jobs import Job
 from loopwright.tuning.reasons import Ended, Reason
 
 log = logging.getLogger(__name__)
@@ -55,7 +55,7 @@ def restore_abandoned(loop: Loop, home: LoopState, session: int | None) -> Resto
     return Restoration(restored.state, text, reason)
 
 
-def look(row: JobRow, loops: Mapping[str, LoopConfig], open_loop: Callable[[LoopConfig], Loop]) -> Restoration:
+def look(row: Job, loops: Mapping[str, LoopConfig], open_loop: Callable[[LoopConfig], Loop]) -> Restoration:
     """The loop of a job, opened and made safe. Raises nothing: one loop must not keep others from being looked at."""
     config = loops.get(row.loop)
     if config is None:

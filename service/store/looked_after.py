@@ -13,17 +13,18 @@ from sqlalchemy.orm import Session
 
 from loopwright.service.jsonable import to_jsonable
 from loopwright.service.store import audit
+from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store, Write, append, set_columns
 from loopwright.service.store.tables import JobRow
 
 
-def rows(store: Store, loop: str | None = None) -> Sequence[JobRow]:
+def rows(store: Store, loop: str | None = None) -> Sequence[Job]:
     """The jobs of this host with a loop that is looked after, or those of one loop on whatever host; the latest
     first."""
     mine = JobRow.host == store.host if loop is None else JobRow.loop == loop
     with store.reading() as session:
         wanted = select(JobRow).where(mine, JobRow.look_after.is_(True)).order_by(JobRow.number.desc())
-        return session.scalars(wanted).all()
+        return [Job.from_row(row) for row in session.scalars(wanted)]
 
 
 def count(session: Session, host: str) -> int:

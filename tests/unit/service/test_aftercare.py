@@ -22,8 +22,9 @@ from loopwright.service.jobs.aftercare import EVERY_S, LONGEST_S, Aftercare
 from loopwright.service.loop_state import state_json
 from loopwright.service.request import RetuneRequest
 from loopwright.service.store import audit, looked_after
+from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
-from loopwright.service.store.tables import JobRow, LoopRow
+from loopwright.service.store.tables import LoopRow
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Reason
 from tests.unit.service.fakes import TAG, FakeController, Service, loop_entry
@@ -54,7 +55,7 @@ def clock(service: Service) -> Clock:
     return clock
 
 
-def left_by_a_job(service: Service, becomes: Callable[[FakeController], None]) -> JobRow:
+def left_by_a_job(service: Service, becomes: Callable[[FakeController], None]) -> Job:
     """A job that ends with what has become of its controller in the middle of the test."""
     service.tune.hold.clear()
     service.tune.inside.clear()
