@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, Field
 
 from loopwright.service.config import Limits, LoopConfig
 from loopwright.service.job_states import ACTIVE, JobState, shown
-from loopwright.service.jobs.active_job import Running
-from loopwright.service.jobs.aftercare import NotHome
 from loopwright.service.loop_state import LoopState, gains_of
 from loopwright.service.results import (
     ComparisonView,
@@ -27,10 +25,14 @@ from loopwright.service.results import (
     VerificationView,
     empty_result,
 )
-from loopwright.service.store.jobs import Job, JobEvent
-from loopwright.service.store.tables import LoopLockRow
 from loopwright.tuning.five_stage.procedure import PROCEDURE
 from loopwright.tuning.reasons import ADVICE
+
+if TYPE_CHECKING:  # the command line reads views, and has no store
+    from loopwright.service.jobs.active_job import Running
+    from loopwright.service.jobs.aftercare import NotHome
+    from loopwright.service.store.jobs import Job, JobEvent
+    from loopwright.service.store.tables import LoopLockRow
 
 
 class LockView(BaseModel):
