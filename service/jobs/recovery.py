@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from loopwright.service.config import LoopConfig
 from loopwright.service.errors import Locked
@@ -16,7 +15,7 @@ from loopwright.service.loops.loop import Loop
 from loopwright.service.loops.restoration import Restoration, look
 from loopwright.service.request import RetuneRequest, within
 from loopwright.service.store import loop_locks
-from loopwright.service.store.jobs import Job
+from loopwright.service.store.jobs import Job, JobColumns
 from loopwright.service.store.store import Store
 from loopwright.tuning.reasons import Reason
 
@@ -48,20 +47,22 @@ class Recovery:
         if row.found is not None and (row.session is not None or row.version != WORKFLOW_VERSION):
             safe = look(row, self.loops, self.open_loop)
             self.store.append(row.id, "loop_found", {"text": safe.text}, row.plant_time_s)
-        restored: dict[str, Any] = {}
+        columns: JobColumns = {}
         if safe is not None and safe.state is not None:
-            restored = {"restored": state_json(safe.state)}
+            columns["restored"] = state_json(safe.state)
         elif safe is not None:
-            restored = {"look_after": True}
+            columns["look_after"] = True
         if row.stop_reason is not None:
-            detail = "asked to stop before the service ended; " + _loop_words(safe)
-            self.store.move(row.id, JobState.ABORTED, reason=row.stop_reason, detail=detail, **restored)
+            columns["reason"] = row.stop_reason
+            columns["detail"] = "asked to stop before the service ended; " + _loop_words(safe)
+            self.store.move(row.id, JobState.ABORTED, **columns)
             return
         why = self._why_not(row, safe)
         if why is not None:
             reason, text = why
-            detail = f"cut off by the end of the service, and not resumed: {text}; {_loop_words(safe)}"
-            self.store.move(row.id, JobState.INTERRUPTED, reason=reason.value, detail=detail, **restored)
+            columns["reason"] = reason
+            columns["detail"] = f"cut off by the end of the service, and not resumed: {text}; {_loop_words(safe)}"
+            self.store.move(row.id, JobState.INTERRUPTED, **columns)
 
     def _why_not(self, row: Job, safe: Restoration | None) -> tuple[Reason, str] | None:
         """Returns why a job is not to be resumed, None where it is."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import asdict
-from typing import Any
 
 from loopwright.service.config import LoopConfig
 from loopwright.service.errors import Locked
@@ -27,7 +26,7 @@ from loopwright.service.loops.restoration import restore_abandoned
 from loopwright.service.planning.known_loop import known
 from loopwright.service.request import BadLimits, RetuneRequest, within
 from loopwright.service.store import looked_after
-from loopwright.service.store.jobs import Job
+from loopwright.service.store.jobs import Job, JobColumns
 from loopwright.service.store.lock import FolderInUse
 from loopwright.service.store.store import NoSuchJob, Store
 from loopwright.service.telemetry.logs import about
@@ -139,7 +138,7 @@ class Worker:
 
         The note goes through the journal: the session is open, and waits for no database.
         """
-        columns: dict[str, Any] = {}
+        columns: JobColumns = {}
         if differences(home, read):
             columns = {"found": state_json(home), "old_gains": asdict(home.gains)}
         self.journal.put(looked_after.opened(job_id, columns))
@@ -151,9 +150,10 @@ class Worker:
         if row.found is None or row.session is None:
             # No attempt has touched it. What an earlier one had read may have been another tuner's test.
             state = loop.read(beside_tests=True)
-            columns: dict[str, Any] = {"old_gains": asdict(state.gains), "found": state_json(state)}
+            columns: JobColumns = {"old_gains": asdict(state.gains), "found": state_json(state)}
             if row.found is None:
-                self._lasting(lambda: self.store.move(row.id, JobState.RUNNING, attempt=1, **columns))
+                columns["attempt"] = 1
+                self._lasting(lambda: self.store.move(row.id, JobState.RUNNING, **columns))
             else:
                 self._lasting(lambda: self.store.note(row.id, **columns))
                 self._resumed(row, "the loop had not been touched")
@@ -196,7 +196,7 @@ class Worker:
                 log.error("the database takes nothing, the last reports of the job are lost")
                 break
         times = self._earlier_times(running.job_id) | outcome.plant_time_s
-        columns: dict[str, Any] = {
+        columns: JobColumns = {
             "result": outcome.result,
             "stage_times_s": times,
             "plant_time_s": max(running.progress.plant_time_s, running.before_s + sum(outcome.plant_time_s.values())),

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from enum import StrEnum
-from typing import Any, TypeVar
+from typing import Any, TypedDict, TypeVar
 
 from loopwright.service.job_states import JobState
 from loopwright.service.results import FastResult, FiveStageResult
@@ -12,6 +13,23 @@ from loopwright.service.store.tables import EventRow, JobRow
 from loopwright.tuning.reasons import Reason
 
 Word = TypeVar("Word", bound=StrEnum)
+
+
+class JobColumns(TypedDict, total=False):
+    """What a transaction may set of a job's row, besides what the store keeps itself."""
+
+    attempt: int
+    detail: str
+    found: Mapping[str, object]
+    look_after: bool
+    old_gains: Mapping[str, object]
+    plant_time_s: float
+    reason: str
+    restored: Mapping[str, object]
+    result: FastResult | FiveStageResult | None
+    session: int | None
+    stage: str
+    stage_times_s: Mapping[str, float]
 
 
 class UnknownWord(ValueError):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from sqlalchemy import ColumnElement, delete, func, select, update
 from sqlalchemy.exc import IntegrityError, SQLAlchemyError, TimeoutError
@@ -31,7 +31,7 @@ from loopwright.service.store.database import (
     postgresql,
     sessions,
 )
-from loopwright.service.store.jobs import Job, JobEvent
+from loopwright.service.store.jobs import Job, JobColumns, JobEvent
 from loopwright.service.store.lock import FolderInUse, FolderLock, HostLock, ourselves
 from loopwright.service.store.tables import ChunkRow, EventRow, HostRow, JobRow, LoopRow, RetuneRow
 from loopwright.tuning.plan import Sample
@@ -173,7 +173,7 @@ class Store:
             of_host(session, self.host).written_at = now()
 
     # loops
-    def own_loops(self, loops: dict[str, dict[str, Any]]) -> None:
+    def own_loops(self, loops: Mapping[str, Mapping[str, object]]) -> None:
         """These are the loops of this host from now on, by tag.
 
         A loop of a host that is not running is taken over with its active job, and looked after here if it was there:
@@ -218,7 +218,7 @@ class Store:
     def create(
         self,
         loop: str,
-        request: dict[str, Any],
+        request: Mapping[str, object],
         requested_by: str,
         dry_run: bool,
         host: str | None = None,
@@ -255,7 +255,7 @@ class Store:
                 raise
             raise Busy(loop, active.id) from error
 
-    def move(self, job_id: str, wanted: JobState, by: str = "service", **columns: Any) -> Job:
+    def move(self, job_id: str, wanted: JobState, by: str = "service", **columns: Unpack[JobColumns]) -> Job:
         """Moves the job as the table allows and sets the columns, in one transaction with its event. Raises
         IllegalMove, and Locked where its test is to begin."""
         with self.writing() as session:
@@ -282,7 +282,7 @@ class Store:
             loop_locks.check(session, row.loop)
             append(session, job_id, _BEGUN, {"decision": DECISIONS[wanted], "by": by}, row.plant_time_s)
 
-    def resumed(self, job_id: str, details: dict[str, Any], **columns: Any) -> None:
+    def resumed(self, job_id: str, details: Mapping[str, object], **columns: Unpack[JobColumns]) -> None:
         """Notes that an active job has begun another attempt. Raises IllegalMove when it is over, Locked."""
         with self.writing() as session:
             row = _find(session, job_id, lock=True)
@@ -292,7 +292,7 @@ class Store:
             set_columns(row, columns)
             append(session, job_id, "resumed", details, row.plant_time_s)
 
-    def note(self, job_id: str, **columns: Any) -> None:
+    def note(self, job_id: str, **columns: Unpack[JobColumns]) -> None:
         """Sets columns of an active job."""
         with self.writing() as session:
             set_columns(_find(session, job_id, lock=True), columns)
@@ -405,7 +405,7 @@ class Store:
             return [Job.from_row(row) for row in latest]
 
     # events
-    def append(self, job_id: str, kind: str, data: dict[str, Any], plant_time_s: float) -> None:
+    def append(self, job_id: str, kind: str, data: Mapping[str, object], plant_time_s: float) -> None:
         with self.writing() as session:
             _find(session, job_id, lock=True)
             append(session, job_id, kind, data, plant_time_s)
@@ -496,13 +496,17 @@ def is_shown_as(state: JobState) -> ColumnElement[bool]:
     return stored
 
 
-def event_of(job_id: str, kind: str, data: dict[str, Any], plant_time_s: float, **columns: Any) -> Write:
-    """An event, at the time it happened, and what it changes in the job's row."""
+def event_of(
+    job_id: str, kind: str, data: Mapping[str, object], plant_time_s: float, stage: str | None = None
+) -> Write:
+    """An event, at the time it happened. stage: the one that the job has entered with it."""
     at, details = now(), to_jsonable(data)
 
     def write(session: Session) -> None:
         row = _find(session, job_id, lock=True)
-        set_columns(row, {"plant_time_s": plant_time_s, **columns})
+        row.plant_time_s = plant_time_s
+        if stage is not None:
+            row.stage = stage
         append(session, job_id, kind, details, plant_time_s, at)
 
     return write
@@ -538,7 +542,7 @@ def of_host(session: Session, host: str) -> HostRow:
     return row
 
 
-def set_columns(row: JobRow, columns: dict[str, Any]) -> None:
+def set_columns(row: JobRow, columns: JobColumns) -> None:
     for name, value in columns.items():
         setattr(row, name, to_jsonable(value))
 
@@ -549,7 +553,7 @@ def _may_begin(session: Session, row: JobRow) -> None:
         loop_locks.check(session, row.loop)
 
 
-def _move(session: Session, row: JobRow, wanted: JobState, by: str, columns: dict[str, Any]) -> JobRow:
+def _move(session: Session, row: JobRow, wanted: JobState, by: str, columns: JobColumns) -> JobRow:
     previous = row.state
     check(previous, wanted)
     if wanted is JobState.RUNNING:
@@ -565,7 +569,8 @@ def _move(session: Session, row: JobRow, wanted: JobState, by: str, columns: dic
     append(session, row.id, "state", details, row.plant_time_s)
     if wanted in DECISIONS:
         claims.changed(session, f"/jobs/{row.id}")
-        _audit_decision(session, row, previous, wanted, by, (columns.get("restored") or {}).get("gains"))
+        held = None if row.restored is None or "restored" not in columns else row.restored.get("gains")
+        _audit_decision(session, row, previous, wanted, by, held)
     return row
 
 
@@ -599,7 +604,7 @@ def _audit_decision(
 
 
 def append(
-    session: Session, job_id: str, kind: str, data: dict[str, Any], plant_time_s: float, at: str | None = None
+    session: Session, job_id: str, kind: str, data: Mapping[str, object], plant_time_s: float, at: str | None = None
 ) -> None:
     """The next event of a job whose row this transaction has locked."""
     seq = session.scalar(select(func.max(EventRow.seq)).where(EventRow.job_id == job_id)) or 0
