@@ -18,10 +18,13 @@ from loopwright.controller.channel import Channel, Settings
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.rehearsal import RehearsedLoop, _parameters
+from loopwright.service.execution.result import result_of
 from loopwright.service.execution.runner import run
+from loopwright.service.job_states import JobState
 from loopwright.service.jobs.relay_record import relay_record
 from loopwright.service.jsonable import to_jsonable
 from loopwright.service.plots.fast_job import fast_job
+from loopwright.service.results import EvidenceView, GainsView, ModelView, TransferModelView, VerificationView
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.procedure import FastOptions, fast
 from loopwright.tuning.fast.proposal import EvaluationSummary
@@ -119,14 +122,33 @@ def cases() -> dict[str, Case]:
     }  # fmt: skip
 
 
-def rehearsed(reason: str, case: Case) -> dict[str, Any]:
+@dataclass
+class Pictured:
+    """A job as its picture needs it (`service.plots.shown`), with its samples as columns."""
+
+    loop: str
+    state: JobState
+    reason: str | None
+    detail: str | None
+    advice: str | None
+    old_gains: GainsView | None
+    new_gains: GainsView | None
+    evidence: EvidenceView | None
+    model: ModelView | TransferModelView | None
+    samples: dict[str, Any]
+    verification: VerificationView | None = None
+    id: str = ""
+    method: str = "fast"
+
+
+def rehearsed(reason: str, case: Case) -> Pictured:
     """The job, as GET /jobs/{id} would show it, with its samples as columns."""
     plant = Odd(case)
     settings = Settings(mv_low=0.0, mv_high=100.0, safe_output=MIDDLE, pv_low=-1e9, pv_high=1e9, reverse=case.reverse)
     loop = RehearsedLoop(plant, Channel(TS, settings, _parameters(case.gains), SP, int(Mode.AUTOMATIC), MIDDLE), TS)
     stages: list[tuple[float, str]] = []
     samples: list[Sample] = []
-    found: dict[str, Any] | None = None
+    found: EvidenceView | None = None
 
     def hear(event: Event) -> None:
         nonlocal found
@@ -135,7 +157,7 @@ def rehearsed(reason: str, case: Case) -> dict[str, Any]:
             if event.stage == case.of:
                 plant.t = 0.0
         elif isinstance(event, StageDone) and isinstance(event.result, EvaluationSummary):
-            found = to_jsonable(event.result)
+            found = EvidenceView.model_validate(to_jsonable(event.result))
 
     class Heard:
         def __getattr__(self, name: str) -> Any:
@@ -149,27 +171,24 @@ def rehearsed(reason: str, case: Case) -> dict[str, Any]:
     ran = run(fast(facts, FastOptions(**case.options, propose_anyway=True)), Heard(), limits=RunLimits(), on_event=hear)
     names = [next(name for first, name in reversed(stages) if first <= i) for i in range(len(samples))]
     ended = ran.ended
-    return {
-        "loop": case.why,
-        "state": "proposed" if ran.value else "refused",
-        "reason": ended.reason.value if ended else None,
-        "detail": ended.detail if ended else None,
-        "advice": ended.advice if ended else None,
-        "new_gains": to_jsonable(ran.value.gains) if ran.value else None,
-        "old_gains": to_jsonable(case.gains),
-        "evidence": found,
-        "model": to_jsonable(ran.value.model) if ran.value else None,
-        "verification": None,
-        "samples": {
-            "stage": names,
-            **{key: [getattr(s, name) for s in samples]
-               for key, name in (("t_s", "t"), ("sp", "sp"), ("pv", "pv"), ("mv", "mv"), ("mode", "mode"))},
-        },
-    }  # fmt: skip
+    columns = {"t_s": "t", "sp": "sp", "pv": "pv", "mv": "mv", "mode": "mode"}
+    result = None if ran.value is None else result_of(ran.value)
+    return Pictured(
+        loop=case.why,
+        state=JobState.PROPOSED if ran.value else JobState.REFUSED,
+        reason=ended.reason.value if ended else None,
+        detail=ended.detail if ended else None,
+        advice=ended.advice if ended else None,
+        old_gains=GainsView.of(case.gains),
+        new_gains=None if result is None else result.new_gains,
+        evidence=found,
+        model=None if result is None else result.model,
+        samples={"stage": names, **{key: [getattr(s, name) for s in samples] for key, name in columns.items()}},
+    )
 
 
-def draw(folder: Path, reason: str, job: dict[str, Any]) -> Path:
-    record = relay_record(job["samples"])
+def draw(folder: Path, reason: str, job: Pictured) -> Path:
+    record = relay_record(job.samples)
     assert record is not None
     path = folder / f"{reason.replace('_', '-')}.png"
     fast_job(path, job, record, "degC")
@@ -190,9 +209,7 @@ def main() -> None:
             continue
         job = rehearsed(reason, case)
         path = draw(folder, reason, job)
-        print(
-            f"{reason}: {job['state']} {job['reason']}: {job['detail']} ({path.stat().st_size // 1000} kB)", flush=True
-        )
+        print(f"{reason}: {job.state} {job.reason}: {job.detail} ({path.stat().st_size // 1000} kB)", flush=True)
 
 
 if __name__ == "__main__":

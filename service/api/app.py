@@ -30,14 +30,14 @@ from loopwright.service.api.job_views import (
 from loopwright.service.api.paging import LARGEST
 from loopwright.service.api.samples import Reading, csv_text, json_text, parts, takes_gzip
 from loopwright.service.execution.computing.pool import Pool
-from loopwright.service.job_states import ACTIVE, JobState
+from loopwright.service.job_states import ACTIVE
 from loopwright.service.jobs.fleet import Fleet
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.loops.shared_reading import SharedReading
 from loopwright.service.request import FastRetune, RetuneRequest
 from loopwright.service.security.principal import current
 from loopwright.service.store.idempotency import IdempotencyKeys
-from loopwright.service.store.tables import JobRow
+from loopwright.service.store.jobs import Job
 from loopwright.service.telemetry.lateness import watched_event_loop
 from loopwright.tuning.reasons import Ended
 
@@ -92,11 +92,11 @@ def create_app(
     checks = operations.checks(jobs) if checks is None else checks
     operations.install(app, jobs, checks, {} if sdo_retries is None else sdo_retries)
 
-    def views(rows: Sequence[JobRow]) -> list[JobView]:
+    def views(rows: Sequence[Job]) -> list[JobView]:
         events = jobs.store.events_by_job([row.id for row in rows], limit=MAX_EVENTS)
         return [job_view(row, events[row.id], jobs.running(row.id)) for row in rows]
 
-    def view(row: JobRow) -> JobView:
+    def view(row: Job) -> JobView:
         return views([row])[0]
 
     fleet.install(app, jobs, many, views)
@@ -170,7 +170,7 @@ def create_app(
         ] = 0,
     ) -> Response:
         row = jobs.store.get(job_id)
-        over = JobState(row.state) not in ACTIVE
+        over = row.state not in ACTIVE
         if over and last_event_id and not jobs.store.events(job_id, last_event_id, limit=1):
             return Response(status_code=204)
         stream = event_stream(jobs, job_id, last_event_id, still_permitted(keyring, current.get().key_id))

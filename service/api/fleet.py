@@ -17,8 +17,9 @@ from loopwright.service.api.paging import LINK, Cursor, Limit, more
 from loopwright.service.job_states import JobState
 from loopwright.service.jobs.fleet import BadFleet, Fleet, FleetRequest
 from loopwright.service.jobs.manager import Jobs
+from loopwright.service.store.jobs import Job
 from loopwright.service.store.retunes import NoSuchRetune, Part, RetuneOver, RetuneState, StopReason
-from loopwright.service.store.tables import JobRow, RetuneRow
+from loopwright.service.store.tables import RetuneRow
 from loopwright.tuning.reasons import Reason
 
 RetuneId = Annotated[str, Path(description="Id of the retune", examples=["9d1b7c02aa45"])]
@@ -63,7 +64,7 @@ class RetuneView(RetuneSummary):
     loops: list[RetuneLoopView] = Field(description="In the order in which they are begun")
 
 
-def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[JobRow]], list[JobView]]) -> None:
+def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Job]], list[JobView]]) -> None:
     """Adds the routes. views: jobs as the API shows them."""
     router = APIRouter(route_class=JsonRoute)
 

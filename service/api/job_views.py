@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, Field
 
 from loopwright.service.config import Limits, LoopConfig
 from loopwright.service.job_states import ACTIVE, JobState, shown
-from loopwright.service.jobs.active_job import Running
-from loopwright.service.jobs.aftercare import NotHome
 from loopwright.service.loop_state import LoopState, gains_of
 from loopwright.service.results import (
     ComparisonView,
@@ -27,9 +25,14 @@ from loopwright.service.results import (
     VerificationView,
     empty_result,
 )
-from loopwright.service.store.tables import EventRow, JobRow, LoopLockRow
 from loopwright.tuning.five_stage.procedure import PROCEDURE
-from loopwright.tuning.reasons import ADVICE, Reason
+from loopwright.tuning.reasons import ADVICE
+
+if TYPE_CHECKING:  # the command line reads views, and has no store
+    from loopwright.service.jobs.active_job import Running
+    from loopwright.service.jobs.aftercare import NotHome
+    from loopwright.service.store.jobs import Job, JobEvent
+    from loopwright.service.store.tables import LoopLockRow
 
 
 class LockView(BaseModel):
@@ -227,7 +230,7 @@ def live_view(state: LoopState) -> LiveView:
     )
 
 
-def job_view(row: JobRow, events: Sequence[EventRow], running: Running | None) -> JobView:
+def job_view(row: Job, events: Sequence[JobEvent], running: Running | None) -> JobView:
     """The job from the store, and from its live part while it runs."""
     state = shown(row.state, row.dry_run)
     method = row.request.get("method", PROCEDURE)
@@ -268,13 +271,13 @@ def job_view(row: JobRow, events: Sequence[EventRow], running: Running | None) -
         notes=[e.data["text"] for e in events if e.kind == "note"] + result.notes,
         reason=row.reason,
         detail=row.detail,
-        advice=ADVICE[Reason(row.reason)] if row.reason else None,
+        advice=ADVICE[row.reason] if row.reason else None,
         restored=row.restored,
     )
 
 
 def _progress(
-    state: JobState, row: JobRow, events: Sequence[EventRow], running: Running | None
+    state: JobState, row: Job, events: Sequence[JobEvent], running: Running | None
 ) -> tuple[float, float | None, float]:
     """Fraction, remaining and present plant time; of a job on another host as of its last stage."""
     if running is not None:
@@ -290,7 +293,7 @@ def _progress(
     return (min(0.99, row.plant_time_s / total) if total > 0 else 0.0), remaining, row.plant_time_s
 
 
-def _stages(events: Sequence[EventRow], row: JobRow) -> list[StageView]:
+def _stages(events: Sequence[JobEvent], row: Job) -> list[StageView]:
     over = row.ended_at is not None
     times = row.stage_times_s or {}
     stages: dict[str, StageView] = {}
@@ -305,7 +308,7 @@ def _stages(events: Sequence[EventRow], row: JobRow) -> list[StageView]:
     return list(stages.values())
 
 
-def _evidence(result: FastResult | FiveStageResult, events: Sequence[EventRow]) -> EvidenceView | None:
+def _evidence(result: FastResult | FiveStageResult, events: Sequence[JobEvent]) -> EvidenceView | None:
     """Of a refused job, which has none in its result, as its stages came to it."""
     if isinstance(result, FastResult) and result.evidence is not None:
         return result.evidence
@@ -313,14 +316,14 @@ def _evidence(result: FastResult | FiveStageResult, events: Sequence[EventRow]) 
     return None if told is None else EvidenceView.model_validate(told)
 
 
-def _verification(result: FastResult | FiveStageResult, events: Sequence[EventRow]) -> VerificationView | None:
+def _verification(result: FastResult | FiveStageResult, events: Sequence[JobEvent]) -> VerificationView | None:
     if isinstance(result, FastResult) and result.verification is not None:
         return result.verification
     told = _told(events, ("verify",), "tested")
     return None if told is None else VerificationView.of_stage(told)
 
 
-def _told(events: Sequence[EventRow], stages: Sequence[str], sign: str) -> dict[str, Any] | None:
+def _told(events: Sequence[JobEvent], stages: Sequence[str], sign: str) -> dict[str, Any] | None:
     """The last result of the first of these stages that has one; `sign` is a field that others' results lack."""
     for stage in stages:
         for event in reversed(events):

@@ -15,7 +15,7 @@ from loopwright.service.planning.obstacles import Now
 from loopwright.service.planning.preview import FleetPreview, LastProposal, Preview, fleet_preview, preview
 from loopwright.service.request import FastRetune, RetuneRequest
 from loopwright.service.store import loop_locks
-from loopwright.service.store.tables import JobRow
+from loopwright.service.store.jobs import Job
 from loopwright.tuning.reasons import Ended
 
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
@@ -77,7 +77,7 @@ def _locked(jobs: Jobs) -> dict[str, str]:
     return {tag: loop_locks.words(row) for tag, row in jobs.locking.locks().items()}
 
 
-def _last(row: JobRow | None) -> LastProposal | None:
+def _last(row: Job | None) -> LastProposal | None:
     if row is None or row.result is None:
         return None
     return LastProposal.of(row.id, row.ended_at, row.plant_time_s, row.result)

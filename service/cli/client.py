@@ -37,9 +37,9 @@ class Client:
     def get(self, path: str, **query: Any) -> Any:
         return self._json("GET", path, params={k: v for k, v in query.items() if v is not None})
 
-    def samples_of(self, job: dict[str, Any]) -> Callable[[str | None], dict[str, Any]]:
+    def samples_of(self, job_url: str) -> Callable[[str | None], dict[str, Any]]:
         """Asks for the columns of the samples of a job, of one stage or (None) of all."""
-        return lambda stage: self.get(f"{job['url']}/samples", stage=stage)
+        return lambda stage: self.get(f"{job_url}/samples", stage=stage)
 
     def pages(self, path: str) -> list[Any]:
         """The whole of a list that comes in pages."""

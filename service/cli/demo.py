@@ -11,9 +11,11 @@ from typing import Any
 
 import yaml
 
+from loopwright.service.api.job_views import JobView
 from loopwright.service.cli import job_tables
 from loopwright.service.cli.child_process import ChildProcess, NotReady
 from loopwright.service.cli.client import ApiError, Client
+from loopwright.service.job_states import JobState
 from loopwright.service.plots.job import NoPicture, job_picture
 
 TAG = "TIC-101"
@@ -71,12 +73,12 @@ def run_demo(folder: Path | None, speed: str, hub_only: bool) -> None:
             client = _start(stack, kept, speed, hub_only)
             job, seconds = _retune(client)
             picture = kept / "before-after.png"
-            job_picture(picture, client.samples_of(job), job, PV_UNIT)
+            job_picture(picture, client.samples_of(job.url), job, PV_UNIT)
         except (NotReady, ApiError, NoPicture) as error:
             raise DemoFailed(f"{error}\n(logs are in {kept})") from error
     _tell(job, seconds, kept, picture)
-    if job["state"] != "proposed":
-        raise DemoFailed(f"the job ended as {job['state']}, not as a proposal")
+    if job.state is not JobState.PROPOSED:
+        raise DemoFailed(f"the job ended as {job.state}, not as a proposal")
 
 
 def _start(stack: ExitStack, folder: Path, speed: str, hub_only: bool) -> Client:
@@ -106,17 +108,17 @@ def _start(stack: ExitStack, folder: Path, speed: str, hub_only: bool) -> Client
     return Client(url)
 
 
-def _retune(client: Client) -> tuple[dict[str, Any], float]:
+def _retune(client: Client) -> tuple[JobView, float]:
     job_tables.console.print(f"POST       {client.url}/loops/{TAG}/retune", highlight=False)
     started = time.monotonic()
-    job = client.post(f"/loops/{TAG}/retune", {"requested_by": "demo"})
-    job = job_tables.follow(client, job["url"])
+    begun = client.post(f"/loops/{TAG}/retune", {"requested_by": "demo"})
+    job = job_tables.follow(client, begun["url"])
     return job, time.monotonic() - started
 
 
-def _tell(job: dict[str, Any], seconds: float, folder: Path, picture: Path) -> None:
+def _tell(job: JobView, seconds: float, folder: Path, picture: Path) -> None:
     job_tables.job_report(job, PV_UNIT)
-    plant_s = job["plant_time_s"]
+    plant_s = job.plant_time_s
     lines = [
         f"{plant_s:.0f} s of plant time in {seconds:.1f} s of wall time: {plant_s / seconds:.0f} times as fast",
         f"picture          {picture}",

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+from pydantic import BaseModel
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from loopwright.service.api.job_views import JobView, LockView, LoopDetail
 from loopwright.service.cli.client import Client
-from loopwright.service.results import ComparisonView
+from loopwright.service.job_states import JobState
+from loopwright.service.results import ModelView, TransferModelView
 
 console = Console()
 _MARGINS = (("GM", "GM", ""), ("PM", "PM_deg", "deg"), ("Ms", "Ms", ""))
@@ -23,7 +26,7 @@ _PREDICTED = (
 """Of a job of an earlier version, which has no comparison."""
 
 
-def follow(client: Client, job_url: str) -> dict[str, Any]:
+def follow(client: Client, job_url: str) -> JobView:
     """Shows a job live until it is over; returns it."""
     columns = (
         TextColumn("{task.description:<11}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[left]}"),
@@ -43,8 +46,8 @@ def follow(client: Client, job_url: str) -> dict[str, Any]:
                 bars.console.print(f"  note: {data['text']}")
             elif kind == "state":
                 bars.update(task, description=data["state"], left="")
-        job: dict[str, Any] = client.get(job_url)
-        bars.update(task, completed=job["progress"])
+        job = JobView.model_validate(client.get(job_url))
+        bars.update(task, completed=job.progress)
     return job
 
 
@@ -65,60 +68,62 @@ def number(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def job_report(job: dict[str, Any], pv_unit: str = "PV unit") -> None:
+def job_report(job: JobView, pv_unit: str = "PV unit") -> None:
     """Everything a decision needs, as a table."""
     table = Table(title=title(job), show_header=True)
-    of_new = {"no_gain": "designed", "rehearsed": "rehearsed"}.get(job["state"], "after")
+    of_new = {JobState.NO_GAIN: "designed", JobState.REHEARSED: "rehearsed"}.get(job.state, "after")
     for heading in ("", "before", of_new, "unit"):
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
-    old, new = job["old_gains"] or {}, job["new_gains"] or {}
     per = f"% per {pv_unit}"
     for name, unit in (("Kp", f"{per} (ISA)"), ("Ti", "s"), ("Td", "s")):
-        table.add_row(f"gain {name}", cell(old.get(name)), cell(new.get(name)), unit)
-    before, after = job["before"] or {}, job["after"] or {}
-    if before or after:
+        table.add_row(f"gain {name}", figure(job.old_gains, name), figure(job.new_gains, name), unit)
+    if job.before or job.after:
         for label, name, unit in (
             ("measured IAE", "IAE", f"{pv_unit} s"),
             ("measured overshoot", "overshoot_pct", "%"),
             ("measured settling", "settling_s", "s"),
         ):
-            table.add_row(label, cell(before.get(name)), cell(after.get(name)), unit)
+            table.add_row(label, figure(job.before, name), figure(job.after, name), unit)
     for label, was, now, unit in _predicted(job, pv_unit):
         table.add_row(f"predicted {label}", was, now, unit)
-    for label, value, unit in (*_model(job["model"], pv_unit), *_certainty(job)):
+    for label, value, unit in (*_model(job.model, pv_unit), *_certainty(job)):
         table.add_row(label, "", value, unit)
-    ultimate = job["ultimate"] or {}
-    table.add_row("ultimate Ku, Pu", "", ", ".join(cell(ultimate.get(n)) for n in ("Ku", "Pu_s")), f"{per}, s")
-    table.add_row("plant time", "", cell(job["plant_time_s"]), "s")
+    table.add_row("ultimate Ku, Pu", "", ", ".join(figure(job.ultimate, n) for n in ("Ku", "Pu_s")), f"{per}, s")
+    table.add_row("plant time", "", cell(job.plant_time_s), "s")
     console.print(table)
-    if job["reason"]:
-        console.print(f"[bold]{job['reason']}[/bold]: {job['detail']}\n{job['advice']}", highlight=False)
-    elif job["comparison"]:
-        console.print(job["comparison"]["verdict"], markup=False, highlight=False)
-    if on := job["rehearsed_on"]:
-        text = f"Rehearsed on {on['plant_text']}; {on['gains_text']}. Nothing was tested on the loop."
+    if job.reason:
+        console.print(f"[bold]{job.reason}[/bold]: {job.detail}\n{job.advice}", highlight=False)
+    elif job.comparison:
+        console.print(job.comparison.verdict, markup=False, highlight=False)
+    if on := job.rehearsed_on:
+        text = f"Rehearsed on {on.plant_text}; {on.gains_text}. Nothing was tested on the loop."
         console.print(text, markup=False, highlight=False)
 
 
-def title(job: dict[str, Any]) -> str:
+def figure(part: BaseModel | None, name: str) -> str:
+    """One figure of a part of a result, where there is such a part."""
+    return cell(None if part is None else getattr(part, name))
+
+
+def title(job: JobView) -> str:
     """What has become of the job, so that a rehearsal and a loop that stays as it is are not taken for a proposal."""
-    what = f"job {job['id']}: {job['loop']} {job['state']}"
-    if job["state"] == "no_gain":
+    what = f"job {job.id}: {job.loop} {job.state}"
+    if job.state is JobState.NO_GAIN:
         return f"{what}: tuned as well as asked already, the present gains are kept"
-    if job["dry_run"] and (on := job["rehearsed_on"]):
-        done = f"job {job['id']}: {job['loop']} rehearsed"
-        return f"{done if job['state'] == 'rehearsed' else what} on {on['plant_text']}, nothing was tested"
-    return f"{what}, nothing was tested" if job["dry_run"] else what
+    if job.dry_run and (on := job.rehearsed_on):
+        done = f"job {job.id}: {job.loop} rehearsed"
+        return f"{done if job.state is JobState.REHEARSED else what} on {on.plant_text}, nothing was tested"
+    return f"{what}, nothing was tested" if job.dry_run else what
 
 
-def _predicted(job: dict[str, Any], pv_unit: str) -> Iterator[tuple[str, str, str, str]]:
+def _predicted(job: JobView, pv_unit: str) -> Iterator[tuple[str, str, str, str]]:
     """Lines of the table: label, before, after, unit."""
-    if job["comparison"] is None:
-        predicted, earlier = job["predicted"] or {}, job["predicted_before"] or {}
-        for label, name, unit in _PREDICTED if earlier or not job["after"] else _MARGINS:
-            yield label, cell(earlier[name]) if earlier else "", cell(predicted.get(name)), unit
+    compared = job.comparison
+    if compared is None:
+        earlier = job.predicted_before
+        for label, name, unit in _PREDICTED if earlier or not job.after else _MARGINS:
+            yield label, "" if earlier is None else figure(earlier, name), figure(job.predicted, name), unit
         return
-    compared = ComparisonView.model_validate(job["comparison"])
     for label, part, name, unit in (
         ("overshoot", None, "overshoot_pct", "%"),
         ("settling, set-point", "setpoint", "settling_s", "s"),
@@ -138,18 +143,18 @@ def _predicted(job: dict[str, Any], pv_unit: str) -> Iterator[tuple[str, str, st
     yield "J, what is made small", cell(compared.J_before), cell(compared.J_after), ""
 
 
-def _model(model: dict[str, Any] | None, pv_unit: str) -> Iterator[tuple[str, str, str]]:
+def _model(model: ModelView | TransferModelView | None, pv_unit: str) -> Iterator[tuple[str, str, str]]:
     """Lines of the table: label, value, unit."""
-    if model is None or "num" not in model:
-        known = model or {}
-        yield "model K, T, L", ", ".join(cell(known.get(n)) for n in ("K", "T_s", "L_s")), f"{pv_unit} per %, s, s"
+    if not isinstance(model, TransferModelView):
+        yield "model K, T, L", ", ".join(figure(model, n) for n in ("K", "T_s", "L_s")), f"{pv_unit} per %, s, s"
         return
-    for label, name, error, unit in (
-        ("model num", "num", "num_errors", f"{pv_unit} per %"),
-        ("model den", "den", "den_errors", ""),
+    for label, values, errors, unit in (
+        ("model num", model.num, model.num_errors, f"{pv_unit} per %"),
+        ("model den", model.den, model.den_errors, ""),
     ):
-        yield label, " ".join(map(_with_error, model[name], model[error] or [None] * len(model[name]))), unit
-    yield "model dead time", _with_error(model["dead_time_s"], model["dead_time_error_s"]), "s"
+        known = errors or [0.0] * len(values)
+        yield label, " ".join(map(_with_error, values, known)), unit
+    yield "model dead time", _with_error(model.dead_time_s, model.dead_time_error_s), "s"
 
 
 def _with_error(value: float, error: float | None) -> str:
@@ -157,44 +162,47 @@ def _with_error(value: float, error: float | None) -> str:
     return cell(value) if not error or error < 1e-4 * abs(value) else f"{cell(value)}±{error:.1g}"
 
 
-def _certainty(job: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+def _certainty(job: JobView) -> Iterator[tuple[str, str, str]]:
     """What the record of fast says of itself."""
-    found, step = job["evidence"], job["verification"]
+    found, step = job.evidence, job.verification
     if found is not None:
-        yield "Ms uncertain by", cell(found["uncertainty"]), "(2 std. dev.)"
-        yield "on rival models by", cell(found["ambiguity"]), ""
-        for load in found["loads"]:
-            yield "load step found", f"{load['size']:+.4g} at {load['t_s']:.4g}", "%, s into the relay"
+        yield "Ms uncertain by", cell(found.uncertainty), "(2 std. dev.)"
+        yield "on rival models by", cell(found.ambiguity), ""
+        for load in found.loads:
+            yield "load step found", f"{load.size:+.4g} at {load.t_s:.4g}", "%, s into the relay"
     if step is not None:
-        yield "measured step explained", f"{step['fit_pct']:.1f}", "%"
+        yield "measured step explained", f"{step.fit_pct:.1f}", "%"
 
 
-def loop_report(loop: dict[str, Any]) -> None:
+def loop_report(loop: LoopDetail) -> None:
     """A loop as it is now."""
-    live = loop["live"] or {}
-    unit, gains = loop["pv_unit"], live.get("gains") or {}
-    job, last = loop["active_job"], loop["last_job_state"]
-    table = Table("", "now", "unit", title=f"loop {loop['tag']}: {loop['description']}")
+    live, unit = loop.live, loop.pv_unit
+    gains = None if live is None else live.gains
+    job, last = loop.active_job, loop.last_job_state
+    table = Table("", "now", "unit", title=f"loop {loop.tag}: {loop.description}")
     for label, value, of in (
-        ("SP", live.get("sp"), unit),
-        ("PV", live.get("pv"), unit),
-        ("MV", live.get("mv"), "%"),
-        ("mode", live.get("mode"), ""),
-        *((f"gain {name}", gains.get(name), of) for name, of in (("Kp", f"% per {unit}"), ("Ti", "s"), ("Td", "s"))),
-        ("nodes", live.get("node_state"), ""),
-        ("host", loop["host"], ""),
-        ("job", job or (last and f"none; the last one: {last}"), ""),
-        ("locked", lock(loop["locked"]), ""),
+        ("SP", figure(live, "sp"), unit),
+        ("PV", figure(live, "pv"), unit),
+        ("MV", figure(live, "mv"), "%"),
+        ("mode", figure(live, "mode"), ""),
+        *(
+            (f"gain {name}", figure(gains, name), of)
+            for name, of in (("Kp", f"% per {unit}"), ("Ti", "s"), ("Td", "s"))
+        ),
+        ("nodes", figure(live, "node_state"), ""),
+        ("host", loop.host, ""),
+        ("job", cell(job or (last and f"none; the last one: {last}")), ""),
+        ("locked", cell(lock(loop.locked)), ""),
     ):
-        table.add_row(label, cell(value), of)
+        table.add_row(label, value, of)
     console.print(table)
-    if loop["not_confirmed_home"]:
-        console.print(loop["not_confirmed_home"]["advice"], highlight=False)
+    if loop.not_confirmed_home:
+        console.print(loop.not_confirmed_home.advice, highlight=False)
 
 
-def lock(locked: dict[str, Any] | None) -> str | None:
+def lock(locked: LockView | None) -> str | None:
     """Who keeps tests from a loop, and why."""
-    return None if locked is None else f"by {locked['by']}: {locked['reason']}"
+    return None if locked is None else f"by {locked.by}: {locked.reason}"
 
 
 def cell(value: object) -> str:

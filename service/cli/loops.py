@@ -18,13 +18,14 @@ Tag = Annotated[str, typer.Argument(help="Tag of the loop.")]
 @app.command("loop")
 def one_loop(tag: Tag, url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
     """A loop and its present state."""
+    from loopwright.service.api.job_views import LoopDetail
     from loopwright.service.cli import job_tables
 
     found = Client(url).get(f"/loops/{quote(tag, safe='')}")
     if as_json:
         print_json(found)
     else:
-        job_tables.loop_report(found)
+        job_tables.loop_report(LoopDetail.model_validate(found))
 
 
 @app.command()

@@ -188,17 +188,19 @@ def serve(
 @app.command("loops")
 def list_loops(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
     """The configured loops."""
+    from loopwright.service.api.job_views import LoopView
     from loopwright.service.cli import job_tables
 
     found = Client(url).pages("/loops")
     if as_json:
         print_json(found)
         return
+    loops = [LoopView.model_validate(each) for each in found]
     shown = ("tag", "description", "bus", "controller_node", "pv_unit", "t95_s", "active_job")
     job_tables.rows(
         "loops",
         ("tag", "description", "bus", "node", "unit", "T95 s", "job", "locked"),
-        ((*(x[name] for name in shown), job_tables.lock(x["locked"])) for x in found),
+        ((*(getattr(each, name) for name in shown), job_tables.lock(each.locked)) for each in loops),
     )
 
 
@@ -255,32 +257,35 @@ def _previewed(client: Client, path: str, body: dict[str, Any], *, alone: bool =
     from rich.console import Console
 
     from loopwright.service.cli import preview_tables
+    from loopwright.service.planning.preview import FleetPreview, Preview
 
-    found = client.post(f"{path}/preview", body)
-    able = found["would_start"] == found.get("count", True)
+    told = client.post(f"{path}/preview", body)
+    found = FleetPreview.model_validate(told) if "count" in told else Preview.model_validate(told)
     if as_json:
-        print_json(found)
+        print_json(told)
     else:
-        (preview_tables.many if "count" in found else preview_tables.one)(found, Console(stderr=not alone))
-    return bool(able)
+        preview_tables.show(found, Console(stderr=not alone))
+    return found.would_start == (found.count if isinstance(found, FleetPreview) else True)
 
 
-def _one(client: Client, job: dict[str, Any], wait: bool, as_json: bool) -> int:
+def _one(client: Client, started: dict[str, Any], wait: bool, as_json: bool) -> int:
     """Follows a job; the exit status."""
+    from loopwright.service.api.job_views import JobView
     from loopwright.service.cli import job_tables
     from loopwright.service.job_states import GOOD
 
+    job = JobView.model_validate(started)
     if wait and as_json:
-        for _ in client.events(job["url"]):
+        for _ in client.events(job.url):
             pass
-        job = client.get(job["url"])
+        job = JobView.model_validate(client.get(job.url))
     elif wait:
-        job = job_tables.follow(client, job["url"])
+        job = job_tables.follow(client, job.url)
     if as_json:
-        print_json(job)
+        print_json(job.model_dump(mode="json"))
     else:
         job_tables.job_report(job)
-    return 3 if wait and job["state"] not in GOOD else 0
+    return 3 if wait and job.state not in GOOD else 0
 
 
 def _many(client: Client, started: dict[str, Any], wait: bool, as_json: bool) -> int:
@@ -339,6 +344,7 @@ def one_job(
     as_json: AsJson = False,
 ) -> None:
     """A job; or a decision about it."""
+    from loopwright.service.api.job_views import JobView
     from loopwright.service.cli import job_tables
 
     client = Client(url)
@@ -346,22 +352,22 @@ def one_job(
     wishes = [name for name, wanted in (("abort", abort), ("accept", accept), ("rollback", rollback)) if wanted]
     if len(wishes) > 1:
         die("one decision at a time", 2)
-    job = client.post(f"{path}/{wishes[0]}", {"by": "cli"}) if wishes else client.get(path)
+    job = JobView.model_validate(client.post(f"{path}/{wishes[0]}", {"by": "cli"}) if wishes else client.get(path))
     if follow:
         job = job_tables.follow(client, path)
     if plot is not None:
         from loopwright.service.plots.job import NoPicture, job_picture
 
         tuning.check_plot(plot)
-        unit = client.get(f"/loops/{job['loop']}")["pv_unit"]
+        unit = client.get(f"/loops/{job.loop}")["pv_unit"]
         try:
-            job_picture(plot, client.samples_of(job), job, unit)
+            job_picture(plot, client.samples_of(job.url), job, unit)
         except NoPicture as error:
             die(str(error), 1)
         except OSError as error:
             die(f"{plot}: {error.strerror}", 2)
     if as_json:
-        print_json(job)
+        print_json(job.model_dump(mode="json"))
     else:
         job_tables.job_report(job)
 

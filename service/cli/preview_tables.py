@@ -2,47 +2,47 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from rich.console import Console
 from rich.table import Table
 
 from loopwright.service.cli.job_tables import number
-from loopwright.service.planning.preview import duration_text
+from loopwright.service.planning.preview import FleetPreview, Preview, duration_text
 
 
-def one(found: dict[str, Any], console: Console) -> None:
-    """The preview of one loop: sentences, a table of its stages, and what stands in the way."""
-    for line in found["summary"]:
+def show(found: Preview | FleetPreview, console: Console) -> None:
+    """The preview of one loop or of many, and what stands in the way of each."""
+    for line in found.summary:
         console.print(line, highlight=False)
-    moving = [each for each in found["stages"] if each["mv_move_pct"] or each["sp_move"]]
-    if moving:
-        table = Table("stage", "MV %", "SP", "plant time", "what is moved")
-        for each in moving:
-            table.add_row(
-                each["stage"],
-                _range(each["mv_low_pct"], each["mv_high_pct"], each["mv_move_pct"]),
-                _range(each["sp_low"], each["sp_high"], each["sp_move"]),
-                duration_text(each["duration_low_s"], each["duration_high_s"]),
-                each["what"],
-            )
-        console.print(table)
+    if isinstance(found, FleetPreview):
+        for each in found.loops:
+            _obstacles(each, console)
+        return
+    _stages(found, console)
     _obstacles(found, console)
 
 
-def many(found: dict[str, Any], console: Console) -> None:
-    """The preview of a retune of many loops, and what stands in the way of each."""
-    for line in found["summary"]:
-        console.print(line, highlight=False)
-    for each in found["loops"]:
-        _obstacles(each, console)
+def _stages(found: Preview, console: Console) -> None:
+    """A table of the stages that move something."""
+    moving = [each for each in found.stages if each.mv_move_pct or each.sp_move]
+    if not moving:
+        return
+    table = Table("stage", "MV %", "SP", "plant time", "what is moved")
+    for each in moving:
+        table.add_row(
+            each.stage,
+            _range(each.mv_low_pct, each.mv_high_pct, each.mv_move_pct),
+            _range(each.sp_low, each.sp_high, each.sp_move),
+            duration_text(each.duration_low_s, each.duration_high_s),
+            each.what,
+        )
+    console.print(table)
 
 
-def _obstacles(found: dict[str, Any], console: Console) -> None:
-    if found["obstacles"]:
-        console.print(f"[bold]{found['loop']} would be refused now[/bold]:", highlight=False)
-    for each in found["obstacles"]:
-        console.print(f"  {each['reason']}: {each['detail']}\n    {each['advice']}", highlight=False, markup=False)
+def _obstacles(found: Preview, console: Console) -> None:
+    if found.obstacles:
+        console.print(f"[bold]{found.loop} would be refused now[/bold]:", highlight=False)
+    for each in found.obstacles:
+        console.print(f"  {each.reason}: {each.detail}\n    {each.advice}", highlight=False, markup=False)
 
 
 def _range(low: float | None, high: float | None, move: float) -> str:

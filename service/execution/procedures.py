@@ -14,7 +14,7 @@ from loopwright.service.planning.ground import Ground, rehearsal_spec
 from loopwright.service.planning.moves import broken_limits
 from loopwright.service.request import FastRetune, RetuneRequest
 from loopwright.service.results import Result, empty_result
-from loopwright.service.store.tables import EventRow
+from loopwright.service.store.jobs import JobEvent
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.settle import after_settling
 from loopwright.tuning.models import Model
@@ -43,7 +43,7 @@ class Hooks:
     on_event: Callable[[Event], None]
     on_samples: Callable[[list[Sample]], None]
     stop: Callable[[], Reason | None]
-    earlier: Sequence[EventRow] = ()
+    earlier: Sequence[JobEvent] = ()
     note_session: Callable[[int], None] = lambda session: None
     on_home: Callable[[LoopState], None] = lambda home: None
     ground: Ground = field(default_factory=Ground)
@@ -126,7 +126,7 @@ def tune(
     return Outcome(None if ran.value is None else result_of(ran.value), ended, ran.restored, dict(ran.plant_time_s))
 
 
-def plan(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow] = ()) -> Plan[Any]:
+def plan(request: RetuneRequest, facts: Facts, earlier: Sequence[JobEvent] = ()) -> Plan[Any]:
     """Returns the plan of the requested procedure.
 
     earlier: events of interrupted attempts, after which the loop gets time to come to rest. The record of an
@@ -136,7 +136,7 @@ def plan(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow] = ())
     return after_settling(facts, procedure) if earlier else procedure
 
 
-def _procedure(request: RetuneRequest, facts: Facts, earlier: Sequence[EventRow]) -> Plan[Any]:
+def _procedure(request: RetuneRequest, facts: Facts, earlier: Sequence[JobEvent]) -> Plan[Any]:
     if isinstance(request, FastRetune):
         from loopwright.tuning.fast.design_trial import trial
         from loopwright.tuning.fast.procedure import fast

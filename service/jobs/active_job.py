@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
 
 from loopwright.service.jobs.journal import Journal
 from loopwright.service.jobs.progress import Progress
@@ -58,7 +57,7 @@ class Running:
         if isinstance(event, StageStarted):
             self.progress.stage_started(event)
             self._boundaries.append((self._last_t, event.stage))
-            data: dict[str, Any] = {
+            data: dict[str, object] = {
                 "stage": event.stage, "expected_s": event.expected_s, "remaining_s": event.remaining_s,
             }  # fmt: skip
             self.tell("stage_started", data, stage=event.stage)
@@ -100,6 +99,6 @@ class Running:
             self._last_t = t
             self.progress.at(t)
 
-    def tell(self, kind: str, data: dict[str, Any], **columns: Any) -> None:
-        """Stores an event of the job, and columns of its row, through the journal."""
-        self._journal.put(event_of(self.job_id, kind, data, self.progress.plant_time_s, **columns))
+    def tell(self, kind: str, data: Mapping[str, object], stage: str | None = None) -> None:
+        """Stores an event of the job, and its stage where it is given, through the journal."""
+        self._journal.put(event_of(self.job_id, kind, data, self.progress.plant_time_s, stage))

@@ -16,8 +16,8 @@ from loopwright.service.jobs.machine import Machine
 from loopwright.service.loop_state import state_json
 from loopwright.service.loops.restoration import Restoration, restore_loop_of
 from loopwright.service.store import looked_after
+from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Busy, Store
-from loopwright.service.store.tables import JobRow
 from loopwright.service.telemetry.logs import about
 from loopwright.tuning.reasons import ADVICE, Reason
 
@@ -108,11 +108,11 @@ class Aftercare:
             by_loop.setdefault(row.loop, self._not_home(row))
         return list(by_loop.values())
 
-    def _not_home(self, row: JobRow) -> NotHome:
+    def _not_home(self, row: Job) -> NotHome:
         again = self._again.get(row.id)
         if again is not None:
             return NotHome(row.loop, row.id, again.restoration.reason, again.restoration.text)
-        reason = Reason(row.reason) if row.reason else None
+        reason = row.reason
         return NotHome(row.loop, row.id, reason, row.detail or "it was not read back")
 
     def dismiss(self, tag: str, by: str) -> list[str]:
@@ -139,14 +139,14 @@ class Aftercare:
             return
         self._machine.side_by_side(self._one, due, _AT_ONCE)
 
-    def _one(self, row: JobRow) -> None:
+    def _one(self, row: Job) -> None:
         with about(job=row.id, loop=row.loop):
             try:
                 self._look_at(row)
             except Exception:  # one loop must not keep the others from being read
                 log.exception("defect in the supervision of loop %s", row.loop)
 
-    def _look_at(self, row: JobRow) -> None:
+    def _look_at(self, row: Job) -> None:
         with self._directory.alone_with(row.loop):
             # A running job answers for its loop: this row may have been read before that job began.
             if self._stopping or self._store.active(row.loop) is not None:
@@ -157,7 +157,7 @@ class Aftercare:
         elif looked_after.home_again(self._store, row.id, state_json(restoration.state), restoration.text):
             log.info("the loop is not supervised any more: %s", restoration.text)
 
-    def _not_yet(self, row: JobRow, restoration: Restoration) -> None:
+    def _not_yet(self, row: Job, restoration: Restoration) -> None:
         before = self._again.get(row.id)
         wait_s = EVERY_S if before is None else min(LONGEST_S, 2.0 * before.wait_s)
         if before is None or before.restoration.reason is not restoration.reason:

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from typing import Any
 
 from loopwright.service.errors import Conflict
-from loopwright.service.job_states import ACTIVE, JobState
+from loopwright.service.job_states import ACTIVE
 from loopwright.service.jobs.relay_record import RelayRecord
 from loopwright.service.model_json import dump_model, parse_model
 from loopwright.service.offline.tunings import MethodResult, answer, tune_each
 from loopwright.service.planning.found_model import DISPROVED, FoundModel, found_model
-from loopwright.service.store.tables import EventRow, JobRow
+from loopwright.service.store.jobs import Job, JobEvent
 from loopwright.tuning.analysis.assessment import Assessment, assess
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.design_trial import designed_on
@@ -44,7 +44,7 @@ FAST_DESIGN = Method(
 )
 
 
-def alternatives(row: JobRow, events: Sequence[EventRow], method: str | None = None) -> dict[str, Any]:
+def alternatives(row: Job, events: Sequence[JobEvent], method: str | None = None) -> dict[str, Any]:
     """Returns the JSON object of GET /jobs/{id}/alternatives, for the named method, else for all that are not slow.
 
     Raises Conflict for a job that has no model (yet) or has disproved it, BadTuning for an unknown method.
@@ -60,7 +60,7 @@ def alternatives(row: JobRow, events: Sequence[EventRow], method: str | None = N
 
 
 def redesigned(
-    row: JobRow, events: Sequence[EventRow], record: RelayRecord | None, ms: float, derivative: bool
+    row: Job, events: Sequence[JobEvent], record: RelayRecord | None, ms: float, derivative: bool
 ) -> dict[str, Any]:
     """Returns the same object with the gains of fast for another Ms, without a new experiment.
 
@@ -101,9 +101,9 @@ def _tuned(gains: Gains, ms: float, assessed: Assessment) -> MethodResult:
     return MethodResult(FAST_DESIGN, gains, {"Ms": ms}, notes, assessed)
 
 
-def job_model(row: JobRow, events: Sequence[EventRow]) -> FoundModel:
+def job_model(row: Job, events: Sequence[JobEvent]) -> FoundModel:
     """Returns the model of the job's result, else the last one of a stage, else the one entered. Raises Conflict."""
-    if JobState(row.state) in ACTIVE:
+    if row.state in ACTIVE:
         raise Conflict(f"job {row.id} is not over: it has no model to compare methods on yet")
     model = found_model(row, events) or _typed_in(row)
     if model is not None:
@@ -111,13 +111,13 @@ def job_model(row: JobRow, events: Sequence[EventRow]) -> FoundModel:
     raise Conflict(f"job {row.id} ended as {row.state} before it had a model")
 
 
-def _typed_in(row: JobRow) -> FoundModel | None:
+def _typed_in(row: Job) -> FoundModel | None:
     asked = row.request.get("model")
     model = parse_model(asked) if asked else None
     return TransferFunction(model.num, model.den, model.L) if isinstance(model, Integrating) else model
 
 
-def _not_disproved(row: JobRow, reasons: Sequence[Reason]) -> None:
+def _not_disproved(row: Job, reasons: Sequence[Reason]) -> None:
     if row.reason in reasons:
         text = f"job {row.id} ended as {row.reason}, which speaks against its model ({row.detail})"
         raise Conflict(f"{text}: retune instead")

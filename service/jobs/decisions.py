@@ -11,8 +11,8 @@ from loopwright.service.jobs.machine import Machine
 from loopwright.service.loop_state import gains_of, state_json
 from loopwright.service.loops.gain_change import ForeignGains, replace_accepted
 from loopwright.service.store import loop_locks
+from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Busy, Store
-from loopwright.service.store.tables import JobRow
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Ended, Reason
 
@@ -31,7 +31,7 @@ class Decisions:
         # By loop: an event that is set when a decision that writes to its controller has ended.
         self._writes: dict[str, threading.Event] = {}
 
-    def accept(self, job_id: str, by: str) -> JobRow:
+    def accept(self, job_id: str, by: str) -> Job:
         """Makes the proposed gains the accepted ones of the controller, and reads them back. Returns the job.
 
         After an error the decision can be repeated, which completes it, or be rolled back.
@@ -39,13 +39,13 @@ class Decisions:
         """
         return self._decide(job_id, JobState.ACCEPTED, by)
 
-    def rollback(self, job_id: str, by: str) -> JobRow:
+    def rollback(self, job_id: str, by: str) -> Job:
         """Declines a proposal (the loop has its old gains already), or takes back an accepted or begun change. Gains
         that were changed by others since then stay: a proposal is declined, but an accepted change is not taken back
         (Conflict)."""
         return self._decide(job_id, JobState.ROLLED_BACK, by)
 
-    def _decide(self, job_id: str, wanted: JobState, by: str) -> JobRow:
+    def _decide(self, job_id: str, wanted: JobState, by: str) -> Job:
         row = self.store.get(job_id)
         with self._directory.alone_with(row.loop):
             row = self.store.get(job_id)
@@ -101,7 +101,7 @@ class Decisions:
         return writes is None or writes.wait(WRITES_S)
 
 
-def new_gains(row: JobRow) -> Gains:
+def new_gains(row: Job) -> Gains:
     """Raises Conflict for a job without new gains."""
     if row.result is None or row.result.new_gains is None:
         raise Conflict("the job has no gains to put")

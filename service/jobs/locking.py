@@ -7,8 +7,9 @@ from loopwright.service.job_states import JobState
 from loopwright.service.jobs.decisions import Decisions
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.store import loop_locks
+from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
-from loopwright.service.store.tables import JobRow, LoopLockRow
+from loopwright.service.store.tables import LoopLockRow
 
 
 class Locking:
@@ -22,7 +23,7 @@ class Locking:
         self._directory = directory
         self._decisions = decisions
 
-    def lock(self, tag: str, reason: str, by: str) -> tuple[LoopLockRow, JobRow | None]:
+    def lock(self, tag: str, reason: str, by: str) -> tuple[LoopLockRow, Job | None]:
         """Locks a loop: from now on no test starts on it, on any host, and no decision writes to it. Returns the lock,
         and the job whose test was running already and continues. Raises UnknownLoop, LockedOtherwise."""
         self._directory.owner(tag)

@@ -28,9 +28,9 @@ from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.until_answered import STOP_PATIENCE_S, UntilAnswered
 from loopwright.service.jobs.worker import Worker
 from loopwright.service.request import RetuneRequest, within
+from loopwright.service.store.jobs import Job
 from loopwright.service.store.lock import CHECK_S
 from loopwright.service.store.store import FolderInUse, Store, WithJob
-from loopwright.service.store.tables import JobRow
 from loopwright.tuning.reasons import Reason
 
 log = logging.getLogger(__name__)
@@ -135,7 +135,7 @@ class Jobs:
                 self.engine.enqueue(row.id, self._queue_of(row))
         self._lost = lost
 
-    def _queue_of(self, row: JobRow) -> str:
+    def _queue_of(self, row: Job) -> str:
         return self._rehearsals(row.host) if row.dry_run else self._queue(self.directory.loops[row.loop])
 
     def _queue(self, config: LoopConfig, host: str | None = None) -> str:
@@ -155,7 +155,7 @@ class Jobs:
         return self.registry.under_test()
 
     # start and stop
-    def start(self, tag: str, request: RetuneRequest, also: WithJob | None = None) -> JobRow:
+    def start(self, tag: str, request: RetuneRequest, also: WithJob | None = None) -> Job:
         """Queues a job on the host that has the loop. Raises UnknownLoop, BadLimits, Busy, Locked, Stopping.
 
         also: writes in the same transaction; when it raises, there is no job.
@@ -183,7 +183,7 @@ class Jobs:
                     self._request_stop_of(job_id, Reason.INTERNAL, JobState.FAILED, "it could not be queued")
                 else:  # its own host may have found and begun it; only that host knows
                     with suppress(IllegalMove):
-                        self.store.request_stop(job_id, Reason.INTERNAL.value, "service")
+                        self.store.request_stop(job_id, Reason.INTERNAL, "service")
             except SQLAlchemyError as error:
                 log.error(
                     "job %s of loop %s could not be queued, and its end could not be written: it does not begin, and "
@@ -193,13 +193,13 @@ class Jobs:
             else:
                 self.registry.unqueued.pop(job_id, None)
 
-    def abort(self, job_id: str, by: str) -> JobRow:
+    def abort(self, job_id: str, by: str) -> Job:
         """Asks an active job to stop; it ends as aborted once the loop is restored. Raises IllegalMove.
 
         A job that runs here is asked before the abort is stored, so the loop does not wait for the database.
         """
         is_running_here = self.tell_to_stop(job_id)
-        row = self.store.request_stop(job_id, Reason.OPERATOR.value, by, is_running_here)
+        row = self.store.request_stop(job_id, Reason.OPERATOR, by, is_running_here)
         if row.host == self.store.host:
             self._request_stop_of(job_id, Reason.OPERATOR)
         return self.store.get(job_id)
@@ -228,7 +228,7 @@ class Jobs:
                 running.stop_reason = running.stop_reason or reason
                 return
             row = self.store.get(job_id)
-            if JobState(row.state) in ACTIVE:
+            if row.state in ACTIVE:
                 self.store.move(job_id, state, reason=reason.value, detail=detail)
 
     def request_stop(self) -> None:
@@ -296,7 +296,7 @@ class Jobs:
                 continue
             try:
                 for job_id, reason in self.store.stop_requests().items():
-                    self._request_stop_of(job_id, Reason(reason))
+                    self._request_stop_of(job_id, reason)
                 if self._machine.monotonic() - reconciled > _RECONCILE_S:
                     self.reconcile()
                     reconciled = self._machine.monotonic()

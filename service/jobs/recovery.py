@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from loopwright.service.config import LoopConfig
 from loopwright.service.errors import Locked
@@ -16,8 +15,8 @@ from loopwright.service.loops.loop import Loop
 from loopwright.service.loops.restoration import Restoration, restore_loop_of
 from loopwright.service.request import retune_request, within
 from loopwright.service.store import loop_locks
+from loopwright.service.store.jobs import Job, JobColumns
 from loopwright.service.store.store import Store
-from loopwright.service.store.tables import JobRow
 from loopwright.tuning.reasons import Reason
 
 log = logging.getLogger(__name__)
@@ -40,7 +39,7 @@ class Recovery:
     resumes: bool
     stopping: Callable[[], bool] = lambda: False
 
-    def recover(self, row: JobRow) -> None:
+    def recover(self, row: Job) -> None:
         """Restores the loop of the job, and ends the job if it is not to be resumed."""
         if self.stopping():
             return
@@ -49,22 +48,24 @@ class Recovery:
         if row.found is not None and (row.session is not None or row.version != WORKFLOW_VERSION):
             safe = restore_loop_of(row, self.loops, self.open_loop)
             self.store.append(row.id, "loop_found", {"text": safe.text}, row.plant_time_s)
-        restored: dict[str, Any] = {}
+        columns: JobColumns = {}
         if safe is not None and safe.state is not None:
-            restored = {"restored": state_json(safe.state)}
+            columns["restored"] = state_json(safe.state)
         elif safe is not None:
-            restored = {"look_after": True}
+            columns["look_after"] = True
         if row.stop_reason is not None:
-            detail = "asked to stop before the service ended; " + _loop_words(safe)
-            self.store.move(row.id, JobState.ABORTED, reason=row.stop_reason, detail=detail, **restored)
+            columns["reason"] = row.stop_reason
+            columns["detail"] = "asked to stop before the service ended; " + _loop_words(safe)
+            self.store.move(row.id, JobState.ABORTED, **columns)
             return
         why = self._why_not(row, safe)
         if why is not None:
             reason, text = why
-            detail = f"cut off by the end of the service, and not resumed: {text}; {_loop_words(safe)}"
-            self.store.move(row.id, JobState.INTERRUPTED, reason=reason.value, detail=detail, **restored)
+            columns["reason"] = reason
+            columns["detail"] = f"cut off by the end of the service, and not resumed: {text}; {_loop_words(safe)}"
+            self.store.move(row.id, JobState.INTERRUPTED, **columns)
 
-    def _why_not(self, row: JobRow, safe: Restoration | None) -> tuple[Reason, str] | None:
+    def _why_not(self, row: Job, safe: Restoration | None) -> tuple[Reason, str] | None:
         """Returns why a job is not to be resumed, None where it is."""
         config = self.loops.get(row.loop)
         if row.version != WORKFLOW_VERSION:

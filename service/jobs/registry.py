@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 
 from loopwright.service.jobs.active_job import Running
-from loopwright.service.store.tables import JobRow
+from loopwright.service.store.jobs import Job
 
 
 class Registry:
@@ -20,7 +20,7 @@ class Registry:
         self.why_stopping = "the service is shutting down"
         self.running: dict[str, Running] = {}
         # By id: jobs that could not be queued, as the caller was told, and whose end could not be stored either.
-        self.unqueued: dict[str, JobRow] = {}
+        self.unqueued: dict[str, Job] = {}
         # Guards the registry of running jobs and `stopping`.
         self.lock = threading.Lock()
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import asdict
-from typing import Any
 
 from loopwright.service.config import LoopConfig
 from loopwright.service.errors import Locked
@@ -27,9 +26,9 @@ from loopwright.service.loops.restoration import restore_abandoned
 from loopwright.service.planning.known_loop import known
 from loopwright.service.request import BadLimits, RetuneRequest, retune_request, within
 from loopwright.service.store import looked_after
+from loopwright.service.store.jobs import Job, JobColumns
 from loopwright.service.store.lock import FolderInUse
 from loopwright.service.store.store import NoSuchJob, Store
-from loopwright.service.store.tables import JobRow
 from loopwright.service.telemetry.logs import about
 from loopwright.tuning.plan import Event
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
@@ -85,16 +84,16 @@ class Worker:
         try:
             # Read again: before the job was registered as running, an abort would have ended it as a waiting one.
             row = self._lasting(lambda: self.store.get(job_id))
-            if JobState(row.state) not in ACTIVE:
+            if row.state not in ACTIVE:
                 return
             if row.stop_reason is not None:
-                running.stop_reason = running.stop_reason or Reason(row.stop_reason)
+                running.stop_reason = running.stop_reason or row.stop_reason
             with about(job=job_id, loop=row.loop):
                 self._to_the_end(running, row)
         finally:
             self._registry.leave(running)
 
-    def _to_the_end(self, running: Running, row: JobRow) -> None:
+    def _to_the_end(self, running: Running, row: Job) -> None:
         log.info("job started, attempt %d", row.attempt + 1)
         try:
             self._finish(running, self._run(running, row), row.dry_run)
@@ -104,7 +103,7 @@ class Worker:
         except Exception:
             log.exception("the end of the job could not be written")
 
-    def _run(self, running: Running, row: JobRow) -> Outcome:
+    def _run(self, running: Running, row: Job) -> Outcome:
         try:
             request = retune_request(**row.request)
             config = within(self._directory.config(row.loop), request)
@@ -118,7 +117,7 @@ class Worker:
             log.exception("a defect in the job")
             return Outcome(None, Failed(Reason.INTERNAL, f"{type(error).__name__}: {error}"), None, {})
 
-    def _live(self, running: Running, row: JobRow, config: LoopConfig, request: RetuneRequest) -> Outcome:
+    def _live(self, running: Running, row: Job, config: LoopConfig, request: RetuneRequest) -> Outcome:
         self._check_stop_request(running)
         loop = ObservedLoop(self._directory.open_loop(config))
         try:
@@ -141,21 +140,22 @@ class Worker:
     def _note_home(self, job_id: str, read: LoopState, home: LoopState) -> None:
         """Stores the state before the test as the controller noted it at the opening, where it changed after the
         service's reading. The note goes through the journal: the session is open, and waits for no database."""
-        columns: dict[str, Any] = {}
+        columns: JobColumns = {}
         if differences(home, read):
             columns = {"found": state_json(home), "old_gains": asdict(home.gains)}
         self.journal.put(looked_after.opened(job_id, columns))
         if not same_gains(home.gains, read.gains):  # the plan is based on the gains that were read
             raise Aborted(Reason.GAINS_CHANGED, "other gains were accepted as the test was about to begin")
 
-    def _begun(self, loop: Loop, row: JobRow) -> LoopState:
+    def _begun(self, loop: Loop, row: Job) -> LoopState:
         """Returns the state of the loop at the start of an attempt, stored before the loop is touched."""
         if row.found is None or row.session is None:
             # No attempt has touched the loop; the state that an earlier one read may have been another tuner's test.
             state = loop.read(beside_tests=True)
-            columns: dict[str, Any] = {"old_gains": asdict(state.gains), "found": state_json(state)}
+            columns: JobColumns = {"old_gains": asdict(state.gains), "found": state_json(state)}
             if row.found is None:
-                self._lasting(lambda: self.store.move(row.id, JobState.RUNNING, attempt=1, **columns))
+                columns["attempt"] = 1
+                self._lasting(lambda: self.store.move(row.id, JobState.RUNNING, **columns))
             else:
                 self._lasting(lambda: self.store.note(row.id, **columns))
                 self._resumed(row, "the loop had not been touched")
@@ -168,8 +168,8 @@ class Worker:
         self._resumed(row, safe.text)
         return safe.state
 
-    def _dry(self, running: Running, row: JobRow, config: LoopConfig, request: RetuneRequest) -> Outcome:
-        if JobState(row.state) is JobState.QUEUED:
+    def _dry(self, running: Running, row: Job, config: LoopConfig, request: RetuneRequest) -> Outcome:
+        if row.state is JobState.QUEUED:
             self._lasting(lambda: self.store.move(row.id, JobState.RUNNING, attempt=1))
         else:
             self._resumed(row, "a rehearsal begins anew")
@@ -182,7 +182,7 @@ class Worker:
         hooks = Hooks(on_event, running.on_samples, lambda: running.stop_reason, ground=ground)
         return self._rehearse(config, request, hooks)
 
-    def _resumed(self, row: JobRow, text: str) -> None:
+    def _resumed(self, row: Job, text: str) -> None:
         details = {"attempt": row.attempt + 1, "text": text}
         self._lasting(lambda: self.store.resumed(row.id, details, attempt=row.attempt + 1))
 
@@ -198,7 +198,7 @@ class Worker:
                 log.error("the database accepts nothing, the last reports of the job are lost")
                 break
         times = self._earlier_times(running.job_id) | outcome.plant_time_s
-        columns: dict[str, Any] = {
+        columns: JobColumns = {
             "result": outcome.result,
             "stage_times_s": times,
             "plant_time_s": max(running.progress.plant_time_s, running.before_s + sum(outcome.plant_time_s.values())),

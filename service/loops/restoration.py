@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from loopwright.service.config import LoopConfig
 from loopwright.service.loop_state import LoopState, loop_state
 from loopwright.service.loops.loop import Loop
-from loopwright.service.store.tables import JobRow
+from loopwright.service.store.jobs import Job
 from loopwright.tuning.reasons import Ended, Reason
 
 log = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ def restore_abandoned(loop: Loop, home: LoopState, session: int | None) -> Resto
 
 
 def restore_loop_of(
-    row: JobRow, loops: Mapping[str, LoopConfig], open_loop: Callable[[LoopConfig], Loop]
+    row: Job, loops: Mapping[str, LoopConfig], open_loop: Callable[[LoopConfig], Loop]
 ) -> Restoration:
     """Opens the loop of a job and restores it. Raises nothing: one loop must not keep others from being restored."""
     config = loops.get(row.loop)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from loopwright.service.results import TYPED_IN
-from loopwright.service.store.tables import EventRow, JobRow
+from loopwright.service.store.jobs import Job, JobEvent
 from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
 from loopwright.tuning.reasons import Reason
 
@@ -15,7 +15,7 @@ DISPROVED = (Reason.WRONG_SIGN, Reason.MODEL_MISMATCH, Reason.DIVERGES, Reason.U
 """How a job ends whose own record speaks against the model that an earlier stage had found."""
 
 
-def found_model(row: JobRow, events: Sequence[EventRow]) -> FoundModel | None:
+def found_model(row: Job, events: Sequence[JobEvent]) -> FoundModel | None:
     """The model of the job's result, else the last that a stage found; none that was typed in."""
     if row.result is not None and row.result.model is not None and not row.result.model.typed_in:
         return row.result.model.process_model()

@@ -9,8 +9,8 @@ from loopwright.service.job_states import JobState
 from loopwright.service.loop_state import LoopState, gains_of, loop_state
 from loopwright.service.planning.found_model import DISPROVED, found_model
 from loopwright.service.planning.ground import Ground, LastModel
+from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
-from loopwright.service.store.tables import JobRow
 from loopwright.tuning.reasons import Ended
 
 LOOKED_AT = 50
@@ -28,12 +28,12 @@ def known(store: Store, tag: str, read: Callable[[], LoopState]) -> Ground:
     row = next((row for row in rows if row.found), None)
     if row is None or row.found is None:
         return Ground(last, silence=words)
-    accepted = row.result.new_gains if JobState(row.state) is JobState.ACCEPTED and row.result is not None else None
+    accepted = row.result.new_gains if row.state is JobState.ACCEPTED and row.result is not None else None
     gains = gains_of(row.old_gains or row.found["gains"]) if accepted is None else accepted.gains()
     return Ground(last, replace(loop_state(row.found), gains=gains), row.id, words)
 
 
-def _last_model(store: Store, rows: Sequence[JobRow]) -> LastModel | None:
+def _last_model(store: Store, rows: Sequence[Job]) -> LastModel | None:
     for row in rows:
         if row.ended_at is None or row.reason in DISPROVED:
             continue

@@ -4,45 +4,45 @@ from __future__ import annotations
 
 import textwrap
 from pathlib import Path
-from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from loopwright.service.jobs.relay_record import RelayRecord
+from loopwright.service.plots.shown import Shown
+from loopwright.service.results import EvidenceView, GainsView
 from loopwright.tuning.analysis.assessment import assess
 from loopwright.tuning.analysis.step_response import step_response
 from loopwright.tuning.fast.structure_choice import choose_structure
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.output_error import Fit, averaged
-from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.reasons import Ended
 
 GREY, RED, BLUE, GREEN = "0.55", "tab:red", "tab:blue", "tab:green"
 SHOWN_SETTLINGS = 2.5
 
 
-def fast_job(path: Path, job: dict[str, Any], record: RelayRecord, pv_unit: str) -> None:
-    """job: as of GET /jobs/{id}, of whatever end."""
-    proposed = job["new_gains"] is not None
+def fast_job(path: Path, job: Shown, record: RelayRecord, pv_unit: str) -> None:
+    """job: of whatever end."""
+    proposed = job.new_gains is not None
     figure = Figure(figsize=(12 if proposed else 9, 6.5), layout="constrained")
     canvas = FigureCanvasAgg(figure)
-    why = f", {job['reason']}" if job["reason"] and job["reason"] != job["state"] else ""
-    title = f"{job['loop']}: {job['state']}{why}"
-    figure.suptitle(title if proposed else "\n".join([title, *textwrap.wrap(job["detail"] or "", 110)]), fontsize=11)
+    why = f", {job.reason}" if job.reason and job.reason != job.state else ""
+    title = f"{job.loop}: {job.state}{why}"
+    figure.suptitle(title if proposed else "\n".join([title, *textwrap.wrap(job.detail or "", 110)]), fontsize=11)
     grid = figure.add_gridspec(3, 2 if proposed else 1, height_ratios=(3, 1, 1.5), width_ratios=(3, 2)[: 1 + proposed])
     pv, rest = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
     mv = figure.add_subplot(grid[2, 0])
-    _record(pv, rest, mv, record, job["evidence"], pv_unit)
+    _record(pv, rest, mv, record, job.evidence, pv_unit)
     if proposed:
         _before_after(figure.add_subplot(grid[0:2, 1]), figure.add_subplot(grid[2, 1]), job, pv_unit)
-    elif job["advice"]:
-        figure.supxlabel("\n".join(textwrap.wrap(f"Advice: {job['advice']}", 110)), fontsize=9)
+    elif job.advice:
+        figure.supxlabel("\n".join(textwrap.wrap(f"Advice: {job.advice}", 110)), fontsize=9)
     canvas.print_figure(path, dpi=80)
 
 
-def _record(pv: Axes, rest: Axes, mv: Axes, record: RelayRecord, found: dict[str, Any] | None, pv_unit: str) -> None:
+def _record(pv: Axes, rest: Axes, mv: Axes, record: RelayRecord, found: EvidenceView | None, pv_unit: str) -> None:
     t = record.t
     pv.plot(t, record.pv, color=GREY, linewidth=1.0, label="PV measured")
     pv.step(t, record.sp, where="post", color="black", linestyle=":", linewidth=1.0, label="set-point")
@@ -61,8 +61,8 @@ def _record(pv: Axes, rest: Axes, mv: Axes, record: RelayRecord, found: dict[str
         noise = 2.0 * evidence.noise
         rest.axhspan(-noise, noise, color="0.88", zorder=0, label="noise at rest, 2 standard deviations")
         rest.legend(loc="upper left", fontsize=7)
-    for load in (found or {}).get("loads", ()):
-        pv.axvline(load["t_s"], color="tab:orange", linewidth=1.2, label=f"load {load['size']:+.3g} % found")
+    for load in () if found is None else found.loads:
+        pv.axvline(load.t_s, color="tab:orange", linewidth=1.2, label=f"load {load.size:+.3g} % found")
     mv.step(t, record.mv, where="post", color=GREEN, linewidth=1.0)
     for axes, label in ((pv, f"PV, {pv_unit}"), (rest, "left over"), (mv, "MV, %")):
         axes.set_ylabel(label)
@@ -76,11 +76,12 @@ def _record(pv: Axes, rest: Axes, mv: Axes, record: RelayRecord, found: dict[str
     mv.set_xlabel(f"plant time since the relay began, s{taken_over}")
 
 
-def _before_after(top: Axes, bottom: Axes, job: dict[str, Any], pv_unit: str) -> None:
+def _before_after(top: Axes, bottom: Axes, job: Shown, pv_unit: str) -> None:
     """A set-point step of the size tested, computed on the model found."""
-    model = TransferFunction(tuple(job["model"]["num"]), tuple(job["model"]["den"]), job["model"]["dead_time_s"])
-    size = (job["verification"] or {}).get("step") or 1.0
-    both = {"before": (job["old_gains"], RED, "--"), "after": (job["new_gains"], BLUE, "-")}
+    assert job.model is not None and job.old_gains is not None and job.new_gains is not None
+    model = job.model.process_model()
+    size = 1.0 if job.verification is None else job.verification.step or 1.0
+    both = {"before": (job.old_gains, RED, "--"), "after": (job.new_gains, BLUE, "-")}
     gains = {label: _gains(told) for label, (told, _, _) in both.items()}
     settled = [f.settling_s for f in (assess(model, g).setpoint for g in gains.values()) if f and f.settling_s]
     horizon = SHOWN_SETTLINGS * min(settled) if settled else 20.0 * (model.L + 1.0)
@@ -105,5 +106,5 @@ def _before_after(top: Axes, bottom: Axes, job: dict[str, Any], pv_unit: str) ->
         axes.set_ylim(max(low, -2.0 * abs(high)), high)
 
 
-def _gains(told: dict[str, Any]) -> Gains:
-    return Gains(told["Kp"], told["Ti"], told.get("Td") or 0.0, told.get("Tf") or 0.0)
+def _gains(told: GainsView) -> Gains:
+    return Gains(told.Kp, told.Ti, told.Td, told.Tf)

@@ -10,6 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from loopwright.service.jobs.relay_record import relay_record
+from loopwright.service.plots.shown import Shown
 
 LEAD_IN = 20
 """Samples shown before the step."""
@@ -23,11 +24,11 @@ class NoPicture(Exception):
     """There is nothing to be shown yet."""
 
 
-def job_picture(path: Path, samples: Samples, job: dict[str, Any], pv_unit: str) -> None:
+def job_picture(path: Path, samples: Samples, job: Shown, pv_unit: str) -> None:
     """A picture of a fast job shows its record, fit and residual, and the loop before and after; a picture of any other
-    job shows the set-point step before and after. job: the answer to GET /jobs/{id}.  Raises NoPicture.
+    job shows the set-point step before and after. Raises NoPicture.
     """
-    if job["method"] == "fast" and (record := relay_record(samples(None))) is not None:
+    if job.method == "fast" and (record := relay_record(samples(None))) is not None:
         from loopwright.service.plots.fast_job import fast_job
 
         fast_job(path, job, record, pv_unit)
@@ -36,8 +37,8 @@ def job_picture(path: Path, samples: Samples, job: dict[str, Any], pv_unit: str)
     stages = {label: samples(stage) for label, stage in named.items()}
     stages = {label: columns for label, columns in stages.items() if columns["t_s"]}
     if not stages:
-        raise NoPicture(f"job {job['id']} has neither a relay's record nor a set-point step to show")
-    before_after(path, f"{job['loop']}: the same set-point step before and after", pv_unit, stages)
+        raise NoPicture(f"job {job.id} has neither a relay's record nor a set-point step to show")
+    before_after(path, f"{job.loop}: the same set-point step before and after", pv_unit, stages)
 
 
 def before_after(path: Path, title: str, pv_unit: str, stages: dict[str, dict[str, Any]]) -> None:

@@ -5,25 +5,25 @@ The column is `JobRow.look_after`; everything that ends it writes an event of th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 from sqlalchemy import distinct, func, select
 from sqlalchemy.orm import Session
 
 from loopwright.service.jsonable import to_jsonable
 from loopwright.service.store import audit
+from loopwright.service.store.jobs import Job, JobColumns
 from loopwright.service.store.store import Store, Write, append, set_columns
 from loopwright.service.store.tables import JobRow
 
 
-def rows(store: Store, loop: str | None = None) -> Sequence[JobRow]:
+def rows(store: Store, loop: str | None = None) -> Sequence[Job]:
     """The jobs of this host with a loop that is looked after, or those of one loop on whatever host; the latest
     first."""
     mine = JobRow.host == store.host if loop is None else JobRow.loop == loop
     with store.reading() as session:
         wanted = select(JobRow).where(mine, JobRow.look_after.is_(True)).order_by(JobRow.number.desc())
-        return session.scalars(wanted).all()
+        return [Job.from_row(row) for row in session.scalars(wanted)]
 
 
 def count(session: Session, host: str) -> int:
@@ -32,7 +32,7 @@ def count(session: Session, host: str) -> int:
     return session.scalar(wanted) or 0
 
 
-def home_again(store: Store, job_id: str, restored: dict[str, Any], text: str) -> bool:
+def home_again(store: Store, job_id: str, restored: Mapping[str, object], text: str) -> bool:
     """The loop was read back. False when somebody else was faster to end it."""
     with store.writing() as session:
         wanted = select(JobRow).where(JobRow.id == job_id, JobRow.look_after.is_(True)).with_for_update()
@@ -44,7 +44,7 @@ def home_again(store: Store, job_id: str, restored: dict[str, Any], text: str) -
         return True
 
 
-def opened(job_id: str, columns: dict[str, Any]) -> Write:
+def opened(job_id: str, columns: JobColumns) -> Write:
     """The job has opened a session of its own: its loop is looked after for no other job. columns: what else is now
     known of the job."""
     text = f"looked after no more: job {job_id} has opened a session on the loop"

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
 
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
@@ -95,7 +94,9 @@ class Part:
         return SKIPPED if self.job_state is None else self.job_state.value
 
 
-def add(session: Session, host: str, request: dict[str, Any], loops: Sequence[str], requested_by: str) -> RetuneRow:
+def add(
+    session: Session, host: str, request: Mapping[str, object], loops: Sequence[str], requested_by: str
+) -> RetuneRow:
     """A new retune of these loops, in this order."""
     row = RetuneRow(
         id=secrets.token_hex(6),

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from sqlalchemy import ColumnElement, delete, func, select, update
 from sqlalchemy.exc import IntegrityError, SQLAlchemyError, TimeoutError
@@ -31,6 +31,7 @@ from loopwright.service.store.database import (
     postgresql,
     sessions,
 )
+from loopwright.service.store.jobs import Job, JobColumns, JobEvent
 from loopwright.service.store.lock import FolderInUse, FolderLock, HostLock, ourselves
 from loopwright.service.store.tables import ChunkRow, EventRow, HostRow, JobRow, LoopRow, RetuneRow
 from loopwright.tuning.plan import Sample
@@ -172,7 +173,7 @@ class Store:
             of_host(session, self.host).written_at = now()
 
     # loops
-    def own_loops(self, loops: dict[str, dict[str, Any]]) -> None:
+    def own_loops(self, loops: Mapping[str, Mapping[str, object]]) -> None:
         """These are the loops of this host from now on, by tag.
 
         A loop of a host that is not running is taken over with its active job, and looked after here if it was there:
@@ -217,18 +218,18 @@ class Store:
     def create(
         self,
         loop: str,
-        request: dict[str, Any],
+        request: Mapping[str, object],
         requested_by: str,
         dry_run: bool,
         host: str | None = None,
         version: str = "0",
         also: WithJob | None = None,
-    ) -> JobRow:
+    ) -> Job:
         """A new queued job, on this host unless on another. Raises Busy when the loop has an active one, and Locked."""
         row = JobRow(
             id=secrets.token_hex(6),
             loop=loop,
-            state=JobState.QUEUED.value,
+            state=JobState.QUEUED,
             dry_run=dry_run,
             request=to_jsonable(request),
             requested_by=requested_by,
@@ -247,26 +248,26 @@ class Store:
                 audit.record(session, "retune", row.id, after=row.request, loop=loop, said_by=requested_by)
                 if also is not None:
                     also(session, row)
+                return Job.from_row(row)
         except IntegrityError as error:
             active = self.active(loop)
             if active is None:
                 raise
             raise Busy(loop, active.id) from error
-        return row
 
-    def move(self, job_id: str, wanted: JobState, by: str = "service", **columns: Any) -> JobRow:
+    def move(self, job_id: str, wanted: JobState, by: str = "service", **columns: Unpack[JobColumns]) -> Job:
         """Moves the job as the table allows and sets the columns, in one transaction with its event. Raises
         IllegalMove, and Locked where its test is to begin."""
         with self.writing() as session:
-            return _move(session, _find(session, job_id, lock=True), wanted, by, columns)
+            return Job.from_row(_move(session, _find(session, job_id, lock=True), wanted, by, columns))
 
-    def decline(self, job_id: str, by: str) -> JobRow | None:
+    def decline(self, job_id: str, by: str) -> Job | None:
         """Rolls back a proposal of which nothing was written to the controller; None when it is no such one."""
         with self.writing() as session:
             row = _find(session, job_id, lock=True)
             if row.state != JobState.PROPOSED or _last_begun(session, job_id) is not None:
                 return None
-            return _move(session, row, JobState.ROLLED_BACK, by, {})
+            return Job.from_row(_move(session, row, JobState.ROLLED_BACK, by, {}))
 
     def decision_begun(self, job_id: str) -> bool:
         """Whether any decision on the job may have written to the controller."""
@@ -277,22 +278,21 @@ class Store:
         """Notes that the controller is about to be written to. Raises IllegalMove when another was faster, Locked."""
         with self.writing() as session:
             row = _find(session, job_id, lock=True)
-            check(JobState(row.state), wanted)
+            check(row.state, wanted)
             loop_locks.check(session, row.loop)
             append(session, job_id, _BEGUN, {"decision": DECISIONS[wanted], "by": by}, row.plant_time_s)
 
-    def resumed(self, job_id: str, details: dict[str, Any], **columns: Any) -> None:
+    def resumed(self, job_id: str, details: Mapping[str, object], **columns: Unpack[JobColumns]) -> None:
         """Notes that an active job has begun another attempt. Raises IllegalMove when it is over, Locked."""
         with self.writing() as session:
             row = _find(session, job_id, lock=True)
-            state = JobState(row.state)
-            if state not in ACTIVE:
-                raise IllegalMove(state, JobState.RUNNING)
+            if row.state not in ACTIVE:
+                raise IllegalMove(row.state, JobState.RUNNING)
             _may_begin(session, row)
             set_columns(row, columns)
             append(session, job_id, "resumed", details, row.plant_time_s)
 
-    def note(self, job_id: str, **columns: Any) -> None:
+    def note(self, job_id: str, **columns: Unpack[JobColumns]) -> None:
         """Sets columns of an active job."""
         with self.writing() as session:
             set_columns(_find(session, job_id, lock=True), columns)
@@ -301,15 +301,16 @@ class Store:
         """The session that is about to be opened for the job; 0: it was refused, and there is none."""
         self.note(job_id, session=number or None)
 
-    def get(self, job_id: str) -> JobRow:
+    def get(self, job_id: str) -> Job:
         with self._session() as session:
-            return _find(session, job_id)
+            return Job.from_row(_find(session, job_id))
 
-    def active(self, loop: str) -> JobRow | None:
+    def active(self, loop: str) -> Job | None:
         """The job that has the loop, if any."""
         wanted = select(JobRow).where(JobRow.loop == loop, JobRow.state.in_(_ACTIVE), JobRow.dry_run.is_(False))
         with self._session() as session:
-            return session.scalars(wanted).one_or_none()
+            row = session.scalars(wanted).one_or_none()
+        return None if row is None else Job.from_row(row)
 
     def busy(self) -> dict[str, str]:
         """The active job by loop, of every host."""
@@ -317,25 +318,25 @@ class Store:
         with self._session() as session:
             return {row.loop: row.id for row in session.execute(wanted)}
 
-    def unfinished(self) -> list[JobRow]:
+    def unfinished(self) -> list[Job]:
         """Every job of this host in an active state, dry runs included."""
         mine = (JobRow.host == self.host, JobRow.state.in_(_ACTIVE))
         with self._session() as session:
-            return list(session.scalars(select(JobRow).where(*mine).order_by(JobRow.number)))
+            return list(map(Job.from_row, session.scalars(select(JobRow).where(*mine).order_by(JobRow.number))))
 
     def active_among(self, job_ids: Collection[str]) -> set[str]:
         """Those of the jobs that are in an active state."""
         with self._session() as session:
             return set(session.scalars(select(JobRow.id).where(JobRow.id.in_(job_ids), JobRow.state.in_(_ACTIVE))))
 
-    def stop_requests(self) -> dict[str, str]:
+    def stop_requests(self) -> dict[str, Reason]:
         """The reason by job, for the active jobs of this host that somebody wants to stop."""
         mine = (JobRow.host == self.host, JobRow.state.in_(_ACTIVE), JobRow.stop_reason.is_not(None))
         with self._session() as session:
             rows = session.execute(select(JobRow.id, JobRow.stop_reason).where(*mine))
-            return {row.id: row.stop_reason for row in rows}
+            return {row.id: Reason(row.stop_reason) for row in rows}
 
-    def request_stop(self, job_id: str, reason: str, by: str, heard: bool = False) -> JobRow:
+    def request_stop(self, job_id: str, reason: Reason, by: str, heard: bool = False) -> Job:
         """Notes that the job is to stop, once. Raises IllegalMove when it is over.
 
         heard: the job knows of this request already, and may have ended for it by now.
@@ -344,13 +345,13 @@ class Store:
             row = _find(session, job_id, lock=True)
             ended_for_it = heard and (row.state, row.reason, row.stop_reason) == (JobState.ABORTED, reason, None)
             if not ended_for_it:
-                check(JobState(row.state), JobState.ABORTED)
+                check(row.state, JobState.ABORTED)
             claims.changed(session, f"/jobs/{job_id}")
             if row.stop_reason is None:
                 row.stop_reason = reason
                 append(session, job_id, "abort_requested", {"by": by}, row.plant_time_s)
                 audit.record(session, "abort", job_id, before={"state": row.state}, loop=row.loop, said_by=by)
-            return row
+            return Job.from_row(row)
 
     def decision_failed(self, job_id: str, wanted: JobState, by: str, detail: str) -> None:
         """A decision that reached for the controller and ended in an error: its gains may have been written."""
@@ -361,7 +362,7 @@ class Store:
                 session, what, job_id, before={"state": row.state}, after={"error": detail}, loop=row.loop, said_by=by
             )
 
-    def last_states(self, loop: str | None = None) -> dict[str, str]:
+    def last_states(self, loop: str | None = None) -> dict[str, JobState]:
         """The state of the latest job by loop, of every host or of one loop; dry runs do not count."""
         last = select(func.max(JobRow.number)).where(JobRow.dry_run.is_(False)).group_by(JobRow.loop)
         if loop is not None:
@@ -370,7 +371,7 @@ class Store:
             found = session.execute(select(JobRow.loop, JobRow.state).where(JobRow.number.in_(last)))
             return {row.loop: row.state for row in found}
 
-    def last_models(self, loop: str | None = None) -> dict[str, JobRow]:
+    def last_models(self, loop: str | None = None) -> dict[str, Job]:
         """The latest job by loop, of every host or of one loop, that has found a model on the live loop."""
         ended = (JobState.PROPOSED.value, JobState.ACCEPTED.value, JobState.ROLLED_BACK.value)
         last = select(func.max(JobRow.number)).where(JobRow.dry_run.is_(False), JobRow.state.in_(ended))
@@ -378,13 +379,13 @@ class Store:
             last = last.where(JobRow.loop == loop)
         with self._session() as session:
             return {
-                row.loop: row
+                row.loop: Job.from_row(row)
                 for row in session.scalars(select(JobRow).where(JobRow.number.in_(last.group_by(JobRow.loop))))
             }
 
     def recent(
         self, loop: str | None = None, state: JobState | None = None, limit: int = 50, before: int | None = None
-    ) -> Sequence[JobRow]:
+    ) -> Sequence[Job]:
         """The latest jobs first; before: only those with a smaller number."""
         wanted = select(JobRow).order_by(JobRow.number.desc()).limit(limit)
         if before is not None:
@@ -394,37 +395,38 @@ class Store:
         if state is not None:
             wanted = wanted.where(is_shown_as(state))
         with self._session() as session:
-            return session.scalars(wanted).all()
+            return [Job.from_row(row) for row in session.scalars(wanted)]
 
-    def tests_of(self, loop: str, limit: int) -> Sequence[JobRow]:
+    def tests_of(self, loop: str, limit: int) -> Sequence[Job]:
         """The latest jobs of the loop first; no dry runs, which have found nothing."""
         mine = (JobRow.loop == loop, JobRow.dry_run.is_(False))
         with self._session() as session:
-            return session.scalars(select(JobRow).where(*mine).order_by(JobRow.number.desc()).limit(limit)).all()
+            latest = session.scalars(select(JobRow).where(*mine).order_by(JobRow.number.desc()).limit(limit))
+            return [Job.from_row(row) for row in latest]
 
     # events
-    def append(self, job_id: str, kind: str, data: dict[str, Any], plant_time_s: float) -> None:
+    def append(self, job_id: str, kind: str, data: Mapping[str, object], plant_time_s: float) -> None:
         with self.writing() as session:
             _find(session, job_id, lock=True)
             append(session, job_id, kind, data, plant_time_s)
 
-    def events(self, job_id: str, after: int = 0, limit: int | None = None) -> Sequence[EventRow]:
+    def events(self, job_id: str, after: int = 0, limit: int | None = None) -> Sequence[JobEvent]:
         """In order; after: only those with a larger number."""
         wanted = select(EventRow).where(EventRow.job_id == job_id, EventRow.seq > after).order_by(EventRow.seq)
         if limit is not None:
             wanted = wanted.limit(limit)
         with self._session() as session:
-            return session.scalars(wanted).all()
+            return [JobEvent.from_row(row) for row in session.scalars(wanted)]
 
-    def events_by_job(self, job_ids: Sequence[str], limit: int) -> dict[str, list[EventRow]]:
+    def events_by_job(self, job_ids: Sequence[str], limit: int) -> dict[str, list[JobEvent]]:
         """The first events of each of these jobs, in order: a query for a hundred jobs, not for each."""
-        found: dict[str, list[EventRow]] = {job_id: [] for job_id in job_ids}
+        found: dict[str, list[JobEvent]] = {job_id: [] for job_id in job_ids}
         with self._session() as session:
             for begin in range(0, len(job_ids), _JOBS_AT_ONCE):
                 some = job_ids[begin : begin + _JOBS_AT_ONCE]
                 theirs = select(EventRow).where(EventRow.job_id.in_(some), EventRow.seq <= limit)
                 for event in session.scalars(theirs.order_by(EventRow.job_id, EventRow.seq)):
-                    found[event.job_id].append(event)
+                    found[event.job_id].append(JobEvent.from_row(event))
         return found
 
     def restored(self, source: str) -> int:
@@ -490,13 +492,17 @@ def is_shown_as(state: JobState) -> ColumnElement[bool]:
     return stored
 
 
-def event_of(job_id: str, kind: str, data: dict[str, Any], plant_time_s: float, **columns: Any) -> Write:
-    """An event, at the time it happened, and what it changes in the job's row."""
+def event_of(
+    job_id: str, kind: str, data: Mapping[str, object], plant_time_s: float, stage: str | None = None
+) -> Write:
+    """An event, at the time it happened. stage: the one that the job has entered with it."""
     at, details = now(), to_jsonable(data)
 
     def write(session: Session) -> None:
         row = _find(session, job_id, lock=True)
-        set_columns(row, {"plant_time_s": plant_time_s, **columns})
+        row.plant_time_s = plant_time_s
+        if stage is not None:
+            row.stage = stage
         append(session, job_id, kind, details, plant_time_s, at)
 
     return write
@@ -532,7 +538,7 @@ def of_host(session: Session, host: str) -> HostRow:
     return row
 
 
-def set_columns(row: JobRow, columns: dict[str, Any]) -> None:
+def set_columns(row: JobRow, columns: JobColumns) -> None:
     for name, value in columns.items():
         setattr(row, name, to_jsonable(value))
 
@@ -543,12 +549,12 @@ def _may_begin(session: Session, row: JobRow) -> None:
         loop_locks.check(session, row.loop)
 
 
-def _move(session: Session, row: JobRow, wanted: JobState, by: str, columns: dict[str, Any]) -> JobRow:
-    previous = JobState(row.state)
+def _move(session: Session, row: JobRow, wanted: JobState, by: str, columns: JobColumns) -> JobRow:
+    previous = row.state
     check(previous, wanted)
     if wanted is JobState.RUNNING:
         _may_begin(session, row)
-    row.state = wanted.value
+    row.state = wanted
     set_columns(row, columns)
     if wanted is JobState.RUNNING:
         row.started_at = now()
@@ -559,7 +565,8 @@ def _move(session: Session, row: JobRow, wanted: JobState, by: str, columns: dic
     append(session, row.id, "state", details, row.plant_time_s)
     if wanted in DECISIONS:
         claims.changed(session, f"/jobs/{row.id}")
-        _audit_decision(session, row, previous, wanted, by, (columns.get("restored") or {}).get("gains"))
+        held = None if row.restored is None or "restored" not in columns else row.restored.get("gains")
+        _audit_decision(session, row, previous, wanted, by, held)
     return row
 
 
@@ -593,7 +600,7 @@ def _audit_decision(
 
 
 def append(
-    session: Session, job_id: str, kind: str, data: dict[str, Any], plant_time_s: float, at: str | None = None
+    session: Session, job_id: str, kind: str, data: Mapping[str, object], plant_time_s: float, at: str | None = None
 ) -> None:
     """The next event of a job whose row this transaction has locked."""
     seq = session.scalar(select(func.max(EventRow.seq)).where(EventRow.job_id == job_id)) or 0

@@ -2,12 +2,33 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import JSON, BigInteger, Dialect, ForeignKey, Index, LargeBinary, TypeDecorator, text
+from sqlalchemy import JSON, BigInteger, Dialect, ForeignKey, Index, LargeBinary, String, TypeDecorator, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
+from loopwright.service.job_states import JobState
 from loopwright.service.results import RESULT, FastResult, FiveStageResult
+from loopwright.tuning.reasons import Reason
+
+
+class EnumColumn(TypeDecorator[StrEnum]):
+    """A closed list as text. The database does not check it: a version that adds a word needs no migration. A word that
+    is not in the list comes as it is, so that the row with it can be named (`service.store.jobs`)."""
+
+    impl = String
+    cache_ok = True
+
+    def __init__(self, kind: type[StrEnum]) -> None:
+        super().__init__()
+        self.kind = kind
+
+    def process_bind_param(self, value: str | None, dialect: Dialect) -> str | None:
+        return None if value is None else self.kind(value).value
+
+    def process_result_value(self, value: str | None, dialect: Dialect) -> Any:
+        return self.kind(value) if value in set(self.kind) else value
 
 
 class ResultColumn(TypeDecorator[FastResult | FiveStageResult]):
@@ -46,7 +67,7 @@ class JobRow(Base):
     number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
     id: Mapped[str] = mapped_column(unique=True)
     loop: Mapped[str]
-    state: Mapped[str]
+    state: Mapped[JobState] = mapped_column(EnumColumn(JobState))
     dry_run: Mapped[bool]
     request: Mapped[dict[str, Any]]
     requested_by: Mapped[str]
@@ -56,7 +77,7 @@ class JobRow(Base):
     stage: Mapped[str | None]
     plant_time_s: Mapped[float] = mapped_column(default=0.0)
     stage_times_s: Mapped[dict[str, Any] | None]
-    reason: Mapped[str | None]
+    reason: Mapped[Reason | None] = mapped_column(EnumColumn(Reason))
     detail: Mapped[str | None]
     old_gains: Mapped[dict[str, Any] | None]
     restored: Mapped[dict[str, Any] | None]
@@ -72,7 +93,7 @@ class JobRow(Base):
     # The loop was not read back as home: it is looked at until it is, or a person says otherwise.
     look_after: Mapped[bool] = mapped_column(server_default=text("false"), default=False)
     # Why the job is to stop, once somebody wants it to: any host may write it, the job's own host acts.
-    stop_reason: Mapped[str | None]
+    stop_reason: Mapped[Reason | None] = mapped_column(EnumColumn(Reason))
 
 
 class LoopRow(Base):

@@ -12,7 +12,7 @@ import pytest
 from benchmarks.rehearsed import MIDDLE, TS, AroundTheMiddle, entry
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
-from loopwright.service.api.job_views import job_view
+from loopwright.service.api.job_views import JobView, job_view
 from loopwright.service.cli.job_tables import job_report, title
 from loopwright.service.config import LoopConfig, parse_site
 from loopwright.service.execution.procedures import rehearse as dry_run
@@ -79,8 +79,8 @@ def test_gains_that_the_method_itself_has_proposed_are_kept(tmp_path: Path, meth
     assert not compared["gain"] and compared["verdict"] == job["detail"]
     assert compared["after"]["load"]["IAE"] == pytest.approx(compared["before"]["load"]["IAE"], rel=0.05)
     assert job["model"] and job["new_gains"]["Kp"] == pytest.approx(own(method).Kp, rel=0.05)
-    assert "tuned as well as asked already, the present gains are kept" in title(job)
-    job_report(job)
+    assert "tuned as well as asked already, the present gains are kept" in title(JobView.model_validate(job))
+    job_report(JobView.model_validate(job))
 
 
 @pytest.mark.parametrize("method", ["fast", "five-stage"])

@@ -19,12 +19,12 @@ WITH_FIT = {"unexplained", "disturbed", "uncertain", "model_mismatch", "diverges
 @pytest.mark.parametrize("reason", cases())
 def test_a_fault_is_refused_with_its_reason_and_shown(reason: str, tmp_path: Path) -> None:
     job = rehearsed(reason, cases()[reason])
-    assert (job["state"], job["reason"]) == ("refused", reason), job["detail"]
-    assert job["detail"] and job["advice"] == ADVICE[Reason(reason)]
+    assert (job.state, job.reason) == ("refused", reason), job.detail
+    assert job.detail and job.advice == ADVICE[Reason(reason)]
     # what the record came to is told wherever it was enough for a fit
-    assert (job["evidence"] is not None) == (reason in WITH_FIT)
+    assert (job.evidence is not None) == (reason in WITH_FIT)
     if reason in WITH_FIT - {"diverges"}:
-        assert job["evidence"]["reason"] == reason
+        assert job.evidence is not None and job.evidence.reason == reason
     picture = draw(tmp_path, reason, job)
     assert 5_000 < picture.stat().st_size < 60_000
     name = reason.replace("_", "-")
@@ -35,7 +35,7 @@ def test_a_fault_is_refused_with_its_reason_and_shown(reason: str, tmp_path: Pat
 @pytest.mark.parametrize("Ms", [1.4, 1.6])
 def test_what_the_step_has_refuted_is_no_alternative_either(Ms: float) -> None:
     """The record as a whole fits well, with load disturbances added: only its parts tell."""
-    record = relay_record(rehearsed("model_mismatch", cases()["model_mismatch"])["samples"])
+    record = relay_record(rehearsed("model_mismatch", cases()["model_mismatch"]).samples)
     assert record is not None
     evidence = record.experiment_record()
     assert evidence is not None and len(evidence.steps) == 2

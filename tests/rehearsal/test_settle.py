@@ -11,7 +11,7 @@ from loopwright.service.execution.procedures import plan
 from loopwright.service.execution.runner import RunResult, run
 from loopwright.service.loops.loop import Loop
 from loopwright.service.request import retune_request
-from loopwright.service.store.tables import EventRow
+from loopwright.service.store.jobs import JobEvent
 from loopwright.tuning.experiments.preflight import SETTLE
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.settle import MAX_ATTEMPTS
@@ -19,7 +19,7 @@ from loopwright.tuning.plan import Event, Mode, Plan, SetMode, SetOutput, StageS
 from loopwright.tuning.reasons import Reason
 
 TAG = "TIC-1"
-CUT_OFF = [EventRow(kind="loop_found", data={})]
+CUT_OFF = [JobEvent(job_id="cut", seq=1, at="", plant_time_s=0.0, kind="loop_found", data={})]
 
 
 def _pushed(facts: Facts, working_output: float) -> Plan[None]:
@@ -42,7 +42,7 @@ def swinging() -> tuple[Loop, Facts]:
     return loop, facts
 
 
-def _attempt(loop: Loop, facts: Facts, earlier: list[EventRow], method: str) -> tuple[RunResult[object], list[str]]:
+def _attempt(loop: Loop, facts: Facts, earlier: list[JobEvent], method: str) -> tuple[RunResult[object], list[str]]:
     stages: list[str] = []
 
     def hear(event: Event) -> None:

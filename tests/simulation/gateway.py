@@ -28,8 +28,9 @@ from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_reading import BusReading
 from loopwright.service.loops.loop import Loop
 from loopwright.service.server.assembly import make_jobs
+from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
-from loopwright.service.store.tables import Base, JobRow
+from loopwright.service.store.tables import Base
 from tests.simulation.scheduler import Killed, Process, Simulation, Task
 from tests.simulation.wire import Port, Wire
 
@@ -238,7 +239,7 @@ class SimStore(Store):
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self.on_statement: Callable[[str], None] | None = None
-        self.on_move: Callable[[JobRow, JobState], None] | None = None
+        self.on_move: Callable[[Job, JobState], None] | None = None
         event.listen(self.engine, "before_cursor_execute", self._before_statement)
         event.listen(self.engine, "commit", self._before_commit)
 
@@ -261,7 +262,7 @@ class SimStore(Store):
     def _tables(self) -> Collection[str]:
         return {*Base.metadata.tables}
 
-    def move(self, job_id: str, wanted: JobState, by: str = "service", **columns: Any) -> JobRow:
+    def move(self, job_id: str, wanted: JobState, by: str = "service", **columns: Any) -> Job:
         row = super().move(job_id, wanted, by, **columns)
         if self.on_move is not None:
             self.on_move(row, wanted)
@@ -402,7 +403,7 @@ class Gateway:
             asker.pause(None)
         return True
 
-    def rows(self) -> list[JobRow]:
+    def rows(self) -> list[Job]:
         return list(reversed(self.store.recent()))
 
     def busy(self) -> bool:

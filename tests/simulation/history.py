@@ -18,7 +18,7 @@ from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.loop_state import LoopState, state_json
 from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.service.request import retune_request
-from loopwright.service.store.tables import JobRow
+from loopwright.service.store.jobs import Job
 from tests.simulation import plans
 from tests.simulation.devices import Controller, PlantNode
 from tests.simulation.gateway import Gateway, SimStation, noted_reading
@@ -186,7 +186,7 @@ class World:
     def tune_of(self, *args: Any, **more: Any) -> Any:
         return self.tune(*args, **more)
 
-    def _moved(self, gateway: Gateway, row: JobRow, state: JobState) -> None:
+    def _moved(self, gateway: Gateway, row: Job, state: JobState) -> None:
         restored, since = row.restored, self.simulation.now
         for said, began in self.readings[gateway.name]:
             if restored is not None and _alike(said, restored):
@@ -209,7 +209,7 @@ class World:
 
             self.simulation.after(_OVER_S, look)
 
-    def permit(self, row: JobRow) -> None:
+    def permit(self, row: Job) -> None:
         """A person decides: either set of the job may be the accepted one from now on."""
         proposed = None if row.result is None or row.result.new_gains is None else asdict(row.result.new_gains.gains())
         for gains in (row.old_gains, proposed):

@@ -28,7 +28,7 @@ from loopwright.protocol.profile import (
 )
 from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.loop_state import LoopState
-from loopwright.service.store.tables import JobRow
+from loopwright.service.store.jobs import Job
 from tests.simulation.devices import Controller, PlantNode
 from tests.simulation.disk import AGAIN_S, SOON_S
 from tests.simulation.scheduler import START, Simulation
@@ -377,7 +377,7 @@ class Invariants:
 
     # -- what a job says
 
-    def moved(self, gateway: str, row: JobRow, state: JobState, restoring_since: float, since: float) -> None:
+    def moved(self, gateway: str, row: Job, state: JobState, restoring_since: float, since: float) -> None:
         """A job has got a state: it must agree with what the controller held as it was read."""
         reason = row.reason or ""
         self.simulation.note(gateway, f"job is {state.value} {reason} {row.detail or ''}".rstrip())

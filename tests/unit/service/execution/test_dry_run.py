@@ -111,7 +111,7 @@ def test_a_dry_run_takes_the_model_that_the_last_job_found_and_the_gains_of_the_
     assert on.gains_source == "controller" and view.old_gains is not None and view.old_gains.Kp == OLD.Kp
     assert view.comparison is not None and view.comparison.verdict
     assert any(f"the model that job {job_id} found" in note for note in view.notes)
-    title = job_tables.title(view.model_dump(mode="json"))
+    title = job_tables.title(view)
     assert "rehearsed on the model that job" in title and title.endswith("nothing was tested")
     assert "proposed" not in title
 
@@ -127,7 +127,7 @@ def test_neither_a_dry_run_nor_a_model_that_was_disproved_or_typed_in_is_the_las
     service.store.move(typed_in.id, JobState.PROPOSED, result=result)
     view = dry_run(service)
     assert view.rehearsed_on is not None and view.rehearsed_on.plant_source == "guessed"
-    title = job_tables.title(view.model_dump(mode="json"))
+    title = job_tables.title(view)
     assert title == (
         f"job {view.id}: {TAG} rehearsed on a guessed plant (from T95 9 s, MV 0 to 100 %, step 2), nothing was tested"
     )
@@ -176,7 +176,7 @@ def test_a_refused_rehearsal_says_what_it_was_on(service: Service) -> None:
     view = dry_run(service, plant=PlantModel(num=[-0.2], den=[2.4, 1.0], dead_time_s=1.8))
     assert (view.state, view.reason) == (JobState.REFUSED, "wrong_sign"), view.detail
     assert view.rehearsed_on is not None and view.rehearsed_on.plant_source == "given"
-    assert job_tables.title(view.model_dump(mode="json")).endswith("refused on the plant given, nothing was tested")
+    assert job_tables.title(view).endswith("refused on the plant given, nothing was tested")
 
 
 @pytest.mark.parametrize(
@@ -221,4 +221,4 @@ def test_dry_runs_of_earlier_versions_are_shown_as_rehearsed(service: Service, c
     told = exposition(registry(service.loops, service.store, {})).decode()
     assert 'loopwright_jobs{reason="",state="rehearsed"} 1.0' in told
     assert 'loopwright_jobs{reason="",state="proposed"} 1.0' in told
-    job_tables.job_report(job)
+    job_tables.job_report(JobView.model_validate(job))

@@ -22,8 +22,9 @@ from loopwright.service.jobs.aftercare import EVERY_S, LONGEST_S, Aftercare
 from loopwright.service.loop_state import state_json
 from loopwright.service.request import FastRetune
 from loopwright.service.store import audit, looked_after
+from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
-from loopwright.service.store.tables import JobRow, LoopRow
+from loopwright.service.store.tables import LoopRow
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Reason
 from tests.unit.service.fakes import TAG, FakeController, Service, loop_entry
@@ -54,7 +55,7 @@ def clock(service: Service) -> Clock:
     return clock
 
 
-def left_by_a_job(service: Service, becomes: Callable[[FakeController], None]) -> JobRow:
+def left_by_a_job(service: Service, becomes: Callable[[FakeController], None]) -> Job:
     """A job that ends with what has become of its controller in the middle of the test."""
     service.tune.hold.clear()
     service.tune.inside.clear()
@@ -198,14 +199,14 @@ def test_a_defect_with_one_loop_does_not_keep_the_others_from_being_looked_at(
     row = left_by_a_job(service, stopped)
     started(service.controller)
     other = service.store.create("FIC-2", {}, "me", False)
-    service.store.note(other.id, state="failed", look_after=True, found={"no": "state"}, session=3)
+    service.store.note(other.id, state="failed", look_after=True, found={"no": "state"}, session=3)  # type: ignore[call-arg]
     service.jobs.aftercare.check_due_loops()
     assert not service.store.get(row.id).look_after and service.store.get(other.id).look_after
 
 
 def test_a_loop_that_is_configured_no_more_is_kept_and_can_be_dismissed(service: Service, clock: Clock) -> None:
     row = service.store.create("GONE", {}, "me", False)
-    service.store.note(row.id, state="failed", look_after=True, session=3)
+    service.store.note(row.id, state="failed", look_after=True, session=3)  # type: ignore[call-arg]
     service.jobs.aftercare.check_due_loops()
     (found,) = service.jobs.aftercare.not_home()
     assert "no longer configured here" in found.words
@@ -215,7 +216,7 @@ def test_a_loop_that_is_configured_no_more_is_kept_and_can_be_dismissed(service:
 def test_it_moves_with_its_loop_to_another_host(tmp_path: Path, postgres: Server) -> None:
     store = Store(tmp_path, postgres.database(), "gateway A")
     row = store.create(TAG, {}, "me", False, host="gateway B")
-    store.note(row.id, state="failed", look_after=True)
+    store.note(row.id, state="failed", look_after=True)  # type: ignore[call-arg]
     with store.writing() as session:
         session.add(LoopRow(tag=TAG, host="gateway B", config={}))
     store.own_loops({TAG: loop_entry()})

@@ -20,8 +20,8 @@ from loopwright.service.loops.loop import Restored
 from loopwright.service.request import FastRetune, retune_request
 from loopwright.service.results import ModelView, TransferModelView
 from loopwright.service.store import audit
+from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
-from loopwright.service.store.tables import JobRow
 from loopwright.tuning.plan import StageStarted
 from loopwright.tuning.reasons import Reason
 from tests.unit.service.fakes import OLD, TAG, FakeLoop, Service
@@ -194,7 +194,7 @@ def test_a_job_that_ends_for_an_abort_before_it_is_written_down_was_aborted_by_i
 ) -> None:
     write = service.store.request_stop
 
-    def slow(job_id: str, *more: Any) -> JobRow:
+    def slow(job_id: str, *more: Any) -> Job:
         service.wait(job_id, 60)
         return write(job_id, *more)
 

@@ -20,8 +20,8 @@ from loopwright.service.jobs.recovery import MAX_ATTEMPTS
 from loopwright.service.loop_state import LoopState, state_json
 from loopwright.service.request import FastRetune
 from loopwright.service.server.assembly import make_jobs
+from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
-from loopwright.service.store.tables import JobRow
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Reason
@@ -281,7 +281,7 @@ def test_the_loop_of_a_job_is_configured_no_more(started: list[Service], tmp_pat
     row = store.create("GONE", {}, "me", False, version=WORKFLOW_VERSION)
     store.close()
     service = again(started, tmp_path)
-    found: JobRow = service.store.get(row.id)
+    found: Job = service.store.get(row.id)
     assert found.state == "interrupted" and "no longer configured" in (found.detail or "")
 
 
@@ -449,7 +449,7 @@ def test_a_stop_request_written_just_as_the_job_gets_its_turn_is_heard(
     job_id = left(tmp_path)
     service = again(started, tmp_path, engine=Forgetful())
     monkeypatch.setattr(service.store, "stop_requests", dict)  # the watcher comes later
-    as_it_gets_its_turn(monkeypatch, lambda: service.store.request_stop(job_id, Reason.OPERATOR.value, "gateway B"))
+    as_it_gets_its_turn(monkeypatch, lambda: service.store.request_stop(job_id, Reason.OPERATOR, "gateway B"))
     service.jobs.worker.work(job_id)
     row = service.store.get(job_id)
     assert (row.state, row.reason) == ("aborted", "operator") and not service.tune.inside.is_set()
@@ -475,7 +475,7 @@ def test_an_abort_written_by_another_host_is_heard(service: Service) -> None:
     service.tune.hold.clear()
     row = service.jobs.start(TAG, FastRetune())
     service.tune.inside.wait(60)
-    service.store.request_stop(row.id, Reason.OPERATOR.value, "gateway B")
+    service.store.request_stop(row.id, Reason.OPERATOR, "gateway B")
     service.wait(row.id)
     assert (service.store.get(row.id).state, service.controller.state) == ("aborted", HOME)
 

@@ -327,7 +327,7 @@ def test_keys_and_audit_log_on_a_shared_database(tmp_path: Path, postgres: Serve
     found = two.check(key)
     assert found is not None and found.id == row.id
     job = stores[1].create("L", {"x": 1}, "me", False)
-    stores[1].request_stop(job.id, "operator", "me")
+    stores[1].request_stop(job.id, Reason.OPERATOR, "me")
     two.revoke(row.id)
     assert one.check(key) is None
     entries = [(entry.what, entry.subject) for entry in audit.trail(stores[0].engine, 10)]

@@ -11,16 +11,18 @@ from alembic.autogenerate import compare_metadata
 from alembic.config import Config
 from alembic.migration import MigrationContext
 from sqlalchemy import Connection, inspect, text
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy.exc import IntegrityError, StatementError
 
 from loopwright.service.job_states import MOVES, IllegalMove, JobState, check
 from loopwright.service.results import FiveStageResult, GainsView
 from loopwright.service.store import lock
 from loopwright.service.store.database import USUAL, BadDatabase, urgent
+from loopwright.service.store.jobs import UnknownWord
 from loopwright.service.store.store import Busy, FolderInUse, ForeignLoop, NoSuchJob, Store
 from loopwright.service.store.tables import Base
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Sample
+from loopwright.tuning.reasons import Reason
 from tests.unit.service.fakes import add_samples
 from tests.unit.service.postgres import Server
 
@@ -29,6 +31,18 @@ def test_migrations_make_the_tables_of_the_code(store: Store) -> None:
     with store.engine.connect() as connection:
         differences = compare_metadata(MigrationContext.configure(connection), Base.metadata)
     assert differences == []
+
+
+def test_a_word_that_is_not_known_names_its_job(store: Store) -> None:
+    """One that a later version wrote, say: the other jobs can be read as ever."""
+    good, bad = (store.create(loop, {}, "me", False) for loop in "AB")
+    with store.engine.begin() as connection:
+        connection.execute(text("UPDATE jobs SET reason = 'full_moon' WHERE id = :id"), {"id": bad.id})
+    with pytest.raises(UnknownWord, match=f"job {bad.id} holds 'full_moon', which is no Reason"):
+        store.get(bad.id)
+    assert store.get(good.id) == good
+    with pytest.raises(StatementError, match="full_moon"):
+        store.note(good.id, reason="full_moon")
 
 
 def migrate(connection: Connection, revision: str) -> None:
@@ -334,7 +348,7 @@ def test_what_is_urgent_has_connections_of_its_own(store: Store) -> None:
             stack.enter_context(store.engine.connect())
         token = urgent.set(True)
         try:
-            assert store.request_stop(job.id, "operator", "me").stop_reason == "operator"
+            assert store.request_stop(job.id, Reason.OPERATOR, "me").stop_reason == "operator"
             assert store.get(job.id).stop_reason == "operator"
         finally:
             urgent.reset(token)

@@ -1,0 +1,101 @@
+"""Jobs and their events as the store hands them out: frozen, and typed to the edges."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from enum import StrEnum
+from typing import Any, TypedDict, TypeVar
+
+from loopwright.service.job_states import JobState
+from loopwright.service.results import FastResult, FiveStageResult
+from loopwright.service.store.tables import EventRow, JobRow
+from loopwright.tuning.reasons import Reason
+
+Word = TypeVar("Word", bound=StrEnum)
+
+
+class JobColumns(TypedDict, total=False):
+    """What a transaction may set of a job's row, besides what the store keeps itself."""
+
+    attempt: int
+    detail: str
+    found: Mapping[str, object]
+    look_after: bool
+    old_gains: Mapping[str, object]
+    plant_time_s: float
+    reason: str
+    restored: Mapping[str, object]
+    result: FastResult | FiveStageResult | None
+    session: int | None
+    stage: str
+    stage_times_s: Mapping[str, float]
+
+
+class UnknownWord(ValueError):
+    """A row holds a word that this version does not know."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """A job as stored. Times of day are UTC, ISO 8601; the columns are explained in `service.store.tables`."""
+
+    number: int
+    id: str
+    loop: str
+    state: JobState
+    dry_run: bool
+    request: dict[str, Any]
+    requested_by: str
+    created_at: str
+    started_at: str | None
+    ended_at: str | None
+    stage: str | None
+    plant_time_s: float
+    stage_times_s: dict[str, float] | None
+    reason: Reason | None
+    detail: str | None
+    old_gains: dict[str, Any] | None
+    restored: dict[str, Any] | None
+    result: FastResult | FiveStageResult | None
+    host: str
+    version: str
+    attempt: int
+    found: dict[str, Any] | None
+    session: int | None
+    look_after: bool
+    stop_reason: Reason | None
+
+    @classmethod
+    def from_row(cls, row: JobRow) -> Job:
+        """Raises UnknownWord."""
+        columns = {field.name: getattr(row, field.name) for field in fields(cls)}
+        columns["state"] = _word(JobState, row.state, row.id)
+        for name in ("reason", "stop_reason"):
+            if columns[name] is not None:
+                columns[name] = _word(Reason, columns[name], row.id)
+        return cls(**columns)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobEvent:
+    """One thing that happened in a job; seq counts from 1 within the job."""
+
+    job_id: str
+    seq: int
+    at: str
+    plant_time_s: float
+    kind: str
+    data: dict[str, Any]
+
+    @classmethod
+    def from_row(cls, row: EventRow) -> JobEvent:
+        return cls(**{field.name: getattr(row, field.name) for field in fields(cls)})
+
+
+def _word(kind: type[Word], value: str, job_id: str) -> Word:
+    try:
+        return kind(value)
+    except ValueError:
+        known = ", ".join(kind)
+        raise UnknownWord(f"job {job_id} holds {value!r}, which is no {kind.__name__} ({known})") from None
