@@ -11,13 +11,13 @@ from pathlib import Path
 
 from benchmarks.command import command
 from benchmarks.rehearsed import entry, open_loop
-from loopwright.service.config import LoopConfig, parse_site
 from loopwright.service.execution.procedures import Hooks, Outcome, rehearse
+from loopwright.service.inputs.config import LoopConfig, parse_site
+from loopwright.service.inputs.request import FastRetune, RetuneRequest
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.dbos_engine import DurableEngine
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
-from loopwright.service.request import FastRetune, RetuneRequest
 from loopwright.service.results import empty_result
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store

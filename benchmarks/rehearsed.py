@@ -19,8 +19,8 @@ from benchmarks.command import parser_of
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
-from loopwright.service.config import LoopConfig
 from loopwright.service.execution.rehearsal import RehearsedLoop
+from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.server.serving import Setup, serve
 from loopwright.tuning.plan import Command, Mode, Sample
 

@@ -30,11 +30,11 @@ from loopwright.service.api.job_views import (
 from loopwright.service.api.paging import LARGEST
 from loopwright.service.api.samples import Reading, csv_text, json_text, parts, takes_gzip
 from loopwright.service.execution.computing.pool import Pool
+from loopwright.service.inputs.request import FastRetune, RetuneRequest
 from loopwright.service.job_states import ACTIVE
 from loopwright.service.jobs.fleet import Fleet
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.loops.shared_reading import SharedReading
-from loopwright.service.request import FastRetune, RetuneRequest
 from loopwright.service.security.principal import current
 from loopwright.service.store.idempotency import IdempotencyKeys
 from loopwright.service.store.jobs import Job

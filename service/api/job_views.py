@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, Field
 
-from loopwright.service.config import Limits, LoopConfig
+from loopwright.service.inputs.config import Limits, LoopConfig
 from loopwright.service.job_states import ACTIVE, JobState, shown
 from loopwright.service.loop_state import LoopState, gains_of
 from loopwright.service.results import (

@@ -12,7 +12,7 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
-from loopwright.service.config import LoopConfig
+from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.job_states import ACTIVE, JobState, shown
 from loopwright.service.store import looked_after
 from loopwright.service.store.store import Store

@@ -15,15 +15,15 @@ from starlette.exceptions import HTTPException
 from loopwright.service.api.bodies import BadBody
 from loopwright.service.errors import Conflict, Locked, Stopping, UnknownLoop
 from loopwright.service.execution.computing.pool import NotWanted
+from loopwright.service.inputs.model_json import BadModel
+from loopwright.service.inputs.request import BadLimits
+from loopwright.service.inputs.validation import place, words
 from loopwright.service.job_states import IllegalMove
 from loopwright.service.jobs.journal import temporary
-from loopwright.service.model_json import BadModel
 from loopwright.service.offline.tunings import BadTuning
-from loopwright.service.request import BadLimits
 from loopwright.service.store.claims import StillAnswering
 from loopwright.service.store.damage import is_damage
 from loopwright.service.store.store import Busy, FolderInUse, NoSuchJob
-from loopwright.service.validation import place, words
 from loopwright.tuning.reasons import ADVICE, Ended, Reason
 
 MEDIA_TYPE = "application/problem+json"

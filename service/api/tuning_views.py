@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from loopwright.service.model_json import ModelForm, form_shown
+from loopwright.service.inputs.model_json import ModelForm, form_shown
 from loopwright.service.results import GainsView
 from loopwright.tuning.reasons import Reason
 from loopwright.tuning.rules.design import MIN_GM, MAX_Ms

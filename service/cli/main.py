@@ -137,8 +137,8 @@ def serve(
 
     from loopwright.protocol.device_process import node_id
     from loopwright.service.api.gate.limits import RequestLimits
-    from loopwright.service.config import ConfigError
     from loopwright.service.execution.computing.limits import ComputingLimits
+    from loopwright.service.inputs.config import ConfigError
     from loopwright.service.jobs.retention import RetentionPolicy
     from loopwright.service.server.serving import NotSafe, Setup
     from loopwright.service.server.serving import serve as run

@@ -40,7 +40,7 @@ def tune(
     """Gains for a process model by one method or all, compared on it. Exit 0: gains found, 3: none."""
     # the matrices are small: threads of the linear algebra cost more than they save
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from loopwright.service.model_json import BadModel, parse_model
+    from loopwright.service.inputs.model_json import BadModel, parse_model
     from loopwright.service.offline import tunings
 
     check_plot(plot)

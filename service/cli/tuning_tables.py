@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from loopwright.service.model_json import describe
+from loopwright.service.inputs.model_json import describe
 
 console = Console(highlight=False)
 

@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
-from loopwright.service.config import LoopConfig
+from loopwright.service.inputs.config import LoopConfig
+from loopwright.service.inputs.request import FastRetune, RetuneRequest
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.service.planning.facts import facts_of, time_budget_s
 from loopwright.service.planning.ground import Ground, rehearsal_spec
 from loopwright.service.planning.moves import broken_limits
-from loopwright.service.request import FastRetune, RetuneRequest
 from loopwright.service.results import Result, empty_result
 from loopwright.service.store.jobs import JobEvent
 from loopwright.tuning.experiments.primitives import Facts

@@ -19,10 +19,7 @@ from loopwright.plantsim.plant import LinearPlant, SimulatedProcess
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.result import result_of
 from loopwright.service.execution.runner import RunResult, run
-from loopwright.service.jsonable import to_jsonable
-from loopwright.service.loop_state import LoopState
-from loopwright.service.loops.loop import Restored
-from loopwright.service.plausible import (
+from loopwright.service.inputs.plausible import (
     Finite,
     Gain,
     Implausible,
@@ -33,8 +30,11 @@ from loopwright.service.plausible import (
     check_model,
     check_sampling,
 )
+from loopwright.service.inputs.validation import lines
+from loopwright.service.jsonable import to_jsonable
+from loopwright.service.loop_state import LoopState
+from loopwright.service.loops.loop import Restored
 from loopwright.service.results import FastResult, FiveStageResult, UltimateView, empty_result
-from loopwright.service.validation import lines
 from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.fast.design_trial import trial
 from loopwright.tuning.fast.procedure import FAST, FAST_STAGES, FastOptions, FastProposal, fast

@@ -7,12 +7,12 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from loopwright.service.config import LoopConfig
 from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.computing.pool import NotWanted, Pool
 from loopwright.service.execution.procedures import Hooks, Outcome, Rehearse
+from loopwright.service.inputs.config import LoopConfig
+from loopwright.service.inputs.request import RetuneRequest
 from loopwright.service.planning.ground import Ground
-from loopwright.service.request import RetuneRequest
 from loopwright.tuning.plan import Event, Sample
 from loopwright.tuning.reasons import Aborted, Reason
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from loopwright.service.errors import Conflict
+from loopwright.service.inputs.model_json import dump_model, parse_model
 from loopwright.service.job_states import ACTIVE
 from loopwright.service.jobs.relay_record import RelayRecord
-from loopwright.service.model_json import dump_model, parse_model
 from loopwright.service.offline.tunings import MethodResult, answer, tune_each
 from loopwright.service.planning.found_model import DISPROVED, FoundModel, found_model
 from loopwright.service.store.jobs import Job, JobEvent

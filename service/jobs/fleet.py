@@ -16,11 +16,9 @@ from typing import Annotated, Any, Self
 from pydantic import BaseModel, Field, TypeAdapter, model_validator
 from sqlalchemy.exc import SQLAlchemyError
 
-from loopwright.service.config import BusConfig, LoopConfig
 from loopwright.service.errors import Locked, Stopping, UnknownLoop
-from loopwright.service.job_states import IllegalMove
-from loopwright.service.jobs.manager import Jobs
-from loopwright.service.request import (
+from loopwright.service.inputs.config import BusConfig, LoopConfig
+from loopwright.service.inputs.request import (
     AnyRetune,
     BadLimits,
     FastRetune,
@@ -30,11 +28,13 @@ from loopwright.service.request import (
     retune_request,
     within,
 )
+from loopwright.service.inputs.validation import branch
+from loopwright.service.job_states import IllegalMove
+from loopwright.service.jobs.manager import Jobs
 from loopwright.service.store import retunes
 from loopwright.service.store.retunes import Part, RetuneOver, StopReason
 from loopwright.service.store.store import Busy, FolderInUse
 from loopwright.service.store.tables import RetuneRow
-from loopwright.service.validation import branch
 from loopwright.tuning.reasons import Reason
 
 log = logging.getLogger(__name__)

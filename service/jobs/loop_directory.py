@@ -7,8 +7,8 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any
 
-from loopwright.service.config import BusConfig, LoopConfig
 from loopwright.service.errors import UnknownLoop
+from loopwright.service.inputs.config import BusConfig, LoopConfig
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.loop_state import LoopState, gains_of, loop_state

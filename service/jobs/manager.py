@@ -12,8 +12,9 @@ from contextlib import suppress
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from loopwright.service.config import LoopConfig
 from loopwright.service.errors import Stopping
+from loopwright.service.inputs.config import LoopConfig
+from loopwright.service.inputs.request import RetuneRequest, within
 from loopwright.service.job_states import ACTIVE, IllegalMove, JobState
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.aftercare import Aftercare
@@ -27,7 +28,6 @@ from loopwright.service.jobs.recovery import Recovery
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.until_answered import STOP_PATIENCE_S, UntilAnswered
 from loopwright.service.jobs.worker import Worker
-from loopwright.service.request import RetuneRequest, within
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.lock import CHECK_S
 from loopwright.service.store.store import FolderInUse, Store, WithJob

@@ -6,14 +6,14 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from loopwright.service.config import LoopConfig
 from loopwright.service.errors import Locked
+from loopwright.service.inputs.config import LoopConfig
+from loopwright.service.inputs.request import retune_request, within
 from loopwright.service.job_states import JobState
 from loopwright.service.jobs.engine import WORKFLOW_VERSION
 from loopwright.service.loop_state import state_json
 from loopwright.service.loops.loop import Loop
 from loopwright.service.loops.restoration import Restoration, restore_loop_of
-from loopwright.service.request import retune_request, within
 from loopwright.service.store import loop_locks
 from loopwright.service.store.jobs import Job, JobColumns
 from loopwright.service.store.store import Store

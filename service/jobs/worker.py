@@ -9,9 +9,10 @@ from __future__ import annotations
 import logging
 from dataclasses import asdict
 
-from loopwright.service.config import LoopConfig
 from loopwright.service.errors import Locked
 from loopwright.service.execution.procedures import Hooks, Outcome, Rehearse, Tune
+from loopwright.service.inputs.config import LoopConfig
+from loopwright.service.inputs.request import BadLimits, RetuneRequest, retune_request, within
 from loopwright.service.job_states import ACTIVE, GOOD, JobState, state_after
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.journal import Journal
@@ -24,7 +25,6 @@ from loopwright.service.loops.loop import Loop
 from loopwright.service.loops.observed_loop import ObservedLoop
 from loopwright.service.loops.restoration import restore_abandoned
 from loopwright.service.planning.known_loop import known
-from loopwright.service.request import BadLimits, RetuneRequest, retune_request, within
 from loopwright.service.store import looked_after
 from loopwright.service.store.jobs import Job, JobColumns
 from loopwright.service.store.lock import FolderInUse

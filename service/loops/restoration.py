@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from loopwright.service.config import LoopConfig
+from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.loop_state import LoopState, loop_state
 from loopwright.service.loops.loop import Loop
 from loopwright.service.store.jobs import Job
@@ -58,9 +58,7 @@ def restore_abandoned(loop: Loop, home: LoopState, session: int | None) -> Resto
     return Restoration(restored.state, text, reason)
 
 
-def restore_loop_of(
-    row: Job, loops: Mapping[str, LoopConfig], open_loop: Callable[[LoopConfig], Loop]
-) -> Restoration:
+def restore_loop_of(row: Job, loops: Mapping[str, LoopConfig], open_loop: Callable[[LoopConfig], Loop]) -> Restoration:
     """Opens the loop of a job and restores it. Raises nothing: one loop must not keep others from being restored."""
     config = loops.get(row.loop)
     if config is None:

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
+from loopwright.service.inputs.model_json import dump_model
 from loopwright.service.jsonable import to_jsonable
-from loopwright.service.model_json import dump_model
 from loopwright.service.offline.csv_record import Record
 from loopwright.tuning.identification.identify import Identified
 from loopwright.tuning.reasons import Refused

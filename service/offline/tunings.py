@@ -10,9 +10,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from loopwright.service.inputs.model_json import dump_model
+from loopwright.service.inputs.plausible import Implausible, check_option
 from loopwright.service.jsonable import to_jsonable
-from loopwright.service.model_json import dump_model
-from loopwright.service.plausible import Implausible, check_option
 from loopwright.tuning.analysis.assessment import Assessment
 from loopwright.tuning.analysis.step_figures import StepFigures
 from loopwright.tuning.gain_forms import to_parallel

@@ -6,7 +6,7 @@ ten), and the limits of time of the procedures.
 
 from __future__ import annotations
 
-from loopwright.service.request import FastRetune, RetuneRequest
+from loopwright.service.inputs.request import FastRetune, RetuneRequest
 from loopwright.tuning.experiments.preflight import MAX_ATTEMPTS, MIN_LISTENED_SAMPLES
 from loopwright.tuning.fast.procedure import MIN_SAMPLES
 from loopwright.tuning.fast.relay_test import MAX_PERIODS, STEP_BACK_FRACTION, VERIFICATION_PERIODS

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from loopwright.service.config import LoopConfig
+from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.loop_state import LoopState
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.procedure import FAST

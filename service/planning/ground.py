@@ -7,10 +7,10 @@ from typing import Any
 
 from numpy.linalg import LinAlgError
 
-from loopwright.service.config import LoopConfig
+from loopwright.service.inputs.config import LoopConfig
+from loopwright.service.inputs.request import RetuneRequest
 from loopwright.service.loop_state import LoopState
 from loopwright.service.planning.found_model import FoundModel
-from loopwright.service.request import RetuneRequest
 from loopwright.service.results import GainsSource, PlantSource, RehearsedOnView
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains

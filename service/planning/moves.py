@@ -10,8 +10,8 @@ import math
 from dataclasses import dataclass
 
 from loopwright.protocol.real32 import TOLERANCE
-from loopwright.service.config import LoopConfig
-from loopwright.service.request import FastRetune, FiveStages, RetuneRequest
+from loopwright.service.inputs.config import LoopConfig
+from loopwright.service.inputs.request import FastRetune, FiveStages, RetuneRequest
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.design_trial import trial_stages
 from loopwright.tuning.fast.procedure import fast_stages

@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
-from loopwright.service.config import LoopConfig
+from loopwright.service.inputs.config import LoopConfig
+from loopwright.service.inputs.request import FastRetune, RetuneRequest, narrow
 from loopwright.service.loop_state import OPERATIONAL, LoopState
 from loopwright.service.planning.facts import facts_of
 from loopwright.service.planning.moves import broken_limits, stages_asked
-from loopwright.service.request import FastRetune, RetuneRequest, narrow
 from loopwright.tuning.experiments.preflight import MAX_ATTEMPTS, MAX_AWAY, MAX_NOISE, MIN_ROOM
 from loopwright.tuning.fast.relay_test import BIAS, max_amplitude
 from loopwright.tuning.models import sign

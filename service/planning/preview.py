@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 from pydantic import BaseModel, Field
 
-from loopwright.service.config import Limits, LoopConfig
+from loopwright.service.inputs.config import Limits, LoopConfig
+from loopwright.service.inputs.request import FiveStages, RetuneRequest, narrow
 from loopwright.service.loop_state import LoopState
 from loopwright.service.planning.durations import Span, durations
 from loopwright.service.planning.facts import time_budget_s
 from loopwright.service.planning.moves import Before, Moves, moves
 from loopwright.service.planning.obstacles import Now, Obstacle, Occupied, obstacles
-from loopwright.service.request import FiveStages, RetuneRequest, narrow
 from loopwright.service.results import Result, TransferModelView
 from loopwright.tuning.gains import Gains
 

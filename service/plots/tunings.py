@@ -11,7 +11,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from loopwright.service.model_json import describe, dump_model
+from loopwright.service.inputs.model_json import describe, dump_model
 from loopwright.service.offline.csv_record import Record
 from loopwright.service.offline.tunings import MethodResult
 from loopwright.tuning.analysis.step_response import Response, step_response

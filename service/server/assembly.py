@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from loopwright.service.config import BusConfig, LoopConfig
 from loopwright.service.execution.procedures import Rehearse, Tune
+from loopwright.service.inputs.config import BusConfig, LoopConfig
 from loopwright.service.jobs.aftercare import Aftercare
 from loopwright.service.jobs.decisions import Decisions
 from loopwright.service.jobs.engine import Engine

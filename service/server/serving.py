@@ -31,12 +31,12 @@ from loopwright.service.api.gate.connections import (
 )
 from loopwright.service.api.gate.gate import Policy, is_loopback
 from loopwright.service.api.gate.limits import RequestLimits
-from loopwright.service.config import LoopConfig, load_site
 from loopwright.service.execution.computing.limits import ComputationKind, ComputingLimits
 from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.execution.procedures import Tune, rehearse
 from loopwright.service.execution.procedures import tune as live
 from loopwright.service.execution.rehearsals import rehearsed_in_pool
+from loopwright.service.inputs.config import LoopConfig, load_site
 from loopwright.service.jobs.dbos_engine import POLL_S, DurableEngine
 from loopwright.service.jobs.loop_directory import LoopFactory
 from loopwright.service.jobs.manager import Jobs

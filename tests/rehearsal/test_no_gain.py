@@ -14,12 +14,12 @@ from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.service.api.job_views import JobView, job_view
 from loopwright.service.cli.job_tables import job_report, title
-from loopwright.service.config import LoopConfig, parse_site
 from loopwright.service.execution.procedures import rehearse as dry_run
 from loopwright.service.execution.procedures import tune
 from loopwright.service.execution.rehearsal import RehearsedLoop
+from loopwright.service.inputs.config import LoopConfig, parse_site
+from loopwright.service.inputs.request import retune_request
 from loopwright.service.job_states import JobState
-from loopwright.service.request import retune_request
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.retunes import Part
 from loopwright.service.store.store import Store

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 
 from benchmarks.rehearsed import entry, open_loop
-from loopwright.service.config import parse_site
 from loopwright.service.execution.procedures import rehearse, tune
 from loopwright.service.execution.rehearsal import RehearsedLoop
+from loopwright.service.inputs.config import parse_site
+from loopwright.service.inputs.request import retune_request
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.request import retune_request
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.tuning.experiments.preflight import SETTLE

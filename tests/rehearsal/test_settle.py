@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 from benchmarks.rehearsed import entry, open_loop
-from loopwright.service.config import parse_site
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.procedures import plan
 from loopwright.service.execution.runner import RunResult, run
+from loopwright.service.inputs.config import parse_site
+from loopwright.service.inputs.request import retune_request
 from loopwright.service.loops.loop import Loop
-from loopwright.service.request import retune_request
 from loopwright.service.store.jobs import JobEvent
 from loopwright.tuning.experiments.preflight import SETTLE
 from loopwright.tuning.experiments.primitives import Facts

@@ -14,8 +14,8 @@ from loopwright.protocol.profile import (
     channel_ids,
     sdo_request_id,
 )
-from loopwright.service.model_json import FirstOrderModel
-from loopwright.service.request import RetuneRequest, retune_request
+from loopwright.service.inputs.model_json import FirstOrderModel
+from loopwright.service.inputs.request import RetuneRequest, retune_request
 from tests.simulation import plans
 from tests.simulation.gateway import Gateway
 from tests.simulation.history import World

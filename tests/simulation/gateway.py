@@ -19,8 +19,8 @@ from sqlalchemy import event, text
 
 from loopwright.protocol.fair_lock import FairLock
 from loopwright.protocol.station import Station
-from loopwright.service.config import LoopConfig
 from loopwright.service.execution.procedures import Tune
+from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.manager import Jobs

@@ -12,12 +12,12 @@ from loopwright.controller.device import ControllerChannel
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, Mode, NmtState
-from loopwright.service.config import Limits, LoopConfig
 from loopwright.service.execution.procedures import Tune
+from loopwright.service.inputs.config import Limits, LoopConfig
+from loopwright.service.inputs.request import retune_request
 from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.loop_state import LoopState, state_json
 from loopwright.service.loops.bus_loop import BusLoop
-from loopwright.service.request import retune_request
 from loopwright.service.store.jobs import Job
 from tests.simulation import plans
 from tests.simulation.devices import Controller, PlantNode

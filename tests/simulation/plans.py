@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from random import Random
 from typing import Any
 
-from loopwright.service.config import LoopConfig
 from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.procedures import Hooks, Outcome, Tune, tune
 from loopwright.service.execution.runner import run
+from loopwright.service.inputs.config import LoopConfig
+from loopwright.service.inputs.request import RetuneRequest
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
-from loopwright.service.request import RetuneRequest
 from loopwright.service.results import FiveStageResult, GainsView
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import (

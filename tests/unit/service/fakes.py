@@ -12,13 +12,13 @@ from typing import Any
 
 import pytest
 
-from loopwright.service.config import LoopConfig, parse_site
 from loopwright.service.execution.procedures import Hooks, Outcome, Rehearse
+from loopwright.service.inputs.config import LoopConfig, parse_site
+from loopwright.service.inputs.request import RetuneRequest
 from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.loop_state import OPERATIONAL, LoopState, differences, same_gains
 from loopwright.service.loops.loop import Loop, Restored
-from loopwright.service.request import RetuneRequest
 from loopwright.service.results import (
     FiveStageResult,
     GainsView,

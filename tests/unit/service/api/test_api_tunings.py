@@ -9,11 +9,11 @@ import pytest
 from fastapi.testclient import TestClient
 
 from loopwright.service.execution.procedures import rehearse
+from loopwright.service.inputs.model_json import parse_model
+from loopwright.service.inputs.request import PlantModel, retune_request
 from loopwright.service.jobs.alternatives import alternatives
-from loopwright.service.model_json import parse_model
 from loopwright.service.offline.tunings import tunings
 from loopwright.service.planning.found_model import DISPROVED
-from loopwright.service.request import PlantModel, retune_request
 from loopwright.service.results import ModelView
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains

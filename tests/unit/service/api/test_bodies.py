@@ -14,7 +14,7 @@ from loopwright.service.api.app import create_app
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.gate.bodies import SMALL
 from loopwright.service.api.gate.places import DECIDES, kind_of
-from loopwright.service.request import FastRetune
+from loopwright.service.inputs.request import FastRetune
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from tests.unit.service.fakes import TAG, FakeController, FakeLoop, FakeTune, Service, ThreadEngine, fake_rehearse

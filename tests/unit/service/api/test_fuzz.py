@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.api.gate.limits import RequestLimits
-from loopwright.service.request import FastRetune
+from loopwright.service.inputs.request import FastRetune
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.keyring import Keyring
 from loopwright.tuning.reasons import Failed, Reason

@@ -17,8 +17,8 @@ from sqlalchemy.exc import OperationalError
 from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.api.gate.limits import RequestLimits
+from loopwright.service.inputs.request import FastRetune
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.request import FastRetune
 from loopwright.service.security.keys import Scope
 from loopwright.service.store import audit, claims
 from loopwright.service.store.claims import Claim, StillAnswering

@@ -169,7 +169,7 @@ def rehearsed(service: Service, through: Through) -> str:
     from loopwright.service.execution.procedures import rehearse
 
     jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
-    from loopwright.service.request import PlantModel, retune_request
+    from loopwright.service.inputs.request import PlantModel, retune_request
 
     row = jobs.start(TAG, retune_request(dry_run=True, plant=PlantModel(**PLANT)))
     service.wait(row.id, 60)

@@ -14,11 +14,11 @@ from loopwright.service.api.job_views import JobView, job_view
 from loopwright.service.api.metrics import exposition, registry
 from loopwright.service.cli import job_tables
 from loopwright.service.execution.procedures import Hooks, rehearse
+from loopwright.service.inputs.model_json import TransferFunctionModel
+from loopwright.service.inputs.request import FastRetune, PlantModel, retune_request
 from loopwright.service.job_states import JobState
-from loopwright.service.model_json import TransferFunctionModel
 from loopwright.service.planning.found_model import DISPROVED
 from loopwright.service.planning.ground import Ground, LastModel, rehearsal_spec
-from loopwright.service.request import FastRetune, PlantModel, retune_request
 from loopwright.service.results import FastResult, GainsSource, PlantSource, TransferModelView
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains

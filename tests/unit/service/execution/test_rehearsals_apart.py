@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from loopwright.service.config import LoopConfig, parse_site
 from loopwright.service.execution.computing.limits import ComputingLimits
 from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.procedures import Hooks, Outcome, rehearse
 from loopwright.service.execution.rehearsals import rehearsed_in_pool
 from loopwright.service.execution.runner import run
+from loopwright.service.inputs.config import LoopConfig, parse_site
+from loopwright.service.inputs.request import RetuneRequest, retune_request
 from loopwright.service.job_states import JobState
-from loopwright.service.request import RetuneRequest, retune_request
 from loopwright.tuning.plan import Event, Mode, Plan, Sample, StageStarted
 from loopwright.tuning.reasons import Aborted, Failed, Reason
 from tests.unit.service.fakes import TAG, FakeController, FakeLoop, Service, loop_entry

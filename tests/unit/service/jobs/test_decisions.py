@@ -11,9 +11,9 @@ from fastapi.testclient import TestClient
 from sqlalchemy.exc import OperationalError
 
 from loopwright.service.errors import Conflict
+from loopwright.service.inputs.request import FastRetune
 from loopwright.service.job_states import IllegalMove, JobState
 from loopwright.service.loop_state import LoopState
-from loopwright.service.request import FastRetune
 from loopwright.service.store import audit
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Failed, Reason

@@ -20,13 +20,13 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
 
-from loopwright.service.config import LoopConfig, parse_site
 from loopwright.service.errors import Conflict, Locked
 from loopwright.service.execution.procedures import Hooks, Outcome
+from loopwright.service.inputs.config import LoopConfig, parse_site
+from loopwright.service.inputs.request import RetuneRequest, retune_request
 from loopwright.service.job_states import IllegalMove
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
-from loopwright.service.request import RetuneRequest, retune_request
 from loopwright.service.results import FiveStageResult, GainsView
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store import database

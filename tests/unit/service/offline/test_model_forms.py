@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loopwright.service.model_json import BadModel, describe, dump_model, form_shown, parse_model
+from loopwright.service.inputs.model_json import BadModel, describe, dump_model, form_shown, parse_model
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 
 FORMS: list[tuple[dict[str, Any], Model]] = [

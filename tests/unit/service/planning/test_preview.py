@@ -9,13 +9,13 @@ import pytest
 from fastapi.testclient import TestClient
 
 from loopwright.service.api.gate.gate import scope_for
-from loopwright.service.config import LoopConfig
 from loopwright.service.execution.procedures import Hooks, tune
+from loopwright.service.inputs.config import LoopConfig
+from loopwright.service.inputs.request import FastRetune, retune_request, within
 from loopwright.service.loop_state import LoopState
 from loopwright.service.planning.moves import broken_limits
 from loopwright.service.planning.obstacles import Now
 from loopwright.service.planning.preview import LastProposal, Preview, duration_text, preview
-from loopwright.service.request import FastRetune, retune_request, within
 from loopwright.service.results import UltimateView
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.store import Store

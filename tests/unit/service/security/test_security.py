@@ -21,7 +21,7 @@ from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy, is_loopback
 from loopwright.service.api.gate.limits import Buckets, RequestLimits
 from loopwright.service.cli import main as cli
-from loopwright.service.request import FastRetune
+from loopwright.service.inputs.request import FastRetune
 from loopwright.service.security.keys import Scope, hash_key, matches, new_key
 from loopwright.service.server.serving import NotSafe, Setup, serve
 from loopwright.service.store import audit

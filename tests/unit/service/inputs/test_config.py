@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from loopwright.service.cli.demo import loops_yaml
-from loopwright.service.config import ConfigError, load_site, parse_site
+from loopwright.service.inputs.config import ConfigError, load_site, parse_site
 from tests.unit.service.fakes import loop_entry
 
 

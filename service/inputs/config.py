@@ -14,7 +14,7 @@ from typing import Annotated, Any, Self
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from loopwright.service.plausible import Positive, Size, Time, Value, check_step
+from loopwright.service.inputs.plausible import Positive, Size, Time, Value, check_step
 
 Node = Annotated[int, Field(ge=1, le=127)]
 

@@ -25,8 +25,8 @@ from pydantic import (
     model_validator,
 )
 
-from loopwright.service.plausible import MAX_TIME_S, MIN_TIME_S, Implausible, check_damping, check_model
-from loopwright.service.validation import branch, branch_of, lines
+from loopwright.service.inputs.plausible import MAX_TIME_S, MIN_TIME_S, Implausible, check_damping, check_model
+from loopwright.service.inputs.validation import branch, branch_of, lines
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 
 MAX_COEFFICIENTS = 12

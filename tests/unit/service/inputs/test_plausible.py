@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from benchmarks.plants import plants
-from loopwright.service.config import ConfigError, parse_site
-from loopwright.service.model_json import BadModel, dump_model, parse_model
+from loopwright.service.inputs.config import ConfigError, parse_site
+from loopwright.service.inputs.model_json import BadModel, dump_model, parse_model
+from loopwright.service.inputs.plausible import Implausible, check_model, check_sampling
+from loopwright.service.inputs.request import BadLimits, retune_request, within
 from loopwright.service.offline.tunings import BadTuning, tune_model
-from loopwright.service.plausible import Implausible, check_model, check_sampling
-from loopwright.service.request import BadLimits, retune_request, within
 from tests.rehearsed import rehearse
 from tests.unit.service.fakes import TAG, Service, loop_entry
 from validation.references import References, load

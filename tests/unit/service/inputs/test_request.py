@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from loopwright.service.inputs.request import FastRetune, FiveStageRetune, RuleRetune, retune_request
+from loopwright.service.inputs.validation import lines, place
 from loopwright.service.jobs.fleet import FastRetunes, FiveStageRetunes, RuleRetunes, fleet_request
-from loopwright.service.request import FastRetune, FiveStageRetune, RuleRetune, retune_request
-from loopwright.service.validation import lines, place
 from loopwright.tuning.fast.procedure import FastOptions
 from loopwright.tuning.five_stage.procedure import Options
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating

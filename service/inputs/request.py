@@ -16,9 +16,9 @@ from pydantic import (
     model_validator,
 )
 
-from loopwright.service.config import LoopConfig
-from loopwright.service.model_json import ModelForm
-from loopwright.service.plausible import (
+from loopwright.service.inputs.config import LoopConfig
+from loopwright.service.inputs.model_json import ModelForm
+from loopwright.service.inputs.plausible import (
     Finite,
     Gain,
     Implausible,
@@ -31,7 +31,7 @@ from loopwright.service.plausible import (
     check_option,
     check_step,
 )
-from loopwright.service.validation import branch, branch_of
+from loopwright.service.inputs.validation import branch, branch_of
 from loopwright.tuning.fast.procedure import FAST, FastOptions
 from loopwright.tuning.five_stage.procedure import PROCEDURE, Options, rule_of
 from loopwright.tuning.models import FOPDT, SOPDT
