@@ -44,7 +44,6 @@ FORBIDDEN_IN_TUNING = FORBIDDEN | {
 EXTERNAL = {"least_squares"}
 """Names of other libraries."""
 KEPT = {
-    ("tuning/analysis/step_figures.py", "_moving_mean"),  # the field's word
     ("tuning/experiments/step_test.py", "mv_span"),  # a key of stored results
     ("tuning/fast/proposal.py", "span"),  # a key of stored results
     ("tuning/fast/relay_test.py", "span"),

@@ -59,7 +59,7 @@ def test_a_job_that_does_not_end_holds_the_stop_up_for_a_while_only(
     finally:
         free.set()
     (error,) = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
-    assert row.id in error and TAG in error and "unknown" in error and "check the controller" in error
+    assert row.id in error and TAG in error and "unknown" in error and "look at the controller" in error
     assert service.store.get(row.id).state == "running"  # the next start looks at its loop
     assert running is not None and running.over.wait(60)
 

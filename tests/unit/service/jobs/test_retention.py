@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from sqlalchemy import MetaData, Table, func, inspect, select
+from sqlalchemy import MetaData, Table, func, inspect, select, update
 
 from loopwright.service.job_states import JobState
 from loopwright.service.jobs.dbos_engine import DurableEngine
@@ -14,6 +14,7 @@ from loopwright.service.jobs.retention import Retention, RetentionPolicy, delete
 from loopwright.service.store import audit
 from loopwright.service.store.clock_watch import ClockWatch
 from loopwright.service.store.store import Store
+from loopwright.service.store.tables import JobRow
 from loopwright.service.telemetry.metrics import CLOCK_JUMPS
 from loopwright.tuning.plan import Sample
 from tests.unit.service.fakes import ThreadEngine, add_samples
@@ -30,7 +31,7 @@ def job(store: Store, loop: str, *states: JobState, dry: bool = False, days_ago:
         store.move(row.id, state)
         if state is not JobState.RUNNING:
             with store.writing() as session:
-                session.merge(store.get(row.id)).ended_at = ended
+                session.execute(update(JobRow).where(JobRow.id == row.id).values(ended_at=ended))
     return row.id
 
 
@@ -231,7 +232,7 @@ def test_before_the_first_look_the_jobs_say_what_time_it_was(store: Store) -> No
     ids = [job(store, "A", R, X, days_ago=40), job(store, "A", R, X, days_ago=0)]
     with store.writing() as session:
         for job_id in ids:
-            session.merge(store.get(job_id)).created_at = "2020-01-01T00:00:00.000Z"
+            session.execute(update(JobRow).where(JobRow.id == job_id).values(created_at="2020-01-01T00:00:00.000Z"))
     clocks = Clocks()
     clocks.wall += timedelta(days=365)
     once(clocks.retention(store))
