@@ -16,10 +16,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from loopwright.protocol.real32 import nearest
 from tests.e2e.plantsite import STAGES, Stage
 from tests.faults.cases import FAULTS
 from tests.faults.ending import Ending, unsafe
-from tests.faults.stand import HOME, LOOP, PACE, Missing, Stand
+from tests.faults.faulty_hub import FaultyHub
+from tests.faults.stand import HOME, LOOP, PACE, Missing, Stand, StoredSample
 
 HOME_WITHIN_S = 6.0
 """After the end of a job that could not restore its loop: heartbeat or lease runs out, the law brings MV to rest."""
@@ -29,6 +31,8 @@ STALL_S = 0.4
 """A machine that stands still so long may itself cost a job its session (a fast loop loses samples): what comes of the
 fault is looked for again, but for a bad end, which stands."""
 REPEATS = 2
+BEGUN_WITHIN = 200
+"""Samples after the opening of a session within which the first one is stored."""
 RESULTS = Path(__file__).with_name("results.json")
 
 
@@ -37,7 +41,7 @@ def ending(stand: Stand, name: str, stage: str, database: str = "sqlite") -> End
     fault, where = FAULTS[name], STAGES[stage]
     began = time.monotonic()
     url = _brought_into(stand, where)
-    first, struck_at, struck = stand.hub.first_of_session, stand.hub.answered, time.monotonic()
+    struck_at, struck = stand.hub.answered, time.monotonic()
     with stand.eye.watching(HOME) as safe, fault.inject(stand, url) as other:
         job = _over(stand, url)
         home = other or HOME
@@ -46,7 +50,7 @@ def ending(stand: Stand, name: str, stage: str, database: str = "sqlite") -> End
         safe.append(last.at)
     safe_s = min(safe, default=math.nan) - struck
     went_on = job["attempts"] == 1 and job["state"] == "proposed"
-    kept, lost, missing = _samples(stand, url, struck_at - first)
+    kept, lost, missing = _samples(stand, url, struck_at)
     return Ending(
         database, name, stage, job["state"], job["reason"], job["detail"], job["attempts"],
         None if went_on or math.isnan(safe_s) else round(safe_s, 1),
@@ -88,15 +92,33 @@ def _over(stand: Stand, url: str) -> dict[str, Any]:
         return job
 
 
-def _samples(stand: Stand, url: str, struck_s: int) -> tuple[int, int, int]:
-    """Of the attempt that was struck after that sample: how many until then are stored, how many after the last of
-    them are not, and how many never came over the bus, between two that did."""
-    numbers = stand.left
-    if numbers is None:
-        numbers = [round(t / LOOP.ts) for t in stand.site.http.get(f"{url}/samples").json()["t_s"]]
-    before = [number for number in numbers if number <= struck_s]
+def _samples(stand: Stand, url: str, struck_at: int) -> tuple[int, int, int]:
+    """Counts the samples of the attempt that was struck after the sample of that number: how many until then are
+    stored, how many after the last of them are not, and how many never came over the bus, between two that did."""
+    stored = stand.left
+    if stored is None:
+        job = stand.site.http.get(f"{url}/samples").json()
+        stored = [
+            StoredSample(round(t / LOOP.ts), pv, mv) for t, pv, mv in zip(job["t_s"], job["pv"], job["mv"], strict=True)
+        ]
+    first = _first_number(stand.hub, stored, struck_at)
+    numbers = [first + sample.number for sample in stored]
+    before = [number for number in numbers if number <= struck_at]
     missing = sum(b - a - 1 for a, b in pairwise(numbers))
-    return len(before), struck_s - max(before, default=-1), missing
+    return len(before), struck_at - max(before, default=first - 1), missing
+
+
+def _first_number(hub: FaultyHub, stored: Sequence[StoredSample], struck_at: int) -> int:
+    """Returns the number that the first stored sample had on the bus. The service begins to store some samples after
+    the opening of its session: how many, the values of PV and MV tell. Raises AssertionError where they never fit."""
+    for first in range(hub.first_of_session, hub.first_of_session + BEGUN_WITHIN):
+        if all(
+            hub.samples.get(first + number) == (nearest(pv), nearest(mv))
+            for number, pv, mv in stored
+            if first + number <= struck_at
+        ):
+            return first
+    raise AssertionError("the samples stored before the fault are not those of the bus")
 
 
 def run(faults: Sequence[str], stages: Sequence[str], databases: Sequence[str], at_once: int) -> Iterator[list[Ending]]:

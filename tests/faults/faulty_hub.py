@@ -6,6 +6,7 @@ whose SDO dialogue no fault touches: through it a loop is read while its bus is 
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 
@@ -52,10 +53,13 @@ class FaultyHub(Hub):
         """Of the latest MV that was passed on as the answer to the latest PV: that sample was there to be stored."""
         self.first_of_session = 0
         """The number of the first sample after the session was opened."""
+        self.samples: dict[int, tuple[float, float]] = {}
+        """PV and MV of every sample of the session whose frames were passed on, by its number."""
         self.commanded = 0
         """The number of the sample in which a tuner has last given an order within its session."""
         self.pv_broken = False
         """The transmitter of channel 1 gives no number."""
+        self._pv = math.nan
         self._taken = self._held = False
         self._onlooker: _Member | None = None
         self._late: list[tuple[float, _Member, bytes]] = []
@@ -98,15 +102,17 @@ class FaultyHub(Hub):
                 other.queue += frame
         _, _, can_id, _, data, *_ = frame.split()
         if int(can_id, 16) == _MV and len(data) == 2 * MV_FRAME.size:
-            number = MV_FRAME.unpack(bytes.fromhex(data.decode()))[1]
+            mv, number = MV_FRAME.unpack(bytes.fromhex(data.decode()))
             if number == self.sample_number:
                 self.answered = number
+                self.samples[number] = self._pv, mv
 
     def _witness(self, can_id: int, data: bytes) -> None:
         if can_id == _PV and len(data) == 2 * PV_FRAME.size:
-            self.sample_number = PV_FRAME.unpack(bytes.fromhex(data.decode()))[1]
+            self._pv, self.sample_number = PV_FRAME.unpack(bytes.fromhex(data.decode()))
             if self._taken:
                 self._taken, self.first_of_session = False, self.sample_number
+                self.samples.clear()
         elif can_id == sdo_request_id(CONTROLLER_NODE):
             request = bytes.fromhex(data.decode())
             if request[:1] != b"\x23":

@@ -13,6 +13,7 @@ import threading
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import httpx
 from sqlalchemy import create_engine, select
@@ -34,6 +35,14 @@ PACE = 10.0
 """Three stands at a time are then what two processors can just do."""
 HOME = Home(Mode.AUTOMATIC, LOOP.sp, LOOP.kp, LOOP.ti, mv=50.0)
 SMALL_DISK_MIB = 8
+
+
+class StoredSample(NamedTuple):
+    """A sample as the service has stored it. number: counted from the job's first sample.  pv, mv: percent."""
+
+    number: int
+    pv: float
+    mv: float
 
 
 @dataclass(frozen=True)
@@ -59,8 +68,8 @@ class Stand:
         needs = needs or Needs()
         self.folder = folder
         self.defects: list[str] = []
-        self.left: list[int] | None = None
-        """The numbers of the job's samples in the database when its service had died."""
+        self.left: list[StoredSample] | None = None
+        """The job's samples in the database when its service had died."""
         self.server: Server | None = None
         self.database: str | None = None
         self.clock = folder / "clock"
@@ -105,7 +114,9 @@ class Stand:
         mine = select(ChunkRow).where(ChunkRow.job_id == url.rsplit("/", 1)[1]).order_by(ChunkRow.seq)
         with Session(engine) as session:
             blocks = [unpack(Block(row.stage, row.first_t_s, row.count, row.data)) for row in session.scalars(mine)]
-        self.left = [round(sample.t / LOOP.ts) for block in blocks for sample in block]
+        self.left = [
+            StoredSample(round(sample.t / LOOP.ts), sample.pv, sample.mv) for block in blocks for sample in block
+        ]
         engine.dispose()
         self.site.serve()
 
