@@ -122,6 +122,7 @@ class Tuner:
         self._channel = channel
         self._sdo_timeout_s = sdo_timeout_s
         self._sdo_tries = sdo_tries
+        self._retry_until = 0.0
         self._pv_id, self._mv_id, self._status_id = ids.pv, ids.mv, ids.status
         self._alive = {heartbeat_id(node): node for node in (controller_node, plant_node) if node is not None}
         self._bus: Bus = self.station.open_bus(url)
@@ -265,6 +266,19 @@ class Tuner:
         return entry, node, sub
 
     @contextmanager
+    def retrying(self, until: float) -> Iterator[None]:
+        """Repeats an unanswered request until that time on the station's clock (at least the usual number of times): on
+        a bus that loses frames, a long sequence of requests otherwise fails at one of them.
+
+        until: monotonic seconds.
+        """
+        self._retry_until = until
+        try:
+            yield
+        finally:
+            self._retry_until = 0.0
+
+    @contextmanager
     def _turn(self, node: int, name: str) -> Iterator[None]:
         """Holds the lock of the node and receives its answers; requests that keep the session alive go first. Outside
         of it the answers are not received: they belong to other loops, and each of fifty loops would wake for all of
@@ -290,9 +304,11 @@ class Tuner:
         expected = 0x40 if command == 0x40 else 0x60
         self._take_in()
         self._answers.clear()
-        for attempt in range(self._sdo_tries):
+        attempt = 0
+        while attempt < self._sdo_tries or self.station.monotonic() < self._retry_until:
             if attempt:
                 self.station.sdo_retries[self._url] += 1
+            attempt += 1
             self._bus.send(sdo_request_id(node), request)
             give_up = self.station.monotonic() + self._sdo_timeout_s
             while (answer := self._answer(node, give_up)) is not None:

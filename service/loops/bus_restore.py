@@ -26,7 +26,7 @@ def restore(connection: BusConnection, home: LoopState, number: int) -> Restored
     give_up = station.monotonic() + RESTORE_PATIENCE_S
     while True:
         try:
-            with connection.tuner() as tuner:
+            with connection.tuner() as tuner, tuner.retrying(give_up):
                 how = close_session(tuner, number) if number else "no session was opened"
                 return read_back(connection.reading(tuner), home, number, how)
         except Ended as ended:
@@ -47,7 +47,7 @@ def end_acceptance(connection: BusConnection, number: int, why: Ended | None) ->
     give_up = station.monotonic() + RESTORE_PATIENCE_S
     while True:
         try:
-            with connection.tuner() as tuner:
+            with connection.tuner() as tuner, tuner.retrying(give_up):
                 close_session(tuner, number)
                 return connection.reading(tuner).state()
         except Ended as ended:

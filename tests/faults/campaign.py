@@ -101,24 +101,24 @@ def _samples(stand: Stand, url: str, struck_at: int) -> tuple[int, int, int]:
         stored = [
             StoredSample(round(t / LOOP.ts), pv, mv) for t, pv, mv in zip(job["t_s"], job["pv"], job["mv"], strict=True)
         ]
-    first = _first_number(stand.hub, stored, struck_at)
+    first = _first_number(stand.hub, stored)
     numbers = [first + sample.number for sample in stored]
     before = [number for number in numbers if number <= struck_at]
     missing = sum(b - a - 1 for a, b in pairwise(numbers))
     return len(before), struck_at - max(before, default=first - 1), missing
 
 
-def _first_number(hub: FaultyHub, stored: Sequence[StoredSample], struck_at: int) -> int:
+def _first_number(hub: FaultyHub, stored: Sequence[StoredSample]) -> int:
     """Returns the number that the first stored sample had on the bus. The service begins to store some samples after
-    the opening of its session: how many, the values of PV and MV tell. Raises AssertionError where they never fit."""
+    the opening of its session: how many, the values of PV and MV tell, and which samples are missing. Raises
+    AssertionError where they never fit."""
     for first in range(hub.first_of_session, hub.first_of_session + BEGUN_WITHIN):
         if all(
-            hub.samples.get(first + number) == (nearest(pv), nearest(mv))
+            math.isnan(pv + mv) or (nearest(pv), nearest(mv)) in hub.samples.get(first + number, ())
             for number, pv, mv in stored
-            if first + number <= struck_at
         ):
             return first
-    raise AssertionError("the samples stored before the fault are not those of the bus")
+    raise AssertionError("the stored samples are not those of the bus")
 
 
 def run(faults: Sequence[str], stages: Sequence[str], databases: Sequence[str], at_once: int) -> Iterator[list[Ending]]:

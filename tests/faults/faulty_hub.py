@@ -53,8 +53,9 @@ class FaultyHub(Hub):
         """Of the latest MV that was passed on as the answer to the latest PV: that sample was there to be stored."""
         self.first_of_session = 0
         """The number of the first sample after the session was opened."""
-        self.samples: dict[int, tuple[float, float]] = {}
-        """PV and MV of every sample of the session whose frames were passed on, by its number."""
+        self.samples: dict[int, list[tuple[float, float]]] = {}
+        """PV and MV of every sample of the session whose frames were passed on, by its number; more than one pair where
+        somebody else has sent a PV of that number as well."""
         self.commanded = 0
         """The number of the sample in which a tuner has last given an order within its session."""
         self.pv_broken = False
@@ -105,7 +106,7 @@ class FaultyHub(Hub):
             mv, number = MV_FRAME.unpack(bytes.fromhex(data.decode()))
             if number == self.sample_number:
                 self.answered = number
-                self.samples[number] = self._pv, mv
+                self.samples.setdefault(number, []).append((self._pv, mv))
 
     def _witness(self, can_id: int, data: bytes) -> None:
         if can_id == _PV and len(data) == 2 * PV_FRAME.size:

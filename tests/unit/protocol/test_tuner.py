@@ -137,6 +137,19 @@ def test_a_silent_node_is_a_timeout(tuner: Tuner, bus: ListBus) -> None:
     assert caught.value.kind is FailureKind.TIMEOUT
 
 
+def test_while_retrying_a_request_is_repeated_for_longer(tuner: Tuner, bus: ListBus) -> None:
+    """As at the end of a test on a bus that loses frames: two tries are the usual number of this tuner."""
+    bus.mute = 6
+    with tuner.retrying(tuner.station.monotonic() + 60.0):
+        assert tuner.number("controller_mode_command") == 2
+    bus.mute = 6
+    with tuner.retrying(tuner.station.monotonic() - 1.0), pytest.raises(TunerError):
+        tuner.number("controller_mode_command")
+    assert bus.mute == 4
+    with pytest.raises(TunerError):
+        tuner.number("controller_mode_command")
+
+
 def test_an_answer_to_another_request_is_passed_over(tuner: Tuner, bus: ListBus) -> None:
     stray = bytes([0x4F, 0x01, 0x21, 1, 3, 0, 0, 0])
     bus.before = [(sdo_response_id(NODE), stray), (sdo_response_id(PLANT), stray)]
