@@ -114,7 +114,7 @@ def _first_number(hub: FaultyHub, stored: Sequence[StoredSample]) -> int:
     AssertionError where they never fit."""
     for first in range(hub.first_of_session, hub.first_of_session + BEGUN_WITHIN):
         if all(
-            math.isnan(pv + mv) or (nearest(pv), nearest(mv)) in hub.samples.get(first + number, ())
+            pv is None or mv is None or (nearest(pv), nearest(mv)) in hub.samples.get(first + number, ())
             for number, pv, mv in stored
         ):
             return first

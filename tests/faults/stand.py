@@ -38,11 +38,12 @@ SMALL_DISK_MIB = 8
 
 
 class StoredSample(NamedTuple):
-    """A sample as the service has stored it. number: counted from the job's first sample.  pv, mv: percent."""
+    """A sample as the service has stored it. number: counted from the job's first sample.  pv, mv: percent; None where
+    the frame carried no number."""
 
     number: int
-    pv: float
-    mv: float
+    pv: float | None
+    mv: float | None
 
 
 @dataclass(frozen=True)
