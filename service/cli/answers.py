@@ -35,8 +35,8 @@ class StateEvent(BaseModel):
     state: str
 
 
-JobEvent = ProgressEvent | StageDoneEvent | NoteEvent | StateEvent
-_EVENTS: dict[str, type[JobEvent]] = {
+ShownEvent = ProgressEvent | StageDoneEvent | NoteEvent | StateEvent
+_EVENTS: dict[str, type[ShownEvent]] = {
     "progress": ProgressEvent,
     "stage_done": StageDoneEvent,
     "note": NoteEvent,
@@ -44,20 +44,20 @@ _EVENTS: dict[str, type[JobEvent]] = {
 }
 
 
-def job_event(kind: str, data: object) -> JobEvent | None:
+def job_event(kind: str, data: object) -> ShownEvent | None:
     """Returns an event of GET /jobs/{id}/events; None for a kind that the commands do not show."""
     model = _EVENTS.get(kind)
     return None if model is None else model.model_validate(data)
 
 
-class Locked(BaseModel):
+class LockAnswer(BaseModel):
     """The answer to POST /loops/{tag}/lock."""
 
     locked: LockView
     note: str | None
 
 
-class Unlocked(BaseModel):
+class UnlockAnswer(BaseModel):
     """The answer to POST /loops/{tag}/unlock; was_locked is None where the loop was not locked."""
 
     was_locked: LockView | None

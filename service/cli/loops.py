@@ -39,13 +39,13 @@ def lock(
     as_json: AsJson = False,
 ) -> None:
     """Lock a loop: until it is unlocked no test begins on it, and no decision writes to it."""
-    from loopwright.service.cli.answers import Locked
+    from loopwright.service.cli.answers import LockAnswer
 
     answer = Client(url).post(f"/loops/{quote(tag, safe='')}/lock", {"reason": reason, "by": by or user()})
     if as_json:
         print_json(answer)
         return
-    found = Locked.model_validate(answer)
+    found = LockAnswer.model_validate(answer)
     print(f"{tag} is locked by {found.locked.by} since {found.locked.since}: {found.locked.reason}")
     if found.note:
         print(found.note)
@@ -61,11 +61,11 @@ def unlock(
     as_json: AsJson = False,
 ) -> None:
     """Unlock a loop."""
-    from loopwright.service.cli.answers import Unlocked
+    from loopwright.service.cli.answers import UnlockAnswer
 
     answer = Client(url).post(f"/loops/{quote(tag, safe='')}/unlock", {"by": by or user()})
     if as_json:
         print_json(answer)
         return
-    was = Unlocked.model_validate(answer).was_locked
+    was = UnlockAnswer.model_validate(answer).was_locked
     print(f"{tag} was not locked" if was is None else f"{tag} is unlocked; it was locked by {was.by}: {was.reason}")
