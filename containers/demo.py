@@ -11,7 +11,7 @@ import time
 
 from pydantic import BaseModel
 
-from loopwright.service.api.job_views import JobView, LoopDetail
+from loopwright.service.api.job_views import JobView, LoopDetail, LoopView
 from loopwright.service.cli import job_tables
 from loopwright.service.cli.client import ApiError, Client
 from loopwright.service.job_states import JobState
@@ -29,15 +29,16 @@ def main() -> int:
 
 def _demonstrate(client: Client) -> int:
     started = time.monotonic()
-    loop = client.get("/loops")[0]
-    if url := loop["active_job"]:
+    loop = LoopView.model_validate(client.pages("/loops")[0])
+    if url := loop.active_job:
         job_tables.console.print(f"GET   {url}: a retune is on its way", highlight=False)
     else:
-        url = client.post(f"/loops/{loop['tag']}/retune", {"requested_by": "demo"})["url"]
-        job_tables.console.print(f"POST  /loops/{loop['tag']}/retune -> {url}", highlight=False)
+        begun = JobView.model_validate(client.post(f"/loops/{loop.tag}/retune", {"requested_by": "demo"}))
+        url = begun.url
+        job_tables.console.print(f"POST  /loops/{loop.tag}/retune -> {url}", highlight=False)
     job = job_tables.follow(client, url)
-    job_tables.job_report(job, loop["pv_unit"])
-    now = LoopDetail.model_validate(client.get(f"/loops/{loop['tag']}"))
+    job_tables.job_report(job, loop.pv_unit)
+    now = LoopDetail.model_validate(client.get(f"/loops/{loop.tag}"))
     proof = _proof(job, now, time.monotonic() - started)
     job_tables.console.print("\n".join(proof), highlight=False, soft_wrap=True)
     return 0 if job.state is JobState.PROPOSED else 3

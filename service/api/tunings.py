@@ -27,7 +27,7 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
 
     @routes.get("/methods", tags=["tunings"], summary="The tuning methods")
     def methods() -> list[MethodView]:
-        return [MethodView(**each) for each in tunings.methods_json()]
+        return [MethodView.model_validate(each) for each in tunings.methods_json()]
 
     @routes.post(
         "/tunings",

@@ -1,4 +1,4 @@
-"""Child processes that say when they are ready and are stopped for certain."""
+"""Child processes that report when they are ready and are stopped for certain."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 _STOP_S = 90.0
-"""Wall time that a process has for its end, as the unit's TimeoutStopSec: a service restores its loops first."""
+"""Wall time until a process is killed, s, as TimeoutStopSec of the systemd unit: a service restores its loops first."""
 
 
 class NotReady(Exception):
-    """A process ended or said nothing in time; the text has its last words."""
+    """A process ended or was not ready in time; the text has the last lines of its log."""
 
 
 class ChildProcess:
-    """python -m MODULE ARGS with its output in a log file; `ready` is its line that starts with "ready"."""
+    """Runs python -m MODULE ARGS with its output in a log file; `ready` is the line that starts with "ready"."""
 
     def __init__(self, name: str, arguments: Sequence[str], log: Path) -> None:
         self.name = name
@@ -44,7 +44,7 @@ class ChildProcess:
         self._ready.set()
 
     def wait_ready(self, timeout_s: float = 90.0) -> str:
-        """The ready line. Raises NotReady."""
+        """Returns the ready line. Raises NotReady."""
         if not self._ready.wait(timeout_s) or not self.ready:
             last = self._log.read_text(errors="replace").strip().splitlines()[-5:]
             raise NotReady(f"the {self.name} did not start: " + (" / ".join(last) or "no output"))
@@ -61,12 +61,12 @@ class ChildProcess:
         self._process.send_signal(number)
 
     def kill(self) -> None:
-        """SIGKILL: no chance to clean up."""
+        """Ends the process by SIGKILL, which leaves it no time to clean up."""
         self._process.kill()
         self._process.wait()
 
     def stop(self) -> int:
-        """SIGTERM, and SIGKILL for who does not listen. Returns the exit status."""
+        """Ends the process by SIGTERM, then by SIGKILL if it does not end. Returns the exit status."""
         if self._process.poll() is None:
             self._process.terminate()
         try:

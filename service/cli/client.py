@@ -1,4 +1,4 @@
-"""The service's HTTP API as the command line uses it. httpx is imported where it is used: most commands need none."""
+"""The HTTP client of the commands. httpx is imported where it is used, because most commands do not need it."""
 
 from __future__ import annotations
 
@@ -6,25 +6,27 @@ import json
 import os
 import secrets
 import time
-from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import httpx
 
+    from loopwright.service.plots.shown import ShownSamples
+
 DEFAULT_URL = "http://127.0.0.1:8080"
 KEY_VARIABLE = "LOOPWRIGHT_KEY"
-"""In the environment and not on the command line, where every user of the machine could read it."""
+"""The key is in the environment, because every user of the machine can read a command line."""
 _PATIENCE_S = 30.0
-"""For the answer to a request whose connection broke while it was being answered."""
+"""Longest wait for the answer to a request whose connection broke, wall time, s."""
 
 
 class ApiError(Exception):
-    """The service said no, or is not there; the text says which and what to do."""
+    """The service refused the request or does not answer; the text says which, and what to do."""
 
 
 class Client:
-    """One service."""
+    """A client of one service. Every request raises ApiError if the service refuses it or does not answer."""
 
     def __init__(self, url: str) -> None:
         import httpx
@@ -34,18 +36,22 @@ class Client:
         headers = {"Authorization": f"Bearer {key}"} if key else {}
         self._http = httpx.Client(base_url=self.url, timeout=30.0, trust_env=False, headers=headers)
 
-    def get(self, path: str, **query: Any) -> Any:
-        return self._json("GET", path, params={k: v for k, v in query.items() if v is not None})
+    def get(self, path: str, **query: str | float | None) -> object:
+        """Returns the JSON of the answer; a query of None is left out."""
+        return _json(self._answer("GET", path, {k: v for k, v in query.items() if v is not None}))
 
-    def samples_of(self, job_url: str) -> Callable[[str | None], dict[str, Any]]:
-        """Asks for the columns of the samples of a job, of one stage or (None) of all."""
-        return lambda stage: self.get(f"{job_url}/samples", stage=stage)
+    def samples_of(self, job_url: str) -> Callable[[str | None], ShownSamples]:
+        """Returns a function that gets the samples of a job, those of one stage or (None) all."""
+        from loopwright.service.plots.shown import ShownSamples
 
-    def pages(self, path: str) -> list[Any]:
-        """The whole of a list that comes in pages."""
+        return lambda stage: ShownSamples.model_validate(self.get(f"{job_url}/samples", stage=stage))
+
+    def pages(self, path: str) -> list[object]:
+        """Returns all items of a list that the service returns in pages."""
         import httpx
 
-        found, following = [], httpx.URL(path)
+        found: list[object] = []
+        following = httpx.URL(path)
         while True:
             answer = self._answer("GET", following)
             found += answer.json()
@@ -53,32 +59,39 @@ class Client:
                 return found
             following = httpx.URL(answer.links["next"]["url"])
 
-    def post(self, path: str, body: dict[str, Any] | None = None) -> Any:
-        """When the connection breaks the request is repeated once, with the key by which the service knows it again."""
+    def post(self, path: str, body: Mapping[str, object] | None = None) -> object:
+        """Returns the JSON of the answer.
+
+        When the connection breaks, the request is repeated once with the same Idempotency-Key, by which the service
+        recognises it.
+        """
         import httpx
 
-        request: dict[str, Any] = {"json": body or {}, "headers": {"Idempotency-Key": secrets.token_hex(16)}}
+        sent, headers = body or {}, {"Idempotency-Key": secrets.token_hex(16)}
         try:
-            answer = self._http.post(path, **request)
+            answer = self._http.post(path, json=sent, headers=headers)
         except httpx.ConnectError as error:
             raise self._no_service(error) from error
         except httpx.TransportError:
-            answer = self._repeated(path, request)
+            answer = self._repeated(path, sent, headers)
         self._check(answer)
-        return answer.json()
+        return _json(answer)
 
-    def _repeated(self, path: str, request: dict[str, Any]) -> httpx.Response:
-        """409 with Retry-After: the service is still busy with what was sent first."""
+    def _repeated(self, path: str, body: Mapping[str, object], headers: Mapping[str, str]) -> httpx.Response:
+        """Repeats a POST; 409 with Retry-After says that the service is still busy with the first request."""
         give_up = time.monotonic() + _PATIENCE_S
         while True:
-            answer = self._send("POST", path, **request)
+            answer = self._send("POST", path, body=body, headers=headers)
             wait = answer.headers.get("Retry-After", "")
             if answer.status_code != 409 or not wait.isdigit() or time.monotonic() + int(wait) > give_up:
                 return answer
             time.sleep(int(wait))
 
-    def events(self, job_url: str) -> Iterator[tuple[str, dict[str, Any]]]:
-        """(kind, data) of each event of a job until it is over; resumes when the connection breaks."""
+    def events(self, job_url: str) -> Iterator[tuple[str, object]]:
+        """Yields the kind and the JSON of each event of a job until the job is over.
+
+        The stream resumes when the connection breaks.
+        """
         import httpx
 
         last, failures = "0", 0
@@ -104,19 +117,25 @@ class Client:
                 if failures > 3:
                     raise ApiError(f"{self.url}: {error}") from error
 
-    def _json(self, method: str, path: str, **more: Any) -> Any:
-        return self._answer(method, path, **more).json()
-
-    def _answer(self, method: str, path: str | httpx.URL, **more: Any) -> httpx.Response:
-        answer = self._send(method, path, **more)
+    def _answer(
+        self, method: str, path: str | httpx.URL, query: Mapping[str, str | float] | None = None
+    ) -> httpx.Response:
+        answer = self._send(method, path, query)
         self._check(answer)
         return answer
 
-    def _send(self, method: str, path: str | httpx.URL, **more: Any) -> httpx.Response:
+    def _send(
+        self,
+        method: str,
+        path: str | httpx.URL,
+        query: Mapping[str, str | float] | None = None,
+        body: Mapping[str, object] | None = None,
+        headers: Mapping[str, str] | None = None,
+    ) -> httpx.Response:
         import httpx
 
         try:
-            return self._http.request(method, path, **more)
+            return self._http.request(method, path, params=query, json=body, headers=headers)
         except httpx.TransportError as error:
             raise self._no_service(error) from error
 
@@ -136,3 +155,8 @@ class Client:
             body["advice"] = f"Put an API key into the environment variable {KEY_VARIABLE}."
         lines = [body.get("detail") or body.get("title"), body.get("advice"), body.get("job")]
         raise ApiError("\n".join(line for line in lines if line))
+
+
+def _json(answer: httpx.Response) -> object:
+    found: object = answer.json()
+    return found

@@ -36,9 +36,11 @@ def backup(
 def restore(
     file: Annotated[Path, typer.Argument(help="The back-up.")],
     data: Data = Path("data"),
-    replace: Annotated[bool, typer.Option("--replace", help="Keep what is there aside, and take the back-up.")] = False,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Move the present data aside, and restore the back-up.")
+    ] = False,
 ) -> None:
-    """Makes a back-up the data of a stopped service. Jobs that were active in it end as interrupted."""
+    """Restores a back-up as the data of a stopped service. Jobs that were active in the back-up end as interrupted."""
     from loopwright.service.store.backup import BackupProblem
     from loopwright.service.store.backup import restore as run
     from loopwright.service.store.store import FolderInUse
@@ -50,20 +52,20 @@ def restore(
         die(f"a service is running on {data}: stop it first", 2)
     except (BackupProblem, OSError) as error:
         die(str(error), 2)
-    print(f"restored {file} to {data}; {interrupted} job(s) that were active in it are marked interrupted")
+    print(f"restored {file} to {data}; {interrupted} job(s) that were active in the back-up are marked interrupted")
     if aside is not None:
-        print(f"what was there before is in {aside}")
-    print("keys are as they were in the back-up: see loopwright key list")
+        print(f"the previous data are in {aside}")
+    print("the keys are those of the back-up: see loopwright key list")
 
 
 @app.command("check-data")
 def check_data(
     data: Data = Path("data"),
     salvage: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Copy what can be read into a new file, for restore.")
+        Path | None, typer.Option(metavar="FILE", help="Copy the readable rows into a new file, for restore.")
     ] = None,
 ) -> None:
-    """Says what of the data can be read, and changes nothing. Exit 0: all of it, 3: something is damaged."""
+    """Reports which data can be read, and changes nothing. Exit status 0: all data, 3: some data are damaged."""
     from loopwright.service.store.check_data import CheckProblem
     from loopwright.service.store.check_data import check_data as check
     from loopwright.service.store.check_data import salvage as copy
@@ -74,23 +76,23 @@ def check_data(
         reports = check(data)
         copied = copy(data, salvage) if salvage is not None else {}
     except FolderInUse:
-        die(f"a service is running on {data}: stop it before something is copied from it", 2)
+        die(f"a service is running on {data}: stop it before its data are copied", 2)
     except (CheckProblem, OSError) as error:
         die(str(error), 2)
     for report in reports:
         rows = ", ".join(f"{table} {count}" for table, count in report.rows.items())
-        print(f"{report.file}: {'damaged' if report.wrong else 'whole'}; rows that can be read: {rows or 'none'}")
+        print(f"{report.file}: {'damaged' if report.wrong else 'whole'}; readable rows: {rows or 'none'}")
         for line in (*report.wrong, *report.notes):
             print(f"  {line}")
     if salvage is not None:
         print(f"{salvage}: {', '.join(f'{table} {count}' for table, count in copied.items())}")
-        print(f"take it with: loopwright restore {salvage} --data {data} --replace")
+        print(f"restore it with: loopwright restore {salvage} --data {data} --replace")
     if any(report.wrong for report in reports):
         if salvage is None:
             print(
                 f"Stop the service and restore the last back-up: loopwright restore FILE --data {data} --replace\n"
-                f"or what can be read: loopwright check-data --data {data} --salvage FILE\n"
-                "A damaged engine.sqlite is made anew at the next start: nothing is lost with it."
+                f"or restore the readable rows: loopwright check-data --data {data} --salvage FILE\n"
+                "A damaged engine.sqlite is created again at the next start: no job or sample is lost with it."
             )
         raise typer.Exit(3)
 

@@ -1,4 +1,4 @@
-"""`loopwright demo`: a badly tuned loop is retuned over a real bus, by real processes, through HTTP."""
+"""`loopwright demo`: retunes a badly tuned loop over a real bus, by real processes, through HTTP."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import tempfile
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -23,17 +22,17 @@ PV_UNIT = "degC"
 SAMPLE_TIME_S = 0.02
 """A 150th of model 14's ultimate period, 3.3 s."""
 NOISE = "0.002"
-"""Standard deviation of PV, degC: 1 % of what the relay moves it by."""
+"""Standard deviation of the noise of PV, degC: 1 % of the PV amplitude under the relay."""
 BAD_GAINS = ("80", "1.2")
-"""Kp in % per PV unit, Ti in s: model 14 (Ku 205, Pu 3.3 s) swings for a long time with these."""
+"""Kp in % per PV unit, Ti in s: model 14 (Ku 205, Pu 3.3 s) oscillates for a long time with these gains."""
 
 
 class DemoFailed(Exception):
-    """What went wrong, in words for who runs the demo."""
+    """The demo failed; the text is for the person who runs it."""
 
 
 def vcan_usable(name: str = "vcan0") -> bool:
-    """True when a CAN interface of that name is there and takes a socket."""
+    """Returns whether there is a CAN interface of that name that a socket can send on."""
     if not hasattr(socket, "AF_CAN"):
         return False
     try:
@@ -46,10 +45,10 @@ def vcan_usable(name: str = "vcan0") -> bool:
 
 
 def loops_yaml(bus: str) -> str:
-    """The demo's loop as a configuration to start from."""
-    loop: dict[str, Any] = {
+    """Returns the configuration of the demo's loop."""
+    loop: dict[str, object] = {
         "tag": TAG,
-        "description": "Model 14 with gains that swing",
+        "description": "Model 14 with gains that make it oscillate",
         "bus": bus,
         "controller_node": 0x20,
         "plant_node": 0x10,
@@ -65,18 +64,18 @@ def loops_yaml(bus: str) -> str:
 
 
 def run_demo(folder: Path | None, speed: str, hub_only: bool) -> None:
-    """Everything from the bus to the picture; leaves nothing running. Raises DemoFailed."""
-    kept = folder or Path(tempfile.mkdtemp(prefix="loopwright-demo-"))
-    kept.mkdir(parents=True, exist_ok=True)
+    """Runs the demo from the bus to the plot, and stops every process that it started. Raises DemoFailed."""
+    target = folder or Path(tempfile.mkdtemp(prefix="loopwright-demo-"))
+    target.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         try:
-            client = _start(stack, kept, speed, hub_only)
+            client = _start(stack, target, speed, hub_only)
             job, seconds = _retune(client)
-            picture = kept / "before-after.png"
+            picture = target / "before-after.png"
             job_picture(picture, client.samples_of(job.url), job, PV_UNIT)
         except (NotReady, ApiError, NoPicture) as error:
-            raise DemoFailed(f"{error}\n(logs are in {kept})") from error
-    _tell(job, seconds, kept, picture)
+            raise DemoFailed(f"{error}\n(logs are in {target})") from error
+    _report(job, seconds, target, picture)
     if job.state is not JobState.PROPOSED:
         raise DemoFailed(f"the job ended as {job.state}, not as a proposal")
 
@@ -97,7 +96,7 @@ def _start(stack: ExitStack, folder: Path, speed: str, hub_only: bool) -> Client
     ts = str(SAMPLE_TIME_S)
     plant = ["--bus", bus, "--model", "model-14", "--ts", ts, "--speed", speed, "--noise", NOISE]
     kp, ti = BAD_GAINS
-    # The plant last: at full speed it waits for nobody, and takes what the processor gives.
+    # The plant starts last, because at full speed it takes all the processor time that is left.
     tuning = ["--kp", kp, "--ti", ti, "--sp", "50", "--ts", ts]
     process("controller", "loopwright.controller", "--bus", bus, "--channels", "1", *tuning)
     loops = folder / "loops.yaml"
@@ -111,12 +110,12 @@ def _start(stack: ExitStack, folder: Path, speed: str, hub_only: bool) -> Client
 def _retune(client: Client) -> tuple[JobView, float]:
     job_tables.console.print(f"POST       {client.url}/loops/{TAG}/retune", highlight=False)
     started = time.monotonic()
-    begun = client.post(f"/loops/{TAG}/retune", {"requested_by": "demo"})
-    job = job_tables.follow(client, begun["url"])
+    begun = JobView.model_validate(client.post(f"/loops/{TAG}/retune", {"requested_by": "demo"}))
+    job = job_tables.follow(client, begun.url)
     return job, time.monotonic() - started
 
 
-def _tell(job: JobView, seconds: float, folder: Path, picture: Path) -> None:
+def _report(job: JobView, seconds: float, folder: Path, picture: Path) -> None:
     job_tables.job_report(job, PV_UNIT)
     plant_s = job.plant_time_s
     lines = [

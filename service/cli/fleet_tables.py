@@ -1,33 +1,34 @@
-"""A retune of many loops on a terminal."""
+"""Shows a retune of many loops on a terminal."""
 
 from __future__ import annotations
 
 import time
-from typing import Any
 
+from loopwright.service.cli.answers import FleetRetune
 from loopwright.service.cli.client import Client
 from loopwright.service.cli.job_tables import console, rows
 
-LOOK_S = 1.0
+POLL_S = 1.0
 _OVER = ("done", "stopped", "aborted")
 
 
-def follow(client: Client, url: str, quiet: bool = False) -> dict[str, Any]:
-    """Tells how many loops are in which state until it is over; returns it."""
-    told: dict[str, int] | None = None
+def follow(client: Client, url: str, quiet: bool = False) -> object:
+    """Shows how many loops are in which state until the retune is over; returns the JSON of the retune."""
+    shown: dict[str, int] | None = None
     while True:
-        found: dict[str, Any] = client.get(url)
-        if found["counts"] != told and not quiet:
-            told = found["counts"]
-            console.print("  " + ", ".join(f"{count} {state}" for state, count in told.items()), highlight=False)
-        if found["state"] in _OVER:
-            return found
-        time.sleep(LOOK_S)
+        answer = client.get(url)
+        found = FleetRetune.model_validate(answer)
+        if found.counts != shown and not quiet:
+            shown = found.counts
+            console.print("  " + ", ".join(f"{count} {state}" for state, count in shown.items()), highlight=False)
+        if found.state in _OVER:
+            return answer
+        time.sleep(POLL_S)
 
 
-def report(found: dict[str, Any]) -> None:
-    """Each loop with what has become of it."""
-    loops = ((each["loop"], each["state"], each["job"], each["reason"]) for each in found["loops"])
-    rows(f"retune {found['id']}: {found['state']}", ("loop", "state", "job", "reason"), loops)
-    if found["detail"]:
-        console.print(found["detail"], highlight=False)
+def report(found: FleetRetune) -> None:
+    """Shows each loop with the state of its job."""
+    loops = ((each.loop, each.state, each.job, each.reason) for each in found.loops)
+    rows(f"retune {found.id}: {found.state}", ("loop", "state", "job", "reason"), loops)
+    if found.detail:
+        console.print(found.detail, highlight=False)

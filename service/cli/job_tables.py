@@ -1,9 +1,8 @@
-"""Jobs and loops on a terminal."""
+"""Shows jobs and loops on a terminal."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping
 
 from pydantic import BaseModel
 from rich.console import Console
@@ -11,6 +10,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 
 from loopwright.service.api.job_views import JobView, LockView, LoopDetail
+from loopwright.service.cli.answers import NoteEvent, ProgressEvent, StageDoneEvent, StateEvent, job_event
 from loopwright.service.cli.client import Client
 from loopwright.service.job_states import JobState
 from loopwright.service.results import ModelView, TransferModelView
@@ -23,11 +23,11 @@ _PREDICTED = (
     ("IAE, unit step", "IAE_per_unit", "s"),
     *_MARGINS,
 )
-"""Of a job of an earlier version, which has no comparison."""
+"""Figures of a job of an earlier version, which has no comparison."""
 
 
 def follow(client: Client, job_url: str) -> JobView:
-    """Shows a job live until it is over; returns it."""
+    """Shows the progress of a job until the job is over; returns the job."""
     columns = (
         TextColumn("{task.description:<11}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[left]}"),
         TimeElapsedColumn(),
@@ -35,28 +35,28 @@ def follow(client: Client, job_url: str) -> JobView:
     with Progress(*columns, console=console) as bars:
         task = bars.add_task("queued", total=1.0, left="")
         for kind, data in client.events(job_url):
-            if kind == "progress":
-                left = data["remaining_plant_time_s"]
-                text = "" if left is None else f"about {left:.0f} s of plant time left"
-                bars.update(task, completed=data["progress"], description=data["stage"] or "", left=text)
-            elif kind == "stage_done":
-                told = f"  {data['stage']:<10} at {data['plant_time_s']:.1f} s  {brief(data['result'])}"
-                bars.console.print(told, soft_wrap=True)
-            elif kind == "note":
-                bars.console.print(f"  note: {data['text']}")
-            elif kind == "state":
-                bars.update(task, description=data["state"], left="")
+            match job_event(kind, data):
+                case ProgressEvent(stage=stage, progress=progress, remaining_plant_time_s=left):
+                    text = "" if left is None else f"about {left:.0f} s of plant time left"
+                    bars.update(task, completed=progress, description=stage or "", left=text)
+                case StageDoneEvent(stage=stage, plant_time_s=plant_time_s, result=result):
+                    line = f"  {stage:<10} at {plant_time_s:.1f} s  {brief(result)}"
+                    bars.console.print(line, soft_wrap=True)
+                case NoteEvent(text=text):
+                    bars.console.print(f"  note: {text}")
+                case StateEvent(state=state):
+                    bars.update(task, description=state, left="")
         job = JobView.model_validate(client.get(job_url))
         bars.update(task, completed=job.progress)
     return job
 
 
-def brief(result: dict[str, Any] | None) -> str:
-    """The numbers of a stage's result on one line."""
+def brief(result: Mapping[str, object] | None) -> str:
+    """Returns the numbers and texts of a stage's result on one line."""
     return ", ".join(f"{key} {number(value)}" for key, value in _leaves(result or {}))
 
 
-def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, int | float | str]]:
+def _leaves(value: object, key: str = "") -> Iterator[tuple[str, int | float | str]]:
     if isinstance(value, dict):
         for name, item in value.items():
             yield from _leaves(item, name)
@@ -69,10 +69,10 @@ def number(value: object) -> str:
 
 
 def job_report(job: JobView, pv_unit: str = "PV unit") -> None:
-    """Everything a decision needs, as a table."""
+    """Shows a job as a table, with all figures that a decision needs."""
     table = Table(title=title(job), show_header=True)
-    of_new = {JobState.NO_GAIN: "designed", JobState.REHEARSED: "rehearsed"}.get(job.state, "after")
-    for heading in ("", "before", of_new, "unit"):
+    heading_new = {JobState.NO_GAIN: "designed", JobState.REHEARSED: "rehearsed"}.get(job.state, "after")
+    for heading in ("", "before", heading_new, "unit"):
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
     per = f"% per {pv_unit}"
     for name, unit in (("Kp", f"{per} (ISA)"), ("Ti", "s"), ("Td", "s")):
@@ -101,15 +101,15 @@ def job_report(job: JobView, pv_unit: str = "PV unit") -> None:
 
 
 def figure(part: BaseModel | None, name: str) -> str:
-    """One figure of a part of a result, where there is such a part."""
+    """Returns one figure of a part of a result as text, "-" where there is no such part."""
     return cell(None if part is None else getattr(part, name))
 
 
 def title(job: JobView) -> str:
-    """What has become of the job, so that a rehearsal and a loop that stays as it is are not taken for a proposal."""
+    """Returns the title of the report, which must not let a rehearsal or an unchanged loop look like a proposal."""
     what = f"job {job.id}: {job.loop} {job.state}"
     if job.state is JobState.NO_GAIN:
-        return f"{what}: tuned as well as asked already, the present gains are kept"
+        return f"{what}: the loop is already tuned as well as asked, the present gains stay"
     if job.dry_run and (on := job.rehearsed_on):
         done = f"job {job.id}: {job.loop} rehearsed"
         return f"{done if job.state is JobState.REHEARSED else what} on {on.plant_text}, nothing was tested"
@@ -117,7 +117,7 @@ def title(job: JobView) -> str:
 
 
 def _predicted(job: JobView, pv_unit: str) -> Iterator[tuple[str, str, str, str]]:
-    """Lines of the table: label, before, after, unit."""
+    """Yields lines of the table: label, before, after, unit."""
     compared = job.comparison
     if compared is None:
         earlier = job.predicted_before
@@ -140,11 +140,11 @@ def _predicted(job: JobView, pv_unit: str) -> Iterator[tuple[str, str, str, str]
             of = getattr(each, part) if part else each
             shown.append(cell(getattr(of, name)) if each.stable else "unstable")
         yield label, shown[0], shown[1], unit
-    yield "J, what is made small", cell(compared.J_before), cell(compared.J_after), ""
+    yield "J, the cost minimised", cell(compared.J_before), cell(compared.J_after), ""
 
 
 def _model(model: ModelView | TransferModelView | None, pv_unit: str) -> Iterator[tuple[str, str, str]]:
-    """Lines of the table: label, value, unit."""
+    """Yields lines of the table: label, value, unit."""
     if not isinstance(model, TransferModelView):
         yield "model K, T, L", ", ".join(figure(model, n) for n in ("K", "T_s", "L_s")), f"{pv_unit} per %, s, s"
         return
@@ -158,24 +158,24 @@ def _model(model: ModelView | TransferModelView | None, pv_unit: str) -> Iterato
 
 
 def _with_error(value: float, error: float | None) -> str:
-    """With its standard error, where that says something."""
+    """Returns a value with its standard error, unless the error is negligible."""
     return cell(value) if not error or error < 1e-4 * abs(value) else f"{cell(value)}±{error:.1g}"
 
 
 def _certainty(job: JobView) -> Iterator[tuple[str, str, str]]:
-    """What the record of fast says of itself."""
+    """Yields lines of the table on how certain the result of fast is: label, value, unit."""
     found, step = job.evidence, job.verification
     if found is not None:
-        yield "Ms uncertain by", cell(found.uncertainty), "(2 std. dev.)"
-        yield "on rival models by", cell(found.ambiguity), ""
+        yield "uncertainty of Ms", cell(found.uncertainty), "(2 std. dev.)"
+        yield "Ms, other models", cell(found.ambiguity), "(max. diff.)"
         for load in found.loads:
-            yield "load step found", f"{load.size:+.4g} at {load.t_s:.4g}", "%, s into the relay"
+            yield "load disturbance", f"{load.size:+.4g} at {load.t_s:.4g}", "%, s into the relay"
     if step is not None:
-        yield "measured step explained", f"{step.fit_pct:.1f}", "%"
+        yield "fit of measured step", f"{step.fit_pct:.1f}", "%"
 
 
 def loop_report(loop: LoopDetail) -> None:
-    """A loop as it is now."""
+    """Shows a loop in its present state."""
     live, unit = loop.live, loop.pv_unit
     gains = None if live is None else live.gains
     job, last = loop.active_job, loop.last_job_state
@@ -201,15 +201,17 @@ def loop_report(loop: LoopDetail) -> None:
 
 
 def lock(locked: LockView | None) -> str | None:
-    """Who keeps tests from a loop, and why."""
+    """Returns who has locked a loop, and why; None for a loop that is not locked."""
     return None if locked is None else f"by {locked.by}: {locked.reason}"
 
 
 def cell(value: object) -> str:
+    """Returns a value as text, "-" for None."""
     return "-" if value is None else number(value)
 
 
 def rows(title: str, headings: Iterable[str], lines: Iterable[Iterable[object]]) -> None:
+    """Shows a table with a row for each line."""
     table = Table(*headings, title=title)
     for line in lines:
         table.add_row(*map(cell, line))

@@ -1,4 +1,4 @@
-"""`loopwright key`: makes, lists and revokes API keys, on the machine that has the data folder."""
+"""`loopwright key`: creates, lists and revokes API keys, on the machine that has the data folder."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from loopwright.service.security.keys import Scope
 if TYPE_CHECKING:
     from loopwright.service.store.keyring import Keyring
 
-app = typer.Typer(help="API keys: made, listed, revoked.", no_args_is_help=True)
+app = typer.Typer(help="Create, list and revoke API keys.", no_args_is_help=True)
 
 Data = Annotated[Path, typer.Option(help="The service's data folder.")]
 Database = Annotated[
@@ -27,14 +27,18 @@ AsJson = Annotated[bool, typer.Option("--json", help="JSON, for scripts.")]
 
 @app.command()
 def create(
-    name: Annotated[str, typer.Argument(help="Whose key it is; the audit log shows it.")],
-    scope: Annotated[Scope, typer.Option(help="read: look; operate: retune and decide; admin: the audit log too.")],
-    days: Annotated[int | None, typer.Option(min=1, max=36_500, help="Days it is valid; default: for good.")] = None,
+    name: Annotated[str, typer.Argument(help="Owner of the key; the audit log shows the name.")],
+    scope: Annotated[
+        Scope, typer.Option(help="read: only read; operate: also retune and decide; admin: also read the audit log.")
+    ],
+    days: Annotated[
+        int | None, typer.Option(min=1, max=36_500, help="Days that the key is valid; default: for ever.")
+    ] = None,
     data: Data = Path("data"),
     database: Database = None,
     as_json: AsJson = False,
 ) -> None:
-    """Makes a key and shows it, this once."""
+    """Creates a key and shows it, only this once."""
     if not name.strip() or len(name) > 100 or not name.isprintable():
         die("a name has 1 to 100 printable characters", 2)
     with _Keys(data, database, make=True) as keys:
@@ -43,12 +47,12 @@ def create(
         print(json.dumps({"id": row.id, "name": name, "scope": scope.value, "expires_at": row.expires_at, "key": key}))
         return
     print(key)
-    print("This is the only time it is shown. Use it as: export LOOPWRIGHT_KEY=...", file=sys.stderr)
+    print("The key is shown only this once. Use it as: export LOOPWRIGHT_KEY=...", file=sys.stderr)
 
 
 @app.command("list")
 def list_keys(data: Data = Path("data"), database: Database = None, as_json: AsJson = False) -> None:
-    """Every key there ever was. What is secret about them is not kept."""
+    """Lists all keys, also revoked and expired ones. The secrets are not stored."""
     from loopwright.service.store.keyring import valid
 
     with _Keys(data, database) as keys:
@@ -65,18 +69,18 @@ def list_keys(data: Data = Path("data"), database: Database = None, as_json: AsJ
 
 @app.command()
 def revoke(
-    key: Annotated[str, typer.Argument(metavar="ID|NAME", help="Which key.")],
+    key: Annotated[str, typer.Argument(metavar="ID|NAME", help="Id or name of the key.")],
     data: Data = Path("data"),
     database: Database = None,
 ) -> None:
-    """Ends a key; a running service takes it no longer than 2 s."""
+    """Revokes a key; a running service accepts it for at most 2 s more."""
     with _Keys(data, database) as keys:
         row = keys.revoke(key)
     print(f"revoked {row.id} ({row.name})")
 
 
 class _Keys:
-    """The keyring of a service, and who is at the keyboard; what goes wrong ends the command."""
+    """Opens the keyring of a service in the name of the user; an error ends the command."""
 
     def __init__(self, data: Path, database: str | None, make: bool = False) -> None:
         from sqlalchemy.exc import SQLAlchemyError

@@ -1,4 +1,4 @@
-"""`loopwright loop`, `lock` and `unlock`."""
+"""`loopwright loop`, `loopwright lock` and `loopwright unlock`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Tag = Annotated[str, typer.Argument(help="Tag of the loop.")]
 
 @app.command("loop")
 def one_loop(tag: Tag, url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
-    """A loop and its present state."""
+    """Show a loop and its present state."""
     from loopwright.service.api.job_views import LoopDetail
     from loopwright.service.cli import job_tables
 
@@ -31,34 +31,41 @@ def one_loop(tag: Tag, url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
 @app.command()
 def lock(
     tag: Tag,
-    reason: Annotated[str, typer.Option(help="Why; whoever is refused is shown it.")],
-    by: Annotated[str | None, typer.Option(help="Who locks it, for the others; default: who is logged in.")] = None,
+    reason: Annotated[str, typer.Option(help="Reason, shown to everyone whose test is refused.")],
+    by: Annotated[
+        str | None, typer.Option(help="Name of the person who locks the loop; default: the user logged in.")
+    ] = None,
     url: Url = DEFAULT_URL,
     as_json: AsJson = False,
 ) -> None:
-    """Lock a loop: no test begins on it and no decision writes to it until it is unlocked."""
-    found = Client(url).post(f"/loops/{quote(tag, safe='')}/lock", {"reason": reason, "by": by or user()})
+    """Lock a loop: until it is unlocked no test begins on it, and no decision writes to it."""
+    from loopwright.service.cli.answers import LockAnswer
+
+    answer = Client(url).post(f"/loops/{quote(tag, safe='')}/lock", {"reason": reason, "by": by or user()})
     if as_json:
-        print_json(found)
+        print_json(answer)
         return
-    locked = found["locked"]
-    print(f"{tag} is locked by {locked['by']} since {locked['since']}: {locked['reason']}")
-    if found["note"]:
-        print(found["note"])
+    found = LockAnswer.model_validate(answer)
+    print(f"{tag} is locked by {found.locked.by} since {found.locked.since}: {found.locked.reason}")
+    if found.note:
+        print(found.note)
 
 
 @app.command()
 def unlock(
     tag: Tag,
-    by: Annotated[str | None, typer.Option(help="Who unlocks it; default: who is logged in.")] = None,
+    by: Annotated[
+        str | None, typer.Option(help="Name of the person who unlocks the loop; default: the user logged in.")
+    ] = None,
     url: Url = DEFAULT_URL,
     as_json: AsJson = False,
 ) -> None:
     """Unlock a loop."""
-    found = Client(url).post(f"/loops/{quote(tag, safe='')}/unlock", {"by": by or user()})
+    from loopwright.service.cli.answers import UnlockAnswer
+
+    answer = Client(url).post(f"/loops/{quote(tag, safe='')}/unlock", {"by": by or user()})
     if as_json:
-        print_json(found)
-    elif found["was_locked"] is None:
-        print(f"{tag} was not locked")
-    else:
-        print(f"{tag} is not locked any more; it was by {found['was_locked']['by']}: {found['was_locked']['reason']}")
+        print_json(answer)
+        return
+    was = UnlockAnswer.model_validate(answer).was_locked
+    print(f"{tag} was not locked" if was is None else f"{tag} is unlocked; it was locked by {was.by}: {was.reason}")

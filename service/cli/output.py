@@ -1,4 +1,4 @@
-"""What the commands have in common: JSON in and out, and how they end when they cannot go on."""
+"""Functions that the commands share: reading and printing JSON, and ending with an error."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import getpass
 import json
 import sys
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, NoReturn
 
 import typer
 
 from loopwright.service.api import strict_json
 
-Url = Annotated[str, typer.Option("--url", envvar="LOOPWRIGHT_URL", help="Where the service is.")]
-AsJson = Annotated[bool, typer.Option("--json", help="JSON, for scripts.")]
+Url = Annotated[str, typer.Option("--url", envvar="LOOPWRIGHT_URL", help="URL of the service.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
 
 
 def user() -> str:
-    """Who gives the command, as the audit log names them."""
+    """Returns the user who runs the command, as the audit log names them."""
     try:
         return f"cli:{getpass.getuser()}"
     except (KeyError, OSError):
@@ -29,7 +29,7 @@ def print_json(value: object) -> None:
 
 
 def on_terminal() -> bool:
-    """Somebody is there to be asked."""
+    """Returns whether there is a terminal on which a question can be answered."""
     return sys.stdin.isatty()
 
 
@@ -38,8 +38,8 @@ def die(text: str, status: int) -> NoReturn:
     raise typer.Exit(status)
 
 
-def read_json_object(path: Path) -> dict[str, Any]:
-    """The JSON object in a file; dies with status 2 for a file that has none."""
+def read_json_object(path: Path) -> dict[str, object]:
+    """Returns the JSON object in a file; ends the command with status 2 if there is none."""
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
@@ -49,8 +49,11 @@ def read_json_object(path: Path) -> dict[str, Any]:
     return json_object(text, str(path))
 
 
-def json_object(text: str, source: str) -> dict[str, Any]:
-    """The JSON object in a text; dies with status 2 if there is none. `source` names it in the error."""
+def json_object(text: str, source: str) -> dict[str, object]:
+    """Returns the JSON object in a text; ends the command with status 2 if there is none.
+
+    source: the name of the text in the error.
+    """
     try:
         found = strict_json.loads(text)
     except strict_json.BadJson as error:

@@ -1,4 +1,4 @@
-"""What a retune would do, on a terminal."""
+"""Shows the preview of a retune on a terminal."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from loopwright.service.planning.preview import FleetPreview, Preview, duration_
 
 
 def show(found: Preview | FleetPreview, console: Console) -> None:
-    """The preview of one loop or of many, and what stands in the way of each."""
+    """Shows the preview of one loop or of many, and the obstacles of each."""
     for line in found.summary:
         console.print(line, highlight=False)
     if isinstance(found, FleetPreview):
@@ -22,7 +22,7 @@ def show(found: Preview | FleetPreview, console: Console) -> None:
 
 
 def _stages(found: Preview, console: Console) -> None:
-    """A table of the stages that move something."""
+    """Shows a table of the stages that move MV or the set-point."""
     moving = [each for each in found.stages if each.mv_move_pct or each.sp_move]
     if not moving:
         return

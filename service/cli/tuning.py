@@ -1,4 +1,4 @@
-"""The commands that need no service: the methods, a model tuned by them, a model from a record."""
+"""`loopwright methods`, `tune` and `identify`, which need no service."""
 
 from __future__ import annotations
 
@@ -12,33 +12,36 @@ import typer
 from loopwright.service.cli.output import AsJson, die, json_object, print_json, read_json_object
 
 PICTURES = (".png", ".svg", ".pdf")
-Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Picture: .png, .svg or .pdf.")]
+Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Write a plot: .png, .svg or .pdf.")]
 
 
 def methods(as_json: AsJson = False) -> None:
-    """The tuning methods, what each is for and its options."""
-    from loopwright.service.offline import tunings
-
-    found = tunings.methods_json()
+    """Lists the tuning methods, what each is for and its options."""
     if as_json:
-        print_json(found)
+        from loopwright.service.offline import tunings
+
+        print_json(tunings.methods_json())
         return
     from loopwright.service.cli import tuning_tables
+    from loopwright.tuning.rules.registry import METHODS
 
-    tuning_tables.methods(found)
+    tuning_tables.methods(METHODS.values())
 
 
 def tune(
-    model: Annotated[str, typer.Option(metavar="JSON|FILE", help='As {"K": 2, "T_s": 10, "L_s": 3}, or a file of it.')],
-    method: Annotated[str, typer.Option(metavar="NAME", help="One of `loopwright methods`, or all.")] = "all",
+    model: Annotated[
+        str, typer.Option(metavar="JSON|FILE", help='Model, such as {"K": 2, "T_s": 10, "L_s": 3}, or its file.')
+    ],
+    method: Annotated[str, typer.Option(metavar="NAME", help="A method of `loopwright methods`, or all.")] = "all",
     option: Annotated[
-        list[str] | None, typer.Option(metavar="NAME=VALUE", help="Of the method, as lambda_s=5; may be repeated.")
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="Option of the method, such as lambda_s=5; may be repeated."),
     ] = None,
     plot: Plot = None,
     as_json: AsJson = False,
 ) -> None:
-    """Gains for a process model by one method or all, compared on it. Exit 0: gains found, 3: none."""
-    # the matrices are small: threads of the linear algebra cost more than they save
+    """Tunes a process model by one method or all, and compares the gains. Exit status 0: gains found, 3: none."""
+    # threads of the linear algebra cost more than they save on small matrices
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from loopwright.service.inputs.model_json import BadModel, parse_model
     from loopwright.service.offline import tunings
@@ -59,22 +62,23 @@ def tune(
     if as_json:
         print_json(answer)
     else:
+        from loopwright.service.api.tuning_views import TuningsView
         from loopwright.service.cli import tuning_tables
 
-        tuning_tables.tunings(answer)
-    if all(each["outcome"] == "refused" for each in answer["methods"]):
+        tuning_tables.tunings(TuningsView.model_validate(answer))
+    if all(each.refusal is not None for each in found):
         raise typer.Exit(3)
 
 
 def identify(
     data: Annotated[Path, typer.Argument(metavar="DATA.csv", help="Columns t, u (or mv), y (or pv).")],
     mv_before: Annotated[
-        float | None, typer.Option(help="MV before the record; needed if it begins with the move.")
+        float | None, typer.Option(help="MV before the record; needed if the record begins with the move.")
     ] = None,
     plot: Plot = None,
     as_json: AsJson = False,
 ) -> None:
-    """A process model from a recorded test of any shape. Exit 0: a model found, 3: none."""
+    """Identifies a process model from a recorded test of any shape. Exit status 0: a model found, 3: none."""
     from loopwright.service.offline.csv_record import RecordError, load_record
     from loopwright.service.offline.identification import identified, refused
     from loopwright.tuning.identification.identify import identify as fit
@@ -90,25 +94,27 @@ def identify(
     except Refused as refusal:
         if refusal.reason is Reason.BAD_INPUT:
             die(f"{data}: {refusal.detail}", 2)
-        answer = refused(refusal)
-    else:
-        answer = identified(found, record)
-        if plot is not None:
-            from loopwright.service.plots.tunings import record_and_model
+        if as_json:
+            print_json(refused(refusal))
+        else:
+            from loopwright.service.cli import tuning_tables
 
-            _save(plot, record_and_model, record, found)
+            tuning_tables.not_identified(refusal)
+        raise typer.Exit(3) from None
+    if plot is not None:
+        from loopwright.service.plots.tunings import record_and_model
+
+        _save(plot, record_and_model, record, found)
     if as_json:
-        print_json(answer)
+        print_json(identified(found, record))
     else:
         from loopwright.service.cli import tuning_tables
 
-        tuning_tables.identified(answer)
-    if answer["outcome"] == "refused":
-        raise typer.Exit(3)
+        tuning_tables.identified(found, len(record.t))
 
 
 def check_plot(plot: Path | None) -> None:
-    """Before the work, not after it."""
+    """Ends the command before any work if the format of the plot is not supported."""
     if plot is not None and plot.suffix.lower() not in PICTURES:
         die(f"--plot must end in {', '.join(PICTURES)}, not {plot}", 2)
 
@@ -121,7 +127,7 @@ def _save(plot: Path, draw: Callable[..., None], *what: object) -> None:
 
 
 def _option(text: str) -> tuple[str, object]:
-    """name=value; the value a number, true or false where it reads as one."""
+    """Returns name and value of "name=value"; the value is a number or a bool where it reads as one."""
     name, equals, value = text.partition("=")
     if not (name and equals):
         die(f"--option must be NAME=VALUE, not {text!r}", 2)

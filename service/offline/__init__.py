@@ -1,1 +1,1 @@
-"""What needs neither a loop nor a service: models, tunings, recorded tests."""
+"""Tunings of a model and recorded tests, which need neither a loop nor a service."""

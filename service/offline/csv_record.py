@@ -1,10 +1,10 @@
-"""A recorded test of a loop as a CSV file: time, MV and PV, perhaps the set-point.
+"""Reads a recorded test of a loop from a CSV file: time, MV and PV, optionally the set-point.
 
-    t,u,y,sp          t or time or t_s: s from anywhere, or ISO 8601 date and time
+    t,u,y,sp          t or time or t_s: s from any origin, or ISO 8601 date and time
     0.0,50,20.1,20    u or mv, y or pv, sp: numbers; other columns are ignored
 
-Comma, semicolon or tab between the columns; with the latter two a decimal comma is understood. Lines that are empty or
-begin with # are skipped. Everything wrong with a file is reported in one go, by line.
+Columns are separated by comma, semicolon or tab; with the latter two a decimal comma is accepted. Empty lines and lines
+that begin with # are skipped. All errors of a file are reported at once, by line.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _MAX_PROBLEMS = 20
 
 
 class RecordError(Exception):
-    """The file cannot be used; `problems` holds what was found, one line each (the first 20)."""
+    """The file cannot be used; `problems` has a line for each error (the first 20)."""
 
     def __init__(self, source: str, problems: Sequence[str]) -> None:
         shown = list(problems[:_MAX_PROBLEMS])
@@ -40,7 +40,13 @@ class RecordError(Exception):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Record:
-    """t: s.  u: MV.  y: PV.  sp: set-point, None if the file has none. All of shape (N,), finite, t increasing."""
+    """The samples of a recorded test, all of shape (N,) and finite.
+
+    t: time, s, increasing.
+    u: MV, MV units.
+    y: PV, PV units.
+    sp: set-point, PV units; None if the file has none.
+    """
 
     t: Reals
     u: Reals
@@ -49,7 +55,7 @@ class Record:
 
 
 def load_record(path: Path) -> Record:
-    """Raises RecordError for a file that cannot be read or used."""
+    """Returns the record in a CSV file. Raises RecordError for a file that cannot be read or used."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
@@ -60,7 +66,7 @@ def load_record(path: Path) -> Record:
 
 
 def parse_record(text: str, source: str) -> Record:
-    """The record in the text of a CSV file; `source` names it in errors."""
+    """Returns the record in the text of a CSV file. Raises RecordError, in which `source` names the file."""
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if _counts(line)]
     if not lines:
         raise RecordError(source, ["is empty: a line of column names and a line for each sample are needed"])
@@ -93,7 +99,7 @@ def parse_record(text: str, source: str) -> Record:
     if not columns["t"]:
         raise RecordError(source, ["has column names but no samples"])
     arrays = {quantity: np.array(values, dtype=float) for quantity, values in columns.items()}
-    # dates are counted in s since 1970: too large for times to be exact
+    # s since 1970 are too large for exact time differences
     t = arrays["t"] - arrays["t"][0] if dated else arrays["t"]
     return Record(t, arrays["u"], arrays["y"], arrays.get("sp"))
 
@@ -107,7 +113,7 @@ def _cells(line: str, delimiter: str) -> list[str]:
 
 
 def _places(names: Sequence[str], line: int) -> tuple[dict[str, int], list[str]]:
-    """Where each quantity is, and what is wrong with the line of names."""
+    """Returns the column index of each quantity, and the errors in the line of column names."""
     places, problems = {}, []
     for quantity, accepted in _NAMES.items():
         at = [i for i, name in enumerate(names) if name in accepted]
@@ -148,5 +154,5 @@ def _seconds(cell: str) -> float:
         moment = datetime.fromisoformat(cell.strip())
     except ValueError:
         raise ValueError(f"is not a date and time: {cell.strip()!r}") from None
-    # without a zone it is a plain clock: this machine's zone and its summer time have no part in it
+    # a time without a zone is read as UTC: the zone and summer time of this machine must not affect it
     return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()

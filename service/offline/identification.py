@@ -1,10 +1,9 @@
-"""A model identified from a record, or the refusal, as the JSON object of `loopwright identify`."""
+"""Formats an identified model, or the refusal, as the JSON object of `loopwright identify`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any
 
 from loopwright.service.inputs.model_json import dump_model
 from loopwright.service.jsonable import to_jsonable
@@ -15,21 +14,20 @@ from loopwright.tuning.reasons import Refused
 _IN_JSON = {"T": "T_s", "L": "L_s"}
 
 
-def identified(found: Identified, record: Record) -> dict[str, Any]:
-    """Errors, noise_std and rms in the units of what they are of; fits in percent.
+def identified(found: Identified, record: Record) -> dict[str, object]:
+    """Returns the JSON object of an identified model; the quantities and their units are those of `Identified`.
 
-    parameters: of the model by name; covariance: of the same, row by row in their order. loads: t_s, when each entered
-    if at the plant's input; seen_s, when PV began to answer; size in MV units.
+    The parameters have the names of the model as JSON (T_s, L_s), and covariance has a row for each of them.
     """
-    answer: dict[str, Any] = to_jsonable(
+    answer: dict[str, object] = to_jsonable(
         {
             "outcome": "identified",
             "reason": None,
             "detail": None,
             "advice": None,
             "model": dump_model(found.model),
-            "parameters": _named(found.parameters),
-            "standard_errors": _named(found.standard_errors),
+            "parameters": named(found.parameters),
+            "standard_errors": named(found.standard_errors),
             "covariance": found.covariance.tolist(),
             "loads": [asdict(each) for each in found.loads],
             "drift": found.drift,
@@ -46,13 +44,13 @@ def identified(found: Identified, record: Record) -> dict[str, Any]:
     return answer
 
 
-def _named(values: Mapping[str, float]) -> dict[str, float]:
-    """Parameters by the names that they have in a model as JSON."""
+def named(values: Mapping[str, float]) -> dict[str, float]:
+    """Returns parameters under the names that they have in a model as JSON."""
     return {_IN_JSON.get(name, name): value for name, value in values.items()}
 
 
-def refused(refusal: Refused) -> dict[str, Any]:
-    """The same object's first fields, and no model."""
+def refused(refusal: Refused) -> dict[str, object]:
+    """Returns the JSON object of a refusal: the first fields of that of a model, and no model."""
     return {
         "outcome": "refused",
         "reason": refusal.reason.value,

@@ -1,14 +1,14 @@
-"""A model tuned by one method or by all: the one call behind `loopwright tune` and POST /tunings.
+"""Tunes a model by one method or by all, for `loopwright tune` and POST /tunings.
 
-The gains are those a controller can carry out (see `tuning.rules.design.realisable`), and margins and step figures are
-of just these, on the model as given with its exact dead time.
+The gains are those that a controller can carry out (see `tuning.rules.design.realisable`). Margins and step figures are
+computed with these gains on the model as given, with its exact dead time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TypedDict
 
 from loopwright.service.inputs.model_json import dump_model
 from loopwright.service.inputs.plausible import Implausible, check_option
@@ -24,9 +24,9 @@ from loopwright.tuning.rules.tuned import tune
 
 ALL = "all"
 FORM = "ISA: u = Kp*(b*SP - PV + integral(SP - PV)/Ti + Td*d/dt(c*SP - PV)/(1 + Tf*s)); Ti = 0: no integral"
-OF_WHAT = (
-    "Margins and figures are of these gains on the model as given, with its exact dead time; an ideal derivative has "
-    "been given a filter first. setpoint: unit step of the set-point; load: unit step at the plant's input."
+FIGURES_ARE = (
+    "Margins and figures are computed with these gains on the model as given, with its exact dead time; an ideal "
+    "derivative is filtered first. setpoint: unit step of the set-point; load: unit step at the plant's input."
 )
 UNITS = {
     "Kp": "MV per PV unit",
@@ -45,12 +45,15 @@ UNITS = {
 
 
 class BadTuning(ValueError):
-    """What was asked for cannot be: an unknown method or option, or a value that the option does not take."""
+    """The request names an unknown method or option, or a value that the option does not take."""
 
 
 @dataclass(frozen=True, slots=True)
 class MethodResult:
-    """What one method says of a model: gains and how they do, or the refusal."""
+    """The result of one method: the gains with their assessment on the model, or the refusal.
+
+    chosen: the design parameters in effect, by name with unit.
+    """
 
     method: Method
     gains: Gains | None = None
@@ -61,15 +64,17 @@ class MethodResult:
 
 
 def tune_model(model: Model, method: str = ALL, options: Mapping[str, object] | None = None) -> list[MethodResult]:
-    """By the method named, or by all in the order of the registry; each option goes to the methods that have it.
+    """Tunes the model by the method named, or by all in the order of the registry.
 
-    Raises BadTuning. A method that refuses the model is in the list with its refusal.
+    Each option goes to the methods that have it. A method that refuses the model is in the list with its refusal.
+
+    Raises BadTuning.
     """
     return tune_each(model, list(METHODS) if method == ALL else [method], options)
 
 
 def tune_each(model: Model, names: Sequence[str], options: Mapping[str, object] | None = None) -> list[MethodResult]:
-    """By the methods named, in this order; as `tune_model`."""
+    """Tunes the model by the methods named, in this order, as `tune_model` does. Raises BadTuning."""
     for name in names:
         if name not in METHODS:
             raise BadTuning(f"method must be one of {', '.join(METHODS)}, not {name!r}")
@@ -80,47 +85,60 @@ def tune_each(model: Model, names: Sequence[str], options: Mapping[str, object] 
     return [_tuned(each, model, {k: v for k, v in asked.items() if k in each.options}) for each in methods]
 
 
-def tunings(model: Model, method: str = ALL, options: Mapping[str, object] | None = None) -> dict[str, Any]:
-    """As `tune_model`, as the JSON object of `loopwright tune --json` and POST /tunings; raises BadTuning."""
-    return answer(model, tune_model(model, method, options))
+def tunings(model: Model, method: str = ALL, options: Mapping[str, object] | None = None) -> dict[str, object]:
+    """Returns the results of `tune_model` as the JSON object of POST /tunings. Raises BadTuning."""
+    return {**answer(model, tune_model(model, method, options))}
 
 
-def answer(model: Model, found: Iterable[MethodResult]) -> dict[str, Any]:
-    """The JSON object; what is not known is null."""
+class Tunings(TypedDict):
+    """The JSON object of the tunings of one model, as `tuning_views.TuningsView` describes it."""
+
+    model: dict[str, object]
+    methods: list[dict[str, object]]
+    form: str
+    figures_are: str
+    units: dict[str, str]
+
+
+def answer(model: Model, found: Iterable[MethodResult]) -> Tunings:
+    """Returns the JSON object of `loopwright tune --json` and POST /tunings; what is not known is null."""
     return {
         "model": dump_model(model),
         "methods": [as_json(each) for each in found],
         "form": FORM,
-        "figures_are": OF_WHAT,
+        "figures_are": FIGURES_ARE,
         "units": UNITS,
     }
 
 
-def as_json(found: MethodResult) -> dict[str, Any]:
-    """One method's part of the JSON object."""
+def as_json(found: MethodResult) -> dict[str, object]:
+    """Returns the part of that JSON object for one method."""
     gains, assessed, refusal = found.gains, found.assessment, found.refusal
     parallel = to_parallel(gains) if gains else None
-    told: dict[str, Any] = {
-        "method": found.method.name,
-        "title": found.method.title,
-        "outcome": "refused" if refusal else "tuned",
-        "reason": refusal.reason.value if refusal else None,
-        "detail": refusal.detail if refusal else None,
-        "advice": refusal.advice if refusal else None,
-        "gains": {"form": "ISA", **asdict(gains)} if gains else None,
-        "parallel": {"Kp": parallel.Kp, "Ki": parallel.Ki, "Kd": parallel.Kd, "Tf": parallel.Tf} if parallel else None,
-        "chosen": dict(found.chosen) if found.chosen is not None else None,
-        "notes": list(found.notes),
-        "margins": _margins(assessed) if assessed else None,
-        "setpoint": _figures(assessed.setpoint) if assessed else None,
-        "load": _figures(assessed.load) if assessed else None,
-    }
-    clean: dict[str, Any] = to_jsonable(told)
+    clean: dict[str, object] = to_jsonable(
+        {
+            "method": found.method.name,
+            "title": found.method.title,
+            "outcome": "refused" if refusal else "tuned",
+            "reason": refusal.reason.value if refusal else None,
+            "detail": refusal.detail if refusal else None,
+            "advice": refusal.advice if refusal else None,
+            "gains": {"form": "ISA", **asdict(gains)} if gains else None,
+            "parallel": {"Kp": parallel.Kp, "Ki": parallel.Ki, "Kd": parallel.Kd, "Tf": parallel.Tf}
+            if parallel
+            else None,
+            "chosen": dict(found.chosen) if found.chosen is not None else None,
+            "notes": list(found.notes),
+            "margins": _margins(assessed) if assessed else None,
+            "setpoint": _figures(assessed.setpoint) if assessed else None,
+            "load": _figures(assessed.load) if assessed else None,
+        }
+    )
     return clean
 
 
-def methods_json() -> list[dict[str, Any]]:
-    """The registry, as GET /methods and `loopwright methods --json` show it."""
+def methods_json() -> list[dict[str, object]]:
+    """Returns the registry as the JSON array of GET /methods and `loopwright methods --json`."""
     return [
         {
             "method": method.name,
@@ -135,7 +153,7 @@ def methods_json() -> list[dict[str, Any]]:
 
 
 def _check(methods: list[Method], name: str, value: object) -> None:
-    """The option must be known to one of the methods and its value accepted by one that knows it."""
+    """Raises BadTuning unless one of the methods has the option and accepts the value."""
     knowing = [method for method in methods if name in method.options]
     if not knowing:
         who = methods[0].name if len(methods) == 1 else "no method"
@@ -166,9 +184,9 @@ def _tuned(method: Method, model: Model, options: Mapping[str, object]) -> Metho
     return MethodResult(method, found.gains, found.chosen, found.notes, found.assessment)
 
 
-def _margins(found: Assessment) -> dict[str, Any]:
+def _margins(found: Assessment) -> dict[str, object]:
     m = found.margins
-    margins = {
+    margins: dict[str, object] = {
         "Ms": m.Ms,
         "Mt": m.Mt,
         "GM": m.GM,
@@ -176,18 +194,18 @@ def _margins(found: Assessment) -> dict[str, Any]:
         "delay_margin_s": m.delay_margin_s,
         "bandwidth_rad_s": m.bandwidth,
     }
-    # an unstable loop has a curve, but no margins
+    # the margins of an unstable loop would mislead
     return {"stable": m.stable} | (margins if m.stable else dict.fromkeys(margins))
 
 
-def _figures(found: StepFigures | None) -> dict[str, Any] | None:
+def _figures(found: StepFigures | None) -> dict[str, object] | None:
     if found is None:
         return None
     figures = asdict(found)
     return {"settling_band": figures.pop("band")} | figures
 
 
-def _option(option: Option) -> dict[str, Any]:
+def _option(option: Option) -> dict[str, object]:
     return {
         "kind": option.kind,
         "unit": option.unit,

@@ -1,7 +1,7 @@
-"""How long the stages of a retune take, in plant time: from T95, and from the ultimate period where a model is known.
+"""Estimates the plant time of each stage of a retune from T95, and from the ultimate period where a model is known.
 
-The factors hold what rehearsals of the plants of `benchmarks.plants` took (the shortest and the longest of nine in
-ten), and the limits of time of the procedures.
+The factors cover the rehearsals of the plants of `benchmarks.plants` (the shortest and the longest of nine in ten) and
+the time limits of the procedures.
 """
 
 from __future__ import annotations
@@ -12,13 +12,16 @@ from loopwright.tuning.fast.procedure import MIN_SAMPLES
 from loopwright.tuning.fast.relay_test import MAX_PERIODS, STEP_BACK_FRACTION, VERIFICATION_PERIODS
 
 PU_OF_T95 = (0.07, 0.95)
-"""The ultimate period in T95, of eight in ten of 116 self-regulating plants."""
+"""Ultimate period as a fraction of T95: the range of eight in ten of 116 self-regulating plants."""
 
 Span = tuple[float, float]
 
 
 def durations(request: RetuneRequest, t95_s: float, sample_time_s: float | None, pu_s: float | None) -> dict[str, Span]:
-    """The shortest and the longest time to be expected of each stage, s. pu_s: None where no model is known."""
+    """Returns the shortest and the longest time expected of each stage, s.
+
+    pu_s: the ultimate period, s; None where no model is known.
+    """
     minimum = MIN_SAMPLES if isinstance(request, FastRetune) and request.start == "relay" else MIN_LISTENED_SAMPLES
     look = max(0.5 * t95_s, minimum * (sample_time_s or 0.0))
     # a loop that is not at rest is given half a T95 before each further look

@@ -1,4 +1,4 @@
-"""What a procedure is told of its loop, and how long it may take."""
+"""What a procedure knows of its loop, and how long it may take."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from loopwright.tuning.fast.procedure import FAST
 TIME_BUDGET_T95 = {FAST: 100.0}
 OTHER_BUDGET_T95 = 500.0
 MIN_BUDGET_SAMPLES = 1000
-"""Of a loop whose T95 is a few samples: the time at rest alone is counted in samples."""
+"""Minimum time limit in samples: the wait for rest is counted in samples, which matters where T95 is a few of them."""
 
 
 def facts_of(config: LoopConfig, state: LoopState) -> Facts:
-    """What the procedures know of a loop; the limits of MV are the narrower of the job's and the controller's own.
+    """Returns what the procedures know of a loop, with the narrower of the job's and the controller's MV limits.
 
     Raises Refused: BAD_LIMITS, SAMPLING_TOO_SLOW.
     """
@@ -30,6 +30,6 @@ def facts_of(config: LoopConfig, state: LoopState) -> Facts:
 
 
 def time_budget_s(method: str, t95_s: float, sample_time_s: float) -> float:
-    """Plant time, s: several times what a loop of this T95 takes."""
+    """Returns the time limit of a retune, plant time in s: several times what a loop of this T95 takes."""
     budget = TIME_BUDGET_T95.get(method, OTHER_BUDGET_T95) * t95_s
     return max(budget, MIN_BUDGET_SAMPLES * sample_time_s)

@@ -1,9 +1,8 @@
-"""The model that a job found on its loop, from its result or from the stages it came through."""
+"""The model that a job found on its loop, taken from the job's result or from the results of its stages."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from loopwright.service.results import TYPED_IN
 from loopwright.service.store.jobs import Job, JobEvent
@@ -12,11 +11,11 @@ from loopwright.tuning.reasons import Reason
 
 FoundModel = FOPDT | SOPDT | TransferFunction
 DISPROVED = (Reason.WRONG_SIGN, Reason.MODEL_MISMATCH, Reason.DIVERGES, Reason.UNEXPLAINED, Reason.DISTURBED)
-"""How a job ends whose own record speaks against the model that an earlier stage had found."""
+"""Reasons for which a job ends when its record contradicts the model that an earlier stage found."""
 
 
 def found_model(row: Job, events: Sequence[JobEvent]) -> FoundModel | None:
-    """The model of the job's result, else the last that a stage found; none that was typed in."""
+    """Returns the model of the job's result, else the last that a stage found; an entered model does not count."""
     if row.result is not None and row.result.model is not None and not row.result.model.typed_in:
         return row.result.model.process_model()
     for data in (event.data.get("result") for event in reversed(events) if event.kind == "stage_done"):
@@ -27,12 +26,17 @@ def found_model(row: Job, events: Sequence[JobEvent]) -> FoundModel | None:
     return None
 
 
-def model_of(data: Mapping[str, Any]) -> FoundModel | None:
-    """The model of a stage's result or of a request; None where it has none, or one that is not to be trusted."""
-    if all(isinstance(data.get(name), int | float) for name in ("K", "T_s", "L_s")):
-        K, T, L, zeta = data["K"], data["T_s"], data["L_s"], data.get("zeta")
+def model_of(data: Mapping[str, object]) -> FoundModel | None:
+    """Returns the model in a stage's result; None where there is none, or where the stage gave a reason against it."""
+    K, T, L, zeta = (_number(data.get(name)) for name in ("K", "T_s", "L_s", "zeta"))
+    if K is not None and T is not None and L is not None:
         return FOPDT(K, T, L) if zeta is None else SOPDT(K, T, zeta, L)
-    if data.get("num") and data.get("den") and not data.get("reason"):
-        dead_time = data.get("dead_time_s", data.get("L_s", 0.0))
-        return TransferFunction(tuple(data["num"]), tuple(data["den"]), dead_time)
+    num, den = data.get("num"), data.get("den")
+    if isinstance(num, list) and isinstance(den, list) and num and den and not data.get("reason"):
+        dead_time = _number(data.get("dead_time_s", data.get("L_s")))
+        return TransferFunction(tuple(num), tuple(den), dead_time or 0.0)
     return None
+
+
+def _number(value: object) -> float | None:
+    return value if isinstance(value, int | float) else None

@@ -1,4 +1,4 @@
-"""What is known of a loop before a dry run: asked of its controller, and of the jobs that it has had."""
+"""Collects what is known of a loop before a dry run, from its controller and from its earlier jobs."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ from loopwright.service.store.store import Store
 from loopwright.tuning.reasons import Ended
 
 LOOKED_AT = 50
-"""Latest jobs of the loop among which a model, and the controller's last state, are looked for."""
+"""Number of the latest jobs that are searched for a model and for the controller's last state."""
 
 
 def known(store: Store, tag: str, read: Callable[[], LoopState]) -> Ground:
-    """read: the present state of the loop; what it raises is told, not raised."""
+    """Returns what is known of the loop.
+
+    read: reads the present state of the loop; its Ended or OSError becomes `Ground.silence`.
+    """
     rows = store.tests_of(tag, LOOKED_AT)
     last = _last_model(store, rows)
     try:

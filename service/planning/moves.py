@@ -1,7 +1,7 @@
-"""What the stages of a retune move, and how far at most: known before anything is moved.
+"""States before a test what each stage of a retune moves, and how far at most.
 
-Figures are what the procedures command by themselves (`tuning.fast.relay_test`, `tuning.five_stage`). In automatic the
-controller's feedback may take MV farther; the limits of the test hold there too.
+The figures are the moves that the procedures command (`tuning.fast.relay_test`, `tuning.five_stage`). In automatic the
+controller's feedback may take MV farther; the limits of the test apply there too.
 """
 
 from __future__ import annotations
@@ -23,15 +23,17 @@ from loopwright.tuning.gains import Gains
 _COMPUTING = ("design", "redesign", "estimate", "optimise")
 _STEPPING = ("baseline", "ultimate", "zn_pi", "verify")
 _UNDER_PRESENT_GAINS, _UNDER_NEW_GAINS = 2.0, 1.4
-"""Of a set-point step: as far as PV goes in a loop that is just stable, and as `verification` lets it go."""
+"""Largest excursion of PV per set-point step: in a loop that is just stable, and as far as `verification` permits."""
 
 
 @dataclass(frozen=True, slots=True)
 class Moves:
-    """What a stage moves. mv_down, mv_up: how far MV is moved away from where it is, percent, both positive.
+    """What a stage moves.
 
-    sp_up: largest step of the set-point, PV units.  pv: how far PV is expected to go from the set-point as it is now,
-    PV units, None where nobody can tell.  first_mv: what the relay begins with, percent, None without one.
+    mv_down, mv_up: largest moves of MV from its present value, percent, both positive.
+    sp_up: largest step of the set-point, PV units.
+    pv: expected excursion of PV from the present set-point, PV units; None where it is not known.
+    first_mv: initial amplitude of the relay, percent; None without a relay.
     """
 
     stage: str
@@ -44,18 +46,18 @@ class Moves:
 
 
 def stages_asked(request: RetuneRequest) -> tuple[str, ...]:
-    """The stages of the retune, in their order."""
+    """Returns the stages of the retune in their order."""
     if isinstance(request, FastRetune):
         return trial_stages(request.verify) if request.start == "design" else fast_stages(request.verify)
     return stages_of(request.start, request.options.baseline, request.verify)
 
 
 def broken_limits(config: LoopConfig, request: RetuneRequest, sp: float) -> list[str]:
-    """The limits of PV that the test itself would break at this set-point, in words with the numbers.
+    """Returns a sentence with the numbers for each PV limit that the test itself would break at this set-point.
 
-    Whether MV has room is the procedures' own to say: they know its mean.
+    The procedures check the room of MV themselves, because they know its mean.
 
-    config: with the limits of the job.
+    config: the configuration with the limits of the job.
     """
     low, high, step, unit = config.pv_limits.low, config.pv_limits.high, config.sp_deviation, config.pv_unit
     hair = TOLERANCE * max(abs(sp), step)
@@ -88,9 +90,11 @@ def _remedy(maximum: float, unit: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Before:
-    """What is known of the loop before the test; what is not is None.
+    """The loop before the test; a quantity that is not known is None.
 
-    gains: in effect.  mv: now, percent.  Ku: ultimate gain of the last model, percent per PV unit.
+    gains: the gains in effect.
+    mv: the present MV, percent.
+    Ku: the ultimate gain of the last model, percent per PV unit.
     """
 
     gains: Gains | None = None
@@ -99,16 +103,18 @@ class Before:
 
 
 def moves(config: LoopConfig, request: RetuneRequest, before: Before) -> list[Moves]:
-    """Each stage's, in their order. config: with the limits of the job, MV limits those that hold.
+    """Returns the moves of each stage, in the order of the stages.
 
-    Where the present gains or MV are not known, the figures are the largest that the limits leave room for.
+    Where the present gains or MV are not known, the figures are the largest that the limits permit.
+
+    config: the configuration with the limits of the job, and the MV limits in effect.
     """
     found = []
     for stage in stages_asked(request):
         if stage == "preflight":
-            found.append(Moves(stage, "Nothing is moved: the loop is listened to in automatic until it is at rest."))
+            found.append(Moves(stage, "Nothing is moved: the loop is observed in automatic until it is at rest."))
         elif stage in _COMPUTING:
-            found.append(Moves(stage, "Nothing is moved by the test: the record is computed on."))
+            found.append(Moves(stage, "Nothing is moved by the test: the gains are computed from the record."))
         else:
             found.append(_moving(stage, config, request, before))
     return found
@@ -129,16 +135,15 @@ def _fast(stage: str, config: LoopConfig, request: FastRetune, before: Before) -
     if stage != "relay":
         what = (
             f"The set-point is stepped up by up to {step:g} {unit} under the new gains, on trial; it is stepped back "
-            "where the record leaves doubt."
+            "where the record is not conclusive."
         )
         return Moves(stage, what, up, up, step, _UNDER_NEW_GAINS * step)
-    size, mean = "Its size stays", 0.5 * (1.0 + BIAS)
-    pv = _swing(mean * first, before.Ku)
+    size, mean = "The size stays", 0.5 * (1.0 + BIAS)
+    pv = _oscillation(mean * first, before.Ku)
     if given is None:
-        size = (
-            f"After its first wave it is adapted, so that PV moves by at most {MAX_OUTPUT_RANGE * step:g} {unit} in all"
-        )
-        if pv is not None:  # nothing bounds the first wave but MV
+        most = MAX_OUTPUT_RANGE * step
+        size = f"After the first wave the size is adapted, so that PV moves by at most {most:g} {unit} in all"
+        if pv is not None:  # only MV bounds the first wave
             pv = max(pv, min(0.5 * MAX_OUTPUT_RANGE * step, pv * maximum / first if first else 0.0))
     what = (
         f"A relay in the controller moves MV by +{first:.4g} and -{BIAS * first:.4g} % at first. {size}; a side on "
@@ -157,12 +162,14 @@ def _five_stage(stage: str, config: LoopConfig, request: FiveStages, before: Bef
     room, step, unit, gains = _room(config, before.mv), config.sp_deviation, config.pv_unit, before.gains
     kick = KICK_OF_ROOM * room
     if stage == "relay":
-        what = f"A relay in the controller moves MV by +-{room:.4g} %, all the room there is, until PV swings evenly."
-        return Moves(stage, what, room, room, pv=_swing(room, before.Ku), first_mv=room)
+        what = (
+            f"A relay in the controller moves MV by +-{room:.4g} %, all the room there is, until PV oscillates evenly."
+        )
+        return Moves(stage, what, room, room, pv=_oscillation(room, before.Ku), first_mv=room)
     if stage == "ultimate":
         what = (
-            f"Set-point steps of up to {step:g} {unit} under a P controller, two to five runs, until PV swings by "
-            "itself; a run ends where MV comes to the end of its room. In between MV is held by hand."
+            f"Set-point steps of up to {step:g} {unit} under a P controller, two to five runs, until PV "
+            "oscillates by itself; a run ends where MV reaches its limit. In between MV is held in manual."
         )
         run = RUN_MV_LIMIT * room
         return Moves(stage, what, run, run, step, _UNDER_PRESENT_GAINS * step)
@@ -174,18 +181,18 @@ def _five_stage(stage: str, config: LoopConfig, request: FiveStages, before: Bef
         )
         return Moves(stage, what, kick, kick, step, (1.0 + high / 100.0) * step)
     if gains is not None and gains.Kp > 0.0:
-        step = min(step, kick / gains.Kp)  # `allowed_step` of the old gains bounds both of these
+        step = min(step, kick / gains.Kp)  # `allowed_step` of the old gains bounds both steps
     which, farthest = ("present", _UNDER_PRESENT_GAINS) if stage == "baseline" else ("new", _UNDER_NEW_GAINS)
     what = f"The set-point is stepped up by up to {step:.4g} {unit} under the {which} gains, and back."
     return Moves(stage, what, kick, kick, step, farthest * step)
 
 
-def _swing(amplitude: float, Ku: float | None) -> float | None:
-    """Of PV to each side under a relay, by its describing function, PV units."""
+def _oscillation(amplitude: float, Ku: float | None) -> float | None:
+    """Returns the amplitude of PV under a relay by the describing function, PV units."""
     return 4.0 * amplitude / (math.pi * Ku) if Ku else None
 
 
 def _room(config: LoopConfig, mv: float | None) -> float:
-    """On the nearer side of MV, percent."""
+    """Returns the room between MV and the nearer limit, percent."""
     low, high = config.mv_limits.low, config.mv_limits.high
     return 0.5 * (high - low) if mv is None else max(0.0, min(high - mv, mv - low))

@@ -1,4 +1,4 @@
-"""What stands in the way of a retune now: everything at once, where a retune itself ends at the first."""
+"""Lists every reason for which a retune would be refused now; a retune itself ends at the first of them."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from loopwright.tuning.reasons import ADVICE, Ended, Reason, Refused
 
 
 class Occupied(StrEnum):
-    """Why a start is answered with 409, which is no reason for which a job ends."""
+    """Reasons for which a start is answered with 409; no job ends for them."""
 
     BUSY = "busy"
 
 
-_ADVICE = {Occupied.BUSY: "Wait for the end of the job that has the loop, or abort it."}
+_ADVICE = {Occupied.BUSY: "Wait for the end of the job that has the loop, or abort that job."}
 
 
 @dataclass(frozen=True, slots=True)
 class Obstacle:
-    """reason: for which a retune would not start, or would end before anything is moved.  detail: with the numbers."""
+    """A reason for which a retune would not start, or would end before anything is moved; detail has the numbers."""
 
     reason: Reason | Occupied
     detail: str
@@ -41,11 +41,13 @@ class Obstacle:
 
 @dataclass(frozen=True, slots=True)
 class Now:
-    """What is known of a loop at the moment, beside its configuration.
+    """What is known of a loop at present, beside its configuration.
 
-    state: as read, or as the job that has the loop has found it; None where nobody can tell.  silent: why the
-    controller could not be read.  active_job: the id of the job that has the loop.  locked: who has locked the loop, in
-    words.  stopping: the service is.
+    state: the state as read, or as found by the job that has the loop; None where it is not known.
+    silent: why the controller could not be read; None where it answered.
+    active_job: the id of the job that has the loop.
+    locked: a sentence that says who has locked the loop; None where it is not locked.
+    stopping: True while the service shuts down.
     """
 
     state: LoopState | None = None
@@ -56,9 +58,9 @@ class Now:
 
 
 def obstacles(config: LoopConfig, request: RetuneRequest, now: Now) -> list[Obstacle]:
-    """Everything for which a retune of this loop would not start, or would end before anything is moved.
+    """Returns every reason for which a retune of this loop would not start, or would end before anything is moved.
 
-    A dry run touches no loop: the limits alone count.
+    A dry run touches no loop, so only the limits count for it.
     """
     narrowed, problems = narrow(config, request)
     found = [Obstacle(Reason.SERVICE_STOPPED, "the service is shutting down")] if now.stopping else []
@@ -72,7 +74,7 @@ def obstacles(config: LoopConfig, request: RetuneRequest, now: Now) -> list[Obst
     if now.silent is not None:
         found.append(Obstacle(now.silent.reason, now.silent.detail))
     if now.state is not None:
-        found += _of_the_loop(narrowed, request, now.state)
+        found += _state_obstacles(narrowed, request, now.state)
     noise, step = config.noise_std_hint or 0.0, narrowed.sp_deviation
     if noise > MAX_NOISE * step:
         text = f"the noise of {noise:g} {config.pv_unit} (noise_std_hint) is above {MAX_NOISE:.0%} of the step {step:g}"
@@ -80,13 +82,13 @@ def obstacles(config: LoopConfig, request: RetuneRequest, now: Now) -> list[Obst
     return found
 
 
-def _of_the_loop(config: LoopConfig, request: RetuneRequest, state: LoopState) -> list[Obstacle]:
-    """What the state of the loop shows. config: with the limits of the job."""
+def _state_obstacles(config: LoopConfig, request: RetuneRequest, state: LoopState) -> list[Obstacle]:
+    """Returns the obstacles in the state of the loop. config: the configuration with the limits of the job."""
     found: list[Obstacle] = []
     if state.node_state != OPERATIONAL:
         found.append(Obstacle(Reason.NODE_NOT_OPERATIONAL, state.node_state))
     if state.on_trial or state.mode is Mode.EXPERIMENT:
-        text = "gains are on trial, or a relay runs, that no job here has started"
+        text = "gains are on trial, or a relay is running, that no job of this service has started"
         found.append(Obstacle(Reason.LOOP_IN_USE, text))
     elif state.mode is not Mode.AUTOMATIC:
         text = f"the controller is in mode {state.mode.name.lower()}, not automatic"
@@ -98,17 +100,18 @@ def _of_the_loop(config: LoopConfig, request: RetuneRequest, state: LoopState) -
         return [*found, Obstacle(refused.reason, refused.detail)]
     if not math.isfinite(state.pv) or not math.isfinite(state.mv):
         return [*found, Obstacle(Reason.BAD_SAMPLE, f"PV is {state.pv}, MV is {state.mv}")]
-    return found + _of_mv(request, state.mv, facts.mv_low, facts.mv_high) + _of_pv(config, request, state)
+    mv = _mv_obstacles(request, state.mv, facts.mv_low, facts.mv_high)
+    return found + mv + _pv_obstacles(config, request, state)
 
 
-def _of_mv(request: RetuneRequest, mv: float, low: float, high: float) -> list[Obstacle]:
+def _mv_obstacles(request: RetuneRequest, mv: float, low: float, high: float) -> list[Obstacle]:
     room, minimum = min(high - mv, mv - low), MIN_ROOM * (high - low)
     if room < minimum:
         text = f"MV {mv:.4g} leaves {room:.3g} of room within {low:.4g} .. {high:.4g}; at least {minimum:.3g} is needed"
         return [Obstacle(Reason.SATURATED, text)]
     maximum = max_amplitude(mv, low, high)
     asked = request.amplitude_pct if isinstance(request, FastRetune) else None
-    fits_nowhere = asked is not None and (1.0 + BIAS) * asked > high - low  # `narrow` has told that
+    fits_nowhere = asked is not None and (1.0 + BIAS) * asked > high - low  # `narrow` has reported this already
     if asked is not None and asked > maximum and not fits_nowhere and "relay" in stages_asked(request):
         text = (
             f"a relay of amplitude_pct {asked:g} moves MV from {mv:.4g} to {mv - BIAS * asked:.4g} and "
@@ -118,10 +121,10 @@ def _of_mv(request: RetuneRequest, mv: float, low: float, high: float) -> list[O
     return []
 
 
-def _of_pv(config: LoopConfig, request: RetuneRequest, state: LoopState) -> list[Obstacle]:
+def _pv_obstacles(config: LoopConfig, request: RetuneRequest, state: LoopState) -> list[Obstacle]:
     found: list[Obstacle] = []
     step, noise = config.sp_deviation, config.noise_std_hint
-    # one reading is not the mean of many: a noise that nobody has told may be as large as is permitted
+    # one reading is not a mean: a noise that the configuration does not state may be as large as is permitted
     maximum = MAX_AWAY * step + 4.0 * (MAX_NOISE * step if noise is None else noise)
     away = state.pv - state.sp
     limits, unit = config.pv_limits, config.pv_unit
@@ -130,11 +133,11 @@ def _of_pv(config: LoopConfig, request: RetuneRequest, state: LoopState) -> list
         found.append(Obstacle(Reason.PV_LIMIT, text))
     if abs(away) > maximum:
         text = (
-            f"PV is {away:+.3g} {unit} off the set-point in this moment, and at most {maximum:.3g} would be at rest; a "
-            f"retune looks {MAX_ATTEMPTS} times, half a T95 each, before it gives up"
+            f"PV is {away:+.3g} {unit} off the set-point at this moment, and at most {maximum:.3g} would be at rest; a "
+            f"retune tries {MAX_ATTEMPTS} times, half a T95 each, before it gives up"
         )
         found.append(Obstacle(Reason.NOT_AT_REST, text))
     if request.model is not None and (sign(request.model.plant()) > 0.0) != state.reverse_acting:
         acts = "reverse" if state.reverse_acting else "direct"
-        found.append(Obstacle(Reason.WRONG_SIGN, f"the sign of the model's gain does not go with a {acts} action"))
+        found.append(Obstacle(Reason.WRONG_SIGN, f"the sign of the model's gain does not agree with a {acts} action"))
     return found

@@ -1,4 +1,4 @@
-"""What a retune would do to a loop, told before it starts: pure, from configuration, request and what is known now."""
+"""Previews what a retune would do to a loop; pure, from the configuration, the request and the loop's present state."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ from loopwright.tuning.gains import Gains
 
 @dataclass(frozen=True, slots=True)
 class LastProposal:
-    """The last retune of this loop that ended in a proposal. Ku, Pu_s: None where its model has none.
+    """The last retune of this loop that ended in a proposal.
 
-    ended_at: UTC, ISO 8601, of the job.  plant_time_s: what it took.
+    ended_at: the end of the job, UTC, ISO 8601.
+    Ku, Pu_s: the ultimate gain, percent per PV unit, and period, s; None where the model has none.
+    plant_time_s: the plant time that the job took, s.
     """
 
     job_id: str
@@ -36,7 +38,7 @@ class LastProposal:
 
     @classmethod
     def of(cls, job_id: str, ended_at: str | None, plant_time_s: float, result: Result) -> LastProposal:
-        """From the result of a job that ended in a proposal."""
+        """Makes it from the result of a job that ended in a proposal."""
         if isinstance(result.model, TransferModelView):
             structure = result.model.structure
         else:
@@ -77,7 +79,7 @@ class StagePreview(BaseModel):
 
 
 class WatchedLimits(BaseModel):
-    """What ends the test at once when it is left; the gains and the set-point are then put back."""
+    """Limits whose violation ends the test at once; the gains and the set-point are then restored."""
 
     pv: Limits = Field(description="PV units; watched in the controller under the relay, and here at every sample")
     mv: Limits = Field(description="Percent; the narrower of the job's and the controller's own")
@@ -88,12 +90,14 @@ class KnownPlant(BaseModel):
     """What is known of the loop before the test."""
 
     t95_s: float = Field(description="Time in which the plant covers 95 % of a step, s, from the configuration")
-    noise_std: float | None = Field(description="Of PV, PV units, from the configuration; null: not told")
+    noise_std: float | None = Field(
+        description="Standard deviation of the noise of PV, PV units, from the configuration; null: not given"
+    )
     model: str | None = Field(description="Structure of the last model found on this loop", examples=["sopdt"])
     model_job: str | None = Field(description="URL of the job that found it", examples=["/jobs/4f0c2a9be113"])
-    model_at: str | None = Field(description="When, UTC, ISO 8601, wall time")
-    Ku: float | None = Field(description="Its ultimate gain, MV percent per PV unit", examples=[9.3])
-    Pu_s: float | None = Field(description="Its ultimate period, s", examples=[14.4])
+    model_at: str | None = Field(description="End of that job, UTC, ISO 8601, wall time")
+    Ku: float | None = Field(description="Ultimate gain of that model, MV percent per PV unit", examples=[9.3])
+    Pu_s: float | None = Field(description="Ultimate period of that model, s", examples=[14.4])
     last_plant_time_s: float | None = Field(description="Plant time that the job took, s", examples=[86.0])
 
 
@@ -103,38 +107,44 @@ class Preview(BaseModel):
     loop: str = Field(examples=["TIC-101"])
     method: str = Field(examples=["fast"])
     dry_run: bool = Field(description="A rehearsal in memory, which moves nothing on the loop")
-    would_start: bool = Field(description="Nothing stands in the way, as far as is known now")
-    obstacles: list[ObstacleView] = Field(description="Everything for which it would be refused, all at once")
+    would_start: bool = Field(description="True: there are no obstacles, as far as is known now")
+    obstacles: list[ObstacleView] = Field(description="Every reason for which the retune would be refused")
     summary: list[str] = Field(description="The same in sentences")
     stages: list[StagePreview] = Field(description="In their order")
     sp: float | None = Field(description="Set-point now, PV units; null: not known", examples=[50.0])
     pv: float | None = Field(description="Process value now, PV units; null: not known", examples=[49.9])
     mv: float | None = Field(description="Controller output now, percent; null: not known", examples=[50.0])
     first_mv_move_pct: float | None = Field(
-        description="What the relay begins with, percent of MV; null: there is no relay", examples=[12.5]
+        description="Initial amplitude of the relay, percent of MV; null: there is no relay", examples=[12.5]
     )
-    largest_mv_move_pct: float = Field(description="Of any stage, percent", examples=[50.0])
-    largest_sp_move: float = Field(description="Of any stage, PV units", examples=[2.0])
+    largest_mv_move_pct: float = Field(description="The largest move of MV in any stage, percent", examples=[50.0])
+    largest_sp_move: float = Field(
+        description="The largest step of the set-point in any stage, PV units", examples=[2.0]
+    )
     largest_pv_move: float | None = Field(
         description="How far PV is expected to go from the present set-point, PV units; null: not known before",
         examples=[2.8],
     )
-    duration_low_s: float = Field(description="Of all stages, plant time, s", examples=[40.0])
-    duration_high_s: float = Field(description="Of all stages, plant time, s", examples=[160.0])
+    duration_low_s: float = Field(description="Shortest expected time of all stages, plant time, s", examples=[40.0])
+    duration_high_s: float = Field(description="Longest expected time of all stages, plant time, s", examples=[160.0])
     duration_basis: str = Field(description="What the estimate is made from")
     watched: WatchedLimits
-    at_the_end: str = Field(description="What the loop is after the test")
-    on_abort: str = Field(description="What the loop is after an abort, a limit or a failure")
+    at_the_end: str = Field(description="State of the loop after the test")
+    on_abort: str = Field(description="State of the loop after an abort, a limit or a failure")
     known: KnownPlant
 
 
 def preview(config: LoopConfig, request: RetuneRequest, now: Now, last: LastProposal | None) -> Preview:
-    """Of one loop. now: without a state the figures are the largest that the configured limits leave room for."""
+    """Returns the preview of one loop.
+
+    now: without a state in it the figures are the largest that the configured limits permit.
+    last: the last retune of the loop that ended in a proposal; None where there is none.
+    """
     narrowed, _ = narrow(config, request)
     state = None if request.dry_run else now.state
     permitted = _permitted(narrowed, state)
     limited = narrowed.model_copy(update={"mv_limits": permitted})
-    Ku, Pu_s = _typed_in(request)
+    Ku, Pu_s = _entered(request)
     pu_s = Pu_s or (last.Pu_s if last else None)
     times = durations(request, config.t95_s, state.sample_time_s if state else None, pu_s)
     mv, sp = (_finite(state.mv), _finite(state.sp)) if state else (None, None)
@@ -153,12 +163,12 @@ def preview(config: LoopConfig, request: RetuneRequest, now: Now, last: LastProp
         sp=sp,
         pv=_finite(state.pv) if state else None,
         mv=mv,
-        first_mv_move_pct=next((_told(each.first_mv) for each in moved if each.first_mv is not None), None),
+        first_mv_move_pct=next((_rounded(each.first_mv) for each in moved if each.first_mv is not None), None),
         largest_mv_move_pct=max((each.mv_move_pct for each in stages), default=0.0),
         largest_sp_move=max((each.sp_move for each in stages), default=0.0),
         largest_pv_move=_largest_pv(stages),
-        duration_low_s=_told(sum(each.duration_low_s for each in stages)),
-        duration_high_s=_told(sum(each.duration_high_s for each in stages)),
+        duration_low_s=_rounded(sum(each.duration_low_s for each in stages)),
+        duration_high_s=_rounded(sum(each.duration_high_s for each in stages)),
         duration_basis=_basis(request, config, last),
         watched=WatchedLimits(pv=narrowed.pv_limits, mv=permitted, max_time_s=_budget_s(request, limited, state)),
         at_the_end=_at_the_end(request),
@@ -169,7 +179,7 @@ def preview(config: LoopConfig, request: RetuneRequest, now: Now, last: LastProp
 
 
 def _permitted(config: LoopConfig, state: LoopState | None) -> Limits:
-    """MV limits that hold: the job's and the controller's own; the job's where the two leave nothing."""
+    """Returns the narrower of the job's and the controller's MV limits; the job's where the two do not overlap."""
     limits = config.mv_limits
     if state is None:
         return limits
@@ -183,15 +193,15 @@ def _stage(each: Moves, time: Span, mv_limits: Limits, mv: float | None, sp: flo
     return StagePreview(
         stage=each.stage,
         what=each.what,
-        mv_low_pct=_told(max(mv_limits.low, mv - each.mv_down)) if mv is not None and moves_mv else None,
-        mv_high_pct=_told(min(mv_limits.high, mv + each.mv_up)) if mv is not None and moves_mv else None,
-        mv_move_pct=_told(max(each.mv_down, each.mv_up)),
+        mv_low_pct=_rounded(max(mv_limits.low, mv - each.mv_down)) if mv is not None and moves_mv else None,
+        mv_high_pct=_rounded(min(mv_limits.high, mv + each.mv_up)) if mv is not None and moves_mv else None,
+        mv_move_pct=_rounded(max(each.mv_down, each.mv_up)),
         sp_low=sp if moves_sp else None,
-        sp_high=_told(sp + each.sp_up) if sp is not None and moves_sp else None,
-        sp_move=_told(each.sp_up),
-        pv_move=None if each.pv is None else _told(each.pv),
-        duration_low_s=_told(low),
-        duration_high_s=_told(high),
+        sp_high=_rounded(sp + each.sp_up) if sp is not None and moves_sp else None,
+        sp_move=_rounded(each.sp_up),
+        pv_move=None if each.pv is None else _rounded(each.pv),
+        duration_low_s=_rounded(low),
+        duration_high_s=_rounded(high),
     )
 
 
@@ -211,25 +221,25 @@ def _budget_s(request: RetuneRequest, config: LoopConfig, state: LoopState | Non
     return time_budget_s(request.method, config.t95_s, state.sample_time_s)
 
 
-def _typed_in(request: RetuneRequest) -> tuple[float | None, float | None]:
-    """The ultimate gain and period of the request."""
+def _entered(request: RetuneRequest) -> tuple[float | None, float | None]:
+    """Returns the ultimate gain and period of the request; None for each that was not entered."""
     return (request.Ku, request.Pu_s) if isinstance(request, FiveStages) else (None, None)
 
 
 def _basis(request: RetuneRequest, config: LoopConfig, last: LastProposal | None) -> str:
     if request.dry_run:
         return "a dry run takes no time of the plant"
-    if (Pu_s := _typed_in(request)[1]) is not None:
-        return f"Pu {Pu_s:g} s as typed in, and T95 {config.t95_s:g} s of the configuration"
+    if (Pu_s := _entered(request)[1]) is not None:
+        return f"Pu {Pu_s:g} s as entered, and T95 {config.t95_s:g} s of the configuration"
     if last is not None and last.Pu_s:
         return f"Pu {last.Pu_s:.4g} s of the model that job {last.job_id} found, and T95 {config.t95_s:g} s"
-    return f"T95 {config.t95_s:g} s of the configuration alone, which leaves the loop's period open by a factor of ten"
+    return f"T95 {config.t95_s:g} s of the configuration alone, which leaves the period uncertain by a factor of ten"
 
 
 def _at_the_end(request: RetuneRequest) -> str:
     if request.dry_run:
         return "Nothing on the loop has changed."
-    return "The loop is as after an abort; the new gains are a proposal, which takes effect when somebody accepts it."
+    return "The loop is as after an abort; the new gains are a proposal, which takes effect when a person accepts it."
 
 
 def _on_abort(request: RetuneRequest, state: LoopState | None, unit: str) -> str:
@@ -238,12 +248,13 @@ def _on_abort(request: RetuneRequest, state: LoopState | None, unit: str) -> str
     silent = ""
     if state is not None and state.when_silent:
         silent = f" If the controller itself falls silent, the plant's I/O {state.when_silent}."
-    return f"{_home(state, unit)} The controller does that by itself when the service or the bus fails too.{silent}"
+    by_itself = "The controller does that by itself also when the service or the bus fails."
+    return f"{_home(state, unit)} {by_itself}{silent}"
 
 
 def _home(state: LoopState | None, unit: str) -> str:
     if state is None:
-        return "The controller has its mode, set-point and gains back as they were before."
+        return "The controller has its mode, set-point and gains as they were before."
     gains = _gains_text(state.gains)
     return f"The controller is in {state.mode.name.lower()} again, set-point {state.sp:.6g} {unit}, with {gains}."
 
@@ -288,7 +299,7 @@ def _summary(found: Preview, unit: str) -> list[str]:
 
 
 def duration_text(low_s: float, high_s: float) -> str:
-    """Two times in a unit that suits them, the first left out where it is 0."""
+    """Returns two times as text in a suitable unit; the first is left out where it is 0."""
     unit, name = next(((u, n) for u, n in ((3600.0, "h"), (60.0, "min")) if high_s >= 3.0 * u), (1.0, "s"))
     low, high = (f"{time / unit:.{0 if time >= 10.0 * unit else 1}f}" for time in (low_s, high_s))
     return f"{low} to {high} {name}" if low_s else f"up to {high} {name}"
@@ -298,35 +309,33 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _told(value: float) -> float:
-    """As many digits as an estimate has."""
+def _rounded(value: float) -> float:
+    """Rounds to six digits, which are enough for an estimate."""
     return float(f"{value:.6g}")
 
 
 class FleetPreview(BaseModel):
-    """What a retune of many loops would do, from configuration and earlier jobs: no controller is asked."""
+    """What a retune of many loops would do, from configuration and earlier jobs; no controller is asked."""
 
-    count: int = Field(description="Loops it is for", examples=[40])
-    would_start: int = Field(
-        description="Of these, those in whose way nothing stands as far as is known", examples=[38]
-    )
-    largest_mv_move_pct: float = Field(description="Of any of the loops, percent; at most", examples=[66.7])
-    largest_mv_move_loop: str = Field(description="The loop that it is of", examples=["TIC-101"])
+    count: int = Field(description="Number of loops", examples=[40])
+    would_start: int = Field(description="Number of loops that would start, as far as is known", examples=[38])
+    largest_mv_move_pct: float = Field(description="Largest move of MV on any of the loops, percent", examples=[66.7])
+    largest_mv_move_loop: str = Field(description="Loop with the largest move of MV", examples=["TIC-101"])
     longest_s: float = Field(description="Longest time of one loop, plant time, s; at most", examples=[600.0])
-    longest_loop: str = Field(description="The loop that it is of", examples=["LIC-7"])
+    longest_loop: str = Field(description="Loop with the longest time", examples=["LIC-7"])
     summary: list[str] = Field(description="The same in sentences")
-    loops: list[Preview] = Field(description="Each loop, in the order in which they are begun")
+    loops: list[Preview] = Field(description="Preview of each loop, in the order in which the loops are begun")
 
 
 def fleet_preview(loops: Sequence[Preview]) -> FleetPreview:
-    """loops: at least one."""
+    """Returns the preview of all loops, of which there must be at least one."""
     boldest, longest = max(loops, key=lambda p: p.largest_mv_move_pct), max(loops, key=lambda p: p.duration_high_s)
     able = sum(each.would_start for each in loops)
     summary = [
-        f"{len(loops)} loops are retuned by {loops[0].method}; {len(loops) - able} of them would be refused as it is.",
+        f"{len(loops)} loops are retuned by {loops[0].method}; {len(loops) - able} of them would be refused now.",
         f"MV is moved by at most {boldest.largest_mv_move_pct:.3g} % ({boldest.loop}).",
         f"One loop takes at most {duration_text(0.0, longest.duration_high_s)} of plant time ({longest.loop}).",
-        "The controllers have not been asked; look at one loop by its own preview.",
+        "The controllers have not been asked; the preview of a single loop asks its controller.",
     ]
     return FleetPreview(
         count=len(loops),

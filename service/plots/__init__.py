@@ -1,1 +1,1 @@
-"""Pictures in files, without a display."""
+"""Plots of jobs, tunings and identified models, written to files without a display."""

@@ -1,4 +1,4 @@
-"""The picture of a fast job: its record, what the model makes of it, what is left; and the loop before and after."""
+"""Plots a fast job: the record, the fitted model, the residual, and the loop before and after."""
 
 from __future__ import annotations
 
@@ -24,7 +24,11 @@ SHOWN_SETTLINGS = 2.5
 
 
 def fast_job(path: Path, job: Shown, record: RelayRecord, pv_unit: str) -> None:
-    """job: of whatever end."""
+    """Writes the plot of a fast job to a file.
+
+    job: the job, however it ended.
+    record: the record of its relay experiment.
+    """
     proposed = job.new_gains is not None
     figure = Figure(figsize=(12 if proposed else 9, 6.5), layout="constrained")
     canvas = FigureCanvasAgg(figure)
@@ -56,15 +60,15 @@ def _record(pv: Axes, rest: Axes, mv: Axes, record: RelayRecord, found: Evidence
         residual = best.linear.residual * evidence.output_range
         at = averaged(t[: len(fit.u)], fit.block)
         pv.plot(at, fit.y * evidence.output_range - residual + record.rest[1], color=BLUE, linewidth=1.2,
-                label="model fitted to it")  # fmt: skip
+                label="fitted model")  # fmt: skip
         rest.plot(at, residual, color=RED, linewidth=0.8)
         noise = 2.0 * evidence.noise
         rest.axhspan(-noise, noise, color="0.88", zorder=0, label="noise at rest, 2 standard deviations")
         rest.legend(loc="upper left", fontsize=7)
     for load in () if found is None else found.loads:
-        pv.axvline(load.t_s, color="tab:orange", linewidth=1.2, label=f"load {load.size:+.3g} % found")
+        pv.axvline(load.t_s, color="tab:orange", linewidth=1.2, label=f"load disturbance {load.size:+.3g} %")
     mv.step(t, record.mv, where="post", color=GREEN, linewidth=1.0)
-    for axes, label in ((pv, f"PV, {pv_unit}"), (rest, "left over"), (mv, "MV, %")):
+    for axes, label in ((pv, f"PV, {pv_unit}"), (rest, "residual"), (mv, "MV, %")):
         axes.set_ylabel(label)
         axes.grid(alpha=0.3)
         axes.set_xlim(t[0], t[-1])
@@ -72,17 +76,17 @@ def _record(pv: Axes, rest: Axes, mv: Axes, record: RelayRecord, found: Evidence
         if record.relayed < len(t):
             axes.axvline(t[record.relayed], color="0.3", linewidth=0.8, linestyle="--")
     pv.legend(loc="best", fontsize=8)
-    taken_over = "; the new gains take over at the second dashed line" if record.relayed < len(t) else ""
-    mv.set_xlabel(f"plant time since the relay began, s{taken_over}")
+    taken_over = "; the new gains are in effect from the second dashed line" if record.relayed < len(t) else ""
+    mv.set_xlabel(f"plant time since the start of the relay, s{taken_over}")
 
 
 def _before_after(top: Axes, bottom: Axes, job: Shown, pv_unit: str) -> None:
-    """A set-point step of the size tested, computed on the model found."""
+    """Plots the set-point step of the size tested, computed on the model found."""
     assert job.model is not None and job.old_gains is not None and job.new_gains is not None
     model = job.model.process_model()
     size = 1.0 if job.verification is None else job.verification.step or 1.0
     both = {"before": (job.old_gains, RED, "--"), "after": (job.new_gains, BLUE, "-")}
-    gains = {label: _gains(told) for label, (told, _, _) in both.items()}
+    gains = {label: _gains(shown) for label, (shown, _, _) in both.items()}
     settled = [f.settling_s for f in (assess(model, g).setpoint for g in gains.values()) if f and f.settling_s]
     horizon = SHOWN_SETTLINGS * min(settled) if settled else 20.0 * (model.L + 1.0)
     for label, (_, colour, line) in both.items():
@@ -106,5 +110,5 @@ def _before_after(top: Axes, bottom: Axes, job: Shown, pv_unit: str) -> None:
         axes.set_ylim(max(low, -2.0 * abs(high)), high)
 
 
-def _gains(told: GainsView) -> Gains:
-    return Gains(told.Kp, told.Ti, told.Td, told.Tf)
+def _gains(shown: GainsView) -> Gains:
+    return Gains(shown.Kp, shown.Ti, shown.Td, shown.Tf)

@@ -1,4 +1,4 @@
-"""Pictures of tunings and of an identified model, without a display."""
+"""Plots tunings and an identified model."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from loopwright.tuning.rules.registry import METHODS
 _COLOURS = colormaps["tab10"]
 _LINES = ("-", "--", ":", "-.")
 SHOWN_SETTLINGS = 2.0
-"""How much of the slow loops is shown: so many times the median settling time."""
+"""Length of the time axis in median settling times, which cuts off the slow loops."""
 OUTLIER = 3.0
-"""A curve may reach so many times the others' median range before the axis stops following it."""
+"""Largest range of the axis in median ranges of the curves; a curve beyond that is cut off."""
 
 
 def responses(path: Path, model: Model, found: Sequence[MethodResult]) -> None:
-    """Unit steps of the set-point (left) and of the load (right), PV over MV; unstable loops are left out."""
+    """Plots unit steps of the set-point (left) and of the load (right), PV above MV; unstable loops are left out."""
     stable = [each for each in found if each.gains and each.assessment and each.assessment.stable]
     figure = Figure(figsize=(13, 7.5), layout="constrained")
     axes = figure.subplots(2, 2, sharex="col")
@@ -52,7 +52,7 @@ def responses(path: Path, model: Model, found: Sequence[MethodResult]) -> None:
 
 
 def record_and_model(path: Path, record: Record, found: Identified) -> None:
-    """PV as recorded and as modelled, what is left, and MV."""
+    """Plots PV as recorded and as modelled, the residual, and MV."""
     figure = Figure(figsize=(10, 7.5), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True, height_ratios=(3, 1, 1.5))
     axes[0].plot(record.t, record.y, color="0.6", linewidth=1.0, label="PV recorded")
@@ -60,11 +60,13 @@ def record_and_model(path: Path, record: Record, found: Identified) -> None:
     if record.sp is not None:
         axes[0].step(record.t, record.sp, where="post", color="black", linestyle=":", linewidth=1.0, label="set-point")
     for load in found.loads:
-        axes[0].axvline(load.seen_s, color="tab:orange", linewidth=1.2, label=f"load {load.size:+.3g} MV units found")
+        axes[0].axvline(
+            load.seen_s, color="tab:orange", linewidth=1.2, label=f"load disturbance {load.size:+.3g} MV units"
+        )
     axes[0].set_ylabel("PV, PV units")
     axes[0].legend(loc="best")
     axes[1].plot(record.t, record.y - found.fitted, color="tab:red", linewidth=0.8)
-    axes[1].set_ylabel("difference,\nPV units")
+    axes[1].set_ylabel("residual,\nPV units")
     axes[2].step(record.t, record.u, where="post", color="tab:green")
     axes[2].set_ylabel("MV, MV units")
     axes[2].set_xlabel("time, s")
@@ -77,7 +79,7 @@ def _curves(axes: Axes, drawn: Sequence[Response], names: Sequence[str], of_mv: 
     lows, highs = [], []
     for response, name in zip(drawn, names, strict=True):
         values = response.u if of_mv else response.y
-        # the same colour in every picture
+        # a method has the same colour in every plot
         i = list(METHODS).index(name)
         style = _LINES[i // 10 % len(_LINES)]
         axes.plot(response.t, values, label=name, linewidth=1.4, color=_COLOURS(i % 10), linestyle=style)
@@ -85,14 +87,14 @@ def _curves(axes: Axes, drawn: Sequence[Response], names: Sequence[str], of_mv: 
         highs.append(float(np.max(values)))
     axes.grid(alpha=0.3)
     if drawn:
-        # one kick of MV must not press all the other curves flat
+        # one large move of MV must not flatten all other curves
         span = max(median(highs) - median(lows), 1e-12)
         low, high = max(min(lows), median(lows) - OUTLIER * span), min(max(highs), median(highs) + OUTLIER * span)
         axes.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
 
 
 def _horizon(stable: Sequence[MethodResult], load: bool) -> float:
-    """s: enough for the median loop to come to rest, and no more than for the slowest."""
+    """Returns the length of the time axis, s: twice the median settling time, at most 1.2 times the longest."""
     times = []
     for each in stable:
         figures = each.assessment and (each.assessment.load if load else each.assessment.setpoint)

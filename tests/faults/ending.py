@@ -19,7 +19,7 @@ NEAR = 1.0
 
 @dataclass(frozen=True)
 class Home:
-    """What the loop must be in the end: as it was found, but for what another's hand has chosen meanwhile.
+    """What the loop must be in the end: as it was found, but for outside changes made meanwhile.
 
     mv: at which the loop rests in automatic, percent; None where that is not known beforehand.
     """

@@ -1,7 +1,7 @@
 """The faults. Each is a context: harm is done to a running job as it is entered, the job comes to its end inside, and
 what is left of the harm is undone as it is left.
 
-It gives how the loop must end, where that is not as it was found: another's hand has the last word.
+It gives how the loop must end, where that is not as it was found: an outside change has priority.
 """
 
 from __future__ import annotations

@@ -79,7 +79,7 @@ def test_gains_that_the_method_itself_has_proposed_are_kept(tmp_path: Path, meth
     assert not compared["gain"] and compared["verdict"] == job["detail"]
     assert compared["after"]["load"]["IAE"] == pytest.approx(compared["before"]["load"]["IAE"], rel=0.05)
     assert job["model"] and job["new_gains"]["Kp"] == pytest.approx(own(method).Kp, rel=0.05)
-    assert "tuned as well as asked already, the present gains are kept" in title(JobView.model_validate(job))
+    assert "the loop is already tuned as well as asked, the present gains stay" in title(JobView.model_validate(job))
     job_report(JobView.model_validate(job))
 
 

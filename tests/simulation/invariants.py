@@ -1,8 +1,8 @@
-"""What must be so, whatever happened: looked at after everything that the controller does, and once more at the end.
+"""Invariants of every history, checked after every action of the controller and once more at the end.
 
-The truth is kept here apart from the controller, from what people have done: home, and after it what another hand has
-chosen last. A controller without an open session must be as the truth has it at every moment; with one, it must have
-noted it as home.
+The truth is recorded independently of the controller, from what people have done: home, and then the last outside
+change. A controller without an open session must agree with the truth at every moment; with one, it must have noted the
+truth as home.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ class Invariants:
 
     def hand(self, what: str) -> None:
         self.hands.append((self.simulation.now, what))
-        self.simulation.note("truth", f"another hand: {what}; {self.words()}")
+        self.simulation.note("truth", f"outside change: {what}; {self.words()}")
 
     def words(self) -> str:
         truth = self.truth

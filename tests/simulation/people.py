@@ -128,7 +128,7 @@ class Person:
 
 
 class Operator:
-    """Another hand on the loop: at each of the times one thing, by SDO as a panel sends it."""
+    """Outside changes to the loop: one at each of the times, by SDO as a panel sends it."""
 
     def __init__(self, world: World, times: list[float], random: Random, kinds: tuple[str, ...] = ()) -> None:
         self._world = world

@@ -1,4 +1,4 @@
-"""Another hand on a loop under test: by SDO, by RPDO, by the ordinary objects of gains and limits."""
+"""Outside changes to a loop under test: by SDO, by RPDO, by the ordinary objects of gains and limits."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ def test_no_gain_is_a_good_end(service: Service, through: Through) -> None:
     service.tune.ends = NoGain(Reason.NO_GAIN, "Nothing asked for gets better by more than 5 %")
     result = run("retune", TAG, "--yes")
     assert result.exit_code == 0, result.output
-    assert "no_gain: tuned as well as asked already" in " ".join(result.output.split())
+    assert "no_gain: the loop is already tuned as well as asked" in " ".join(result.output.split())
     service.tune.ends = Refused(Reason.NOT_AT_REST, "drifts")
     assert run("retune", TAG, "--yes").exit_code == 3
 
@@ -183,7 +183,7 @@ def test_a_job_and_its_picture_and_another_Ms(rehearsed: str, tmp_path: Path) ->
     shown = run("job", rehearsed, "--plot", str(picture))
     assert shown.exit_code == 0, shown.output
     assert picture.stat().st_size > 20_000
-    for words in ("predicted overshoot", "model num", "Ms uncertain by", "explained"):
+    for words in ("predicted overshoot", "model num", "uncertainty of Ms", "fit of measured step"):
         assert words in shown.output
     found = run("alternatives", rehearsed, "--ms", "1.4", "--json")
     (fast,) = json.loads(found.stdout)["methods"]

@@ -251,7 +251,7 @@ def test_identify_finds_an_inverse_response_and_a_load(tmp_path: Path) -> None:
         assert math.sqrt(row[1][row[0]]) == pytest.approx(error)
     (load,) = found["loads"]
     assert load["t_s"] == pytest.approx(36.0, rel=0.1) and load["size"] == pytest.approx(0.6, rel=0.1)
-    assert "MV units found" in picture.read_text()
+    assert "load disturbance" in picture.read_text()
     told = run("identify", str(file)).stdout
     assert "den[0]" in told and "a load" in told and "load disturbance" in told
     assert answer("tune", "--model", json.dumps(found["model"]), "--method", "simc")["methods"][0]["outcome"] == "tuned"

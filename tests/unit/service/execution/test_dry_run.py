@@ -149,7 +149,7 @@ def test_then_the_gains_are_those_that_the_last_job_left(service: Service) -> No
     on = view.rehearsed_on
     assert on is not None and (on.gains_source, on.gains_job) == ("last_job", f"/jobs/{job_id}")
     assert view.old_gains is not None and view.old_gains.Kp == NEW.Kp
-    assert f"as job {job_id} had found them" in on.gains_text
+    assert f"as job {job_id} found them" in on.gains_text
 
 
 def test_beside_a_test_the_gains_are_those_from_before_it(tmp_path: Path) -> None:
@@ -201,7 +201,7 @@ def test_an_extreme_one_is_refused_by_name(
 def test_a_sample_time_too_short_for_a_rehearsal_is_replaced_and_that_is_said(service: Service) -> None:
     config = service.loops[TAG].model_copy(update={"t95_s": 30_000.0})
     spec, on = rehearsal_spec(config, retune_request(dry_run=True), ground_with(service))
-    assert "sample_time_s" not in spec and "its sample time, 0.1 s, is too short beside T95" in on.gains_text
+    assert "sample_time_s" not in spec and "the sample time 0.1 s is too short for this T95" in on.gains_text
 
 
 def test_dry_runs_of_earlier_versions_are_shown_as_rehearsed(service: Service, client: TestClient) -> None:

@@ -422,7 +422,7 @@ def test_the_commands(run: Any, service: Service) -> None:
     lock = json.loads(run("loop", TAG, "--json"))["locked"]
     assert (lock["reason"], lock["by"]) == (WHY, "night shift")
     assert f"by night shift: {WHY}" in run("loop", TAG)
-    assert f"{TAG} is not locked any more; it was by night shift: {WHY}" in run("unlock", TAG)
+    assert f"{TAG} is unlocked; it was locked by night shift: {WHY}" in run("unlock", TAG)
     assert f"{TAG} was not locked" in run("unlock", TAG)
     assert json.loads(run("lock", TAG, "--reason", WHY, "--json"))["locked"]["by"].startswith("cli:")
     assert entries(service)[1][2] == entries(service)[2][2] != "night shift"

@@ -146,7 +146,7 @@ class TestObstacles:
         ("state", "options", "reason", "words"),
         [
             ({"mode": Mode.OFF}, {}, "wrong_mode", "mode off"),
-            ({"mode": Mode.EXPERIMENT}, {}, "loop_in_use", "no job here"),
+            ({"mode": Mode.EXPERIMENT}, {}, "loop_in_use", "no job of this service"),
             ({"on_trial": True}, {}, "loop_in_use", "on trial"),
             ({"mv": 97.0}, {}, "saturated", "leaves 3 of room"),
             ({"pv": 52.0}, {}, "not_at_rest", "+2 degC off"),

@@ -292,7 +292,7 @@ def test_data_that_are_whole(tmp_path: Path) -> None:
     filled(tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     done = run("check-data", "--data", tmp_path)
-    assert done.exit_code == 0 and "whole; rows that can be read: " in done.stdout and "jobs 20," in done.stdout
+    assert done.exit_code == 0 and "whole; readable rows: " in done.stdout and "jobs 20," in done.stdout
     after = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.name != "lock"}
     assert after == {name: content for name, content in before.items() if name != "lock"}
     store = Store(tmp_path)  # a service that runs is looked at, too
@@ -322,7 +322,7 @@ def test_what_can_be_read_of_a_damaged_file_is_copied_and_taken(tmp_path: Path, 
     told = run("check-data", "--data", data)
     assert told.exit_code == 3 and "damaged" in told.stdout and "--salvage FILE" in told.stdout
     made = run("check-data", "--data", data, "--salvage", tmp_path / "s.sqlite")
-    assert made.exit_code == 3 and "take it with: loopwright restore" in made.stdout
+    assert made.exit_code == 3 and "restore it with: loopwright restore" in made.stdout
     assert run("restore", tmp_path / "s.sqlite", "--data", data, "--replace").exit_code == 0
     store = Store(data)
     jobs = [row.id for row in store.recent()]

@@ -1,0 +1,83 @@
+"""Models of the service's answers, for the answers whose views in the API cannot be imported without its server."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, JsonValue
+
+from loopwright.service.api.job_views import LockView
+
+
+class ProgressEvent(BaseModel):
+    """How far a job is: the fraction done, and the expected plant time to the end, s (None: not known)."""
+
+    stage: str | None
+    progress: float
+    remaining_plant_time_s: float | None
+
+
+class StageDoneEvent(BaseModel):
+    """A stage has ended with a result. plant_time_s: the plant time of the job so far, s."""
+
+    stage: str
+    plant_time_s: float
+    result: dict[str, JsonValue] | None
+
+
+class NoteEvent(BaseModel):
+    """A note for the user."""
+
+    text: str
+
+
+class StateEvent(BaseModel):
+    """The job has a new state."""
+
+    state: str
+
+
+ShownEvent = ProgressEvent | StageDoneEvent | NoteEvent | StateEvent
+_EVENTS: dict[str, type[ShownEvent]] = {
+    "progress": ProgressEvent,
+    "stage_done": StageDoneEvent,
+    "note": NoteEvent,
+    "state": StateEvent,
+}
+
+
+def job_event(kind: str, data: object) -> ShownEvent | None:
+    """Returns an event of GET /jobs/{id}/events; None for a kind that the commands do not show."""
+    model = _EVENTS.get(kind)
+    return None if model is None else model.model_validate(data)
+
+
+class LockAnswer(BaseModel):
+    """The answer to POST /loops/{tag}/lock."""
+
+    locked: LockView
+    note: str | None
+
+
+class UnlockAnswer(BaseModel):
+    """The answer to POST /loops/{tag}/unlock; was_locked is None where the loop was not locked."""
+
+    was_locked: LockView | None
+
+
+class FleetLoop(BaseModel):
+    """One loop of a retune of many loops."""
+
+    loop: str
+    state: str
+    job: str | None
+    reason: str | None
+
+
+class FleetRetune(BaseModel):
+    """A retune of many loops, as GET /retunes/{id} returns it. counts: the number of loops in each state."""
+
+    id: str
+    url: str
+    state: str
+    detail: str | None
+    counts: dict[str, int]
+    loops: list[FleetLoop]
