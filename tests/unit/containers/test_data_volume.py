@@ -56,7 +56,7 @@ def test_a_port_that_is_taken_is_named(folder: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         done = serve(folder, other.getsockname()[1])
     assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1 and "choose another with --port" in done.stderr
+    assert len(done.stderr.splitlines()) == 1 and "choose another port with --port" in done.stderr
 
 
 def test_a_port_that_is_none_is_refused(folder: Path) -> None:

@@ -200,7 +200,7 @@ def no_keys(data: Path, stack: ExitStack) -> list[str]:
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        (port_taken, "choose another with --port"),
+        (port_taken, "choose another port with --port"),
         (folder_in_use, "is in use"),
         (newer_database, "made by a newer version"),
         (no_database, "database"),
