@@ -130,7 +130,7 @@ def test_one_machine(machine: Machine) -> None:
     use_it = 'curl --silent -w "%{http_code}" -H "Authorization: Bearer $LOOPWRIGHT_KEY" http://127.0.0.1:8080/loops'
     assert [machine.run(use_it, key=k.strip())[-3:] for k in (new, key, later)] == ["200", "401", "401"]
     (damaged,) = blocks("Damaged data")
-    assert "whole; rows that can be read" in machine.run(damaged)
+    assert "whole; readable rows" in machine.run(damaged)
     assert '"ready":true' in machine.run(upgrade, key=new)
     (many,) = blocks("Many loops")
     assert '"url":"/retunes/' in machine.run(many, key=new)
