@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
+
+from pydantic import JsonValue, TypeAdapter
 
 from loopwright.protocol.real32 import same
 from loopwright.service.errors import Conflict
+from loopwright.service.jsonable import JsonObject, json_object, number
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode
 
@@ -55,20 +57,23 @@ def same_gains(one: Gains, other: Gains) -> bool:
     return all(same(getattr(one, name), getattr(other, name)) for name in Gains.__dataclass_fields__)
 
 
-def gains_of(data: dict[str, Any] | None) -> Gains:
-    """Gains from a job's JSON."""
-    if not data:
+_LOOP_STATE = TypeAdapter(LoopState)
+
+
+def gains_of(data: JsonValue) -> Gains:
+    """Returns the gains in the JSON of a job. Raises Conflict where there are none."""
+    if not data or not isinstance(data, dict):
         raise Conflict("the job has no gains to put")
-    return Gains(**{name: float(data[name]) for name in Gains.__dataclass_fields__ if data.get(name) is not None})
+    return Gains(**{name: number(data[name]) for name in Gains.__dataclass_fields__ if data.get(name) is not None})
 
 
-def state_json(state: LoopState) -> dict[str, Any]:
-    """A loop's state as JSON, the mode by name."""
-    return asdict(state) | {"mode": state.mode.name.lower()}
+def state_json(state: LoopState) -> JsonObject:
+    """Returns the state of a loop as JSON, the mode by name."""
+    return json_object(state) | {"mode": state.mode.name.lower()}
 
 
-def loop_state(data: dict[str, Any]) -> LoopState:
-    """A loop's state from its JSON. PV and MV that were not numbers are of no account."""
+def loop_state(data: JsonObject) -> LoopState:
+    """Returns the state of a loop from its JSON. A PV or MV that was not a number is 0."""
     numbers = {name: 0.0 if data[name] is None else data[name] for name in ("pv", "mv")}
-    known = {name: value for name, value in data.items() if name in LoopState.__dataclass_fields__}
-    return LoopState(**known | numbers | {"mode": Mode[data["mode"].upper()], "gains": gains_of(data["gains"])})
+    mode, gains = Mode[str(data["mode"]).upper()], gains_of(data["gains"])
+    return _LOOP_STATE.validate_python(data | numbers | {"mode": mode, "gains": gains})

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from enum import StrEnum
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
+from loopwright.service.jsonable import JsonObject
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
 
@@ -152,9 +152,11 @@ class VerificationView(Figures):
     rms: float = Field(description="What it leaves, PV units")
 
     @classmethod
-    def of_stage(cls, result: Mapping[str, Any]) -> VerificationView:
-        """From the JSON of a `VerifiedStep`, which is the result of the stage verify."""
-        return cls.model_validate({**result, **result["tested"]})
+    def of_stage(cls, result: JsonObject) -> VerificationView:
+        """Makes the view from the JSON of a `VerifiedStep`, which is the result of the stage verify."""
+        tested = result["tested"]
+        assert isinstance(tested, dict)
+        return cls.model_validate({**result, **tested})
 
 
 class PredictedView(Figures):

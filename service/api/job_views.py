@@ -9,6 +9,7 @@ from pydantic import BaseModel, Field
 
 from loopwright.service.inputs.config import Limits, LoopConfig
 from loopwright.service.job_states import ACTIVE, JobState, shown
+from loopwright.service.jsonable import JsonObject
 from loopwright.service.loop_state import LoopState, gains_of
 from loopwright.service.results import (
     ComparisonView,
@@ -233,7 +234,7 @@ def live_view(state: LoopState) -> LiveView:
 def job_view(row: Job, events: Sequence[JobEvent], running: Running | None) -> JobView:
     """The job from the store, and from its live part while it runs."""
     state = shown(row.state, row.dry_run)
-    method = row.request.get("method", PROCEDURE)
+    method = str(row.request.get("method", PROCEDURE))
     result = row.result or empty_result(method)
     progress, remaining, plant_time = _progress(state, row, events, running)
     return JobView(
@@ -268,7 +269,7 @@ def job_view(row: Job, events: Sequence[JobEvent], running: Running | None) -> J
         verification=_verification(result, events),
         before=result.before if isinstance(result, FiveStageResult) else None,
         after=result.after,
-        notes=[e.data["text"] for e in events if e.kind == "note"] + result.notes,
+        notes=[note for event in events if (note := event.note()) is not None] + result.notes,
         reason=row.reason,
         detail=row.detail,
         advice=ADVICE[row.reason] if row.reason else None,
@@ -285,10 +286,10 @@ def _progress(
         return live.fraction, live.remaining_s, live.plant_time_s
     if state not in ACTIVE:
         return 1.0, 0.0, row.plant_time_s
-    told = next((e.data for e in reversed(events) if e.kind == "stage_started"), None)
-    if told is None:
+    begun = next((begun for event in reversed(events) if (begun := event.stage_begun())), None)
+    if begun is None:
         return 0.0, None, row.plant_time_s
-    remaining = told["expected_s"] + told["remaining_s"]
+    remaining = begun.expected_s + begun.remaining_s
     total = row.plant_time_s + remaining
     return (min(0.99, row.plant_time_s / total) if total > 0 else 0.0), remaining, row.plant_time_s
 
@@ -298,13 +299,15 @@ def _stages(events: Sequence[JobEvent], row: Job) -> list[StageView]:
     times = row.stage_times_s or {}
     stages: dict[str, StageView] = {}
     for event in events:
-        name = event.data.get("stage")
-        if event.kind == "stage_started" and isinstance(name, str):
-            stages[name] = StageView(
-                stage=name, state="ended" if over else "running", result=None, plant_time_s=times.get(name)
+        if begun := event.stage_begun():
+            stages[begun.stage] = StageView(
+                stage=begun.stage,
+                state="ended" if over else "running",
+                result=None,
+                plant_time_s=times.get(begun.stage),
             )
-        elif event.kind == "stage_done" and name in stages:
-            stages[name].state, stages[name].result = "done", event.data.get("result")
+        elif (done := event.stage_ended()) and done.stage in stages:
+            stages[done.stage].state, stages[done.stage].result = "done", done.result
     return list(stages.values())
 
 
@@ -323,18 +326,17 @@ def _verification(result: FastResult | FiveStageResult, events: Sequence[JobEven
     return None if told is None else VerificationView.of_stage(told)
 
 
-def _told(events: Sequence[JobEvent], stages: Sequence[str], sign: str) -> dict[str, Any] | None:
+def _told(events: Sequence[JobEvent], stages: Sequence[str], sign: str) -> JsonObject | None:
     """The last result of the first of these stages that has one; `sign` is a field that others' results lack."""
     for stage in stages:
         for event in reversed(events):
-            data = event.data.get("result")
-            if event.kind == "stage_done" and event.data.get("stage") == stage and data and sign in data:
-                found: dict[str, Any] = data
-                return found
+            done = event.stage_ended()
+            if done and done.stage == stage and done.result and sign in done.result:
+                return done.result
     return None
 
 
-def _stored_gains(data: dict[str, Any] | None) -> GainsView | None:
+def _stored_gains(data: JsonObject | None) -> GainsView | None:
     return GainsView.of(gains_of(data)) if data else None
 
 

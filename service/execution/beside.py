@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, Protocol
+from typing import Protocol, TypeVar
 
 from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.computing.pool import NoProcess, NotWanted
@@ -18,6 +18,8 @@ from loopwright.service.loops.loop import Loop, Restored
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Sample, Work
 from loopwright.tuning.reasons import Reason
+
+T = TypeVar("T")
 
 HELD_S = 0.3
 """Longest wall time for which a computation may delay a step, s: a fraction of the heartbeat time."""
@@ -47,7 +49,7 @@ def _alone() -> Iterator[None]:
 class Workers(Protocol):
     """Computes in other processes, as a `Pool` does."""
 
-    def submit(self, kind: ComputationKind, work: Callable[[], Any], unwanted: Callable[[], bool]) -> Future[Any]: ...
+    def submit(self, kind: ComputationKind, work: Callable[[], T], unwanted: Callable[[], bool]) -> Future[T]: ...
 
 
 class ComputingLoop:
@@ -64,7 +66,7 @@ class ComputingLoop:
         self.idle.set()
         self._over = False
 
-    def start(self, work: Work[Any]) -> None:
+    def start(self, work: Work[T]) -> None:
         """Starts a computation; it is the `start_work` of the runner."""
         self.idle.clear()
         if self._workers is None:
@@ -102,7 +104,7 @@ class ComputingLoop:
     def close(self) -> None:
         self._loop.close()
 
-    def _came(self, work: Work[Any], future: Future[Any]) -> None:
+    def _came(self, work: Work[T], future: Future[T]) -> None:
         """Takes the result of the workers; it is called in one of their threads."""
         error = future.exception()
         if isinstance(error, NoProcess):
@@ -115,10 +117,10 @@ class ComputingLoop:
             work.fail(error)
         self.idle.set()
 
-    def _beside(self, work: Work[Any]) -> None:
+    def _beside(self, work: Work[T]) -> None:
         threading.Thread(target=self._do, args=(work,), daemon=True, name="computation").start()
 
-    def _do(self, work: Work[Any]) -> None:
+    def _do(self, work: Work[T]) -> None:
         try:
             with _alone():
                 if not self._over:

@@ -12,7 +12,7 @@ from pydantic import TypeAdapter, ValidationError
 from loopwright.tuning.five_stage.procedure import Finished
 
 
-def finished(results: Iterable[tuple[str, Mapping[str, Any] | None]]) -> Finished:
+def finished(results: Iterable[tuple[str, Mapping[str, object] | None]]) -> Finished:
     """Returns the results of the finished stages.
 
     results: stage and stored result of each `stage_done` event, in order; the last one of a stage counts.
@@ -29,7 +29,7 @@ def finished(results: Iterable[tuple[str, Mapping[str, Any] | None]]) -> Finishe
     return Finished(**by_stage)
 
 
-def _numbers(result: Mapping[str, Any], kind: Any) -> dict[str, Any]:
+def _numbers(result: Mapping[str, object], kind: Any) -> dict[str, object]:
     """Returns the numbers of a stored result; a null stands for nan, which JSON lacks."""
     hints = get_type_hints(kind.__args__[0])
     return {name: math.nan if value is None and hints.get(name) is float else value for name, value in result.items()}

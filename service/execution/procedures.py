@@ -146,8 +146,8 @@ def _procedure(request: RetuneRequest, facts: Facts, earlier: Sequence[JobEvent]
     from loopwright.service.execution.checkpoints import finished
     from loopwright.tuning.five_stage.procedure import five_stage
 
-    done = ((event.data["stage"], event.data["result"]) for event in earlier if event.kind == "stage_done")
-    return five_stage(facts, request.options, finished(done))
+    done = (event.stage_ended() for event in earlier)
+    return five_stage(facts, request.options, finished((each.stage, each.result) for each in done if each))
 
 
 def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:

@@ -6,7 +6,7 @@ This is the only module of the service that imports plantsim and controller, and
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -204,7 +204,7 @@ class Rehearsal:
     stages: dict[str, object] = field(default_factory=dict)
     plant: PlantFile | None = None
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """The object of `loopwright rehearse --json`: the result under the names of `GET /jobs/{id}`, and how it came
         about. What is not known is null."""
         ended = self.ended
@@ -270,7 +270,7 @@ def _t95(file: PlantFile) -> float:
 
 
 def rehearse(
-    spec: dict[str, Any],
+    spec: Mapping[str, object],
     method: str = FAST,
     on_event: Callable[[Event], None] | None = None,
     on_samples: Callable[[list[Sample]], None] | None = None,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.computing.pool import NotWanted, Pool
@@ -15,6 +14,8 @@ from loopwright.service.inputs.request import RetuneRequest
 from loopwright.service.planning.ground import Ground
 from loopwright.tuning.plan import Event, Sample
 from loopwright.tuning.reasons import Aborted, Reason
+
+Report = Callable[[list[Event | list[Sample]]], None]
 
 SAMPLES_AT_ONCE = 1000
 REPORT_AFTER_S = 0.2
@@ -48,7 +49,7 @@ def rehearsed_in_pool(rehearse: Rehearse, pool: Pool) -> Rehearse:
 
 
 def _rehearsed(
-    rehearse: Rehearse, config: LoopConfig, request: RetuneRequest, ground: Ground, report: Callable[[Any], None]
+    rehearse: Rehearse, config: LoopConfig, request: RetuneRequest, ground: Ground, report: Report
 ) -> Outcome:
     """Runs the rehearsal in the process of the computation."""
     reports = _Reports(report)
@@ -62,7 +63,7 @@ def _rehearsed(
 class _Reports:
     """Gathers the reports of a rehearsal, which may come sample by sample, into messages."""
 
-    def __init__(self, report: Callable[[Any], None]) -> None:
+    def __init__(self, report: Report) -> None:
         self._report = report
         self._gathered: list[Event | list[Sample]] = []
         self._handed_on_at = 0.0

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from loopwright.service.jsonable import to_jsonable
+from loopwright.service.jsonable import json_object
 from loopwright.service.results import RESULT, FastResult, FiveStageResult, VerificationView
 from loopwright.tuning.fast.proposal import FastProposal
 from loopwright.tuning.five_stage.procedure import Proposal
 
 
 def result_of(proposal: Proposal | FastProposal) -> FastResult | FiveStageResult:
-    """The proposal under the names of the service; a number that is not finite is null."""
-    told: dict[str, Any] = to_jsonable(proposal)
-    told |= {"new_gains": told.pop("gains"), "after": told.pop("verification")}
+    """Returns the proposal under the names of the service; a number that is not finite is null."""
+    fields = json_object(proposal)
+    fields |= {"new_gains": fields.pop("gains"), "after": fields.pop("verification")}
     if isinstance(proposal, Proposal):
-        return RESULT.validate_python({**told, "procedure": "five-stage", "before": told["baseline"]})
-    verified = told.pop("verified")
-    told["verification"] = None if verified is None else VerificationView.of_stage(verified)
-    return RESULT.validate_python({**told, "procedure": "fast", "evidence": told["found"]})
+        return RESULT.validate_python({**fields, "procedure": "five-stage", "before": fields["baseline"]})
+    verified = fields.pop("verified")
+    verification = VerificationView.of_stage(verified) if isinstance(verified, dict) else None
+    found = {"procedure": "fast", "evidence": fields["found"], "verification": verification}
+    return RESULT.validate_python(fields | found)

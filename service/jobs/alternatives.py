@@ -4,12 +4,13 @@ loop."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from loopwright.service.errors import Conflict
 from loopwright.service.inputs.model_json import dump_model, parse_model
 from loopwright.service.job_states import ACTIVE
 from loopwright.service.jobs.relay_record import RelayRecord
+from loopwright.service.jsonable import JsonObject, json_object
+from loopwright.service.loop_state import loop_state
 from loopwright.service.offline.tunings import MethodResult, answer, tune_each
 from loopwright.service.planning.found_model import DISPROVED, FoundModel, found_model
 from loopwright.service.store.jobs import Job, JobEvent
@@ -44,7 +45,7 @@ FAST_DESIGN = Method(
 )
 
 
-def alternatives(row: Job, events: Sequence[JobEvent], method: str | None = None) -> dict[str, Any]:
+def alternatives(row: Job, events: Sequence[JobEvent], method: str | None = None) -> JsonObject:
     """Returns the JSON object of GET /jobs/{id}/alternatives, for the named method, else for all that are not slow.
 
     Raises Conflict for a job that has no model (yet) or has disproved it, BadTuning for an unknown method.
@@ -56,12 +57,12 @@ def alternatives(row: Job, events: Sequence[JobEvent], method: str | None = None
     body = answer(model, results)
     for each, shown in zip(results, body["methods"], strict=True):
         shown |= {"retune": _retune(each, model), "uncertainty": None, "ambiguity": None}
-    return {"job": row.id, "loop": row.loop, **body}
+    return json_object({"job": row.id, "loop": row.loop, **body})
 
 
 def redesigned(
     row: Job, events: Sequence[JobEvent], record: RelayRecord | None, ms: float, derivative: bool
-) -> dict[str, Any]:
+) -> JsonObject:
     """Returns the same object with the gains of fast for another Ms, without a new experiment.
 
     record: the job's record, if it is stored; without it, and for a job of another method, the gains are designed for
@@ -81,7 +82,7 @@ def redesigned(
                 raise Refused(evaluation.reason, evaluation.detail)
             sampled: Model = delayed(model, evaluation.design_delay)
         else:
-            Ts = (row.found or {}).get("sample_time_s") or 0.0
+            Ts = loop_state(row.found).sample_time_s if row.found else 0.0
             sampled = delayed(model, 0.5 * Ts)
             gains = designed_on(model, FastOptions(Ms=ms, derivative=derivative), Ts).gains
         result = _tuned(gains, ms, assess(sampled, gains))
@@ -91,9 +92,10 @@ def redesigned(
     retune = None
     if result.gains is not None:
         asked = {"num": list(model.num), "den": list(model.den), "dead_time_s": model.L}
-        retune = {"method": FAST, "start": "design", "ms": ms, "derivative": derivative, "model": asked} | ANYWAY
+        request = {"method": FAST, "start": "design", "ms": ms, "derivative": derivative, "model": asked}
+        retune = json_object(request | ANYWAY)
     body["methods"][0] |= {"retune": retune, **doubt}
-    return {"job": row.id, "loop": row.loop, **body}
+    return json_object({"job": row.id, "loop": row.loop, **body})
 
 
 def _tuned(gains: Gains, ms: float, assessed: Assessment) -> MethodResult:
@@ -123,7 +125,7 @@ def _not_disproved(row: Job, reasons: Sequence[Reason]) -> None:
         raise Conflict(f"{text}: retune instead")
 
 
-def _retune(result: MethodResult, model: FoundModel) -> dict[str, Any] | None:
+def _retune(result: MethodResult, model: FoundModel) -> JsonObject | None:
     """Returns the request that tries the gains on the loop; None for gains that the service would not try (see
     `tuning.rules.design`), and for those of a rule on a model that the five stages do not take."""
     if result.assessment is None or isinstance(model, TransferFunction):
@@ -131,4 +133,4 @@ def _retune(result: MethodResult, model: FoundModel) -> dict[str, Any] | None:
     m = result.assessment.margins
     if not (m.stable and m.Ms <= MAX_Ms and (m.GM is None or m.GM >= MIN_GM)):
         return None
-    return {"start": "optimise", "method": result.method.name, "model": dump_model(model)} | ANYWAY
+    return json_object({"start": "optimise", "method": result.method.name, "model": dump_model(model)} | ANYWAY)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from typing import Any
 
 from loopwright.service.errors import UnknownLoop
 from loopwright.service.inputs.config import BusConfig, LoopConfig
@@ -43,9 +42,9 @@ class LoopDirectory:
         self._buses = buses or {}
         self._machine = machine
         # By loop: held while a job on it is started or decided, or while it is restored.
-        self._loop_locks: dict[str, AbstractContextManager[Any]] = {}
+        self._loop_locks: dict[str, AbstractContextManager[object]] = {}
 
-    def alone_with(self, tag: str) -> AbstractContextManager[Any]:
+    def alone_with(self, tag: str) -> AbstractContextManager[object]:
         """Returns the lock that is held while a job on the loop is started or decided, or the loop is restored."""
         return self._loop_locks.setdefault(tag, self._machine.lock())  # one, also for two who ask at the same time
 

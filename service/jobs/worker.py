@@ -221,4 +221,4 @@ class Worker:
     def _earlier_times(self, job_id: str) -> dict[str, float]:
         """Returns the plant time by stage that any attempt has finished, s."""
         events = self._lasting(lambda: self.store.events(job_id))
-        return {e.data["stage"]: e.data["stage_time_s"] for e in events if e.kind == "stage_done"}
+        return {done.stage: done.stage_time_s for event in events if (done := event.stage_ended())}

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 
 from loopwright.service.inputs.model_json import dump_model
-from loopwright.service.jsonable import to_jsonable
+from loopwright.service.jsonable import JsonObject, json_object
 from loopwright.service.offline.csv_record import Record
 from loopwright.tuning.identification.identify import Identified
 from loopwright.tuning.reasons import Refused
@@ -14,12 +14,12 @@ from loopwright.tuning.reasons import Refused
 _IN_JSON = {"T": "T_s", "L": "L_s"}
 
 
-def identified(found: Identified, record: Record) -> dict[str, object]:
+def identified(found: Identified, record: Record) -> JsonObject:
     """Returns the JSON object of an identified model; the quantities and their units are those of `Identified`.
 
     The parameters have the names of the model as JSON (T_s, L_s), and covariance has a row for each of them.
     """
-    answer: dict[str, object] = to_jsonable(
+    return json_object(
         {
             "outcome": "identified",
             "reason": None,
@@ -41,7 +41,6 @@ def identified(found: Identified, record: Record) -> dict[str, object]:
             "notes": list(found.notes),
         }
     )
-    return answer
 
 
 def named(values: Mapping[str, float]) -> dict[str, float]:

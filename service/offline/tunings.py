@@ -12,7 +12,7 @@ from typing import TypedDict
 
 from loopwright.service.inputs.model_json import dump_model
 from loopwright.service.inputs.plausible import Implausible, check_option
-from loopwright.service.jsonable import to_jsonable
+from loopwright.service.jsonable import JsonObject, json_object
 from loopwright.tuning.analysis.assessment import Assessment
 from loopwright.tuning.analysis.step_figures import StepFigures
 from loopwright.tuning.gain_forms import to_parallel
@@ -94,7 +94,7 @@ class Tunings(TypedDict):
     """The JSON object of the tunings of one model, as `tuning_views.TuningsView` describes it."""
 
     model: dict[str, object]
-    methods: list[dict[str, object]]
+    methods: list[JsonObject]
     form: str
     figures_are: str
     units: dict[str, str]
@@ -111,11 +111,11 @@ def answer(model: Model, found: Iterable[MethodResult]) -> Tunings:
     }
 
 
-def as_json(found: MethodResult) -> dict[str, object]:
+def as_json(found: MethodResult) -> JsonObject:
     """Returns the part of that JSON object for one method."""
     gains, assessed, refusal = found.gains, found.assessment, found.refusal
     parallel = to_parallel(gains) if gains else None
-    clean: dict[str, object] = to_jsonable(
+    return json_object(
         {
             "method": found.method.name,
             "title": found.method.title,
@@ -134,7 +134,6 @@ def as_json(found: MethodResult) -> dict[str, object]:
             "load": _figures(assessed.load) if assessed else None,
         }
     )
-    return clean
 
 
 def methods_json() -> list[dict[str, object]]:

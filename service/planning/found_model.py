@@ -18,9 +18,9 @@ def found_model(row: Job, events: Sequence[JobEvent]) -> FoundModel | None:
     """Returns the model of the job's result, else the last that a stage found; an entered model does not count."""
     if row.result is not None and row.result.model is not None and not row.result.model.typed_in:
         return row.result.model.process_model()
-    for data in (event.data.get("result") for event in reversed(events) if event.kind == "stage_done"):
-        if data and TYPED_IN not in (data.get("structure"), data.get("k_source")):
-            model = model_of(data)
+    for done in (event.stage_ended() for event in reversed(events)):
+        if done and done.result and TYPED_IN not in (done.result.get("structure"), done.result.get("k_source")):
+            model = model_of(done.result)
             if model is not None:
                 return model
     return None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any
 
 from sqlalchemy import ColumnElement, CursorResult, update
 from sqlalchemy.orm import Session
@@ -55,6 +54,6 @@ def changed(session: Session, url: str) -> None:
 
 
 def _note(session: Session, claim: Claim, url: str) -> bool:
-    values: dict[str, Any] = {"effect": url}
+    values: dict[str, object] = {"effect": url}
     done = session.execute(update(IdempotencyRow).where(*claim.ours, IdempotencyRow.effect.is_(None)).values(values))
     return isinstance(done, CursorResult) and done.rowcount == 1

@@ -6,6 +6,7 @@ Nothing that waits for the database waits for ever: a request is answered with 5
 from __future__ import annotations
 
 import logging
+import sqlite3
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
@@ -78,7 +79,7 @@ def postgresql(url: str, name: str, pool: tuple[int, int] | None) -> Engine:
     )
 
 
-def _server(name: str) -> dict[str, Any]:
+def _server(name: str) -> dict[str, str | int]:
     return {
         "connect_timeout": WAIT_S,
         "application_name": name,
@@ -131,7 +132,7 @@ def migrate(engine: Engine) -> None:
             ) from error
 
 
-def pragmas(connection: Any, _record: object) -> None:
+def pragmas(connection: sqlite3.Connection, _record: object) -> None:
     # A transaction that writes takes the lock as it begins: one that read first could not wait for it later.
     connection.isolation_level = "IMMEDIATE"
     cursor = connection.cursor()

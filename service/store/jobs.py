@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from enum import StrEnum
-from typing import Any, TypedDict, TypeVar
+from typing import NamedTuple, TypedDict, TypeVar
 
 from loopwright.service.job_states import JobState
+from loopwright.service.jsonable import JsonObject, number
 from loopwright.service.results import FastResult, FiveStageResult
 from loopwright.service.store.tables import EventRow, JobRow
 from loopwright.tuning.reasons import Reason
@@ -45,7 +46,7 @@ class Job:
     loop: str
     state: JobState
     dry_run: bool
-    request: dict[str, Any]
+    request: JsonObject
     requested_by: str
     created_at: str
     started_at: str | None
@@ -55,13 +56,13 @@ class Job:
     stage_times_s: dict[str, float] | None
     reason: Reason | None
     detail: str | None
-    old_gains: dict[str, Any] | None
-    restored: dict[str, Any] | None
+    old_gains: JsonObject | None
+    restored: JsonObject | None
     result: FastResult | FiveStageResult | None
     host: str
     version: str
     attempt: int
-    found: dict[str, Any] | None
+    found: JsonObject | None
     session: int | None
     look_after: bool
     stop_reason: Reason | None
@@ -77,6 +78,26 @@ class Job:
         return cls(**columns)
 
 
+class StageBegun(NamedTuple):
+    """A stage that has begun.
+
+    expected_s: the plant time that the stage is expected to take, s.
+    remaining_s: the plant time that the stages after it are expected to take, s.
+    """
+
+    stage: str
+    expected_s: float
+    remaining_s: float
+
+
+class StageEnded(NamedTuple):
+    """A stage that has ended. result: its result as stored.  stage_time_s: the plant time that it took, s."""
+
+    stage: str
+    result: JsonObject | None
+    stage_time_s: float
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobEvent:
     """One thing that happened in a job; seq counts from 1 within the job."""
@@ -86,11 +107,29 @@ class JobEvent:
     at: str
     plant_time_s: float
     kind: str
-    data: dict[str, Any]
+    data: JsonObject
 
     @classmethod
     def from_row(cls, row: EventRow) -> JobEvent:
         return cls(**{field.name: getattr(row, field.name) for field in fields(cls)})
+
+    def stage_begun(self) -> StageBegun | None:
+        """Returns what the event says of a stage that has begun; None for an event of another kind."""
+        if self.kind != "stage_started":
+            return None
+        return StageBegun(str(self.data["stage"]), number(self.data["expected_s"]), number(self.data["remaining_s"]))
+
+    def stage_ended(self) -> StageEnded | None:
+        """Returns what the event says of a stage that has ended with a result; None for an event of another kind."""
+        if self.kind != "stage_done":
+            return None
+        result = self.data["result"]
+        time_s = number(self.data["stage_time_s"])
+        return StageEnded(str(self.data["stage"]), result if isinstance(result, dict) else None, time_s)
+
+    def note(self) -> str | None:
+        """Returns the text of a note; None for an event of another kind."""
+        return str(self.data["text"]) if self.kind == "note" else None
 
 
 def _word(kind: type[Word], value: str, job_id: str) -> Word:

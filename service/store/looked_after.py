@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from sqlalchemy import distinct, func, select
 from sqlalchemy.orm import Session
 
-from loopwright.service.jsonable import to_jsonable
+from loopwright.service.jsonable import json_object
 from loopwright.service.store import audit
 from loopwright.service.store.jobs import Job, JobColumns
 from loopwright.service.store.store import Store, Write, append, set_columns
@@ -39,7 +39,7 @@ def home_again(store: Store, job_id: str, restored: Mapping[str, object], text: 
         row = session.scalars(wanted).one_or_none()
         if row is None:
             return False
-        row.look_after, row.restored = False, to_jsonable(restored)
+        row.look_after, row.restored = False, json_object(restored)
         append(session, row.id, "loop_found", {"text": text}, row.plant_time_s)
         return True
 

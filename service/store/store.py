@@ -8,14 +8,14 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Unpack
 
 from sqlalchemy import ColumnElement, delete, func, select, update
 from sqlalchemy.exc import IntegrityError, SQLAlchemyError, TimeoutError
 from sqlalchemy.orm import Session
 
 from loopwright.service.job_states import ACTIVE, IllegalMove, JobState, check
-from loopwright.service.jsonable import to_jsonable
+from loopwright.service.jsonable import JsonObject, json_object, to_jsonable
 from loopwright.service.loop_state import gains_of, same_gains
 from loopwright.service.store import audit, claims, loop_locks, retunes, sample_blocks
 from loopwright.service.store.clock import now
@@ -231,7 +231,7 @@ class Store:
             loop=loop,
             state=JobState.QUEUED,
             dry_run=dry_run,
-            request=to_jsonable(request),
+            request=json_object(request),
             requested_by=requested_by,
             created_at=now(),
             host=host or self.host,
@@ -496,7 +496,7 @@ def event_of(
     job_id: str, kind: str, data: Mapping[str, object], plant_time_s: float, stage: str | None = None
 ) -> Write:
     """An event, at the time it happened. stage: the one that the job has entered with it."""
-    at, details = now(), to_jsonable(data)
+    at, details = now(), json_object(data)
 
     def write(session: Session) -> None:
         row = _find(session, job_id, lock=True)
@@ -565,8 +565,8 @@ def _move(session: Session, row: JobRow, wanted: JobState, by: str, columns: Job
     append(session, row.id, "state", details, row.plant_time_s)
     if wanted in DECISIONS:
         claims.changed(session, f"/jobs/{row.id}")
-        held = None if row.restored is None or "restored" not in columns else row.restored.get("gains")
-        _audit_decision(session, row, previous, wanted, by, held)
+        held = (row.restored or {}).get("gains") if "restored" in columns else None
+        _audit_decision(session, row, previous, wanted, by, held if isinstance(held, dict) else None)
     return row
 
 
@@ -578,7 +578,7 @@ def _last_begun(session: Session, job_id: str) -> str | None:
 
 
 def _audit_decision(
-    session: Session, row: JobRow, previous: JobState, wanted: JobState, by: str, held: dict[str, Any] | None
+    session: Session, row: JobRow, previous: JobState, wanted: JobState, by: str, held: JsonObject | None
 ) -> None:
     """held: the gains read back after the decision, where it went to the controller."""
     proposed = None if row.result is None else row.result.new_gains
@@ -606,7 +606,7 @@ def append(
     seq = session.scalar(select(func.max(EventRow.seq)).where(EventRow.job_id == job_id)) or 0
     session.add(
         EventRow(
-            job_id=job_id, seq=seq + 1, at=at or now(), plant_time_s=plant_time_s, kind=kind, data=to_jsonable(data)
+            job_id=job_id, seq=seq + 1, at=at or now(), plant_time_s=plant_time_s, kind=kind, data=json_object(data)
         )
     )
     session.flush()

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Any
 
 from sqlalchemy import JSON, BigInteger, Dialect, ForeignKey, Index, LargeBinary, String, TypeDecorator, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 from loopwright.service.job_states import JobState
+from loopwright.service.jsonable import JsonObject
 from loopwright.service.results import RESULT, FastResult, FiveStageResult
 from loopwright.tuning.reasons import Reason
 
 
-class EnumColumn(TypeDecorator[StrEnum]):
+class EnumColumn(TypeDecorator[StrEnum | str]):
     """A closed list as text. The database does not check it: a version that adds a word needs no migration. A word that
     is not in the list comes as it is, so that the row with it can be named (`service.store.jobs`)."""
 
@@ -27,7 +27,7 @@ class EnumColumn(TypeDecorator[StrEnum]):
     def process_bind_param(self, value: str | None, dialect: Dialect) -> str | None:
         return None if value is None else self.kind(value).value
 
-    def process_result_value(self, value: str | None, dialect: Dialect) -> Any:
+    def process_result_value(self, value: str | None, dialect: Dialect) -> StrEnum | str | None:
         return self.kind(value) if value in set(self.kind) else value
 
 
@@ -37,15 +37,15 @@ class ResultColumn(TypeDecorator[FastResult | FiveStageResult]):
     impl = JSON
     cache_ok = True
 
-    def process_bind_param(self, value: FastResult | FiveStageResult | None, dialect: Dialect) -> Any:
+    def process_bind_param(self, value: FastResult | FiveStageResult | None, dialect: Dialect) -> JsonObject | None:
         return None if value is None else value.model_dump(mode="json")
 
-    def process_result_value(self, value: Any, dialect: Dialect) -> FastResult | FiveStageResult | None:
+    def process_result_value(self, value: JsonObject | None, dialect: Dialect) -> FastResult | FiveStageResult | None:
         return None if value is None else RESULT.validate_python(value)
 
 
 class Base(DeclarativeBase):
-    type_annotation_map = {dict[str, Any]: JSON}
+    type_annotation_map = {JsonObject: JSON, dict[str, float]: JSON, dict[str, str]: JSON}
 
 
 class JobRow(Base):
@@ -69,25 +69,25 @@ class JobRow(Base):
     loop: Mapped[str]
     state: Mapped[JobState] = mapped_column(EnumColumn(JobState))
     dry_run: Mapped[bool]
-    request: Mapped[dict[str, Any]]
+    request: Mapped[JsonObject]
     requested_by: Mapped[str]
     created_at: Mapped[str]
     started_at: Mapped[str | None]
     ended_at: Mapped[str | None]
     stage: Mapped[str | None]
     plant_time_s: Mapped[float] = mapped_column(default=0.0)
-    stage_times_s: Mapped[dict[str, Any] | None]
+    stage_times_s: Mapped[dict[str, float] | None]
     reason: Mapped[Reason | None] = mapped_column(EnumColumn(Reason))
     detail: Mapped[str | None]
-    old_gains: Mapped[dict[str, Any] | None]
-    restored: Mapped[dict[str, Any] | None]
+    old_gains: Mapped[JsonObject | None]
+    restored: Mapped[JsonObject | None]
     result: Mapped[FastResult | FiveStageResult | None] = mapped_column(ResultColumn)
     # The host that runs it, the version of the workflow it was started under, how often it was started.
     host: Mapped[str] = mapped_column(server_default="local")
     version: Mapped[str] = mapped_column(server_default="0")
     attempt: Mapped[int] = mapped_column(server_default="0", default=0)
     # The loop as the first attempt found it, before anything was touched: what every attempt has to bring back.
-    found: Mapped[dict[str, Any] | None]
+    found: Mapped[JsonObject | None]
     # The number of the session that was opened last, written down before it was: a later process can close it.
     session: Mapped[int | None] = mapped_column(BigInteger)
     # The loop was not read back as home: it is looked at until it is, or a person says otherwise.
@@ -103,7 +103,7 @@ class LoopRow(Base):
 
     tag: Mapped[str] = mapped_column(primary_key=True)
     host: Mapped[str]
-    config: Mapped[dict[str, Any]]
+    config: Mapped[JsonObject]
 
 
 class LoopLockRow(Base):
@@ -143,7 +143,7 @@ class EventRow(Base):
     at: Mapped[str]
     plant_time_s: Mapped[float]
     kind: Mapped[str]
-    data: Mapped[dict[str, Any]]
+    data: Mapped[JsonObject]
 
 
 class ChunkRow(Base):
@@ -169,7 +169,7 @@ class RetuneRow(Base):
     id: Mapped[str] = mapped_column(unique=True)
     host: Mapped[str]
     state: Mapped[str]
-    request: Mapped[dict[str, Any]]
+    request: Mapped[JsonObject]
     requested_by: Mapped[str]
     created_at: Mapped[str]
     ended_at: Mapped[str | None]
@@ -213,7 +213,7 @@ class IdempotencyRow(Base):
     token: Mapped[str]
     effect: Mapped[str | None]
     status: Mapped[int | None]
-    headers: Mapped[dict[str, Any] | None]
+    headers: Mapped[dict[str, str] | None]
     body: Mapped[bytes | None] = mapped_column(LargeBinary)
 
 
@@ -246,5 +246,5 @@ class AuditRow(Base):
     what: Mapped[str]
     subject: Mapped[str]
     loop: Mapped[str | None]
-    before: Mapped[dict[str, Any] | None]
-    after: Mapped[dict[str, Any] | None]
+    before: Mapped[JsonObject | None]
+    after: Mapped[JsonObject | None]

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import UTC, datetime
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Literal
 
 from loopwright.service.security.keys import KEY_PATTERN
 from loopwright.service.store.clock import stamp
@@ -22,11 +22,11 @@ LogFormat = Literal["text", "json"]
 FIELDS = ("job", "loop", "request", "who", "method", "path", "status", "ms", "address")
 """The fields that a line may have besides its message: from `about`, or from `extra`."""
 
-_about: ContextVar[Mapping[str, Any]] = ContextVar("about", default=MappingProxyType({}))
+_about: ContextVar[Mapping[str, object]] = ContextVar("about", default=MappingProxyType({}))
 
 
 @contextmanager
-def about(**fields: Any) -> Iterator[None]:
+def about(**fields: object) -> Iterator[None]:
     """Adds these fields to every line logged in this context."""
     token = _about.set({**_about.get(), **fields})
     try:
@@ -44,7 +44,7 @@ def configure(log_format: LogFormat, level: int = logging.INFO) -> None:
     logging.getLogger("alembic").setLevel(logging.WARNING)
 
 
-def fields_of(record: logging.LogRecord) -> dict[str, Any]:
+def fields_of(record: logging.LogRecord) -> dict[str, object]:
     """Returns the known fields of a record; its own ones take precedence."""
     values = {**_about.get(), **{name: getattr(record, name) for name in FIELDS if hasattr(record, name)}}
     return {name: values[name] for name in FIELDS if values.get(name) is not None}

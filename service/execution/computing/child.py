@@ -17,7 +17,6 @@ from enum import Enum, auto
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 from loopwright.service.execution.computing.limits import MB
 
@@ -36,7 +35,7 @@ class MessageKind(Enum):
 
 
 def compute(
-    connection: Connection, work: Callable[..., Any], reports: bool, cpu_s: float, memory_mb: int, niceness: int
+    connection: Connection, work: Callable[..., object], reports: bool, cpu_s: float, memory_mb: int, niceness: int
 ) -> None:
     """Runs a computation; it is the main function of the process.
 
@@ -49,7 +48,7 @@ def compute(
     attendant.start()
     try:
         value = work(lambda report: attendant.send(MessageKind.REPORT, report)) if reports else work()
-        message: tuple[MessageKind, Any] = (MessageKind.RESULT, value)
+        message: tuple[MessageKind, object] = (MessageKind.RESULT, value)
     except (MemoryError, SystemError):  # the interpreter raises SystemError where memory was refused
         message = (MessageKind.NO_MEMORY, None)
     except BaseException as error:

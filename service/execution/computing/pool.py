@@ -20,7 +20,7 @@ from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerProcess
-from typing import Any
+from typing import Generic, TypeVar
 
 from loopwright.service.execution.computing.child import GO_ON, PAUSE, MessageKind, compute
 from loopwright.service.execution.computing.limits import (
@@ -32,6 +32,9 @@ from loopwright.service.execution.computing.limits import (
     at_once,
 )
 from loopwright.tuning.reasons import Failed, Reason
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 NICE = {ComputationKind.LIVE: 5, ComputationKind.TUNING: 10, ComputationKind.DRY_RUN: 10}
 _LOOK_S, _LOOK_WAITING_S = 0.1, 0.5
@@ -106,11 +109,11 @@ class Pool:
     def run(
         self,
         kind: ComputationKind,
-        work: Callable[..., Any],
+        work: Callable[..., T],
         *,
-        on_report: Callable[[Any], None] | None = None,
+        on_report: Callable[[R], None] | None = None,
         unwanted: Callable[[], bool] = lambda: False,
-    ) -> Any:
+    ) -> T:
         """Waits for the work and returns its result, or raises its error.
 
         on_report: receives, in this thread, each value that the work passes to the function it is called with.
@@ -137,10 +140,10 @@ class Pool:
         raise AssertionError("every try returns or raises")
 
     def submit(
-        self, kind: ComputationKind, work: Callable[[], Any], unwanted: Callable[[], bool] = lambda: False
-    ) -> Future[Any]:
+        self, kind: ComputationKind, work: Callable[[], T], unwanted: Callable[[], bool] = lambda: False
+    ) -> Future[T]:
         """Runs the work as `run` does, in a thread of its own, and returns its future at once."""
-        future: Future[Any] = Future()
+        future: Future[T] = Future()
         future.set_running_or_notify_cancel()  # only `unwanted` ends it
 
         def wait() -> None:
@@ -189,11 +192,11 @@ class Pool:
     def _one(
         self,
         kind: ComputationKind,
-        work: Callable[..., Any],
+        work: Callable[..., T],
         place: _Place,
-        forwarder: _ReportForwarder,
+        forwarder: _ReportForwarder[R],
         unwanted: Callable[[], bool],
-    ) -> Any:
+    ) -> T:
         with self._process(kind, work, place, forwarder.wanted) as (process, connection):
             while True:
                 while not connection.poll(_LOOK_S):
@@ -208,7 +211,8 @@ class Pool:
                     forwarder.report(value)
                     self._check(unwanted)
                 elif message_kind is MessageKind.RESULT:
-                    return value
+                    result: T = value
+                    return result
                 elif message_kind is MessageKind.NO_MEMORY:
                     memory = self.limits.memory_mb
                     text = f"{WORDS[kind]} asked for more than {memory} MB of memory ({MEMORY_OPTION})"
@@ -218,7 +222,7 @@ class Pool:
 
     @contextmanager
     def _process(
-        self, kind: ComputationKind, work: Callable[..., Any], place: _Place, reports: bool
+        self, kind: ComputationKind, work: Callable[..., object], place: _Place, reports: bool
     ) -> Iterator[tuple[ForkServerProcess, Connection]]:
         """Yields the process and its connection; the process is ended with the context. Raises NoProcess, and the
         errors of pickling."""
@@ -252,18 +256,18 @@ class Pool:
                     process.close()
 
 
-class _ReportForwarder:
+class _ReportForwarder(Generic[R]):
     """Passes reports on to `on_report`.
 
     anything: whether there was a report, so that the work cannot be repeated.
     """
 
-    def __init__(self, on_report: Callable[[Any], None] | None) -> None:
+    def __init__(self, on_report: Callable[[R], None] | None) -> None:
         self.wanted = on_report is not None
         self.anything = False
         self._on_report = on_report
 
-    def report(self, value: object) -> None:
+    def report(self, value: R) -> None:
         assert self._on_report is not None
         self.anything = True
         self._on_report(value)

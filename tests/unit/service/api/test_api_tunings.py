@@ -136,7 +136,8 @@ def test_unstable_gains_are_not_to_be_tried(
     monkeypatch.setattr(module, "realisable", lambda gains, _filter: (Gains(100.0 * gains.Kp, gains.Ti), ()))
     job = finished(service, client)
     row, events = service.store.get(job["id"]), service.store.events(job["id"])
-    (found,) = alternatives(row, events, "simc")["methods"]
+    answer: Any = alternatives(row, events, "simc")
+    (found,) = answer["methods"]
     assert not assess(FOPDT(2.0, 3.0, 1.0), Gains(found["gains"]["Kp"], found["gains"]["Ti"])).stable
     assert found["outcome"] == "tuned" and found["margins"]["stable"] is False and found["retune"] is None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -498,4 +498,4 @@ def test_no_loop_is_read_while_a_decision_is_carried_out(service: Service) -> No
     service.jobs.directory.open_loop = lambda config: Slow(service.controller)
     service.jobs.decisions.accept(first.id, "me")
     service.wait(seen[0])
-    assert service.store.get(seen[0]).old_gains == {**state_json(HOME)["gains"], "Kp": NEW.Kp, "Ti": NEW.Ti}
+    assert service.store.get(seen[0]).old_gains == asdict(HOME.gains) | {"Kp": NEW.Kp, "Ti": NEW.Ti}
