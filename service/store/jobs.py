@@ -91,7 +91,8 @@ class StageBegun(NamedTuple):
 
 
 class StageEnded(NamedTuple):
-    """A stage that has ended. result: its result as stored.  stage_time_s: the plant time that it took, s."""
+    """A stage that has ended. result: its result as stored.  stage_time_s: the plant time that it took, s; 0 where
+    it is not stored."""
 
     stage: str
     result: JsonObject | None
@@ -123,8 +124,8 @@ class JobEvent:
         """Returns what the event says of a stage that has ended with a result; None for an event of another kind."""
         if self.kind != "stage_done":
             return None
-        result = self.data["result"]
-        time_s = number(self.data["stage_time_s"])
+        result = self.data.get("result")
+        time_s = number(self.data.get("stage_time_s", 0.0))
         return StageEnded(str(self.data["stage"]), result if isinstance(result, dict) else None, time_s)
 
     def note(self) -> str | None:
