@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import pytest
 from fastapi.testclient import TestClient
@@ -18,11 +18,12 @@ from loopwright.service.api.metrics import exposition, registry
 from loopwright.service.cli import main as cli
 from loopwright.service.cli.client import Client
 from loopwright.service.inputs.request import FastRetune
+from loopwright.service.job_states import JobState
 from loopwright.service.jobs import aftercare
 from loopwright.service.jobs.aftercare import EVERY_S, LONGEST_S, Aftercare
 from loopwright.service.loop_state import state_json
 from loopwright.service.store import audit, looked_after
-from loopwright.service.store.jobs import Job
+from loopwright.service.store.jobs import Job, JobColumns
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import LoopRow
 from loopwright.tuning.plan import Mode
@@ -193,20 +194,25 @@ def test_a_job_that_opens_a_session_answers_for_the_loop(service: Service, clock
     assert second.id in told(service, row.id)[0]
 
 
+def failed(store: Store, job_id: str, **columns: Unpack[JobColumns]) -> None:
+    store.move(job_id, JobState.RUNNING)
+    store.move(job_id, JobState.FAILED, **columns)
+
+
 def test_a_defect_with_one_loop_does_not_keep_the_others_from_being_looked_at(
     service: Service, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     row = left_by_a_job(service, stopped)
     started(service.controller)
     other = service.store.create("FIC-2", {}, "me", False)
-    service.store.note(other.id, state="failed", look_after=True, found={"no": "state"}, session=3)  # type: ignore[call-arg]
+    failed(service.store, other.id, look_after=True, found={"no": "state"}, session=3)
     service.jobs.aftercare.check_due_loops()
     assert not service.store.get(row.id).look_after and service.store.get(other.id).look_after
 
 
 def test_a_loop_that_is_configured_no_more_is_kept_and_can_be_dismissed(service: Service, clock: Clock) -> None:
     row = service.store.create("GONE", {}, "me", False)
-    service.store.note(row.id, state="failed", look_after=True, session=3)  # type: ignore[call-arg]
+    failed(service.store, row.id, look_after=True, session=3)
     service.jobs.aftercare.check_due_loops()
     (found,) = service.jobs.aftercare.not_home()
     assert "no longer configured here" in found.words
@@ -216,7 +222,7 @@ def test_a_loop_that_is_configured_no_more_is_kept_and_can_be_dismissed(service:
 def test_it_moves_with_its_loop_to_another_host(tmp_path: Path, postgres: Server) -> None:
     store = Store(tmp_path, postgres.database(), "gateway A")
     row = store.create(TAG, {}, "me", False, host="gateway B")
-    store.note(row.id, state="failed", look_after=True)  # type: ignore[call-arg]
+    failed(store, row.id, look_after=True)
     with store.writing() as session:
         session.add(LoopRow(tag=TAG, host="gateway B", config={}))
     store.own_loops({TAG: loop_entry()})
