@@ -122,7 +122,7 @@ class Tuner:
         self._channel = channel
         self._sdo_timeout_s = sdo_timeout_s
         self._sdo_tries = sdo_tries
-        self._retry_until = 0.0
+        self._retry_s, self._retry_until = 0.0, 0.0
         self._pv_id, self._mv_id, self._status_id = ids.pv, ids.mv, ids.status
         self._alive = {heartbeat_id(node): node for node in (controller_node, plant_node) if node is not None}
         self._bus: Bus = self.station.open_bus(url)
@@ -266,17 +266,18 @@ class Tuner:
         return entry, node, sub
 
     @contextmanager
-    def retrying(self, until: float) -> Iterator[None]:
-        """Repeats an unanswered request until that time on the station's clock (at least the usual number of times): on
-        a bus that loses frames, a long sequence of requests otherwise fails at one of them.
+    def retrying(self, each_s: float, all_s: float) -> Iterator[None]:
+        """Repeats an unanswered request more often than usual: on a bus that loses frames, a long sequence of requests
+        otherwise fails at one of them.
 
-        until: monotonic seconds.
+        each_s: wall time for which one request is repeated, s.
+        all_s: wall time after which requests are repeated only as often as usual, s.
         """
-        self._retry_until = until
+        self._retry_s, self._retry_until = each_s, self.station.monotonic() + all_s
         try:
             yield
         finally:
-            self._retry_until = 0.0
+            self._retry_s = 0.0
 
     @contextmanager
     def _turn(self, node: int, name: str) -> Iterator[None]:
@@ -305,7 +306,8 @@ class Tuner:
         self._take_in()
         self._answers.clear()
         attempt = 0
-        while attempt < self._sdo_tries or self.station.monotonic() < self._retry_until:
+        until = min(self.station.monotonic() + self._retry_s, self._retry_until)
+        while attempt < self._sdo_tries or self.station.monotonic() < until:
             if attempt:
                 self.station.sdo_retries[self._url] += 1
             attempt += 1

@@ -13,7 +13,9 @@ from loopwright.service.loops.loop import Restored
 from loopwright.tuning.reasons import Ended, Failed, Reason
 
 RESTORE_PATIENCE_S = 4.0
-"""Wall time for which the restoration is retried, s."""
+"""Wall time for which the restoration is retried, and for which a node may leave one of its requests unanswered, s."""
+LOSSY_BUS_S = 15.0
+"""Wall time that the restoration may take on a bus that loses frames but answers now and then, s."""
 
 
 def restore(connection: BusConnection, home: LoopState, number: int) -> Restored:
@@ -26,7 +28,7 @@ def restore(connection: BusConnection, home: LoopState, number: int) -> Restored
     give_up = station.monotonic() + RESTORE_PATIENCE_S
     while True:
         try:
-            with connection.tuner() as tuner, tuner.retrying(give_up):
+            with connection.tuner() as tuner, tuner.retrying(RESTORE_PATIENCE_S, LOSSY_BUS_S):
                 how = close_session(tuner, number) if number else "no session was opened"
                 return read_back(connection.reading(tuner), home, number, how)
         except Ended as ended:
@@ -47,7 +49,7 @@ def end_acceptance(connection: BusConnection, number: int, why: Ended | None) ->
     give_up = station.monotonic() + RESTORE_PATIENCE_S
     while True:
         try:
-            with connection.tuner() as tuner, tuner.retrying(give_up):
+            with connection.tuner() as tuner, tuner.retrying(RESTORE_PATIENCE_S, LOSSY_BUS_S):
                 close_session(tuner, number)
                 return connection.reading(tuner).state()
         except Ended as ended:
