@@ -231,6 +231,13 @@ def integrators(model: Model) -> int:
     return len(den) - len(np.trim_zeros(np.asarray(den), "b"))
 
 
+def monic(model: Model) -> tuple[Reals, Reals]:
+    """Returns numerator and denominator divided by the denominator's first coefficient, both of the same length."""
+    den = np.asarray(model.den)
+    num = np.concatenate((np.zeros(len(den) - len(model.num)), model.num))
+    return num / den[0], den / den[0]
+
+
 def sign(model: Model) -> float:
     """+1 when PV finally rises with MV, else -1."""
     return math.copysign(1.0, model.num[-1] * np.trim_zeros(np.asarray(model.den), "b")[-1])

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from loopwright.protocol.profile import Mode, NmtState
+from loopwright.protocol.real32 import same
 from loopwright.protocol.tuner import Tuner, TunerError
 from tests.faults.faulty_hub import FaultyHub
 
@@ -65,16 +66,16 @@ def unsafe(glance: Glance | None, home: Home, at_rest: bool = False) -> str:
         return "the controller cannot be read"
     wrong = [
         f"{name} is {is_}, not {wanted}"
-        for name, is_, wanted, same in (
+        for name, is_, wanted, agrees in (
             ("mode", glance.mode, int(home.mode), glance.mode == home.mode),
-            ("set-point", glance.sp, home.sp, math.isclose(glance.sp, home.sp, rel_tol=1e-6)),
-            ("Kp", glance.Kp, home.Kp, math.isclose(glance.Kp, home.Kp, rel_tol=1e-6)),
-            ("Ti", glance.Ti, home.Ti, math.isclose(glance.Ti, home.Ti, rel_tol=1e-6)),
+            ("set-point", glance.sp, home.sp, same(glance.sp, home.sp)),
+            ("Kp", glance.Kp, home.Kp, same(glance.Kp, home.Kp)),
+            ("Ti", glance.Ti, home.Ti, same(glance.Ti, home.Ti)),
             ("on trial", glance.on_trial, False, not glance.on_trial),
             ("session", glance.session, 0, not glance.session),
             ("NMT states", glance.states, "operational", set(glance.states) == {NmtState.OPERATIONAL}),
         )
-        if not same
+        if not agrees
     ]
     if not wrong:
         wanted = {Mode.OFF: glance.safe_output, Mode.MANUAL: glance.manual_output}.get(home.mode)

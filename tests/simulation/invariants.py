@@ -26,6 +26,7 @@ from loopwright.protocol.profile import (
     ParameterCommand,
     channel_ids,
 )
+from loopwright.protocol.real32 import same
 from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.loop_state import LoopState
 from loopwright.service.store.jobs import Job
@@ -406,7 +407,7 @@ class Invariants:
         wrong = []
         if not any(each.mode == mode for each in window):
             wrong.append(f"mode {mode.name}")
-        if not any(_same(each.sp, restored["sp"]) for each in window):
+        if not any(same(each.sp, restored["sp"]) for each in window):
             wrong.append(f"SP {restored['sp']:g}")
         if not any(each.on_trial == restored["on_trial"] for each in window):
             wrong.append(f"on trial {restored['on_trial']}")
@@ -463,16 +464,12 @@ class Invariants:
             self._bad_samples = self.controller.device.sessions[0].channel.bad_samples
 
 
-def _same(a: float, b: float) -> bool:
-    return math.isclose(a, b, rel_tol=1e-6, abs_tol=1e-9)
-
-
 def _near(a: float, b: float) -> bool:
     return math.isclose(a, b, rel_tol=1e-5, abs_tol=1e-5)
 
 
 def _same_set(one: Parameters, other: Parameters) -> bool:
-    return all(_same(getattr(one, name), getattr(other, name)) for name in Parameters.__dataclass_fields__)
+    return all(same(getattr(one, name), getattr(other, name)) for name in Parameters.__dataclass_fields__)
 
 
 def real32(value: float) -> float:

@@ -12,11 +12,13 @@ import math
 
 import numpy as np
 from scipy.fft import next_fast_len
-from scipy.linalg import matrix_balance, toeplitz
+from scipy.linalg import toeplitz
 
+from loopwright.tuning.analysis.exponential import exponentials
 from loopwright.tuning.analysis.stability import open_loop
+from loopwright.tuning.analysis.state_space import StateSpace, canonical_form
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.models import Model, Reals, sign, time_constants
+from loopwright.tuning.models import Model, Reals, monic, sign, time_constants
 
 SMALL_BLOCK = 100
 """Number of states of a block up to which all blocks come from powers of one matrix instead of one convolution each."""
@@ -32,7 +34,8 @@ class ClosedLoop:
     def __init__(self, model: Model, gains: Gains, load: bool) -> None:
         g = gains
         open_loop(model, g)  # refuses what is no loop
-        A, B, C, D = _companion(model)
+        plant = _plant(model)
+        A, B, C, D = plant.a, plant.b, plant.c, plant.d
         n = len(B)
         filtered = g.Td > 0.0 and g.Tf > 0.0
         order = n + 3
@@ -67,7 +70,7 @@ class ClosedLoop:
     def immediate(self, steps: int, dt: float) -> Reals:
         """PV of a loop without dead time: one block of steps + 1 samples, shape (1, steps + 1). dt: s."""
         closed = self.c / (1.0 - self.d)
-        advance = _transition((self.a + np.outer(self.b, closed)) * dt)
+        (advance,) = exponentials((self.a + np.outer(self.b, closed))[None] * dt)
         start = np.zeros(len(self.b))
         start[-1] = 1.0
         return np.asarray(closed @ _powers(advance, start, steps + 1))[None, :]
@@ -82,7 +85,7 @@ class ClosedLoop:
         augmented[:order, :order] = self.a * dt
         augmented[:order, order] = self.b * dt
         augmented[order, order + 1] = 1.0
-        full = _transition(augmented)
+        (full,) = exponentials(augmented[None])
         a = full[:order, :order]
         b1 = full[:order, order + 1]
         b0 = full[:order, order] - b1
@@ -117,39 +120,15 @@ class ClosedLoop:
         return y
 
 
-def _companion(model: Model) -> tuple[Reals, Reals, Reals, float]:
-    """(A, B, C, D) of the model without dead time and with positive gain, balanced; time in s."""
-    den = np.asarray(model.den)
-    num = np.concatenate((np.zeros(len(den) - len(model.num)), model.num)) * sign(model) / den[0]
-    den = den / den[0]
+def _plant(model: Model) -> StateSpace:
+    """Returns the state space of the model without dead time and with positive gain, balanced in units of its mean lag;
+    time in s."""
+    num, den = monic(model)
     lags = time_constants(model)
     unit = float(np.exp(np.mean(np.log(lags)))) if len(lags) else 1.0
     scale = unit ** np.arange(len(den))
-    den, num = den * scale, num * scale
-    order = len(den) - 1
-    A = np.zeros((order, order))
-    A[0] = -den[1:]
-    A[1:, :-1] = np.eye(order - 1)
-    C = num[1:] - den[1:] * num[0]
-    balanced, (weights, _) = matrix_balance(A, permute=False, separate=True)
-    B = np.zeros(order)
-    B[0] = 1.0 / weights[0]
-    return np.asarray(balanced, dtype=float) / unit, B / unit, C * weights, float(num[0])
-
-
-def _transition(a: Reals) -> Reals:
-    """exp(a), by scaling, Taylor and squaring: scipy's takes milliseconds for matrices as small as these."""
-    size = float(np.max(np.sum(np.abs(a), axis=1)))
-    halvings = max(0, math.ceil(math.log2(size)) + 1) if size > 0.0 else 0
-    scaled = a / 2.0**halvings
-    one = np.eye(len(a))
-    found = one
-    # of a size up to 1/2, fifteen terms leave 1e-17
-    for k in range(15, 0, -1):
-        found = one + scaled @ found / k
-    for _ in range(halvings):
-        found = found @ found
-    return np.asarray(found)
+    scaled = canonical_form(num * sign(model) * scale, den * scale)
+    return StateSpace(scaled.a / unit, scaled.b / unit, scaled.c, scaled.d)
 
 
 def _powers(a: Reals, x: Reals, count: int) -> Reals:

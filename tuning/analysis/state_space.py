@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import matrix_balance
+from scipy.linalg import companion, matrix_balance
 
-from loopwright.tuning.models import Model, Reals, TransferFunction, integrators, sign, time_constants
+from loopwright.tuning.models import Model, Reals, TransferFunction, integrators, monic, sign, time_constants
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,32 +48,16 @@ def normalised(model: Model, time_unit: float) -> TransferFunction:
 
 
 def state_space(model: Model) -> StateSpace:
-    """The state space of the model without its dead time; balancing keeps very different lags well conditioned."""
-    den = np.asarray(model.den) / model.den[0]
-    order = len(den) - 1
-    num = np.concatenate((np.zeros(len(den) - len(model.num)), model.num)) / model.den[0]
-    a = np.zeros((order, order))
-    a[0] = -den[1:]
-    a[1:, :-1] = np.eye(order - 1)
-    balanced, (scale, _) = matrix_balance(a, permute=False, separate=True)
-    b = np.zeros(order)
+    """Returns the state space of the model without its dead time, see `canonical_form`."""
+    return canonical_form(*monic(model))
+
+
+def canonical_form(num: Reals, den: Reals) -> StateSpace:
+    """Returns the controller canonical form of num/den; balancing keeps very different lags well conditioned.
+
+    num, den: of the same length, highest power first; den begins with 1.
+    """
+    balanced, (scale, _) = matrix_balance(companion(den), permute=False, separate=True)
+    b = np.zeros(len(den) - 1)
     b[0] = 1.0 / scale[0]
     return StateSpace(np.asarray(balanced), b, (num[1:] - den[1:] * num[0]) * scale, float(num[0]))
-
-
-def exponentials(a: Reals) -> Reals:
-    """Matrix exponentials of many small matrices at once, (p, n, n): scaling, Taylor's series, squaring.
-
-    scipy's takes them one by one.
-    """
-    norm = float(np.abs(a).sum(axis=2).max(initial=0.0))
-    squarings = max(0, math.ceil(math.log2(max(norm, 1e-300))) + 1)
-    scaled = a * 0.5**squarings
-    # at a norm of a half the fourteenth term is below rounding
-    total = term = np.broadcast_to(np.eye(a.shape[1]), a.shape)
-    for k in range(1, 14):
-        term = term @ scaled / k
-        total = total + term
-    for _ in range(squarings):
-        total = total @ total
-    return total

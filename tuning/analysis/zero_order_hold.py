@@ -11,13 +11,13 @@ The states are then sums over one short recursion.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.tuning.analysis.exponential import exponentials
 from loopwright.tuning.analysis.recursion import recursive
 from loopwright.tuning.models import Reals
 
@@ -75,7 +75,7 @@ def pulses(monics: Reals, dead_times: Sequence[float] | Reals, count: int) -> Pu
     block[:, : order - 1, 1:order] = np.eye(order - 1)
     block[:, order - 1, :order] = -monics[:, ::-1]
     block[:, order - 1, order] = 1.0
-    both = _exponential(np.concatenate((block * (1.0 - part), block * part)))
+    both = exponentials(np.concatenate((block * (1.0 - part), block * part)))
     late, early = both[:many], both[many:]
     phi = late[:, :order, :order] @ early[:, :order, :order]
     g0 = late[:, :order, order:]
@@ -105,21 +105,3 @@ def _characteristic(phi: Reals) -> Reals:
         found[:, k] = -np.trace(product, axis1=1, axis2=2) / k
         carried = product + found[:, k, None, None] * one
     return found
-
-
-def _exponential(matrices: Reals) -> Reals:
-    """exp of each small matrix, shape (n, k, k): Taylor's series of the matrix halved often enough, squared back.
-
-    scipy's is no slower on an idle machine, but solves with threads, which on a busy one took 1.4 ms against 0.05 ms.
-    """
-    size = float(np.abs(matrices).sum(axis=2).max())
-    halvings = max(0, math.ceil(math.log2(4.0 * size))) if size > 0.0 else 0
-    small = matrices * 0.5**halvings
-    one = np.eye(matrices.shape[1])
-    # below a quarter the term of degree 13 is under 1e-17
-    found = one + small / 12.0
-    for k in range(11, 0, -1):
-        found = one + small @ found / k
-    for _ in range(halvings):
-        found = found @ found
-    return np.asarray(found)

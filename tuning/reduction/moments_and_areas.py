@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterable
 
 import numpy as np
-from scipy.linalg import expm
+from scipy.linalg import companion, expm
 
-from loopwright.tuning.models import FOPDT, Model, integrators
+from loopwright.tuning.models import FOPDT, Model, integrators, monic
 from loopwright.tuning.reasons import Reason, Refused
 
 
@@ -31,13 +31,11 @@ def two_areas(model: Model) -> FOPDT:
     """
     _require_self_regulating(model)
     mean, _ = _moments(model)
-    den = np.asarray(model.den) / model.den[0]
-    num = np.concatenate((np.zeros(len(den) - len(model.num)), model.num)) / model.den[0]
+    num, den = monic(model)
     order = len(den) - 1
     # states of the plant, its step, and the integral of its output
     a = np.zeros((order + 2, order + 2))
-    a[0, :order] = -den[1:]
-    a[1:order, : order - 1] = np.eye(order - 1)
+    a[:order, :order] = companion(den)
     a[0, order] = 1.0
     a[order + 1, :order] = num[1:] - den[1:] * num[0]
     a[order + 1, order] = num[0]

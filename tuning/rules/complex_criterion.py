@@ -24,8 +24,9 @@ from enum import StrEnum
 
 import numpy as np
 
+from loopwright.tuning.analysis.exponential import exponentials
 from loopwright.tuning.analysis.monodromy import DeadTimeLoop
-from loopwright.tuning.analysis.state_space import exponentials, gain_unit, normalised, state_space, time_sum
+from loopwright.tuning.analysis.state_space import gain_unit, normalised, state_space, time_sum
 from loopwright.tuning.models import Model, Reals, time_constants
 from loopwright.tuning.reasons import Reason, Refused
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.tuning.analysis.state_space import exponentials, gain_unit, normalised, state_space, time_sum
+from loopwright.tuning.analysis.exponential import exponentials
+from loopwright.tuning.analysis.state_space import gain_unit, normalised, state_space, time_sum
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 
 MODELS: list[Model] = [
