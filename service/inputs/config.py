@@ -1,6 +1,6 @@
-"""loops.yaml: which loops there are, where they live on the bus, and what a retune may do to them.
+"""The file loops.yaml: the loops, their addresses on the bus, and the limits of a retune.
 
-Everything wrong with a file is reported in one go: who edits it should not have to run it again for each mistake.
+All errors of a file are reported together, so that its author need not load it again for each mistake.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class LoopConfig(BaseModel):
 
 
 class BusConfig(BaseModel):
-    """A bus. at_once: how many of its loops may be tuned at the same time."""
+    """The settings of a bus. at_once: maximum number of its loops that are tuned at the same time."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -89,13 +89,13 @@ class BusConfig(BaseModel):
 
 @dataclass(frozen=True)
 class Site:
-    """What a file configures: the loops by tag, and the buses it says something about."""
+    """The content of a configuration file: the loops by tag, and the settings of the buses that it names."""
 
     loops: dict[str, LoopConfig]
     buses: dict[str, BusConfig]
 
     def check_own_node(self, node: int, source: str) -> None:
-        """Raises ConfigError where a device of the site has the node id that the service is to have."""
+        """Raises ConfigError when a device of the site has `node`, the node id of the service."""
         ours = [
             f"{loop.tag}: {name}_node is {node:#04x}, which is the service's own node id: start it with another --node"
             for loop in self.loops.values()
@@ -107,9 +107,9 @@ class Site:
 
 
 class _OnceEach(yaml.SafeLoader):
-    """A key given twice is one too many: of two limits the last would win without a word.
+    """A YAML loader that refuses a duplicate key, of which PyYAML would silently use the last value.
 
-    Looked for before keys are merged (`<<`): what a mapping says itself may be other than what it is merged from.
+    The loader looks for duplicates before keys are merged (`<<`), because a mapping may override merged keys.
     """
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
@@ -123,7 +123,7 @@ class _OnceEach(yaml.SafeLoader):
 
 
 def load_site(path: Path) -> Site:
-    """The site of a file. Raises ConfigError with everything that is wrong with it."""
+    """Reads the site from a file. Raises ConfigError with all errors of the file."""
     try:
         document = yaml.load(path.read_text(encoding="utf-8"), _OnceEach)
     except OSError as error:

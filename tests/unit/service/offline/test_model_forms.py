@@ -111,5 +111,5 @@ def test_what_a_fit_has_found_is_shown_also_where_nobody_could_type_it() -> None
     [{"K": 1, "T1_s": 1e300, "T2_s": 1e300, "L_s": 1}, {"K": 1, "T1_s": 1e-200, "T2_s": 1e-200, "L_s": 1}],
 )
 def test_times_whose_product_no_number_holds(data: dict[str, Any]) -> None:
-    with pytest.raises(BadModel, match=r"T1_s 1e.* s is no plant's; permitted are 1e-06 to 1e\+08 s"):
+    with pytest.raises(BadModel, match=r"T1_s 1e.* s is not plausible; permitted are 1e-06 to 1e\+08 s"):
         parse_model(data)
