@@ -1,4 +1,4 @@
-"""A computation that somebody waits for at the other end of a connection: it ends when that one goes away."""
+"""Computations for a client that waits for the answer; they are cancelled when the client disconnects."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ Work = Callable[[], dict[str, Any]]
 
 
 async def computed(pool: Pool, work: Work, http: Request, stopping: Callable[[], bool]) -> dict[str, Any]:
-    """The result of the work, in a process of its own. Raises what it raises, NotWanted when the client is gone, and
-    Stopping."""
+    """The result of the work, which runs in a process of the pool.
+
+    Raises what the work raises, NotWanted when the client has disconnected, Stopping when the service shuts down.
+    """
     gone = threading.Event()
     listening = asyncio.create_task(_until_gone(http, gone))
     try:

@@ -1,4 +1,4 @@
-"""The API on one page, from its own OpenAPI document: plain HTML, nothing loaded from elsewhere."""
+"""The page /docs: the OpenAPI document as plain HTML that loads nothing from other hosts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-a
 
 
 def page(document: dict[str, Any]) -> str:
-    """HTML of every operation: what it is for, its parameters and body, its answers."""
+    """The HTML page of an OpenAPI document: the summary, parameters, body and responses of every operation."""
     info = document["info"]
     schemas = document["components"].get("schemas", {})
     parts = [
@@ -56,8 +56,8 @@ def _operation(path: str, method: str, operation: dict[str, Any], schemas: dict[
 
 
 def _body(names: list[str], schemas: dict[str, Any]) -> list[tuple[str, str, bool]]:
-    """The fields of the schemas that a body may have: name, description, whether it is required. A field that not all
-    of the schemas have is followed by the names of those that do."""
+    """The fields of a body with any of these schemas: name, description, whether the field is required. A field that
+    only some of the schemas have is followed by their names."""
     having: dict[str, list[str]] = {}
     for name in names:
         for field in schemas[name].get("properties", {}):
@@ -71,7 +71,7 @@ def _body(names: list[str], schemas: dict[str, Any]) -> list[tuple[str, str, boo
 
 
 def _names(schema: dict[str, Any]) -> list[str]:
-    """The schemas referred to, where the schema may also be null or is one of several."""
+    """The names of the component schemas that a schema refers to, directly or in a union."""
     choices = (schema, *schema.get("anyOf", ()), *schema.get("oneOf", ()))
     direct = [str(choice["$ref"]).rpartition("/")[2] for choice in choices if "$ref" in choice]
     return direct + [name for choice in choices[1:] if "$ref" not in choice for name in _names(choice)]

@@ -1,4 +1,4 @@
-"""Many loops: the list of them, each one's history, and retunes of many."""
+"""Routes for the list of loops, the lists of jobs, and retunes of many loops."""
 
 from __future__ import annotations
 
@@ -28,13 +28,15 @@ LoopFilter = Literal["busy", "idle"] | JobState
 
 
 class RetuneLoopView(BaseModel):
-    """A loop of the retune."""
+    """A loop in a retune of many loops."""
 
     loop: str = Field(examples=["TIC-101"])
-    state: str = Field(description="waiting; skipped: never begun; else the state of its job", examples=["proposed"])
-    job: str | None = Field(description="URL of its job", examples=["/jobs/4f0c2a9be113"])
+    state: str = Field(
+        description="waiting, skipped (the loop was never begun), or the state of its job", examples=["proposed"]
+    )
+    job: str | None = Field(description="URL of the loop's job; null: there is no job", examples=["/jobs/4f0c2a9be113"])
     reason: str | None = Field(description="Why there is no proposal, from the closed list", examples=["not_at_rest"])
-    detail: str | None = Field(description="The reason's numbers, or why there is no job")
+    detail: str | None = Field(description="The numbers behind the reason, or why there is no job")
 
 
 class RetuneSummary(BaseModel):
@@ -43,21 +45,21 @@ class RetuneSummary(BaseModel):
     id: str = Field(examples=["9d1b7c02aa45"])
     url: str = Field(examples=["/retunes/9d1b7c02aa45"])
     state: RetuneState = Field(
-        description="running; stopping: begins no more, some still run; done: every loop had its turn; "
-        "stopped: after failures or with the service; aborted: by somebody",
+        description="running; stopping: no more loops are begun, some jobs still run; done: every loop was begun or "
+        "skipped; stopped: by failures or with the service; aborted: by an operator",
         examples=["running"],
     )
-    host: str = Field(description="The service that drives it", examples=["local"])
+    host: str = Field(description="Name of the service that runs the retune", examples=["local"])
     requested_by: str = Field(examples=["night shift"])
     created_at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
     ended_at: str | None = Field(description="UTC, ISO 8601, wall time")
     request: dict[str, Any] = Field(description="The options asked for")
     counts: dict[str, int] = Field(description="Number of loops by state", examples=[{"waiting": 12, "running": 4}])
     failures: int = Field(
-        description="Loops that ended without a proposal; aborted ones and no_gain not counted", examples=[1]
+        description="Number of loops that ended without a proposal; aborted and no_gain are not counted", examples=[1]
     )
     stop_reason: StopReason | None = Field(description="Why no more loops are begun", examples=["failures"])
-    detail: str | None = Field(description="The same in words")
+    detail: str | None = Field(description="The stop reason in words")
 
 
 class RetuneView(RetuneSummary):
@@ -65,24 +67,24 @@ class RetuneView(RetuneSummary):
 
 
 def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Job]], list[JobView]]) -> None:
-    """Adds the routes. views: jobs as the API shows them."""
+    """Adds the routes. views: makes the API's view of each job."""
     router = APIRouter(route_class=JsonRoute)
 
     @router.get(
         "/loops",
         tags=["loops"],
-        summary="The configured loops of every host, by tag",
+        summary="The configured loops of every host, sorted by tag",
         responses={**LINK, **problems.responses(422)},
     )
     def loops(
         response: Response,
         state: Annotated[
             LoopFilter | None,
-            Query(description="Only busy ones (a job has them), idle ones, or by the state of their latest job"),
+            Query(description="Only busy loops (used by a job), idle loops, or loops whose latest job has this state"),
         ] = None,
         limit: Limit = 1000,
         cursor: Annotated[
-            str | None, Query(max_length=64, description="From the URL of the next page, as it came")
+            str | None, Query(max_length=64, description="Cursor from the URL of the next page, unchanged")
         ] = None,
     ) -> list[LoopView]:
         busy, last, locks = jobs.store.busy(), jobs.store.last_states(), jobs.locking.locks()
@@ -102,7 +104,7 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Jo
     @router.get(
         "/loops/{tag}/jobs",
         tags=["loops"],
-        summary="The jobs of a loop, the latest first",
+        summary="The jobs of a loop, latest first",
         responses={**LINK, **problems.responses(404, 422)},
     )
     def history(tag: Tag, response: Response, limit: Limit = 50, cursor: Cursor = None) -> list[JobView]:
@@ -112,11 +114,16 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Jo
             more(response, f"/loops/{tag}/jobs", rows[limit - 1].number, limit=limit)
         return views(rows[:limit])
 
-    @router.get("/jobs", tags=["jobs"], summary="The latest jobs first", responses={**LINK, **problems.responses(422)})
+    @router.get(
+        "/jobs",
+        tags=["jobs"],
+        summary="The jobs of every loop, latest first",
+        responses={**LINK, **problems.responses(422)},
+    )
     def job_list(
         response: Response,
-        loop: Annotated[str | None, Query(description="Only of this loop", examples=["TIC-101"])] = None,
-        state: Annotated[JobState | None, Query(description="Only in this state")] = None,
+        loop: Annotated[str | None, Query(description="Only jobs of this loop", examples=["TIC-101"])] = None,
+        state: Annotated[JobState | None, Query(description="Only jobs in this state")] = None,
         limit: Limit = 50,
         cursor: Cursor = None,
     ) -> list[JobView]:
@@ -140,7 +147,7 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Jo
     @router.get(
         "/retunes",
         tags=["retunes"],
-        summary="The latest retunes of many loops first",
+        summary="The retunes of many loops, latest first",
         responses={**LINK, **problems.responses(422)},
     )
     def retunes_list(response: Response, limit: Limit = 20, cursor: Cursor = None) -> list[RetuneSummary]:
@@ -152,7 +159,7 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Jo
     @router.get(
         "/retunes/{retune_id}",
         tags=["retunes"],
-        summary="How far a retune of many loops is",
+        summary="A retune of many loops and its progress",
         responses=problems.responses(404),
     )
     def retunes_one(retune_id: RetuneId) -> RetuneView:
@@ -161,7 +168,7 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Jo
     @router.post(
         "/retunes/{retune_id}/abort",
         tags=["retunes"],
-        summary="Begin no more loops, and stop the jobs that run; their loops are restored",
+        summary="Stop a retune of many loops: no more loops are begun, running jobs stop, and their loops are restored",
         status_code=202,
         responses=problems.responses(404, 409, 422),
     )

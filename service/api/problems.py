@@ -1,4 +1,4 @@
-"""Every error of the API as application/problem+json (RFC 9457), with the reason and advice where there are some."""
+"""Errors of the API as application/problem+json (RFC 9457), with reason and advice if there are any."""
 
 from __future__ import annotations
 
@@ -28,20 +28,22 @@ from loopwright.tuning.reasons import ADVICE, Ended, Reason
 
 MEDIA_TYPE = "application/problem+json"
 CLIENT_GONE = 499
-"""As other servers log it: nobody is there to read the answer."""
+"""The status that nginx logs when the client has disconnected; nobody reads the answer."""
 
 
 class Problem(BaseModel):
     """RFC 9457 problem details."""
 
     type: str = Field(description="Kind of problem", examples=["about:blank"])
-    title: str = Field(description="The same for every problem of this kind", examples=["Conflict"])
+    title: str = Field(description="Title of the HTTP status", examples=["Conflict"])
     status: int = Field(description="HTTP status", examples=[409])
-    detail: str = Field(description="What happened this time", examples=["loop TIC-101 is busy with job 4f0c2a9be113"])
-    reason: str | None = Field(default=None, description="From the closed list of reasons", examples=["node_lost"])
-    advice: str | None = Field(default=None, description="What to do about it")
+    detail: str = Field(
+        description="Explanation of this occurrence", examples=["loop TIC-101 is busy with job 4f0c2a9be113"]
+    )
+    reason: str | None = Field(default=None, description="Reason code from the closed list", examples=["node_lost"])
+    advice: str | None = Field(default=None, description="What the client or the operator should do")
     job: str | None = Field(default=None, description="URL of the active job", examples=["/jobs/4f0c2a9be113"])
-    errors: list[dict[str, Any]] | None = Field(default=None, description="Each invalid value: where and why")
+    errors: list[dict[str, Any]] | None = Field(default=None, description="The invalid values of the request")
 
 
 def problem(
@@ -74,11 +76,11 @@ def still_answering(error: StillAnswering) -> JSONResponse:
 
 
 def install(app: FastAPI) -> None:
-    """Every exception that a route may let through becomes a problem."""
+    """Adds handlers that turn every exception of a route into a problem."""
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(_request: Request, error: RequestValidationError) -> JSONResponse:
-        # The input itself is left out: it may be NaN, which JSON cannot say.
+        # The input itself is left out, because it may be NaN, which JSON cannot represent.
         errors = [{"where": place(e["loc"]), "why": words(e["msg"])} for e in error.errors()]
         detail = "; ".join(f"{e['where']}: {e['why']}" for e in errors)
         return problem(422, detail, reason=Reason.BAD_INPUT, errors=errors)
@@ -135,7 +137,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(DataError)
     async def _unkeepable(_request: Request, error: DataError) -> JSONResponse:
-        detail = f"a name or number in the request is none that the database can look for: {error.orig}"
+        detail = f"the database cannot look for a name or number in the request: {error.orig}"
         return problem(422, detail, reason=Reason.BAD_INPUT)
 
     @app.exception_handler(SQLAlchemyError)
@@ -153,7 +155,7 @@ def install(app: FastAPI) -> None:
 
 
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """What a route documents besides its success."""
+    """The documented error responses of a route with these statuses."""
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
         status: {"model": Problem, "content": content, "description": HTTPStatus(status).phrase} for status in statuses
@@ -161,6 +163,6 @@ def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
 
 
 def documented(*statuses: int) -> dict[int, dict[str, Any]]:
-    """The same for a document that is made already."""
+    """The same responses for an OpenAPI document that FastAPI has already generated."""
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {status: {"content": content, "description": HTTPStatus(status).phrase} for status in statuses}
