@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -112,7 +112,7 @@ class _OnceEach(yaml.SafeLoader):
     The loader looks for duplicates before keys are merged (`<<`), because a mapping may override merged keys.
     """
 
-    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+    def compose_mapping_node(self, anchor: dict[object, yaml.Node]) -> yaml.MappingNode:
         node: yaml.MappingNode = super().compose_mapping_node(anchor)
         seen: set[str] = set()
         for name in (name for name, _ in node.value if isinstance(name, yaml.ScalarNode)):
@@ -135,10 +135,9 @@ def load_site(path: Path) -> Site:
     return parse_site(document, str(path))
 
 
-def parse_site(document: Any, source: str) -> Site:
+def parse_site(document: object, source: str) -> Site:
     """The site of a parsed document `{"loops": [...], "buses": {BUS: {"at_once": ...}}}`."""
-    entries = document.get("loops") if isinstance(document, dict) else None
-    if not isinstance(entries, list) or not entries:
+    if not isinstance(document, dict) or not isinstance(entries := document.get("loops"), list) or not entries:
         raise ConfigError(source, ["expected a list of loops under the key 'loops'"])
     problems = [f"{key}: unknown key" for key in document if key not in ("loops", "buses")]
     loops: list[LoopConfig] = []
@@ -157,7 +156,7 @@ def parse_site(document: Any, source: str) -> Site:
     return Site({loop.tag: loop for loop in loops}, buses)
 
 
-def _buses(entries: Any, known: set[str], problems: list[str]) -> dict[str, BusConfig]:
+def _buses(entries: object, known: set[str], problems: list[str]) -> dict[str, BusConfig]:
     if not isinstance(entries, dict):
         problems.append("buses: expected a mapping from the name of a bus to its settings")
         return {}
@@ -172,12 +171,12 @@ def _buses(entries: Any, known: set[str], problems: list[str]) -> dict[str, BusC
     return found
 
 
-def _tag(entry: Any) -> str | None:
+def _tag(entry: object) -> str | None:
     tag = entry.get("tag") if isinstance(entry, dict) else None
     return tag if isinstance(tag, str) else None
 
 
-def _line(number: int, entry: Any, where: tuple[int | str, ...], message: str) -> str:
+def _line(number: int, entry: object, where: tuple[int | str, ...], message: str) -> str:
     name = ".".join([f"loops[{number}]", *map(str, where)])
     tag = _tag(entry)
     return f"{name}{f' ({tag})' if tag else ''}: {message.removeprefix('Value error, ')}"

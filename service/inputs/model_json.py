@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import (
     BaseModel,
@@ -19,6 +19,7 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    JsonValue,
     TypeAdapter,
     ValidationError,
     ValidationInfo,
@@ -133,7 +134,7 @@ class _Form(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _quantities(cls, data: Any) -> Any:
+    def _quantities(cls, data: object) -> object:
         if isinstance(data, cls):
             return data
         if not isinstance(data, Mapping):
@@ -247,7 +248,7 @@ def accepted() -> str:
     return "accepted are " + ", ".join(form.quantities() for form in _FORMS)
 
 
-def _form_of(data: Any) -> type[Form]:
+def _form_of(data: object) -> type[Form]:
     """The form that the quantities of the object belong to."""
     if isinstance(data, _FORMS):
         return type(data)
@@ -283,12 +284,12 @@ def parse_model(data: object) -> Model:
         raise BadModel(lines(error)) from None
 
 
-def form_shown(data: Any) -> Any:
+def form_shown(data: object) -> object:
     """The form of a dumped model without validation, because an identified model may be outside the limits of input."""
     return _form_of(data).model_construct(**data) if isinstance(data, Mapping) else data
 
 
-def dump_model(model: Model) -> dict[str, Any]:
+def dump_model(model: Model) -> dict[str, JsonValue]:
     """The JSON object from which `parse_model` makes the same model. A second-order model has T_s and zeta."""
     match model:
         case FOPDT(K, T, L):
@@ -301,10 +302,11 @@ def dump_model(model: Model) -> dict[str, Any]:
             return {"num": list(num), "den": list(den), "dead_time_s": L}
 
 
-def describe(data: Mapping[str, Any]) -> str:
+def describe(data: Mapping[str, object]) -> str:
     """A dumped model as a line of text; a second-order model with real poles is shown by its two lags."""
-    if "zeta" in data and data["zeta"] >= 1.0:
-        model = SOPDT(data["K"], data["T_s"], data["zeta"], data["L_s"])
+    form = form_shown(data)
+    if isinstance(form, SecondOrderModel) and form.zeta >= 1.0:
+        model = SOPDT(form.K, form.T_s, form.zeta, form.L_s)
         data = {"K": model.K, "T1_s": model.T1, "T2_s": model.T2, "L_s": model.L}
     parts = []
     for name, value in data.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import (
     BaseModel,
@@ -11,6 +11,7 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    JsonValue,
     PrivateAttr,
     TypeAdapter,
     model_validator,
@@ -116,12 +117,12 @@ class _Retune(Bounds):
         examples=["night shift"],
     )
 
-    def asked(self) -> dict[str, Any]:
+    def asked(self) -> dict[str, JsonValue]:
         """The given options as a JSON object."""
         return self.model_dump(mode="json", exclude_none=True)
 
     @classmethod
-    def _foreign(cls, data: Mapping[str, Any]) -> list[str]:
+    def _foreign(cls, data: Mapping[str, object]) -> list[str]:
         """The names in `data` that only another method knows."""
         return [name for name in cls._of_another() if name in data]
 
@@ -135,7 +136,7 @@ class _Retune(Bounds):
 
     @model_validator(mode="before")
     @classmethod
-    def _own_options(cls, data: Any) -> Any:
+    def _own_options(cls, data: object) -> object:
         """Refuses an option of another method, which would otherwise be ignored."""
         if not isinstance(data, Mapping):
             return data
@@ -192,7 +193,7 @@ class FastRetune(_Retune):
         return [name for name in FiveStages.model_fields if name not in cls.model_fields]
 
     @classmethod
-    def _foreign(cls, data: Mapping[str, Any]) -> list[str]:
+    def _foreign(cls, data: Mapping[str, object]) -> list[str]:
         return [
             *super()._foreign(data),
             *["baseline"] * (data.get("baseline") is True),
@@ -290,7 +291,7 @@ class FiveStages(_Retune):
         return [name for name in FastRetune.model_fields if name not in cls.model_fields]
 
     @classmethod
-    def _foreign(cls, data: Mapping[str, Any]) -> list[str]:
+    def _foreign(cls, data: Mapping[str, object]) -> list[str]:
         return [*super()._foreign(data), *["start"] * (data.get("start") == "design")]
 
     @classmethod
@@ -351,7 +352,7 @@ class RuleRetune(FiveStages):
 def by_method(fast: type, five_stage: type, rule: type) -> Discriminator:
     """The discriminator of a union by method. The branch of the rules refuses an unknown method."""
 
-    def kind(data: Any) -> str:
+    def kind(data: object) -> str:
         method = data.get("method", FAST) if isinstance(data, Mapping) else getattr(data, "method", FAST)
         return branch_of(fast if method == FAST else five_stage if method == PROCEDURE else rule)
 
@@ -369,7 +370,7 @@ RetuneRequest = Annotated[
 _ADAPTER: TypeAdapter[AnyRetune] = TypeAdapter(RetuneRequest)
 
 
-def retune_request(**options: Any) -> AnyRetune:
+def retune_request(**options: object) -> AnyRetune:
     """The request with these options, named as in its JSON object. Raises pydantic.ValidationError."""
     return _ADAPTER.validate_python(options)
 

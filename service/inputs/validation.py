@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from pydantic import Tag, ValidationError
+from pydantic_core import ErrorDetails
 
 _BRANCH = "="
 """Prefix of the tag of a union's branch. The tag is part of an error's path, although the sender did not write it."""
@@ -30,7 +30,7 @@ def words(message: str) -> str:
     return message.removeprefix("Value error, ")
 
 
-def line(error: Any) -> str:
+def line(error: ErrorDetails) -> str:
     """One of `ValidationError.errors()` as text: path and message, or the message alone if it begins with the path."""
     where, told = place(error["loc"]), words(error["msg"])
     return told if told.startswith(where) else f"{where}: {told}"
