@@ -118,7 +118,7 @@ def create_app(
         of_it = jobs.store.busy().get(tag), jobs.store.last_states(tag).get(tag), jobs.locking.locks().get(tag)
         shown = loop_view(config, host, *of_it)
         return LoopDetail(
-            **shown,
+            **dict(shown),
             live=live_view(state) if state else None,
             not_confirmed_home=NotHomeView.of(not_home) if not_home else None,
         )

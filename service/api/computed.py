@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 from fastapi import Request
 
@@ -13,10 +13,10 @@ from loopwright.service.errors import Stopping
 from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.computing.pool import NotWanted, Pool
 
-Work = Callable[[], dict[str, Any]]
+T = TypeVar("T")
 
 
-async def computed(pool: Pool, work: Work, http: Request, stopping: Callable[[], bool]) -> dict[str, Any]:
+async def computed(pool: Pool, work: Callable[[], T], http: Request, stopping: Callable[[], bool]) -> T:
     """The result of the work, which runs in a process of the pool.
 
     Raises what the work raises, NotWanted when the client has disconnected, Stopping when the service shuts down.
@@ -25,7 +25,7 @@ async def computed(pool: Pool, work: Work, http: Request, stopping: Callable[[],
     listening = asyncio.create_task(_until_gone(http, gone))
     try:
         future = pool.submit(ComputationKind.TUNING, work, lambda: gone.is_set() or stopping())
-        found: dict[str, Any] = await asyncio.wrap_future(future)
+        found: T = await asyncio.wrap_future(future)
     except NotWanted:
         if gone.is_set():
             raise

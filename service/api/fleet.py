@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from typing import Annotated, Any, Literal
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Body, FastAPI, Path, Query, Request, Response
 from fastapi.responses import JSONResponse
@@ -35,7 +35,9 @@ class RetuneLoopView(BaseModel):
         description="waiting, skipped (the loop was never begun), or the state of its job", examples=["proposed"]
     )
     job: str | None = Field(description="URL of the loop's job; null: there is no job", examples=["/jobs/4f0c2a9be113"])
-    reason: str | None = Field(description="Why there is no proposal, from the closed list", examples=["not_at_rest"])
+    reason: Reason | None = Field(
+        description="Why there is no proposal; reason code from the closed list", examples=["not_at_rest"]
+    )
     detail: str | None = Field(description="The numbers behind the reason, or why there is no job")
 
 
@@ -53,7 +55,7 @@ class RetuneSummary(BaseModel):
     requested_by: str = Field(examples=["night shift"])
     created_at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
     ended_at: str | None = Field(description="UTC, ISO 8601, wall time")
-    request: dict[str, Any] = Field(description="The options asked for")
+    request: Mapping[str, object] = Field(description="The options of the request")
     counts: dict[str, int] = Field(description="Number of loops by state", examples=[{"waiting": 12, "running": 4}])
     failures: int = Field(
         description="Number of loops that ended without a proposal; aborted and no_gain are not counted", examples=[1]
@@ -98,7 +100,7 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Jo
                 more(response, "/loops", found[-1].tag, state=state, limit=limit)
                 break
             of_it = busy.get(config.tag), last.get(config.tag), locks.get(config.tag)
-            found.append(LoopView(**loop_view(config, host, *of_it)))
+            found.append(loop_view(config, host, *of_it))
         return found
 
     @router.get(
@@ -154,7 +156,7 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Jo
         found = fleet.recent(limit + 1, cursor)
         if len(found) > limit:
             more(response, "/retunes", found[limit - 1][0].number, limit=limit)
-        return [RetuneSummary(**_summary(row, parts)) for row, parts in found[:limit]]
+        return [_summary(row, parts) for row, parts in found[:limit]]
 
     @router.get(
         "/retunes/{retune_id}",
@@ -199,22 +201,22 @@ def _is(wanted: LoopFilter | None, busy: bool, last: str | None) -> bool:
     return wanted == last
 
 
-def _summary(row: RetuneRow, parts: list[Part]) -> dict[str, Any]:
+def _summary(row: RetuneRow, parts: list[Part]) -> RetuneSummary:
     may_begin = row.stop_reason is None
-    return {
-        "id": row.id,
-        "url": f"/retunes/{row.id}",
-        "state": row.state,
-        "host": row.host,
-        "requested_by": row.requested_by,
-        "created_at": row.created_at,
-        "ended_at": row.ended_at,
-        "request": row.request,
-        "counts": dict(Counter(part.state(may_begin) for part in parts)),
-        "failures": sum(part.failed for part in parts),
-        "stop_reason": row.stop_reason,
-        "detail": row.detail,
-    }
+    return RetuneSummary(
+        id=row.id,
+        url=f"/retunes/{row.id}",
+        state=RetuneState(row.state),
+        host=row.host,
+        requested_by=row.requested_by,
+        created_at=row.created_at,
+        ended_at=row.ended_at,
+        request=row.request,
+        counts=dict(Counter(part.state(may_begin) for part in parts)),
+        failures=sum(part.failed for part in parts),
+        stop_reason=None if row.stop_reason is None else StopReason(row.stop_reason),
+        detail=row.detail,
+    )
 
 
 def _view(row: RetuneRow, parts: list[Part]) -> RetuneView:
@@ -224,9 +226,9 @@ def _view(row: RetuneRow, parts: list[Part]) -> RetuneView:
             loop=part.loop,
             state=part.state(may_begin),
             job=None if part.job_id is None else f"/jobs/{part.job_id}",
-            reason=part.reason,
+            reason=None if part.reason is None else Reason(part.reason),
             detail=part.detail,
         )
         for part in parts
     ]
-    return RetuneView(**_summary(row, parts), loops=loops)
+    return RetuneView(**dict(_summary(row, parts)), loops=loops)

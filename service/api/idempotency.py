@@ -19,10 +19,10 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.datastructures import Headers
 from starlette.responses import Response
 from starlette.routing import compile_path
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from loopwright.service.api import problems
 from loopwright.service.api.gate.bodies import begins_with
-from loopwright.service.api.gate.gate import App, AsgiScope, Message, Receive, Send
 from loopwright.service.security.principal import LOCAL
 from loopwright.service.security.principal import current as principal
 from loopwright.service.store import claims
@@ -44,12 +44,12 @@ _WORDS = f"letters, digits and . _ ~ : + / = -, 1 to {MAX_CHARACTERS} of them, w
 class Idempotent:
     """Wraps the application. The gate runs before this middleware."""
 
-    def __init__(self, app: App, keys: IdempotencyKeys) -> None:
+    def __init__(self, app: ASGIApp, keys: IdempotencyKeys) -> None:
         self._app = app
         self._keys = keys
         self._threads = anyio.CapacityLimiter(_AT_ONCE)
 
-    async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         given = Headers(scope=scope).getlist(HEADER) if scope["type"] == "http" and scope["method"] == "POST" else []
         if not given:
             await self._app(scope, receive, send)
@@ -61,7 +61,7 @@ class Idempotent:
         if body is not None:
             await self._once(given[0].strip('"'), body, scope, receive, send)
 
-    async def _once(self, key: str, body: bytes, scope: AsgiScope, receive: Receive, send: Send) -> None:
+    async def _once(self, key: str, body: bytes, scope: Scope, receive: Receive, send: Send) -> None:
         who = principal.get().key_id or LOCAL
         try:
             claim = await self._beside(lambda: self._keys.claim(who, key, _fingerprint(scope, body)))
@@ -79,7 +79,7 @@ class Idempotent:
             answer = claim if isinstance(claim, Answer) else await self._answer(claim, body, scope, receive)
             await _response(answer)(scope, receive, send)
 
-    async def _answer(self, claim: Claim, body: bytes, scope: AsgiScope, receive: Receive) -> Answer:
+    async def _answer(self, claim: Claim, body: bytes, scope: Scope, receive: Receive) -> Answer:
         """The answer of the application, which is stored if it is final."""
         answer: Answer | None = None
         try:
@@ -107,7 +107,7 @@ class Idempotent:
         except SQLAlchemyError as error:  # the effect of the request is stored with the claim
             log.warning("the answer to %s %s could not be kept: %s", HEADER, claim.key, error)
 
-    async def _after_the_cut(self, effect: str, scope: AsgiScope) -> Answer:
+    async def _after_the_cut(self, effect: str, scope: Scope) -> Answer:
         """The answer to a request that a killed service left unanswered: the resource that it created or changed."""
         get = {**scope, "method": "GET", "path": effect, "raw_path": effect.encode(), "query_string": b""}
         found = await _ask(self._app, get, begins_with(b"", _gone))
@@ -122,14 +122,14 @@ class Idempotent:
         return await run_sync(work, limiter=self._threads)
 
 
-def _fingerprint(scope: AsgiScope, body: bytes) -> str:
+def _fingerprint(scope: Scope, body: bytes) -> str:
     """The hash of path, query and body, which must be the same in a repetition."""
     found = hashlib.sha256(f"{scope['path']}\0".encode())
     found.update(scope.get("query_string", b"") + b"\0" + body)
     return found.hexdigest()
 
 
-def _status(scope: AsgiScope) -> int:
+def _status(scope: Scope) -> int:
     """The status of success that the OpenAPI document gives for the operation."""
     for path, item in scope["app"].openapi()["paths"].items():
         if "post" in item and compile_path(path)[0].match(scope["path"]):
@@ -154,7 +154,7 @@ async def _gone() -> Message:
     return {"type": "http.disconnect"}
 
 
-async def _ask(app: App, scope: AsgiScope, receive: Receive) -> Answer:
+async def _ask(app: ASGIApp, scope: Scope, receive: Receive) -> Answer:
     """The whole answer of the application; no POST answers with a stream."""
     status, headers, parts = 500, {}, []
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, Field
 
@@ -26,7 +26,7 @@ from loopwright.service.results import (
     empty_result,
 )
 from loopwright.tuning.five_stage.procedure import PROCEDURE
-from loopwright.tuning.reasons import ADVICE
+from loopwright.tuning.reasons import ADVICE, Reason
 
 if TYPE_CHECKING:  # the command line reads views, and has no store
     from loopwright.service.jobs.active_job import Running
@@ -97,14 +97,13 @@ class NotHomeView(BaseModel):
     confirmed, or until `POST /loops/TAG/dismiss`."""
 
     job: str = Field(description="URL of the job", examples=["/jobs/4f0c2a9be113"])
-    reason: str | None = Field(description="Reason code from the closed list", examples=["node_not_operational"])
+    reason: Reason | None = Field(description="Reason code from the closed list", examples=["node_not_operational"])
     detail: str = Field(description="Result of the latest check")
     advice: str = Field(description="The detail, and what the operator should do")
 
     @classmethod
     def of(cls, found: NotHome) -> NotHomeView:
-        reason = None if found.reason is None else found.reason.value
-        return cls(job=f"/jobs/{found.job_id}", reason=reason, detail=found.detail, advice=found.words)
+        return cls(job=f"/jobs/{found.job_id}", reason=found.reason, detail=found.detail, advice=found.words)
 
 
 class LoopDetail(LoopView):
@@ -127,7 +126,7 @@ class DismissedView(BaseModel):
 class StageView(BaseModel):
     stage: str = Field(examples=["relay"])
     state: str = Field(description="running, done or ended", examples=["done"])
-    result: dict[str, Any] | None = Field(description="Result of the stage; times in s, gains in ISA form")
+    result: Mapping[str, object] | None = Field(description="Result of the stage; times in s, gains in ISA form")
     plant_time_s: float | None = Field(description="Plant time the stage took, s", examples=[120.5])
 
 
@@ -147,7 +146,7 @@ class JobView(BaseModel):
     attempts: int = Field(
         description="Number of starts of the job; more than 1 after a crash of the service", examples=[1]
     )
-    request: dict[str, Any] = Field(description="The options of the request")
+    request: Mapping[str, object] = Field(description="The options of the request")
     requested_by: str = Field(examples=["night shift"])
     created_at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
     started_at: str | None = Field(description="UTC, ISO 8601, wall time")
@@ -184,12 +183,12 @@ class JobView(BaseModel):
     before: StepView | None = Field(description="Measured set-point step with the old gains; only for five-stage")
     after: StepView | None = Field(description="Measured set-point step with the new gains, from rest")
     notes: list[str]
-    reason: str | None = Field(
+    reason: Reason | None = Field(
         description="Why there is no proposal; reason code from the closed list", examples=["not_at_rest"]
     )
     detail: str | None = Field(description="The numbers behind the reason")
     advice: str | None = Field(description="What the operator should do about the reason")
-    restored: dict[str, Any] | None = Field(description="State of the loop as read back at the end")
+    restored: Mapping[str, object] | None = Field(description="State of the loop as read back at the end")
 
 
 class SamplesView(BaseModel):
@@ -212,15 +211,16 @@ class Decision(BaseModel):
 
 def loop_view(
     config: LoopConfig, host: str, active: str | None, last: str | None, lock: LoopLockRow | None
-) -> dict[str, Any]:
+) -> LoopView:
     """active: the id of the job that is using the loop.  last: the state of the latest job of the loop."""
     fields = config.model_dump(exclude={"noise_std_hint"})
-    return fields | {
-        "host": host,
-        "active_job": None if active is None else f"/jobs/{active}",
-        "last_job_state": last,
-        "locked": None if lock is None else LockView.of(lock),
-    }
+    return LoopView(
+        **fields,
+        host=host,
+        active_job=None if active is None else f"/jobs/{active}",
+        last_job_state=None if last is None else JobState(last),
+        locked=None if lock is None else LockView.of(lock),
+    )
 
 
 def live_view(state: LoopState) -> LiveView:
@@ -268,7 +268,7 @@ def job_view(row: Job, events: Sequence[JobEvent], running: Running | None) -> J
         chosen=result.chosen,
         ultimate=result.ultimate,
         model=result.model,
-        old_gains=_stored_gains(row.old_gains) or result.old_gains,
+        old_gains=GainsView.of(gains_of(row.old_gains)) if row.old_gains else result.old_gains,
         new_gains=result.new_gains,
         comparison=result.comparison,
         rehearsed_on=result.rehearsed_on,
@@ -333,19 +333,15 @@ def _verification(result: FastResult | FiveStageResult, events: Sequence[JobEven
     return None if told is None else VerificationView.of_stage(told)
 
 
-def _told(events: Sequence[JobEvent], stages: Sequence[str], field: str) -> dict[str, Any] | None:
+def _told(events: Sequence[JobEvent], stages: Sequence[str], field: str) -> Mapping[str, object] | None:
     """The last result of the first of these stages that has one. Only results with the field `field` count."""
     for stage in stages:
         for event in reversed(events):
             data = event.data.get("result")
             if event.kind == "stage_done" and event.data.get("stage") == stage and data and field in data:
-                found: dict[str, Any] = data
+                found: Mapping[str, object] = data
                 return found
     return None
-
-
-def _stored_gains(data: dict[str, Any] | None) -> GainsView | None:
-    return GainsView.of(gains_of(data)) if data else None
 
 
 def _finite(value: float) -> float | None:

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache
-from typing import Annotated, Any
+from typing import Annotated
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, FastAPI, Query, Response
@@ -79,8 +79,8 @@ class AuditView(BaseModel):
         examples=["4f0c2a9be113"],
     )
     loop: str | None = Field(examples=["TIC-101"])
-    before: dict[str, Any] | None = Field(description="State and gains before the change; null: there were none")
-    after: dict[str, Any] | None = Field(description="State and gains after the change; for a retune the request")
+    before: Mapping[str, object] | None = Field(description="State and gains before the change; null: there were none")
+    after: Mapping[str, object] | None = Field(description="State and gains after the change; for a retune the request")
 
 
 class AuditPage(BaseModel):

@@ -3,10 +3,12 @@ there is one (RFC 8288, rel="next")."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 from urllib.parse import urlencode
 
 from fastapi import Query, Response
+
+from loopwright.service.api.problems import Responses
 
 LARGEST = 2**53
 """Maximum of an integer in a query or a header: JSON numbers are exact up to it, and every database can store it."""
@@ -14,7 +16,7 @@ Limit = Annotated[int, Query(ge=1, le=1000, description="Maximum number of entri
 Cursor = Annotated[
     int | None, Query(ge=1, le=LARGEST, description="Cursor from the URL of the next page, unchanged", examples=[17])
 ]
-LINK: dict[int | str, dict[str, Any]] = {
+LINK: Responses = {
     200: {
         "headers": {
             "Link": {

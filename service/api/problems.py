@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from http import HTTPStatus
 from typing import Any
 
@@ -27,8 +28,17 @@ from loopwright.service.store.store import Busy, FolderInUse, NoSuchJob
 from loopwright.tuning.reasons import ADVICE, Ended, Reason
 
 MEDIA_TYPE = "application/problem+json"
+Responses = dict[int | str, dict[str, Any]]
+"""The type of the argument `responses` of a FastAPI route."""
 CLIENT_GONE = 499
 """The status that nginx logs when the client has disconnected; nobody reads the answer."""
+
+
+class InvalidValue(BaseModel):
+    """An invalid value of a request."""
+
+    where: str = Field(description="Path of the value", examples=["body.model.K"])
+    why: str = Field(description="Why the value is invalid", examples=["K must not be 0: PV would not answer MV"])
 
 
 class Problem(BaseModel):
@@ -40,21 +50,34 @@ class Problem(BaseModel):
     detail: str = Field(
         description="Explanation of this occurrence", examples=["loop TIC-101 is busy with job 4f0c2a9be113"]
     )
-    reason: str | None = Field(default=None, description="Reason code from the closed list", examples=["node_lost"])
+    reason: Reason | None = Field(default=None, description="Reason code from the closed list", examples=["node_lost"])
     advice: str | None = Field(default=None, description="What the client or the operator should do")
     job: str | None = Field(default=None, description="URL of the active job", examples=["/jobs/4f0c2a9be113"])
-    errors: list[dict[str, Any]] | None = Field(default=None, description="The invalid values of the request")
+    errors: list[InvalidValue] | None = Field(default=None, description="The invalid values of the request")
 
 
 def problem(
-    status: int, detail: str, *, reason: Reason | None = None, headers: dict[str, str] | None = None, **more: Any
+    status: int,
+    detail: str,
+    *,
+    reason: Reason | None = None,
+    headers: dict[str, str] | None = None,
+    job: str | None = None,
+    errors: Sequence[InvalidValue] = (),
 ) -> JSONResponse:
-    body: dict[str, Any] = {
-        "type": "about:blank", "title": HTTPStatus(status).phrase, "status": status, "detail": detail,
-    }  # fmt: skip
-    if reason is not None:
-        body |= {"reason": reason.value, "advice": ADVICE[reason]}
-    return JSONResponse(body | more, status_code=status, media_type=MEDIA_TYPE, headers=headers)
+    """The response with the problem. job: URL of the active job."""
+    body = Problem(
+        type="about:blank",
+        title=HTTPStatus(status).phrase,
+        status=status,
+        detail=detail,
+        reason=reason,
+        advice=None if reason is None else ADVICE[reason],
+        job=job,
+        errors=list(errors) or None,
+    )
+    content = body.model_dump(mode="json", exclude_none=True)
+    return JSONResponse(content, status_code=status, media_type=MEDIA_TYPE, headers=headers)
 
 
 def of_http(error: HTTPException) -> JSONResponse:
@@ -81,13 +104,13 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     async def _invalid(_request: Request, error: RequestValidationError) -> JSONResponse:
         # The input itself is left out, because it may be NaN, which JSON cannot represent.
-        errors = [{"where": place(e["loc"]), "why": words(e["msg"])} for e in error.errors()]
-        detail = "; ".join(f"{e['where']}: {e['why']}" for e in errors)
+        errors = [InvalidValue(where=place(e["loc"]), why=words(e["msg"])) for e in error.errors()]
+        detail = "; ".join(f"{each.where}: {each.why}" for each in errors)
         return problem(422, detail, reason=Reason.BAD_INPUT, errors=errors)
 
     @app.exception_handler(BadBody)
     async def _body(_request: Request, error: BadBody) -> JSONResponse:
-        errors = [{"where": error.where, "why": error.detail}]
+        errors = [InvalidValue(where=error.where, why=error.detail)]
         return problem(422, f"{error.where}: {error.detail}", reason=Reason.BAD_INPUT, errors=errors)
 
     @app.exception_handler(HTTPException)
@@ -154,7 +177,7 @@ def install(app: FastAPI) -> None:
         return problem(500, f"{type(error).__name__}: {error}", reason=Reason.INTERNAL)
 
 
-def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
+def responses(*statuses: int) -> Responses:
     """The documented error responses of a route with these statuses."""
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
@@ -162,7 +185,7 @@ def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     }
 
 
-def documented(*statuses: int) -> dict[int, dict[str, Any]]:
+def documented(*statuses: int) -> dict[int, dict[str, object]]:
     """The same responses for an OpenAPI document that FastAPI has already generated."""
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {status: {"content": content, "description": HTTPStatus(status).phrase} for status in statuses}

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from typing import Any
 
 DEEPEST = 16
 """Maximum nesting of lists and objects. The deepest valid request has 4 levels."""
@@ -28,11 +27,11 @@ class BadJson(ValueError):
         super().__init__(f"{self.where}: {why}" if where else why)
 
 
-def loads(text: str | bytes) -> Any:
+def loads(text: str | bytes) -> object:
     """The parsed value. Bytes are decoded as UTF-8. Raises BadJson."""
     try:
         text = text.decode("utf-8-sig") if isinstance(text, bytes) else text.removeprefix("\ufeff")
-        found = json.loads(text, object_pairs_hook=_object)
+        found: object = json.loads(text, object_pairs_hook=_object)
     except UnicodeDecodeError as error:
         raise BadJson(f"is not text in UTF-8: byte {error.start}") from None
     except json.JSONDecodeError as error:
@@ -45,13 +44,13 @@ def loads(text: str | bytes) -> Any:
     return found
 
 
-class _Twice(dict[str, Any]):
+class _Twice(dict[str, object]):
     """An object with a duplicate key. Its path is known only after the whole text has been parsed."""
 
     key = ""
 
 
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _object(pairs: list[tuple[str, object]]) -> dict[str, object]:
     found = dict(pairs)
     if len(found) == len(pairs):
         return found
@@ -60,9 +59,9 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return twice
 
 
-def _check(found: Any) -> None:
+def _check(found: object) -> None:
     """Raises BadJson with the path of an invalid value. It does not recurse, because the nesting may be deep."""
-    waiting: list[tuple[Any, tuple[str | int, ...]]] = [(found, ())]
+    waiting: list[tuple[object, tuple[str | int, ...]]] = [(found, ())]
     while waiting:
         value, where = waiting.pop()
         if isinstance(value, str):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from collections.abc import Mapping
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
@@ -50,7 +51,7 @@ class TuningRequest(BaseModel):
         description="Process model in one of five forms", examples=[{"K": 0.8, "T_s": 3.0, "L_s": 1.0}]
     )
     method: str = Field(default="all", description="A method of GET /methods, or all", examples=["simc"])
-    options: dict[str, Any] = Field(
+    options: Mapping[str, object] = Field(
         default_factory=dict,
         description="Options of the method by name; with all, each option goes to the methods that have it",
         examples=[{"tau_c_s": 2.0}],
@@ -138,7 +139,7 @@ class TuningsView(BaseModel):
 class AlternativeView(TunedView):
     """The tuning by one method of the model that a job found."""
 
-    retune: dict[str, Any] | None = Field(
+    retune: Mapping[str, object] | None = Field(
         description="Body for POST /loops/{tag}/retune that tests these gains on the loop without another "
         f"experiment; null: there are no gains, Ms is above {MAX_Ms:g} or GM below {MIN_GM:g}, or a rule has a model "
         "that is not of the form K, T_s, L_s",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Annotated
 
@@ -10,7 +11,7 @@ from fastapi.concurrency import run_in_threadpool
 
 from loopwright.service.api import problems
 from loopwright.service.api.bodies import JsonRoute
-from loopwright.service.api.computed import Work, computed
+from loopwright.service.api.computed import computed
 from loopwright.service.api.samples import record_columns
 from loopwright.service.api.tuning_views import AlternativesView, MethodView, TuningRequest, TuningsView
 from loopwright.service.execution.computing.pool import Pool
@@ -27,7 +28,7 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
 
     @routes.get("/methods", tags=["tunings"], summary="The tuning methods")
     def methods() -> list[MethodView]:
-        return [MethodView(**each) for each in tunings.methods_json()]
+        return [MethodView.model_validate(each) for each in tunings.methods_json()]
 
     @routes.post(
         "/tunings",
@@ -37,7 +38,7 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
     )
     async def tune(request: TuningRequest, http: Request) -> TuningsView:
         work = partial(tunings.tunings, request.model.plant(), request.method, request.options)
-        return TuningsView(**await computed(pool, work, http, lambda: jobs.stopping))
+        return TuningsView.model_validate(await computed(pool, work, http, lambda: jobs.stopping))
 
     @routes.get(
         "/jobs/{job_id}/alternatives",
@@ -68,10 +69,12 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
             raise tunings.BadTuning("derivative needs ms: give ms too")
         if ms is not None and method not in (None, FAST):
             raise tunings.BadTuning(f"ms is an option of fast, not of {method}: leave out ms or method")
-        work = await run_in_threadpool(wish, job_id, method, ms, derivative)
-        return AlternativesView(**await computed(pool, work, http, lambda: jobs.stopping))
+        work = await run_in_threadpool(computation, job_id, method, ms, derivative)
+        return AlternativesView.model_validate(await computed(pool, work, http, lambda: jobs.stopping))
 
-    def wish(job_id: str, method: str | None, ms: float | None, derivative: bool | None) -> Work:
+    def computation(
+        job_id: str, method: str | None, ms: float | None, derivative: bool | None
+    ) -> Callable[[], Mapping[str, object]]:
         """The computation, with everything that it needs from the store."""
         row, events = jobs.store.get(job_id), jobs.store.events(job_id)
         if ms is None:

@@ -6,6 +6,7 @@ from typing import Protocol
 
 from loopwright.service.job_states import JobState
 from loopwright.service.results import EvidenceView, GainsView, ModelView, TransferModelView, VerificationView
+from loopwright.tuning.reasons import Reason
 
 
 class Shown(Protocol):
@@ -15,7 +16,7 @@ class Shown(Protocol):
     loop: str
     method: str
     state: JobState
-    reason: str | None
+    reason: Reason | None
     detail: str | None
     advice: str | None
     model: ModelView | TransferModelView | None

@@ -7,7 +7,8 @@ import random
 import time
 from collections.abc import Callable
 
-from loopwright.service.api.gate.gate import App, AsgiScope, Message, Receive, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
 from loopwright.service.telemetry.logs import about
 from loopwright.service.telemetry.metrics import IN_FLIGHT, REQUEST_SECONDS, REQUESTS
 
@@ -25,11 +26,11 @@ class Access:
     """Wraps the application. The query is not logged, because it may hold secrets. Refusals that a client can provoke
     without end are logged at most once a second for each address."""
 
-    def __init__(self, app: App, wall: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, app: ASGIApp, wall: Callable[[], float] = time.monotonic) -> None:
         self._app, self._wall = app, wall
         self._refused: dict[tuple[int, str | None], float] = {}
 
-    async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -66,7 +67,7 @@ class Access:
         self._refused[status, address] = now
         return False
 
-    def _log(self, scope: AsgiScope, status: int, seconds: float, request: str) -> None:
+    def _log(self, scope: Scope, status: int, seconds: float, request: str) -> None:
         method = scope["method"] if scope["method"] in _METHODS else "other"
         # The template, not the path: a label must not have as many values as there are jobs.
         route = str(getattr(scope.get("route"), "path", _NO_ROUTE))

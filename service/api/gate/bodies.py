@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Awaitable, Callable, MutableMapping
-from typing import Any
 
 from starlette.datastructures import Headers
+from starlette.types import Message, Receive, Scope
 
 from loopwright.service.api.gate.limits import RequestLimits
-
-Message = MutableMapping[str, Any]
-Receive = Callable[[], Awaitable[Message]]
 
 SMALL = 16 << 10
 """Bytes. A shorter body does not count towards the limit of all bodies; the body of a decision must not be longer."""
@@ -33,7 +29,7 @@ class Bodies:
         self._limits = limits
         self._held: Counter[str] = Counter()
 
-    async def whole(self, scope: MutableMapping[str, Any], receive: Receive, client: str, small: bool) -> bytes | None:
+    async def whole(self, scope: Scope, receive: Receive, client: str, small: bool) -> bytes | None:
         """The body; None for a request without a body. small: the request is a decision. Raises BodyRefused."""
         headers = Headers(scope=scope)
         length = headers.get("content-length", "0")

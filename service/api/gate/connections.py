@@ -271,7 +271,7 @@ class Listener(socket.socket):
         self._spare = os.open(os.devnull, os.O_RDONLY)
         self._warning = WarningOnceAMinute()
 
-    def accept(self) -> tuple[socket.socket, Any]:
+    def accept(self) -> tuple[socket.socket, object]:
         while self._left:
             self._left -= 1
             try:

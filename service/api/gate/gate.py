@@ -8,13 +8,13 @@ from __future__ import annotations
 import ipaddress
 import logging
 import time
-from collections.abc import Awaitable, Callable, MutableMapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.datastructures import Headers
 from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Send
+from starlette.types import Scope as AsgiScope
 
 from loopwright.service.api import problems
 from loopwright.service.api.gate.bodies import Bodies, BodyRefused, begins_with
@@ -37,12 +37,6 @@ from loopwright.service.store.database import urgent
 from loopwright.service.store.keyring import Keyring
 
 log = logging.getLogger(__name__)
-
-AsgiScope = MutableMapping[str, Any]
-Message = MutableMapping[str, Any]
-Receive = Callable[[], Awaitable[Message]]
-Send = Callable[[Message], Awaitable[None]]
-App = Callable[[AsgiScope, Receive, Send], Awaitable[None]]
 
 PUBLIC = frozenset({"/healthz", "/docs", "/openapi.json"})
 """Paths that need no key, because their answers say nothing about this installation."""
@@ -76,7 +70,7 @@ class Gate:
     of the same kind. A body that does not arrive therefore takes nobody's place.
     """
 
-    def __init__(self, app: App, policy: Policy) -> None:
+    def __init__(self, app: ASGIApp, policy: Policy) -> None:
         self._app = app
         self._policy = policy
         limits = policy.limits
