@@ -10,11 +10,12 @@ from fastapi import FastAPI
 from loopwright.service.api import problems
 from loopwright.service.api.gate.gate import ALWAYS, scope_for
 from loopwright.service.api.idempotency import HEADER, MAX_CHARACTERS, PATTERN
+from loopwright.service.api.openapi_document import Document, Operation, Parameter, as_document
 from loopwright.service.store.idempotency import KEPT_H
 
 _KEY = "key"
 _METHODS = ("get", "post", "put", "patch", "delete")
-_IDEMPOTENCY_KEY = {
+_IDEMPOTENCY_KEY: Parameter = {
     "name": HEADER,
     "in": "header",
     "required": False,
@@ -32,14 +33,14 @@ def install(app: FastAPI) -> None:
 
     def complete() -> dict[str, Any]:
         if app.openapi_schema is None:
-            _complete(make())
+            _complete(as_document(make()))
         assert app.openapi_schema is not None
         return app.openapi_schema
 
     app.openapi = complete  # type: ignore[method-assign]
 
 
-def _complete(document: dict[str, Any]) -> None:
+def _complete(document: Document) -> None:
     schemas = document.setdefault("components", {})
     schemas["securitySchemes"] = {
         _KEY: {
@@ -57,7 +58,7 @@ def _complete(document: dict[str, Any]) -> None:
                 _one(path, method, item[method])
 
 
-def _one(path: str, method: str, operation: dict[str, Any]) -> None:
+def _one(path: str, method: str, operation: Operation) -> None:
     needed = scope_for(method.upper(), path)
     more: tuple[int, ...] = (403,)  # without keys, a host name that is not this machine's
     if needed is not None:

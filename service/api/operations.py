@@ -17,6 +17,7 @@ from pydantic import BaseModel, Field
 
 from loopwright.service.api import metrics, problems
 from loopwright.service.api.docs_page import POLICY, page
+from loopwright.service.api.openapi_document import as_document
 from loopwright.service.api.paging import LARGEST
 from loopwright.service.jobs.aftercare import NotHome
 from loopwright.service.jobs.manager import Jobs
@@ -202,7 +203,7 @@ def install(app: FastAPI, jobs: Jobs, parts: Mapping[str, Check], sdo_retries: M
     app.include_router(router)
 
     # Encoded once: clients need no key for them, and each encoding holds the interpreter lock for milliseconds.
-    made_once = cache(lambda: (json.dumps(app.openapi()).encode(), page(app.openapi()).encode()))
+    made_once = cache(lambda: (json.dumps(app.openapi()).encode(), page(as_document(app.openapi())).encode()))
 
     @app.get("/openapi.json", include_in_schema=False)
     def document() -> Response:

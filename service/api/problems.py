@@ -14,6 +14,7 @@ from sqlalchemy.exc import DataError, SQLAlchemyError
 from starlette.exceptions import HTTPException
 
 from loopwright.service.api.bodies import BadBody
+from loopwright.service.api.openapi_document import DocumentedResponse, MediaType
 from loopwright.service.errors import Conflict, Locked, Stopping, UnknownLoop
 from loopwright.service.execution.computing.pool import NotWanted
 from loopwright.service.inputs.model_json import BadModel
@@ -185,7 +186,7 @@ def responses(*statuses: int) -> Responses:
     }
 
 
-def documented(*statuses: int) -> dict[int, dict[str, object]]:
+def documented(*statuses: int) -> dict[int, DocumentedResponse]:
     """The same responses for an OpenAPI document that FastAPI has already generated."""
-    content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    content: dict[str, MediaType] = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {status: {"content": content, "description": HTTPStatus(status).phrase} for status in statuses}
