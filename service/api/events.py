@@ -36,7 +36,7 @@ async def event_stream(
     jobs: Jobs, job_id: str, after: int, permitted: Callable[[], bool] = lambda: True
 ) -> AsyncIterator[str]:
     """The events after number `after` as text/event-stream, until the job ends or `permitted` returns false."""
-    told = ""
+    sent = ""
     silent = 0
     asked = time.monotonic()
     while True:
@@ -66,8 +66,8 @@ async def event_stream(
         if more:
             continue
         progress = _progress(jobs, job_id)
-        if progress and progress != told:
-            told, silent = progress, 0
+        if progress and progress != sent:
+            sent, silent = progress, 0
             yield f"event: progress\ndata: {progress}\n\n"
         silent += 1
         if silent % _KEEP_ALIVE_POLLS == 0:

@@ -141,8 +141,8 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Jo
         status_code=202,
         responses=problems.responses(422, 503),
     )
-    def retune_many(request: Request, response: Response, wish: Annotated[FleetRequest, Body()]) -> RetuneView:
-        row = fleet.start(wish)
+    def retune_many(request: Request, response: Response, body: Annotated[FleetRequest, Body()]) -> RetuneView:
+        row = fleet.start(body)
         response.headers["Location"] = str(request.url_for("retunes_one", retune_id=row.id).path)
         return _view(*fleet.get(row.id))
 

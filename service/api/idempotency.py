@@ -100,8 +100,8 @@ class Idempotent:
         """Stores a success or a conflict; a repetition of a refused request must not be executed later."""
         try:
             if answer is not None and (answer.status < 400 or answer.status == 409):
-                kept = answer
-                await self._beside(lambda: self._keys.keep(claim, kept))
+                stored = answer
+                await self._beside(lambda: self._keys.keep(claim, stored))
             else:
                 await self._beside(lambda: self._keys.let_go(claim))
         except SQLAlchemyError as error:  # the effect of the request is stored with the claim

@@ -295,10 +295,10 @@ def _progress(
         return live.fraction, live.remaining_s, live.plant_time_s
     if state not in ACTIVE:
         return 1.0, 0.0, row.plant_time_s
-    told = next((e.data for e in reversed(events) if e.kind == "stage_started"), None)
-    if told is None:
+    started = next((e.data for e in reversed(events) if e.kind == "stage_started"), None)
+    if started is None:
         return 0.0, None, row.plant_time_s
-    remaining = told["expected_s"] + told["remaining_s"]
+    remaining = started["expected_s"] + started["remaining_s"]
     total = row.plant_time_s + remaining
     return (min(0.99, row.plant_time_s / total) if total > 0 else 0.0), remaining, row.plant_time_s
 
@@ -322,18 +322,18 @@ def _evidence(result: FastResult | FiveStageResult, events: Sequence[JobEvent]) 
     """The evidence of the result; for a refused job, whose result has none, that of its latest design stage."""
     if isinstance(result, FastResult) and result.evidence is not None:
         return result.evidence
-    told = _told(events, ("redesign", "design"), "reason")
-    return None if told is None else EvidenceView.model_validate(told)
+    found = _stage_result(events, ("redesign", "design"), "reason")
+    return None if found is None else EvidenceView.model_validate(found)
 
 
 def _verification(result: FastResult | FiveStageResult, events: Sequence[JobEvent]) -> VerificationView | None:
     if isinstance(result, FastResult) and result.verification is not None:
         return result.verification
-    told = _told(events, ("verify",), "tested")
-    return None if told is None else VerificationView.of_stage(told)
+    found = _stage_result(events, ("verify",), "tested")
+    return None if found is None else VerificationView.of_stage(found)
 
 
-def _told(events: Sequence[JobEvent], stages: Sequence[str], field: str) -> Mapping[str, object] | None:
+def _stage_result(events: Sequence[JobEvent], stages: Sequence[str], field: str) -> Mapping[str, object] | None:
     """The last result of the first of these stages that has one. Only results with the field `field` count."""
     for stage in stages:
         for event in reversed(events):

@@ -60,8 +60,8 @@ def router(locking: Locking) -> APIRouter:
         summary="Lock a loop: no test begins on it and no decision writes to it until it is unlocked",
         responses=problems.responses(404, 409, 422),
     )
-    def lock(tag: Tag, wish: Annotated[LockWish, Body()]) -> LockedView:
-        row, running = locking.lock(tag, wish.reason, wish.by)
+    def lock(tag: Tag, asked: Annotated[LockWish, Body()]) -> LockedView:
+        row, running = locking.lock(tag, asked.reason, asked.by)
         url = note = None
         if running is not None:
             url = f"/jobs/{running.id}"

@@ -114,12 +114,12 @@ class Readiness:
     @staticmethod
     async def _one(check: Check) -> ReadinessPart:
         try:
-            told = await asyncio.wait_for(asyncio.to_thread(check), CHECK_S)
+            note = await asyncio.wait_for(asyncio.to_thread(check), CHECK_S)
         except TimeoutError:
             return ReadinessPart(ready=False, detail=f"no answer within {CHECK_S:g} s")
         except Exception as error:  # any exception means that the part is not ready
             return ReadinessPart(ready=False, detail=str(error) or type(error).__name__)
-        return ReadinessPart(ready=True, detail=told)
+        return ReadinessPart(ready=True, detail=note)
 
 
 def checks(jobs: Jobs) -> dict[str, Check]:
@@ -196,8 +196,8 @@ def install(app: FastAPI, jobs: Jobs, parts: Mapping[str, Check], sdo_retries: M
         page_of = rows[:limit]
         more = None
         if len(rows) > limit:
-            kept = {"limit": limit, "before": page_of[-1].number, "what": what, "loop": loop}
-            more = f"/audit?{urlencode({k: v for k, v in kept.items() if v is not None})}"
+            query = {"limit": limit, "before": page_of[-1].number, "what": what, "loop": loop}
+            more = f"/audit?{urlencode({k: v for k, v in query.items() if v is not None})}"
         return AuditPage(entries=[_view(row) for row in page_of], next=more)
 
     app.include_router(router)

@@ -31,5 +31,5 @@ LINK: Responses = {
 
 def more(response: Response, path: str, cursor: object, **query: object) -> None:
     """Sets the Link header. query: the other parameters of the request; None for one that was not given."""
-    kept = {name: value for name, value in {**query, "cursor": cursor}.items() if value is not None}
-    response.headers["Link"] = f'<{path}?{urlencode(kept)}>; rel="next"'
+    given = {name: value for name, value in {**query, "cursor": cursor}.items() if value is not None}
+    response.headers["Link"] = f'<{path}?{urlencode(given)}>; rel="next"'

@@ -42,8 +42,8 @@ def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
         summary="Preview a retune of many loops from configuration and earlier jobs, without reading the controllers",
         responses=problems.responses(422, 503),
     )
-    def retune_many_preview(wish: Annotated[FleetRequest, Body()]) -> FleetPreview:
-        options, busy, models = wish.each(), jobs.store.busy(), jobs.store.last_models()
+    def retune_many_preview(request: Annotated[FleetRequest, Body()]) -> FleetPreview:
+        options, busy, models = request.each(), jobs.store.busy(), jobs.store.last_models()
         locked = _locked(jobs)
         return fleet_preview([
             preview(
@@ -52,7 +52,7 @@ def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
                 Now(active_job=busy.get(config.tag), locked=locked.get(config.tag), stopping=jobs.stopping),
                 _last(models.get(config.tag)),
             )
-            for config in fleet.asked(wish)
+            for config in fleet.asked(request)
         ])  # fmt: skip
 
     return routes

@@ -143,8 +143,8 @@ class _Retune(Bounds):
         foreign = cls._foreign(data)
         if foreign:
             given = "" if "method" in data else ', which is used unless a "method" is named'
-            told = cls._not_mine(", ".join(foreign), f"{data.get('method', FAST)}{given}")
-            raise ValueError(f"{told}; its options are {', '.join(cls.model_fields)}")
+            why = cls._not_mine(", ".join(foreign), f"{data.get('method', FAST)}{given}")
+            raise ValueError(f"{why}; its options are {', '.join(cls.model_fields)}")
         unknown = [str(name) for name in data if name not in cls.model_fields]
         if unknown:
             known = ", ".join(cls.model_fields)

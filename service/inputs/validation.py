@@ -32,8 +32,8 @@ def words(message: str) -> str:
 
 def line(error: ErrorDetails) -> str:
     """One of `ValidationError.errors()` as text: path and message, or the message alone if it begins with the path."""
-    where, told = place(error["loc"]), words(error["msg"])
-    return told if told.startswith(where) else f"{where}: {told}"
+    where, text = place(error["loc"]), words(error["msg"])
+    return text if text.startswith(where) else f"{where}: {text}"
 
 
 def lines(error: ValidationError) -> str:
