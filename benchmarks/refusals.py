@@ -30,6 +30,7 @@ from loopwright.tuning.fast.procedure import FastOptions, fast
 from loopwright.tuning.fast.proposal import EvaluationSummary
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Event, Mode, Sample, StageDone, StageStarted
+from loopwright.tuning.reasons import Reason
 
 TS, T95, MIDDLE, SP = 0.1, 26.0, 50.0, 20.0
 OLD = Gains(1.0, 10.0)
@@ -128,7 +129,7 @@ class Pictured:
 
     loop: str
     state: JobState
-    reason: str | None
+    reason: Reason | None
     detail: str | None
     advice: str | None
     old_gains: GainsView | None
@@ -176,7 +177,7 @@ def rehearsed(reason: str, case: Case) -> Pictured:
     return Pictured(
         loop=case.why,
         state=JobState.PROPOSED if ran.value else JobState.REFUSED,
-        reason=ended.reason.value if ended else None,
+        reason=ended.reason if ended else None,
         detail=ended.detail if ended else None,
         advice=ended.advice if ended else None,
         old_gains=GainsView.of(case.gains),

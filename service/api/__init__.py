@@ -1,1 +1,1 @@
-"""REST over the jobs: routes, views with units, errors as problem+json, server-sent events."""
+"""The REST API: routes, views with units, errors as problem+json, server-sent events."""

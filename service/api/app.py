@@ -1,4 +1,4 @@
-"""The application: routes that translate between HTTP and the jobs, and nothing else."""
+"""The FastAPI application: routes that translate between HTTP and the jobs."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from loopwright.tuning.reasons import Ended
 
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 MAX_EVENTS = 2000
-"""Of a job, for its view: those of its stages come first. After them decisions that fail may be added without end."""
+"""Events read for the view of a job. Those of the stages come first; failed decisions may follow without end."""
 JobId = Annotated[str, Path(description="Id of the job", examples=["4f0c2a9be113"])]
 
 
@@ -54,9 +54,10 @@ def create_app(
     pool: Pool | None = None,
     sdo_retries: Mapping[str, int] | None = None,
 ) -> FastAPI:
-    """The API over these jobs; ends them when the server shuts down. checks: what must be well to be ready.
+    """The application for these jobs, which it stops when the server shuts down.
 
-    pool: who computes tunings; None: one of its own.  sdo_retries: by bus, as the station of this process counts them.
+    checks: the parts of /readyz by name; None for the default ones.  pool: processes that compute tunings; None for a
+    new pool.  sdo_retries: SDO retries by bus, as counted in this process.
     """
 
     policy = policy or Policy()
@@ -75,13 +76,14 @@ def create_app(
     app = FastAPI(
         title="Loopwright",
         version=version("loopwright"),
-        description="Retunes PI loops by itself. Gains are in ISA form, MV in percent, times in plant seconds "
-        "unless they say wall. A retune ends as a proposal; the loop keeps its gains until it is accepted.",
+        description="Retunes PI and PID loops. Gains are in ISA form, MV is in percent, times are plant time in "
+        "seconds unless they are called wall time. A retune ends with a proposal; the loop keeps its gains until the "
+        "proposal is accepted.",
         lifespan=lifespan,
-        openapi_url=None,  # would make the document anew for each who asks: operations.py has it
-        docs_url=None,  # would load its scripts from elsewhere
+        openapi_url=None,  # FastAPI would encode the document for each request; operations.py does it once
+        docs_url=None,  # the page would load scripts from a CDN
         redoc_url=None,
-        generate_unique_id_function=lambda route: route.name,  # clients that are generated name their functions so
+        generate_unique_id_function=lambda route: route.name,  # generated clients name their functions by it
     )
     app.router.route_class = JsonRoute
     app.add_middleware(Idempotent, keys=IdempotencyKeys(jobs.store))
@@ -116,7 +118,7 @@ def create_app(
         of_it = jobs.store.busy().get(tag), jobs.store.last_states(tag).get(tag), jobs.locking.locks().get(tag)
         shown = loop_view(config, host, *of_it)
         return LoopDetail(
-            **shown,
+            **dict(shown),
             live=live_view(state) if state else None,
             not_confirmed_home=NotHomeView.of(not_home) if not_home else None,
         )
@@ -124,7 +126,7 @@ def create_app(
     @app.post(
         "/loops/{tag}/dismiss",
         tags=["loops"],
-        summary="Answer for a loop that is looked after: it is not looked at any more",
+        summary="Take responsibility for a loop whose restoration is not confirmed: the service stops checking it",
         responses=problems.responses(404, 409, 422),
     )
     def dismiss(tag: Tag, decision: Annotated[Decision | None, Body()] = None) -> DismissedView:
@@ -152,21 +154,27 @@ def create_app(
     @app.get(
         "/jobs/{job_id}/events",
         tags=["jobs"],
-        summary="What happens in a job, as server-sent events",
+        summary="The events of a job, as server-sent events",
         response_class=StreamingResponse,
         responses={
             200: {
                 "content": {"text/event-stream": {}},
-                "description": "state, stage_started, stage_done, note, progress, and what befell the job",
+                "description": "Events: state, stage_started, stage_done, note, progress and interruptions of the job",
             },
-            204: {"description": "The job is over and the client has seen everything: do not reconnect"},
+            204: {"description": "The job is over and the client has received every event; it should not reconnect"},
             **problems.responses(404, 422),
         },
     )
     def events(
         job_id: JobId,
         last_event_id: Annotated[
-            int, Header(ge=0, le=LARGEST, description="Only events after this one", examples=[7])
+            int,
+            Header(
+                ge=0,
+                le=LARGEST,
+                description="Number of the last event received; only later events are sent",
+                examples=[7],
+            ),
         ] = 0,
     ) -> Response:
         row = jobs.store.get(job_id)
@@ -181,8 +189,8 @@ def create_app(
         tags=["jobs"],
         summary="The samples of a job",
         response_model=SamplesView,
-        description="Sent as it is read, compressed with gzip where the client takes that: a job of days has millions "
-        "of samples.",
+        description="The answer is streamed, and compressed with gzip if the client accepts it, because a job of "
+        "days has millions of samples.",
         responses={
             200: {"content": {"text/csv": {"example": "stage,t_s,sp,pv,mv,mode\nrelay,12.3,50,50.2,45,3\n"}}},
             **problems.responses(404, 422),
@@ -190,8 +198,10 @@ def create_app(
     )
     def samples(
         job_id: JobId,
-        stage: Annotated[str | None, Query(description="Only of this stage", examples=["baseline"])] = None,
-        format: Annotated[Literal["json", "csv"], Query(description="json: columns; csv: a row per sample")] = "json",
+        stage: Annotated[str | None, Query(description="Only samples of this stage", examples=["baseline"])] = None,
+        format: Annotated[
+            Literal["json", "csv"], Query(description="json: one list per column; csv: one row per sample")
+        ] = "json",
         accept_encoding: Annotated[str, Header(include_in_schema=False)] = "",
     ) -> StreamingResponse:
         jobs.store.get(job_id)
@@ -214,7 +224,7 @@ def create_app(
     @app.post(
         "/jobs/{job_id}/accept",
         tags=["jobs"],
-        summary="Put the proposed gains into the controller for good",
+        summary="Write the proposed gains to the controller permanently",
         responses=problems.responses(404, 409, 422, 503),
     )
     def accept(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
@@ -223,7 +233,7 @@ def create_app(
     @app.post(
         "/jobs/{job_id}/rollback",
         tags=["jobs"],
-        summary="Decline the proposal, or put the old gains back after accepting",
+        summary="Decline the proposal, or write the old gains back after it was accepted",
         responses=problems.responses(404, 409, 422, 503),
     )
     def rollback(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:

@@ -1,9 +1,8 @@
-"""Bodies of requests: JSON, of one meaning (see `service.api.strict_json`), and said to be JSON."""
+"""Routes whose request body must be strict JSON (see `service.api.strict_json`) with a JSON content type."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Coroutine
-from typing import Any
 
 from fastapi import HTTPException, Request, Response
 from fastapi.concurrency import run_in_threadpool
@@ -12,11 +11,11 @@ from fastapi.routing import APIRoute
 from loopwright.service.api import strict_json
 
 _SHORT = 16_384
-"""Bytes that are read at once; reading a longer body would hold up the event loop."""
+"""Bytes. A longer body is parsed in a thread, because parsing it would block the event loop."""
 
 
 class BadBody(HTTPException):
-    """The body is no JSON that can be understood. where: the place in it, as far as there is one."""
+    """The body is not valid JSON. where: the path to the invalid value; empty if there is none."""
 
     def __init__(self, why: str, where: str = "") -> None:
         super().__init__(422, why)
@@ -24,9 +23,9 @@ class BadBody(HTTPException):
 
 
 class JsonRoute(APIRoute):
-    """Every route that takes a body is one: a test looks."""
+    """The class of every route that takes a body; a test checks that."""
 
-    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+    def get_route_handler(self) -> Callable[[Request], Coroutine[object, object, Response]]:
         handle = super().get_route_handler()
         if self.body_field is None:
             return handle
@@ -41,7 +40,7 @@ class JsonRoute(APIRoute):
 
 
 class _JsonRequest(Request):
-    async def json(self) -> Any:
+    async def json(self) -> object:
         if not hasattr(self, "_json"):
             body = await self.body()
             try:
@@ -57,5 +56,5 @@ class _JsonRequest(Request):
 def _check_type(content_type: str) -> None:
     kind = content_type.partition(";")[0].strip().lower()
     if kind != "application/json" and not (kind.startswith("application/") and kind.endswith("+json")):
-        said = f"not {kind[:60]}" if kind else "and it was not said what it is"
+        said = f"not {kind[:60]}" if kind else "which is missing"
         raise HTTPException(415, f"the body must be JSON with the header Content-Type: application/json, {said}")

@@ -1,11 +1,11 @@
-"""A computation that somebody waits for at the other end of a connection: it ends when that one goes away."""
+"""Computations for a client that waits for the answer; they are cancelled when the client disconnects."""
 
 from __future__ import annotations
 
 import asyncio
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 from fastapi import Request
 
@@ -13,17 +13,19 @@ from loopwright.service.errors import Stopping
 from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.computing.pool import NotWanted, Pool
 
-Work = Callable[[], dict[str, Any]]
+T = TypeVar("T")
 
 
-async def computed(pool: Pool, work: Work, http: Request, stopping: Callable[[], bool]) -> dict[str, Any]:
-    """The result of the work, in a process of its own. Raises what it raises, NotWanted when the client is gone, and
-    Stopping."""
+async def computed(pool: Pool, work: Callable[[], T], http: Request, stopping: Callable[[], bool]) -> T:
+    """The result of the work, which runs in a process of the pool.
+
+    Raises what the work raises, NotWanted when the client has disconnected, Stopping when the service shuts down.
+    """
     gone = threading.Event()
     listening = asyncio.create_task(_until_gone(http, gone))
     try:
         future = pool.submit(ComputationKind.TUNING, work, lambda: gone.is_set() or stopping())
-        found: dict[str, Any] = await asyncio.wrap_future(future)
+        found: T = await asyncio.wrap_future(future)
     except NotWanted:
         if gone.is_set():
             raise

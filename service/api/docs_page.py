@@ -1,9 +1,10 @@
-"""The API on one page, from its own OpenAPI document: plain HTML, nothing loaded from elsewhere."""
+"""The page /docs: the OpenAPI document as plain HTML that loads nothing from other hosts."""
 
 from __future__ import annotations
 
 from html import escape
-from typing import Any
+
+from loopwright.service.api.openapi_document import Document, Operation, Schema
 
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
@@ -16,8 +17,8 @@ td, th { text-align: left; vertical-align: top; padding: .1rem .8rem .1rem 0; }
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 
 
-def page(document: dict[str, Any]) -> str:
-    """HTML of every operation: what it is for, its parameters and body, its answers."""
+def page(document: Document) -> str:
+    """The HTML page of an OpenAPI document: the summary, parameters, body and responses of every operation."""
     info = document["info"]
     schemas = document["components"].get("schemas", {})
     parts = [
@@ -36,7 +37,7 @@ def page(document: dict[str, Any]) -> str:
     return "\n".join(parts) + "\n</html>\n"
 
 
-def _operation(path: str, method: str, operation: dict[str, Any], schemas: dict[str, Any]) -> str:
+def _operation(path: str, method: str, operation: Operation, schemas: dict[str, Schema]) -> str:
     rows = [
         (f"{x['name']} ({x['in']})", x.get("description", ""), x.get("required", False))
         for x in operation.get("parameters", ())
@@ -55,9 +56,9 @@ def _operation(path: str, method: str, operation: dict[str, Any], schemas: dict[
     )
 
 
-def _body(names: list[str], schemas: dict[str, Any]) -> list[tuple[str, str, bool]]:
-    """The fields of the schemas that a body may have: name, description, whether it is required. A field that not all
-    of the schemas have is followed by the names of those that do."""
+def _body(names: list[str], schemas: dict[str, Schema]) -> list[tuple[str, str, bool]]:
+    """The fields of a body with any of these schemas: name, description, whether the field is required. A field that
+    only some of the schemas have is followed by their names."""
     having: dict[str, list[str]] = {}
     for name in names:
         for field in schemas[name].get("properties", {}):
@@ -70,8 +71,8 @@ def _body(names: list[str], schemas: dict[str, Any]) -> list[tuple[str, str, boo
     return rows
 
 
-def _names(schema: dict[str, Any]) -> list[str]:
-    """The schemas referred to, where the schema may also be null or is one of several."""
+def _names(schema: Schema) -> list[str]:
+    """The names of the component schemas that a schema refers to, directly or in a union."""
     choices = (schema, *schema.get("anyOf", ()), *schema.get("oneOf", ()))
     direct = [str(choice["$ref"]).rpartition("/")[2] for choice in choices if "$ref" in choice]
     return direct + [name for choice in choices[1:] if "$ref" not in choice for name in _names(choice)]

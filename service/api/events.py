@@ -1,7 +1,9 @@
-"""A job's events as server-sent events. The id of an event is its number in the job, so a client that was cut off
-resumes with Last-Event-ID and misses nothing. `progress` events carry no id: they are not kept.
+"""The events of a job as server-sent events.
 
-A stream may outlive the key it was opened with: that is asked now and then, and ends it."""
+The id of an event is its number in the job, so a client that was disconnected resumes with Last-Event-ID and misses
+nothing. `progress` events have no id, because they are not stored. The key of a stream is checked again while the
+stream is open; a revoked or expired key ends the stream.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,7 @@ _KEEP_ALIVE_POLLS = 75  # 15 s: proxies close a silent connection after 30 s or 
 
 
 def still_permitted(keyring: Keyring | None, key_id: str | None) -> Callable[[], bool]:
-    """Whether the key of a request is valid as yet; always where no keys are asked for."""
+    """A function that tells whether the key of a request is still valid; always true without keys."""
     if keyring is None or key_id is None:
         return lambda: True
     return lambda: keyring.still_valid(key_id)
@@ -33,9 +35,8 @@ def still_permitted(keyring: Keyring | None, key_id: str | None) -> Callable[[],
 async def event_stream(
     jobs: Jobs, job_id: str, after: int, permitted: Callable[[], bool] = lambda: True
 ) -> AsyncIterator[str]:
-    """Everything after event number `after`, then live until the job is no longer active, or the asker no longer
-    permitted to see it."""
-    told = ""
+    """The events after number `after` as text/event-stream, until the job ends or `permitted` returns false."""
+    sent = ""
     silent = 0
     asked = time.monotonic()
     while True:
@@ -45,7 +46,7 @@ async def event_stream(
                     yield ": the key of this stream was revoked or has expired\n\n"
                     return
                 asked = time.monotonic()
-            # Asked before the events are read: an event written in between is then seen in the next round.
+            # The state is read before the events, so an event written in between is sent in the next round.
             row = await asyncio.to_thread(jobs.store.get, job_id)
             events = await asyncio.to_thread(jobs.store.events, job_id, after, _EVENTS_AT_ONCE)
         except SQLAlchemyError as error:
@@ -65,8 +66,8 @@ async def event_stream(
         if more:
             continue
         progress = _progress(jobs, job_id)
-        if progress and progress != told:
-            told, silent = progress, 0
+        if progress and progress != sent:
+            sent, silent = progress, 0
             yield f"event: progress\ndata: {progress}\n\n"
         silent += 1
         if silent % _KEEP_ALIVE_POLLS == 0:

@@ -1,10 +1,10 @@
-"""Many loops: the list of them, each one's history, and retunes of many."""
+"""Routes for the list of loops, the lists of jobs, and retunes of many loops."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from typing import Annotated, Any, Literal
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Body, FastAPI, Path, Query, Request, Response
 from fastapi.responses import JSONResponse
@@ -28,13 +28,17 @@ LoopFilter = Literal["busy", "idle"] | JobState
 
 
 class RetuneLoopView(BaseModel):
-    """A loop of the retune."""
+    """A loop in a retune of many loops."""
 
     loop: str = Field(examples=["TIC-101"])
-    state: str = Field(description="waiting; skipped: never begun; else the state of its job", examples=["proposed"])
-    job: str | None = Field(description="URL of its job", examples=["/jobs/4f0c2a9be113"])
-    reason: str | None = Field(description="Why there is no proposal, from the closed list", examples=["not_at_rest"])
-    detail: str | None = Field(description="The reason's numbers, or why there is no job")
+    state: str = Field(
+        description="waiting, skipped (the loop was never begun), or the state of its job", examples=["proposed"]
+    )
+    job: str | None = Field(description="URL of the loop's job; null: there is no job", examples=["/jobs/4f0c2a9be113"])
+    reason: Reason | None = Field(
+        description="Why there is no proposal; reason code from the closed list", examples=["not_at_rest"]
+    )
+    detail: str | None = Field(description="The numbers behind the reason, or why there is no job")
 
 
 class RetuneSummary(BaseModel):
@@ -43,21 +47,21 @@ class RetuneSummary(BaseModel):
     id: str = Field(examples=["9d1b7c02aa45"])
     url: str = Field(examples=["/retunes/9d1b7c02aa45"])
     state: RetuneState = Field(
-        description="running; stopping: begins no more, some still run; done: every loop had its turn; "
-        "stopped: after failures or with the service; aborted: by somebody",
+        description="running; stopping: no more loops are begun, some jobs still run; done: every loop was begun or "
+        "skipped; stopped: by failures or with the service; aborted: by an operator",
         examples=["running"],
     )
-    host: str = Field(description="The service that drives it", examples=["local"])
+    host: str = Field(description="Name of the service that runs the retune", examples=["local"])
     requested_by: str = Field(examples=["night shift"])
     created_at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
     ended_at: str | None = Field(description="UTC, ISO 8601, wall time")
-    request: dict[str, Any] = Field(description="The options asked for")
+    request: Mapping[str, object] = Field(description="The options of the request")
     counts: dict[str, int] = Field(description="Number of loops by state", examples=[{"waiting": 12, "running": 4}])
     failures: int = Field(
-        description="Loops that ended without a proposal; aborted ones and no_gain not counted", examples=[1]
+        description="Number of loops that ended without a proposal; aborted and no_gain are not counted", examples=[1]
     )
     stop_reason: StopReason | None = Field(description="Why no more loops are begun", examples=["failures"])
-    detail: str | None = Field(description="The same in words")
+    detail: str | None = Field(description="The stop reason in words")
 
 
 class RetuneView(RetuneSummary):
@@ -65,24 +69,24 @@ class RetuneView(RetuneSummary):
 
 
 def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Job]], list[JobView]]) -> None:
-    """Adds the routes. views: jobs as the API shows them."""
+    """Adds the routes. views: makes the API's view of each job."""
     router = APIRouter(route_class=JsonRoute)
 
     @router.get(
         "/loops",
         tags=["loops"],
-        summary="The configured loops of every host, by tag",
+        summary="The configured loops of every host, sorted by tag",
         responses={**LINK, **problems.responses(422)},
     )
     def loops(
         response: Response,
         state: Annotated[
             LoopFilter | None,
-            Query(description="Only busy ones (a job has them), idle ones, or by the state of their latest job"),
+            Query(description="Only busy loops (used by a job), idle loops, or loops whose latest job has this state"),
         ] = None,
         limit: Limit = 1000,
         cursor: Annotated[
-            str | None, Query(max_length=64, description="From the URL of the next page, as it came")
+            str | None, Query(max_length=64, description="Cursor from the URL of the next page, unchanged")
         ] = None,
     ) -> list[LoopView]:
         busy, last, locks = jobs.store.busy(), jobs.store.last_states(), jobs.locking.locks()
@@ -96,13 +100,13 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Jo
                 more(response, "/loops", found[-1].tag, state=state, limit=limit)
                 break
             of_it = busy.get(config.tag), last.get(config.tag), locks.get(config.tag)
-            found.append(LoopView(**loop_view(config, host, *of_it)))
+            found.append(loop_view(config, host, *of_it))
         return found
 
     @router.get(
         "/loops/{tag}/jobs",
         tags=["loops"],
-        summary="The jobs of a loop, the latest first",
+        summary="The jobs of a loop, latest first",
         responses={**LINK, **problems.responses(404, 422)},
     )
     def history(tag: Tag, response: Response, limit: Limit = 50, cursor: Cursor = None) -> list[JobView]:
@@ -112,11 +116,16 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Jo
             more(response, f"/loops/{tag}/jobs", rows[limit - 1].number, limit=limit)
         return views(rows[:limit])
 
-    @router.get("/jobs", tags=["jobs"], summary="The latest jobs first", responses={**LINK, **problems.responses(422)})
+    @router.get(
+        "/jobs",
+        tags=["jobs"],
+        summary="The jobs of every loop, latest first",
+        responses={**LINK, **problems.responses(422)},
+    )
     def job_list(
         response: Response,
-        loop: Annotated[str | None, Query(description="Only of this loop", examples=["TIC-101"])] = None,
-        state: Annotated[JobState | None, Query(description="Only in this state")] = None,
+        loop: Annotated[str | None, Query(description="Only jobs of this loop", examples=["TIC-101"])] = None,
+        state: Annotated[JobState | None, Query(description="Only jobs in this state")] = None,
         limit: Limit = 50,
         cursor: Cursor = None,
     ) -> list[JobView]:
@@ -132,27 +141,27 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Jo
         status_code=202,
         responses=problems.responses(422, 503),
     )
-    def retune_many(request: Request, response: Response, wish: Annotated[FleetRequest, Body()]) -> RetuneView:
-        row = fleet.start(wish)
+    def retune_many(request: Request, response: Response, body: Annotated[FleetRequest, Body()]) -> RetuneView:
+        row = fleet.start(body)
         response.headers["Location"] = str(request.url_for("retunes_one", retune_id=row.id).path)
         return _view(*fleet.get(row.id))
 
     @router.get(
         "/retunes",
         tags=["retunes"],
-        summary="The latest retunes of many loops first",
+        summary="The retunes of many loops, latest first",
         responses={**LINK, **problems.responses(422)},
     )
     def retunes_list(response: Response, limit: Limit = 20, cursor: Cursor = None) -> list[RetuneSummary]:
         found = fleet.recent(limit + 1, cursor)
         if len(found) > limit:
             more(response, "/retunes", found[limit - 1][0].number, limit=limit)
-        return [RetuneSummary(**_summary(row, parts)) for row, parts in found[:limit]]
+        return [_summary(row, parts) for row, parts in found[:limit]]
 
     @router.get(
         "/retunes/{retune_id}",
         tags=["retunes"],
-        summary="How far a retune of many loops is",
+        summary="A retune of many loops and its progress",
         responses=problems.responses(404),
     )
     def retunes_one(retune_id: RetuneId) -> RetuneView:
@@ -161,7 +170,7 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Jo
     @router.post(
         "/retunes/{retune_id}/abort",
         tags=["retunes"],
-        summary="Begin no more loops, and stop the jobs that run; their loops are restored",
+        summary="Stop a retune of many loops: no more loops are begun, running jobs stop, and their loops are restored",
         status_code=202,
         responses=problems.responses(404, 409, 422),
     )
@@ -192,22 +201,22 @@ def _is(wanted: LoopFilter | None, busy: bool, last: str | None) -> bool:
     return wanted == last
 
 
-def _summary(row: RetuneRow, parts: list[Part]) -> dict[str, Any]:
+def _summary(row: RetuneRow, parts: list[Part]) -> RetuneSummary:
     may_begin = row.stop_reason is None
-    return {
-        "id": row.id,
-        "url": f"/retunes/{row.id}",
-        "state": row.state,
-        "host": row.host,
-        "requested_by": row.requested_by,
-        "created_at": row.created_at,
-        "ended_at": row.ended_at,
-        "request": row.request,
-        "counts": dict(Counter(part.state(may_begin) for part in parts)),
-        "failures": sum(part.failed for part in parts),
-        "stop_reason": row.stop_reason,
-        "detail": row.detail,
-    }
+    return RetuneSummary(
+        id=row.id,
+        url=f"/retunes/{row.id}",
+        state=RetuneState(row.state),
+        host=row.host,
+        requested_by=row.requested_by,
+        created_at=row.created_at,
+        ended_at=row.ended_at,
+        request=row.request,
+        counts=dict(Counter(part.state(may_begin) for part in parts)),
+        failures=sum(part.failed for part in parts),
+        stop_reason=None if row.stop_reason is None else StopReason(row.stop_reason),
+        detail=row.detail,
+    )
 
 
 def _view(row: RetuneRow, parts: list[Part]) -> RetuneView:
@@ -217,9 +226,9 @@ def _view(row: RetuneRow, parts: list[Part]) -> RetuneView:
             loop=part.loop,
             state=part.state(may_begin),
             job=None if part.job_id is None else f"/jobs/{part.job_id}",
-            reason=part.reason,
+            reason=None if part.reason is None else Reason(part.reason),
             detail=part.detail,
         )
         for part in parts
     ]
-    return RetuneView(**_summary(row, parts), loops=loops)
+    return RetuneView(**dict(_summary(row, parts)), loops=loops)

@@ -1,7 +1,8 @@
-"""The header Idempotency-Key on every POST, as ASGI middleware behind the gate: a request that is repeated with the
-same key is answered as it was the first time, and does nothing again.
+"""ASGI middleware for the header Idempotency-Key, accepted on every POST: a request that is repeated with the same key
+gets the first answer again, and is not executed again.
 
-After the IETF draft "The Idempotency-Key HTTP Header Field", which wants quotes around the key; they may be left out.
+The header follows the IETF draft "The Idempotency-Key HTTP Header Field"; the quotes that the draft requires are
+optional here.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.datastructures import Headers
 from starlette.responses import Response
 from starlette.routing import compile_path
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from loopwright.service.api import problems
 from loopwright.service.api.gate.bodies import begins_with
-from loopwright.service.api.gate.gate import App, AsgiScope, Message, Receive, Send
 from loopwright.service.security.principal import LOCAL
 from loopwright.service.security.principal import current as principal
 from loopwright.service.store import claims
@@ -36,19 +37,19 @@ MAX_CHARACTERS = 128
 _CHARACTERS = rf"[A-Za-z0-9._~:+/=-]{{1,{MAX_CHARACTERS}}}"
 PATTERN = rf'^(?:{_CHARACTERS}|"{_CHARACTERS}")$'
 _AT_ONCE = 4
-"""Threads of its own: requests that wait for a silent node do not keep an abort from claiming its key."""
+"""Threads reserved for keys, so that requests which wait for a silent node cannot delay the key of an abort."""
 _WORDS = f"letters, digits and . _ ~ : + / = -, 1 to {MAX_CHARACTERS} of them, with or without quotes around"
 
 
 class Idempotent:
-    """Wraps the application."""
+    """Wraps the application. The gate runs before this middleware."""
 
-    def __init__(self, app: App, keys: IdempotencyKeys) -> None:
+    def __init__(self, app: ASGIApp, keys: IdempotencyKeys) -> None:
         self._app = app
         self._keys = keys
         self._threads = anyio.CapacityLimiter(_AT_ONCE)
 
-    async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         given = Headers(scope=scope).getlist(HEADER) if scope["type"] == "http" and scope["method"] == "POST" else []
         if not given:
             await self._app(scope, receive, send)
@@ -60,7 +61,7 @@ class Idempotent:
         if body is not None:
             await self._once(given[0].strip('"'), body, scope, receive, send)
 
-    async def _once(self, key: str, body: bytes, scope: AsgiScope, receive: Receive, send: Send) -> None:
+    async def _once(self, key: str, body: bytes, scope: Scope, receive: Receive, send: Send) -> None:
         who = principal.get().key_id or LOCAL
         try:
             claim = await self._beside(lambda: self._keys.claim(who, key, _fingerprint(scope, body)))
@@ -78,8 +79,8 @@ class Idempotent:
             answer = claim if isinstance(claim, Answer) else await self._answer(claim, body, scope, receive)
             await _response(answer)(scope, receive, send)
 
-    async def _answer(self, claim: Claim, body: bytes, scope: AsgiScope, receive: Receive) -> Answer:
-        """What the application answers, kept where it is the answer for good."""
+    async def _answer(self, claim: Claim, body: bytes, scope: Scope, receive: Receive) -> Answer:
+        """The answer of the application, which is stored if it is final."""
         answer: Answer | None = None
         try:
             if claim.effect is None:
@@ -96,18 +97,18 @@ class Idempotent:
                 await self._conclude(claim, answer)
 
     async def _conclude(self, claim: Claim, answer: Answer | None) -> None:
-        """An answer of success is kept, and a conflict: who was told no must not find that it was done later."""
+        """Stores a success or a conflict; a repetition of a refused request must not be executed later."""
         try:
             if answer is not None and (answer.status < 400 or answer.status == 409):
-                kept = answer
-                await self._beside(lambda: self._keys.keep(claim, kept))
+                stored = answer
+                await self._beside(lambda: self._keys.keep(claim, stored))
             else:
                 await self._beside(lambda: self._keys.let_go(claim))
-        except SQLAlchemyError as error:  # what was made or changed is known all the same
+        except SQLAlchemyError as error:  # the effect of the request is stored with the claim
             log.warning("the answer to %s %s could not be kept: %s", HEADER, claim.key, error)
 
-    async def _after_the_cut(self, effect: str, scope: AsgiScope) -> Answer:
-        """The answer that a service killed before giving it would have given: what was made or changed, as it is."""
+    async def _after_the_cut(self, effect: str, scope: Scope) -> Answer:
+        """The answer to a request that a killed service left unanswered: the resource that it created or changed."""
         get = {**scope, "method": "GET", "path": effect, "raw_path": effect.encode(), "query_string": b""}
         found = await _ask(self._app, get, begins_with(b"", _gone))
         if found.status != 200:
@@ -121,15 +122,15 @@ class Idempotent:
         return await run_sync(work, limiter=self._threads)
 
 
-def _fingerprint(scope: AsgiScope, body: bytes) -> str:
-    """Of what must be the same in a repetition."""
+def _fingerprint(scope: Scope, body: bytes) -> str:
+    """The hash of path, query and body, which must be the same in a repetition."""
     found = hashlib.sha256(f"{scope['path']}\0".encode())
     found.update(scope.get("query_string", b"") + b"\0" + body)
     return found.hexdigest()
 
 
-def _status(scope: AsgiScope) -> int:
-    """With which the operation succeeds, as the OpenAPI document says."""
+def _status(scope: Scope) -> int:
+    """The status of success that the OpenAPI document gives for the operation."""
     for path, item in scope["app"].openapi()["paths"].items():
         if "post" in item and compile_path(path)[0].match(scope["path"]):
             return min(int(status) for status in item["post"]["responses"])
@@ -137,7 +138,7 @@ def _status(scope: AsgiScope) -> int:
 
 
 async def _body(receive: Receive) -> bytes | None:
-    """None: the client has gone before it was whole."""
+    """The whole body; None when the client disconnected before its end."""
     parts = []
     while True:
         message = await receive()
@@ -149,12 +150,12 @@ async def _body(receive: Receive) -> bytes | None:
 
 
 async def _gone() -> Message:
-    """What the application receives from a client that has gone."""
+    """An ASGI receive function for a client that has disconnected."""
     return {"type": "http.disconnect"}
 
 
-async def _ask(app: App, scope: AsgiScope, receive: Receive) -> Answer:
-    """The whole answer of the application, which no POST gives as a stream."""
+async def _ask(app: ASGIApp, scope: Scope, receive: Receive) -> Answer:
+    """The whole answer of the application; no POST answers with a stream."""
     status, headers, parts = 500, {}, []
 
     async def taken(message: Message) -> None:

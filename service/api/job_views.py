@@ -1,9 +1,9 @@
-"""What the API shows. Units are in the descriptions; times without "wall" are plant time."""
+"""The views of jobs and loops. Units are in the descriptions; times are plant time unless they are called wall time."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, Field
 
@@ -27,7 +27,7 @@ from loopwright.service.results import (
     empty_result,
 )
 from loopwright.tuning.five_stage.procedure import PROCEDURE
-from loopwright.tuning.reasons import ADVICE
+from loopwright.tuning.reasons import ADVICE, Reason
 
 if TYPE_CHECKING:  # the command line reads views, and has no store
     from loopwright.service.jobs.active_job import Running
@@ -37,10 +37,10 @@ if TYPE_CHECKING:  # the command line reads views, and has no store
 
 
 class LockView(BaseModel):
-    """Somebody keeps tests and decisions from a loop."""
+    """A lock, which keeps tests and decisions from a loop."""
 
     reason: str = Field(examples=["valve is being overhauled"])
-    by: str = Field(description="Who has locked it, as they said", examples=["night shift"])
+    by: str = Field(description="Who locked the loop, as given in the request", examples=["night shift"])
     since: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
 
     @classmethod
@@ -53,7 +53,7 @@ class LoopView(BaseModel):
 
     tag: str = Field(description="Name of the loop", examples=["TIC-101"])
     description: str = Field(examples=["Reactor outlet temperature"])
-    bus: str = Field(description="Where the devices are", examples=["socketcan:vcan0"])
+    bus: str = Field(description="Address of the CAN bus", examples=["socketcan:vcan0"])
     controller_node: int = Field(description="CANopen node id of the controller", examples=[32])
     plant_node: int | None = Field(description="CANopen node id of a simulated plant", examples=[16])
     channel: int = Field(description="Channel of the controller, from 1", examples=[1])
@@ -62,129 +62,138 @@ class LoopView(BaseModel):
     pv_limits: Limits = Field(description="Permitted PV, PV units")
     t95_s: float = Field(description="Time in which the plant covers 95 % of a step, s", examples=[9.1])
     sp_deviation: float = Field(description="Permitted set-point step, PV units", examples=[2.0])
-    area: str | None = Field(description="Part of the site, by its name in loops.yaml", examples=["distillation"])
-    notes: str = Field(description="For the operator")
-    host: str = Field(description="The service that has the loop's bus", examples=["local"])
-    active_job: str | None = Field(description="URL of the job that has the loop", examples=["/jobs/4f0c2a9be113"])
-    last_job_state: JobState | None = Field(description="State of its latest job; dry runs do not count")
-    locked: LockView | None = Field(description="No test and no decision touches it; null: it is not locked")
+    area: str | None = Field(description="Area of the site, as named in loops.yaml", examples=["distillation"])
+    notes: str = Field(description="Notes for the operator")
+    host: str = Field(description="Name of the service that is connected to the bus of the loop", examples=["local"])
+    active_job: str | None = Field(description="URL of the job that is using the loop", examples=["/jobs/4f0c2a9be113"])
+    last_job_state: JobState | None = Field(description="State of the latest job of the loop; dry runs do not count")
+    locked: LockView | None = Field(description="The lock of the loop; null: the loop is not locked")
 
 
 class LiveView(BaseModel):
-    """The present state, read from the controller or from the job that is using it."""
+    """The present state of a loop, read from the controller or from the job that is using the loop."""
 
     sp: float = Field(description="Set-point, PV units", examples=[50.0])
     pv: float | None = Field(description="Process value, PV units", examples=[49.8])
     mv: float | None = Field(description="Controller output, percent", examples=[41.2])
     mode: str = Field(description="off, manual, automatic or experiment", examples=["automatic"])
-    gains: GainsView = Field(description="Gains in effect; while another tuner has others on trial, the accepted ones")
+    gains: GainsView = Field(description="Gains in effect; the accepted gains while another tuner has gains on trial")
     on_trial: bool = Field(description="True while gains are on trial under the tuner's lease")
     mv_low: float = Field(description="The controller's own lower output limit, percent", examples=[0.0])
     mv_high: float = Field(description="The controller's own upper output limit, percent", examples=[100.0])
     sample_time_s: float = Field(description="Sampling period, s", examples=[0.1])
     reverse_acting: bool = Field(description="True: MV falls as PV rises")
     node_state: str = Field(
-        description="operational, or which node of the loop is in which state and controls nothing",
+        description="operational, or the state of a node of the loop that is not operational",
         examples=["operational", "node 20h is pre-operational"],
     )
     when_silent: str = Field(
-        description="What the plant's I/O does with MV when the controller falls silent; empty: not known",
+        description="What the plant's I/O does with MV when the controller fails; empty: not known",
         examples=["it holds MV where it is"],
     )
 
 
 class NotHomeView(BaseModel):
-    """A loop that a job has left and that was not read back as home since: it is looked at until it is, or until
-    `POST /loops/TAG/dismiss`."""
+    """A loop whose restoration after a job is not confirmed. The service checks the loop until the restoration is
+    confirmed, or until `POST /loops/TAG/dismiss`."""
 
     job: str = Field(description="URL of the job", examples=["/jobs/4f0c2a9be113"])
-    reason: str | None = Field(description="From the closed list", examples=["node_not_operational"])
-    detail: str = Field(description="What was found when it was looked at last")
-    advice: str = Field(description="The same, and what to do about it")
+    reason: Reason | None = Field(description="Reason code from the closed list", examples=["node_not_operational"])
+    detail: str = Field(description="Result of the latest check")
+    advice: str = Field(description="The detail, and what the operator should do")
 
     @classmethod
     def of(cls, found: NotHome) -> NotHomeView:
-        reason = None if found.reason is None else found.reason.value
-        return cls(job=f"/jobs/{found.job_id}", reason=reason, detail=found.detail, advice=found.words)
+        return cls(job=f"/jobs/{found.job_id}", reason=found.reason, detail=found.detail, advice=found.words)
 
 
 class LoopDetail(LoopView):
     live: LiveView | None = Field(
-        description="null: the bus is another host's, whose service can tell; or the loop is not reached, and looked "
-        "after"
+        description="The present state; null: the loop belongs to another host, or it is not reached and its "
+        "restoration is not confirmed"
     )
-    not_confirmed_home: NotHomeView | None = Field(description="null: it is not looked after")
+    not_confirmed_home: NotHomeView | None = Field(description="The unconfirmed restoration; null: there is none")
 
 
 class DismissedView(BaseModel):
-    """What a loop was looked after for."""
+    """The jobs whose unconfirmed restoration of a loop was dismissed."""
 
     loop: str = Field(examples=["TIC-101"])
     jobs: list[str] = Field(
-        description="URLs of the jobs it was looked after for; empty: it was not", examples=[["/jobs/4f0c2a9be113"]]
+        description="URLs of the jobs; empty: every restoration was confirmed", examples=[["/jobs/4f0c2a9be113"]]
     )
 
 
 class StageView(BaseModel):
     stage: str = Field(examples=["relay"])
     state: str = Field(description="running, done or ended", examples=["done"])
-    result: dict[str, Any] | None = Field(description="What the stage found; times in s, gains in ISA form")
+    result: Mapping[str, object] | None = Field(description="Result of the stage; times in s, gains in ISA form")
     plant_time_s: float | None = Field(description="Plant time the stage took, s", examples=[120.5])
 
 
 class JobView(BaseModel):
-    """A job: what was asked, how far it is, what came out."""
+    """A job: its request, its progress and its result."""
 
     id: str = Field(examples=["4f0c2a9be113"])
     url: str = Field(examples=["/jobs/4f0c2a9be113"])
     loop: str = Field(examples=["TIC-101"])
     state: JobState = Field(
-        description="no_gain: the loop is tuned as well as asked already, a good end; rehearsed: a dry run that came "
-        "to gains, nothing was tested",
+        description="State of the job. no_gain: the loop is already tuned as well as requested, which is a success; "
+        "rehearsed: a dry run that found gains without a test of the loop",
         examples=["running"],
     )
     dry_run: bool
-    host: str = Field(description="The service that runs it", examples=["local"])
-    attempts: int = Field(description="How often it was begun: more than once after a crash", examples=[1])
-    request: dict[str, Any] = Field(description="The options asked for")
+    host: str = Field(description="Name of the service that runs the job", examples=["local"])
+    attempts: int = Field(
+        description="Number of starts of the job; more than 1 after a crash of the service", examples=[1]
+    )
+    request: Mapping[str, object] = Field(description="The options of the request")
     requested_by: str = Field(examples=["night shift"])
     created_at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
     started_at: str | None = Field(description="UTC, ISO 8601, wall time")
     ended_at: str | None = Field(description="UTC, ISO 8601, wall time")
     stage: str | None = Field(description="The present or last stage", examples=["ultimate"])
-    progress: float = Field(ge=0, le=1, description="0 to 1, in expected plant time", examples=[0.42])
+    progress: float = Field(ge=0, le=1, description="Fraction of the expected plant time, 0 to 1", examples=[0.42])
     remaining_plant_time_s: float | None = Field(description="Expected plant time to the end, s", examples=[310.0])
     plant_time_s: float = Field(description="Plant time so far, s", examples=[224.0])
     stages: list[StageView]
-    method: str = Field(description="What gives the gains", examples=["fast"])
-    chosen: dict[str, float] = Field(description="The method's design parameters in effect, by name with unit")
+    method: str = Field(description="Method that computes the gains", examples=["fast"])
+    chosen: dict[str, float] = Field(description="Design parameters of the method in effect; the names carry the units")
     ultimate: UltimateView | None
-    model: ModelView | TransferModelView | None = Field(description="As five-stage finds it, or as fast does")
+    model: ModelView | TransferModelView | None = Field(
+        description="The process model, in the form of five-stage or of fast"
+    )
     old_gains: GainsView | None
-    new_gains: GainsView | None = Field(description="Proposed, rehearsed, or (no_gain) not worth a proposal")
+    new_gains: GainsView | None = Field(
+        description="The gains proposed or rehearsed, or of a job with no_gain those found no better"
+    )
     comparison: ComparisonView | None = Field(
-        description="Present and new gains side by side on the model, with the verdict; null: no new gains, or a job "
-        "of an earlier version"
+        description="Comparison of the present and the new gains on the model; null: there are no new gains, or the "
+        "job ran under an earlier version"
     )
-    rehearsed_on: RehearsedOnView | None = Field(description="Of a dry run: on which plant, under which gains")
-    predicted: PredictedView | None = Field(description="The new gains on the model")
+    rehearsed_on: RehearsedOnView | None = Field(
+        description="The plant and the gains of a dry run; null: the job is no dry run"
+    )
+    predicted: PredictedView | None = Field(description="Predicted performance of the new gains on the model")
     predicted_before: PredictedView | None = Field(
-        description="fast: the old gains on the same model, in place of a measured step; null: not stable there. "
-        "`comparison` has more figures, for every method"
+        description="Predicted performance of the old gains on the same model, only for method fast; null: the loop is "
+        "not stable with them. `comparison` has more figures, for every method"
     )
-    evidence: EvidenceView | None = Field(description="fast: what its record says; of a refused job too")
-    verification: VerificationView | None = Field(description="fast: the measured step that proves the model")
-    before: StepView | None = Field(description="Set-point step with the old gains, measured; five-stage only")
-    after: StepView | None = Field(description="The same step with the new gains, from rest, measured")
+    evidence: EvidenceView | None = Field(description="Evidence from the record of method fast, also for a refused job")
+    verification: VerificationView | None = Field(description="Measured step that verifies the model of method fast")
+    before: StepView | None = Field(description="Measured set-point step with the old gains; only for five-stage")
+    after: StepView | None = Field(description="Measured set-point step with the new gains, from rest")
     notes: list[str]
-    reason: str | None = Field(description="Why there is no proposal, from the closed list", examples=["not_at_rest"])
-    detail: str | None = Field(description="The reason's numbers")
-    advice: str | None = Field(description="What to do about it")
-    restored: dict[str, Any] | None = Field(description="The loop as read back at the end")
+    reason: Reason | None = Field(
+        description="Why there is no proposal; reason code from the closed list", examples=["not_at_rest"]
+    )
+    detail: str | None = Field(description="The numbers behind the reason")
+    advice: str | None = Field(description="What the operator should do about the reason")
+    restored: Mapping[str, object] | None = Field(description="State of the loop as read back at the end")
 
 
 class SamplesView(BaseModel):
-    """Columns of equal length. float32 as on the bus."""
+    """Samples of a job as columns of equal length. Values are float32, as on the bus."""
 
     job: str
     stage: list[str] = Field(description="Stage of each sample")
@@ -196,22 +205,23 @@ class SamplesView(BaseModel):
 
 
 class Decision(BaseModel):
-    """Who decides, for the record."""
+    """The person who decides, for the audit trail."""
 
     by: str = Field(default="api", max_length=100, examples=["operator A"])
 
 
 def loop_view(
     config: LoopConfig, host: str, active: str | None, last: str | None, lock: LoopLockRow | None
-) -> dict[str, Any]:
-    """active: the id of the job that has the loop.  last: the state of its latest one."""
+) -> LoopView:
+    """active: the id of the job that is using the loop.  last: the state of the latest job of the loop."""
     fields = config.model_dump(exclude={"noise_std_hint"})
-    return fields | {
-        "host": host,
-        "active_job": None if active is None else f"/jobs/{active}",
-        "last_job_state": last,
-        "locked": None if lock is None else LockView.of(lock),
-    }
+    return LoopView(
+        **fields,
+        host=host,
+        active_job=None if active is None else f"/jobs/{active}",
+        last_job_state=None if last is None else JobState(last),
+        locked=None if lock is None else LockView.of(lock),
+    )
 
 
 def live_view(state: LoopState) -> LiveView:
@@ -232,7 +242,7 @@ def live_view(state: LoopState) -> LiveView:
 
 
 def job_view(row: Job, events: Sequence[JobEvent], running: Running | None) -> JobView:
-    """The job from the store, and from its live part while it runs."""
+    """The view of a job from its row and events, and from the live progress while it runs."""
     state = shown(row.state, row.dry_run)
     method = str(row.request.get("method", PROCEDURE))
     result = row.result or empty_result(method)
@@ -259,7 +269,7 @@ def job_view(row: Job, events: Sequence[JobEvent], running: Running | None) -> J
         chosen=result.chosen,
         ultimate=result.ultimate,
         model=result.model,
-        old_gains=_stored_gains(row.old_gains) or result.old_gains,
+        old_gains=GainsView.of(gains_of(row.old_gains)) if row.old_gains else result.old_gains,
         new_gains=result.new_gains,
         comparison=result.comparison,
         rehearsed_on=result.rehearsed_on,
@@ -280,7 +290,7 @@ def job_view(row: Job, events: Sequence[JobEvent], running: Running | None) -> J
 def _progress(
     state: JobState, row: Job, events: Sequence[JobEvent], running: Running | None
 ) -> tuple[float, float | None, float]:
-    """Fraction, remaining and present plant time; of a job on another host as of its last stage."""
+    """Fraction, remaining and present plant time. For a job on another host they are those at its last stage start."""
     if running is not None:
         live = running.progress_now()
         return live.fraction, live.remaining_s, live.plant_time_s
@@ -312,32 +322,28 @@ def _stages(events: Sequence[JobEvent], row: Job) -> list[StageView]:
 
 
 def _evidence(result: FastResult | FiveStageResult, events: Sequence[JobEvent]) -> EvidenceView | None:
-    """Of a refused job, which has none in its result, as its stages came to it."""
+    """The evidence of the result; for a refused job, whose result has none, that of its latest design stage."""
     if isinstance(result, FastResult) and result.evidence is not None:
         return result.evidence
-    told = _told(events, ("redesign", "design"), "reason")
-    return None if told is None else EvidenceView.model_validate(told)
+    found = _stage_result(events, ("redesign", "design"), "reason")
+    return None if found is None else EvidenceView.model_validate(found)
 
 
 def _verification(result: FastResult | FiveStageResult, events: Sequence[JobEvent]) -> VerificationView | None:
     if isinstance(result, FastResult) and result.verification is not None:
         return result.verification
-    told = _told(events, ("verify",), "tested")
-    return None if told is None else VerificationView.of_stage(told)
+    found = _stage_result(events, ("verify",), "tested")
+    return None if found is None else VerificationView.of_stage(found)
 
 
-def _told(events: Sequence[JobEvent], stages: Sequence[str], sign: str) -> JsonObject | None:
-    """The last result of the first of these stages that has one; `sign` is a field that others' results lack."""
+def _stage_result(events: Sequence[JobEvent], stages: Sequence[str], field: str) -> JsonObject | None:
+    """The last result of the first of these stages that has one. Only results with the field `field` count."""
     for stage in stages:
         for event in reversed(events):
             done = event.stage_ended()
-            if done and done.stage == stage and done.result and sign in done.result:
+            if done and done.stage == stage and done.result and field in done.result:
                 return done.result
     return None
-
-
-def _stored_gains(data: JsonObject | None) -> GainsView | None:
-    return GainsView.of(gains_of(data)) if data else None
 
 
 def _finite(value: float) -> float | None:

@@ -17,12 +17,13 @@ Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 
 
 class LockWish(BaseModel):
-    """Why a loop is to be left alone, and who says so."""
+    """The reason for a lock, and the person who locks the loop."""
 
     model_config = ConfigDict(extra="forbid")
 
     by: str = Field(
-        default="api", max_length=100, pattern=_ONE_LINE, description="Whoever is refused is shown it",
+        default="api", max_length=100, pattern=_ONE_LINE,
+        description="Who locks the loop; shown to users whose requests are refused",
         examples=["night shift"],
     )  # fmt: skip
     reason: str = Field(
@@ -32,25 +33,26 @@ class LockWish(BaseModel):
 
 
 class LockedView(BaseModel):
-    """A loop that is locked now."""
+    """A loop that has just been locked."""
 
     loop: str = Field(examples=["TIC-101"])
     locked: LockView
     running_job: str | None = Field(
-        description="URL of the job whose test was running already: it goes on", examples=["/jobs/4f0c2a9be113"]
+        description="URL of a job whose test is already running and continues; null: there is none",
+        examples=["/jobs/4f0c2a9be113"],
     )
-    note: str | None = Field(description="The same in words, and how to end the test")
+    note: str | None = Field(description="The running test in words, and how to abort it")
 
 
 class UnlockedView(BaseModel):
-    """A loop that is not locked any more."""
+    """A loop that has just been unlocked."""
 
     loop: str = Field(examples=["TIC-101"])
-    was_locked: LockView | None = Field(description="null: it was not locked")
+    was_locked: LockView | None = Field(description="The lock that was removed; null: the loop was not locked")
 
 
 def router(locking: Locking) -> APIRouter:
-    """POST /loops/{tag}/lock and /loops/{tag}/unlock."""
+    """A router with POST /loops/{tag}/lock and POST /loops/{tag}/unlock."""
     routes = APIRouter(tags=["loops"], route_class=JsonRoute)
 
     @routes.post(
@@ -58,8 +60,8 @@ def router(locking: Locking) -> APIRouter:
         summary="Lock a loop: no test begins on it and no decision writes to it until it is unlocked",
         responses=problems.responses(404, 409, 422),
     )
-    def lock(tag: Tag, wish: Annotated[LockWish, Body()]) -> LockedView:
-        row, running = locking.lock(tag, wish.reason, wish.by)
+    def lock(tag: Tag, asked: Annotated[LockWish, Body()]) -> LockedView:
+        row, running = locking.lock(tag, asked.reason, asked.by)
         url = note = None
         if running is not None:
             url = f"/jobs/{running.id}"

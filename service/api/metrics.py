@@ -1,4 +1,4 @@
-"""What Prometheus sees: the counters of this process, and jobs and loops, asked of the store when somebody looks."""
+"""The Prometheus metrics: the counters of this process, and the jobs and loops, which are counted at each scrape."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class _OfTheStore(Collector):
         found: Tally[tuple[str, str]] = Tally()
         for state, dry_run, reason, count in counts:
             found[shown(state, dry_run).value, reason or ""] += count
-        # Active states are always there: a gauge that vanishes cannot be alarmed on.
+        # Active states are always exported, because an alarm cannot use a gauge that vanishes.
         for key in sorted(found.keys() | {(state.value, "") for state in ACTIVE | {JobState.PROPOSED}}):
             jobs.add_metric(list(key), found.get(key, 0))
         return jobs
@@ -70,7 +70,7 @@ class _OfTheStore(Collector):
 
 
 def registry(loops: Mapping[str, LoopConfig], store: Store, sdo_retries: Mapping[str, int]) -> CollectorRegistry:
-    """Everything that /metrics shows of a service. sdo_retries: by bus, as the station of this process counts them."""
+    """The registry of the metrics of a service. sdo_retries: SDO retries by bus, as counted in this process."""
     found = CollectorRegistry()
     for collector in (*OF_THIS_PROCESS, _OfTheStore(loops, store, sdo_retries)):
         found.register(collector)
@@ -78,5 +78,5 @@ def registry(loops: Mapping[str, LoopConfig], store: Store, sdo_retries: Mapping
 
 
 def exposition(of: CollectorRegistry) -> bytes:
-    """The text that Prometheus scrapes."""
+    """The metrics in the text format of Prometheus."""
     return generate_latest(of)

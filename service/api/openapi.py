@@ -1,5 +1,5 @@
-"""What every operation shares is written into the OpenAPI document in one place: the key it needs, and what the door
-may answer instead of it."""
+"""Completes the OpenAPI document with what all operations share: the security scheme, the scope of the key, the header
+Idempotency-Key, and the errors that middleware answers with."""
 
 from __future__ import annotations
 
@@ -10,43 +10,44 @@ from fastapi import FastAPI
 from loopwright.service.api import problems
 from loopwright.service.api.gate.gate import ALWAYS, scope_for
 from loopwright.service.api.idempotency import HEADER, MAX_CHARACTERS, PATTERN
+from loopwright.service.api.openapi_document import Document, Operation, Parameter, as_document
 from loopwright.service.store.idempotency import KEPT_H
 
 _KEY = "key"
 _METHODS = ("get", "post", "put", "patch", "delete")
-_IDEMPOTENCY_KEY = {
+_IDEMPOTENCY_KEY: Parameter = {
     "name": HEADER,
     "in": "header",
     "required": False,
-    "description": "Any text that the client gives to no other request, a UUID say. Repeated with the same key within "
-    f"{KEPT_H} h, the request does nothing again and is answered as it was the first time. With another path or body: "
-    "422; while the first is still being answered: 409 with Retry-After",
+    "description": "A unique text chosen by the client, for example a UUID. A request that is repeated with the same "
+    f"key within {KEPT_H} h is not executed again and gets the first answer. The same key with another path or body "
+    "gets 422; a repetition while the first request is still being answered gets 409 with Retry-After",
     "schema": {"type": "string", "pattern": PATTERN, "maxLength": MAX_CHARACTERS + 2},
     "example": "7f1c4f5e-2b8f-4a36-9f3a-5d0b3c1e8a77",
 }
 
 
 def install(app: FastAPI) -> None:
-    """Completes the document that the application makes of itself."""
+    """Makes `app.openapi` return the completed document."""
     make = app.openapi
 
     def complete() -> dict[str, Any]:
         if app.openapi_schema is None:
-            _complete(make())
+            _complete(as_document(make()))
         assert app.openapi_schema is not None
         return app.openapi_schema
 
     app.openapi = complete  # type: ignore[method-assign]
 
 
-def _complete(document: dict[str, Any]) -> None:
+def _complete(document: Document) -> None:
     schemas = document.setdefault("components", {})
     schemas["securitySchemes"] = {
         _KEY: {
             "type": "http",
             "scheme": "bearer",
-            "description": "An API key, made by `loopwright key create`. Not asked for on a service that listens on "
-            "its own machine only, unless it was started with --auth.",
+            "description": "An API key, created by `loopwright key create`. A service that listens only on its own "
+            "machine needs no key, unless it was started with --auth.",
         }
     }
     for never_answered in ("HTTPValidationError", "ValidationError"):
@@ -57,9 +58,9 @@ def _complete(document: dict[str, Any]) -> None:
                 _one(path, method, item[method])
 
 
-def _one(path: str, method: str, operation: dict[str, Any]) -> None:
+def _one(path: str, method: str, operation: Operation) -> None:
     needed = scope_for(method.upper(), path)
-    more: tuple[int, ...] = (403,)  # without keys, a name that is not this machine's
+    more: tuple[int, ...] = (403,)  # without keys, a host name that is not this machine's
     if needed is not None:
         operation["security"] = [{_KEY: []}]
         operation["description"] = "\n\n".join(
@@ -67,19 +68,19 @@ def _one(path: str, method: str, operation: dict[str, Any]) -> None:
         )
         more += (401,)
     if method != "get":
-        more += (408, 413)  # the body did not come, or is too long
+        more += (408, 413)  # the body did not arrive, or is too long
     if method == "post":
         operation.setdefault("parameters", []).append(_IDEMPOTENCY_KEY)
         more += (409, 422)
     if "requestBody" in operation:
-        more += (400, 415)  # cut off; not JSON by its header
+        more += (400, 415)  # the body was cut off; its content type is not JSON
     if operation.get("parameters"):
-        more += (422,)  # text that no database keeps
+        more += (422,)  # text that the database cannot store
     if path not in ALWAYS:
         more += (429, 503)
     elif needed is not None:
         more += (429, 503)  # too many wrong keys; the keys cannot be read
     for status, documented in problems.documented(*more).items():
-        if status == 422:  # FastAPI documents its own object, which the service never answers with
+        if status == 422:  # FastAPI documents a schema that the service never answers with
             operation["responses"][str(status)] = documented
         operation["responses"].setdefault(str(status), documented)

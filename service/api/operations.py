@@ -1,4 +1,4 @@
-"""What an operator's tools ask: is it alive, is it ready, what does it count, who changed what."""
+"""Routes for operations: liveness, readiness, metrics, audit trail, and the documentation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache
-from typing import Annotated, Any
+from typing import Annotated
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, FastAPI, Query, Response
@@ -17,6 +17,7 @@ from pydantic import BaseModel, Field
 
 from loopwright.service.api import metrics, problems
 from loopwright.service.api.docs_page import POLICY, page
+from loopwright.service.api.openapi_document import as_document
 from loopwright.service.api.paging import LARGEST
 from loopwright.service.jobs.aftercare import NotHome
 from loopwright.service.jobs.manager import Jobs
@@ -25,11 +26,11 @@ from loopwright.service.store import audit
 from loopwright.service.store.tables import AuditRow
 
 Check = Callable[[], str | None]
-"""Returns when all is well, with what is worth knowing; raises with the reason when not."""
+"""Returns a note, or None, when the part is ready; raises an exception with the reason when it is not."""
 CHECK_S = 2.0
 BEHIND_S = 1.0
 FRESH_S = 2.0
-"""An answer this old is given again: who asks often does not open the buses as often."""
+"""Age up to which an answer is reused, so that frequent requests do not open the buses as often."""
 
 
 class Alive(BaseModel):
@@ -37,58 +38,61 @@ class Alive(BaseModel):
 
 
 class ReadinessPart(BaseModel):
-    """One thing the service cannot do without."""
+    """A part that the service needs."""
 
     ready: bool
     detail: str | None = Field(
-        description="What is wrong with it; of a part that is ready, what is worth knowing",
+        description="Why the part is not ready; a note if it is ready",
         examples=["CAN interface 'can0' cannot be opened"],
     )
 
 
 class Ready(BaseModel):
-    """Whether the service can take work."""
+    """The readiness of the service."""
 
-    ready: bool = Field(description="All of its parts are")
+    ready: bool = Field(description="True when every part is ready")
     parts: dict[str, ReadinessPart] = Field(
-        description="database, engine, samples (what is deleted when), each bus by its address, and each loop that is "
-        "looked after"
+        description="The parts: database, engine, samples (with the retention), each bus by its address, and each loop "
+        "whose restoration is not confirmed"
     )
 
 
 class AuditView(BaseModel):
-    """One change."""
+    """A change in the audit trail."""
 
-    number: int = Field(description="Counts up; the latest change has the largest", examples=[17])
+    number: int = Field(description="Sequence number; the latest change has the largest one", examples=[17])
     at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
     who: str = Field(
-        description="Name of the key; `local`: without a key, from this machine; `cli:USER`: by a command there; "
-        "`service`: by itself",
+        description="Name of the key; `local`: a request without a key from this machine; `cli:USER`: a command on "
+        "this machine; `service`: the service itself",
         examples=["control room"],
     )
     key_id: str | None = Field(description="Id of the key", examples=["0f3ac2d9be11"])
     address: str | None = Field(description="Network address of the caller", examples=["10.0.0.7"])
-    said_by: str | None = Field(description="Who the request itself says it is from", examples=["night shift"])
+    said_by: str | None = Field(description="Name of the person, as given in the request", examples=["night shift"])
     what: str = Field(
         description="retune, abort, accept, rollback, accept_failed, rollback_failed, retune_many, retune_many_abort, "
         "dismiss, lock, unlock, samples_delete, clock_jump, restore, key_create, key_revoke",
         examples=["accept"],
     )
     subject: str = Field(
-        description="Id of the job, key, or retune of many loops, or tag of the loop", examples=["4f0c2a9be113"]
+        description="Id of the job, the key or the retune of many loops, or the tag of the loop",
+        examples=["4f0c2a9be113"],
     )
     loop: str | None = Field(examples=["TIC-101"])
-    before: dict[str, Any] | None = Field(description="State and gains before, where there were some")
-    after: dict[str, Any] | None = Field(description="State and gains after; of a retune the request")
+    before: Mapping[str, object] | None = Field(description="State and gains before the change; null: there were none")
+    after: Mapping[str, object] | None = Field(description="State and gains after the change; for a retune the request")
 
 
 class AuditPage(BaseModel):
     entries: list[AuditView] = Field(description="The latest change first")
-    next: str | None = Field(description="URL of the page after this one", examples=["/audit?before=17"])
+    next: str | None = Field(
+        description="URL of the next page; null: this is the last one", examples=["/audit?before=17"]
+    )
 
 
 class Readiness:
-    """Asks every part, each within CHECK_S. more: parts that come and go, asked for each time."""
+    """Checks every part, each within CHECK_S seconds. more: returns the parts that may change between requests."""
 
     def __init__(self, checks: Mapping[str, Check], more: Callable[[], Mapping[str, Check]] = dict) -> None:
         self._checks = checks
@@ -100,7 +104,7 @@ class Readiness:
         async with self._asking:
             if self._last is None or time.monotonic() - self._last[0] > FRESH_S:
                 checks = dict(self._checks)
-                with suppress(Exception):  # the database that should name them is a part of its own
+                with suppress(Exception):  # the check of the database reports the error
                     checks |= await asyncio.wait_for(asyncio.to_thread(self._more), CHECK_S)
                 views = await asyncio.gather(*(self._one(check) for check in checks.values()))
                 parts = dict(zip(checks, views, strict=True))
@@ -110,21 +114,23 @@ class Readiness:
     @staticmethod
     async def _one(check: Check) -> ReadinessPart:
         try:
-            told = await asyncio.wait_for(asyncio.to_thread(check), CHECK_S)
+            note = await asyncio.wait_for(asyncio.to_thread(check), CHECK_S)
         except TimeoutError:
             return ReadinessPart(ready=False, detail=f"no answer within {CHECK_S:g} s")
-        except Exception as error:  # whatever it is, this part is not ready
+        except Exception as error:  # any exception means that the part is not ready
             return ReadinessPart(ready=False, detail=str(error) or type(error).__name__)
-        return ReadinessPart(ready=True, detail=told)
+        return ReadinessPart(ready=True, detail=note)
 
 
 def checks(jobs: Jobs) -> dict[str, Check]:
-    """database, engine, and each bus of the configured loops."""
+    """The checks of the database, the engine, and each bus of the configured loops."""
 
     def database() -> None:
         jobs.store.ping()
         if jobs.journal.behind_s > BEHIND_S:
-            raise RuntimeError(f"takes nothing for {jobs.journal.behind_s:.0f} s; reports of jobs wait in memory")
+            raise RuntimeError(
+                f"the database takes nothing for {jobs.journal.behind_s:.0f} s; reports of jobs wait in memory"
+            )
 
     def engine() -> None:
         if jobs.stopping:
@@ -137,7 +143,7 @@ def checks(jobs: Jobs) -> dict[str, Check]:
 
 
 def loops_looked_after(jobs: Jobs) -> dict[str, Check]:
-    """A part for each of this host's loops that is not confirmed home: never ready, and says why."""
+    """A failing check for each loop of this host whose restoration is not confirmed, with the reason."""
 
     def part(found: NotHome) -> Check:
         def check() -> None:
@@ -149,18 +155,18 @@ def loops_looked_after(jobs: Jobs) -> dict[str, Check]:
 
 
 def install(app: FastAPI, jobs: Jobs, parts: Mapping[str, Check], sdo_retries: Mapping[str, int]) -> None:
-    """Adds the routes."""
+    """Adds the routes. parts: the checks of /readyz.  sdo_retries: SDO retries by bus."""
     router = APIRouter(tags=["operations"])
     readiness = Readiness(parts, lambda: loops_looked_after(jobs))
     counted = metrics.registry(jobs.directory.loops, jobs.store, sdo_retries)
 
-    @router.get("/healthz", summary="Is the process alive")
+    @router.get("/healthz", summary="Whether the process is alive")
     async def healthz() -> Alive:
         return Alive(status="alive")
 
     @router.get(
         "/readyz",
-        summary="Can it take work: database, engine, each bus; and is each loop home",
+        summary="Whether the service is ready: database, engine, each bus, and the restoration of each loop",
         response_model=Ready,
         responses={503: {"model": Ready, "description": "At least one part is not ready"}},
     )
@@ -170,34 +176,34 @@ def install(app: FastAPI, jobs: Jobs, parts: Mapping[str, Check], sdo_retries: M
 
     @router.get(
         "/metrics",
-        summary="Counts for Prometheus",
+        summary="Metrics for Prometheus",
         response_class=Response,
-        responses={200: {"content": {"text/plain": {}}, "description": "Prometheus' text format"}},
+        responses={200: {"content": {"text/plain": {}}, "description": "Metrics in the text format of Prometheus"}},
     )
     def counts() -> Response:
         return Response(metrics.exposition(counted), media_type=metrics.MEDIA_TYPE)
 
-    @router.get("/audit", summary="Every change, the latest first", responses=problems.responses(422))
+    @router.get("/audit", summary="The audit trail, latest change first", responses=problems.responses(422))
     def changes(
-        limit: Annotated[int, Query(ge=1, le=1000, description="At most so many")] = 100,
+        limit: Annotated[int, Query(ge=1, le=1000, description="Maximum number of changes")] = 100,
         before: Annotated[
-            int | None, Query(ge=1, le=LARGEST, description="Only those with a smaller number", examples=[17])
+            int | None, Query(ge=1, le=LARGEST, description="Only changes with a smaller number", examples=[17])
         ] = None,
         what: Annotated[str | None, Query(description="Only this kind of change", examples=["accept"])] = None,
-        loop: Annotated[str | None, Query(description="Only of this loop", examples=["TIC-101"])] = None,
+        loop: Annotated[str | None, Query(description="Only changes of this loop", examples=["TIC-101"])] = None,
     ) -> AuditPage:
         rows = audit.trail(jobs.store.engine, limit + 1, before, what, loop)
         page_of = rows[:limit]
         more = None
         if len(rows) > limit:
-            kept = {"limit": limit, "before": page_of[-1].number, "what": what, "loop": loop}
-            more = f"/audit?{urlencode({k: v for k, v in kept.items() if v is not None})}"
+            query = {"limit": limit, "before": page_of[-1].number, "what": what, "loop": loop}
+            more = f"/audit?{urlencode({k: v for k, v in query.items() if v is not None})}"
         return AuditPage(entries=[_view(row) for row in page_of], next=more)
 
     app.include_router(router)
 
-    # Made once: anybody may ask for them without a key, and each making holds the interpreter for milliseconds.
-    made_once = cache(lambda: (json.dumps(app.openapi()).encode(), page(app.openapi()).encode()))
+    # Encoded once: clients need no key for them, and each encoding holds the interpreter lock for milliseconds.
+    made_once = cache(lambda: (json.dumps(app.openapi()).encode(), page(as_document(app.openapi())).encode()))
 
     @app.get("/openapi.json", include_in_schema=False)
     def document() -> Response:

@@ -1,4 +1,4 @@
-"""What a retune would do, before it starts: of one loop, and of many. Nothing is changed."""
+"""Routes that preview a retune of one loop or of many. They change nothing."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 
 
 def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
+    """A router with POST /loops/{tag}/retune/preview and POST /retunes/preview."""
     routes = APIRouter()
 
     @routes.post(
         "/loops/{tag}/retune/preview",
         tags=["loops"],
-        summary="What a retune with this body would do now: moves, time, limits, and all that would refuse it",
+        summary="Preview a retune: its moves, time and limits, and every reason why it would be refused now",
         responses=problems.responses(404, 422, 503),
     )
     def retune_preview(tag: Tag, options: Annotated[RetuneRequest | None, Body()] = None) -> Preview:
@@ -38,11 +39,11 @@ def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
     @routes.post(
         "/retunes/preview",
         tags=["retunes"],
-        summary="What a retune of many loops would do, from configuration and earlier jobs: no controller is asked",
+        summary="Preview a retune of many loops from configuration and earlier jobs, without reading the controllers",
         responses=problems.responses(422, 503),
     )
-    def retune_many_preview(wish: Annotated[FleetRequest, Body()]) -> FleetPreview:
-        options, busy, models = wish.each(), jobs.store.busy(), jobs.store.last_models()
+    def retune_many_preview(request: Annotated[FleetRequest, Body()]) -> FleetPreview:
+        options, busy, models = request.each(), jobs.store.busy(), jobs.store.last_models()
         locked = _locked(jobs)
         return fleet_preview([
             preview(
@@ -51,14 +52,14 @@ def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
                 Now(active_job=busy.get(config.tag), locked=locked.get(config.tag), stopping=jobs.stopping),
                 _last(models.get(config.tag)),
             )
-            for config in fleet.asked(wish)
+            for config in fleet.asked(request)
         ])  # fmt: skip
 
     return routes
 
 
 def _now(jobs: Jobs, tag: str, request: RetuneRequest) -> Now:
-    """What the loop is now. While a job has it, what that job has found and will bring back counts."""
+    """The present state of the loop. While a job is using it, this is the state that the job will restore."""
     if request.dry_run:
         return Now(stopping=jobs.stopping)
     active = jobs.store.active(tag)
@@ -73,7 +74,7 @@ def _now(jobs: Jobs, tag: str, request: RetuneRequest) -> Now:
 
 
 def _locked(jobs: Jobs) -> dict[str, str]:
-    """Of each loop that is locked, by whom, since when and why."""
+    """The lock of each locked loop in words: by whom, since when and why."""
     return {tag: loop_locks.words(row) for tag, row in jobs.locking.locks().items()}
 
 

@@ -1,7 +1,8 @@
-"""Every error of the API as application/problem+json (RFC 9457), with the reason and advice where there are some."""
+"""Errors of the API as application/problem+json (RFC 9457), with reason and advice if there are any."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from http import HTTPStatus
 from typing import Any
 
@@ -13,6 +14,7 @@ from sqlalchemy.exc import DataError, SQLAlchemyError
 from starlette.exceptions import HTTPException
 
 from loopwright.service.api.bodies import BadBody
+from loopwright.service.api.openapi_document import DocumentedResponse, MediaType
 from loopwright.service.errors import Conflict, Locked, Stopping, UnknownLoop
 from loopwright.service.execution.computing.pool import NotWanted
 from loopwright.service.inputs.model_json import BadModel
@@ -27,32 +29,56 @@ from loopwright.service.store.store import Busy, FolderInUse, NoSuchJob
 from loopwright.tuning.reasons import ADVICE, Ended, Reason
 
 MEDIA_TYPE = "application/problem+json"
+Responses = dict[int | str, dict[str, Any]]
+"""The type of the argument `responses` of a FastAPI route."""
 CLIENT_GONE = 499
-"""As other servers log it: nobody is there to read the answer."""
+"""The status that nginx logs when the client has disconnected; nobody reads the answer."""
+
+
+class InvalidValue(BaseModel):
+    """An invalid value of a request."""
+
+    where: str = Field(description="Path of the value", examples=["body.model.K"])
+    why: str = Field(description="Why the value is invalid", examples=["K must not be 0: PV would not answer MV"])
 
 
 class Problem(BaseModel):
     """RFC 9457 problem details."""
 
     type: str = Field(description="Kind of problem", examples=["about:blank"])
-    title: str = Field(description="The same for every problem of this kind", examples=["Conflict"])
+    title: str = Field(description="Title of the HTTP status", examples=["Conflict"])
     status: int = Field(description="HTTP status", examples=[409])
-    detail: str = Field(description="What happened this time", examples=["loop TIC-101 is busy with job 4f0c2a9be113"])
-    reason: str | None = Field(default=None, description="From the closed list of reasons", examples=["node_lost"])
-    advice: str | None = Field(default=None, description="What to do about it")
+    detail: str = Field(
+        description="Explanation of this occurrence", examples=["loop TIC-101 is busy with job 4f0c2a9be113"]
+    )
+    reason: Reason | None = Field(default=None, description="Reason code from the closed list", examples=["node_lost"])
+    advice: str | None = Field(default=None, description="What the client or the operator should do")
     job: str | None = Field(default=None, description="URL of the active job", examples=["/jobs/4f0c2a9be113"])
-    errors: list[dict[str, Any]] | None = Field(default=None, description="Each invalid value: where and why")
+    errors: list[InvalidValue] | None = Field(default=None, description="The invalid values of the request")
 
 
 def problem(
-    status: int, detail: str, *, reason: Reason | None = None, headers: dict[str, str] | None = None, **more: Any
+    status: int,
+    detail: str,
+    *,
+    reason: Reason | None = None,
+    headers: dict[str, str] | None = None,
+    job: str | None = None,
+    errors: Sequence[InvalidValue] = (),
 ) -> JSONResponse:
-    body: dict[str, Any] = {
-        "type": "about:blank", "title": HTTPStatus(status).phrase, "status": status, "detail": detail,
-    }  # fmt: skip
-    if reason is not None:
-        body |= {"reason": reason.value, "advice": ADVICE[reason]}
-    return JSONResponse(body | more, status_code=status, media_type=MEDIA_TYPE, headers=headers)
+    """The response with the problem. job: URL of the active job."""
+    body = Problem(
+        type="about:blank",
+        title=HTTPStatus(status).phrase,
+        status=status,
+        detail=detail,
+        reason=reason,
+        advice=None if reason is None else ADVICE[reason],
+        job=job,
+        errors=list(errors) or None,
+    )
+    content = body.model_dump(mode="json", exclude_none=True)
+    return JSONResponse(content, status_code=status, media_type=MEDIA_TYPE, headers=headers)
 
 
 def of_http(error: HTTPException) -> JSONResponse:
@@ -74,18 +100,18 @@ def still_answering(error: StillAnswering) -> JSONResponse:
 
 
 def install(app: FastAPI) -> None:
-    """Every exception that a route may let through becomes a problem."""
+    """Adds handlers that turn every exception of a route into a problem."""
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(_request: Request, error: RequestValidationError) -> JSONResponse:
-        # The input itself is left out: it may be NaN, which JSON cannot say.
-        errors = [{"where": place(e["loc"]), "why": words(e["msg"])} for e in error.errors()]
-        detail = "; ".join(f"{e['where']}: {e['why']}" for e in errors)
+        # The input itself is left out, because it may be NaN, which JSON cannot represent.
+        errors = [InvalidValue(where=place(e["loc"]), why=words(e["msg"])) for e in error.errors()]
+        detail = "; ".join(f"{each.where}: {each.why}" for each in errors)
         return problem(422, detail, reason=Reason.BAD_INPUT, errors=errors)
 
     @app.exception_handler(BadBody)
     async def _body(_request: Request, error: BadBody) -> JSONResponse:
-        errors = [{"where": error.where, "why": error.detail}]
+        errors = [InvalidValue(where=error.where, why=error.detail)]
         return problem(422, f"{error.where}: {error.detail}", reason=Reason.BAD_INPUT, errors=errors)
 
     @app.exception_handler(HTTPException)
@@ -135,7 +161,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(DataError)
     async def _unkeepable(_request: Request, error: DataError) -> JSONResponse:
-        detail = f"a name or number in the request is none that the database can look for: {error.orig}"
+        detail = f"the database cannot look for a name or number in the request: {error.orig}"
         return problem(422, detail, reason=Reason.BAD_INPUT)
 
     @app.exception_handler(SQLAlchemyError)
@@ -152,15 +178,15 @@ def install(app: FastAPI) -> None:
         return problem(500, f"{type(error).__name__}: {error}", reason=Reason.INTERNAL)
 
 
-def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """What a route documents besides its success."""
+def responses(*statuses: int) -> Responses:
+    """The documented error responses of a route with these statuses."""
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
         status: {"model": Problem, "content": content, "description": HTTPStatus(status).phrase} for status in statuses
     }
 
 
-def documented(*statuses: int) -> dict[int, dict[str, Any]]:
-    """The same for a document that is made already."""
-    content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+def documented(*statuses: int) -> dict[int, DocumentedResponse]:
+    """The same responses for an OpenAPI document that FastAPI has already generated."""
+    content: dict[str, MediaType] = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {status: {"content": content, "description": HTTPStatus(status).phrase} for status in statuses}

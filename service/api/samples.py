@@ -1,7 +1,7 @@
-"""The samples of a job as they go to a client: text in parts of bounded size, written block by block.
+"""The samples of a job as streamed JSON or CSV text, in parts of bounded size, read block by block.
 
-A job of days has millions of samples: neither they nor their text are ever in memory together. JSON, which has a
-list for each column, is written in as many passes over the blocks.
+A job of days has millions of samples; neither they nor their text are ever in memory together. JSON has a list for each
+column, so the blocks are read once for each column.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from loopwright.service.store.store import Store
 from loopwright.tuning.models import Reals
 
 _PART = 1 << 16
-"""Characters that are handed to the server at once."""
+"""Characters of a part that is handed to the server."""
 _GZIP_LEVEL = 4
 _NO_NUMBERS = frozenset({"nan", "inf", "-inf"})
 
 
 class Gone(Exception):
-    """Samples were deleted while they were read: the client must not take what it has for the whole."""
+    """Samples were deleted while they were read. The answer is cut off, so the client does not take it for complete."""
 
 
 class Reading:
-    """The samples that a job has now, of one stage or of all, to be read more than once: those that come meanwhile are
-    left out."""
+    """The samples that a job has now, of one stage or of all. They can be read more than once; later samples are left
+    out."""
 
     def __init__(self, store: Store, job_id: str, stage: str | None = None) -> None:
         self.job_id = job_id
@@ -39,7 +39,7 @@ class Reading:
         self._count: int | None = None
 
     def blocks(self) -> Iterator[Block]:
-        """Raises Gone when there are fewer samples than the last time."""
+        """The blocks in order. Raises Gone when the number of samples differs from the previous pass."""
         count = 0
         for block in self._store.blocks(self.job_id, self._stage, self._last):
             count += block.count
@@ -50,7 +50,7 @@ class Reading:
 
 
 def json_text(of: Reading) -> Iterator[str]:
-    """The object of GET /jobs/{id}/samples."""
+    """The JSON object that GET /jobs/{id}/samples answers with."""
     yield f'{{"job":{json.dumps(of.job_id)}'
     for column in ("stage", *COLUMNS):
         yield f',"{column}":['
@@ -70,7 +70,7 @@ def _json_values(block: Block, column: str) -> Iterable[str]:
 
 
 def csv_text(of: Reading) -> Iterator[str]:
-    """A row for each sample, under a row of names."""
+    """CSV text: a header, then a row for each sample."""
     yield ",".join(("stage", *COLUMNS)) + "\n"
     for block in of.blocks():
         columns = (block.texts(column) for column in COLUMNS)
@@ -79,11 +79,11 @@ def csv_text(of: Reading) -> Iterator[str]:
 
 
 def parts(text: Iterator[str], compress: bool) -> Iterator[bytes]:
-    """The text as bytes, in parts that are worth sending."""
+    """The text as bytes in parts of about 64 kB, compressed with gzip if asked."""
     if not compress:
         yield from (part.encode() for part in _gathered(text))
         return
-    packer = zlib.compressobj(_GZIP_LEVEL, wbits=31)  # 31: with the header of gzip
+    packer = zlib.compressobj(_GZIP_LEVEL, wbits=31)  # 31 selects the gzip format
     for part in _gathered(text):
         if packed := packer.compress(part.encode()):
             yield packed
@@ -104,7 +104,7 @@ def _gathered(text: Iterator[str]) -> Iterator[str]:
 
 
 def takes_gzip(accept_encoding: str) -> bool:
-    """Whether the header Accept-Encoding names gzip, and does not rule it out (q=0)."""
+    """Whether the header Accept-Encoding names gzip, and not with q=0."""
     for each in accept_encoding.lower().split(","):
         name, _, weight = each.partition(";")
         if name.strip() == "gzip":
@@ -113,7 +113,7 @@ def takes_gzip(accept_encoding: str) -> bool:
 
 
 def record_columns(blocks: Iterable[Block]) -> Columns:
-    """All of the samples as arrays, for who computes with them: 48 bytes each."""
+    """All samples as one array for each column, 48 bytes a sample, for computations."""
     stages: list[str] = []
     numbers: dict[str, list[Reals]] = {column: [np.empty(0)] for column in COLUMNS}
     for block in blocks:

@@ -1,8 +1,8 @@
-"""JSON that comes from outside, in a request or a file: one meaning for every text, or none.
+"""A strict JSON parser for requests and files.
 
-Refused beside what is no JSON at all: a key that an object has twice (of two values the last would win without a word),
-NaN, Infinity and numbers too large for a float, nesting deeper than anything we ask for, and text that a database
-cannot keep. A byte order mark is passed over: some editors write one.
+Besides invalid JSON the parser refuses a duplicate key in an object (Python's parser would silently use the last
+value), NaN, Infinity and numbers too large for a float, deep nesting, and text that a database cannot store. It skips a
+byte order mark, because some editors write one.
 """
 
 from __future__ import annotations
@@ -10,17 +10,16 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from typing import Any
 
 DEEPEST = 16
-"""Lists and objects within each other. The deepest that is asked for anywhere is 4."""
+"""Maximum nesting of lists and objects. The deepest valid request has 4 levels."""
 
 
 _LOOKED_AT = (str, float, dict, list)
 
 
 class BadJson(ValueError):
-    """The text is refused. where: the way to the place through keys and indices, as far as there is one."""
+    """The text is refused. where: the path to the invalid value by keys and indices; empty if there is none."""
 
     def __init__(self, why: str, where: tuple[str | int, ...] = ()) -> None:
         self.why = why
@@ -28,11 +27,11 @@ class BadJson(ValueError):
         super().__init__(f"{self.where}: {why}" if where else why)
 
 
-def loads(text: str | bytes) -> Any:
-    """What the text says. Bytes are UTF-8. Raises BadJson."""
+def loads(text: str | bytes) -> object:
+    """The parsed value. Bytes are decoded as UTF-8. Raises BadJson."""
     try:
         text = text.decode("utf-8-sig") if isinstance(text, bytes) else text.removeprefix("\ufeff")
-        found = json.loads(text, object_pairs_hook=_object)
+        found: object = json.loads(text, object_pairs_hook=_object)
     except UnicodeDecodeError as error:
         raise BadJson(f"is not text in UTF-8: byte {error.start}") from None
     except json.JSONDecodeError as error:
@@ -45,13 +44,13 @@ def loads(text: str | bytes) -> Any:
     return found
 
 
-class _Twice(dict[str, Any]):
-    """An object of which a key was given twice. Its place is known only when all is read."""
+class _Twice(dict[str, object]):
+    """An object with a duplicate key. Its path is known only after the whole text has been parsed."""
 
     key = ""
 
 
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _object(pairs: list[tuple[str, object]]) -> dict[str, object]:
     found = dict(pairs)
     if len(found) == len(pairs):
         return found
@@ -60,16 +59,16 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return twice
 
 
-def _check(found: Any) -> None:
-    """Raises BadJson with the place. Without recursion: the depth is what is checked."""
-    waiting: list[tuple[Any, tuple[str | int, ...]]] = [(found, ())]
+def _check(found: object) -> None:
+    """Raises BadJson with the path of an invalid value. It does not recurse, because the nesting may be deep."""
+    waiting: list[tuple[object, tuple[str | int, ...]]] = [(found, ())]
     while waiting:
         value, where = waiting.pop()
         if isinstance(value, str):
             _check_text(value, where)
         elif isinstance(value, float):
             if not math.isfinite(value):
-                raise BadJson("NaN, Infinity and what is beyond 1.8e308 are not numbers here", where)
+                raise BadJson("NaN, Infinity and what is beyond 1.8e308 are not numbers in JSON", where)
         elif isinstance(value, dict | list):
             if len(where) >= DEEPEST:
                 raise BadJson(_too_deep(), where)

@@ -1,8 +1,9 @@
-"""What the API shows of methods and tunings; the same objects as `loopwright methods` and `loopwright tune`."""
+"""The views of methods and tunings; `loopwright methods` and `loopwright tune` print the same objects."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from collections.abc import Mapping
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
@@ -18,10 +19,14 @@ class OptionView(BaseModel):
     """An option of a method."""
 
     kind: Literal["number", "whole", "flag", "choice"] = Field(examples=["number"])
-    unit: str = Field(description="Empty for none", examples=["s"])
-    default: float | str | bool | None = Field(description="null: the method decides from the model", examples=[None])
+    unit: str = Field(description="Unit of the value; empty: it has none", examples=["s"])
+    default: float | str | bool | None = Field(
+        description="Default value; null: the method chooses one from the model", examples=[None]
+    )
     meaning: str = Field(examples=["time constant of the closed loop; none: the dead time"])
-    choices: list[str | float] = Field(description="The only values, for kind choice", examples=[["pi", "pid"]])
+    choices: list[str | float] = Field(
+        description="Permitted values of an option of kind choice", examples=[["pi", "pid"]]
+    )
     minimum: float | None = Field(examples=[0.0])
     maximum: float | None = Field(examples=[None])
 
@@ -29,58 +34,66 @@ class OptionView(BaseModel):
 class MethodView(BaseModel):
     """A tuning method."""
 
-    method: str = Field(description="Its name", examples=["simc"])
+    method: str = Field(description="Name of the method", examples=["simc"])
     title: str = Field(examples=["SIMC"])
     source: str = Field(examples=["S. Skogestad, J. Process Control 13, 2003"])
-    for_what: str = Field(description="When to choose it")
-    needs: str = Field(description="The models it takes; richer ones are reduced where a sound reduction exists")
+    for_what: str = Field(description="When to choose the method")
+    needs: str = Field(description="Models that the method takes; others are reduced where a sound reduction exists")
     options: dict[str, OptionView]
 
 
 class TuningRequest(BaseModel):
-    """A model, and what to tune it by."""
+    """A process model, and the method that tunes it."""
 
     model_config = ConfigDict(extra="forbid")
 
     model: ModelForm = Field(
-        description="The model, in one of five forms", examples=[{"K": 0.8, "T_s": 3.0, "L_s": 1.0}]
+        description="Process model in one of five forms", examples=[{"K": 0.8, "T_s": 3.0, "L_s": 1.0}]
     )
-    method: str = Field(default="all", description="One of GET /methods, or all", examples=["simc"])
-    options: dict[str, Any] = Field(
+    method: str = Field(default="all", description="A method of GET /methods, or all", examples=["simc"])
+    options: Mapping[str, object] = Field(
         default_factory=dict,
-        description="By name; with all, each goes to the methods that have it",
+        description="Options of the method by name; with all, each option goes to the methods that have it",
         examples=[{"tau_c_s": 2.0}],
     )
 
 
 class ParallelView(BaseModel):
-    """The same controller as Kp + Ki/s + Kd s/(1 + Tf s)."""
+    """The gains in parallel form, Kp + Ki/s + Kd s/(1 + Tf s)."""
 
-    Kp: float = Field(description="MV units per PV unit", examples=[1.5])
-    Ki: float = Field(description="MV units per PV unit and s", examples=[0.5])
-    Kd: float = Field(description="MV units times s per PV unit", examples=[0.0])
-    Tf: float = Field(description="s", examples=[0.0])
+    Kp: float = Field(description="Proportional gain, MV units per PV unit", examples=[1.5])
+    Ki: float = Field(description="Integral gain, MV units per PV unit and s", examples=[0.5])
+    Kd: float = Field(description="Derivative gain, MV units times s per PV unit", examples=[0.0])
+    Tf: float = Field(description="Derivative filter time, s", examples=[0.0])
 
 
 class MarginsView(BaseModel):
-    """Of the loop on the model; null where there is no such crossing, all for an unstable loop."""
+    """Stability margins of the loop on the model. A margin is null if the frequency response has no such crossing; all
+    margins are null for an unstable loop."""
 
     stable: bool
     Ms: float | None = Field(description="Maximum sensitivity", examples=[1.59])
     Mt: float | None = Field(description="Maximum complementary sensitivity", examples=[1.0])
     GM: float | None = Field(description="Gain margin, ratio", examples=[3.1])
     PM_deg: float | None = Field(description="Phase margin, degrees", examples=[61.0])
-    delay_margin_s: float | None = Field(description="Dead time that the loop bears in addition, s", examples=[2.1])
-    bandwidth_rad_s: float | None = Field(description="rad/s", examples=[0.7])
+    delay_margin_s: float | None = Field(
+        description="Additional dead time at which the loop becomes unstable, s", examples=[2.1]
+    )
+    bandwidth_rad_s: float | None = Field(description="Bandwidth, rad/s", examples=[0.7])
 
 
 class FiguresView(BaseModel):
-    """Of the answer to a unit step; null where it does not settle or there is no such figure."""
+    """Performance figures of the response to a unit step. A figure is null if the response does not settle or the
+    figure does not exist."""
 
-    overshoot_pct: float = Field(description="Of the final change; 0 for a load", examples=[4.0])
-    rise_s: float | None = Field(description="10 to 90 %, s", examples=[3.2])
-    settling_s: float | None = Field(description="Into settling_band for good, s", examples=[8.4])
-    settling_band: float = Field(description="2 % of the final change (load: of the peak), PV units", examples=[0.02])
+    overshoot_pct: float = Field(
+        description="Overshoot, percent of the final change; 0 for a load disturbance", examples=[4.0]
+    )
+    rise_s: float | None = Field(description="Rise time from 10 to 90 %, s", examples=[3.2])
+    settling_s: float | None = Field(description="Settling time into settling_band, s", examples=[8.4])
+    settling_band: float = Field(
+        description="2 % of the final change (load disturbance: of the peak), PV units", examples=[0.02]
+    )
     peak: float = Field(description="Largest change of PV, PV units", examples=[1.04])
     IAE: float = Field(description="Integral of |e|, PV units s", examples=[2.2])
     ISE: float = Field(description="Integral of e^2, PV units^2 s", examples=[1.7])
@@ -94,25 +107,27 @@ class FiguresView(BaseModel):
 
 
 class TunedView(BaseModel):
-    """What one method says of the model. The figures are of just these gains, an ideal derivative filtered first."""
+    """The tuning of the model by one method. An ideal derivative is filtered before the figures are computed."""
 
     method: str = Field(examples=["simc"])
     title: str = Field(examples=["SIMC"])
     outcome: Literal["tuned", "refused"]
-    reason: Reason | None = Field(description="Why it refused, from the closed list")
-    detail: str | None = Field(description="The reason's numbers")
-    advice: str | None = Field(description="What to do about it")
+    reason: Reason | None = Field(description="Why the method refused; reason code from the closed list")
+    detail: str | None = Field(description="The numbers behind the reason")
+    advice: str | None = Field(description="What to do about the refusal")
     gains: GainsView | None
     parallel: ParallelView | None
-    chosen: dict[str, float] | None = Field(description="Design parameters in effect, by name with unit")
+    chosen: dict[str, float] | None = Field(description="Design parameters in effect; the names carry the units")
     notes: list[str]
     margins: MarginsView | None
-    setpoint: FiguresView | None = Field(description="Unit step of the set-point; null for an unstable loop")
-    load: FiguresView | None = Field(description="Unit step at the plant's input; null for an unstable loop")
+    setpoint: FiguresView | None = Field(
+        description="Figures of a unit step of the set-point; null for an unstable loop"
+    )
+    load: FiguresView | None = Field(description="Figures of a unit step of the load; null for an unstable loop")
 
 
 class TuningsView(BaseModel):
-    """A model and what the methods say of it."""
+    """A model and its tunings by the methods."""
 
     model: ShownModel = Field(description="The model as understood", examples=[{"K": 0.8, "T_s": 3.0, "L_s": 1.0}])
     methods: list[TunedView]
@@ -122,10 +137,12 @@ class TuningsView(BaseModel):
 
 
 class AlternativeView(TunedView):
-    retune: dict[str, Any] | None = Field(
-        description="Body for POST /loops/{tag}/retune, which tries these gains on the loop without another "
-        f"experiment; null without gains, where Ms is above {MAX_Ms:g} or GM below {MIN_GM:g}, and for a rule on a "
-        "model that is not K, T_s, L_s",
+    """The tuning by one method of the model that a job found."""
+
+    retune: Mapping[str, object] | None = Field(
+        description="Body for POST /loops/{tag}/retune that tests these gains on the loop without another "
+        f"experiment; null: there are no gains, Ms is above {MAX_Ms:g} or GM below {MIN_GM:g}, or a rule has a model "
+        "that is not of the form K, T_s, L_s",
         examples=[
             {
                 "start": "optimise",
@@ -137,19 +154,20 @@ class AlternativeView(TunedView):
     )
 
     uncertainty: float | None = Field(
-        description="With `ms`: so much larger Ms would be with the model two standard deviations off; null: no record"
+        description="Increase of Ms when the model is two standard deviations off, only with `ms`; null: no record"
     )
     ambiguity: float | None = Field(
-        description="With `ms`: largest difference of Ms on a rival model of the same record; null: no record"
+        description="Largest difference of Ms on a candidate model that explains the record as well, only with `ms`; "
+        "null: no record"
     )
 
 
 class AlternativesView(BaseModel):
-    """What the methods, or fast for another Ms, say of the model that a job found."""
+    """Tunings of the model that a job found, by other methods or by fast for another Ms."""
 
     job: str = Field(examples=["4f0c2a9be113"])
     loop: str = Field(examples=["TIC-101"])
-    model: ShownModel = Field(description="The job's model", examples=[{"K": 0.8, "T_s": 3.0, "L_s": 1.0}])
+    model: ShownModel = Field(description="Model that the job found", examples=[{"K": 0.8, "T_s": 3.0, "L_s": 1.0}])
     methods: list[AlternativeView]
     form: str = Field(description="The controller that the gains belong to")
     figures_are: str = Field(description="What margins and figures were computed with")

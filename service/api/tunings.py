@@ -1,7 +1,8 @@
-"""Routes over models: the methods, and tunings of a model that was typed in or that a job found."""
+"""Routes for the tuning methods, and for tunings of a given model or of the model that a job found."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Annotated
 
@@ -10,7 +11,7 @@ from fastapi.concurrency import run_in_threadpool
 
 from loopwright.service.api import problems
 from loopwright.service.api.bodies import JsonRoute
-from loopwright.service.api.computed import Work, computed
+from loopwright.service.api.computed import computed
 from loopwright.service.api.samples import record_columns
 from loopwright.service.api.tuning_views import AlternativesView, MethodView, TuningRequest, TuningsView
 from loopwright.service.execution.computing.pool import Pool
@@ -22,7 +23,7 @@ from loopwright.tuning.fast.procedure import FAST
 
 
 def router(jobs: Jobs, pool: Pool) -> APIRouter:
-    """GET /methods, POST /tunings, GET /jobs/{job_id}/alternatives. pool: who computes."""
+    """A router with GET /methods, POST /tunings and GET /jobs/{job_id}/alternatives. pool: computes the tunings."""
     routes = APIRouter(route_class=JsonRoute)
 
     @routes.get("/methods", tags=["tunings"], summary="The tuning methods")
@@ -37,45 +38,49 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
     )
     async def tune(request: TuningRequest, http: Request) -> TuningsView:
         work = partial(tunings.tunings, request.model.plant(), request.method, request.options)
-        return TuningsView(**await computed(pool, work, http, lambda: jobs.stopping))
+        return TuningsView.model_validate(await computed(pool, work, http, lambda: jobs.stopping))
 
     @routes.get(
         "/jobs/{job_id}/alternatives",
         tags=["jobs"],
-        summary="What other methods, or fast for another Ms, make of what the job found",
+        summary="Tunings of the model that a job found, by other methods or by fast for another Ms",
         responses=problems.responses(404, 409, 422),
     )
     async def job_alternatives(
         http: Request,
         job_id: Annotated[str, Path(description="Id of the job", examples=["4f0c2a9be113"])],
         method: Annotated[
-            str | None, Query(description="Only this one; without it all but the slow one, me-pso", examples=["me-pso"])
+            str | None,
+            Query(description="Only this method; default: all but me-pso, which is slow", examples=["me-pso"]),
         ] = None,
         ms: Annotated[
             float | None,
             Query(
                 ge=1.2, le=2.0, allow_inf_nan=False, examples=[1.4],
-                description="The gains of fast for this Ms instead, from the same record; without `method`",
+                description="Ms for which fast designs the gains from the same record; not together with `method`",
             ),
         ] = None,
         derivative: Annotated[
-            bool | None, Query(description="With `ms`: a PID where it pays; by default as the job had it")
+            bool | None,
+            Query(description="Whether fast may design a PID; only with `ms`. The default is the option of the job"),
         ] = None,
     ) -> AlternativesView:  # fmt: skip
         if ms is None and derivative is not None:
-            raise tunings.BadTuning("derivative is for another ms: give that too")
+            raise tunings.BadTuning("derivative needs ms: give ms too")
         if ms is not None and method not in (None, FAST):
-            raise tunings.BadTuning(f"ms is for the method fast, not for {method}: leave one of them out")
-        work = await run_in_threadpool(wish, job_id, method, ms, derivative)
-        return AlternativesView(**await computed(pool, work, http, lambda: jobs.stopping))
+            raise tunings.BadTuning(f"ms is an option of fast, not of {method}: leave out ms or method")
+        work = await run_in_threadpool(computation, job_id, method, ms, derivative)
+        return AlternativesView.model_validate(await computed(pool, work, http, lambda: jobs.stopping))
 
-    def wish(job_id: str, method: str | None, ms: float | None, derivative: bool | None) -> Work:
-        """What is to be computed, with all that it needs of the store."""
+    def computation(
+        job_id: str, method: str | None, ms: float | None, derivative: bool | None
+    ) -> Callable[[], Mapping[str, object]]:
+        """The computation, with everything that it needs from the store."""
         row, events = jobs.store.get(job_id), jobs.store.events(job_id)
         if ms is None:
             return partial(alternatives, row, events, method)
         wanted = bool(row.request.get("derivative")) if derivative is None else derivative
-        fast = row.request.get("method") == FAST  # of others the model they found is designed on
+        fast = row.request.get("method") == FAST  # other jobs are designed on the model that they found
         record = relay_record(record_columns(jobs.store.blocks(job_id))) if fast else None
         return partial(redesigned, row, events, record, ms, wanted)
 

@@ -1,1 +1,1 @@
-"""What people give: the configuration of the loops, requests and models, and what is wrong with them."""
+"""Input from users: the configuration of the loops, requests and models as JSON, and their validation."""

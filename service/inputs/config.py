@@ -1,6 +1,6 @@
-"""loops.yaml: which loops there are, where they live on the bus, and what a retune may do to them.
+"""The file loops.yaml: the loops, their addresses on the bus, and the limits of a retune.
 
-Everything wrong with a file is reported in one go: who edits it should not have to run it again for each mistake.
+All errors of a file are reported together, so that its author need not load it again for each mistake.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -80,7 +80,7 @@ class LoopConfig(BaseModel):
 
 
 class BusConfig(BaseModel):
-    """A bus. at_once: how many of its loops may be tuned at the same time."""
+    """The settings of a bus. at_once: maximum number of its loops that are tuned at the same time."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -89,13 +89,13 @@ class BusConfig(BaseModel):
 
 @dataclass(frozen=True)
 class Site:
-    """What a file configures: the loops by tag, and the buses it says something about."""
+    """The content of a configuration file: the loops by tag, and the settings of the buses that it names."""
 
     loops: dict[str, LoopConfig]
     buses: dict[str, BusConfig]
 
     def check_own_node(self, node: int, source: str) -> None:
-        """Raises ConfigError where a device of the site has the node id that the service is to have."""
+        """Raises ConfigError when a device of the site has `node`, the node id of the service."""
         ours = [
             f"{loop.tag}: {name}_node is {node:#04x}, which is the service's own node id: start it with another --node"
             for loop in self.loops.values()
@@ -107,12 +107,12 @@ class Site:
 
 
 class _OnceEach(yaml.SafeLoader):
-    """A key given twice is one too many: of two limits the last would win without a word.
+    """A YAML loader that refuses a duplicate key, of which PyYAML would silently use the last value.
 
-    Looked for before keys are merged (`<<`): what a mapping says itself may be other than what it is merged from.
+    The loader looks for duplicates before keys are merged (`<<`), because a mapping may override merged keys.
     """
 
-    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+    def compose_mapping_node(self, anchor: dict[object, yaml.Node]) -> yaml.MappingNode:
         node: yaml.MappingNode = super().compose_mapping_node(anchor)
         seen: set[str] = set()
         for name in (name for name, _ in node.value if isinstance(name, yaml.ScalarNode)):
@@ -123,7 +123,7 @@ class _OnceEach(yaml.SafeLoader):
 
 
 def load_site(path: Path) -> Site:
-    """The site of a file. Raises ConfigError with everything that is wrong with it."""
+    """Reads the site from a file. Raises ConfigError with all errors of the file."""
     try:
         document = yaml.load(path.read_text(encoding="utf-8"), _OnceEach)
     except OSError as error:
@@ -135,10 +135,9 @@ def load_site(path: Path) -> Site:
     return parse_site(document, str(path))
 
 
-def parse_site(document: Any, source: str) -> Site:
+def parse_site(document: object, source: str) -> Site:
     """The site of a parsed document `{"loops": [...], "buses": {BUS: {"at_once": ...}}}`."""
-    entries = document.get("loops") if isinstance(document, dict) else None
-    if not isinstance(entries, list) or not entries:
+    if not isinstance(document, dict) or not isinstance(entries := document.get("loops"), list) or not entries:
         raise ConfigError(source, ["expected a list of loops under the key 'loops'"])
     problems = [f"{key}: unknown key" for key in document if key not in ("loops", "buses")]
     loops: list[LoopConfig] = []
@@ -157,7 +156,7 @@ def parse_site(document: Any, source: str) -> Site:
     return Site({loop.tag: loop for loop in loops}, buses)
 
 
-def _buses(entries: Any, known: set[str], problems: list[str]) -> dict[str, BusConfig]:
+def _buses(entries: object, known: set[str], problems: list[str]) -> dict[str, BusConfig]:
     if not isinstance(entries, dict):
         problems.append("buses: expected a mapping from the name of a bus to its settings")
         return {}
@@ -172,12 +171,12 @@ def _buses(entries: Any, known: set[str], problems: list[str]) -> dict[str, BusC
     return found
 
 
-def _tag(entry: Any) -> str | None:
+def _tag(entry: object) -> str | None:
     tag = entry.get("tag") if isinstance(entry, dict) else None
     return tag if isinstance(tag, str) else None
 
 
-def _line(number: int, entry: Any, where: tuple[int | str, ...], message: str) -> str:
+def _line(number: int, entry: object, where: tuple[int | str, ...], message: str) -> str:
     name = ".".join([f"loops[{number}]", *map(str, where)])
     tag = _tag(entry)
     return f"{name}{f' ({tag})' if tag else ''}: {message.removeprefix('Value error, ')}"

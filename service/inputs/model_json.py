@@ -1,4 +1,4 @@
-"""Process models as JSON objects, in the five forms that a person may type, and back.
+"""Process models as JSON objects, in five forms that a user can type, and the conversion back.
 
 {"K": 2, "T_s": 10, "L_s": 3}                            first order with dead time
 {"K": 2, "T1_s": 10, "T2_s": 4, "L_s": 3}                second order, two real lags
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import (
     BaseModel,
@@ -19,6 +19,7 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    JsonValue,
     TypeAdapter,
     ValidationError,
     ValidationInfo,
@@ -33,15 +34,15 @@ MAX_COEFFICIENTS = 12
 _BESIDE = frozenset(
     {"name", "sample_time_s", "t95_s", "noise_std", "seed", "mv_limits", "sp_deviation", "gains", "reverse_acting"}
 )
-"""Fields of a plant file of `loopwright rehearse` that say nothing of the model."""
+"""Fields of a plant file of `loopwright rehearse` that do not belong to the model."""
 
 
 class BadModel(ValueError):
-    """No model: the message names the quantity, its value, and what would be accepted."""
+    """The input is no valid model. The message names the quantity, its value, and what is accepted."""
 
 
 def finite(value: object, name: str) -> float:
-    """The number, neither text nor true or false. Raises ValueError."""
+    """The value as a finite float. Raises ValueError for anything but a number, also for a bool."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         try:
             number = float(value)
@@ -78,8 +79,8 @@ def _dead_time(value: object, info: ValidationInfo) -> float:
 def _in_seconds(number: float, info: ValidationInfo, minimum: float) -> float:
     if not minimum <= number <= MAX_TIME_S:
         raise Implausible(
-            f"{info.field_name} {number:.3g} s is no plant's; permitted are {minimum:g} to {MAX_TIME_S:g} s: "
-            "look whether times are in seconds"
+            f"{info.field_name} {number:.3g} s is not plausible; permitted are {minimum:g} to {MAX_TIME_S:g} s: "
+            "check that times are in seconds"
         )
     return number
 
@@ -128,12 +129,12 @@ class _Form(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     def plant(self) -> Model:
-        """The model of `tuning`, in the kind of this form."""
+        """The model as an object of `tuning`."""
         raise NotImplementedError
 
     @model_validator(mode="before")
     @classmethod
-    def _quantities(cls, data: Any) -> Any:
+    def _quantities(cls, data: object) -> object:
         if isinstance(data, cls):
             return data
         if not isinstance(data, Mapping):
@@ -154,7 +155,7 @@ class _Form(BaseModel):
 
     @classmethod
     def quantities(cls) -> str:
-        """The names of the form, for people."""
+        """The names of the quantities of this form, for messages."""
         fields = cls.model_fields.items()
         return (
             "{" + ", ".join(name if each.is_required() else f"{name} (may be left out)" for name, each in fields) + "}"
@@ -200,7 +201,7 @@ class SecondOrderModel(_Form):
 
 
 class IntegratingModel(_Form):
-    """Integrating with dead time and perhaps a lag: K exp(-L s) / (s (T s + 1))."""
+    """Integrating with dead time and an optional lag: K exp(-L s) / (s (T s + 1))."""
 
     K: Gain = Field(
         description="Gain, PV units per MV unit (on a loop: per percent) and second, not 0, either sign", examples=[0.1]
@@ -214,7 +215,7 @@ class IntegratingModel(_Form):
 
 
 class TransferFunctionModel(_Form):
-    """num(s)/den(s) exp(-dead_time_s s), coefficients by falling powers of s; PV units over MV units."""
+    """Transfer function num(s)/den(s) exp(-dead_time_s s), PV units per MV unit; falling powers of s."""
 
     num: Coefficients = Field(description="Numerator, highest power of s first", examples=[[3.0, 2.0]])
     den: Coefficients = Field(description="Denominator, highest power of s first", examples=[[3.0, 4.0, 1.0]])
@@ -247,8 +248,8 @@ def accepted() -> str:
     return "accepted are " + ", ".join(form.quantities() for form in _FORMS)
 
 
-def _form_of(data: Any) -> type[Form]:
-    """The form whose own quantities are there."""
+def _form_of(data: object) -> type[Form]:
+    """The form that the quantities of the object belong to."""
     if isinstance(data, _FORMS):
         return type(data)
     names: Sequence[object] | Mapping[object, object] = data if isinstance(data, Mapping) else ()
@@ -274,7 +275,7 @@ _ADAPTER: TypeAdapter[Form] = TypeAdapter(ModelForm)
 
 
 def parse_model(data: object) -> Model:
-    """The model that a JSON object, or a plant file of `loopwright rehearse`, describes; raises BadModel."""
+    """The model that a JSON object or a plant file of `loopwright rehearse` describes. Raises BadModel."""
     if isinstance(data, Mapping) and {"num", "den"} <= data.keys():
         data = {name: value for name, value in data.items() if name not in _BESIDE}
     try:
@@ -283,13 +284,13 @@ def parse_model(data: object) -> Model:
         raise BadModel(lines(error)) from None
 
 
-def form_shown(data: Any) -> Any:
-    """A model as dumped, in its form as it is: what a fit has found is shown also where nobody could type it."""
+def form_shown(data: object) -> object:
+    """The form of a dumped model without validation, because an identified model may be outside the limits of input."""
     return _form_of(data).model_construct(**data) if isinstance(data, Mapping) else data
 
 
-def dump_model(model: Model) -> dict[str, Any]:
-    """The JSON object that `parse_model` makes the same model of; a second order is given by T_s and zeta."""
+def dump_model(model: Model) -> dict[str, JsonValue]:
+    """The JSON object from which `parse_model` makes the same model. A second-order model has T_s and zeta."""
     match model:
         case FOPDT(K, T, L):
             return {"K": K, "T_s": T, "L_s": L}
@@ -301,10 +302,11 @@ def dump_model(model: Model) -> dict[str, Any]:
             return {"num": list(num), "den": list(den), "dead_time_s": L}
 
 
-def describe(data: Mapping[str, Any]) -> str:
-    """A model as dumped, on one line for people; two real lags are shown as such."""
-    if "zeta" in data and data["zeta"] >= 1.0:
-        model = SOPDT(data["K"], data["T_s"], data["zeta"], data["L_s"])
+def describe(data: Mapping[str, object]) -> str:
+    """A dumped model as a line of text; a second-order model with real poles is shown by its two lags."""
+    form = form_shown(data)
+    if isinstance(form, SecondOrderModel) and form.zeta >= 1.0:
+        model = SOPDT(form.K, form.T_s, form.zeta, form.L_s)
         data = {"K": model.K, "T1_s": model.T1, "T2_s": model.T2, "L_s": model.L}
     parts = []
     for name, value in data.items():

@@ -1,9 +1,9 @@
-"""Which numbers can be those of a plant. What is far outside is refused by name, before anything is computed with it.
+"""Limits of plausible numbers for a plant. An input outside them is refused before anything is computed with it.
 
-Beyond these limits an input is a slip of the hand or a mistaken unit, and answers would be worth nothing: a double has
-16 digits, of which lags that differ by a factor of a million leave few to compute with, and what simulates or searches
-takes as many steps as the longest time has shortest ones. Real plants, the 121 of the benchmarks and every case of the
-five papers lie well inside.
+An input beyond these limits is a typing error or a wrong unit, and results would be worthless: a double has 16 digits,
+of which time constants that differ by a factor of a million leave few, and simulations and searches take a number of
+steps proportional to the ratio of the longest to the shortest time. Real plants, the 121 plants of the benchmarks and
+every case of the five papers lie well inside.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
 MIN_TIME_S, MAX_TIME_S = 1e-6, 1e8
-"""From a microsecond, the unit of a controller's sample time, to three years."""
+"""The range is from a microsecond, the unit of a controller's sampling period, to three years."""
 MIN_GAIN, MAX_GAIN = 1e-9, 1e9
-"""PV units over MV units, or the other way round: from flows in m3/s to pressures in Pa."""
+"""The range of a gain, in PV units per MV unit or the inverse, covers flows in m3/s and pressures in Pa."""
 MAX_VALUE = 1e12
-"""Of PV, in its units."""
+"""Maximum of |PV|, PV units."""
 SPREAD = 1e5
-"""Of a plant's time constants. The stiffest plant of the benchmarks has 1e3."""
+"""Maximum ratio of two time constants of a plant. The stiffest plant of the benchmarks has 1e3."""
 MIN_DEAD_TIME, MAX_DEAD_TIME = 1e-5, 1e3
-"""Over the longest time constant. The benchmarks have 1e-3 to 50; a shorter one is none."""
+"""Range of the dead time over the longest time constant, apart from 0. The benchmarks have 1e-3 to 50."""
 SPREAD_OF_ZEROS = 1e9
-"""Of a zero that is faster than every lag: fits leave such, and they do no harm."""
+"""Maximum ratio of the longest lag to the time constant of a zero. Fits leave fast zeros, which do no harm."""
 MIN_DAMPING = 1e-3
 MAX_SAMPLES = 200_000
-"""In T95 or in the dead time: of more, a rehearsal takes minutes."""
+"""Maximum of sampling periods in T95 or in the dead time. A rehearsal with more takes minutes."""
 MIN_STEP = 1e-6
-"""Of a set-point step, over the largest PV: values travel as REAL32, which has 7 digits."""
+"""Minimum of a set-point step over the largest |PV|: the bus transmits REAL32 values, which have 7 digits."""
 _LARGEST_COEFFICIENT = 1e100
 
 
@@ -39,14 +39,14 @@ Reals = NDArray[np.float64]
 
 
 class Implausible(ValueError):
-    """The message names the quantity, its value, what is permitted and what to do."""
+    """A number is not plausible. The message names the quantity, its value, the permitted range and what to do."""
 
 
 def check_model(num: Sequence[float], den: Sequence[float], dead_time_s: float) -> None:
-    """Of a transfer function, coefficients by falling powers of s. Raises Implausible."""
+    """Raises Implausible for a transfer function outside the limits. Coefficients are by falling powers of s."""
     above, below = np.trim_zeros(np.asarray(num, float), "f"), np.trim_zeros(np.asarray(den, float), "f")
     if not len(above) or not len(below):
-        return  # no transfer function: others say so
+        return  # not a transfer function; other validators refuse it
     for name, coefficients in (("num", above), ("den", below)):
         sizes = np.abs(coefficients[coefficients != 0.0])
         if not (
@@ -63,7 +63,7 @@ def check_model(num: Sequence[float], den: Sequence[float], dead_time_s: float) 
 
 
 def _time_constants(coefficients: Reals) -> Reals:
-    """1/|p| of every root but those at the origin, s, the longest first."""
+    """1/|p| of every root except those at the origin, s, longest first."""
     sizes = np.abs(np.roots(coefficients))
     found: Reals = np.sort(1.0 / sizes[sizes > 0.0])[::-1]
     return found
@@ -71,13 +71,13 @@ def _time_constants(coefficients: Reals) -> Reals:
 
 def _check_gain(num: Reals, den: Reals, lags: Reals, dead_time_s: float) -> None:
     at_the_end = np.trim_zeros(den, "b")
-    gain = abs(float(num[-1] / at_the_end[-1]))  # 0: PV comes back, which others refuse
-    if len(at_the_end) < len(den):  # integrating: what PV moves in the plant's own time
+    gain = abs(float(num[-1] / at_the_end[-1]))  # 0 is refused by other validators
+    if len(at_the_end) < len(den):  # integrating: the change of PV within the longest time of the plant
         gain *= max([dead_time_s, *lags]) or 1.0
     if gain and not MIN_GAIN <= gain <= MAX_GAIN:
         raise Implausible(
-            f"a gain of {gain:.3g} PV units per MV unit is no plant's; permitted are {MIN_GAIN:g} to {MAX_GAIN:g}: "
-            "look whether K is given per percent of MV, or choose another unit of PV"
+            f"a gain of {gain:.3g} PV units per MV unit is not plausible; permitted are {MIN_GAIN:g} to {MAX_GAIN:g}: "
+            "check that K is given per percent of MV, or choose another unit of PV"
         )
 
 
@@ -85,8 +85,8 @@ def _check_times(lags: Reals, leads: Reals, dead_time_s: float) -> None:
     for name, value in (*(("time constant", lag) for lag in lags), ("dead time", dead_time_s)):
         if value and not MIN_TIME_S <= value <= MAX_TIME_S:
             raise Implausible(
-                f"a {name} of {value:.3g} s is no plant's; permitted are {MIN_TIME_S:g} to {MAX_TIME_S:g} s: "
-                "look whether times are in seconds"
+                f"a {name} of {value:.3g} s is not plausible; permitted are {MIN_TIME_S:g} to {MAX_TIME_S:g} s: "
+                "check that times are in seconds"
             )
     if not len(lags):
         return
@@ -94,7 +94,7 @@ def _check_times(lags: Reals, leads: Reals, dead_time_s: float) -> None:
     if longest > SPREAD * shortest:
         raise Implausible(
             f"time constants of {shortest:.3g} s and {longest:.3g} s differ by a factor {longest / shortest:.3g}; "
-            f"permitted is {SPREAD:g}: leave the short one out, which nobody could see beside the long one"
+            f"permitted is {SPREAD:g}: leave out the short one, whose effect cannot be measured beside the long one"
         )
     for lead in leads:
         if not longest / SPREAD_OF_ZEROS <= lead <= longest * SPREAD:
@@ -112,7 +112,7 @@ def _check_times(lags: Reals, leads: Reals, dead_time_s: float) -> None:
 
 
 def check_option(name: str, unit: str, value: object) -> None:
-    """Of a method. Raises Implausible."""
+    """Raises Implausible for the value of a method's option that is out of range."""
     if isinstance(value, bool) or not isinstance(value, int | float) or value == 0:
         return
     low, high = (MIN_TIME_S, MAX_TIME_S) if unit == "s" else (MIN_GAIN, MAX_GAIN)
@@ -121,15 +121,15 @@ def check_option(name: str, unit: str, value: object) -> None:
 
 
 def check_damping(zeta: float) -> None:
-    """Raises Implausible."""
+    """Raises Implausible for a damping ratio below the minimum."""
     if zeta < MIN_DAMPING:
         raise Implausible(
-            f"zeta {zeta:.3g} is no plant's: it hardly ever comes to rest; permitted are {MIN_DAMPING:g} and more"
+            f"zeta {zeta:.3g} is not plausible: PV would hardly come to rest; permitted are {MIN_DAMPING:g} and more"
         )
 
 
 def check_sampling(dead_time_s: float, t95_s: float, sample_time_s: float) -> None:
-    """Of a plant to rehearse on. Raises Implausible."""
+    """Raises Implausible for times with which a plant cannot be rehearsed."""
     if not MIN_TIME_S <= t95_s <= MAX_TIME_S:
         raise Implausible(f"t95_s {t95_s:.3g}; permitted are {MIN_TIME_S:g} to {MAX_TIME_S:g} s: correct t95_s")
     check_dead_time(dead_time_s, t95_s)
@@ -147,16 +147,16 @@ def check_sampling(dead_time_s: float, t95_s: float, sample_time_s: float) -> No
 
 
 def check_dead_time(dead_time_s: float, t95_s: float) -> None:
-    """Of a plant to rehearse on, beside the T95 of its loop. Raises Implausible."""
+    """Raises Implausible for a dead time of a rehearsed plant that is too long for the T95 of the loop."""
     if dead_time_s > 10.0 * t95_s:
         raise Implausible(
-            f"a dead time of {dead_time_s:.3g} s with a T95 of {t95_s:.3g} s, in which it is contained; permitted are "
-            f"{10.0 * t95_s:.3g} s: correct t95_s"
+            f"a dead time of {dead_time_s:.3g} s with a T95 of {t95_s:.3g} s, which includes the dead time; at most "
+            f"{10.0 * t95_s:.3g} s are permitted: correct t95_s"
         )
 
 
 def check_step(sp_deviation: float, pv_low: float, pv_high: float) -> None:
-    """Raises Implausible."""
+    """Raises Implausible for a set-point step that REAL32 values cannot resolve within these PV limits."""
     largest = max(abs(pv_low), abs(pv_high))
     if sp_deviation < MIN_STEP * largest:
         raise Implausible(
@@ -168,7 +168,7 @@ def check_step(sp_deviation: float, pv_low: float, pv_high: float) -> None:
 def _within(low: float, high: float, unit: str) -> AfterValidator:
     def check(value: float) -> float:
         if value and not low <= abs(value) <= high:
-            raise Implausible(f"{value:.4g} is no plant's; permitted are {low:g} to {high:g} {unit}")
+            raise Implausible(f"{value:.4g} is not plausible; permitted are {low:g} to {high:g} {unit}")
         return value
 
     return AfterValidator(check)

@@ -1,9 +1,9 @@
-"""What may be asked of a retune, by the method that is to do it, and how it combines with the loop's configuration."""
+"""Requests for a retune, one class for each kind of method, and their limits within the loop's configuration."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import (
     BaseModel,
@@ -11,6 +11,7 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    JsonValue,
     PrivateAttr,
     TypeAdapter,
     model_validator,
@@ -45,15 +46,15 @@ else:
 
 Percent = Annotated[float, Field(gt=0, lt=74, allow_inf_nan=False)]
 MIN_AMPLITUDE_PCT = 1e-3
-"""Of the relay: less is not to be told from nothing by a REAL32 of some ten percent."""
+"""Minimum amplitude of the relay, percent. A REAL32 of some ten percent hardly resolves a smaller one."""
 
 
 class BadLimits(ValueError):
-    """The limits asked for contradict each other or the loop's configuration."""
+    """The limits of a request contradict each other or the loop's configuration."""
 
 
 class PlantModel(BaseModel):
-    """A transfer function for a dry run, coefficients by falling powers of s, deviation variables."""
+    """A transfer function to rehearse on, in deviation variables. Coefficients are by falling powers of s."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -71,7 +72,7 @@ class PlantModel(BaseModel):
 
 
 class Bounds(BaseModel):
-    """What the test may do; at most what loops.yaml permits."""
+    """Limits of the test, within those of loops.yaml."""
 
     sp_deviation: Positive | None = Field(
         default=None, description="Permitted set-point step, PV units; at most the loop's own", examples=[2.0]
@@ -88,36 +89,41 @@ class Bounds(BaseModel):
 
 
 class _Retune(Bounds):
-    """What every method may be asked."""
+    """The options that every method has."""
 
     model_config = ConfigDict(extra="forbid")
 
     model: ModelForm | None = Field(
         default=None,
-        description="Model for start=design or, of first or second order, for start=optimise; in a dry run without "
-        "`plant` the plant itself",
+        description="Model for start=design, or first- or second-order model for start=optimise; in a dry run without "
+        "`plant` it is the plant",
     )
-    verify: bool = Field(default=True, description="Record the set-point step with the new gains")
+    verify: bool = Field(default=True, description="Record a set-point step with the new gains")
     propose_anyway: bool = Field(
         default=False,
-        description="Propose new gains also where nothing asked for gets better by more than 5 %; without it such a "
-        "job ends as no_gain, the present gains are kept, and the new ones are not tried on the loop",
+        description="Propose new gains even if they are not better than the present ones by more than 5 %; otherwise "
+        "such a job ends as no_gain, and the new gains are not tested on the loop",
     )
     dry_run: bool = Field(
         default=False,
-        description="Rehearse in memory; the loop is not touched. On the plant given, else on the last model found on "
-        "the loop, else on a guess; the job says which",
+        description="Rehearse in memory without touching the loop, on the plant given, else on the last model found on "
+        "the loop, else on a guess; the job shows which",
     )
-    plant: PlantModel | None = Field(default=None, description="Plant to rehearse on; only with dry_run")
-    requested_by: str = Field(default="api", max_length=100, description="Who asks", examples=["night shift"])
+    plant: PlantModel | None = Field(default=None, description="Plant to rehearse on, only with dry_run")
+    requested_by: str = Field(
+        default="api",
+        max_length=100,
+        description="Name of the person who requests the retune",
+        examples=["night shift"],
+    )
 
-    def asked(self) -> dict[str, Any]:
-        """As JSON."""
+    def asked(self) -> dict[str, JsonValue]:
+        """The given options as a JSON object."""
         return self.model_dump(mode="json", exclude_none=True)
 
     @classmethod
-    def _foreign(cls, data: Mapping[str, Any]) -> list[str]:
-        """What another method would know, and this one does not."""
+    def _foreign(cls, data: Mapping[str, object]) -> list[str]:
+        """The names in `data` that only another method knows."""
         return [name for name in cls._of_another() if name in data]
 
     @classmethod
@@ -130,15 +136,15 @@ class _Retune(Bounds):
 
     @model_validator(mode="before")
     @classmethod
-    def _own_options(cls, data: Any) -> Any:
-        """An option of another method says nothing to this one: better refused than ignored."""
+    def _own_options(cls, data: object) -> object:
+        """Refuses an option of another method, which would otherwise be ignored."""
         if not isinstance(data, Mapping):
             return data
         foreign = cls._foreign(data)
         if foreign:
             given = "" if "method" in data else ', which is used unless a "method" is named'
-            told = cls._not_mine(", ".join(foreign), f"{data.get('method', FAST)}{given}")
-            raise ValueError(f"{told}; its options are {', '.join(cls.model_fields)}")
+            why = cls._not_mine(", ".join(foreign), f"{data.get('method', FAST)}{given}")
+            raise ValueError(f"{why}; its options are {', '.join(cls.model_fields)}")
         unknown = [str(name) for name in data if name not in cls.model_fields]
         if unknown:
             known = ", ".join(cls.model_fields)
@@ -153,26 +159,28 @@ class _Retune(Bounds):
 
 
 class FastRetune(_Retune):
-    """A retune by one short relay record, fitted as a whole: the best gains for the Ms asked."""
+    """A retune by method fast: a model is fitted to a short relay test, and the gains are designed for the given Ms."""
 
-    method: Literal["fast"] = Field(default="fast", description="May be left out")
+    method: Literal["fast"] = Field(default="fast", description="Method fast, the default")
     start: Literal["relay", "design"] = Field(
-        default="relay", description="Stage to enter at: design takes the model that is then typed in, without a relay"
+        default="relay", description="First stage: relay, or design with a given model and without a relay test"
     )
     baseline: bool | None = Field(
-        default=None, description="fast records no set-point step with the old gains: false, or left out"
+        default=None, description="Must be false or left out: fast records no set-point step with the old gains"
     )
     ms: Annotated[float, Field(ge=1.2, le=2.0, allow_inf_nan=False)] = Field(
-        default=1.6, description="largest peak of the sensitivity: 1.2 robust .. 1.6 .. 2.0 fast", examples=[1.4]
+        default=1.6,
+        description="Maximum sensitivity for which the gains are designed: 1.2 (robust) to 2.0 (fast)",
+        examples=[1.4],
     )
-    derivative: bool = Field(default=False, description="a PID, where a derivative pays")
+    derivative: bool = Field(default=False, description="Design a PID where a derivative improves the loop")
     amplitude_pct: Positive | None = Field(
         default=None,
-        description="MV under the relay goes so far up, and half as far down, percent; by default half of what "
-        "the limits of MV allow, adapted after the first wave",
+        description="Step of MV up under the relay, percent; the step down is half as large. The default is half of "
+        "what the MV limits permit, adapted after the first period",
         examples=[10.0],
     )
-    careful: bool = Field(default=False, description="at least six switches of the relay, not four")
+    careful: bool = Field(default=False, description="Use at least six switches of the relay, not four")
 
     _options: FastOptions = PrivateAttr()
 
@@ -185,7 +193,7 @@ class FastRetune(_Retune):
         return [name for name in FiveStages.model_fields if name not in cls.model_fields]
 
     @classmethod
-    def _foreign(cls, data: Mapping[str, Any]) -> list[str]:
+    def _foreign(cls, data: Mapping[str, object]) -> list[str]:
         return [
             *super()._foreign(data),
             *["baseline"] * (data.get("baseline") is True),
@@ -225,16 +233,16 @@ FIVE_STAGE_STARTS = ("relay", "zn_pi", "estimate", "optimise")
 
 
 class FiveStages(_Retune):
-    """What the five-stage experiment may be asked, whichever rule the gains are of."""
+    """The options of the five-stage experiment, with any rule."""
 
     method: str
     start: Literal["relay", "zn_pi", "estimate", "optimise"] = Field(
         default="relay",
-        description="Stage to enter at; what earlier stages would have found is then typed in: Ku and Pu_s for zn_pi; "
-        "Kp, Ti_s and overshoot_pct for estimate; model for optimise",
+        description="First stage. The results of earlier stages must be given: Ku and Pu_s for zn_pi; Kp, Ti_s and "
+        "overshoot_pct for estimate; model for optimise",
     )
     baseline: bool | None = Field(
-        default=None, description="Record the set-point step with the old gains; by default it is recorded"
+        default=None, description="Record a set-point step with the old gains; the default is true"
     )
     method_options: dict[str, bool | float | str] = Field(
         default_factory=dict,
@@ -243,15 +251,17 @@ class FiveStages(_Retune):
     )
     model_from: Literal["overshoot", "record"] | None = Field(
         default=None,
-        description="Model for the method: the estimate from the overshoot, or one identified from the set-point step; "
-        "by default the first for five-stage, the second for the rules if it explains the step",
+        description="Model for the method: overshoot estimates it from the overshoot, record identifies it from the "
+        "set-point step. The default is overshoot for five-stage, and record for a rule if its model fits the step",
     )
     Ku: Gain | None = Field(
         default=None, description="Ultimate gain, MV percent per PV unit, for start=zn_pi", examples=[2.05]
     )
     Pu_s: Time | None = Field(default=None, description="Ultimate period, s, for start=zn_pi", examples=[3.32])
     Kp: Gain | None = Field(
-        default=None, description="ISA gain of the recorded PI step, MV percent per PV unit", examples=[0.9]
+        default=None,
+        description="Proportional gain of the recorded PI step, ISA form, MV percent per PV unit",
+        examples=[0.9],
     )
     Ti_s: Time | None = Field(default=None, description="Integral time of the recorded PI step, s", examples=[2.8])
     overshoot_pct: Positive | None = Field(
@@ -262,11 +272,11 @@ class FiveStages(_Retune):
         description="Static gain of the model: from the overshoot formulas (k5) or from the experiment (ke)",
     )
     kp_step_factor: Annotated[float, Field(gt=1, le=2, allow_inf_nan=False)] | None = Field(
-        default=None, description="Factor by which Kp grows between attempts, over 1", examples=[1.5]
+        default=None, description="Factor by which Kp grows between attempts, above 1", examples=[1.5]
     )
     overshoot_window_pct: tuple[Percent, Percent] = Field(
         default=(10.0, 50.0),
-        description="Overshoot that the PI step must show, percent: low, high; 0 < low < high < 74",
+        description="Permitted overshoot of the PI step, percent: low, high; 0 < low < high < 74",
         examples=[[8.0, 50.0]],
     )
 
@@ -281,7 +291,7 @@ class FiveStages(_Retune):
         return [name for name in FastRetune.model_fields if name not in cls.model_fields]
 
     @classmethod
-    def _foreign(cls, data: Mapping[str, Any]) -> list[str]:
+    def _foreign(cls, data: Mapping[str, object]) -> list[str]:
         return [*super()._foreign(data), *["start"] * (data.get("start") == "design")]
 
     @classmethod
@@ -322,7 +332,7 @@ class FiveStages(_Retune):
 
 
 class FiveStageRetune(FiveStages):
-    """A retune by the procedure of the paper with its own optimisation."""
+    """A retune by the five-stage procedure with its own optimisation."""
 
     method: Literal["five-stage"]
 
@@ -334,15 +344,15 @@ def _named(value: object) -> object:
 
 
 class RuleRetune(FiveStages):
-    """A retune by the experiment of five-stage, with the gains of a rule of GET /methods."""
+    """A retune by the five-stage experiment with the gains of a rule of GET /methods."""
 
-    method: Annotated[RuleName, BeforeValidator(_named)] = Field(description="The rule that the gains are of")
+    method: Annotated[RuleName, BeforeValidator(_named)] = Field(description="Rule that computes the gains")
 
 
 def by_method(fast: type, five_stage: type, rule: type) -> Discriminator:
-    """Chooses the branch of a union by the method; what is no method is for the branch of the rules to name."""
+    """The discriminator of a union by method. The branch of the rules refuses an unknown method."""
 
-    def kind(data: Any) -> str:
+    def kind(data: object) -> str:
         method = data.get("method", FAST) if isinstance(data, Mapping) else getattr(data, "method", FAST)
         return branch_of(fast if method == FAST else five_stage if method == PROCEDURE else rule)
 
@@ -356,20 +366,17 @@ RetuneRequest = Annotated[
     | Annotated[RuleRetune, branch(RuleRetune)],
     by_method(FastRetune, FiveStageRetune, RuleRetune),
 ]
-"""Options of a retune; what is left out comes from the loop's configuration, and a method left out is fast."""
+"""The options of a retune. The loop's configuration gives the defaults of limits; the default method is fast."""
 _ADAPTER: TypeAdapter[AnyRetune] = TypeAdapter(RetuneRequest)
 
 
-def retune_request(**options: Any) -> AnyRetune:
-    """The request with these options, in the names and values of its JSON object. Raises pydantic.ValidationError."""
+def retune_request(**options: object) -> AnyRetune:
+    """The request with these options, named as in its JSON object. Raises pydantic.ValidationError."""
     return _ADAPTER.validate_python(options)
 
 
 def within(loop: LoopConfig, request: RetuneRequest) -> LoopConfig:
-    """The loop with the limits of this job: a request may narrow what the file permits, never widen it.
-
-    Raises BadLimits.
-    """
+    """The loop with the limits of the request, which may narrow those of the file, not widen them. Raises BadLimits."""
     narrowed, problems = narrow(loop, request)
     if problems:
         raise BadLimits("; ".join(problems))
@@ -377,8 +384,7 @@ def within(loop: LoopConfig, request: RetuneRequest) -> LoopConfig:
 
 
 def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[str]]:
-    """The loop with the limits of this job, and what is wrong with those asked for; where that is something, the file's
-    own stay."""
+    """The loop with the limits of the request, and the errors in those limits. With an error the loop is unchanged."""
     problems = []
     limits = {}
     for name, unit in (("mv", "%"), ("pv", loop.pv_unit)):
@@ -397,7 +403,7 @@ def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[s
     if amplitude is not None and 1.5 * amplitude > mv.high - mv.low and not problems:
         problems.append(
             f"a relay of amplitude_pct {amplitude:g} needs {1.5 * amplitude:g} % of MV between its limits, "
-            f"there are {mv.high - mv.low:g} %"
+            f"which are {mv.high - mv.low:g} % apart"
         )
     if amplitude is not None and amplitude < MIN_AMPLITUDE_PCT:
         problems.append(f"a relay of amplitude_pct {amplitude:g} moves nothing; at least {MIN_AMPLITUDE_PCT:g} %")
@@ -408,7 +414,7 @@ def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[s
         problems.append(f"sp_deviation {deviation:g} {loop.pv_unit} needs at least twice that between the PV limits")
     try:
         check_step(deviation, limits["pv_limits"].low, limits["pv_limits"].high)
-        check_dead_time(_given_dead_time_s(request), loop.t95_s)  # here, where it costs no job and no process
+        check_dead_time(_given_dead_time_s(request), loop.t95_s)  # checked before a job and a process are started
     except Implausible as error:
         problems.append(str(error))
     if problems:
@@ -417,7 +423,7 @@ def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[s
 
 
 def _given_dead_time_s(request: RetuneRequest) -> float:
-    """Of the plant that a dry run is to be on; 0 where none is given."""
+    """The dead time of the plant given for a dry run, s; 0 if no plant is given."""
     if not request.dry_run:
         return 0.0
     if request.plant is not None:

@@ -1,14 +1,14 @@
-"""What is wrong with an input that pydantic has refused, in the words and places that its sender knows."""
+"""Messages for input that pydantic has refused, with paths and words that the sender of the input knows."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from pydantic import Tag, ValidationError
+from pydantic_core import ErrorDetails
 
 _BRANCH = "="
-"""Begins the tag of a branch of a union: it stands in the place of an error, and is nothing that the sender wrote."""
+"""Prefix of the tag of a union's branch. The tag is part of an error's path, although the sender did not write it."""
 
 
 def branch(kind: type) -> Tag:
@@ -21,20 +21,21 @@ def branch_of(kind: type) -> str:
 
 
 def place(loc: Sequence[int | str]) -> str:
-    """Where in the input, as body.model.K."""
+    """The path of an error in the input, such as body.model.K."""
     return ".".join(str(part) for part in loc if not str(part).startswith(_BRANCH))
 
 
 def words(message: str) -> str:
-    """A message of pydantic's, without what pydantic puts before ours."""
+    """A message of pydantic without the prefix that pydantic adds to the text of a ValueError."""
     return message.removeprefix("Value error, ")
 
 
-def line(error: Any) -> str:
-    """One of `ValidationError.errors()`: its place, unless the words begin with it, and the words."""
-    where, told = place(error["loc"]), words(error["msg"])
-    return told if told.startswith(where) else f"{where}: {told}"
+def line(error: ErrorDetails) -> str:
+    """One of `ValidationError.errors()` as text: path and message, or the message alone if it begins with the path."""
+    where, text = place(error["loc"]), words(error["msg"])
+    return text if text.startswith(where) else f"{where}: {text}"
 
 
 def lines(error: ValidationError) -> str:
+    """All errors of a ValidationError as one text."""
     return "; ".join(map(line, error.errors()))

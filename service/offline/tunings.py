@@ -93,7 +93,7 @@ def tunings(model: Model, method: str = ALL, options: Mapping[str, object] | Non
 class Tunings(TypedDict):
     """The JSON object of the tunings of one model, as `tuning_views.TuningsView` describes it."""
 
-    model: dict[str, object]
+    model: JsonObject
     methods: list[JsonObject]
     form: str
     figures_are: str

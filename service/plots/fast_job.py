@@ -32,7 +32,7 @@ def fast_job(path: Path, job: Shown, record: RelayRecord, pv_unit: str) -> None:
     proposed = job.new_gains is not None
     figure = Figure(figsize=(12 if proposed else 9, 6.5), layout="constrained")
     canvas = FigureCanvasAgg(figure)
-    why = f", {job.reason}" if job.reason and job.reason != job.state else ""
+    why = f", {job.reason}" if job.reason and job.reason.value != job.state.value else ""
     title = f"{job.loop}: {job.state}{why}"
     figure.suptitle(title if proposed else "\n".join([title, *textwrap.wrap(job.detail or "", 110)]), fontsize=11)
     grid = figure.add_gridspec(3, 2 if proposed else 1, height_ratios=(3, 1, 1.5), width_ratios=(3, 2)[: 1 + proposed])

@@ -9,6 +9,7 @@ from pydantic import BaseModel, BeforeValidator
 
 from loopwright.service.job_states import JobState
 from loopwright.service.results import EvidenceView, GainsView, ModelView, TransferModelView, VerificationView
+from loopwright.tuning.reasons import Reason
 
 
 class Shown(Protocol):
@@ -18,7 +19,7 @@ class Shown(Protocol):
     loop: str
     method: str
     state: JobState
-    reason: str | None
+    reason: Reason | None
     detail: str | None
     advice: str | None
     model: ModelView | TransferModelView | None

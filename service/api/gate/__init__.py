@@ -1,1 +1,1 @@
-"""Who may come in, and how much of the service one caller may take."""
+"""ASGI middleware in front of the routes: authentication, authorization, rate limits and access log."""

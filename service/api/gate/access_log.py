@@ -1,4 +1,4 @@
-"""One line and one count for each request, as ASGI middleware. Outermost: it sees what the gate refuses, too."""
+"""ASGI middleware that logs and counts each request. It is the outermost one, so it sees what the gate refuses too."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import random
 import time
 from collections.abc import Callable
 
-from loopwright.service.api.gate.gate import App, AsgiScope, Message, Receive, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
 from loopwright.service.telemetry.logs import about
 from loopwright.service.telemetry.metrics import IN_FLIGHT, REQUEST_SECONDS, REQUESTS
 
@@ -15,28 +16,28 @@ log = logging.getLogger(__name__)
 
 _NO_ROUTE = "none"
 _REFUSED = frozenset({400, 401, 408, 429, 503})
-"""What somebody who asks too much, or goes away before all is asked, is answered, as often as they ask."""
+"""Status codes that a client can provoke as often as it likes, by too many or by incomplete requests."""
 _REFUSED_EVERY_S = 1.0
 _REMEMBERED = 1000
 _METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 
 
 class Access:
-    """Wraps the application. The query is not logged: who knows what somebody puts there. Of the refusals that somebody
-    brings about as often as they ask there is a line a second for each address."""
+    """Wraps the application. The query is not logged, because it may hold secrets. Refusals that a client can provoke
+    without end are logged at most once a second for each address."""
 
-    def __init__(self, app: App, wall: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, app: ASGIApp, wall: Callable[[], float] = time.monotonic) -> None:
         self._app, self._wall = app, wall
         self._refused: dict[tuple[int, str | None], float] = {}
 
-    async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
         status = 500
-        request = f"{random.getrandbits(32):08x}"  # no secret: one from the system costs a system call
+        request = f"{random.getrandbits(32):08x}"  # the id is no secret; os.urandom would cost a system call
 
-        async def watched(message: Message) -> None:
+        async def sending(message: Message) -> None:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
@@ -50,12 +51,12 @@ class Access:
         started = time.perf_counter()
         try:
             with about(request=request), IN_FLIGHT.track_inprogress():
-                await self._app(scope, receive, watched)
+                await self._app(scope, receive, sending)
         finally:
-            self._tell(scope, status, time.perf_counter() - started, request)
+            self._log(scope, status, time.perf_counter() - started, request)
 
-    def _often(self, status: int, address: str | None) -> bool:
-        """Whether a line of such a refusal was written just now; each is counted in the metrics all the same."""
+    def _logged_just_now(self, status: int, address: str | None) -> bool:
+        """Whether the same refusal was logged less than a second ago. The metrics count every refusal all the same."""
         if status not in _REFUSED:
             return False
         now = self._wall()
@@ -66,7 +67,7 @@ class Access:
         self._refused[status, address] = now
         return False
 
-    def _tell(self, scope: AsgiScope, status: int, seconds: float, request: str) -> None:
+    def _log(self, scope: Scope, status: int, seconds: float, request: str) -> None:
         method = scope["method"] if scope["method"] in _METHODS else "other"
         # The template, not the path: a label must not have as many values as there are jobs.
         route = str(getattr(scope.get("route"), "path", _NO_ROUTE))
@@ -75,7 +76,7 @@ class Access:
             REQUEST_SECONDS.labels(route).observe(seconds)
         client = scope.get("client")
         address = client[0] if client else None
-        if self._often(status, address):
+        if self._logged_just_now(status, address):
             return
         found = scope.get("path_params") or {}
         level = logging.DEBUG if method in ("GET", "HEAD") and status < 400 else logging.INFO

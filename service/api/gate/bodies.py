@@ -1,25 +1,21 @@
-"""Bodies of requests: received whole before anybody works on them, in a time and in no more memory than permitted."""
+"""Request bodies are received whole before the application is called, within limits of time and memory."""
 
 from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Awaitable, Callable, MutableMapping
-from typing import Any
 
 from starlette.datastructures import Headers
+from starlette.types import Message, Receive, Scope
 
 from loopwright.service.api.gate.limits import RequestLimits
 
-Message = MutableMapping[str, Any]
-Receive = Callable[[], Awaitable[Message]]
-
 SMALL = 16 << 10
-"""A body that counts towards no limit of all bodies; a decision has none that is longer."""
+"""Bytes. A shorter body does not count towards the limit of all bodies; the body of a decision must not be longer."""
 
 
 class BodyRefused(Exception):
-    """The body is too long (413), did not come (400, 408), or there is no room for it (429, 503)."""
+    """The body is too long (413), did not arrive (400, 408), or there is no memory for it (429, 503)."""
 
     def __init__(self, status: int, why: str) -> None:
         super().__init__(why)
@@ -27,14 +23,14 @@ class BodyRefused(Exception):
 
 
 class Bodies:
-    """Those that are being received. For one event loop."""
+    """The bodies that are being received. An object belongs to one event loop."""
 
     def __init__(self, limits: RequestLimits) -> None:
         self._limits = limits
         self._held: Counter[str] = Counter()
 
-    async def whole(self, scope: MutableMapping[str, Any], receive: Receive, client: str, small: bool) -> bytes | None:
-        """The body; None where there is none. small: it is that of a decision. Raises BodyRefused."""
+    async def whole(self, scope: Scope, receive: Receive, client: str, small: bool) -> bytes | None:
+        """The body; None for a request without a body. small: the request is a decision. Raises BodyRefused."""
         headers = Headers(scope=scope)
         length = headers.get("content-length", "0")
         maximum = min(SMALL, self._limits.body_bytes) if small else self._limits.body_bytes
@@ -52,7 +48,7 @@ class Bodies:
                     if message["type"] == "http.disconnect":
                         raise BodyRefused(400, "the connection ended before the body did")
                     body += message.get("body", b"")
-                    if len(body) > maximum:  # sent in chunks, without saying how much it will be
+                    if len(body) > maximum:  # a chunked body does not announce its length
                         raise too_long
                     if len(body) > SMALL:
                         self._hold(client, len(body) - held)
@@ -77,7 +73,7 @@ class Bodies:
 
 
 def begins_with(body: bytes, receive: Receive) -> Receive:
-    """What the application receives: the body, then whatever comes."""
+    """An ASGI receive function that gives the body first, then what the server sends."""
     given = False
 
     async def receiving() -> Message:

@@ -1,8 +1,9 @@
-"""Connections: how many there may be, and how long one may keep us waiting. uvicorn bounds neither.
+"""Limits of the number of open connections and of the time that a client may keep one waiting. uvicorn has neither.
 
-When there is no room a new connection that says nothing is closed at once: who wants something has said it by the time
-it is accepted. One that says something takes the place of the one that has waited longest for a request, or for the
-rest of one; a connection on which a request is answered stays. So those who open many keep nobody out, and cost little.
+When all places are taken, a new connection that has sent nothing yet is closed at once; a client with a request has
+sent it by the time the connection is accepted. A new connection that has sent something takes the place of the one that
+has waited longest for a request or for the rest of one; a connection on which a request is answered stays. A client
+that opens many connections therefore shuts nobody out, and costs little.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ from loopwright.service.api.gate.limits import RequestLimits
 
 log = logging.getLogger(__name__)
 
-TOLD_EVERY_S = 60.0
+WARN_EVERY_S = 60.0
 ACCEPTED_AT_ONCE = 8
-"""Between two looks of the event loop at everything else."""
+"""Connections accepted in one pass; then the event loop serves everything else."""
 _OUT_OF_DESCRIPTORS = (errno.EMFILE, errno.ENFILE)
 _NO_ROOM = (
     b"HTTP/1.1 503 Service Unavailable\r\nRetry-After: 1\r\nConnection: close\r\n"
@@ -39,30 +40,30 @@ _NO_ROOM_BODY = (
 
 
 def raise_descriptor_limit() -> int:
-    """As many file descriptors as the system lets us have. How many that is."""
+    """Raises the soft limit of file descriptors to the hard one, and returns it."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != hard:
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     return hard if hard != resource.RLIM_INFINITY else 1 << 20
 
 
-class Told:
-    """Something that may happen often, in one line of the log a minute."""
+class WarningOnceAMinute:
+    """Logs an event that may happen often at most once a minute, with the number of times since."""
 
     def __init__(self, wall: Callable[[], float] = time.monotonic) -> None:
         self._wall = wall
-        self._at = -TOLD_EVERY_S
+        self._at = -WARN_EVERY_S
         self._since = 0
 
     def happened(self, text: str) -> None:
         self._since += 1
-        if self._wall() - self._at >= TOLD_EVERY_S:
+        if self._wall() - self._at >= WARN_EVERY_S:
             log.warning("%s (%d since the last such line, of which there is one a minute)", text, self._since)
             self._at, self._since = self._wall(), 0
 
 
 class OnceAMinute(logging.Filter):
-    """Of a logger's warnings each text once a minute: some are for every bad request."""
+    """Passes each text of a logger's warnings once a minute: uvicorn warns for every bad request."""
 
     def __init__(self, wall: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
@@ -73,38 +74,38 @@ class OnceAMinute(logging.Filter):
         if record.levelno > logging.WARNING:
             return True
         now = self._wall()
-        if now - self._at.get(record.msg, -TOLD_EVERY_S) < TOLD_EVERY_S:
+        if now - self._at.get(record.msg, -WARN_EVERY_S) < WARN_EVERY_S:
             return False
         self._at[record.msg] = now
         return True
 
 
 class Connections:
-    """The open ones. exempt: whether an address is not a client's own (a proxy's), and may have as many as there are.
+    """The open connections. An object belongs to one event loop.
 
-    For one event loop.
+    exempt: whether an address is a proxy's, which may have as many connections as there are.
     """
 
     def __init__(
         self, limits: RequestLimits, descriptors: int, exempt: Callable[[str], bool] = lambda address: False
     ) -> None:
         self.limits = limits
-        # The other half is for buses, database and files.
+        # The other half of the descriptors is for buses, database and files.
         self._max = min(limits.connections, descriptors // 2)
         self._max_of_address = min(limits.connections_of_address, self._max)
         self._exempt = exempt
         self._open: Counter[str] = Counter()
         self._idle: dict[str, OrderedDict[Connection, None]] = {}
-        self._told = Told()
+        self._warning = WarningOnceAMinute()
 
     def wanted(self, new: socket.socket, address: str) -> bool:
-        """Whether it may go before the event loop at all."""
+        """Whether an accepted connection is handed to the event loop; else the caller closes it."""
         if not self._address_is_full(address) and self._open.total() < self._max:
             return True
         try:
             if new.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT):
                 return True
-        except OSError:  # nothing is there yet, or it has gone already
+        except OSError:  # nothing has arrived yet, or the client has gone
             pass
         self.refused(address)
         return False
@@ -113,7 +114,7 @@ class Connections:
         return self._open[address] >= self._max_of_address and not self._exempt(address)
 
     def admit(self, new: Connection) -> bool:
-        """Makes room if there is none. False: there is no connection that could give way."""
+        """Adds the connection; closes a waiting one if there is no room. False: no connection could give way."""
         if self._address_is_full(new.address):
             found = self._give_way(new.address)
         else:
@@ -124,11 +125,11 @@ class Connections:
         return found
 
     def idle(self, connection: Connection) -> None:
-        """It waits for a request, from now on."""
+        """The connection waits for a request from now on."""
         self._idle.setdefault(connection.address, OrderedDict())[connection] = None
 
     def busy(self, connection: Connection) -> None:
-        """A request has arrived on it."""
+        """A request has arrived on the connection."""
         waiting = self._idle.get(connection.address, OrderedDict())
         waiting.pop(connection, None)
         if not waiting:
@@ -141,7 +142,7 @@ class Connections:
             del self._open[connection.address]
 
     def refused(self, address: str) -> None:
-        self._tell(f"a connection from {address} was refused")
+        self._warn(f"a connection from {address} was refused")
 
     def _by_number(self) -> list[str]:
         return [address for address, _ in self._open.most_common()]
@@ -151,19 +152,21 @@ class Connections:
         if not waiting:
             return False
         oldest = next(iter(waiting))
-        self._tell(f"a connection from {address} that was waited for gave way to a new one")
+        self._warn(f"a waiting connection from {address} gave way to a new one")
         oldest.give_way()
         return True
 
-    def _tell(self, what: str) -> None:
-        self._told.happened(
+    def _warn(self, what: str) -> None:
+        self._warning.happened(
             f"{what}: {self._open.total()} are open, {self._max} may be, {self._max_of_address} of one address"
         )
 
 
 class Connection(H11Protocol):
-    """uvicorn's, with an end to every wait for the client: for the head of its request, and until it takes an answer.
-    The wait for the body is the gate's."""
+    """uvicorn's connection with a time limit for the head of a request and for the client taking the answer.
+
+    The gate limits the time for the body.
+    """
 
     def __init__(self, among: Connections, **more: Any) -> None:
         super().__init__(**more)
@@ -197,32 +200,32 @@ class Connection(H11Protocol):
     def data_received(self, data: bytes) -> None:
         if self._admitted:
             super().data_received(data)
-            self._look()
+            self._on_data()
 
     def on_response_complete(self) -> None:
-        super().on_response_complete()  # which may begin the next request, where that is here already
+        super().on_response_complete()  # this begins the next request if it has arrived already
         if self._busy:
             self._busy = False
             self._among.idle(self)
         self._wait_for_head()
-        self._look()
+        self._on_data()
 
     def pause_writing(self) -> None:
         super().pause_writing()
         self._unsent = self.transport.get_write_buffer_size()
-        self._write_due = self.loop.call_later(self._among.limits.write_s, self._end_unless_it_takes, "_write_due")
+        self._write_due = self.loop.call_later(self._among.limits.write_s, self._end_unless_taking, "_write_due")
 
     def resume_writing(self) -> None:
         self._cancel("_write_due")
         super().resume_writing()
 
     def give_way(self) -> None:
-        """At once: the descriptor is wanted."""
+        """Closes the connection at once: its descriptor is needed."""
         self._leave()
         self.transport.abort()
 
-    def _look(self) -> None:
-        """Whether a request has arrived, whole or its head."""
+    def _on_data(self) -> None:
+        """Ends the wait for the head once it has arrived; a whole request makes the connection busy."""
         cycle = self.cycle
         if self.transport.is_closing() or cycle is None or cycle.response_complete:
             return
@@ -234,16 +237,16 @@ class Connection(H11Protocol):
     def _wait_for_head(self) -> None:
         self._cancel("_head_due")
         self._unsent = self.transport.get_write_buffer_size()
-        self._head_due = self.loop.call_later(self._among.limits.headers_s, self._end_unless_it_takes, "_head_due")
+        self._head_due = self.loop.call_later(self._among.limits.headers_s, self._end_unless_taking, "_head_due")
 
-    def _end_unless_it_takes(self, due: str) -> None:
-        """A long answer may take long, as long as the client goes on taking it."""
+    def _end_unless_taking(self, due: str) -> None:
+        """Ends the connection, unless the client has taken a part of the answer since the timer was set."""
         unsent, before = self.transport.get_write_buffer_size(), self._unsent
         if not 0 < unsent < before:
             self.transport.abort()
             return
         self._unsent = unsent
-        setattr(self, due, self.loop.call_later(self._among.limits.headers_s, self._end_unless_it_takes, due))
+        setattr(self, due, self.loop.call_later(self._among.limits.headers_s, self._end_unless_taking, due))
 
     def _leave(self) -> None:
         if self._admitted:
@@ -258,17 +261,17 @@ class Connection(H11Protocol):
 
 
 class Listener(socket.socket):
-    """The listening socket. What asyncio would do at the end of the descriptors is to write a traceback for each
-    connection it cannot accept, in a loop: here a descriptor is kept to turn them away with."""
+    """The listening socket. Without file descriptors asyncio would log a traceback for each connection that it cannot
+    accept, in a loop; this socket keeps a spare descriptor, with which it accepts and closes such connections."""
 
     def __init__(self, fileno: int) -> None:
         super().__init__(fileno=fileno)
         self.wanted: Callable[[socket.socket, str], bool] = lambda new, address: True
         self._left = ACCEPTED_AT_ONCE
         self._spare = os.open(os.devnull, os.O_RDONLY)
-        self._told = Told()
+        self._warning = WarningOnceAMinute()
 
-    def accept(self) -> tuple[socket.socket, Any]:
+    def accept(self) -> tuple[socket.socket, object]:
         while self._left:
             self._left -= 1
             try:
@@ -279,13 +282,13 @@ class Listener(socket.socket):
                 if error.errno not in _OUT_OF_DESCRIPTORS or not self._turn_away():
                     self._left = 0
                     raise
-                self._told.happened("a connection was turned away, all file descriptors are taken")
+                self._warning.happened("a connection was turned away, all file descriptors are taken")
                 continue
             if self.wanted(new, address[0]):
                 return new, address
             new.close()
         self._left = ACCEPTED_AT_ONCE
-        raise BlockingIOError  # what else there is to do comes first; then we are asked again
+        raise BlockingIOError  # the event loop serves the rest first, then calls again
 
     def close(self) -> None:
         super().close()

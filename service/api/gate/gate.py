@@ -1,6 +1,6 @@
-"""The door of the API as ASGI middleware: who asks, may they, and is it too much. Everything it refuses is a problem.
+"""ASGI middleware for authentication, authorization and rate limits. Every refusal is a problem (RFC 9457).
 
-Closed by default: what is not known to need less needs `operate` (changes) or `read` (the rest).
+A path that no rule names needs the scope `operate` for a request that changes something, `read` for the rest.
 """
 
 from __future__ import annotations
@@ -8,13 +8,13 @@ from __future__ import annotations
 import ipaddress
 import logging
 import time
-from collections.abc import Awaitable, Callable, MutableMapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.datastructures import Headers
 from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Send
+from starlette.types import Scope as AsgiScope
 
 from loopwright.service.api import problems
 from loopwright.service.api.gate.bodies import Bodies, BodyRefused, begins_with
@@ -38,21 +38,15 @@ from loopwright.service.store.keyring import Keyring
 
 log = logging.getLogger(__name__)
 
-AsgiScope = MutableMapping[str, Any]
-Message = MutableMapping[str, Any]
-Receive = Callable[[], Awaitable[Message]]
-Send = Callable[[Message], Awaitable[None]]
-App = Callable[[AsgiScope, Receive, Send], Awaitable[None]]
-
 PUBLIC = frozenset({"/healthz", "/docs", "/openapi.json"})
-"""Say nothing about this installation."""
+"""Paths that need no key, because their answers say nothing about this installation."""
 ALWAYS = frozenset({"/healthz", "/readyz", "/metrics"})
-"""Answered however busy the service is: that is when somebody looks."""
+"""Paths that are answered however busy the service is, because then operators ask for them."""
 _ADMIN = ("/audit",)
 
 
 def scope_for(method: str, path: str) -> Scope | None:
-    """What a request needs; None: nothing."""
+    """The scope that a request needs; None for a public path."""
     if path in PUBLIC:
         return None
     if path.startswith(_ADMIN):
@@ -62,7 +56,7 @@ def scope_for(method: str, path: str) -> Scope | None:
 
 @dataclass(frozen=True)
 class Policy:
-    """keyring None: no keys are asked for, and only names of this machine are answered to."""
+    """keyring: None to ask for no keys. local_only: without keys, refuse host names other than this machine's."""
 
     keyring: Keyring | None = None
     limits: RequestLimits = field(default_factory=RequestLimits)
@@ -72,15 +66,15 @@ class Policy:
 class Gate:
     """Wraps the application.
 
-    In this order: the key, how often its holder asks, the body, a place among requests of the same kind. A body that
-    does not come takes nobody's place.
+    The gate checks the key, then the rate of its holder, then receives the body, then takes a place among the requests
+    of the same kind. A body that does not arrive therefore takes nobody's place.
     """
 
-    def __init__(self, app: App, policy: Policy) -> None:
+    def __init__(self, app: ASGIApp, policy: Policy) -> None:
         self._app = app
         self._policy = policy
         limits = policy.limits
-        # Apart: who reads too much may still stop a test.
+        # Decisions have buckets of their own: a client that reads too much may still stop a test.
         self._asked, self._decided = (Buckets(limits.rate_per_s, limits.burst) for _ in range(2))
         self._checks = None if policy.keyring is None else KeyChecks(policy.keyring, limits)
         self._bodies = Bodies(limits)
@@ -127,7 +121,7 @@ class Gate:
             raise TooOften("too many requests from this caller", wait)
 
     async def _who(self, scope: AsgiScope) -> Principal | Response:
-        """Who asks, or the refusal; scope["principal"] names them for the log."""
+        """The principal of the request, or the refusal. scope["principal"] gets the name for the log."""
         headers, keyring = Headers(scope=scope), self._policy.keyring
         client = scope.get("client")
         anyone = Principal(LOCAL, Scope.ADMIN, address=client[0] if client else None)
@@ -163,7 +157,7 @@ class Gate:
 
 
 def _until_it_begins(send: Send, turn: Turn) -> Send:
-    """The work is done when the answer begins: a client that is slow to take it keeps nobody waiting."""
+    """A send function that ends the turn when the answer begins, so that a slow client does not block others."""
 
     async def sending(message: Message) -> None:
         turn.over()
@@ -173,8 +167,8 @@ def _until_it_begins(send: Send, turn: Turn) -> Send:
 
 
 def _not_local(headers: Headers) -> str | None:
-    """Without keys, a web page in a browser on this machine must not be able to command a loop: neither under a name
-    that was made to point here, nor as a request across sites."""
+    """Why a request without a key is refused, None if it is not. A web page in a browser on this machine must not
+    command a loop, neither by DNS rebinding nor by a cross-site request."""
     host = headers.get("host", "")
     if not is_loopback(host.rpartition(":")[0] if not host.endswith("]") and ":" in host else host):
         return f"without keys only names of this machine are answered to, not {host!r}"
@@ -185,7 +179,7 @@ def _not_local(headers: Headers) -> str | None:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a name or address is this machine's own."""
+    """Whether a host name or an address is a loopback one."""
     if host == "localhost":
         return True
     try:
@@ -199,6 +193,6 @@ def _unauthorized(why: str) -> Response:
 
 
 def _refusal(status: int, why: str, wait_s: float) -> Response:
-    """With the connection's end where the rest of a body may still come: it would be read as the next request."""
+    """A refusal. It closes the connection where the rest of a body may follow and be read as the next request."""
     headers = {"Retry-After": retry_after(wait_s)} if status in (429, 503) else {"Connection": "close"}
     return problems.problem(status, why, headers=headers)

@@ -1,8 +1,8 @@
-"""Keys at the door: those in use are let through without waiting, those not known yet are checked one at a time.
+"""Checks of API keys: a key in use passes without waiting, unknown keys are hashed one at a time.
 
-The hash of a key takes some 50 ms and 16 MiB, so an unknown key is a guess until it is found right: its attempt is
-counted as it begins, by address and by the id of the key that is guessed at, before anything is hashed. From an address
-one key is checked at a time: who comes from another one waits behind one guess of each, and not behind them all.
+The hash of a key takes some 50 ms and 16 MiB, so an unknown key counts as a guess until it is found valid: the attempt
+is counted by address and by key id before anything is hashed. One key of an address is checked at a time, so a client
+waits behind one guess of each other address, not behind all guesses.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from loopwright.service.store.tables import KeyRow
 
 
 class TooOften(Exception):
-    """Too many wrong keys; the text says of whom. wait_s: until another one is looked at."""
+    """Too many requests or wrong keys; the text says of whom. wait_s: seconds until the next one is permitted."""
 
     def __init__(self, why: str, wait_s: float) -> None:
         super().__init__(why)
@@ -31,7 +31,7 @@ class TooOften(Exception):
 
 
 class KeyChecks:
-    """For one event loop. Threads of its own: what goes on behind the door does not keep anybody before it."""
+    """Checks keys in threads of its own, which the routes cannot block. An object belongs to one event loop."""
 
     def __init__(self, keyring: Keyring, limits: RequestLimits, wall: Callable[[], float] = time.monotonic) -> None:
         self._keyring = keyring
@@ -43,7 +43,7 @@ class KeyChecks:
         self._looking = ThreadPoolExecutor(2, "key")
 
     async def row(self, key: str, address: str) -> KeyRow | None:
-        """The row of a valid key, None for a wrong one. Raises TooOften, SQLAlchemyError."""
+        """The row of a valid key, None for a wrong key. Raises TooOften, SQLAlchemyError."""
         found = self._keyring.known(key)
         if found is not None:
             return found
@@ -54,7 +54,7 @@ class KeyChecks:
             return self._keyring.known(key) or await self._guess(key, address)
 
     async def _guess(self, key: str, address: str) -> KeyRow | None:
-        # The id alone does not refuse an address that has guessed nothing wrong of late: it may be the key's owner.
+        # Many guesses at a key id do not refuse an address without wrong guesses of late: it may be the key's owner.
         clean = self._by_address.full(address)
         self._refuse_early(address)
         self._by_address.take(address)

@@ -1,4 +1,4 @@
-"""How much one client, and all of them together, may ask for."""
+"""Limits of the requests of one client and of all clients, and the token buckets that enforce rates."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class RequestLimits:
-    """A client is a key, or an address without one.
+    """A client is a key, or an address without a key.
 
     rate_per_s, burst: requests of one client; decisions (abort, accept, roll back, dismiss) are counted apart.
-    at_once, streams_at_once, computations_at_once: requests of that kind that wait or are answered, of all clients; one
-    client may have half of them (`service.api.gate.places` has the kinds without an option here).
-    body_bytes: of one request.  bodies_bytes: of all that have begun to arrive; one client may have half.
-    body_s: within which a body must be here.  wait_s: how long a request waits for its turn before it is refused.
+    at_once, streams_at_once, computations_at_once: requests of that kind, waiting or being answered, of all clients;
+    one client may have half of them (`service.api.gate.places` has the kinds without an option).
+    body_bytes: length of one body.  bodies_bytes: all bodies that have begun to arrive; one client may have half.
+    body_s: time for a body to arrive.  wait_s: time that a request waits for its turn before it is refused.
     bad_keys_per_s, bad_keys_burst: unknown keys from one address, and guesses at one key.
-    connections, connections_of_address: open at the same time; one that waits for a request gives way to a new one.
-    headers_s: within which the head of a request must be here, from the opening or from the last answer on.
-    write_s: how long a client may take nothing of an answer.
+    connections, connections_of_address: open connections; one that waits for a request gives way to a new one.
+    headers_s: time for the head of a request to arrive, since the connection opened or the last answer ended.
+    write_s: time that a client may take nothing of an answer.
     """
 
     body_bytes: int = 1 << 20
@@ -42,7 +42,7 @@ class RequestLimits:
 
 
 class Buckets:
-    """A token bucket for each caller. Not for use by two threads."""
+    """A token bucket for each caller. The class is not thread-safe."""
 
     def __init__(
         self, rate_per_s: float, burst: int, wall: Callable[[], float] = time.monotonic, maximum: int = 10_000
@@ -51,7 +51,7 @@ class Buckets:
         self._levels: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def wait_s(self, caller: str) -> float:
-        """Seconds until this caller's next token; 0: there is one."""
+        """Seconds until the caller's next token; 0 if there is one."""
         return max(0.0, (1.0 - self._level(caller)) / self._rate)
 
     def take(self, caller: str) -> float:
@@ -62,17 +62,17 @@ class Buckets:
         return wait
 
     def give_back(self, caller: str) -> None:
-        """What the token was taken for was no reason to take one."""
+        """Returns a token that was taken without a reason, as for a key that turned out valid."""
         self._put(caller, self._level(caller) + 1.0)
 
     def full(self, caller: str) -> bool:
-        """Whether this caller has taken nothing for a while."""
+        """Whether all tokens of the caller are there."""
         return self._level(caller) >= self._burst
 
     def _put(self, caller: str, level: float) -> None:
         self._levels[caller] = (level, self._wall())
         self._levels.move_to_end(caller)
-        if len(self._levels) > self._max:  # who was not seen for longest has a full bucket, most likely
+        if len(self._levels) > self._max:  # the caller not seen for longest most likely has a full bucket
             self._levels.popitem(last=False)
 
     def _level(self, caller: str) -> float:
@@ -81,5 +81,5 @@ class Buckets:
 
 
 def retry_after(wait_s: float) -> str:
-    """Whole seconds, at least one, as the header wants it."""
+    """The value of the header Retry-After: whole seconds, at least one."""
     return str(max(1, math.ceil(wait_s)))

@@ -1,8 +1,8 @@
-"""Kinds of work, and the places that each kind has: what one kind does, and how long it takes, is no other's business.
+"""Limits of concurrent requests by kind, so that one kind of request cannot block another.
 
-A request has a place from the moment in which it has arrived whole until its answer is sent, and a turn from its
-beginning until its answer begins: so many are worked on at a time, the rest wait for their turn. Waiting takes no
-thread, and turns are few, so that the threads of the web framework (40, shared by all) are never all taken.
+A request has a place from its arrival until its answer is sent, and a turn while it is worked on, which ends when the
+answer begins. Requests without a turn wait for one. Waiting takes no thread, and turns are few, so that the 40 threads
+that the web framework shares among all requests are never all taken.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _PREVIEW = re.compile(r"/loops/[^/]+/retune/preview|/retunes/preview")
 
 
 class RequestKind(StrEnum):
-    """What a request asks for, in the words of a refusal."""
+    """The kind of a request; the value is how a refusal names it."""
 
     ABORT = "aborts and dismissals"
     DECISION = "acceptances and rollbacks"
@@ -31,7 +31,7 @@ class RequestKind(StrEnum):
     BUS = "reads of the bus"
     COMPUTATION = "computations"
     STREAM = "event streams"
-    WATCH = "looks at /readyz and /metrics"
+    WATCH = "requests of /readyz and /metrics"
 
 
 DECIDES = (RequestKind.ABORT, RequestKind.DECISION)
@@ -43,12 +43,12 @@ _WATCHED = ("/readyz", "/metrics")
 
 
 def changes_nothing(path: str) -> bool:
-    """Whether a POST to this path only answers."""
+    """Whether a POST to this path changes nothing."""
     return path == "/tunings" or _PREVIEW.fullmatch(path) is not None
 
 
 def kind_of(method: str, path: str) -> RequestKind | None:
-    """The kind of a request; None: it costs nothing, and is always answered."""
+    """The kind of a request; None for /healthz, which costs nothing and is always answered."""
     if path == "/healthz":
         return None
     last = path.rpartition("/")[2]
@@ -67,7 +67,7 @@ def kind_of(method: str, path: str) -> RequestKind | None:
 
 @dataclass(frozen=True)
 class Room:
-    """places: requests that wait or are answered.  turns: those that are worked on."""
+    """places: requests of a kind that wait or are answered.  turns: requests of the kind that are worked on."""
 
     places: int
     turns: int
@@ -78,13 +78,13 @@ class Room:
 
     @property
     def turns_of_client(self) -> int:
-        """One is left for the others."""
+        """All turns but one, which is left for other clients."""
         return max(1, self.turns - 1)
 
 
 def rooms(limits: RequestLimits) -> dict[RequestKind, Room]:
-    """Threads that read, and show what they read, contend for one interpreter with those that pump the loops and with
-    the event loop, which gives it away in each system call: few turns. Those who wait for a bus need hardly any."""
+    """The places and turns of each kind. Turns are few: threads that read the database contend for the interpreter
+    lock with the threads of the loops and with the event loop. Threads that wait for a bus hardly need the lock."""
     return {
         RequestKind.ABORT: Room(64, 4),
         RequestKind.DECISION: Room(32, 8),
@@ -98,7 +98,7 @@ def rooms(limits: RequestLimits) -> dict[RequestKind, Room]:
 
 
 class Full(Exception):
-    """There is no place: the client has its share (429), or all are taken (503). The text says how many."""
+    """There is no place: the client has its share (429), or all places are taken (503)."""
 
     def __init__(self, status: int, why: str) -> None:
         super().__init__(why)
@@ -106,7 +106,7 @@ class Full(Exception):
 
 
 class Turn:
-    """What a request has while it is worked on. `over` may be called more than once."""
+    """The turn of a request, which it has while it is worked on. `over` may be called more than once."""
 
     def __init__(self, place: _Places, client: str) -> None:
         self._place, self._client = place, client
@@ -119,7 +119,7 @@ class Turn:
 
 
 class _Places:
-    """Those of one kind. For one event loop."""
+    """The places of one kind. An object belongs to one event loop."""
 
     def __init__(self, kind: RequestKind, room: Room) -> None:
         self._kind, self._room = kind, room
@@ -128,7 +128,7 @@ class _Places:
         self._waiting: list[tuple[str, asyncio.Future[None]]] = []
 
     def check(self, client: str) -> None:
-        """Raises Full."""
+        """Raises Full when the client would get no place."""
         everybodys, its = self.taken.total(), self.taken[client]
         if everybodys >= self._room.places:
             raise Full(503, f"{everybodys} {self._kind} are under way already, no more are taken")
@@ -143,26 +143,26 @@ class _Places:
         _less(self.taken, client)
 
     async def turn(self, client: str, wait_s: float) -> Turn:
-        """Raises Full when it is not had in that time."""
+        """Waits for a turn. Raises Full when none is free within `wait_s` seconds."""
         if not self._may(client):
             mine = asyncio.get_running_loop().create_future()
             self._waiting.append((client, mine))
             try:
                 await asyncio.wait_for(asyncio.shield(mine), wait_s)
             except BaseException as error:
-                if mine.done():  # it came in the very moment
+                if mine.done():  # the turn was given at the moment of the timeout
                     self.leave(client)
                 else:
                     self._waiting.remove((client, mine))
                 if isinstance(error, TimeoutError):
-                    raise Full(503, f"{self._kind}: no turn in {wait_s:g} s, so many are before it") from None
+                    raise Full(503, f"there was no turn in {wait_s:g} s, too many {self._kind} are under way") from None
                 raise
         else:
             self._working[client] += 1
         return Turn(self, client)
 
     def leave(self, client: str) -> None:
-        """Hands the turn on, in the order in which they came."""
+        """Ends a turn, and gives it to the first waiting request that may have it."""
         _less(self._working, client)
         for each in self._waiting:
             if self._may(each[0]):
@@ -176,19 +176,19 @@ class _Places:
 
 
 class Places:
-    """Those of every kind."""
+    """The places of every kind."""
 
     def __init__(self, limits: RequestLimits, of: Mapping[RequestKind, Room] | None = None) -> None:
         self._wait_s = limits.wait_s
         self._of = {kind: _Places(kind, room) for kind, room in (of or rooms(limits)).items()}
 
     def check(self, kind: RequestKind, client: str) -> None:
-        """Whether there would be a place. Raises Full."""
+        """Raises Full when the client would get no place."""
         self._of[kind].check(client)
 
     @asynccontextmanager
     async def taken(self, kind: RequestKind, client: str) -> AsyncIterator[Turn]:
-        """A place, and the turn in it. Raises Full."""
+        """Takes a place, waits for its turn, and gives both back at the end. Raises Full."""
         places = self._of[kind]
         places.take(client)
         try:

@@ -163,7 +163,7 @@ def test_absent_node(service: Service, client: TestClient) -> None:
         ({"start": "design", "model": {"num": [1], "den": [1]}}, "bad_input", "den must have a pole"),
         ({"ms": 1.1}, "bad_input", "ms"),
         ({"ms": 2.1}, "bad_input", "ms"),
-        ({"amplitude_pct": 70}, "bad_limits", "needs 105 % of MV between its limits, there are 100 %"),
+        ({"amplitude_pct": 70}, "bad_limits", "needs 105 % of MV between its limits, which are 100 % apart"),
         ({"sp_devation": 1}, "bad_input", "sp_devation"),
         ({"plant": {"num": [1], "den": [1, 1]}}, "bad_input", "dry run"),
     ],

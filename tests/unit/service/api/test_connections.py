@@ -16,7 +16,7 @@ import pytest
 
 from loopwright.service.api.app import create_app
 from loopwright.service.api.gate import key_checks
-from loopwright.service.api.gate.connections import Connections, OnceAMinute, Told
+from loopwright.service.api.gate.connections import Connections, OnceAMinute, WarningOnceAMinute
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.api.gate.limits import RequestLimits
 from loopwright.service.api.gate.places import Full, Places, RequestKind, Room, kind_of
@@ -426,11 +426,11 @@ def test_without_descriptors_connections_are_turned_away(caplog: pytest.LogCaptu
 
 def test_one_line_a_minute(caplog: pytest.LogCaptureFixture) -> None:
     now = [0.0]
-    told, once = Told(lambda: now[0]), OnceAMinute(lambda: now[0])
+    warning, once = WarningOnceAMinute(lambda: now[0]), OnceAMinute(lambda: now[0])
     passed = []
     for second in range(121):
         now[0] = float(second)
-        told.happened("refused")
+        warning.happened("refused")
         passed.append(once.filter(logging.makeLogRecord({"msg": "Invalid HTTP request received.", "levelno": 30})))
         assert once.filter(logging.makeLogRecord({"msg": "a defect", "levelno": 40}))
     assert len(caplog.records) == 3 == sum(passed)

@@ -70,7 +70,7 @@ def test_a_dead_time_far_beyond_the_t95_of_the_loop_makes_no_job(
     """It was refused by the dry run, in a process of its own and after the controller had been read: who asked again at
     once kept the service busy with that, and other loops of that controller waiting for their turn."""
     answer = client.post(f"/loops/{TAG}/retune", json={"dry_run": True, **plant})
-    assert answer.status_code == 422 and "permitted are 90 s" in answer.json()["detail"]
+    assert answer.status_code == 422 and "at most 90 s are permitted" in answer.json()["detail"]
     assert not service.store.recent()
 
 

@@ -1,0 +1,73 @@
+"""The types of the parts of an OpenAPI document that this package reads or completes."""
+
+from __future__ import annotations
+
+from typing import Any, TypedDict, cast
+
+Schema = TypedDict(
+    "Schema",
+    {
+        "$ref": str,
+        "type": str,
+        "pattern": str,
+        "maxLength": int,
+        "description": str,
+        "properties": dict[str, "Schema"],
+        "required": list[str],
+        "anyOf": list["Schema"],
+        "oneOf": list["Schema"],
+    },
+    total=False,
+)
+
+
+class MediaType(TypedDict, total=False):
+    schema: Schema
+
+
+class RequestBody(TypedDict, total=False):
+    content: dict[str, MediaType]
+
+
+class DocumentedResponse(TypedDict, total=False):
+    description: str
+    content: dict[str, MediaType]
+
+
+Parameter = TypedDict(
+    "Parameter",
+    {"name": str, "in": str, "description": str, "required": bool, "schema": Schema, "example": str},
+    total=False,
+)
+
+
+class Operation(TypedDict, total=False):
+    tags: list[str]
+    summary: str
+    description: str
+    security: list[dict[str, list[str]]]
+    parameters: list[Parameter]
+    requestBody: RequestBody
+    responses: dict[str, DocumentedResponse]
+
+
+class Info(TypedDict, total=False):
+    title: str
+    version: str
+    description: str
+
+
+class Components(TypedDict, total=False):
+    schemas: dict[str, Schema]
+    securitySchemes: dict[str, dict[str, str]]
+
+
+class Document(TypedDict):
+    info: Info
+    paths: dict[str, dict[str, Operation]]
+    components: Components
+
+
+def as_document(generated: dict[str, Any]) -> Document:
+    """The document that FastAPI generates, which FastAPI types as a dictionary."""
+    return cast("Document", generated)
