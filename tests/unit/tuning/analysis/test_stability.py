@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterator
 
 import control
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
+from scipy.optimize import brentq
 
 from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.analysis.stability import is_stable, unstable_poles
@@ -63,6 +66,7 @@ def test_against_roots_without_dead_time(poles: list[float], Kp: float, Ti: floa
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.floats(-2.0, 2.0), min_size=2, max_size=6), st.floats(-2.0, 2.0), st.booleans())
+@example([-1.0, -1.0], 2.0, False)
 def test_the_limit_of_lags_far_apart(decades: list[float], dead: float, integrating: bool) -> None:
     den = np.array([1.0])
     for decade in decades:
@@ -73,7 +77,26 @@ def test_the_limit_of_lags_far_apart(decades: list[float], dead: float, integrat
     at = model.frequency_response(np.array([2.0 * math.pi / Pu]))[0]
     assert at == pytest.approx(1.0 / Ku, rel=1e-6)
     assert is_stable(model, Gains(0.999 * Ku))
-    assert unstable_poles(model, Gains(1.001 * Ku)) == 2
+    # with a dead time far above the lags further pairs of poles cross the axis at hardly more than Ku
+    crossed = sum(gain * 1.001 * Ku > 1.0 for gain in gains_at_180_degrees(decades, 10.0**dead, integrating, 1.0 / Ku))
+    assert unstable_poles(model, Gains(1.001 * Ku)) == 2 * crossed
+
+
+def gains_at_180_degrees(decades: list[float], L: float, integrating: bool, largest: float) -> Iterator[float]:
+    """|G| where the phase is an odd multiple of -180 degrees, falling, as far as it is close to the largest."""
+    lags = 10.0 ** np.array(decades)
+
+    def beyond(w: float, limit: float) -> float:
+        return float(np.sum(np.arctan(lags * w))) + L * w + (0.5 * math.pi if integrating else 0.0) - limit
+
+    for odd in itertools.count(1, 2):
+        limit = odd * math.pi
+        w = brentq(beyond, 0.0, limit / L, args=(limit,), xtol=1e-300, rtol=1e-14)
+        gain = 2.0 / float(np.prod(np.hypot(1.0, lags * w))) / (w if integrating else 1.0)
+        if gain < 0.99 * largest:
+            return
+        assume(abs(gain / largest * 1.001 - 1.0) > 1e-6)
+        yield gain
 
 
 @pytest.mark.parametrize("entry", MODELS, ids=lambda m: str(m["id"]))
