@@ -468,7 +468,7 @@ def test_jobs_do_what_the_model_says(
 
     monkeypatch.setattr(database, "pragmas", hasty)
     Store(tmp_path).close()
-    for round_number in range(4):  # threads decide too what happens: a rare outcome may want another round
+    for round_number in range(12):  # threads decide too what happens: a rare outcome may want further rounds
         run_state_machine_as_test(  # type: ignore[no-untyped-call]
             lambda: JobsMachine(tmp_path / FILE, machine_count),
             settings=settings(
