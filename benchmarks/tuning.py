@@ -47,7 +47,7 @@ from loopwright.tuning.fast.design import DesignSpec, GainDesign
 from loopwright.tuning.fast.evaluation import evaluate_again
 from loopwright.tuning.fast.procedure import MIN_SAMPLES, FastOptions, FastProposal, fast
 from loopwright.tuning.fast.record import ExperimentRecord
-from loopwright.tuning.fast.relay_test import Experiment
+from loopwright.tuning.fast.relay_test import RelayTest
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import sign
 from loopwright.tuning.plan import Command, Event, Mode, Plan, Sample, StageStarted
@@ -130,7 +130,7 @@ def relay_span(plant: Plant) -> float:
 
     def plan(facts: Facts) -> Plan[float]:
         point, listened = yield from at_rest(facts, 0.0, MIN_SAMPLES)
-        experiment = Experiment(facts, point, listened, 1.0)
+        experiment = RelayTest(facts, point, listened, 1.0)
         yield from experiment.relay(4)
         return experiment.experiment_record().output_range
 

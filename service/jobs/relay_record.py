@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from loopwright.tuning.fast.record import MIN_LISTENED, MIN_SWITCHES, ExperimentRecord
+from loopwright.tuning.fast.record import MIN_LISTENED, MIN_SWITCHES, ExperimentRecord, oscillation_period
 from loopwright.tuning.models import Reals
 from loopwright.tuning.plan import Mode
 
@@ -54,8 +54,9 @@ class RelayRecord:
             # the relay begins high, and switches after PV has moved in the direction in which MV drives it
             direction=1.0 if y[self.switches[0]] > 0.0 else -1.0,
             listened=self.listened,
-            relayed=self.relayed,
-            switches=self.switches,
+            excited=self.relayed,
+            turns=len(self.switches),
+            period=oscillation_period(self.switches),
             steps=tuple(int(i) for i in self.relayed + np.flatnonzero(np.diff(self.sp[self.relayed - 1 :]))),
         )
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 from loopwright.service.inputs.request import FastRetune, RetuneRequest
 from loopwright.tuning.experiments.preflight import MAX_ATTEMPTS, MIN_LISTENED_SAMPLES
 from loopwright.tuning.fast.procedure import MIN_SAMPLES
-from loopwright.tuning.fast.relay_test import MAX_PERIODS, STEP_BACK_FRACTION, VERIFICATION_PERIODS
+from loopwright.tuning.fast.experiment import STEP_BACK_FRACTION, VERIFICATION_PERIODS
+from loopwright.tuning.fast.relay_test import MAX_PERIODS
 
 PU_OF_T95 = (0.07, 0.95)
 """Ultimate period as a fraction of T95: the range of eight in ten of 116 self-regulating plants."""

@@ -69,10 +69,18 @@ class Evaluation:
     period: float
 
 
-def evaluate(record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | None = None) -> Evaluation:
+def evaluate(
+    record: ExperimentRecord,
+    spec: DesignSpec,
+    earlier: Evaluation | None = None,
+    max_uncertainty: float = MAX_UNCERTAINTY,
+    cautious: bool = False,
+) -> Evaluation:
     """Identifies the model, designs the gains and assesses both.
 
     spec: the design specification.
+    max_uncertainty: the largest accepted uncertainty of Ms, by the delta method and among rival models.
+    cautious: see `fit_covariance`.
     earlier: the evaluation of the first part of the record, whose gains were tested in the rest of it.
     Raises Refused, NOT_ROBUST, where the model permits no such controller.
     """
@@ -83,7 +91,7 @@ def evaluate(record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | N
     delay = 0.5 * record.Ts
     design = GainDesign(replace(model, L=model.L + delay), spec, record.period * record.Ts)
     best = design.best()
-    spread = uncertainty_of_Ms(fit, found, best.gains, design.w, spec.N, delay)
+    spread = uncertainty_of_Ms(fit, found, best.gains, design.w, spec.N, delay, cautious)
     rivals = difference_of_rivals(fit, found, chosen.rivals, best.gains, design.w, delay)
     noise, rounding = record.noise / record.output_range, record.rounding / record.output_range
     ratio = durbin_watson_ratio(found.linear.residual)
@@ -99,10 +107,10 @@ def evaluate(record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | N
         reason = Reason.DISTURBED
         at_rest = f"{record.durbin_watson_ratio_at_rest:.2f} at rest"
         detail = f"what the model leaves varies slowly: {ratio:.2f} times white noise, {at_rest}"
-    elif spread > MAX_UNCERTAINTY:
+    elif spread > max_uncertainty:
         reason = Reason.UNCERTAIN
         detail = f"Ms is known to +{spread:.2g} only"
-    elif rivals > MAX_UNCERTAINTY:
+    elif rivals > max_uncertainty:
         reason = Reason.AMBIGUOUS
         detail = f"another model that explains the record as well gives an Ms off by {rivals:.2g}"
     elif earlier is not None:
@@ -135,7 +143,7 @@ def evaluate_again(record: ExperimentRecord, spec: DesignSpec) -> Evaluation:
     """
     if not record.steps:
         return evaluate(record, spec)
-    until = slice(record.relayed)
+    until = slice(record.excited)
     return evaluate(record, spec, evaluate(replace(record, u=record.u[until], y=record.y[until], steps=()), spec))
 
 

@@ -27,7 +27,7 @@ from loopwright.tuning.fast.proposal import (
     verified_step,
 )
 from loopwright.tuning.fast.record import MIN_LISTENED, ExperimentRecord
-from loopwright.tuning.fast.relay_test import Experiment
+from loopwright.tuning.fast.relay_test import RelayTest
 from loopwright.tuning.models import sign
 from loopwright.tuning.plan import Note, Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
@@ -94,7 +94,7 @@ def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
 
     after_s = sum(expected[stage] for stage in todo[1:])
     point, listened = yield from at_rest(facts, after_s, MIN_SAMPLES)
-    experiment = Experiment(facts, point, listened, options.amplitude)
+    experiment = RelayTest(facts, point, listened, options.amplitude)
     yield from experiment.report(StageDone("preflight", point))
 
     yield from experiment.report(*started("relay"))
@@ -151,12 +151,12 @@ def _evaluated(
     Raises Refused, NOT_ROBUST.
     """
     evaluation = evaluate(record, options.spec(), first)
-    return evaluation, _refusal(facts, evaluation) or comparison_of(
+    return evaluation, refusal(facts, evaluation) or comparison_of(
         evaluation, facts, options.spec(), options.propose_anyway
     )
 
 
-def _refusal(facts: Facts, evaluation: Evaluation) -> Refused | None:
+def refusal(facts: Facts, evaluation: Evaluation) -> Refused | None:
     """The refusal that follows from an evaluation, None where its gains may be proposed."""
     model = evaluation.model
     if (sign(model) > 0.0) != facts.reverse:

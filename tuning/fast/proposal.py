@@ -199,7 +199,7 @@ def evaluation_summary(evaluation: Evaluation) -> EvaluationSummary:
         residual=evaluation.residual,
         loads=loads,
         drift=best.hypothesis.drift,
-        switches=len(record.switches),
+        switches=record.turns,
         period_s=record.period * record.Ts,
         reason=evaluation.reason,
         detail=evaluation.detail,
@@ -244,7 +244,7 @@ def verified_step(evaluation: Evaluation, tested: Gains, size: float, duration_s
     duration_s: the time since the step, s.
     """
     fit, residual = evaluation.fit, evaluation.chosen.best.linear.residual
-    first = fit.record.relayed // fit.block
+    first = fit.record.excited // fit.block
     rest, shown = residual[first:], fit.y[first:]
     spread = float(np.linalg.norm(shown - shown.mean()))
     return VerifiedStep(

@@ -10,7 +10,7 @@ import numpy as np
 from loopwright.tuning.fast.design import controller
 from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.identification.output_error import LOG_STEP, Fit, Fitted
+from loopwright.tuning.identification.output_error import LOG_STEP, DisturbanceHypothesis, Fit, Fitted
 from loopwright.tuning.identification.sensitivity import sensitivities
 from loopwright.tuning.models import Complexes, Reals, TransferFunction, sign
 
@@ -33,13 +33,22 @@ def durbin_watson_ratio(residual: Reals) -> float:
     return max(1.0, float(np.mean(residual**2)) / fast) if fast > 0.0 else 1.0
 
 
-def fit_covariance(fit: Fit[ExperimentRecord], found: Fitted) -> Reals:
+def fit_covariance(fit: Fit[ExperimentRecord], found: Fitted, cautious: bool = False) -> Reals:
     """The covariance of theta and of the linear coefficients, in this order, shape (parameters, parameters).
 
     The variance of the residual is multiplied by its Durbin-Watson ratio.
+
+    cautious: what a drift of PV and a start that was not at rest would explain tells nothing of the model.
     """
     variance = found.linear.rss / max(fit.samples - found.parameters, 1) * durbin_watson_ratio(found.linear.residual)
-    return seen_covariance(sensitivities(fit, found), variance)
+    columns = sensitivities(fit, found)
+    if cautious:
+        other = DisturbanceHypothesis(drift=True, not_at_rest_initially=True)
+        theta = found.theta[None, : found.structure.searched]
+        nuisances = fit.regressors(found.structure, other, theta)[0][:, found.structure.inputs :]
+        basis = np.linalg.qr(nuisances / np.linalg.norm(nuisances, axis=0))[0]
+        columns = columns - basis @ (basis.T @ columns)
+    return seen_covariance(columns, variance)
 
 
 def seen_covariance(columns: Reals, variance: float) -> Reals:
@@ -54,7 +63,13 @@ def seen_covariance(columns: Reals, variance: float) -> Reals:
 
 
 def uncertainty_of_Ms(
-    fit: Fit[ExperimentRecord], found: Fitted, gains: Gains, w: Reals, N: float, delay: float
+    fit: Fit[ExperimentRecord],
+    found: Fitted,
+    gains: Gains,
+    w: Reals,
+    N: float,
+    delay: float,
+    cautious: bool = False,
 ) -> float:
     """Ms with the model two standard deviations off, less the nominal Ms, by the delta method.
 
@@ -62,6 +77,7 @@ def uncertainty_of_Ms(
     w: the frequency grid, rad/s.
     N: the derivative filter is Td/N.
     delay: the delay of the sampling, s.
+    cautious: see `fit_covariance`.
     """
     structure, theta, c = found.structure, found.theta, found.linear.coefficients
     inputs = structure.inputs
@@ -85,7 +101,7 @@ def uncertainty_of_Ms(
         slopes.append((loop(at + move) - loop(at - move)) / (2.0 * step))
     distance = np.abs(1.0 + nominal)
     along = np.real(np.array(slopes) * np.conj(1.0 + nominal) / distance)
-    whole = fit_covariance(fit, found)
+    whole = fit_covariance(fit, found, cautious)
     kept = np.concatenate((np.arange(structure.searched), len(theta) + np.arange(inputs)))
     sigma = np.sqrt(np.maximum(np.einsum("iw,ij,jw->w", along, whole[np.ix_(kept, kept)], along), 0.0))
     near = distance < 1.0 / NEAR_THE_PEAK

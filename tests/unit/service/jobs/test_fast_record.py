@@ -57,7 +57,7 @@ def test_the_same_model_comes_out_of_it_again(
     assert record.Ts == pytest.approx(0.1) and record.t[record.listened] == 0.0
     evidence = record.experiment_record()
     assert evidence is not None
-    assert len(evidence.switches) == answer["evidence"]["switches"]
+    assert evidence.turns == answer["evidence"]["switches"]
     assert evidence.direction == -1.0  # the plant's gain is negative
     fit = Fit(evidence)
     model = fit.model(choose_structure(fit).best)
