@@ -30,7 +30,9 @@ noise."""
 SAMPLES_AVERAGED = 3
 SWING = 2.0
 """The swing of the set-point from one level to the other, in sizes of a pulse."""
-MAX_T95 = 3.0
+MIN_PERIOD = 8.0
+"""Shortest time scale of a record, in samples; the longest is the record."""
+MAX_T95 = 10.0
 """Longest time for PV to follow a pulse, in T95."""
 
 
@@ -160,6 +162,7 @@ def first_period(u: Reals, y: Reals, Ts: float) -> float:
     model = problem.model(problem.fit(SECOND, UNDISTURBED))
     plant = TransferFunction(model.num, model.den, model.L + 0.5 * Ts)
     try:
-        return ultimate_point(plant)[1] / Ts
+        found = ultimate_point(plant)[1] / Ts
     except Ended:
-        return 4.0 * (plant.L + float(np.min(time_constants(plant), initial=0.0))) / Ts
+        found = 4.0 * (plant.L + float(np.min(time_constants(plant), initial=0.0))) / Ts
+    return min(max(found, MIN_PERIOD), float(len(u)))

@@ -7,7 +7,7 @@ The pulses end when the gains that would be proposed are certain enough: see `_s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from loopwright.tuning.analysis.comparison import Comparison
@@ -44,10 +44,11 @@ MIN_OWN_PERIODS = 2.0
 MAX_UNCERTAINTY = 0.06
 MAX_DISAGREEMENT = 0.08
 """Largest difference of Ms from the Ms asked for, of the gains of two successive looks on each other's model."""
-PERIOD_IS_RIGHT = (0.6, 1.6)
+PERIOD_IS_RIGHT = (0.6, 1.25)
 """Ratio of the model's own ultimate period to the period of the fit outside which the record is fitted again."""
-MAX_PERIODS, MAX_T95 = 12.0, 1.5
-"""Longest record, in ultimate periods or in T95, whichever is longer."""
+MAX_REFITS, MUCH_BETTER = 2, 1.03
+MAX_PERIODS, MAX_T95, MAX_TURNS = 12.0, 1.5, 2.5
+"""Longest record: the longest of these numbers of ultimate periods, of T95, and of the time of the first two turns."""
 MAX_PERIODS_IN_ALL = 30.0
 
 
@@ -90,18 +91,20 @@ def setpoint(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
     yield from test.until_turned(2)
     test.period = yield from test.computed(partial(first_period, *test.columns(), facts.sample_time_s))
     look = Look(test.period, None, Refused(Reason.STALLED, "the pulses came to nothing"))
+    turned_at = test.elapsed
     at = FIRST_LOOK * test.period
     while True:
         yield from test.lasting(at)
         looked_at = test.elapsed
         record = test.experiment_record()
-        last, look = look, (yield from test.computed(partial(_look, facts, options, record, test.period)))
+        last, look = look, (yield from test.computed(partial(_look, facts, options, record)))
         test.period = look.period
         if _settled(look, last, looked_at, options.Ms):
             break
         own = look.period
         longest = min(
-            max(MAX_PERIODS * own, MAX_T95 * facts.T95_s / facts.sample_time_s), MAX_PERIODS_IN_ALL * own
+            max(MAX_PERIODS * own, MAX_T95 * facts.T95_s / facts.sample_time_s, MAX_TURNS * turned_at),
+            max(MAX_PERIODS_IN_ALL * own, turned_at),
         )
         if looked_at >= longest:
             break
@@ -156,23 +159,30 @@ def _settled(look: Look, last: Look, samples: int, asked: float) -> bool:
     )
 
 
-def _look(facts: Facts, options: FastOptions, record: ExperimentRecord, period: float) -> Look:
+def _look(facts: Facts, options: FastOptions, record: ExperimentRecord) -> Look:
     """One look at the record so far; the time scale is corrected where the model's own ultimate period is another."""
-    from dataclasses import replace
-
-    evaluation: Evaluation | None = None
-    outcome: Refused | Comparison
-    for _ in range(2):
-        try:
-            evaluation, outcome = _evaluated(facts, options, replace(record, period=period))
-        except Refused as refused:
-            return Look(period, evaluation, refused)
-        own = evaluation.period / record.Ts
-        low, high = PERIOD_IS_RIGHT
-        if low <= own / period <= high:
+    first = first_period(record.u[record.listened :], record.y[record.listened :], record.Ts)
+    look = _look_with(facts, options, replace(record, period=first))
+    for _ in range(MAX_REFITS):
+        if look.evaluation is None:
             break
-        period = own
-    return Look(period, evaluation, outcome)
+        own = look.evaluation.period / record.Ts
+        low, high = PERIOD_IS_RIGHT
+        if low <= own / look.period <= high:
+            break
+        again = _look_with(facts, options, replace(record, period=own))
+        if again.evaluation is None or again.evaluation.residual > MUCH_BETTER * look.evaluation.residual:
+            break
+        look = again
+    return look
+
+
+def _look_with(facts: Facts, options: FastOptions, record: ExperimentRecord) -> Look:
+    try:
+        evaluation, outcome = _evaluated(facts, options, record)
+    except Refused as refused:
+        return Look(record.period, None, refused)
+    return Look(record.period, evaluation, outcome)
 
 
 def _evaluated(

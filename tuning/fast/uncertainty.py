@@ -44,10 +44,9 @@ def fit_covariance(fit: Fit[ExperimentRecord], found: Fitted, cautious: bool = F
     columns = sensitivities(fit, found)
     if cautious:
         other = DisturbanceHypothesis(drift=True, not_at_rest_initially=True)
-        theta = found.theta[None, : found.structure.searched]
-        nuisances = fit.regressors(found.structure, other, theta)[0][:, found.structure.inputs :]
-        basis = np.linalg.qr(nuisances / np.linalg.norm(nuisances, axis=0))[0]
-        columns = columns - basis @ (basis.T @ columns)
+        everything = fit.regressors(found.structure, other, found.theta[None, : found.structure.searched])[0]
+        first = found.structure.inputs + 1 + found.hypothesis.drift  # the level of PV is among the columns already
+        columns = np.column_stack((columns, everything[:, first:]))
     return seen_covariance(columns, variance)
 
 
