@@ -64,7 +64,8 @@ def _recorded(noise: float, seed: int) -> ExperimentRecord:
         if k > LISTENED and u[-1] != u[-2]:
             switches.append(k)
         plant.step(u[-1])
-    return ExperimentRecord(TS, np.array(u), np.array(y), 1.0, LISTENED, SAMPLES, len(switches), oscillation_period(switches))
+    period = oscillation_period(switches)
+    return ExperimentRecord(TS, np.array(u), np.array(y), 1.0, LISTENED, SAMPLES, len(switches), period)
 
 
 def plain_response(structure: Structure, theta: Reals, b: Reals, u: Reals) -> Reals:

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 from loopwright.tuning.fast.design import DesignSpec, GainDesign, OptimalGains
-from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.fast.structure_choice import StructureChoice, choose_structure
 from loopwright.tuning.fast.uncertainty import difference_of_rivals, durbin_watson_ratio, peak, uncertainty_of_Ms
 from loopwright.tuning.fast.valve_faults import find_valve_fault
@@ -21,7 +21,7 @@ the range of PV below which a residual is accepted in any case."""
 MAX_DURBIN_WATSON_RATIO = 1.35
 MAX_ROUNDED = 1.25
 """Residual, in average rounding errors, below which slow variations are accepted: rounding errors are not white."""
-MAX_UNCERTAINTY = 0.10
+MAX_UNCERTAINTY = {Excitation.RELAY: 0.10, Excitation.SETPOINT: 0.06}
 """Largest accepted uncertainty of Ms, by the delta method and among rival models."""
 MAX_MODEL_MISMATCH, MAX_MODEL_MISMATCH_OF_TWO_LOADS = 0.5, 0.2
 """Largest accepted difference of Ms from the Ms asked for, of the tested gains on the new model and of the new gains on
@@ -69,29 +69,22 @@ class Evaluation:
     period: float
 
 
-def evaluate(
-    record: ExperimentRecord,
-    spec: DesignSpec,
-    earlier: Evaluation | None = None,
-    max_uncertainty: float = MAX_UNCERTAINTY,
-    cautious: bool = False,
-) -> Evaluation:
+def evaluate(record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | None = None) -> Evaluation:
     """Identifies the model, designs the gains and assesses both.
 
     spec: the design specification.
-    max_uncertainty: the largest accepted uncertainty of Ms, by the delta method and among rival models.
-    cautious: see `fit_covariance`.
     earlier: the evaluation of the first part of the record, whose gains were tested in the rest of it.
     Raises Refused, NOT_ROBUST, where the model permits no such controller.
     """
     fit = Fit(record)
     chosen = choose_structure(fit, earlier.chosen.fits if earlier else ())
     found = chosen.best
+    max_uncertainty = MAX_UNCERTAINTY[record.excitation]
     model = fit.model(found)
     delay = 0.5 * record.Ts
     design = GainDesign(replace(model, L=model.L + delay), spec, record.period * record.Ts)
     best = design.best()
-    spread = uncertainty_of_Ms(fit, found, best.gains, design.w, spec.N, delay, cautious)
+    spread = uncertainty_of_Ms(fit, found, best.gains, design.w, spec.N, delay)
     rivals = difference_of_rivals(fit, found, chosen.rivals, best.gains, design.w, delay)
     noise, rounding = record.noise / record.output_range, record.rounding / record.output_range
     ratio = durbin_watson_ratio(found.linear.residual)
@@ -134,17 +127,6 @@ def evaluate(
         design_delay=delay,
         period=design.period,
     )
-
-
-def evaluate_again(record: ExperimentRecord, spec: DesignSpec) -> Evaluation:
-    """Evaluates a whole record as the procedure does: the relay's part first, then all of it.
-
-    Raises Refused, NOT_ROBUST.
-    """
-    if not record.steps:
-        return evaluate(record, spec)
-    until = slice(record.excited)
-    return evaluate(record, spec, evaluate(replace(record, u=record.u[until], y=record.y[until], steps=()), spec))
 
 
 def _load_with_the_step(

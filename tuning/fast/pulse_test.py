@@ -9,18 +9,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace
 from loopwright.tuning.fast.experiment import STEP_BACK_FRACTION, VERIFICATION_PERIODS, Experiment
-from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.proposal import PulseFigures
+from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.identification.output_error import UNDISTURBED
-from loopwright.tuning.identification.problem import IdentificationProblem
-from loopwright.tuning.identification.record import recorded_test
-from loopwright.tuning.identification.structures import SECOND
-from loopwright.tuning.models import Reals, TransferFunction, time_constants
+from loopwright.tuning.models import Reals
 from loopwright.tuning.plan import Command, Plan, Sample, SetGains, SetSetpoint
-from loopwright.tuning.reasons import Ended, Reason, Refused
+from loopwright.tuning.reasons import Reason, Refused
 
 PULSES = (1.0, -1.0, 1.0)
 """The levels of the set-point, in sizes of a pulse; the last level is held until the step home."""
@@ -30,8 +26,6 @@ noise."""
 SAMPLES_AVERAGED = 3
 SWING = 2.0
 """The swing of the set-point from one level to the other, in sizes of a pulse."""
-MIN_PERIOD = 8.0
-"""Shortest time scale of a record, in samples; the longest is the record."""
 MAX_T95 = 10.0
 """Longest time for PV to follow a pulse, in T95."""
 
@@ -45,7 +39,7 @@ class PulseTest(Experiment):
 
     def __init__(self, facts: Facts, point: OperatingPoint, listened: Trace) -> None:
         super().__init__(facts, point, listened)
-        self.size = first_size(facts, point)
+        self.size = pulse_size(facts.sp_deviation, point.room, facts.old_gains)
         self.turns: list[int] = []  # samples at which the set-point moved; the first one is the start
         self.period = 0.0
         """The time scale of the record, in samples, from `first_period`."""
@@ -114,6 +108,19 @@ class PulseTest(Experiment):
             turns=len(self.turns) - 1,
             period=self.period,
             steps=tuple(self._steps),
+            excitation=Excitation.SETPOINT,
+        )
+
+    def figures(self) -> PulseFigures:
+        """The figures of the pulses so far."""
+        record = self.experiment_record()
+        return PulseFigures(
+            turns=record.turns,
+            size=self.size,
+            period_s=record.period * record.Ts,
+            span=record.output_range,
+            noise=self.noise,
+            samples=len(record.y),
         )
 
     def columns(self) -> tuple[Reals, Reals]:
@@ -145,24 +152,11 @@ class PulseTest(Experiment):
         return Refused(Reason.STALLED, text)
 
 
-def first_size(facts: Facts, point: OperatingPoint) -> float:
-    """The size of the first pulses, PV units: a swing from one level to the other keeps MV within its room under the
-    proportional action of the present gains."""
-    kick = SWING * facts.old_gains.b * facts.old_gains.Kp
-    return min(facts.sp_deviation, point.room / kick) if kick > 0.0 else facts.sp_deviation
+def pulse_size(sp_deviation: float, room: float, gains: Gains) -> float:
+    """The size of the pulses, PV units: a swing from one level to the other keeps MV within its room under the
+    proportional action of the present gains.
 
-
-def first_period(u: Reals, y: Reals, Ts: float) -> float:
-    """The ultimate period, in samples, of two lags fitted to a record without any idea of its time scale.
-
-    u, y: MV and PV as deviations from rest, shape (N,). Ts: the sample time, s.
-    Where the model has no ultimate point its dead time and lags give the time scale. Raises Refused as `recorded_test`.
+    sp_deviation: the largest permitted set-point step, PV units. room: the largest permitted move of MV, MV units.
     """
-    problem = IdentificationProblem(recorded_test(Ts * np.arange(len(u)), u, y, 0.0))
-    model = problem.model(problem.fit(SECOND, UNDISTURBED))
-    plant = TransferFunction(model.num, model.den, model.L + 0.5 * Ts)
-    try:
-        found = ultimate_point(plant)[1] / Ts
-    except Ended:
-        found = 4.0 * (plant.L + float(np.min(time_constants(plant), initial=0.0))) / Ts
-    return min(max(found, MIN_PERIOD), float(len(u)))
+    kick = SWING * gains.b * gains.Kp
+    return min(sp_deviation, room / kick) if kick > 0.0 else sp_deviation

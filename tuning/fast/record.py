@@ -5,12 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
 from loopwright.tuning.identification.output_error import averaged
 from loopwright.tuning.models import Reals
 from loopwright.tuning.reasons import Reason, Refused
+
+
+class Excitation(StrEnum):
+    """What moves the loop during a test."""
+
+    RELAY = "relay"
+    SETPOINT = "setpoint"
+
+    @property
+    def in_words(self) -> str:
+        """The excitation in the words of a sentence."""
+        return "relay" if self is Excitation.RELAY else "pulses"
+
 
 MIN_LISTENED = 60
 """Smallest number of averages of the time at rest, from which noise and offset are estimated."""
@@ -33,6 +47,7 @@ class ExperimentRecord:
     turns: the number of switches of the relay, or of turns of the set-point.
     period: the time scale, in samples: the period of the relay oscillation, or the ultimate period of a first model.
     steps: the samples at which the set-point stepped under the new gains.
+    excitation: what moved the loop.
     Raises Refused: BAD_INPUT, NO_RESPONSE.
     """
 
@@ -45,6 +60,7 @@ class ExperimentRecord:
     turns: int
     period: float
     steps: tuple[int, ...] = ()
+    excitation: Excitation = Excitation.RELAY
 
     def __post_init__(self) -> None:
         if self.listened < MIN_LISTENED:

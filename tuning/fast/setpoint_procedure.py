@@ -7,25 +7,26 @@ The pulses end when the gains that would be proposed are certain enough: see `_s
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 from loopwright.tuning.analysis.comparison import Comparison
 from loopwright.tuning.experiments.preflight import at_rest
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.design import frequencies
-from loopwright.tuning.fast.evaluation import Evaluation, evaluate
-from loopwright.tuning.fast.procedure import OPEN_REASONS, FastOptions, refusal
+from loopwright.tuning.fast.evaluation import Evaluation
+from loopwright.tuning.fast.options import DesignOptions
+from loopwright.tuning.fast.outcome import OPEN_REASONS, evaluated
 from loopwright.tuning.fast.proposal import (
     FastProposal,
     VerifiedStep,
-    comparison_of,
     evaluation_summary,
     proposed,
     verified_step,
 )
-from loopwright.tuning.fast.pulse_test import PulseTest, first_period
+from loopwright.tuning.fast.pulse_test import PulseTest
 from loopwright.tuning.fast.record import MIN_LISTENED, ExperimentRecord
+from loopwright.tuning.fast.record_evaluation import first_period
 from loopwright.tuning.fast.uncertainty import peak
 from loopwright.tuning.plan import Note, Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
@@ -41,12 +42,8 @@ NEXT_LOOK, NEXT_LOOK_PERIODS = 1.25, 0.35
 """Growth of the record from one look to the next: this factor, and this number of periods more."""
 MIN_OWN_PERIODS = 2.0
 """Smallest length of the record, in ultimate periods of its own model."""
-MAX_UNCERTAINTY = 0.06
 MAX_DISAGREEMENT = 0.08
 """Largest difference of Ms from the Ms asked for, of the gains of two successive looks on each other's model."""
-PERIOD_IS_RIGHT = (0.6, 1.25)
-"""Ratio of the model's own ultimate period to the period of the fit outside which the record is fitted again."""
-MAX_REFITS, MUCH_BETTER = 2, 1.03
 MAX_PERIODS, MAX_T95, MAX_TURNS = 12.0, 1.5, 2.5
 """Longest record: the longest of these numbers of ultimate periods, of T95, and of the time of the first two turns."""
 MAX_PERIODS_IN_ALL = 30.0
@@ -71,7 +68,7 @@ def setpoint_stages(verify: bool) -> tuple[str, ...]:
     return SETPOINT_STAGES if verify else SETPOINT_STAGES[:3]
 
 
-def setpoint(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
+def setpoint(facts: Facts, options: DesignOptions) -> Plan[FastProposal]:
     """The plan of the whole procedure, for a loop in automatic and at rest.
 
     Raises Refused. The plan restores nothing: the runner restores the loop.
@@ -112,7 +109,7 @@ def setpoint(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
             yield from test.report(Note(f"after {looked_at} samples: {look.outcome.detail}"))
         at = min(NEXT_LOOK * looked_at + NEXT_LOOK_PERIODS * own, longest)
     evaluation, outcome = look.evaluation, look.outcome
-    yield from test.report(*started("design"))
+    yield from test.report(StageDone("pulses", test.figures()), *started("design"))
     if evaluation is not None:
         yield from test.report(StageDone("design", evaluation_summary(evaluation)))
     if isinstance(outcome, Refused):
@@ -126,21 +123,21 @@ def setpoint(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
         tested = first.best.gains
         yield from test.step(tested, first.period)
         evaluation, outcome = yield from test.computed(
-            partial(_evaluated, facts, options, test.experiment_record(), first)
+            partial(evaluated, facts, options, test.experiment_record(), first)
         )
         shown = verified_step(evaluation, tested, *test.stepped)
         if isinstance(outcome, Refused) and outcome.reason in OPEN_REASONS:
             yield from test.report(Note(f"after the set-point step: {outcome.detail}; it is stepped again"))
             yield from test.step_again()
             evaluation, outcome = yield from test.computed(
-                partial(_evaluated, facts, options, test.experiment_record(), first)
+                partial(evaluated, facts, options, test.experiment_record(), first)
             )
             shown = verified_step(evaluation, tested, *test.stepped)
         yield (StageDone("verify", shown), *started("redesign"), StageDone("redesign", evaluation_summary(evaluation)))
         if isinstance(outcome, Refused):
             raise outcome
     begun_at_s = test.trace.t[test.listened]
-    return (yield from test.computed(partial(proposed, facts, spec, evaluation, outcome, shown, begun_at_s)))
+    return (yield from test.computed(partial(proposed, SETPOINT, facts, spec, evaluation, outcome, shown, begun_at_s)))
 
 
 def _settled(look: Look, last: Look, samples: int, asked: float) -> bool:
@@ -159,41 +156,10 @@ def _settled(look: Look, last: Look, samples: int, asked: float) -> bool:
     )
 
 
-def _look(facts: Facts, options: FastOptions, record: ExperimentRecord) -> Look:
-    """One look at the record so far; the time scale is corrected where the model's own ultimate period is another."""
-    first = first_period(record.u[record.listened :], record.y[record.listened :], record.Ts)
-    look = _look_with(facts, options, replace(record, period=first))
-    for _ in range(MAX_REFITS):
-        if look.evaluation is None:
-            break
-        own = look.evaluation.period / record.Ts
-        low, high = PERIOD_IS_RIGHT
-        if low <= own / look.period <= high:
-            break
-        again = _look_with(facts, options, replace(record, period=own))
-        if again.evaluation is None or again.evaluation.residual > MUCH_BETTER * look.evaluation.residual:
-            break
-        look = again
-    return look
-
-
-def _look_with(facts: Facts, options: FastOptions, record: ExperimentRecord) -> Look:
+def _look(facts: Facts, options: DesignOptions, record: ExperimentRecord) -> Look:
+    """One look at the record so far."""
     try:
-        evaluation, outcome = _evaluated(facts, options, record)
+        evaluation, outcome = evaluated(facts, options, record)
     except Refused as refused:
         return Look(record.period, None, refused)
-    return Look(record.period, evaluation, outcome)
-
-
-def _evaluated(
-    facts: Facts, options: FastOptions, record: ExperimentRecord, first: Evaluation | None = None
-) -> tuple[Evaluation, Refused | Comparison]:
-    """The evaluation of a record, with the refusal that follows from it or else the comparison of old and new gains.
-
-    first: the evaluation of the record of the pulses.
-    Raises Refused, NOT_ROBUST.
-    """
-    evaluation = evaluate(record, options.spec(), first, MAX_UNCERTAINTY, cautious=True)
-    return evaluation, refusal(facts, evaluation) or comparison_of(
-        evaluation, facts, options.spec(), options.propose_anyway
-    )
+    return Look(evaluation.fit.period, evaluation, outcome)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from loopwright.tuning.fast.design import controller
-from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.output_error import LOG_STEP, DisturbanceHypothesis, Fit, Fitted
 from loopwright.tuning.identification.sensitivity import sensitivities
@@ -33,16 +33,15 @@ def durbin_watson_ratio(residual: Reals) -> float:
     return max(1.0, float(np.mean(residual**2)) / fast) if fast > 0.0 else 1.0
 
 
-def fit_covariance(fit: Fit[ExperimentRecord], found: Fitted, cautious: bool = False) -> Reals:
+def fit_covariance(fit: Fit[ExperimentRecord], found: Fitted) -> Reals:
     """The covariance of theta and of the linear coefficients, in this order, shape (parameters, parameters).
 
-    The variance of the residual is multiplied by its Durbin-Watson ratio.
-
-    cautious: what a drift of PV and a start that was not at rest would explain tells nothing of the model.
+    The variance of the residual is multiplied by its Durbin-Watson ratio. Under pulses of the set-point, what a drift
+    of PV and a start that was not at rest would explain tells nothing of the model.
     """
     variance = found.linear.rss / max(fit.samples - found.parameters, 1) * durbin_watson_ratio(found.linear.residual)
     columns = sensitivities(fit, found)
-    if cautious:
+    if fit.record.excitation is Excitation.SETPOINT:
         other = DisturbanceHypothesis(drift=True, not_at_rest_initially=True)
         everything = fit.regressors(found.structure, other, found.theta[None, : found.structure.searched])[0]
         first = found.structure.inputs + 1 + found.hypothesis.drift  # the level of PV is among the columns already
@@ -62,13 +61,7 @@ def seen_covariance(columns: Reals, variance: float) -> Reals:
 
 
 def uncertainty_of_Ms(
-    fit: Fit[ExperimentRecord],
-    found: Fitted,
-    gains: Gains,
-    w: Reals,
-    N: float,
-    delay: float,
-    cautious: bool = False,
+    fit: Fit[ExperimentRecord], found: Fitted, gains: Gains, w: Reals, N: float, delay: float
 ) -> float:
     """Ms with the model two standard deviations off, less the nominal Ms, by the delta method.
 
@@ -76,7 +69,6 @@ def uncertainty_of_Ms(
     w: the frequency grid, rad/s.
     N: the derivative filter is Td/N.
     delay: the delay of the sampling, s.
-    cautious: see `fit_covariance`.
     """
     structure, theta, c = found.structure, found.theta, found.linear.coefficients
     inputs = structure.inputs
@@ -100,7 +92,7 @@ def uncertainty_of_Ms(
         slopes.append((loop(at + move) - loop(at - move)) / (2.0 * step))
     distance = np.abs(1.0 + nominal)
     along = np.real(np.array(slopes) * np.conj(1.0 + nominal) / distance)
-    whole = fit_covariance(fit, found, cautious)
+    whole = fit_covariance(fit, found)
     kept = np.concatenate((np.arange(structure.searched), len(theta) + np.arange(inputs)))
     sigma = np.sqrt(np.maximum(np.einsum("iw,ij,jw->w", along, whole[np.ix_(kept, kept)], along), 0.0))
     near = distance < 1.0 / NEAR_THE_PEAK
