@@ -1,4 +1,4 @@
-"""The record of a job of fast or setpoint, rebuilt from the stored samples of its job: for another Ms, or for a plot."""
+"""The record of a job of fast or setpoint, rebuilt from its stored samples: for another Ms, or for a plot."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace
+from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.experiment import STEP_BACK_FRACTION, VERIFICATION_PERIODS, Experiment
 from loopwright.tuning.fast.proposal import PulseFigures
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
@@ -153,10 +154,10 @@ class PulseTest(Experiment):
 
 
 def pulse_size(sp_deviation: float, room: float, gains: Gains) -> float:
-    """The size of the pulses, PV units: a swing from one level to the other keeps MV within its room under the
-    proportional action of the present gains.
+    """The size of the pulses, PV units: under the proportional action of the present gains a swing from one level to the
+    other takes a part of MV's room, and leaves the rest to what PV and the integral add.
 
     sp_deviation: the largest permitted set-point step, PV units. room: the largest permitted move of MV, MV units.
     """
     kick = SWING * gains.b * gains.Kp
-    return min(sp_deviation, room / kick) if kick > 0.0 else sp_deviation
+    return min(sp_deviation, KICK_OF_ROOM * room / kick) if kick > 0.0 else sp_deviation
