@@ -59,7 +59,7 @@ def test_new_gains_take_over_without_a_bump() -> None:
 
 
 def test_the_pulses_leave_room_for_MV() -> None:
-    """The present Kp makes a swing of MV from each swing of the set-point: where MV has little room, pulses are small."""
+    """The present Kp makes a swing of MV of each swing of the set-point: where MV has little room, pulses are small."""
     plant = under("first order", 0.4, mv_limits=[-1.0, 1.0], sp_deviation=2.0)
     taken: list[Sample] = []
     answer = rehearse(plant, method="setpoint", on_samples=taken.extend, verify=False, propose_anyway=True)

@@ -154,8 +154,8 @@ class PulseTest(Experiment):
 
 
 def pulse_size(sp_deviation: float, room: float, gains: Gains) -> float:
-    """The size of the pulses, PV units: under the proportional action of the present gains a swing from one level to the
-    other takes a part of MV's room, and leaves the rest to what PV and the integral add.
+    """The size of the pulses, PV units. Under the proportional action of the present gains, a swing from one level to
+    the other takes a part of MV's room, and leaves the rest to what PV and the integral add.
 
     sp_deviation: the largest permitted set-point step, PV units. room: the largest permitted move of MV, MV units.
     """
