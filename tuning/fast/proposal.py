@@ -72,7 +72,7 @@ class PulseFigures:
     turns: the number of turns of the set-point.
     size: the size of a pulse, PV units.
     period_s: the time scale of the record, s.
-    span: the range of PV (maximum less minimum) during the pulses, PV units.
+    output_range: the range of PV (maximum less minimum) during the pulses, PV units.
     noise: the standard deviation of PV at rest, PV units.
     samples: the number of samples of the record, those at rest included.
     """
@@ -80,7 +80,7 @@ class PulseFigures:
     turns: int
     size: float
     period_s: float
-    span: float
+    output_range: float
     noise: float
     samples: int
 

@@ -25,7 +25,7 @@ MIN_FOLLOWED, MIN_FOLLOWED_NOISES = 0.2, 5.0
 """A pulse turns when PV has followed this fraction of the set-point's move, and this many standard deviations of the
 noise."""
 SAMPLES_AVERAGED = 3
-SWING = 2.0
+LEVELS_APART = 2.0
 """The swing of the set-point from one level to the other, in sizes of a pulse."""
 MAX_T95 = 10.0
 """Longest time for PV to follow a pulse, in T95."""
@@ -119,7 +119,7 @@ class PulseTest(Experiment):
             turns=record.turns,
             size=self.size,
             period_s=record.period * record.Ts,
-            span=record.output_range,
+            output_range=record.output_range,
             noise=self.noise,
             samples=len(record.y),
         )
@@ -137,7 +137,7 @@ class PulseTest(Experiment):
         if len(self.trace) < since + SAMPLES_AVERAGED:
             return ()
         level = PULSES[len(self.turns) - 1]
-        move = self.size * (SWING if len(self.turns) > 1 else 1.0)
+        move = self.size * (LEVELS_APART if len(self.turns) > 1 else 1.0)
         begun = float(np.mean(self.trace.pv[max(since - SAMPLES_AVERAGED, 0) : since]))
         followed = level * (float(np.mean(self.trace.pv[-SAMPLES_AVERAGED:])) - begun)
         if followed < max(MIN_FOLLOWED * move, MIN_FOLLOWED_NOISES * self.noise):
@@ -159,5 +159,5 @@ def pulse_size(sp_deviation: float, room: float, gains: Gains) -> float:
 
     sp_deviation: the largest permitted set-point step, PV units. room: the largest permitted move of MV, MV units.
     """
-    kick = SWING * gains.b * gains.Kp
+    kick = LEVELS_APART * gains.b * gains.Kp
     return min(sp_deviation, KICK_OF_ROOM * room / kick) if kick > 0.0 else sp_deviation
