@@ -28,7 +28,7 @@ from loopwright.plantsim.plant import LinearPlant
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.evaluation import evaluate
-from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.record import ExperimentRecord, oscillation_period
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.disturbances import STRUCTURES
 from loopwright.tuning.identification.output_error import Fit
@@ -64,7 +64,8 @@ def _recorded(noise: float, seed: int) -> ExperimentRecord:
         if k > LISTENED and u[-1] != u[-2]:
             switches.append(k)
         plant.step(u[-1])
-    return ExperimentRecord(TS, np.array(u), np.array(y), 1.0, LISTENED, SAMPLES, tuple(switches))
+    period = oscillation_period(switches)
+    return ExperimentRecord(TS, np.array(u), np.array(y), 1.0, LISTENED, SAMPLES, len(switches), period)
 
 
 def plain_response(structure: Structure, theta: Reals, b: Reals, u: Reals) -> Reals:

@@ -21,7 +21,7 @@ from loopwright.service.execution.rehearsal import RehearsedLoop, _parameters
 from loopwright.service.execution.result import result_of
 from loopwright.service.execution.runner import run
 from loopwright.service.job_states import JobState
-from loopwright.service.jobs.relay_record import relay_record
+from loopwright.service.jobs.stored_record import stored_record
 from loopwright.service.jsonable import to_jsonable
 from loopwright.service.plots.fast_job import fast_job
 from loopwright.service.results import EvidenceView, GainsView, ModelView, TransferModelView, VerificationView
@@ -189,7 +189,7 @@ def rehearsed(reason: str, case: Case) -> Pictured:
 
 
 def draw(folder: Path, reason: str, job: Pictured) -> Path:
-    record = relay_record(job.samples)
+    record = stored_record(job.samples)
     assert record is not None
     path = folder / f"{reason.replace('_', '-')}.png"
     fast_job(path, job, record, "degC")

@@ -39,15 +39,15 @@ from loopwright.plantsim.reactor import Reactor
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.execution.runner import RunResult, run
-from loopwright.service.jobs.relay_record import relay_record
+from loopwright.service.jobs.stored_record import stored_record
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.experiments.preflight import PREFLIGHT, SETTLE, at_rest
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.design import DesignSpec, GainDesign
-from loopwright.tuning.fast.evaluation import evaluate_again
 from loopwright.tuning.fast.procedure import MIN_SAMPLES, FastOptions, FastProposal, fast
 from loopwright.tuning.fast.record import ExperimentRecord
-from loopwright.tuning.fast.relay_test import Experiment
+from loopwright.tuning.fast.record_evaluation import evaluate_again
+from loopwright.tuning.fast.relay_test import RelayTest
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import sign
 from loopwright.tuning.plan import Command, Event, Mode, Plan, Sample, StageStarted
@@ -88,7 +88,7 @@ class Troubled(RehearsedLoop):
         """Of what was taken, without the last so many samples."""
         columns = zip(*self.taken[: len(self.taken) - tail], strict=True)
         named = dict(zip(("t_s", "sp", "pv", "mv", "mode"), columns, strict=True))
-        record = relay_record({"stage": len(named["t_s"]) * [PREFLIGHT], **named})
+        record = stored_record({"stage": len(named["t_s"]) * [PREFLIGHT], **named})
         return record.experiment_record() if record else None
 
 
@@ -130,7 +130,7 @@ def relay_span(plant: Plant) -> float:
 
     def plan(facts: Facts) -> Plan[float]:
         point, listened = yield from at_rest(facts, 0.0, MIN_SAMPLES)
-        experiment = Experiment(facts, point, listened, 1.0)
+        experiment = RelayTest(facts, point, listened, 1.0)
         yield from experiment.relay(4)
         return experiment.experiment_record().output_range
 
@@ -193,7 +193,7 @@ def _run(plant: Plant, case: Case, seed: int) -> tuple[RunResult[FastProposal], 
     spec = case.spec(plant)
     amplitude = None if case.adapted else case.amplitude
     # what is judged is the design, whatever it is worth beside the gains that the loop has to begin with
-    options = FastOptions(spec.Ms, spec.derivative, spec.Mt, spec.noise_gain, amplitude, propose_anyway=True)
+    options = FastOptions(spec.Ms, spec.derivative, spec.Mt, spec.noise_gain, amplitude=amplitude, propose_anyway=True)
     result = run(fast(facts, options), loop, limits=RunLimits(max_time_s=100.0 * plant.Pu), on_event=loop.hear)
     passed = sum(value for stage, value in result.plant_time_s.items() if stage not in (PREFLIGHT, SETTLE))
     return result, passed / plant.Pu, loop

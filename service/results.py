@@ -11,6 +11,8 @@ from loopwright.service.jsonable import JsonObject
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
 
+DESIGNED = ("fast", "setpoint")
+"""The methods that fit a model to one record and design the gains on it."""
 TYPED_IN = "typed in"
 """The structure, or the source of the gain, of a model that a person has typed in."""
 
@@ -117,7 +119,7 @@ class TransferModelView(Figures):
 class LoadStepView(Figures):
     """A load disturbance during the test: a step that the fit estimates together with the model."""
 
-    t_s: float = Field(description="Time since the start of the relay, s")
+    t_s: float = Field(description="Time since the start of the relay or of the pulses, s")
     size: float = Field(description="Size at the plant's input, MV percent")
 
 
@@ -135,8 +137,8 @@ class EvidenceView(Figures):
     residual: float | None = Field(description="Residual of the model as a ratio to the noise at rest", examples=[1.0])
     loads: list[LoadStepView] = Field(description="Load disturbances found in the record")
     drift: bool = Field(description="Whether the fit includes a steady drift of PV")
-    switches: int = Field(description="Number of switches of the relay", examples=[4])
-    period_s: float = Field(description="Period of PV under the relay, s", examples=[12.5])
+    switches: int = Field(description="Number of switches of the relay, or of turns of the set-point", examples=[4])
+    period_s: float = Field(description="Period of PV under the relay or time scale of the pulses, s", examples=[12.5])
     reason: str | None = Field(
         description="Why the evidence is not enough for a proposal; reason code from the closed list"
     )
@@ -279,7 +281,7 @@ class _Result(Figures):
 
 
 class FastResult(_Result):
-    """The result of the procedure fast."""
+    """The result of the methods fast and setpoint, which fit a model to one record and design the gains on it."""
 
     procedure: Literal["fast"] = "fast"
     model: TransferModelView | None = None
@@ -305,5 +307,5 @@ RESULT: TypeAdapter[FastResult | FiveStageResult] = TypeAdapter(Result)
 
 def empty_result(method: str, rehearsed_on: RehearsedOnView | None = None) -> FastResult | FiveStageResult:
     """The result of a retune that found no gains."""
-    kind = FastResult if method == "fast" else FiveStageResult
+    kind = FastResult if method in DESIGNED else FiveStageResult
     return kind(method=method, rehearsed_on=rehearsed_on)

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from loopwright.service.jobs.relay_record import Columns
+from loopwright.service.jobs.stored_record import Columns
 from loopwright.service.store.sample_blocks import COLUMNS, Block
 from loopwright.service.store.store import Store
 from loopwright.tuning.models import Reals

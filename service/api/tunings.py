@@ -17,8 +17,9 @@ from loopwright.service.api.tuning_views import AlternativesView, MethodView, Tu
 from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.jobs.alternatives import alternatives, redesigned
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.jobs.relay_record import relay_record
+from loopwright.service.jobs.stored_record import stored_record
 from loopwright.service.offline import tunings
+from loopwright.service.results import DESIGNED
 from loopwright.tuning.fast.procedure import FAST
 
 
@@ -80,8 +81,8 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
         if ms is None:
             return partial(alternatives, row, events, method)
         wanted = bool(row.request.get("derivative")) if derivative is None else derivative
-        fast = row.request.get("method") == FAST  # other jobs are designed on the model that they found
-        record = relay_record(record_columns(jobs.store.blocks(job_id))) if fast else None
+        fast = row.request.get("method") in DESIGNED  # other jobs are designed on the model that they found
+        record = stored_record(record_columns(jobs.store.blocks(job_id))) if fast else None
         return partial(redesigned, row, events, record, ms, wanted)
 
     return routes

@@ -232,10 +232,10 @@ def retune(
     sp_deviation: Annotated[float | None, typer.Option(help="Permitted set-point step, PV units.")] = None,
     mv_low: Annotated[float | None, typer.Option(help="Lowest MV during the test, percent.")] = None,
     mv_high: Annotated[float | None, typer.Option(help="Highest MV during the test, percent.")] = None,
-    method: Annotated[str | None, typer.Option(help="fast, five-stage or a rule; default: fast.")] = None,
-    ms: Annotated[float | None, typer.Option(help="Ms that fast designs for: 1.2 robust .. 1.6 .. 2.0 fast.")] = None,
+    method: Annotated[str | None, typer.Option(help="fast, setpoint, five-stage or a rule; default: fast.")] = None,
+    ms: Annotated[float | None, typer.Option(help="Ms that is designed for: 1.2 robust .. 1.6 .. 2.0 fast.")] = None,
     derivative: Annotated[
-        bool, typer.Option("--derivative", help="Let fast design a PID where it is better than a PI.")
+        bool, typer.Option("--derivative", help="Design a PID where it is better than a PI.")
     ] = False,
     amplitude: Annotated[float | None, typer.Option(help="Relay amplitude for fast, percent of MV.")] = None,
     careful: Annotated[
@@ -448,10 +448,10 @@ def alternatives_of_job(
 @app.command("rehearse")
 def rehearse_file(
     plant_file: Annotated[Path, typer.Argument(metavar="PLANT.json", help="Plant file, see docs/offline.md.")],
-    method: Annotated[str, typer.Option(help="fast, five-stage, or a rule of `loopwright methods`.")] = "fast",
-    ms: Annotated[float | None, typer.Option(help="Ms that fast designs for: 1.2 robust .. 1.6 .. 2.0 fast.")] = None,
+    method: Annotated[str, typer.Option(help="fast, setpoint, five-stage, or one of `loopwright methods`.")] = "fast",
+    ms: Annotated[float | None, typer.Option(help="Ms that is designed for: 1.2 robust .. 1.6 .. 2.0 fast.")] = None,
     derivative: Annotated[
-        bool, typer.Option("--derivative", help="Let fast design a PID where it is better than a PI.")
+        bool, typer.Option("--derivative", help="Design a PID where it is better than a PI.")
     ] = False,
     propose_anyway: Annotated[
         bool,
@@ -476,8 +476,8 @@ def rehearse_file(
     listener = None if as_json else show
     given = {"Ms": ms, "derivative": derivative or None}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    if options and method != "fast":
-        die(f"--ms and --derivative are options of the method fast, not of {method}", 2)
+    if options and method not in ("fast", "setpoint"):
+        die(f"--ms and --derivative are options of the methods fast and setpoint, not of {method}", 2)
     answer = rehearse(spec, method=method, on_event=listener, propose_anyway=propose_anyway, **options).as_json()
     if as_json:
         print_json(answer)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.inputs.request import FastRetune, RetuneRequest
+from loopwright.service.inputs.request import FastRetune, RetuneRequest, SetpointRetune
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.service.planning.facts import facts_of, time_budget_s
@@ -143,6 +143,10 @@ def _procedure(request: RetuneRequest, facts: Facts, earlier: Sequence[JobEvent]
 
         known = _known_model(request)
         return fast(facts, request.options) if known is None else trial(facts, request.options, known)
+    if isinstance(request, SetpointRetune):
+        from loopwright.tuning.fast.setpoint_procedure import setpoint
+
+        return setpoint(facts, request.options)
     from loopwright.service.execution.checkpoints import finished
     from loopwright.tuning.five_stage.procedure import five_stage
 

@@ -37,7 +37,9 @@ from loopwright.service.loops.loop import Restored
 from loopwright.service.results import FastResult, FiveStageResult, UltimateView, empty_result
 from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.fast.design_trial import trial
+from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.procedure import FAST, FAST_STAGES, FastOptions, FastProposal, fast
+from loopwright.tuning.fast.setpoint_procedure import SETPOINT, SETPOINT_STAGES, setpoint
 from loopwright.tuning.five_stage.procedure import STAGES, Facts, Options, Proposal, five_stage
 from loopwright.tuning.five_stage.ultimate_gain import UltimateResult
 from loopwright.tuning.gains import Gains
@@ -46,6 +48,7 @@ from loopwright.tuning.plan import (
     Command,
     Event,
     Mode,
+    Plan,
     Sample,
     SetGains,
     SetMode,
@@ -275,13 +278,13 @@ def rehearse(
     on_event: Callable[[Event], None] | None = None,
     on_samples: Callable[[list[Sample]], None] | None = None,
     model: Model | None = None,
-    asked: FastOptions | Options | None = None,
+    asked: DesignOptions | Options | None = None,
     **options: Any,
 ) -> Rehearsal:
     """Runs preflight to verification on a model in memory.
 
     spec: the fields of `PlantFile`. A spec that cannot be used is refused with the reason "bad_input".
-    method: "fast", "five-stage", or a rule of `tuning.rules.registry` in place of the fifth stage.
+    method: "fast", "setpoint", "five-stage", or a rule of `tuning.rules.registry` in place of the fifth stage.
     model: the model to design for; fast then needs no relay.
     options: those of `tuning.fast.procedure.FastOptions`, or of `tuning.five_stage.procedure.Options`.
     asked: the options as one of these two; in place of the options by name.
@@ -301,8 +304,8 @@ def rehearse(
         limits = _limits(facts, _reach(file))
         hear = on_samples or (lambda samples: None)
         asked = asked or _asked(method, model, options)
-        if isinstance(asked, FastOptions):
-            plan = fast(facts, asked) if model is None else trial(facts, asked, model)
+        if isinstance(asked, DesignOptions):
+            plan = _designing(facts, asked, model)
             outcome = run(plan, loop, limits=limits, on_event=listen, on_samples=hear)
         else:
             outcome = run(five_stage(facts, asked), loop, limits=limits, on_event=listen, on_samples=hear)
@@ -313,10 +316,18 @@ def rehearse(
     return _rehearsal(file, method, outcome, results, anyway=asked.propose_anyway)
 
 
-def _asked(method: str, model: Model | None, options: dict[str, Any]) -> FastOptions | Options:
+def _designing(facts: Facts, asked: DesignOptions, model: Model | None) -> Plan[FastProposal]:
+    if not isinstance(asked, FastOptions):
+        return setpoint(facts, asked)
+    return fast(facts, asked) if model is None else trial(facts, asked, model)
+
+
+def _asked(method: str, model: Model | None, options: dict[str, Any]) -> DesignOptions | Options:
     """Raises Refused."""
     if method == FAST:
         return FastOptions(**options)
+    if method == SETPOINT:
+        return DesignOptions(**options)
     return Options(method=method, model=_entered(model), **options)
 
 
@@ -370,7 +381,7 @@ def _rehearsal(
     proposal, ended = outcome.value, outcome.ended
     if proposal is not None and not proposal.comparison.gain and not anyway:
         ended = NoGain(Reason.NO_GAIN, proposal.comparison.verdict)
-    stages = dict.fromkeys((*STAGES, *FAST_STAGES))
+    stages = dict.fromkeys((*STAGES, *FAST_STAGES, *SETPOINT_STAGES))
     times = {stage: outcome.plant_time_s[stage] for stage in stages if stage in outcome.plant_time_s}
     if proposal is not None:
         return Rehearsal(result_of(proposal), ended, times, results, file)

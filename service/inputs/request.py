@@ -33,7 +33,9 @@ from loopwright.service.inputs.plausible import (
     check_step,
 )
 from loopwright.service.inputs.validation import branch, branch_of
+from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.procedure import FAST, FastOptions
+from loopwright.tuning.fast.setpoint_procedure import SETPOINT
 from loopwright.tuning.five_stage.procedure import PROCEDURE, Options, rule_of
 from loopwright.tuning.models import FOPDT, SOPDT
 from loopwright.tuning.reasons import Refused
@@ -83,7 +85,8 @@ class Bounds(BaseModel):
     pv_high: Finite | None = Field(default=None, description="Abort above this PV, PV units", examples=[60.0])
     max_time_s: Time | None = Field(
         default=None,
-        description="Budget of plant time, s; by default 100 times the loop's T95 for fast, 500 times for five-stage",
+        description="Budget of plant time, s; by default 100 times the loop's T95 for fast and setpoint, 500 times for "
+        "five-stage",
         examples=[3600.0],
     )
 
@@ -158,7 +161,34 @@ class _Retune(Bounds):
         return self
 
 
-class FastRetune(_Retune):
+class DesignRetune(_Retune):
+    """The options of the methods that fit a model to one record and design the gains on it."""
+
+    method: str
+    ms: Annotated[float, Field(ge=1.2, le=2.0, allow_inf_nan=False)] = Field(
+        default=1.6,
+        description="Maximum sensitivity for which the gains are designed: 1.2 (robust) to 2.0 (fast)",
+        examples=[1.4],
+    )
+    derivative: bool = Field(default=False, description="Design a PID where a derivative improves the loop")
+
+    @property
+    def options(self) -> DesignOptions:
+        raise NotImplementedError
+
+    @classmethod
+    def _of_another(cls) -> list[str]:
+        return [name for name in FiveStages.model_fields if name not in FastRetune.model_fields]
+
+    @classmethod
+    def _not_mine(cls, foreign: str, method: object) -> str:
+        return (
+            f"{foreign}: of the five-stage experiment, not of {method}; "
+            'add "method": "five-stage" (or a rule of GET /methods), or leave it out'
+        )
+
+
+class FastRetune(DesignRetune):
     """A retune by method fast: a model is fitted to a short relay test, and the gains are designed for the given Ms."""
 
     method: Literal["fast"] = Field(default="fast", description="Method fast, the default")
@@ -168,12 +198,6 @@ class FastRetune(_Retune):
     baseline: bool | None = Field(
         default=None, description="Must be false or left out: fast records no set-point step with the old gains"
     )
-    ms: Annotated[float, Field(ge=1.2, le=2.0, allow_inf_nan=False)] = Field(
-        default=1.6,
-        description="Maximum sensitivity for which the gains are designed: 1.2 (robust) to 2.0 (fast)",
-        examples=[1.4],
-    )
-    derivative: bool = Field(default=False, description="Design a PID where a derivative improves the loop")
     amplitude_pct: Positive | None = Field(
         default=None,
         description="Step of MV up under the relay, percent; the step down is half as large. The default is half of "
@@ -189,23 +213,12 @@ class FastRetune(_Retune):
         return self._options
 
     @classmethod
-    def _of_another(cls) -> list[str]:
-        return [name for name in FiveStages.model_fields if name not in cls.model_fields]
-
-    @classmethod
     def _foreign(cls, data: Mapping[str, object]) -> list[str]:
         return [
             *super()._foreign(data),
             *["baseline"] * (data.get("baseline") is True),
             *["start"] * (data.get("start") in FIVE_STAGE_STARTS and data["start"] != "relay"),
         ]
-
-    @classmethod
-    def _not_mine(cls, foreign: str, method: object) -> str:
-        return (
-            f"{foreign}: of the five-stage experiment, not of {method}; "
-            'add "method": "five-stage" (or a rule of GET /methods), or leave it out'
-        )
 
     @model_validator(mode="after")
     def _understood(self) -> Self:
@@ -223,6 +236,31 @@ class FastRetune(_Retune):
                 careful=self.careful,
                 verify=self.verify,
                 propose_anyway=self.propose_anyway,
+            )
+        except Refused as refused:
+            raise ValueError(refused.detail) from refused
+        return self
+
+
+class SetpointRetune(DesignRetune):
+    """A retune by method setpoint: as fast, but the record is made by pulses of the set-point under the present gains.
+    The loop stays in automatic all the time."""
+
+    method: Literal["setpoint"] = Field(description="Method setpoint")
+
+    _options: DesignOptions = PrivateAttr()
+
+    @property
+    def options(self) -> DesignOptions:
+        return self._options
+
+    @model_validator(mode="after")
+    def _understood(self) -> Self:
+        if self.model is not None and not self.dry_run:
+            raise ValueError("model is for a dry run: the pulses find their own; fast takes one with start=design")
+        try:
+            self._options = DesignOptions(
+                Ms=self.ms, derivative=self.derivative, verify=self.verify, propose_anyway=self.propose_anyway
             )
         except Refused as refused:
             raise ValueError(refused.detail) from refused
@@ -339,7 +377,7 @@ class FiveStageRetune(FiveStages):
 
 def _named(value: object) -> object:
     if not isinstance(value, str) or value not in METHODS:
-        raise ValueError(f"method must be one of {FAST}, {PROCEDURE}, {', '.join(METHODS)}, not {value!r}")
+        raise ValueError(f"method must be one of {FAST}, {SETPOINT}, {PROCEDURE}, {', '.join(METHODS)}, not {value!r}")
     return value
 
 
@@ -349,22 +387,24 @@ class RuleRetune(FiveStages):
     method: Annotated[RuleName, BeforeValidator(_named)] = Field(description="Rule that computes the gains")
 
 
-def by_method(fast: type, five_stage: type, rule: type) -> Discriminator:
+def by_method(fast: type, setpoint: type, five_stage: type, rule: type) -> Discriminator:
     """The discriminator of a union by method. The branch of the rules refuses an unknown method."""
+    kinds = {FAST: fast, SETPOINT: setpoint, PROCEDURE: five_stage}
 
     def kind(data: object) -> str:
         method = data.get("method", FAST) if isinstance(data, Mapping) else getattr(data, "method", FAST)
-        return branch_of(fast if method == FAST else five_stage if method == PROCEDURE else rule)
+        return branch_of(kinds.get(method, rule) if isinstance(method, str) else rule)
 
     return Discriminator(kind)
 
 
-AnyRetune = FastRetune | FiveStageRetune | RuleRetune
+AnyRetune = FastRetune | SetpointRetune | FiveStageRetune | RuleRetune
 RetuneRequest = Annotated[
     Annotated[FastRetune, branch(FastRetune)]
+    | Annotated[SetpointRetune, branch(SetpointRetune)]
     | Annotated[FiveStageRetune, branch(FiveStageRetune)]
     | Annotated[RuleRetune, branch(RuleRetune)],
-    by_method(FastRetune, FiveStageRetune, RuleRetune),
+    by_method(FastRetune, SetpointRetune, FiveStageRetune, RuleRetune),
 ]
 """The options of a retune. The loop's configuration gives the defaults of limits; the default method is fast."""
 _ADAPTER: TypeAdapter[AnyRetune] = TypeAdapter(RetuneRequest)

@@ -8,18 +8,19 @@ from collections.abc import Sequence
 from loopwright.service.errors import Conflict
 from loopwright.service.inputs.model_json import dump_model, parse_model
 from loopwright.service.job_states import ACTIVE
-from loopwright.service.jobs.relay_record import RelayRecord
+from loopwright.service.jobs.stored_record import StoredRecord
 from loopwright.service.jsonable import JsonObject, json_object
 from loopwright.service.loop_state import loop_state
 from loopwright.service.offline.tunings import MethodResult, answer, tune_each
 from loopwright.service.planning.found_model import DISPROVED, FoundModel, found_model
+from loopwright.service.results import DESIGNED
 from loopwright.service.store.jobs import Job, JobEvent
 from loopwright.tuning.analysis.assessment import Assessment, assess
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.design_trial import designed_on
-from loopwright.tuning.fast.evaluation import evaluate_again
 from loopwright.tuning.fast.procedure import FAST, FastOptions
 from loopwright.tuning.fast.proposal import delayed
+from loopwright.tuning.fast.record_evaluation import evaluate_again
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 from loopwright.tuning.reasons import Ended, Reason, Refused
@@ -61,7 +62,7 @@ def alternatives(row: Job, events: Sequence[JobEvent], method: str | None = None
 
 
 def redesigned(
-    row: Job, events: Sequence[JobEvent], record: RelayRecord | None, ms: float, derivative: bool
+    row: Job, events: Sequence[JobEvent], record: StoredRecord | None, ms: float, derivative: bool
 ) -> JsonObject:
     """Returns the same object with the gains of fast for another Ms, without a new experiment.
 
@@ -71,7 +72,7 @@ def redesigned(
     """
     model = job_model(row, events)
     doubt: dict[str, float | None] = {"uncertainty": None, "ambiguity": None}
-    evidence = record.experiment_record() if record and row.request.get("method") == FAST else None
+    evidence = record.experiment_record() if record and row.request.get("method") in DESIGNED else None
     _not_disproved(row, (Reason.WRONG_SIGN,) if evidence else DISPROVED)
     try:
         if evidence is not None:

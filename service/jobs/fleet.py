@@ -24,6 +24,7 @@ from loopwright.service.inputs.request import (
     FastRetune,
     FiveStageRetune,
     RuleRetune,
+    SetpointRetune,
     by_method,
     retune_request,
     within,
@@ -84,6 +85,10 @@ class FastRetunes(_Loops, FastRetune):
     """Which loops, how many of them at once, and the options of the retune of each, by fast."""
 
 
+class SetpointRetunes(_Loops, SetpointRetune):
+    """Which loops, how many of them at once, and the options of the retune of each, by setpoint."""
+
+
 class FiveStageRetunes(_Loops, FiveStageRetune):
     """Which loops, how many of them at once, and the options of the retune of each, by five-stage."""
 
@@ -94,11 +99,12 @@ class RuleRetunes(_Loops, RuleRetune):
 
 FleetRequest = Annotated[
     Annotated[FastRetunes, branch(FastRetunes)]
+    | Annotated[SetpointRetunes, branch(SetpointRetunes)]
     | Annotated[FiveStageRetunes, branch(FiveStageRetunes)]
     | Annotated[RuleRetunes, branch(RuleRetunes)],
-    by_method(FastRetunes, FiveStageRetunes, RuleRetunes),
+    by_method(FastRetunes, SetpointRetunes, FiveStageRetunes, RuleRetunes),
 ]
-_ADAPTER: TypeAdapter[FastRetunes | FiveStageRetunes | RuleRetunes] = TypeAdapter(FleetRequest)
+_ADAPTER: TypeAdapter[FastRetunes | SetpointRetunes | FiveStageRetunes | RuleRetunes] = TypeAdapter(FleetRequest)
 
 
 def fleet_request(**options: Any) -> FleetRequest:

@@ -6,10 +6,13 @@ the time limits of the procedures.
 
 from __future__ import annotations
 
-from loopwright.service.inputs.request import FastRetune, RetuneRequest
+from loopwright.service.inputs.request import FastRetune, RetuneRequest, SetpointRetune
 from loopwright.tuning.experiments.preflight import MAX_ATTEMPTS, MIN_LISTENED_SAMPLES
+from loopwright.tuning.fast.experiment import STEP_BACK_FRACTION, VERIFICATION_PERIODS
 from loopwright.tuning.fast.procedure import MIN_SAMPLES
-from loopwright.tuning.fast.relay_test import MAX_PERIODS, STEP_BACK_FRACTION, VERIFICATION_PERIODS
+from loopwright.tuning.fast.relay_test import MAX_PERIODS
+from loopwright.tuning.fast.setpoint_procedure import MAX_PERIODS as MAX_PERIODS_OF_PULSES
+from loopwright.tuning.fast.setpoint_procedure import MAX_T95
 
 PU_OF_T95 = (0.07, 0.95)
 """Ultimate period as a fraction of T95: the range of eight in ten of 116 self-regulating plants."""
@@ -22,7 +25,8 @@ def durations(request: RetuneRequest, t95_s: float, sample_time_s: float | None,
 
     pu_s: the ultimate period, s; None where no model is known.
     """
-    minimum = MIN_SAMPLES if isinstance(request, FastRetune) and request.start == "relay" else MIN_LISTENED_SAMPLES
+    whole = isinstance(request, SetpointRetune) or (isinstance(request, FastRetune) and request.start == "relay")
+    minimum = MIN_SAMPLES if whole else MIN_LISTENED_SAMPLES
     look = max(0.5 * t95_s, minimum * (sample_time_s or 0.0))
     # a loop that is not at rest is given half a T95 before each further look
     listening = (look, MAX_ATTEMPTS * look + (MAX_ATTEMPTS - 1) * 0.5 * t95_s)
@@ -34,6 +38,14 @@ def durations(request: RetuneRequest, t95_s: float, sample_time_s: float | None,
         return {
             "preflight": listening,
             "relay": (1.8 * low, MAX_PERIODS * high),
+            "design": nothing,
+            "verify": (VERIFICATION_PERIODS * low, (1.0 + STEP_BACK_FRACTION) * VERIFICATION_PERIODS * high),
+            "redesign": nothing,
+        }
+    if isinstance(request, SetpointRetune):
+        return {
+            "preflight": listening,
+            "pulses": (1.5 * low, max(MAX_PERIODS_OF_PULSES * high, MAX_T95 * t95_s)),
             "design": nothing,
             "verify": (VERIFICATION_PERIODS * low, (1.0 + STEP_BACK_FRACTION) * VERIFICATION_PERIODS * high),
             "redesign": nothing,

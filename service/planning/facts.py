@@ -6,8 +6,9 @@ from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.loop_state import LoopState
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.procedure import FAST
+from loopwright.tuning.fast.setpoint_procedure import SETPOINT
 
-TIME_BUDGET_T95 = {FAST: 100.0}
+TIME_BUDGET_T95 = {FAST: 100.0, SETPOINT: 100.0}
 OTHER_BUDGET_T95 = 500.0
 MIN_BUDGET_SAMPLES = 1000
 """Minimum time limit in samples: the wait for rest is counted in samples, which matters where T95 is a few of them."""

@@ -11,11 +11,13 @@ from dataclasses import dataclass
 
 from loopwright.protocol.real32 import TOLERANCE
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.inputs.request import FastRetune, FiveStages, RetuneRequest
+from loopwright.service.inputs.request import FastRetune, FiveStages, RetuneRequest, SetpointRetune
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.design_trial import trial_stages
 from loopwright.tuning.fast.procedure import fast_stages
+from loopwright.tuning.fast.pulse_test import pulse_size
 from loopwright.tuning.fast.relay_test import BIAS, FIRST_AMPLITUDE, MAX_OUTPUT_RANGE, MAX_RAISE, max_amplitude
+from loopwright.tuning.fast.setpoint_procedure import setpoint_stages
 from loopwright.tuning.five_stage.procedure import stages_of
 from loopwright.tuning.five_stage.ultimate_gain import RUN_MV_LIMIT
 from loopwright.tuning.gains import Gains
@@ -49,6 +51,8 @@ def stages_asked(request: RetuneRequest) -> tuple[str, ...]:
     """Returns the stages of the retune in their order."""
     if isinstance(request, FastRetune):
         return trial_stages(request.verify) if request.start == "design" else fast_stages(request.verify)
+    if isinstance(request, SetpointRetune):
+        return setpoint_stages(request.verify)
     return stages_of(request.start, request.options.baseline, request.verify)
 
 
@@ -67,13 +71,18 @@ def broken_limits(config: LoopConfig, request: RetuneRequest, sp: float) -> list
     share = 1.0
     if isinstance(request, FiveStages) and "zn_pi" in stages:
         share += request.overshoot_window_pct[0] / 100.0
-    if any(stage in stages for stage in _STEPPING) and sp + share * step > high + hair:
+    if any(stage in stages for stage in (*_STEPPING, "pulses")) and sp + share * step > high + hair:
         overshoot = f" and an overshoot of {100 * (share - 1):g} % is looked for," if share > 1 else ","
         broken.append(
             f"the set-point is stepped from {sp:.6g} by up to {step:g} {unit} (sp_deviation),{overshoot} which takes "
             f"PV to {sp + share * step:.6g}, above the PV limit {high:g}: {_remedy((high - sp) / share, unit)}"
         )
     adapted = isinstance(request, FastRetune) and request.amplitude_pct is None
+    if "pulses" in stages and sp - step < low - hair:
+        broken.append(
+            f"the set-point is moved from {sp:.6g} down by up to {step:g} {unit} (sp_deviation), which takes PV to "
+            f"{sp - step:.6g}, below the PV limit {low:g}: {_remedy(sp - low, unit)}"
+        )
     if adapted and "relay" in stages and sp - step < low - hair:
         broken.append(
             f"the relay may move PV from {sp:.6g} by up to {step:g} {unit} (sp_deviation), which takes it to "
@@ -121,6 +130,8 @@ def moves(config: LoopConfig, request: RetuneRequest, before: Before) -> list[Mo
 
 
 def _moving(stage: str, config: LoopConfig, request: RetuneRequest, before: Before) -> Moves:
+    if isinstance(request, SetpointRetune):
+        return _setpoint(stage, config, before)
     if not isinstance(request, FastRetune):
         return _five_stage(stage, config, request, before)
     return _trial(stage, config, before) if request.start == "design" else _fast(stage, config, request, before)
@@ -150,6 +161,23 @@ def _fast(stage: str, config: LoopConfig, request: FastRetune, before: Before) -
         "which PV stalls is raised, up to twice."
     )
     return Moves(stage, what, BIAS * up, up, pv=pv, first_mv=first)
+
+
+def _setpoint(stage: str, config: LoopConfig, before: Before) -> Moves:
+    step, unit, room, gains = config.sp_deviation, config.pv_unit, _room(config, before.mv), before.gains
+    if gains is not None and gains.Kp * gains.b > 0.0:
+        step = pulse_size(step, room, gains)
+    if stage == "pulses":
+        what = (
+            f"The set-point moves up, down and up again by up to {step:.4g} {unit} under the present gains; the loop "
+            "stays in automatic."
+        )
+        return Moves(stage, what, room, room, step, _UNDER_PRESENT_GAINS * step)
+    what = (
+        f"The set-point goes back by {step:.4g} {unit} to where it was, under the new gains, on trial; it is stepped "
+        "once more, by half as much, where the record is not conclusive."
+    )
+    return Moves(stage, what, room, room, step, _UNDER_NEW_GAINS * step)
 
 
 def _trial(stage: str, config: LoopConfig, before: Before) -> Moves:

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from loopwright.service.jobs.relay_record import RelayRecord
+from loopwright.service.jobs.stored_record import StoredRecord
 from loopwright.service.plots.shown import Shown
 from loopwright.service.results import EvidenceView, GainsView
 from loopwright.tuning.analysis.assessment import assess
@@ -23,7 +23,7 @@ GREY, RED, BLUE, GREEN = "0.55", "tab:red", "tab:blue", "tab:green"
 SHOWN_SETTLINGS = 2.5
 
 
-def fast_job(path: Path, job: Shown, record: RelayRecord, pv_unit: str) -> None:
+def fast_job(path: Path, job: Shown, record: StoredRecord, pv_unit: str) -> None:
     """Writes the plot of a fast job to a file.
 
     job: the job, however it ended.
@@ -46,13 +46,13 @@ def fast_job(path: Path, job: Shown, record: RelayRecord, pv_unit: str) -> None:
     canvas.print_figure(path, dpi=80)
 
 
-def _record(pv: Axes, rest: Axes, mv: Axes, record: RelayRecord, found: EvidenceView | None, pv_unit: str) -> None:
+def _record(pv: Axes, rest: Axes, mv: Axes, record: StoredRecord, found: EvidenceView | None, pv_unit: str) -> None:
     t = record.t
     pv.plot(t, record.pv, color=GREY, linewidth=1.0, label="PV measured")
     pv.step(t, record.sp, where="post", color="black", linestyle=":", linewidth=1.0, label="set-point")
     evidence = record.experiment_record()
     if evidence is None:
-        rest.text(0.5, 0.5, "too few switches of the relay for a fit", ha="center", transform=rest.transAxes)
+        rest.text(0.5, 0.5, "too few turns for a fit", ha="center", transform=rest.transAxes)
         rest.set_yticks([])
     else:
         fit = Fit(evidence)
@@ -73,11 +73,11 @@ def _record(pv: Axes, rest: Axes, mv: Axes, record: RelayRecord, found: Evidence
         axes.grid(alpha=0.3)
         axes.set_xlim(t[0], t[-1])
         axes.axvline(0.0, color="0.3", linewidth=0.8, linestyle="--")
-        if record.relayed < len(t):
-            axes.axvline(t[record.relayed], color="0.3", linewidth=0.8, linestyle="--")
+        if record.excited < len(t):
+            axes.axvline(t[record.excited], color="0.3", linewidth=0.8, linestyle="--")
     pv.legend(loc="best", fontsize=8)
-    taken_over = "; the new gains are in effect from the second dashed line" if record.relayed < len(t) else ""
-    mv.set_xlabel(f"plant time since the start of the relay, s{taken_over}")
+    taken_over = "; the new gains are in effect from the second dashed line" if record.excited < len(t) else ""
+    mv.set_xlabel(f"plant time since the start of the {record.excitation.in_words}, s{taken_over}")
 
 
 def _before_after(top: Axes, bottom: Axes, job: Shown, pv_unit: str) -> None:

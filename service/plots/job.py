@@ -8,8 +8,9 @@ from pathlib import Path
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from loopwright.service.jobs.relay_record import relay_record
+from loopwright.service.jobs.stored_record import stored_record
 from loopwright.service.plots.shown import Shown, ShownSamples
+from loopwright.service.results import DESIGNED
 
 LEAD_IN = 20
 """Number of samples shown before the step."""
@@ -28,7 +29,7 @@ def job_picture(path: Path, samples: Samples, job: Shown, pv_unit: str) -> None:
     The plot of a fast job shows the record, the fit and the residual, and the loop before and after; the plot of any
     other job shows the set-point step before and after. Raises NoPicture.
     """
-    if job.method == "fast" and (record := relay_record(samples(None).columns())) is not None:
+    if job.method in DESIGNED and (record := stored_record(samples(None).columns())) is not None:
         from loopwright.service.plots.fast_job import fast_job
 
         fast_job(path, job, record, pv_unit)

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from benchmarks.refusals import cases, draw, rehearsed
-from loopwright.service.jobs.relay_record import relay_record
+from loopwright.service.jobs.stored_record import stored_record
 from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.evaluation import evaluate_again
+from loopwright.tuning.fast.record_evaluation import evaluate_again
 from loopwright.tuning.reasons import ADVICE, Reason
 
 PAGE = (Path(__file__).parents[2] / "docs" / "refusals.md").read_text(encoding="utf-8")
@@ -35,7 +35,7 @@ def test_a_fault_is_refused_with_its_reason_and_shown(reason: str, tmp_path: Pat
 @pytest.mark.parametrize("Ms", [1.4, 1.6])
 def test_what_the_step_has_refuted_is_no_alternative_either(Ms: float) -> None:
     """The record as a whole fits well, with load disturbances added: only its parts tell."""
-    record = relay_record(rehearsed("model_mismatch", cases()["model_mismatch"]).samples)
+    record = stored_record(rehearsed("model_mismatch", cases()["model_mismatch"]).samples)
     assert record is not None
     evidence = record.experiment_record()
     assert evidence is not None and len(evidence.steps) == 2

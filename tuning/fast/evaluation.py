@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 from loopwright.tuning.fast.design import DesignSpec, GainDesign, OptimalGains
-from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.fast.structure_choice import StructureChoice, choose_structure
 from loopwright.tuning.fast.uncertainty import difference_of_rivals, durbin_watson_ratio, peak, uncertainty_of_Ms
 from loopwright.tuning.fast.valve_faults import find_valve_fault
@@ -21,7 +21,7 @@ the range of PV below which a residual is accepted in any case."""
 MAX_DURBIN_WATSON_RATIO = 1.35
 MAX_ROUNDED = 1.25
 """Residual, in average rounding errors, below which slow variations are accepted: rounding errors are not white."""
-MAX_UNCERTAINTY = 0.10
+MAX_UNCERTAINTY = {Excitation.RELAY: 0.10, Excitation.SETPOINT: 0.06}
 """Largest accepted uncertainty of Ms, by the delta method and among rival models."""
 MAX_MODEL_MISMATCH, MAX_MODEL_MISMATCH_OF_TWO_LOADS = 0.5, 0.2
 """Largest accepted difference of Ms from the Ms asked for, of the tested gains on the new model and of the new gains on
@@ -79,6 +79,7 @@ def evaluate(record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | N
     fit = Fit(record)
     chosen = choose_structure(fit, earlier.chosen.fits if earlier else ())
     found = chosen.best
+    max_uncertainty = MAX_UNCERTAINTY[record.excitation]
     model = fit.model(found)
     delay = 0.5 * record.Ts
     design = GainDesign(replace(model, L=model.L + delay), spec, record.period * record.Ts)
@@ -99,10 +100,10 @@ def evaluate(record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | N
         reason = Reason.DISTURBED
         at_rest = f"{record.durbin_watson_ratio_at_rest:.2f} at rest"
         detail = f"what the model leaves varies slowly: {ratio:.2f} times white noise, {at_rest}"
-    elif spread > MAX_UNCERTAINTY:
+    elif spread > max_uncertainty:
         reason = Reason.UNCERTAIN
         detail = f"Ms is known to +{spread:.2g} only"
-    elif rivals > MAX_UNCERTAINTY:
+    elif rivals > max_uncertainty:
         reason = Reason.AMBIGUOUS
         detail = f"another model that explains the record as well gives an Ms off by {rivals:.2g}"
     elif earlier is not None:
@@ -126,17 +127,6 @@ def evaluate(record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | N
         design_delay=delay,
         period=design.period,
     )
-
-
-def evaluate_again(record: ExperimentRecord, spec: DesignSpec) -> Evaluation:
-    """Evaluates a whole record as the procedure does: the relay's part first, then all of it.
-
-    Raises Refused, NOT_ROBUST.
-    """
-    if not record.steps:
-        return evaluate(record, spec)
-    until = slice(record.relayed)
-    return evaluate(record, spec, evaluate(replace(record, u=record.u[until], y=record.y[until], steps=()), spec))
 
 
 def _load_with_the_step(

@@ -16,19 +16,18 @@ from functools import partial
 from loopwright.tuning.analysis.comparison import Comparison
 from loopwright.tuning.experiments.preflight import at_rest
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.evaluation import Evaluation, evaluate
+from loopwright.tuning.fast.evaluation import Evaluation
+from loopwright.tuning.fast.options import DesignOptions
+from loopwright.tuning.fast.outcome import OPEN_REASONS, evaluated
 from loopwright.tuning.fast.proposal import (
     FastProposal,
     VerifiedStep,
-    comparison_of,
     evaluation_summary,
     proposed,
     verified_step,
 )
-from loopwright.tuning.fast.record import MIN_LISTENED, ExperimentRecord
-from loopwright.tuning.fast.relay_test import Experiment
-from loopwright.tuning.models import sign
+from loopwright.tuning.fast.record import MIN_LISTENED
+from loopwright.tuning.fast.relay_test import RelayTest
 from loopwright.tuning.plan import Note, Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -37,36 +36,21 @@ __all__ = ["FAST", "FAST_STAGES", "FastOptions", "FastProposal", "fast"]
 FAST = "fast"
 FAST_STAGES = ("preflight", "relay", "design", "verify", "redesign")
 SWITCHES = (4, 6, 8, 10)
-OPEN_REASONS = (Reason.UNCERTAIN, Reason.AMBIGUOUS)
-"""Reasons for a refusal that a longer record of the same kind may remove."""
 MIN_SAMPLES = 2 * MIN_LISTENED
 """Smallest number of samples at rest, from which noise and offset are estimated."""
 
 
 @dataclass(frozen=True, slots=True)
-class FastOptions:
-    """The options of the procedure: the design specification and the conduct of the test.
+class FastOptions(DesignOptions):
+    """The options of the procedure: those of the design, and the conduct of the relay test.
 
-    Ms, derivative, Mt, noise_gain: see `tuning.fast.design.DesignSpec`.
     amplitude: the amplitude of the relay's higher side, MV units; by default half of what MV permits, adapted after the
     first wave.
-    careful: the relay switches six times at least.
-    verify: the set-point step under the new gains is made; without it the relay switches six times at least.
-    propose_anyway: the procedure goes on where the new gains improve nothing that was asked for.
+    careful: the relay switches six times at least; without the set-point step it does so in any case.
     """
 
-    Ms: float = 1.6
-    derivative: bool = False
-    Mt: float | None = None
-    noise_gain: float | None = None
     amplitude: float | None = None
     careful: bool = False
-    verify: bool = True
-    propose_anyway: bool = False
-
-    def spec(self) -> DesignSpec:
-        """The design specification of these options. Raises Refused, BAD_INPUT."""
-        return DesignSpec(self.Ms, self.derivative, self.Mt, self.noise_gain)
 
     def __post_init__(self) -> None:
         self.spec()
@@ -94,7 +78,7 @@ def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
 
     after_s = sum(expected[stage] for stage in todo[1:])
     point, listened = yield from at_rest(facts, after_s, MIN_SAMPLES)
-    experiment = Experiment(facts, point, listened, options.amplitude)
+    experiment = RelayTest(facts, point, listened, options.amplitude)
     yield from experiment.report(StageDone("preflight", point))
 
     yield from experiment.report(*started("relay"))
@@ -106,7 +90,7 @@ def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
         evaluation = None
         try:
             record = experiment.experiment_record()
-            evaluation, outcome = yield from experiment.computed(partial(_evaluated, facts, options, record))
+            evaluation, outcome = yield from experiment.computed(partial(evaluated, facts, options, record))
         except Refused as refused:
             outcome = refused
         if isinstance(outcome, Comparison) or not in_time:
@@ -126,43 +110,18 @@ def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
         first = evaluation
         tested = first.best.gains
         yield from experiment.step(tested, first.period)
-        evaluating = partial(_evaluated, facts, options, experiment.experiment_record(), first)
+        evaluating = partial(evaluated, facts, options, experiment.experiment_record(), first)
         evaluation, outcome = yield from experiment.computed(evaluating)
         shown = verified_step(evaluation, tested, *experiment.stepped)
         if isinstance(outcome, Refused) and outcome.reason in OPEN_REASONS:
             yield from experiment.report(Note(f"after the set-point step: {outcome.detail}; it is stepped back"))
             yield from experiment.step_back()
-            evaluating = partial(_evaluated, facts, options, experiment.experiment_record(), first)
+            evaluating = partial(evaluated, facts, options, experiment.experiment_record(), first)
             evaluation, outcome = yield from experiment.computed(evaluating)
             shown = verified_step(evaluation, tested, *experiment.stepped)
         yield (StageDone("verify", shown), *started("redesign"), StageDone("redesign", evaluation_summary(evaluation)))
         if isinstance(outcome, Refused):
             raise outcome
-    relay_at_s = experiment.trace.t[experiment.listened]
-    return (yield from experiment.computed(partial(proposed, facts, spec, evaluation, outcome, shown, relay_at_s)))
-
-
-def _evaluated(
-    facts: Facts, options: FastOptions, record: ExperimentRecord, first: Evaluation | None = None
-) -> tuple[Evaluation, Refused | Comparison]:
-    """The evaluation of a record, with the refusal that follows from it or else the comparison of old and new gains.
-
-    first: the evaluation of the relay's record, see `earlier` of `evaluate`.
-    Raises Refused, NOT_ROBUST.
-    """
-    evaluation = evaluate(record, options.spec(), first)
-    return evaluation, _refusal(facts, evaluation) or comparison_of(
-        evaluation, facts, options.spec(), options.propose_anyway
-    )
-
-
-def _refusal(facts: Facts, evaluation: Evaluation) -> Refused | None:
-    """The refusal that follows from an evaluation, None where its gains may be proposed."""
-    model = evaluation.model
-    if (sign(model) > 0.0) != facts.reverse:
-        return Refused(
-            Reason.WRONG_SIGN,
-            f"the record fits a plant of {'positive' if sign(model) > 0.0 else 'negative'} gain; the controller acts "
-            f"{'reverse' if facts.reverse else 'direct'}",
-        )
-    return None if evaluation.reason is None else Refused(evaluation.reason, evaluation.detail)
+    begun_at_s = experiment.trace.t[experiment.listened]
+    work = partial(proposed, FAST, facts, spec, evaluation, outcome, shown, begun_at_s)
+    return (yield from experiment.computed(work))

@@ -37,7 +37,7 @@ CRITERION = "half of the set-point's and half of the load's IAE, each over the l
 class LoadDisturbance:
     """A step-shaped load disturbance that the record shows.
 
-    t_s: the time of the step since the start of the relay, s.
+    t_s: the time of the step since the start of the relay or of the pulses, s.
     size: the size of the step at the plant's input, MV units.
     """
 
@@ -62,6 +62,26 @@ class RelayFigures:
     span: float
     noise: float
     amplitude: float
+    samples: int
+
+
+@dataclass(frozen=True, slots=True)
+class PulseFigures:
+    """The figures of the pulses of the set-point.
+
+    turns: the number of turns of the set-point.
+    size: the size of a pulse, PV units.
+    period_s: the time scale of the record, s.
+    output_range: the range of PV (maximum less minimum) during the pulses, PV units.
+    noise: the standard deviation of PV at rest, PV units.
+    samples: the number of samples of the record, those at rest included.
+    """
+
+    turns: int
+    size: float
+    period_s: float
+    output_range: float
+    noise: float
     samples: int
 
 
@@ -97,7 +117,8 @@ class EvaluationSummary:
     residual: the rms of the residual divided by the standard deviation of the noise at rest.
     loads: the load disturbances that the record shows.
     drift: True if PV drifted at a steady rate, which the fit allows for.
-    switches, period_s: the number of switches of the relay and the period of the oscillation, s.
+    switches, period_s: the number of switches of the relay, or of turns of the set-point, and the time scale of the
+    record, s.
     reason: the reason why the result is not good enough for a proposal, None if it is.
     detail: the sentence with the numbers behind that reason.
     """
@@ -199,7 +220,7 @@ def evaluation_summary(evaluation: Evaluation) -> EvaluationSummary:
         residual=evaluation.residual,
         loads=loads,
         drift=best.hypothesis.drift,
-        switches=len(record.switches),
+        switches=record.turns,
         period_s=record.period * record.Ts,
         reason=evaluation.reason,
         detail=evaluation.detail,
@@ -244,7 +265,7 @@ def verified_step(evaluation: Evaluation, tested: Gains, size: float, duration_s
     duration_s: the time since the step, s.
     """
     fit, residual = evaluation.fit, evaluation.chosen.best.linear.residual
-    first = fit.record.relayed // fit.block
+    first = fit.record.excited // fit.block
     rest, shown = residual[first:], fit.y[first:]
     spread = float(np.linalg.norm(shown - shown.mean()))
     return VerifiedStep(
@@ -278,30 +299,36 @@ def comparison_on(sampled: Model, best: OptimalGains, facts: Facts, spec: Design
 
 
 def proposed(
+    method: str,
     facts: Facts,
     spec: DesignSpec,
     evaluation: Evaluation,
     comparison: Comparison,
     verified: VerifiedStep | None,
-    relay_at_s: float,
+    begun_at_s: float,
 ) -> FastProposal:
-    """The proposal of the gains of an evaluation. relay_at_s: the plant time at which the relay began, s."""
+    """The proposal of the gains of an evaluation.
+
+    method: the name of the procedure.
+    begun_at_s: the plant time at which the relay or the pulses began, s.
+    """
     found, gains = evaluation_summary(evaluation), evaluation.best.gains
+    moved_by = evaluation.fit.record.excitation.in_words
     notes = [
         f"A load disturbance of {load.size:+.3g} at the plant's input was found {load.t_s:.4g} s after the start of "
-        f"the relay (at {relay_at_s + load.t_s:.4g} s), and allowed for."
+        f"the {moved_by} (at {begun_at_s + load.t_s:.4g} s), and allowed for."
         for load in found.loads
     ]
     input_range = evaluation.fit.record.input_range
     if any(abs(load.size) > input_range for load in found.loads):
         notes.append(
-            f"Such a load disturbance is larger than what the relay moved MV by ({input_range:.3g}): a change of the "
-            "plant would look the same. Look at the record before accepting."
+            f"Such a load disturbance is larger than what the {moved_by} moved MV by ({input_range:.3g}): a change of "
+            "the plant would look the same. Look at the record before accepting."
         )
     if found.drift:
         notes.append("PV drifted at a steady rate during the test; this was allowed for.")
     return FastProposal(
-        method="fast",
+        method=method,
         chosen={"Ms": spec.Ms, **({"N": spec.N} if gains.Td else {})},
         model=identified_model(evaluation.fit, evaluation.chosen.best),
         old_gains=facts.old_gains,

@@ -3,13 +3,28 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
 from loopwright.tuning.identification.output_error import averaged
 from loopwright.tuning.models import Reals
 from loopwright.tuning.reasons import Reason, Refused
+
+
+class Excitation(StrEnum):
+    """What moves the loop during a test."""
+
+    RELAY = "relay"
+    SETPOINT = "setpoint"
+
+    @property
+    def in_words(self) -> str:
+        """The excitation in the words of a sentence."""
+        return "relay" if self is Excitation.RELAY else "pulses"
+
 
 MIN_LISTENED = 60
 """Smallest number of averages of the time at rest, from which noise and offset are estimated."""
@@ -20,17 +35,20 @@ MIN_SWITCHES = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExperimentRecord:
-    """The record of a fast experiment so far: time at rest, then the relay, then possibly set-point steps.
+    """The record of a fast experiment so far: time at rest, then the excitation (the relay, or pulses of the
+    set-point), then possibly set-point steps under new gains.
 
     Ts: the sample time, s.
     u: MV as a deviation from rest, held from each sample to the next, MV units, shape (N,).
     y: PV as a deviation from rest at each sample, PV units, shape (N,).
     direction: +1 if PV finally rises with MV, else -1; the action of the controller tells which.
     listened: the number of samples at rest.
-    relayed: the number of samples up to the end of the relay.
-    switches: the samples at which the relay switched, without its start.
+    excited: the number of samples up to the end of the excitation.
+    turns: the number of switches of the relay, or of turns of the set-point.
+    period: the time scale, in samples: the period of the relay oscillation, or the ultimate period of a first model.
     steps: the samples at which the set-point stepped under the new gains.
-    Raises Refused: CANNOT_OSCILLATE, BAD_INPUT, NO_RESPONSE.
+    excitation: what moved the loop.
+    Raises Refused: BAD_INPUT, NO_RESPONSE.
     """
 
     Ts: float
@@ -38,29 +56,22 @@ class ExperimentRecord:
     y: Reals
     direction: float
     listened: int
-    relayed: int
-    switches: tuple[int, ...]
+    excited: int
+    turns: int
+    period: float
     steps: tuple[int, ...] = ()
+    excitation: Excitation = Excitation.RELAY
 
     def __post_init__(self) -> None:
-        if len(self.switches) < MIN_SWITCHES:
-            raise Refused(
-                Reason.CANNOT_OSCILLATE, f"the relay switched {len(self.switches)} times; {MIN_SWITCHES} are needed"
-            )
         if self.listened < MIN_LISTENED:
             raise Refused(Reason.BAD_INPUT, f"{self.listened} samples at rest; at least {MIN_LISTENED} are needed")
         if not self.output_range > 0.0:
-            raise Refused(Reason.NO_RESPONSE, "PV did not move at all under the relay")
-
-    @property
-    def period(self) -> float:
-        """The period of the relay oscillation, in samples, see `period`."""
-        return float(period(self.switches))
+            raise Refused(Reason.NO_RESPONSE, "PV did not move at all under the test")
 
     @property
     def output_range(self) -> float:
-        """The range of PV (maximum less minimum) under the relay, PV units."""
-        return float(np.ptp(self.y[self.listened : self.relayed]))
+        """The range of PV (maximum less minimum) under the excitation, PV units."""
+        return float(np.ptp(self.y[self.listened : self.excited]))
 
     @property
     def input_range(self) -> float:
@@ -99,6 +110,14 @@ class ExperimentRecord:
         rest = averaged(self.y[: self.listened], self.block)
         fast = 0.5 * float(np.mean(np.diff(rest) ** 2))
         return float(np.var(rest)) / fast if fast > 0.0 else 1.0
+
+
+def oscillation_period(switches: Sequence[int]) -> float:
+    """The period of the relay oscillation of a record, in samples, see `period`. Raises Refused, CANNOT_OSCILLATE: the
+    relay switched too rarely."""
+    if len(switches) < MIN_SWITCHES:
+        raise Refused(Reason.CANNOT_OSCILLATE, f"the relay switched {len(switches)} times; {MIN_SWITCHES} are needed")
+    return period(tuple(switches))
 
 
 def period(switches: tuple[int, ...]) -> float:

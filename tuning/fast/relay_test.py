@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, no_oscillation
+from loopwright.tuning.fast.experiment import VERIFICATION_PERIODS, Experiment
 from loopwright.tuning.fast.proposal import RelayFigures
-from loopwright.tuning.fast.record import MIN_SWITCHES, ExperimentRecord, noise_of, period
+from loopwright.tuning.fast.record import MIN_SWITCHES, ExperimentRecord, oscillation_period, period
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import (
     Command,
-    Event,
     Mode,
     Plan,
     Sample,
@@ -23,11 +21,9 @@ from loopwright.tuning.plan import (
     SetOutput,
     SetRelay,
     SetSetpoint,
-    Work,
 )
 from loopwright.tuning.reasons import Reason, Refused
 
-T = TypeVar("T")
 BIAS = 0.5
 """Ratio of the relay's lower amplitude to its higher one."""
 FIRST_AMPLITUDE = 0.5
@@ -44,13 +40,8 @@ MIN_OUTPUT_RANGE, GOOD_OUTPUT_RANGE = 25.0, 60.0
 MAX_OUTPUT_RANGE = 2.0
 """Largest range of PV under the relay, in permitted set-point steps."""
 MAX_PERIODS = 8.4
-VERIFICATION_PERIODS = 3.0
-STEP_BACK_FRACTION = 0.5
-"""Duration of the step back as a fraction of the duration of the first step."""
 MIN_MODEL_PERIOD = 0.5
 """Fraction of the relay's period below which the ultimate period of a model is not used."""
-DIVERGED = 20.0
-"""Deviation of PV, in ranges of PV under the relay, at which the step under the new gains is ended."""
 
 
 def max_amplitude(mv: float, mv_low: float, mv_high: float) -> float:
@@ -58,8 +49,8 @@ def max_amplitude(mv: float, mv_low: float, mv_high: float) -> float:
     return min(mv_high - mv, (mv - mv_low) / BIAS)
 
 
-class Experiment:
-    """The experiment of the fast procedure on one loop: its plans move the loop and extend its record.
+class RelayTest(Experiment):
+    """The relay test and the set-point step that follows it.
 
     facts, point: what is known of the loop, and the operating point at rest.
     listened: the samples at rest, with which the record begins.
@@ -68,11 +59,8 @@ class Experiment:
     """
 
     def __init__(self, facts: Facts, point: OperatingPoint, listened: Trace, amplitude: float | None) -> None:
-        self.facts, self.point, self.trace = facts, point, listened
-        self.listened = len(listened)
-        self.relayed = 0
+        super().__init__(facts, point, listened)
         self.switches: list[int] = []
-        self.noise = noise_of(np.asarray(listened.pv))
         self._max = max_amplitude(point.mv, facts.mv_low, facts.mv_high)
         if amplitude is not None and not 0.0 < amplitude <= self._max:
             raise Refused(
@@ -83,16 +71,12 @@ class Experiment:
         self._sides = [BIAS, 1.0]  # low, high, in amplitudes
         self._high = True
         self._raise_at = 0
-        self._follow_s = 0.0
-        self._steps: list[int] = []
-        self._commands: tuple[Command, ...] = ()
-        self._step = 0.0
 
     def relay_figures(self) -> RelayFigures:
         """The figures of the relay test so far."""
         record = self.experiment_record()
         return RelayFigures(
-            switches=len(record.switches),
+            switches=record.turns,
             period_s=record.period * record.Ts,
             span=record.output_range,
             noise=self.noise,
@@ -100,22 +84,13 @@ class Experiment:
             samples=len(record.y),
         )
 
-    @property
-    def stepped(self) -> tuple[float, float]:
-        """The size of the set-point step, PV units, and the time since that step, s."""
-        return self._step, self.trace.t[-1] - self.trace.t[self.relayed]
-
-    def report(self, *events: Event) -> Plan[None]:
-        """Hands events to the runner; the sample that comes back belongs to the record."""
-        self._commands = self._on_sample((yield (*self._commands, *events)))
-
     def relay(self, switches: int) -> Plan[bool]:
         """Runs the relay until it has switched this number of times; False if the time is over before that.
 
         Raises Refused: NO_RESPONSE, WRONG_SIGN, CANNOT_OSCILLATE up to the second switch, STALLED before the fourth.
         """
-        if not self.relayed:
-            self.listened = self.relayed = len(self.trace)
+        if not self.excited:
+            self.listened = self.excited = len(self.trace)
             self._commands = (self._relay_command(), SetMode(Mode.EXPERIMENT))
         while len(self.switches) < switches:
             self._commands = self._on_sample((yield self._commands))
@@ -137,7 +112,7 @@ class Experiment:
         facts, point = self.facts, self.point
         output_range = self.experiment_record().output_range
         size = min(0.5 * output_range, self.amplitude / gains.Kp, facts.sp_deviation)
-        self.relayed = len(self.trace)
+        self.excited = len(self.trace)
         self._commands = ()
         # A bumpless transfer from the relay would start the integral at the relay's output, which acts like a load
         # disturbance. The output is set to the proportional part first, so that the integral starts at rest.
@@ -147,62 +122,20 @@ class Experiment:
         self._step = size
         yield from self._follow((SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp + size)), output_range)
 
-    def step_back(self) -> Plan[None]:
-        """Steps the set-point back under the same gains and follows PV for half as long as after the first step."""
-        self._follow_s *= STEP_BACK_FRACTION
-        yield from self._follow((SetSetpoint(self.point.sp),), self.experiment_record().output_range)
-
-    def _follow(self, commands: tuple[Command, ...], output_range: float) -> Plan[None]:
-        """Follows PV after a set-point step. Raises Refused, DIVERGES."""
-        self._steps.append(len(self.trace))
-        sample = yield commands
-        self._add(sample)
-        end = sample.t + self._follow_s
-        while sample.t < end:
-            sample = yield ()
-            self._add(sample)
-            if abs(sample.pv - self.point.pv) > DIVERGED * output_range:
-                raise Refused(
-                    Reason.DIVERGES,
-                    f"PV is {sample.pv - self.point.pv:+.4g} away; the relay had moved it by {output_range:.4g}",
-                )
-
-    def computed(self, compute: Callable[[], T]) -> Plan[T]:
-        """The result of a long computation; the record goes on meanwhile."""
-        work = Work(compute)
-        self._commands = self._on_sample((yield (*self._commands, work)))
-        while not work.done:
-            self._commands = self._on_sample((yield self._commands))
-        return work.result()
-
     def experiment_record(self) -> ExperimentRecord:
-        """The record so far, as deviations from rest."""
-        trace = self.trace
-        rest = slice(0, self.listened)
+        """The record so far, as deviations from rest. Raises Refused as `ExperimentRecord` and `oscillation_period`."""
+        u, y = self._deviations()
         return ExperimentRecord(
             Ts=self.facts.sample_time_s,
-            u=np.asarray(trace.mv) - float(np.mean(trace.mv[rest])),
-            y=np.asarray(trace.pv) - float(np.mean(trace.pv[rest])),
-            direction=1.0 if self.facts.reverse else -1.0,
+            u=u,
+            y=y,
+            direction=self._direction,
             listened=self.listened,
-            relayed=self.relayed if self._stepping else len(trace),
-            switches=tuple(self.switches),
+            excited=self.excited if self._stepping else len(self.trace),
+            turns=len(self.switches),
+            period=oscillation_period(self.switches),
             steps=tuple(self._steps),
         )
-
-    def _add(self, sample: Sample) -> None:
-        """Adds a sample to the record. Missing samples before it are filled: PV interpolated, MV held."""
-        trace, Ts = self.trace, self.facts.sample_time_s
-        lost = round((sample.t - trace.t[-1]) / Ts) - 1
-        t, pv = trace.t[-1], trace.pv[-1]
-        for k in range(1, lost + 1):
-            between = pv + (sample.pv - pv) * k / (lost + 1)
-            trace.add(sample._replace(t=t + k * Ts, pv=between, mv=trace.mv[-1]))
-        trace.add(sample)
-
-    @property
-    def _stepping(self) -> bool:
-        return self.relayed > self.listened
 
     def _on_sample(self, sample: Sample) -> tuple[Command, ...]:
         """Records one sample and returns the commands that follow from it."""

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from loopwright.tuning.fast.design import controller
-from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.identification.output_error import LOG_STEP, Fit, Fitted
+from loopwright.tuning.identification.output_error import LOG_STEP, DisturbanceHypothesis, Fit, Fitted
 from loopwright.tuning.identification.sensitivity import sensitivities
 from loopwright.tuning.models import Complexes, Reals, TransferFunction, sign
 
@@ -36,10 +36,17 @@ def durbin_watson_ratio(residual: Reals) -> float:
 def fit_covariance(fit: Fit[ExperimentRecord], found: Fitted) -> Reals:
     """The covariance of theta and of the linear coefficients, in this order, shape (parameters, parameters).
 
-    The variance of the residual is multiplied by its Durbin-Watson ratio.
+    The variance of the residual is multiplied by its Durbin-Watson ratio. Under pulses of the set-point, what a drift
+    of PV and a start that was not at rest would explain tells nothing of the model.
     """
     variance = found.linear.rss / max(fit.samples - found.parameters, 1) * durbin_watson_ratio(found.linear.residual)
-    return seen_covariance(sensitivities(fit, found), variance)
+    columns = sensitivities(fit, found)
+    if fit.record.excitation is Excitation.SETPOINT:
+        other = DisturbanceHypothesis(drift=True, not_at_rest_initially=True)
+        everything = fit.regressors(found.structure, other, found.theta[None, : found.structure.searched])[0]
+        first = found.structure.inputs + 1 + found.hypothesis.drift  # the level of PV is among the columns already
+        columns = np.column_stack((columns, everything[:, first:]))
+    return seen_covariance(columns, variance)
 
 
 def seen_covariance(columns: Reals, variance: float) -> Reals:

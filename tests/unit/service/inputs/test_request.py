@@ -74,7 +74,7 @@ def test_fast_designs_for_every_form() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"method": "magic"}, "method must be one of fast, five-stage, zn-ultimate"),
+        ({"method": "magic"}, "method must be one of fast, setpoint, five-stage, zn-ultimate"),
         ({"method": "magic"}, "not 'magic'"),
         ({"method": None}, "not None"),
         ({"method": ["fast"]}, "not ['fast']"),

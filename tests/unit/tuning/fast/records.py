@@ -8,7 +8,7 @@ import numpy as np
 
 from loopwright.controller.channel import Channel, Mode, Parameters, RelaySettings, Settings
 from loopwright.plantsim.plant import LinearPlant
-from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.record import ExperimentRecord, oscillation_period
 from loopwright.tuning.models import TransferFunction, sign
 
 LISTENED = 130
@@ -72,4 +72,7 @@ def record(
         if k > LISTENED and u[-1] != u[-2]:
             switched.append(k)
         plant.step(u[-1])
-    return ExperimentRecord(bench.Ts, np.array(u), np.array(y), sign(bench.model), LISTENED, len(u), tuple(switched))
+    return ExperimentRecord(
+        bench.Ts, np.array(u), np.array(y), sign(bench.model), LISTENED, len(u), len(switched),
+        oscillation_period(switched),
+    )  # fmt: skip

@@ -11,6 +11,7 @@ from scipy.signal import lfilter
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.evaluation import evaluate
+from loopwright.tuning.fast.record import oscillation_period
 from loopwright.tuning.fast.uncertainty import peak, seen_covariance
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
@@ -79,7 +80,7 @@ def test_gains_that_came_of_another_plant_are_a_surprise() -> None:
 def test_too_few_switches_or_too_short_a_rest_are_no_evidence() -> None:
     evidence = record(FIRST)
     with pytest.raises(Refused) as refused:
-        replace(evidence, switches=evidence.switches[:3])
+        oscillation_period([130, 150, 170])
     assert refused.value.reason is Reason.CANNOT_OSCILLATE
     with pytest.raises(Refused):
         replace(evidence, listened=20)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace
-from loopwright.tuning.fast.relay_test import Experiment
+from loopwright.tuning.fast.relay_test import RelayTest
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode, Sample
 from loopwright.tuning.reasons import Reason, Refused
@@ -17,7 +17,7 @@ def test_a_PV_that_stands_still_while_MV_switches_is_refused() -> None:
     for n in range(60):
         listened.add(Sample(0.1 * n, 50.0, 50.0 + 0.01 * (-1) ** n, 50.0, Mode.AUTOMATIC))
     point = OperatingPoint(50.0, 50.0, 50.0, 0.01, 40.0)
-    relay = Experiment(facts, point, listened, None).relay(4)
+    relay = RelayTest(facts, point, listened, None).relay(4)
     next(relay)
     with pytest.raises(Refused) as refused:
         for n in range(60, 100):

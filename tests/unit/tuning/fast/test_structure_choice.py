@@ -57,7 +57,7 @@ def test_a_part_that_passes_at_once_is_found() -> None:
 @pytest.mark.parametrize("part", [0.3, 0.6])
 def test_a_step_of_the_load_in_mid_relay_is_found_within_ten_percent(bench: Bench, size: float, part: float) -> None:
     undisturbed = record(bench)
-    at = undisturbed.listened + round(part * (undisturbed.relayed - undisturbed.listened))
+    at = undisturbed.listened + round(part * (undisturbed.excited - undisturbed.listened))
     evidence = record(bench, 0.01 * undisturbed.output_range, load=size, load_at=at)
     fit = Fit(evidence)
     chosen = choose_structure(fit)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loopwright.service.jobs.relay_record import relay_record
+from loopwright.service.jobs.stored_record import stored_record
 from loopwright.tuning.fast.structure_choice import choose_structure
 from loopwright.tuning.identification.output_error import Fit
 from loopwright.tuning.plan import Event, Mode, Sample, StageStarted
@@ -52,12 +52,12 @@ def test_the_same_model_comes_out_of_it_again(
     job: tuple[dict[str, Any], dict[str, list[Any]]], lost: tuple[int, ...]
 ) -> None:
     answer, columns = job
-    record = relay_record(without(columns, set(lost)))
+    record = stored_record(without(columns, set(lost)))
     assert record is not None and len(record.t) == len(columns["t_s"])
     assert record.Ts == pytest.approx(0.1) and record.t[record.listened] == 0.0
     evidence = record.experiment_record()
     assert evidence is not None
-    assert len(evidence.switches) == answer["evidence"]["switches"]
+    assert evidence.turns == answer["evidence"]["switches"]
     assert evidence.direction == -1.0  # the plant's gain is negative
     fit = Fit(evidence)
     model = fit.model(choose_structure(fit).best)
@@ -72,7 +72,7 @@ def test_the_last_attempt_counts(job: tuple[dict[str, Any], dict[str, list[Any]]
     later = cut["t_s"][-1] + 0.1
     both = {name: cut[name] + values for name, values in columns.items() if name != "t_s"}
     both["t_s"] = cut["t_s"] + [t + later for t in columns["t_s"]]
-    again, once = relay_record(both), relay_record(columns)
+    again, once = stored_record(both), stored_record(columns)
     assert again is not None and once is not None
     assert again.switches == once.switches and np.array_equal(again.pv, once.pv)
 
@@ -86,7 +86,7 @@ def test_the_last_look_at_the_loop_counts(job: tuple[dict[str, Any], dict[str, l
     both = {name: 2 * looked[name] + values for name, values in columns.items()}
     both["stage"][len(first) : 2 * len(first)] = len(first) * ["settle"]
     both["t_s"] = [0.1 * i for i in range(len(both["t_s"]))]
-    again, once = relay_record(both), relay_record(columns)
+    again, once = stored_record(both), stored_record(columns)
     assert again is not None and once is not None
     assert again.listened == once.listened and np.array_equal(again.pv, once.pv)
 
@@ -94,8 +94,8 @@ def test_the_last_look_at_the_loop_counts(job: tuple[dict[str, Any], dict[str, l
 def test_no_relay_no_record(job: tuple[dict[str, Any], dict[str, list[Any]]]) -> None:
     columns = job[1]
     quiet = [i for i, mode in enumerate(columns["mode"]) if mode != Mode.EXPERIMENT]
-    assert relay_record({name: [values[i] for i in quiet] for name, values in columns.items()}) is None
-    assert relay_record({name: [] for name in columns}) is None
+    assert stored_record({name: [values[i] for i in quiet] for name, values in columns.items()}) is None
+    assert stored_record({name: [] for name in columns}) is None
     first = columns["mode"].index(Mode.EXPERIMENT)
-    begun = relay_record({name: values[: first + 5] for name, values in columns.items()})
+    begun = stored_record({name: values[: first + 5] for name, values in columns.items()})
     assert begun is not None and begun.experiment_record() is None

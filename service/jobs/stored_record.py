@@ -1,0 +1,119 @@
+"""The record of a job of fast or setpoint, rebuilt from its stored samples: for another Ms, or for a plot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopwright.tuning.fast.record import MIN_LISTENED, MIN_SWITCHES, Excitation, ExperimentRecord, oscillation_period
+from loopwright.tuning.fast.record_evaluation import first_period
+from loopwright.tuning.models import Reals
+from loopwright.tuning.plan import Mode
+
+MIN_TURNS = 2
+"""Smallest number of turns of the set-point for a fit."""
+Columns = Mapping[str, Sequence[Any] | Reals]
+"""Columns by their names in GET /jobs/{id}/samples."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredRecord:
+    """The samples of the last attempt of a job.
+
+    Ts: the sample time, s.
+    t: time since the relay or the pulses began, s.
+    sp, pv, mv: as recorded, in PV and MV units.
+    listened, excited: number of samples before the relay or the pulses, and up to their end.
+    switches: the samples at which the relay switched, or the set-point turned.
+    excitation: what moved the loop.
+    """
+
+    Ts: float
+    t: Reals
+    sp: Reals
+    pv: Reals
+    mv: Reals
+    listened: int
+    excited: int
+    switches: tuple[int, ...]
+    excitation: Excitation
+
+    @property
+    def rest(self) -> tuple[float, float]:
+        """Returns MV and PV at rest."""
+        return float(np.mean(self.mv[: self.listened])), float(np.mean(self.pv[: self.listened]))
+
+    def experiment_record(self) -> ExperimentRecord | None:
+        """Returns the record for a fit; None where the relay has not switched often enough."""
+        relay = self.excitation is Excitation.RELAY
+        if len(self.switches) < (MIN_SWITCHES if relay else MIN_TURNS) or self.listened < MIN_LISTENED:
+            return None
+        mv, pv = self.rest
+        u, y = self.mv - mv, self.pv - pv
+        excited = slice(self.listened, self.excited)
+        return ExperimentRecord(
+            Ts=self.Ts,
+            u=u,
+            y=y,
+            # both begin high, and turn after PV has moved in the direction in which MV drives it
+            direction=1.0 if (y[self.switches[0]] > 0.0) == (relay or self._rises_with_setpoint) else -1.0,
+            listened=self.listened,
+            excited=self.excited,
+            turns=len(self.switches),
+            period=oscillation_period(self.switches) if relay else first_period(u[excited], y[excited], self.Ts),
+            steps=tuple(int(i) for i in self.excited + np.flatnonzero(np.diff(self.sp[self.excited - 1 :]))),
+            excitation=self.excitation,
+        )
+
+    @property
+    def _rises_with_setpoint(self) -> bool:
+        """Whether MV has risen with the first move of the set-point."""
+        mv, _ = self.rest
+        return bool(np.mean(self.mv[self.listened : self.switches[0]]) > mv)
+
+
+def stored_record(columns: Columns) -> StoredRecord | None:
+    """Returns the record of these columns; None where neither a relay nor pulses of the set-point were run."""
+    stages = columns["stage"]
+    first = max(
+        (i for i, name in enumerate(stages) if name == "preflight" and stages[max(i - 1, 0)] != name), default=0
+    )
+    t, sp, pv, mv, mode = (np.asarray(columns[name][first:], dtype=float) for name in ("t_s", "sp", "pv", "mv", "mode"))
+    stage = np.asarray(stages[first:], dtype=str)
+    relay = bool(np.any(mode == Mode.EXPERIMENT))
+    if len(t) < 2 or not (relay or np.any(np.diff(sp[stage == "pulses"]))):
+        return None
+    Ts = float(np.median(np.diff(t)))
+    # missing samples are filled: PV interpolated, the rest held
+    number = np.round((t - t[0]) / Ts).astype(np.int64)
+    whole = np.arange(number[-1] + 1)
+    before = np.searchsorted(number, whole, side="right") - 1
+    pv = np.interp(whole, number, pv)
+    sp, mv, mode, stage = sp[before], mv[before], mode[before], stage[before]
+    listened, excited, switches = _of_relay(mv, mode) if relay else _of_pulses(sp, stage)
+    excitation = Excitation.RELAY if relay else Excitation.SETPOINT
+    return StoredRecord(Ts, (whole - listened) * Ts, sp, pv, mv, listened, excited, switches, excitation)
+
+
+Parts = tuple[int, int, tuple[int, ...]]
+"""The number of samples at rest, that up to the end of the excitation, and the samples of its turns."""
+
+
+def _of_relay(mv: Reals, mode: Reals) -> Parts:
+    listened = int(np.argmax(mode == Mode.EXPERIMENT))
+    after = np.flatnonzero(mode[listened:] != Mode.EXPERIMENT)
+    excited = listened + int(after[0]) if len(after) else len(mode)
+    # the relay begins high
+    high = np.append(True, mv[listened:excited] > np.mean(mv[: max(listened, 1)]))
+    return listened, excited, tuple(int(i) + listened for i in np.flatnonzero(high[1:] != high[:-1]))
+
+
+def _of_pulses(sp: Reals, stage: NDArray[np.str_]) -> Parts:
+    moved = 1 + np.flatnonzero(np.diff(sp))
+    verified = [int(i) for i in moved if stage[i] == "verify"]
+    excited = verified[0] if verified else len(sp)
+    return int(moved[0]), excited, tuple(int(i) for i in moved[1:] if i < excited)

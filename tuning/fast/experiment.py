@@ -1,0 +1,108 @@
+"""What the tests of the fast procedure share: the record that goes on sample by sample, and steps of the set-point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+
+from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace
+from loopwright.tuning.fast.record import ExperimentRecord, noise_of
+from loopwright.tuning.models import Reals
+from loopwright.tuning.plan import Command, Event, Plan, Sample, SetSetpoint, Work
+from loopwright.tuning.reasons import Reason, Refused
+
+T = TypeVar("T")
+VERIFICATION_PERIODS = 3.0
+STEP_BACK_FRACTION = 0.5
+"""Duration of the step back as a fraction of the duration of the first step."""
+DIVERGED = 20.0
+"""Deviation of PV, in ranges of PV under the excitation, at which the step under the new gains is ended."""
+
+
+class Experiment:
+    """The experiment of the fast procedure on one loop: its plans move the loop and extend its record.
+
+    facts, point: what is known of the loop, and the operating point at rest.
+    listened: the samples at rest, with which the record begins.
+    """
+
+    def __init__(self, facts: Facts, point: OperatingPoint, listened: Trace) -> None:
+        self.facts, self.point, self.trace = facts, point, listened
+        self.listened = len(listened)
+        self.excited = 0
+        self.noise = noise_of(np.asarray(listened.pv))
+        self._follow_s = 0.0
+        self._steps: list[int] = []
+        self._commands: tuple[Command, ...] = ()
+        self._step = 0.0
+
+    @property
+    def stepped(self) -> tuple[float, float]:
+        """The size of the set-point step, PV units, and the time since that step, s."""
+        return self._step, self.trace.t[-1] - self.trace.t[self.excited]
+
+    def report(self, *events: Event) -> Plan[None]:
+        """Hands events to the runner; the sample that comes back belongs to the record."""
+        self._commands = self._on_sample((yield (*self._commands, *events)))
+
+    def computed(self, compute: Callable[[], T]) -> Plan[T]:
+        """The result of a long computation; the record goes on meanwhile."""
+        work = Work(compute)
+        self._commands = self._on_sample((yield (*self._commands, work)))
+        while not work.done:
+            self._commands = self._on_sample((yield self._commands))
+        return work.result()
+
+    def step_back(self) -> Plan[None]:
+        """Steps the set-point back under the same gains and follows PV for half as long as after the first step."""
+        self._follow_s *= STEP_BACK_FRACTION
+        yield from self._follow((SetSetpoint(self.point.sp),), self.experiment_record().output_range)
+
+    def experiment_record(self) -> ExperimentRecord:
+        """The record so far, as deviations from rest."""
+        raise NotImplementedError
+
+    def _deviations(self) -> tuple[Reals, Reals]:
+        """MV and PV of the record as deviations from their means at rest."""
+        rest = slice(0, self.listened)
+        mv, pv = np.asarray(self.trace.mv), np.asarray(self.trace.pv)
+        return mv - float(np.mean(mv[rest])), pv - float(np.mean(pv[rest]))
+
+    @property
+    def _direction(self) -> float:
+        return 1.0 if self.facts.reverse else -1.0
+
+    @property
+    def _stepping(self) -> bool:
+        return self.excited > self.listened
+
+    def _follow(self, commands: tuple[Command, ...], output_range: float) -> Plan[None]:
+        """Follows PV after a set-point step. Raises Refused, DIVERGES."""
+        self._steps.append(len(self.trace))
+        sample = yield commands
+        self._add(sample)
+        end = sample.t + self._follow_s
+        while sample.t < end:
+            sample = yield ()
+            self._add(sample)
+            if abs(sample.pv - self.point.pv) > DIVERGED * output_range:
+                raise Refused(
+                    Reason.DIVERGES,
+                    f"PV is {sample.pv - self.point.pv:+.4g} away; the test had moved it by {output_range:.4g}",
+                )
+
+    def _add(self, sample: Sample) -> None:
+        """Adds a sample to the record. Missing samples before it are filled: PV interpolated, MV held."""
+        trace, Ts = self.trace, self.facts.sample_time_s
+        lost = round((sample.t - trace.t[-1]) / Ts) - 1
+        t, pv = trace.t[-1], trace.pv[-1]
+        for k in range(1, lost + 1):
+            between = pv + (sample.pv - pv) * k / (lost + 1)
+            trace.add(sample._replace(t=t + k * Ts, pv=between, mv=trace.mv[-1]))
+        trace.add(sample)
+
+    def _on_sample(self, sample: Sample) -> tuple[Command, ...]:
+        """Records one sample and returns the commands that follow from it."""
+        raise NotImplementedError

@@ -1,0 +1,32 @@
+"""The options that the procedures with a designed controller share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from loopwright.tuning.fast.design import DesignSpec
+
+
+@dataclass(frozen=True, slots=True)
+class DesignOptions:
+    """The design specification that is asked for, and what is done with the new gains.
+
+    Ms, derivative, Mt, noise_gain: see `tuning.fast.design.DesignSpec`.
+    verify: the set-point step under the new gains is made.
+    propose_anyway: the procedure goes on where the new gains improve nothing that was asked for.
+    Raises Refused, BAD_INPUT.
+    """
+
+    Ms: float = 1.6
+    derivative: bool = False
+    Mt: float | None = None
+    noise_gain: float | None = None
+    verify: bool = True
+    propose_anyway: bool = False
+
+    def spec(self) -> DesignSpec:
+        """The design specification of these options. Raises Refused, BAD_INPUT."""
+        return DesignSpec(self.Ms, self.derivative, self.Mt, self.noise_gain)
+
+    def __post_init__(self) -> None:
+        self.spec()

@@ -1,0 +1,84 @@
+"""The evaluation of the records of either excitation.
+
+The relay's record has a time scale, the period of the oscillation. The time scale of pulses of the set-point is found
+with the model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from loopwright.tuning.analysis.margins import ultimate_point
+from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.evaluation import Evaluation, evaluate
+from loopwright.tuning.fast.record import Excitation, ExperimentRecord
+from loopwright.tuning.identification.output_error import UNDISTURBED
+from loopwright.tuning.identification.problem import IdentificationProblem
+from loopwright.tuning.identification.record import recorded_test
+from loopwright.tuning.identification.structures import SECOND
+from loopwright.tuning.models import Reals, TransferFunction, time_constants
+from loopwright.tuning.reasons import Ended, Refused
+
+PERIOD_IS_RIGHT = (0.6, 1.25)
+"""Ratio of the model's own ultimate period to the time scale of the fit outside which the record is fitted again."""
+MAX_REFITS = 2
+AS_GOOD = 1.03
+"""Largest ratio of the residual of a fit with another time scale to the residual of the fit before it."""
+MIN_PERIOD = 8.0
+"""Shortest time scale of a record, in samples; the longest is the record."""
+
+
+def evaluate_excitation(record: ExperimentRecord, spec: DesignSpec) -> Evaluation:
+    """Evaluates the record of an excitation without the steps that follow it. Raises Refused as `evaluate`.
+
+    Under pulses of the set-point the time scale of the record is found first, and found again where the model's own
+    ultimate period is another one.
+    """
+    if record.excitation is Excitation.RELAY:
+        return evaluate(record, spec)
+    pulses = slice(record.listened, record.excited)
+    first = first_period(record.u[pulses], record.y[pulses], record.Ts)
+    found = evaluate(replace(record, period=first), spec)
+    for _ in range(MAX_REFITS):
+        own = found.period / record.Ts
+        low, high = PERIOD_IS_RIGHT
+        if low <= own / found.fit.period <= high:
+            break
+        try:
+            again = evaluate(replace(record, period=own), spec)
+        except Refused:
+            break
+        if again.residual > AS_GOOD * found.residual:
+            break
+        found = again
+    return found
+
+
+def evaluate_again(record: ExperimentRecord, spec: DesignSpec) -> Evaluation:
+    """Evaluates a whole record as the procedure does: the part of the excitation first, then all of it.
+
+    Raises Refused, NOT_ROBUST.
+    """
+    if not record.steps:
+        return evaluate_excitation(record, spec)
+    until = slice(record.excited)
+    first = evaluate_excitation(replace(record, u=record.u[until], y=record.y[until], steps=()), spec)
+    return evaluate(replace(record, period=first.fit.period), spec, first)
+
+
+def first_period(u: Reals, y: Reals, Ts: float) -> float:
+    """The ultimate period, in samples, of two lags fitted to a record without any idea of its time scale.
+
+    u, y: MV and PV as deviations from rest, shape (N,). Ts: the sample time, s.
+    Where the model has no ultimate point its dead time and lags give the time scale. Raises Refused as `recorded_test`.
+    """
+    problem = IdentificationProblem(recorded_test(Ts * np.arange(len(u)), u, y, 0.0))
+    model = problem.model(problem.fit(SECOND, UNDISTURBED))
+    plant = TransferFunction(model.num, model.den, model.L + 0.5 * Ts)
+    try:
+        found = ultimate_point(plant)[1] / Ts
+    except Ended:
+        found = 4.0 * (plant.L + float(np.min(time_constants(plant), initial=0.0))) / Ts
+    return min(max(found, MIN_PERIOD), float(len(u)))

@@ -1,0 +1,165 @@
+"""The set-point procedure is one plan made of smaller plans; the loop stays in automatic all the time.
+
+    listen - pulses of the set-point under the present gains - fit and design - set-point step home under the new gains
+
+The pulses end when the gains that would be proposed are certain enough: see `_settled`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+from loopwright.tuning.analysis.comparison import Comparison
+from loopwright.tuning.experiments.preflight import at_rest
+from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.fast.design import frequencies
+from loopwright.tuning.fast.evaluation import Evaluation
+from loopwright.tuning.fast.options import DesignOptions
+from loopwright.tuning.fast.outcome import OPEN_REASONS, evaluated
+from loopwright.tuning.fast.proposal import (
+    FastProposal,
+    VerifiedStep,
+    evaluation_summary,
+    proposed,
+    verified_step,
+)
+from loopwright.tuning.fast.pulse_test import PulseTest
+from loopwright.tuning.fast.record import MIN_LISTENED, ExperimentRecord
+from loopwright.tuning.fast.record_evaluation import first_period
+from loopwright.tuning.fast.uncertainty import peak
+from loopwright.tuning.plan import Note, Plan, StageDone, StageStarted
+from loopwright.tuning.reasons import Reason, Refused
+
+__all__ = ["SETPOINT", "SETPOINT_STAGES", "setpoint"]
+
+SETPOINT = "setpoint"
+SETPOINT_STAGES = ("preflight", "pulses", "design", "verify", "redesign")
+MIN_SAMPLES = 2 * MIN_LISTENED
+FIRST_LOOK = 1.5
+"""Length of the record at the first look, in first periods."""
+NEXT_LOOK, NEXT_LOOK_PERIODS = 1.25, 0.35
+"""Growth of the record from one look to the next: this factor, and this number of periods more."""
+MIN_OWN_PERIODS = 2.0
+"""Smallest length of the record, in ultimate periods of its own model."""
+MAX_DISAGREEMENT = 0.08
+"""Largest difference of Ms from the Ms asked for, of the gains of two successive looks on each other's model."""
+MAX_PERIODS, MAX_T95, MAX_TURNS = 12.0, 1.5, 2.5
+"""Longest record: the longest of these numbers of ultimate periods, of T95, and of the time of the first two turns."""
+MAX_PERIODS_IN_ALL = 30.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """One look at the record.
+
+    period: the time scale of the fit, in samples.
+    evaluation: the evaluation, None where the record could not be evaluated.
+    outcome: the refusal that follows from the look, or the comparison of old and new gains.
+    """
+
+    period: float
+    evaluation: Evaluation | None
+    outcome: Refused | Comparison
+
+
+def setpoint_stages(verify: bool) -> tuple[str, ...]:
+    """The stages of a run with or without the set-point step, in their order."""
+    return SETPOINT_STAGES if verify else SETPOINT_STAGES[:3]
+
+
+def setpoint(facts: Facts, options: DesignOptions) -> Plan[FastProposal]:
+    """The plan of the whole procedure, for a loop in automatic and at rest.
+
+    Raises Refused. The plan restores nothing: the runner restores the loop.
+    """
+    T95, spec = facts.T95_s, options.spec()
+    expected = {"preflight": T95 / 2, "pulses": T95, "design": 0.0, "verify": 1.5 * T95, "redesign": 0.0}
+    todo = setpoint_stages(options.verify)
+
+    def started(stage: str) -> tuple[StageStarted]:
+        after = todo[todo.index(stage) + 1 :]
+        return (StageStarted(stage, expected[stage], sum(expected[s] for s in after)),)
+
+    point, listened = yield from at_rest(facts, sum(expected[stage] for stage in todo[1:]), MIN_SAMPLES)
+    test = PulseTest(facts, point, listened)
+    yield from test.report(StageDone("preflight", point), *started("pulses"))
+    yield from test.start()
+    yield from test.until_turned(2)
+    test.period = yield from test.computed(partial(first_period, *test.columns(), facts.sample_time_s))
+    look = Look(test.period, None, Refused(Reason.STALLED, "the pulses came to nothing"))
+    turned_at = test.elapsed
+    at = FIRST_LOOK * test.period
+    while True:
+        yield from test.lasting(at)
+        looked_at = test.elapsed
+        record = test.experiment_record()
+        last, look = look, (yield from test.computed(partial(_look, facts, options, record)))
+        test.period = look.period
+        if _settled(look, last, looked_at, options.Ms):
+            break
+        own = look.period
+        longest = min(
+            max(MAX_PERIODS * own, MAX_T95 * facts.T95_s / facts.sample_time_s, MAX_TURNS * turned_at),
+            max(MAX_PERIODS_IN_ALL * own, turned_at),
+        )
+        if looked_at >= longest:
+            break
+        if isinstance(look.outcome, Refused):
+            yield from test.report(Note(f"after {looked_at} samples: {look.outcome.detail}"))
+        at = min(NEXT_LOOK * looked_at + NEXT_LOOK_PERIODS * own, longest)
+    evaluation, outcome = look.evaluation, look.outcome
+    yield from test.report(StageDone("pulses", test.figures()), *started("design"))
+    if evaluation is not None:
+        yield from test.report(StageDone("design", evaluation_summary(evaluation)))
+    if isinstance(outcome, Refused):
+        raise outcome
+    assert evaluation is not None
+
+    shown: VerifiedStep | None = None
+    if options.verify and (outcome.gain or options.propose_anyway):
+        yield from test.report(*started("verify"))
+        first = evaluation
+        tested = first.best.gains
+        yield from test.step(tested, first.period)
+        evaluation, outcome = yield from test.computed(
+            partial(evaluated, facts, options, test.experiment_record(), first)
+        )
+        shown = verified_step(evaluation, tested, *test.stepped)
+        if isinstance(outcome, Refused) and outcome.reason in OPEN_REASONS:
+            yield from test.report(Note(f"after the set-point step: {outcome.detail}; it is stepped again"))
+            yield from test.step_again()
+            evaluation, outcome = yield from test.computed(
+                partial(evaluated, facts, options, test.experiment_record(), first)
+            )
+            shown = verified_step(evaluation, tested, *test.stepped)
+        yield (StageDone("verify", shown), *started("redesign"), StageDone("redesign", evaluation_summary(evaluation)))
+        if isinstance(outcome, Refused):
+            raise outcome
+    begun_at_s = test.trace.t[test.listened]
+    return (yield from test.computed(partial(proposed, SETPOINT, facts, spec, evaluation, outcome, shown, begun_at_s)))
+
+
+def _settled(look: Look, last: Look, samples: int, asked: float) -> bool:
+    """Whether the pulses may end: the look has no objection, the record is long enough for its own model, and this
+    look and the one before agree on each other's gains."""
+    now, before = look.evaluation, last.evaluation
+    if now is None or before is None or isinstance(look.outcome, Refused):
+        return False
+    if samples < MIN_OWN_PERIODS * now.period / now.fit.record.Ts:
+        return False
+    w = frequencies(now.period)
+    delay = now.design_delay
+    return all(
+        abs(peak(model.model, gains.best.gains, w, delay) - asked) <= MAX_DISAGREEMENT
+        for model, gains in ((now, before), (before, now))
+    )
+
+
+def _look(facts: Facts, options: DesignOptions, record: ExperimentRecord) -> Look:
+    """One look at the record so far."""
+    try:
+        evaluation, outcome = evaluated(facts, options, record)
+    except Refused as refused:
+        return Look(record.period, None, refused)
+    return Look(evaluation.fit.period, evaluation, outcome)
