@@ -17,6 +17,8 @@ from loopwright.tuning.models import Complexes, Reals, TransferFunction, sign
 NEAR_THE_PEAK = 0.7
 """Smallest |S| at which a model error is counted: where the sensitivity S is smaller, an error does not raise Ms."""
 STANDARD_DEVIATIONS = 2.0
+LOG_RATE_KNOWN = 3.0
+"""Standard deviation of the logarithm of a rate before the record is seen."""
 UNSEEN = 1e-7
 """Singular value, of columns of unit length, below which the record does not show a direction of the parameters."""
 MIN_DISTANCE = 0.05
@@ -46,7 +48,20 @@ def fit_covariance(fit: Fit[ExperimentRecord], found: Fitted) -> Reals:
         everything = fit.regressors(found.structure, other, found.theta[None, : found.structure.searched])[0]
         first = found.structure.inputs + 1 + found.hypothesis.drift  # the level of PV is among the columns already
         columns = np.column_stack((columns, everything[:, first:]))
+        columns = np.vstack((columns, math.sqrt(variance) * _known_before(fit, found, columns.shape[1])))
     return seen_covariance(columns, variance)
+
+
+def _known_before(fit: Fit[ExperimentRecord], found: Fitted, parameters: int) -> Reals:
+    """What is known of theta without the record, as rows of sensitivities in standard deviations, shape (searched,
+    parameters): a rate is known to a factor, a dead time to the longest one that is searched.
+
+    A rate beyond the sampling and the dead time can replace each other without a trace in the record. Without these
+    rows such a direction would be so long that its linear approximation has no meaning.
+    """
+    structure = found.structure
+    size = np.append(np.full(structure.lags, LOG_RATE_KNOWN), fit.record.max_dead_time)
+    return np.asarray(np.eye(structure.searched, parameters) / size[:, None])
 
 
 def seen_covariance(columns: Reals, variance: float) -> Reals:
