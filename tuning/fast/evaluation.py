@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 from loopwright.tuning.fast.design import DesignSpec, GainDesign, OptimalGains
+from loopwright.tuning.fast.linearity import find_nonlinearity, unknown_difference
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.fast.structure_choice import StructureChoice, choose_structure
 from loopwright.tuning.fast.uncertainty import difference_of_rivals, durbin_watson_ratio, peak, uncertainty_of_Ms
@@ -23,6 +24,9 @@ MAX_ROUNDED = 1.25
 """Residual, in average rounding errors, below which slow variations are accepted: rounding errors are not white."""
 MAX_UNCERTAINTY = {Excitation.RELAY: 0.10, Excitation.SETPOINT: 0.06}
 """Largest accepted uncertainty of Ms, by the delta method and among rival models."""
+MAX_DIFFERENCE = 0.25
+"""Largest difference of the gain above and below rest that the record of pulses may leave open, a fraction of the
+gain."""
 MAX_MODEL_MISMATCH, MAX_MODEL_MISMATCH_OF_TWO_LOADS = 0.5, 0.2
 """Largest accepted difference of Ms from the Ms asked for, of the tested gains on the new model and of the new gains on
 the earlier model; the second value holds where the model has two load disturbances."""
@@ -106,6 +110,11 @@ def evaluate(record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | N
     elif rivals > max_uncertainty:
         reason = Reason.AMBIGUOUS
         detail = f"another model that explains the record as well gives an Ms off by {rivals:.2g}"
+    elif record.excitation is Excitation.SETPOINT and (shown := find_nonlinearity(fit, found)) is not None:
+        reason, detail = Reason.UNEXPLAINED, f"{shown.what}, +-{2.0 * shown.deviation:.2g}"
+    elif record.excitation is Excitation.SETPOINT and (unknown := unknown_difference(fit, found)) > MAX_DIFFERENCE:
+        reason = Reason.UNCERTAIN
+        detail = f"the gain above and below the operating point may differ by {100.0 * unknown:.0f} %"
     elif earlier is not None:
         reason, detail = _model_mismatch(earlier, model, best.gains, spec, design, found.hypothesis.load_disturbances)
         if reason is None and (fault := find_valve_fault(fit, found)) is not None:

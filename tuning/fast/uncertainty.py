@@ -42,14 +42,22 @@ def fit_covariance(fit: Fit[ExperimentRecord], found: Fitted) -> Reals:
     of PV and a start that was not at rest would explain tells nothing of the model.
     """
     variance = found.linear.rss / max(fit.samples - found.parameters, 1) * durbin_watson_ratio(found.linear.residual)
-    columns = sensitivities(fit, found)
-    if fit.record.excitation is Excitation.SETPOINT:
-        other = DisturbanceHypothesis(drift=True, not_at_rest_initially=True)
-        everything = fit.regressors(found.structure, other, found.theta[None, : found.structure.searched])[0]
-        first = found.structure.inputs + 1 + found.hypothesis.drift  # the level of PV is among the columns already
-        columns = np.column_stack((columns, everything[:, first:]))
-        columns = np.vstack((columns, math.sqrt(variance) * _known_before(fit, found, columns.shape[1])))
-    return seen_covariance(columns, variance)
+    if fit.record.excitation is Excitation.RELAY:
+        return seen_covariance(sensitivities(fit, found), variance)
+    columns = unknown_columns(fit, found)
+    known = math.sqrt(variance) * _known_before(fit, found, columns.shape[1])
+    return seen_covariance(np.vstack((columns, known)), variance)
+
+
+def unknown_columns(fit: Fit[ExperimentRecord], found: Fitted) -> Reals:
+    """The sensitivities of PV to everything that the fit does not know beforehand, shape (rows, parameters and more).
+
+    A drift of PV and a start that was not at rest follow after theta and the linear coefficients.
+    """
+    other = DisturbanceHypothesis(drift=True, not_at_rest_initially=True)
+    everything = fit.regressors(found.structure, other, found.theta[None, : found.structure.searched])[0]
+    first = found.structure.inputs + 1 + found.hypothesis.drift  # the level of PV is among the columns already
+    return np.column_stack((sensitivities(fit, found), everything[:, first:]))
 
 
 def _known_before(fit: Fit[ExperimentRecord], found: Fitted, parameters: int) -> Reals:

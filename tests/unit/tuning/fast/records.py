@@ -8,7 +8,8 @@ import numpy as np
 
 from loopwright.controller.channel import Channel, Mode, Parameters, RelaySettings, Settings
 from loopwright.plantsim.plant import LinearPlant
-from loopwright.tuning.fast.record import ExperimentRecord, oscillation_period
+from loopwright.tuning.analysis.margins import ultimate_point
+from loopwright.tuning.fast.record import Excitation, ExperimentRecord, oscillation_period
 from loopwright.tuning.models import TransferFunction, sign
 
 LISTENED = 130
@@ -75,4 +76,28 @@ def record(
     return ExperimentRecord(
         bench.Ts, np.array(u), np.array(y), sign(bench.model), LISTENED, len(u), len(switched),
         oscillation_period(switched),
+    )  # fmt: skip
+
+
+def pulse_record(
+    bench: Bench, Kp: float, Ti: float, noise: float, below: float = 1.0, seed: int = 1
+) -> ExperimentRecord:
+    """Pulses of the set-point by 1 up, down and up, turned after 0.7 and 1.7 ultimate periods, over three periods.
+
+    below: the plant's gain below rest, as a part of that above.
+    """
+    plant = LinearPlant(bench.num, bench.den, bench.L, bench.Ts, noise_std=noise, seed=seed)
+    channel = Channel(bench.Ts, Settings(-50.0, 50.0, 0.0), Parameters(Kp, Ti), 0.0, Mode.AUTOMATIC)
+    period = ultimate_point(bench.model)[1] / bench.Ts
+    u, y = [], []
+    for k in range(LISTENED + round(3.0 * period)):
+        channel.setpoint = 0.0 if k < LISTENED else -1.0 if 0.7 < (k - LISTENED) / period < 1.7 else 1.0
+        y.append(plant.pv)
+        u.append(channel.step(y[-1]))
+        plant.step(u[-1] if u[-1] > 0.0 else below * u[-1])
+    at, pv = np.array(u), np.array(y)
+    rest = slice(LISTENED)
+    return ExperimentRecord(
+        bench.Ts, at - at[rest].mean(), pv - pv[rest].mean(), 1.0, LISTENED, len(u), 2,
+        period, (), Excitation.SETPOINT,
     )  # fmt: skip

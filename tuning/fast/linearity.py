@@ -1,0 +1,101 @@
+"""Score tests of a plant that is not linear: one whose gain differs above and below rest, or changes with MV.
+
+After a fit, the fitted model is driven with a changed input. What the parameters, the load disturbances, a drift and a
+start that was not at rest could explain is projected out of that response and of the residual; the regression of the
+residual on the response gives the size of the alternative and its standard deviation, without a new fit. Source: the
+Lagrange multiplier test, C. R. Rao, Proc. Cambridge Phil. Soc. 44, 1948.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.uncertainty import durbin_watson_ratio, unknown_columns
+from loopwright.tuning.identification.output_error import UNDISTURBED, Fit, Fitted
+from loopwright.tuning.models import Reals
+
+STANDARD_DEVIATIONS = 4.0
+"""Size of an alternative, in its standard deviations, above which it is told."""
+NEGLIGIBLE_DIRECTION = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Nonlinearity:
+    """An alternative to the linear plant that the record shows.
+
+    what: the alternative in words, with its size.
+    size: its size, a fraction of the plant's gain.
+    deviation: the standard deviation of the size.
+    """
+
+    what: str
+    size: float
+    deviation: float
+
+
+def above_rest(u: Reals) -> Reals:
+    """MV above rest alone. u: MV as a deviation from rest, shape (N,)."""
+    return np.maximum(u, 0.0)
+
+
+def squared(u: Reals) -> Reals:
+    """The square of MV. u: MV as a deviation from rest, in its largest deviation, shape (N,)."""
+    return np.square(u)
+
+
+def find_nonlinearity(fit: Fit[ExperimentRecord], found: Fitted) -> Nonlinearity | None:
+    """The clearest alternative to a linear plant, None where the record shows none of a size that matters for Ms."""
+    shown = []
+    for changed, minimum, words in ALTERNATIVES:
+        size, deviation = score(fit, found, changed)
+        if abs(size) > max(minimum, STANDARD_DEVIATIONS * deviation):
+            shown.append(Nonlinearity(words(size), size, deviation))
+    return max(shown, key=lambda each: abs(each.size) / each.deviation, default=None)
+
+
+def unknown_difference(fit: Fit[ExperimentRecord], found: Fitted) -> float:
+    """By how much the gain may differ above and below rest without a trace in the record, as a fraction of the gain:
+    two standard deviations. Load disturbances in the model can stand for such a difference."""
+    return 2.0 * score(fit, found, above_rest)[1]
+
+
+def score(fit: Fit[ExperimentRecord], found: Fitted, changed: Callable[[Reals], Reals]) -> tuple[float, float]:
+    """The size of an alternative, as a fraction of the plant's gain, and its standard deviation.
+
+    changed: the further input of the alternative, from MV in its largest deviation; the size multiplies it.
+    """
+    structure, inputs = found.structure, found.structure.inputs
+    further = Fit(replace(fit.record, u=fit.record.input_range * changed(fit.u)))
+    # a record's input range is its own: the scale of MV must stay that of the fit
+    scale = further.record.input_range / fit.record.input_range
+    columns = further.regressors(structure, UNDISTURBED, found.theta[None, : structure.searched])[0]
+    response = scale * (columns[:, :inputs] @ found.linear.coefficients[:inputs])
+    known = unknown_columns(fit, found)
+    lengths = np.linalg.norm(known, axis=0)
+    basis, singular, _ = np.linalg.svd(known[:, lengths > 0.0] / lengths[lengths > 0.0], full_matrices=False)
+    basis = basis[:, singular > NEGLIGIBLE_DIRECTION * singular[0]]
+    response = response - basis @ (basis.T @ response)
+    residual = found.linear.residual
+    left = residual - basis @ (basis.T @ residual)
+    power = float(response @ response)
+    if power <= 0.0:
+        return 0.0, math.inf
+    variance = found.linear.rss / max(fit.samples - found.parameters, 1) * durbin_watson_ratio(residual)
+    return float(response @ left) / power, math.sqrt(variance / power)
+
+
+def _sides(size: float) -> str:
+    return f"the plant's gain above the operating point is {1.0 + size:.2g} times that below"
+
+
+def _curve(size: float) -> str:
+    return f"the plant's gain changes by {200.0 * size:+.0f} % from the operating point to the largest MV"
+
+
+ALTERNATIVES = ((above_rest, 0.05, _sides), (squared, 0.03, _curve))
+"""The further input of each alternative, the smallest size that matters, and the alternative in words."""
