@@ -1,8 +1,8 @@
 """Rows of the history of a loop: bins of consecutive samples with the extremes and means of PV and MV. Pure.
 
-A sample is a bin of one. Times are wall time, seconds since 1970 UTC. What is not known is NaN, in `mode` UNKNOWN_MODE
-and in `gains` 0; `gains` otherwise counts the sets of gains that come with the rows, from 1. A bin knows set-point, mode
-and gains only where all its samples do, and then has those of the last sample.
+A sample is a bin of one. Times are wall time, seconds since 1970 UTC. What is not known is NaN, in `mode` UNKNOWN_MODE,
+and in `gains` 0; `gains` otherwise counts the sets of gains that come with the rows, from 1. A bin knows set-point,
+mode and gains only where all its samples do, and then has those of the last sample.
 """
 
 from __future__ import annotations

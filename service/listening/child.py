@@ -129,6 +129,7 @@ class Child:
         # Spread over the time of a block, so that they are not all packed at once.
         first_s = clock.now()
         spread = enumerate(self._of_tag, 1)
+        self._last_s: dict[str, float] = {}
         self._saved_s = {tag: first_s - BLOCK_S + BLOCK_S * n / len(self._of_tag) for n, tag in spread}
 
     def start(self) -> None:
@@ -191,7 +192,8 @@ class Child:
         if rows is None:
             return None
         first_s, last_s = rows.bins["at_s"][0].item(), rows.bins["until_s"][-1].item()
-        return Block(tag, first_s, last_s, len(rows.bins), packed(rows))
+        after_s, self._last_s[tag] = self._last_s.get(tag), last_s
+        return Block(tag, after_s, first_s, last_s, len(rows.bins), packed(rows))
 
 
 def main() -> None:

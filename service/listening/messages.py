@@ -57,9 +57,13 @@ class Answer:
 
 @dataclass(frozen=True)
 class Block:
-    """Finished bins of a loop, to be stored: `bins.packed`."""
+    """Finished bins of a loop, to be stored: `bins.packed`.
+
+    after_s: time of the last sample of the block before; None for the first block.
+    """
 
     tag: str
+    after_s: float | None
     first_s: float
     last_s: float
     count: int

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import delete, func, select, tuple_
+from sqlalchemy import delete, select, tuple_
 
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import HistoryRow
@@ -16,9 +16,14 @@ _DELETED_AT_ONCE = 1000
 
 @dataclass(frozen=True, slots=True)
 class HistoryBlock:
-    """A block of a loop. Times of its first and last sample in seconds since 1970 UTC."""
+    """A block of a loop. Times in seconds since 1970 UTC.
+
+    after_s: time of the last sample before the block, if the listener had one: where the block before ends otherwise,
+    blocks are missing.
+    """
 
     loop: str
+    after_s: float | None
     first_s: float
     last_s: float
     count: int
@@ -30,8 +35,8 @@ def write(store: Store, blocks: Sequence[HistoryBlock]) -> None:
     with store.writing() as session:
         for block in blocks:
             session.merge(HistoryRow(
-                loop=block.loop, first_s=block.first_s, last_s=block.last_s, host=store.host, count=block.count,
-                data=block.data,
+                loop=block.loop, after_s=block.after_s, first_s=block.first_s, last_s=block.last_s, host=store.host,
+                count=block.count, data=block.data,
             ))  # fmt: skip
 
 
@@ -45,15 +50,8 @@ def read(store: Store, loop: str, from_s: float, to_s: float) -> Iterator[list[H
             rows = session.scalars(wanted.where(HistoryRow.first_s > after)).all()
         if not rows:
             return
-        yield [HistoryBlock(row.loop, row.first_s, row.last_s, row.count, row.data) for row in rows]
+        yield [HistoryBlock(row.loop, row.after_s, row.first_s, row.last_s, row.count, row.data) for row in rows]
         after = rows[-1].first_s
-
-
-def last_s(store: Store, loop: str, before_s: float) -> float | None:
-    """Returns the time of the last stored sample of the blocks that begin before this time; None: there is none."""
-    with store.reading() as session:
-        of_loop = (HistoryRow.loop == loop, HistoryRow.first_s < before_s)
-        return session.scalar(select(func.max(HistoryRow.last_s)).where(*of_loop))
 
 
 def delete_older(store: Store, before_s: float) -> int:

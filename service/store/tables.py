@@ -169,6 +169,7 @@ class HistoryRow(Base):
     loop: Mapped[str] = mapped_column(primary_key=True)
     first_s: Mapped[float] = mapped_column(Double, primary_key=True)
     last_s: Mapped[float] = mapped_column(Double)
+    after_s: Mapped[float | None] = mapped_column(Double)
     host: Mapped[str]
     count: Mapped[int]
     data: Mapped[bytes] = mapped_column(LargeBinary)

@@ -17,6 +17,7 @@ def upgrade() -> None:
         sa.Column("loop", sa.String, primary_key=True),
         sa.Column("first_s", sa.Double, primary_key=True),
         sa.Column("last_s", sa.Double, nullable=False),
+        sa.Column("after_s", sa.Double),
         sa.Column("host", sa.String, nullable=False),
         sa.Column("count", sa.Integer, nullable=False),
         sa.Column("data", sa.LargeBinary, nullable=False),
