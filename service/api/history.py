@@ -60,9 +60,11 @@ class HistoryView(BaseModel):
         description=f"Gains in effect at the last sample, as position in `gain_sets` from 0; {_UNKNOWN}"
     )
     gain_sets: list[GainsView] = Field(description="The sets of gains that were in effect")
+    incomplete: list[bool] = Field(description="True: samples are missing in the bin, or just before it")
     gaps: list[GapView] = Field(
-        description="Times in which samples are missing. Gaps closer to each other than a bin are one; where a bin has "
-        "samples from before and after a gap, the gap is given as the time of a bin"
+        description="Times in which samples are missing. Where bins were put together to keep to `points`, gaps that "
+        "are shorter than a bin are left out (see `incomplete`); of a gap within a bin of the memory (4 s, or 32 s for "
+        "what is older than 8 h) the time of the bin is given"
     )
     not_heard: str | None = Field(
         description="Why the loop is not heard at present; null: it is",
@@ -119,8 +121,8 @@ def _view(config: LoopConfig, found: History, from_s: float, to_s: float) -> His
     return HistoryView(
         loop=config.tag,
         pv_unit=config.pv_unit,
-        from_s=from_s,
-        to_s=to_s,
+        from_s=round(from_s, 3),
+        to_s=round(to_s, 3),
         at_s=_milliseconds(bins, "at_s"),
         until_s=_milliseconds(bins, "until_s"),
         sample_number=bins["n"].tolist(),
@@ -130,6 +132,7 @@ def _view(config: LoopConfig, found: History, from_s: float, to_s: float) -> His
         mode=[names.get(mode) for mode in bins["mode"].tolist()],
         gains=[number - 1 if number else None for number in bins["gains"].tolist()],
         gain_sets=[GainsView.of(Gains(*each)) for each in found.rows.sets],
+        incomplete=(bins["gap"] > 0).tolist(),
         gaps=[GapView(from_s=round(begin, 3), to_s=round(end, 3)) for begin, end in found.rows.gaps],
         not_heard=found.not_heard,
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -90,31 +90,22 @@ def thinned(bins: Bins, from_s: float, to_s: float, points: int) -> Bins:
     return merged(bins, np.flatnonzero(np.diff(part, prepend=-1)))
 
 
-def gaps(bins: Bins, from_s: float, to_s: float, joined_s: float = 0.0) -> tuple[tuple[float, float], ...]:
+def shortest_gap_s(count: int, from_s: float, to_s: float, points: int) -> float:
+    """Returns how long a gap has to be to be told beside so many bins, s: they are thinned to `points`, and shorter
+    ones are told by the flag of a bin alone."""
+    return (to_s - from_s) / points if count > points else 0.0
+
+
+def gaps(bins: Bins, from_s: float, to_s: float) -> tuple[tuple[float, float], ...]:
     """Returns the times in which samples are missing, as far as they touch this time: from the last sample before to
     the first one after; minus infinity for a gap before the first bin. Of a gap inside a bin it is only known that it
-    lies in the bin's time.
-
-    joined_s: gaps that are closer to each other than this are one.
-    """
+    lies in the bin's time."""
     found: list[tuple[float, float]] = []
     for n in np.flatnonzero(bins["gap"]).tolist():
         at_s, until_s, gap = (bins[name][n].item() for name in ("at_s", "until_s", "gap"))
-        parts = [(bins["until_s"][n - 1].item() if n else -math.inf, at_s)] if gap & GAP_BEFORE else []
-        parts += [(at_s, until_s)] if gap & GAP_INSIDE else []
-        found += [(begin, end) for begin, end in parts if end >= from_s and begin <= to_s]
-    return joined_gaps(found, joined_s)
-
-
-def joined_gaps(found: Iterable[tuple[float, float]], joined_s: float) -> tuple[tuple[float, float], ...]:
-    """Returns the gaps, those as one that are closer to each other than this."""
-    result: list[tuple[float, float]] = []
-    for begin, end in found:
-        if result and begin - result[-1][1] < joined_s:
-            result[-1] = result[-1][0], end
-        else:
-            result.append((begin, end))
-    return tuple(result)
+        found += [(bins["until_s"][n - 1].item() if n else -math.inf, at_s)] if gap & GAP_BEFORE else []
+        found += [(at_s, until_s)] if gap & GAP_INSIDE else []
+    return tuple((begin, end) for begin, end in found if end >= from_s and begin <= to_s)
 
 
 @dataclass(frozen=True)
@@ -154,7 +145,7 @@ def joined(parts: Sequence[Rows]) -> Rows:
 def packed(rows: Rows) -> bytes:
     """Returns bins and sets as a compressed block: column by column, then the sets, zlib."""
     columns: list[Any] = [np.ascontiguousarray(rows.bins[name]).tobytes() for name in BIN.names or ()]
-    sets = np.asarray(rows.sets, dtype="<f4").tobytes()
+    sets = np.asarray(rows.sets, dtype="<f8").tobytes()
     return zlib.compress(b"".join([*columns, sets]), 1)
 
 
@@ -166,5 +157,5 @@ def unpacked(data: bytes, count: int) -> Rows:
         kind = BIN[name]
         bins[name] = np.frombuffer(raw, kind, count, at)
         at += count * kind.itemsize
-    sets = np.frombuffer(raw, "<f4", offset=at).reshape(-1, 6)
+    sets = np.frombuffer(raw, "<f8", offset=at).reshape(-1, 6)
     return Rows(bins, tuple(tuple(each) for each in sets.tolist()))

@@ -7,6 +7,7 @@ FD is its connection to the service, which starts it; it ends with the service. 
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import struct
@@ -202,6 +203,7 @@ def main() -> None:
     os.setpriority(os.PRIO_PROCESS, 0, max(_NICENESS, os.getpriority(os.PRIO_PROCESS, 0)))
     with suppress(OSError):  # where there is none, or it may not be written
         Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_DIE)
+    logging.getLogger("can").setLevel(logging.ERROR)  # as in the service
     connection = Connection(int(sys.argv[1]))
     with suppress(EOFError, OSError):
         first = connection.recv()

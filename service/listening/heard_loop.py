@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from loopwright.protocol.process_data import ProcessData
 from loopwright.protocol.profile import Mode, samples_between
+from loopwright.protocol.real32 import nearest, shortest
 from loopwright.service.listening.bins import GAP_BEFORE, UNKNOWN_MODE, GainSet
 from loopwright.service.listening.rings import Rings
 
@@ -100,7 +101,9 @@ class HeardLoop:
             return
         self._sp, self._mode = found.sp, found.mode if found.mode in _MODES else UNKNOWN_MODE
         self._data.on_trial, self._status_known = found.on_trial, True
-        self._gains = 0 if found.gains is None else self.rings.number_of(found.gains)
+        # A job knows them as they were computed, the controller as REAL32.
+        gains = found.gains and tuple(shortest(nearest(each)) for each in found.gains)
+        self._gains = self.rings.number_of(gains) if gains else 0
         self._read_s, self._to_read = now_s, False
 
     def to_read(self, now_s: float) -> bool:

@@ -6,6 +6,7 @@ import logging
 import math
 import threading
 import time
+import zlib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ import numpy as np
 
 from loopwright.protocol.profile import PLANT_NODE, ChannelIds, channel_ids
 from loopwright.service.inputs.config import BusConfig, LoopConfig
-from loopwright.service.listening.bins import GAP_BEFORE, Rows, between, gaps, joined, joined_gaps, thinned, unpacked
+from loopwright.service.listening.bins import GAP_BEFORE, Rows, between, gaps, joined, shortest_gap_s, thinned, unpacked
 from loopwright.service.listening.block_writer import BlockWriter
 from loopwright.service.listening.heard_loop import InEffect
 from loopwright.service.listening.messages import Answer, Learn, Report
@@ -125,18 +126,26 @@ class Listening:
         for blocks in history.read(self._store, tag, from_s, to_s):
             each = []
             for block in blocks:
-                rows = unpacked(block.data, block.count)
+                try:
+                    rows = unpacked(block.data, block.count)
+                except (zlib.error, ValueError):
+                    log.error("a block of the history of %s is damaged: it is shown as a gap", tag)
+                    continue
                 if last_s is not None and block.after_s != last_s:
                     rows.bins["gap"][0] |= GAP_BEFORE
                 each.append(rows)
                 last_s = block.last_s
+            if not each:
+                continue
             rows = joined(each)
             found = gaps(rows.bins, from_s, to_s)
             if parts and found and found[0][0] == -math.inf:
                 found = ((parts[-1].bins["until_s"][-1].item(), found[0][1]), *found[1:])
             bins = between(rows.bins, from_s, np.nextafter(to_s, -math.inf))
             if len(bins):
-                parts.append(Rows(thinned(bins, from_s, to_s, points), rows.sets, found))
+                shortest_s = shortest_gap_s(len(bins), from_s, to_s, points)
+                told = tuple(gap for gap in found if gap[1] - gap[0] >= shortest_s)
+                parts.append(Rows(thinned(bins, from_s, to_s, points), rows.sets, told))
         return parts
 
     # -- beside the process
@@ -214,6 +223,7 @@ def _whole(stored: list[Rows], answer: Answer | None, from_s: float, to_s: float
     else:
         missing_from_s = last_s if to_s - last_s > HOLE_S else to_s
     found.append((missing_from_s, to_s))
-    clipped = ((max(begin, from_s), min(end, to_s)) for begin, end in found)
-    whole = joined_gaps((gap for gap in clipped if gap[1] > gap[0]), (to_s - from_s) / points)
+    shortest_s = shortest_gap_s(len(rows.bins), from_s, to_s, points)
+    clipped = ((max(begin, from_s), min(end, to_s)) for begin, end in found if end - begin >= shortest_s)
+    whole = tuple(gap for gap in clipped if gap[1] > gap[0])
     return Rows(thinned(rows.bins, from_s, to_s, points), rows.sets, whole)

@@ -27,6 +27,7 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
 _LOOK_S = 0.5
 _FINISH_S = 3.0
 _SAY_AGAIN_S = 60.0
+_WRITING_S = 1.0
 _HANGS_S = 30.0
 """Wall time without a report, of which there is one a second, after which the process is ended, s."""
 ANSWER_S = 3.0
@@ -57,6 +58,7 @@ class ListeningProcess:
         self._loops, self._on_report, self._first_pause_s = loops, on_report, first_pause_s
         self._over = threading.Event()
         self._guard = threading.Lock()
+        self._writing = threading.Lock()
         self._connection: Connection[object, object] | None = None
         self._asked: dict[int, Future[Answer]] = {}
         self._number = 0
@@ -70,8 +72,14 @@ class ListeningProcess:
     def close(self) -> None:
         """Ends the process, when it has reported the rest."""
         self._over.set()
+        self._finish()
         if self._thread.is_alive():
             self._thread.join(2.0 * _FINISH_S)
+
+    def _finish(self) -> None:
+        """Asks the process for the rest; it may be asked twice, by `close` and as it is started."""
+        with suppress(NotListening):
+            self._send(Finish())
 
     def learn(self, message: Learn) -> None:
         """Passes a reading on; it is dropped where there is no process."""
@@ -95,13 +103,16 @@ class ListeningProcess:
                 self._asked.pop(number, None)
 
     def _send(self, message: object) -> None:
-        with self._guard:
+        if not self._writing.acquire(timeout=_WRITING_S):
+            raise NotListening("the listening process takes no questions")
+        try:
             if self._connection is None:
                 raise NotListening("the listening process is being started")
-            try:
-                self._connection.send(message)
-            except OSError:
-                raise NotListening("the listening process has just died") from None
+            self._connection.send(message)
+        except OSError:
+            raise NotListening("the listening process has just died") from None
+        finally:
+            self._writing.release()
 
     def _run(self) -> None:
         pause_s = self._first_pause_s
@@ -138,16 +149,15 @@ class ListeningProcess:
             self.pid = process.pid
             try:
                 ours.send(Listen(self._loops))
-                with self._guard:
-                    self._connection = ours
+                self._connection = ours
                 self._receive(ours)
             except (EOFError, OSError):
                 pass
             except _Hangs:
                 process.kill()
             finally:
+                self._connection = None
                 with self._guard:
-                    self._connection = None
                     for answer in self._asked.values():
                         answer.set_exception(NotListening("the listening process has just died"))
                     self._asked.clear()
@@ -168,8 +178,7 @@ class ListeningProcess:
         while give_up is None or time.monotonic() < give_up:
             if give_up is None and self._over.is_set():
                 give_up = time.monotonic() + _FINISH_S
-                with self._guard:
-                    connection.send(Finish())
+                self._finish()
             if not connection.poll(_LOOK_S):
                 if time.monotonic() - heard_at > _HANGS_S:
                     raise _Hangs

@@ -16,6 +16,7 @@ from loopwright.service.listening.bins import (
     gaps,
     merged,
     of_samples,
+    shortest_gap_s,
     thinned,
     with_sets,
 )
@@ -145,12 +146,14 @@ class Rings:
         return Rows(bins, sets)
 
     def rows(self, from_s: float, to_s: float, points: int) -> Rows:
-        """Returns at most `points` bins of this time, of the finest level that goes back far enough, and the gaps."""
+        """Returns at most `points` bins of this time, of the finest level that goes back far enough, and the gaps
+        that are not shorter than a bin."""
         reaching = [level for level, ring in enumerate(self._rings) if ring.first_s <= from_s]
         oldest = min(range(len(self._rings)), key=lambda level: self._rings[level].first_s)
         every = self._all(reaching[0] if reaching else oldest)
         whole, sets = with_sets(between(every, from_s, to_s), self._sets)
-        found = gaps(every, from_s, to_s, (to_s - from_s) / points)
+        shortest_s = shortest_gap_s(len(whole), from_s, to_s, points)
+        found = tuple(gap for gap in gaps(every, from_s, to_s) if gap[1] - gap[0] >= shortest_s)
         return Rows(thinned(whole, from_s, to_s, points), sets, found)
 
     def _all(self, level: int) -> Bins:
