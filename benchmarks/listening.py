@@ -1,4 +1,4 @@
-"""What listening takes: the process that hears 100 loops at ten samples a second on a hub, and 1,000 loops on ten buses.
+"""What listening takes: 100 loops with ten samples a second on a hub, and 1,000 such loops on ten buses.
 
 The 100 loops come from a hub of this machine through python-can, which is the slowest way there is; the figure is the
 processor time of the listening process alone. The 1,000 loops are handed to it as fast as it takes them, from buses in

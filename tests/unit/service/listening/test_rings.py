@@ -44,7 +44,7 @@ def test_8_hours_at_ten_samples_a_second_take_less_than_1_MB_and_are_all_there()
     width_s, bins = LEVELS[0]
     assert width_s * bins >= 8 * 3600
     step_s, count = 2.0, 20 * 3600 // 2  # slower than ten a second, for longer: bins of two samples
-    at_s, pv = filled(rings, count, step_s)
+    at_s, _ = filled(rings, count, step_s)
     end_s = float(at_s[-1])
     found = rings.rows(end_s - 8 * 3600, end_s, 5000)
     assert int(found.bins["count"].sum()) == pytest.approx(8 * 3600 / step_s, abs=3)
