@@ -221,7 +221,7 @@ class _Socketcand(SocketCanDaemonBus):
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         """Notices a server that is gone: the library would report a silent bus, without waiting for the time-out."""
-        received: tuple[can.Message | None, bool] = super()._recv_internal(timeout)
+        received: tuple[can.Message | None, bool] = super()._recv_internal(timeout)  # type: ignore[no-untyped-call]
         if received[0] is None and self._is_over():
             raise can.CanError("the server has closed the connection")
         return received

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -82,10 +83,7 @@ def test_a_restart_is_a_gap_and_so_is_what_the_database_did_not_take(
 
 
 def test_a_damaged_block_is_a_gap(listening: Listening, store: Store, caplog: pytest.LogCaptureFixture) -> None:
-    damaged = block(1)
-    history.write(
-        store, [block(0), HistoryBlock(*(getattr(damaged, n) for n in damaged.__slots__[:-1]), b"?"), block(2)]
-    )
+    history.write(store, [block(0), replace(block(1), data=b"?"), block(2)])
     found = listening.history(TAG, T0, T0 + 179.0, 5000).rows
     assert found.gaps == ((pytest.approx(T0 + 59.9), pytest.approx(T0 + 120.0)),)
     assert "damaged" in caplog.text
