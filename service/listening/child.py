@@ -23,7 +23,7 @@ from loopwright.protocol.bus import Bus, BusError, open_bus
 from loopwright.protocol.profile import ChannelIds
 from loopwright.service.listening.bins import packed
 from loopwright.service.listening.heard_loop import HeardLoop
-from loopwright.service.listening.messages import Answer, Block, Finish, Learn, Listen, Query, Report
+from loopwright.service.listening.messages import Finish, FinishedBlock, HistoryAnswer, Learn, Listen, Query, Report
 
 AGAIN_S = 2.0
 """Wall time between two tries to open a bus, s."""
@@ -154,12 +154,12 @@ class Child:
                 connection.send(self.report())
                 due = time.monotonic() + REPORT_S
 
-    def answer(self, query: Query) -> Answer:
+    def answer(self, query: Query) -> HistoryAnswer:
         bus = self._of_tag[query.tag]
         with bus.lock:
             loop = bus.loops[query.tag]
             rows = loop.rings.rows(query.from_s, query.to_s, query.points)
-            return Answer(query.number, rows, loop.rings.oldest_s, loop.silent_from_s(self._clock.now()))
+            return HistoryAnswer(query.number, rows, loop.rings.oldest_s, loop.silent_from_s(self._clock.now()))
 
     def learn(self, message: Learn) -> None:
         bus = self._of_tag[message.tag]
@@ -182,7 +182,7 @@ class Child:
             finished=finished,
         )
 
-    def _block(self, tag: str, now_s: float, finished: bool) -> Block | None:
+    def _block(self, tag: str, now_s: float, finished: bool) -> FinishedBlock | None:
         """Returns the block of a loop that is due."""
         if not finished and 0.0 <= now_s - self._saved_s[tag] < BLOCK_S:
             return None
@@ -194,7 +194,7 @@ class Child:
             return None
         first_s, last_s = rows.bins["at_s"][0].item(), rows.bins["until_s"][-1].item()
         after_s, self._last_s[tag] = self._last_s.get(tag), last_s
-        return Block(tag, after_s, first_s, last_s, len(rows.bins), packed(rows))
+        return FinishedBlock(tag, after_s, first_s, last_s, len(rows.bins), packed(rows))
 
 
 def main() -> None:

@@ -17,7 +17,7 @@ from loopwright.service.inputs.config import BusConfig, LoopConfig
 from loopwright.service.listening.bins import GAP_BEFORE, Rows, between, gaps, joined, shortest_gap_s, thinned, unpacked
 from loopwright.service.listening.block_writer import BlockWriter
 from loopwright.service.listening.heard_loop import InEffect
-from loopwright.service.listening.messages import Answer, Learn, Report
+from loopwright.service.listening.messages import HistoryAnswer, Learn, Report
 from loopwright.service.listening.process import ListeningProcess, NotListening
 from loopwright.service.store import history
 from loopwright.service.store.history import HistoryBlock
@@ -35,6 +35,7 @@ _OPENED_TWICE = ("socketcan", "socketcand")
 away, a virtual bus exists in one process only, and drivers of other adapters refuse or disturb."""
 PER_LOOP_S, EACH_S = 2.0, 0.1
 """Least wall time between two readings of a loop, and between two readings, s."""
+_LOOK_S = 0.5
 HOLE_S = 128.0
 """Wall time without a stored sample at the edge of what is known that is shown as a gap, s: blocks are stored once a
 minute, and a bin of the coarsest level is 32 s."""
@@ -105,7 +106,7 @@ class Listening:
         stored = self._stored(tag, from_s, min(to_s, oldest_s), points) if from_s < oldest_s else []
         return History(_whole(stored, answer, from_s, to_s, points), not_heard)
 
-    def _heard(self, tag: str, from_s: float, to_s: float, points: int) -> tuple[Answer | None, str | None]:
+    def _heard(self, tag: str, from_s: float, to_s: float, points: int) -> tuple[HistoryAnswer | None, str | None]:
         """Returns what is in memory, and why the loop is not heard."""
         if tag not in self._loops:
             return None, "the loop belongs to another host, which stores its history once a minute"
@@ -164,7 +165,7 @@ class Listening:
     def _read_loops(self) -> None:
         """Reads the loops that the process names, one after the other."""
         last: dict[str, float] = {}
-        while not self._over.wait(EACH_S):
+        while not self._over.wait(_LOOK_S):
             for tag in self._to_read:
                 if time.monotonic() - last.get(tag, -math.inf) < PER_LOOP_S:
                     continue
@@ -201,7 +202,7 @@ def _ids(loops: Mapping[str, LoopConfig], off: Collection[str]) -> dict[str, dic
     return found
 
 
-def _whole(stored: list[Rows], answer: Answer | None, from_s: float, to_s: float, points: int) -> Rows:
+def _whole(stored: list[Rows], answer: HistoryAnswer | None, from_s: float, to_s: float, points: int) -> Rows:
     """Returns what is stored and what is in memory as one."""
     heard = answer is not None and len(answer.rows.bins) > 0
     parts = [*stored, answer.rows] if answer is not None and heard else stored

@@ -42,7 +42,7 @@ class Finish:
 
 
 @dataclass(frozen=True)
-class Answer:
+class HistoryAnswer:
     """The answer to a question.
 
     oldest_s: time of the oldest row in memory, s; infinite where there is none.
@@ -56,7 +56,7 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Block:
+class FinishedBlock:
     """Finished bins of a loop, to be stored: `bins.packed`.
 
     after_s: time of the last sample of the block before; None for the first block.
@@ -83,5 +83,5 @@ class Report:
     down: Mapping[str, str]
     frames: Mapping[str, int]
     to_read: Sequence[str] = ()
-    blocks: Sequence[Block] = field(default=())
+    blocks: Sequence[FinishedBlock] = field(default=())
     finished: bool = False

@@ -17,7 +17,7 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 
 from loopwright.protocol.profile import ChannelIds
-from loopwright.service.listening.messages import Answer, Finish, Learn, Listen, Query, Report
+from loopwright.service.listening.messages import Finish, HistoryAnswer, Learn, Listen, Query, Report
 from loopwright.service.telemetry.metrics import LISTENER_RESTARTS
 
 log = logging.getLogger(__name__)
@@ -60,7 +60,7 @@ class ListeningProcess:
         self._guard = threading.Lock()
         self._writing = threading.Lock()
         self._connection: Connection[object, object] | None = None
-        self._asked: dict[int, Future[Answer]] = {}
+        self._asked: dict[int, Future[HistoryAnswer]] = {}
         self._number = 0
         self._said_at: float | None = None
         self._thread = threading.Thread(target=self._run, name="listening", daemon=True)
@@ -86,9 +86,9 @@ class ListeningProcess:
         with suppress(NotListening):
             self._send(message)
 
-    def ask(self, tag: str, from_s: float, to_s: float, points: int) -> Answer:
+    def ask(self, tag: str, from_s: float, to_s: float, points: int) -> HistoryAnswer:
         """Asks for rows of a loop. Raises NotListening."""
-        answer: Future[Answer] = Future()
+        answer: Future[HistoryAnswer] = Future()
         with self._guard:
             self._number += 1
             number = self._number
@@ -184,7 +184,7 @@ class ListeningProcess:
                     raise _Hangs
                 continue
             message, heard_at = connection.recv(), time.monotonic()
-            if isinstance(message, Answer):
+            if isinstance(message, HistoryAnswer):
                 with self._guard:
                     asked = self._asked.pop(message.number, None)
                 if asked is not None:

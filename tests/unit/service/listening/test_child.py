@@ -16,7 +16,7 @@ from loopwright.service.listening import child as module
 from loopwright.service.listening.bins import unpacked
 from loopwright.service.listening.child import BLOCK_S, Child, Clock
 from loopwright.service.listening.heard_loop import InEffect
-from loopwright.service.listening.messages import Answer, Learn, Query
+from loopwright.service.listening.messages import HistoryAnswer, Learn, Query
 from tests.unit.service.processes import until
 
 IDS = {"A": channel_ids(1), "B": channel_ids(2)}
@@ -78,7 +78,7 @@ def clock(time: Time) -> Clock:
     return Clock(lambda: time.wall, lambda: time.monotonic)
 
 
-def answer(child: Child, time: Time, tag: str = "A", points: int = 100) -> Answer:
+def answer(child: Child, time: Time, tag: str = "A", points: int = 100) -> HistoryAnswer:
     return child.answer(Query(1, tag, time.wall - 3000.0, time.wall, points))
 
 

@@ -11,7 +11,7 @@ import pytest
 from loopwright.service.inputs.config import LoopConfig, parse_site
 from loopwright.service.listening.bins import GAP_BEFORE, Rows, packed
 from loopwright.service.listening.listening import HOLE_S, Listening
-from loopwright.service.listening.messages import Answer
+from loopwright.service.listening.messages import HistoryAnswer
 from loopwright.service.listening.rings import Rings
 from loopwright.service.store import history
 from loopwright.service.store.history import HistoryBlock
@@ -54,7 +54,7 @@ def listening(store: Store) -> Listening:
 def heard(listening: Listening, monkeypatch: pytest.MonkeyPatch, rows: Rows, silent_from_s: float = math.inf) -> None:
     """As if the process had these rows."""
     oldest_s = rows.bins["at_s"][0].item() if len(rows.bins) else math.inf
-    answer = Answer(1, rows, oldest_s, silent_from_s)
+    answer = HistoryAnswer(1, rows, oldest_s, silent_from_s)
     monkeypatch.setattr(listening, "_heard", lambda *_: (answer, None))
 
 
