@@ -237,6 +237,28 @@ def of_fast(fast: Figures) -> list[str]:
     ]
 
 
+def of_listening(listening: Figures) -> list[str]:
+    hub, many, memory = listening["hub"], listening["many"], listening["memory"]
+    return [
+        row(
+            f"listening to {hub['loops']} loops on a hub, {hub['samples_per_s']:,.0f} samples/s",
+            f"{100 * hub['share_of_a_core']:.1f} % of a core",
+            "25 %",
+            hub["share_of_a_core"] < 0.25,
+        ),
+        row(
+            f"listening to {many['loops']:,} loops on ten buses in memory, {many['samples_per_s']:,.0f} samples/s",
+            f"{100 * many['share_of_a_core']:.0f} % of a core, {many['us_per_sample']:.1f} us a sample",
+        ),
+        row(
+            f"history of a loop with {memory['hours']:g} h at ten samples/s",
+            f"{memory['bytes_per_loop']:,} bytes, {memory['answer_ms']:.1f} ms to answer for all of it",
+            "1 MB",
+            memory["bytes_per_loop"] < 1_000_000,
+        ),
+    ]
+
+
 ROWS: dict[str, Callable[[Figures], list[str]]] = {
     "bus": of_bus,
     "load": of_load,
@@ -248,5 +270,6 @@ ROWS: dict[str, Callable[[Figures], list[str]]] = {
     "engine": of_engine,
     "gateways": of_gateways,
     "answers": of_answers,
+    "listening": of_listening,
     "fast": of_fast,
 }

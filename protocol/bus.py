@@ -219,6 +219,22 @@ class _Socketcand(SocketCanDaemonBus):
         if received != msg.encode():
             raise can.CanError(f"expected {msg!r}, got {received!r}")
 
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        """Notices a server that is gone: the library would report a silent bus, without waiting for the time-out."""
+        received: tuple[can.Message | None, bool] = super()._recv_internal(timeout)  # type: ignore[no-untyped-call]
+        if received[0] is None and self._is_over():
+            raise can.CanError("the server has closed the connection")
+        return received
+
+    def _is_over(self) -> bool:
+        server: socket.socket = vars(self)["_SocketCanDaemonBus__socket"]
+        try:
+            return server.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
+        except BlockingIOError:
+            return False
+        except OSError as error:
+            raise can.CanError(f"the connection is lost: {error}") from error
+
 
 _LIBRARY_STATES = {can.BusState.PASSIVE: BusState.PASSIVE, can.BusState.ERROR: BusState.BUS_OFF}
 

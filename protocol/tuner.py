@@ -11,18 +11,14 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
-from typing import NamedTuple
 
 from loopwright.protocol.bus import Bus, Frame
 from loopwright.protocol.objects import Device, Object, Shape, Type, Value, lookup
+from loopwright.protocol.process_data import BusSample, ProcessData
 from loopwright.protocol.profile import (
     HEARTBEAT_FRAME,
-    MV_FRAME,
     PLANT_NODE,
-    PV_FRAME,
     RENEWAL_FRAME,
-    STATUS_FRAME,
-    UNASKED,
     Abort,
     NmtState,
     channel_ids,
@@ -83,18 +79,7 @@ class TunerError(Exception):
         self.code = code
 
 
-class BusSample(NamedTuple):
-    """One sample as seen on the bus: PV(n), the MV that answers it, and the status in effect then."""
-
-    n: int
-    pv: float
-    mv: float
-    mode: int
-    on_trial: bool
-    sp: float
-
-
-class Tuner:
+class Tuner(ProcessData):
     """The client of one loop: one channel of a controller and of the plant I/O that feeds it."""
 
     def __init__(
@@ -114,6 +99,7 @@ class Tuner:
         10h.
         station: state that this process shares; by default a new one, for a client that only reads.
         """
+        super().__init__()
         self.station = station or Station()
         ids = channel_ids(channel, plant_node or PLANT_NODE, controller_node)
         self._url = url
@@ -130,7 +116,6 @@ class Tuner:
         self._bus.set_filters(self._heard)
         self._answers: deque[Frame] = deque()
         self._samples: deque[BusSample] = deque()
-        self._pv = (0.0, -1)
         self.beating = False
         """Whether this tuner sends heartbeats. A client that only reads must not keep alive the trial of a tuner that
         died."""
@@ -138,8 +123,6 @@ class Tuner:
         """Number of the session whose lease is renewed during every wait; 0 for none."""
         self._renewed_at = 0.0
         self._check_stop_request: Callable[[], None] = lambda: None
-        self.mode, self.on_trial, self.sp = 0, False, 0.0
-        self.session_is_open = False
         self.node_states: dict[int, int] = {}
         """NMT states of controller and plant from their latest heartbeats, by node-ID."""
         self.restarted = False
@@ -204,17 +187,15 @@ class Tuner:
         can_id, data = frame
         try:
             if can_id == self._mv_id:
-                mv, n = MV_FRAME.unpack(data)
-                pv, answered = self._pv
-                if n == answered and n != UNASKED:
+                answered = self.take_mv(data)
+                if answered is not None:
+                    n, pv, mv = answered
                     sample = BusSample(n, shortest(pv), shortest(mv), self.mode, self.on_trial, self.sp)
                     self._samples.append(sample)
             elif can_id == self._pv_id:
-                self._pv = PV_FRAME.unpack(data)
+                self.take_pv(data)
             elif can_id == self._status_id:
-                self.mode, on_trial, sp, is_open, _cause = STATUS_FRAME.unpack(data)
-                self.sp = shortest(sp)
-                self.on_trial, self.session_is_open = bool(on_trial), bool(is_open)
+                self.take_status(data)
             elif can_id in self._alive:
                 (state,) = HEARTBEAT_FRAME.unpack(data)
                 self.node_states[self._alive[can_id]] = state

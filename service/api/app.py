@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from loopwright.service.api import fleet, locks, openapi, operations, previews, problems, tunings
+from loopwright.service.api import fleet, history, locks, openapi, operations, previews, problems, tunings
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.events import event_stream, still_permitted
 from loopwright.service.api.gate.access_log import Access
@@ -34,6 +34,7 @@ from loopwright.service.inputs.request import FastRetune, RetuneRequest
 from loopwright.service.job_states import ACTIVE
 from loopwright.service.jobs.fleet import Fleet
 from loopwright.service.jobs.manager import Jobs
+from loopwright.service.listening.listening import Listening
 from loopwright.service.loops.shared_reading import SharedReading
 from loopwright.service.security.principal import current
 from loopwright.service.store.idempotency import IdempotencyKeys
@@ -53,11 +54,13 @@ def create_app(
     checks: Mapping[str, operations.Check] | None = None,
     pool: Pool | None = None,
     sdo_retries: Mapping[str, int] | None = None,
+    listening: Listening | None = None,
 ) -> FastAPI:
     """The application for these jobs, which it stops when the server shuts down.
 
     checks: the parts of /readyz by name; None for the default ones.  pool: processes that compute tunings; None for a
-    new pool.  sdo_retries: SDO retries by bus, as counted in this process.
+    new pool.  sdo_retries: SDO retries by bus, as counted in this process.  listening: None for one that knows only
+    what is stored.
     """
 
     policy = policy or Policy()
@@ -240,6 +243,9 @@ def create_app(
         return view(jobs.decisions.rollback(job_id, (decision or Decision()).by))
 
     app.include_router(locks.router(jobs.locking))
+    app.include_router(
+        history.router(jobs.directory, listening or Listening(jobs.directory.loops, jobs.store, on=False))
+    )
     app.include_router(previews.router(jobs, many))
     app.include_router(tunings.router(jobs, pool or Pool()))
     return app

@@ -142,6 +142,15 @@ def serve(
             min=0.0, max=36_500, envvar="LOOPWRIGHT_KEEP_DAYS", help="Days that samples are kept; default: for ever."
         ),
     ] = None,
+    listen: Annotated[
+        bool, typer.Option(envvar="LOOPWRIGHT_LISTEN", help="Hear the process data of all loops, and keep the history.")
+    ] = True,
+    keep_history_days: Annotated[
+        float,
+        typer.Option(
+            min=0.0, max=36_500, envvar="LOOPWRIGHT_KEEP_HISTORY_DAYS", help="Days that stored history is kept."
+        ),
+    ] = 7.0,
     log_format: Annotated[
         str, typer.Option(envvar="LOOPWRIGHT_LOG_FORMAT", help="text, or json with one object per line.")
     ] = "text",
@@ -185,7 +194,7 @@ def serve(
     setup = Setup(
         loops, data, bind, port, database, host, resume,
         node=own_node, auth=auth, limits=limits, log_format="json" if log_format == "json" else "text",
-        keep=RetentionPolicy(keep_jobs, keep_days), trusted_proxies=proxies,
+        keep=RetentionPolicy(keep_jobs, keep_days, keep_history_days), trusted_proxies=proxies, listen=listen,
         computing=ComputingLimits(live_cpu_s, tuning_cpu_s, dry_run_cpu_s, computation_memory_mb),
     )  # fmt: skip
     try:

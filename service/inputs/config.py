@@ -80,11 +80,16 @@ class LoopConfig(BaseModel):
 
 
 class BusConfig(BaseModel):
-    """The settings of a bus. at_once: maximum number of its loops that are tuned at the same time."""
+    """The settings of a bus.
+
+    at_once: maximum number of its loops that are tuned at the same time.
+    listen: whether the process data of its loops are heard and kept as history.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     at_once: int = Field(default=8, ge=1, le=1000)
+    listen: bool = True
 
 
 @dataclass(frozen=True)

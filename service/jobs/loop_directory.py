@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 from loopwright.service.errors import UnknownLoop
 from loopwright.service.inputs.config import BusConfig, LoopConfig
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.registry import Registry
+from loopwright.service.listening.heard_loop import InEffect
 from loopwright.service.loop_state import LoopState, gains_of, loop_state
 from loopwright.service.loops.loop import Loop
 from loopwright.service.store.store import Store
@@ -89,6 +91,20 @@ class LoopDirectory:
             return loop.read()
         finally:
             loop.close()
+
+    def in_effect(self, tag: str) -> InEffect | None:
+        """Returns what is in effect on a loop of this host, for its history: from the job that has the loop, else from
+        the bus; None while that job has not read it yet. Raises Ended."""
+        began_s = time.time()
+        for running in self._registry.running.copy().values():
+            if running.tag == tag and running.loop is not None:
+                state = running.loop.latest
+                if state is None:
+                    return None
+                return InEffect(began_s, state.sp, state.mode, state.on_trial, astuple(state.gains))
+        state = self.read(tag)
+        gains = None if state.on_trial else astuple(state.gains)  # those that another tuner tries are not read
+        return InEffect(began_s, state.sp, state.mode, state.on_trial, gains)
 
     def present(self, tag: str) -> LoopState:
         """Returns the loop as its controller has it, or as it was at the start of the running job. Raises Ended."""

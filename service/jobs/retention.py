@@ -1,4 +1,4 @@
-"""Deletes old samples and finished engine records, at the start of the service and once an hour.
+"""Deletes old samples, old history and finished engine records, at the start of the service and once an hour.
 
 Jobs, their events and results stay. The audit log lists the jobs whose samples are deleted, and each job gets an event.
 After a jump of the clock nothing is deleted for its age: service/store/clock_watch.py.
@@ -17,7 +17,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.engine import Engine
-from loopwright.service.store import audit, hosts
+from loopwright.service.store import audit, history, hosts
 from loopwright.service.store.clock import stamp
 from loopwright.service.store.clock_watch import ClockWatch, longest_stop
 from loopwright.service.store.store import FolderInUse, Store, append
@@ -41,10 +41,12 @@ class RetentionPolicy:
 
     jobs: the newest `jobs` of each loop keep them; None disables the criterion.
     days: jobs that ended in the last `days` keep them; None disables the criterion. With both None, all jobs keep them.
+    history_days: the stored history of the loops is kept for this time; None for ever.
     """
 
     jobs: int | None = None
     days: float | None = None
+    history_days: float | None = 7.0
 
     def __bool__(self) -> bool:
         return self.jobs is not None or self.days is not None
@@ -65,6 +67,19 @@ def delete_old_samples(
     while policy and (jobs := _some(store, policy, at)):
         count += len(jobs)
     return count
+
+
+def delete_old_history(store: Store, policy: RetentionPolicy, at: datetime, ages_from: datetime | None = None) -> int:
+    """Deletes the old history of this host's loops. Returns the number of blocks.
+
+    at, ages_from: as for `delete_old_samples`.
+    """
+    if policy.history_days is None:
+        return 0
+    before = at - timedelta(days=policy.history_days)
+    if ages_from is not None and ages_from > before:
+        return 0
+    return history.delete_older(store, before.timestamp())
 
 
 def forget_finished(store: Store, engine: Engine) -> int:
@@ -193,4 +208,5 @@ class Retention:
         seen = self._watch.seen
         if seen is not None:
             delete_old_samples(self._store, self._policy, seen.at, seen.ages_from)
+            delete_old_history(self._store, self._policy, seen.at, seen.ages_from)
         forget_finished(self._store, self._engine)

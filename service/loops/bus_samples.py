@@ -11,8 +11,9 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 
+from loopwright.protocol.process_data import BusSample
 from loopwright.protocol.profile import FOREVER, samples_between
-from loopwright.protocol.tuner import BusSample, Tuner
+from loopwright.protocol.tuner import Tuner
 from loopwright.service.loops.bus_connection import BusConnection
 from loopwright.service.loops.bus_session import BusSession
 from loopwright.service.telemetry.metrics import SAMPLES_LOST

@@ -41,6 +41,7 @@ from loopwright.service.jobs.dbos_engine import POLL_S, DurableEngine
 from loopwright.service.jobs.loop_directory import LoopFactory
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.retention import Retention, RetentionPolicy
+from loopwright.service.listening.listening import Listening
 from loopwright.service.loops.loop import Loop
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.server.signals import Signals
@@ -60,9 +61,10 @@ class _Server(uvicorn.Server):
     """An HTTP server that prints when it is ready. It does not handle signals: uvicorn would raise each signal again
     after its shutdown, and take a second SIGINT as permission to abort."""
 
-    def __init__(self, config: uvicorn.Config, jobs: Jobs) -> None:
+    def __init__(self, config: uvicorn.Config, jobs: Jobs, listening: Listening) -> None:
         super().__init__(config)
         self._jobs = jobs
+        self._listening = listening
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -74,6 +76,7 @@ class _Server(uvicorn.Server):
             host, port = sockets[0].getsockname()[:2]
             print(f"ready http://{f'[{host}]' if ':' in host else host}:{port}", flush=True)
             tell_systemd("READY=1")
+            self._listening.start()
             if (every_s := interval_s()) is not None:
                 watchdog = Watchdog(self._jobs.unwatched_s, self._jobs.store.ping, tell_systemd)
                 self._watchdog = asyncio.create_task(watchdog.run(every_s))
@@ -130,6 +133,7 @@ class Setup:
     keep: which samples are kept.
     computing: the limits of one computation.
     trusted_proxies: addresses and networks whose X-Forwarded-For and -Proto headers are trusted.
+    listen: whether the process data of the loops are heard and kept as history.
     """
 
     loops_file: Path
@@ -147,6 +151,7 @@ class Setup:
     keep: RetentionPolicy = field(default_factory=RetentionPolicy)
     computing: ComputingLimits = field(default_factory=ComputingLimits)
     trusted_proxies: tuple[IPv4Network | IPv6Network, ...] = ()
+    listen: bool = True
 
 
 def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None = None) -> None:
@@ -200,8 +205,10 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         stack.callback(jobs.stop)
         retention = stack.enter_context(closing(Retention(store, engine, setup.keep)))
         checks = {**operations.checks(jobs), "samples": retention.note}
-        app = create_app(jobs, policy, checks, pool, station.sdo_retries)
-        server = _Server(server_config(app, setup, listener, descriptors), jobs)
+        listening = Listening(site.loops, store, jobs.directory.in_effect, site.buses, setup.listen)
+        stack.callback(listening.close)
+        app = create_app(jobs, policy, checks, pool, station.sdo_retries, listening)
+        server = _Server(server_config(app, setup, listener, descriptors), jobs, listening)
 
         def end() -> None:
             """Ends jobs and server: the server waits for its connections, and event streams end with their jobs."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from sqlalchemy import JSON, BigInteger, Dialect, ForeignKey, Index, LargeBinary, String, TypeDecorator, text
+from sqlalchemy import JSON, BigInteger, Dialect, Double, ForeignKey, Index, LargeBinary, String, TypeDecorator, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 from loopwright.service.job_states import JobState
@@ -155,6 +155,22 @@ class ChunkRow(Base):
     seq: Mapped[int] = mapped_column(primary_key=True)
     stage: Mapped[str]
     first_t_s: Mapped[float]
+    count: Mapped[int]
+    data: Mapped[bytes] = mapped_column(LargeBinary)
+
+
+class HistoryRow(Base):
+    """A block of the history of a loop: bins of the samples that were heard, see service.listening.bins for the layout
+    of `data`. Times are seconds since 1970 UTC: they are compared, and 8 bytes."""
+
+    __tablename__ = "history_blocks"
+    __table_args__ = (Index("history_blocks_by_age", "host", "last_s"),)
+
+    loop: Mapped[str] = mapped_column(primary_key=True)
+    first_s: Mapped[float] = mapped_column(Double, primary_key=True)
+    last_s: Mapped[float] = mapped_column(Double)
+    after_s: Mapped[float | None] = mapped_column(Double)
+    host: Mapped[str]
     count: Mapped[int]
     data: Mapped[bytes] = mapped_column(LargeBinary)
 

@@ -40,6 +40,20 @@ CLOCK_JUMPS = Counter(
     registry=None,
 )  # fmt: skip
 
+FRAMES_HEARD = Counter(
+    "loopwright_frames_heard", "Frames of process data heard for the history", ["bus"], registry=None
+)
+LISTENING_UP = Gauge(
+    "loopwright_listening_up", "1: the process data of the bus is heard for the history", ["bus"], registry=None
+)
+LISTENER_RESTARTS = Counter(
+    "loopwright_listener_restarts", "Starts of the listening process after it had died", registry=None
+)
+HISTORY_BLOCKS_LOST = Counter(
+    "loopwright_history_blocks_lost", "Blocks of history that the database did not take in time", registry=None
+)
+
 OF_THIS_PROCESS = (
     SAMPLES_LOST, STAGE_SECONDS, REQUESTS, REQUEST_SECONDS, IN_FLIGHT, LATE_SECONDS, LATEST_SECONDS, CLOCK_JUMPS,
+    FRAMES_HEARD, LISTENING_UP, LISTENER_RESTARTS, HISTORY_BLOCKS_LOST,
 )  # fmt: skip

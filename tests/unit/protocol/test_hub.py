@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 
 import can
 import pytest
@@ -139,3 +140,24 @@ def test_a_server_that_says_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch)
         pytest.raises(BusError, match="cannot be opened: timed out"),
     ):
         open_bus(f"socketcand:127.0.0.1:{listener.getsockname()[1]}")
+
+
+def test_a_hub_that_is_gone_is_an_error_and_no_silent_bus() -> None:
+    with closing(socket.create_server(("127.0.0.1", 0))) as server:
+
+        def greet() -> None:
+            server.accept()[0].close()  # the probe
+            connection, _ = server.accept()
+            with connection:
+                for answer in (b"< hi >", b"< ok >"):
+                    connection.sendall(answer)
+                    connection.recv(64)
+                connection.sendall(b"< ok >")
+
+        thread = threading.Thread(target=greet)
+        thread.start()
+        with closing(open_bus(f"socketcand:127.0.0.1:{server.getsockname()[1]}")) as bus:
+            bus.set_filters({1})
+            with pytest.raises(BusError, match="closed the connection"):
+                bus.recv(60.0)
+        thread.join(60)

@@ -1,0 +1,218 @@
+"""The process that listens: each bus is opened once more, and nothing is ever sent.
+
+    python -m loopwright.service.listening.child FD
+
+FD is its connection to the service, which starts it; it ends with the service. It imports little: numpy and the bus.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import struct
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+from loopwright.protocol.bus import Bus, BusError, open_bus
+from loopwright.protocol.profile import ChannelIds
+from loopwright.service.listening.bins import packed
+from loopwright.service.listening.heard_loop import HeardLoop
+from loopwright.service.listening.messages import Finish, FinishedBlock, HistoryAnswer, Learn, Listen, Query, Report
+
+AGAIN_S = 2.0
+"""Wall time between two tries to open a bus, s."""
+REPORT_S = 1.0
+BLOCK_S = 60.0
+"""Wall time after which the bins of a loop are handed over to be stored, s: a process that dies loses at most these."""
+_RECV_S = 0.5
+_JUMP_S = 0.1
+_NICENESS = 5
+_FIRST_TO_DIE = "500"
+
+Take = Callable[[bytes, float], None]
+
+
+class Clock:
+    """The wall time, steady between its jumps: the time of a sample is never before that of an earlier one."""
+
+    def __init__(self, wall: Callable[[], float] = time.time, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._wall, self._monotonic = wall, monotonic
+        self._offset = wall() - monotonic()
+
+    def now(self) -> float:
+        return self._monotonic() + self._offset
+
+    def set_back(self) -> bool:
+        """Follows the wall clock where it has jumped. Returns whether it was put back."""
+        ahead_s = self.now() - self._wall()
+        if abs(ahead_s) > _JUMP_S:
+            self._offset -= ahead_s
+        return ahead_s > _JUMP_S
+
+
+class HeardBus:
+    """Listens to one bus, in a thread. `lock` guards the loops."""
+
+    def __init__(self, url: str, ids: Mapping[str, ChannelIds], clock: Clock, open_bus: Callable[[str], Bus]) -> None:
+        self.lock = threading.Lock()
+        self.loops = {tag: HeardLoop() for tag in ids}
+        self.down: str | None = "not opened yet"
+        self._url, self._clock, self._open = url, clock, open_bus
+        self._frames = self._reported = 0
+        self._takes: dict[int, tuple[Take, ...]] = {}
+        for tag, of_loop in ids.items():
+            loop = self.loops[tag]
+            each: tuple[tuple[int, Take], ...] = (
+                (of_loop.pv, loop.take_pv), (of_loop.mv, loop.take_mv), (of_loop.status, loop.take_status)
+            )  # fmt: skip
+            for can_id, take in each:  # plant I/O may feed several controllers
+                self._takes[can_id] = (*self._takes.get(can_id, ()), take)
+
+    def run(self) -> None:
+        """Listens for ever; a bus that is down is opened again."""
+        while True:
+            try:
+                bus = self._open(self._url)
+                try:
+                    bus.set_filters(self._takes)
+                    self.down = None
+                    self._listen(bus)
+                finally:
+                    bus.close()
+            except BusError as error:
+                self.down = str(error)
+            except Exception as error:  # python-can's interfaces raise what they like
+                self.down = f"{type(error).__name__}: {error}"
+            with self.lock:
+                for loop in self.loops.values():
+                    loop.interrupted()
+            time.sleep(AGAIN_S)
+
+    def _listen(self, bus: Bus) -> None:
+        while True:
+            frame = bus.recv(_RECV_S)
+            if frame is not None:
+                self.take(*frame)
+
+    def take(self, can_id: int, data: bytes) -> None:
+        """Takes a frame."""
+        takes = self._takes.get(can_id)
+        if takes is None:  # a frame from before the filter
+            return
+        now_s = self._clock.now()
+        self._frames += 1
+        with self.lock:
+            for take in takes:
+                with suppress(struct.error):  # a foreign frame with this identifier
+                    take(data, now_s)
+
+    def new_frames(self) -> int:
+        """Returns the number of frames since this was asked last."""
+        frames, self._reported = self._frames - self._reported, self._frames
+        return frames
+
+
+class Child:
+    """The process: it answers the service, and reports to it."""
+
+    def __init__(
+        self, loops: Mapping[str, Mapping[str, ChannelIds]], clock: Clock, open_bus: Callable[[str], Bus] = open_bus
+    ) -> None:
+        self._clock = clock
+        self.buses = {url: HeardBus(url, ids, clock, open_bus) for url, ids in loops.items()}
+        self._of_tag = {tag: bus for bus in self.buses.values() for tag in bus.loops}
+        # Spread over the time of a block, so that they are not all packed at once.
+        first_s = clock.now()
+        spread = enumerate(self._of_tag, 1)
+        self._last_s: dict[str, float] = {}
+        self._saved_s = {tag: first_s - BLOCK_S + BLOCK_S * n / len(self._of_tag) for n, tag in spread}
+
+    def start(self) -> None:
+        for url, bus in self.buses.items():
+            threading.Thread(target=bus.run, name=url, daemon=True).start()
+
+    def serve(self, connection: Connection) -> None:
+        """Serves until the service asks for the end. Raises EOFError, OSError when the service is gone."""
+        due = time.monotonic() + REPORT_S
+        while True:
+            if connection.poll(max(0.0, due - time.monotonic())):
+                message = connection.recv()
+                if isinstance(message, Query):
+                    connection.send(self.answer(message))
+                elif isinstance(message, Learn):
+                    self.learn(message)
+                elif isinstance(message, Finish):
+                    connection.send(self.report(finished=True))
+                    return
+            if time.monotonic() >= due:
+                connection.send(self.report())
+                due = time.monotonic() + REPORT_S
+
+    def answer(self, query: Query) -> HistoryAnswer:
+        bus = self._of_tag[query.tag]
+        with bus.lock:
+            loop = bus.loops[query.tag]
+            rows = loop.rings.rows(query.from_s, query.to_s, query.points)
+            return HistoryAnswer(query.number, rows, loop.rings.oldest_s, loop.silent_from_s(self._clock.now()))
+
+    def learn(self, message: Learn) -> None:
+        bus = self._of_tag[message.tag]
+        with bus.lock:
+            bus.loops[message.tag].learn(message.found, self._clock.now())
+
+    def report(self, finished: bool = False) -> Report:
+        if self._clock.set_back():
+            for bus in self.buses.values():
+                with bus.lock:
+                    for loop in bus.loops.values():
+                        loop.began_anew()
+        now_s = self._clock.now()
+        to_read = [tag for tag, bus in self._of_tag.items() if bus.loops[tag].to_read(now_s)]
+        return Report(
+            down={url: bus.down for url, bus in self.buses.items() if bus.down is not None},
+            frames={url: bus.new_frames() for url, bus in self.buses.items()},
+            to_read=to_read,
+            blocks=[block for tag in self._of_tag if (block := self._block(tag, now_s, finished)) is not None],
+            finished=finished,
+        )
+
+    def _block(self, tag: str, now_s: float, finished: bool) -> FinishedBlock | None:
+        """Returns the block of a loop that is due."""
+        if not finished and 0.0 <= now_s - self._saved_s[tag] < BLOCK_S:
+            return None
+        self._saved_s[tag] = now_s
+        bus = self._of_tag[tag]
+        with bus.lock:
+            rows = bus.loops[tag].rings.unsaved(all_of_it=finished)
+        if rows is None:
+            return None
+        first_s, last_s = rows.bins["at_s"][0].item(), rows.bins["until_s"][-1].item()
+        after_s, self._last_s[tag] = self._last_s.get(tag), last_s
+        return FinishedBlock(tag, after_s, first_s, last_s, len(rows.bins), packed(rows))
+
+
+def main() -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # the service alone ends it, by closing the connection
+    os.setpriority(os.PRIO_PROCESS, 0, max(_NICENESS, os.getpriority(os.PRIO_PROCESS, 0)))
+    with suppress(OSError):  # where there is none, or it may not be written
+        Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_DIE)
+    logging.getLogger("can").setLevel(logging.ERROR)  # as in the service
+    connection = Connection(int(sys.argv[1]))
+    with suppress(EOFError, OSError):
+        first = connection.recv()
+        assert isinstance(first, Listen)
+        child = Child(first.loops, Clock())
+        child.start()
+        child.serve(connection)
+    os._exit(0)  # the threads of the buses wait for frames
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,230 @@
+"""The listening of a service: which buses are heard, what is read by SDO beside, what is stored, and the history."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+import zlib
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopwright.protocol.profile import PLANT_NODE, ChannelIds, channel_ids
+from loopwright.service.inputs.config import BusConfig, LoopConfig
+from loopwright.service.listening.bins import GAP_BEFORE, Rows, between, gaps, joined, shortest_gap_s, thinned, unpacked
+from loopwright.service.listening.block_writer import BlockWriter
+from loopwright.service.listening.heard_loop import InEffect
+from loopwright.service.listening.messages import HistoryAnswer, Learn, Report
+from loopwright.service.listening.process import ListeningProcess, NotListening
+from loopwright.service.store import history
+from loopwright.service.store.history import HistoryBlock
+from loopwright.service.store.store import Store
+from loopwright.service.telemetry.metrics import FRAMES_HEARD, LISTENING_UP
+from loopwright.tuning.reasons import Ended
+
+log = logging.getLogger(__name__)
+
+Read = Callable[[str], InEffect | None]
+"""Reads a loop; None while a job that has the loop has not read it yet. Raises Ended."""
+
+_OPENED_TWICE = ("socketcan", "socketcand")
+"""Kinds of bus that a second process can open beside the service. Of a serial adapter (slcan) it would take frames
+away, a virtual bus exists in one process only, and drivers of other adapters refuse or disturb."""
+PER_LOOP_S, EACH_S = 2.0, 0.1
+"""Least wall time between two readings of a loop, and between two readings, s."""
+_LOOK_S = 0.5
+HOLE_S = 128.0
+"""Wall time without a stored sample at the edge of what is known that is shown as a gap, s: blocks are stored once a
+minute, and a bin of the coarsest level is 32 s."""
+_STOP_S = 5.0
+
+
+@dataclass(frozen=True)
+class History:
+    """The history of a loop in a time.
+
+    not_heard: why the loop is not heard at present; None where it is.
+    """
+
+    rows: Rows
+    not_heard: str | None
+
+
+class Listening:
+    """Listens for the loops of this host once it is started, and knows the stored history of all.
+
+    loops, buses: the configuration.
+    read: reads set-point, mode and gains of a loop, which its process data do not carry.
+    on: False where nothing is to be heard.
+    """
+
+    def __init__(
+        self,
+        loops: Mapping[str, LoopConfig],
+        store: Store,
+        read: Read | None = None,
+        buses: Mapping[str, BusConfig] | None = None,
+        on: bool = True,
+    ) -> None:
+        self._loops, self._store, self._read = loops, store, read
+        self.off = {url: why for url in {loop.bus for loop in loops.values()} if (why := _off(url, buses or {}, on))}
+        """Buses that are not listened to, with the reason."""
+        self._down: Mapping[str, str] = {}
+        self._writer = BlockWriter(store)
+        self.process = ListeningProcess(_ids(loops, self.off), self._take)
+        self._to_read: Collection[str] = ()
+        self._over = threading.Event()
+        self._reader = threading.Thread(target=self._read_loops, name="listening: readings", daemon=True)
+        self._started = False
+
+    def start(self) -> None:
+        """Starts to listen, in the background."""
+        for url, why in sorted(self.off.items()):
+            log.info("no history of the loops on %s: %s", url, why)
+        if len(self.off) < len({loop.bus for loop in self._loops.values()}):
+            self._started = True
+            self._writer.start()
+            self.process.start()
+            if self._read is not None:
+                self._reader.start()
+
+    def close(self) -> None:
+        self._over.set()
+        if self._started:
+            self._reader.join(_STOP_S)
+            self.process.close()
+            self._writer.close()
+
+    def history(self, tag: str, from_s: float, to_s: float, points: int) -> History:
+        """Returns at most `points` bins of a loop of any host, from memory and from the database. Raises
+        SQLAlchemyError."""
+        answer, not_heard = self._heard(tag, from_s, to_s, points)
+        oldest_s = math.inf if answer is None else answer.oldest_s
+        stored = self._stored(tag, from_s, min(to_s, oldest_s), points) if from_s < oldest_s else []
+        return History(_whole(stored, answer, from_s, to_s, points), not_heard)
+
+    def _heard(self, tag: str, from_s: float, to_s: float, points: int) -> tuple[HistoryAnswer | None, str | None]:
+        """Returns what is in memory, and why the loop is not heard."""
+        if tag not in self._loops:
+            return None, "the loop belongs to another host, which stores its history once a minute"
+        url = self._loops[tag].bus
+        if url in self.off:
+            return None, self.off[url]
+        if not self._started:
+            return None, "listening has not begun yet"
+        try:
+            return self.process.ask(tag, from_s, to_s, points), self._down.get(url)
+        except NotListening as why:
+            return None, str(why)
+
+    def _stored(self, tag: str, from_s: float, to_s: float, points: int) -> list[Rows]:
+        """Returns what the database has. Where it lacks blocks there is a gap."""
+        parts: list[Rows] = []
+        last_s: float | None = None
+        for blocks in history.read(self._store, tag, from_s, to_s):
+            each = []
+            for block in blocks:
+                try:
+                    rows = unpacked(block.data, block.count)
+                except (zlib.error, ValueError):
+                    log.error("a block of the history of %s is damaged: it is shown as a gap", tag)
+                    continue
+                if last_s is not None and block.after_s != last_s:
+                    rows.bins["gap"][0] |= GAP_BEFORE
+                each.append(rows)
+                last_s = block.last_s
+            if not each:
+                continue
+            rows = joined(each)
+            found = gaps(rows.bins, from_s, to_s)
+            if parts and found and found[0][0] == -math.inf:
+                found = ((parts[-1].bins["until_s"][-1].item(), found[0][1]), *found[1:])
+            bins = between(rows.bins, from_s, np.nextafter(to_s, -math.inf))
+            if len(bins):
+                shortest_s = shortest_gap_s(len(bins), from_s, to_s, points)
+                told = tuple(gap for gap in found if gap[1] - gap[0] >= shortest_s)
+                parts.append(Rows(thinned(bins, from_s, to_s, points), rows.sets, told))
+        return parts
+
+    # -- beside the process
+
+    def _take(self, report: Report) -> None:
+        self._down = report.down
+        for url, frames in report.frames.items():
+            FRAMES_HEARD.labels(url).inc(frames)
+            LISTENING_UP.labels(url).set(0 if url in report.down else 1)
+        self._to_read = report.to_read
+        self._writer.put(
+            HistoryBlock(block.tag, block.after_s, block.first_s, block.last_s, block.count, block.data)
+            for block in report.blocks
+        )
+
+    def _read_loops(self) -> None:
+        """Reads the loops that the process names, one after the other."""
+        last: dict[str, float] = {}
+        while not self._over.wait(_LOOK_S):
+            for tag in self._to_read:
+                if time.monotonic() - last.get(tag, -math.inf) < PER_LOOP_S:
+                    continue
+                last[tag] = time.monotonic()
+                try:
+                    found = self._read(tag) if self._read is not None else None
+                except Ended:
+                    found = None  # what is wrong with the loop is shown where it is asked for
+                except Exception:
+                    log.exception("defect while reading %s for the history", tag)
+                    found = None
+                if found is not None:
+                    self.process.learn(Learn(tag, found))
+                if self._over.wait(EACH_S):
+                    return
+
+
+def _off(url: str, buses: Mapping[str, BusConfig], on: bool) -> str | None:
+    """Returns why a bus is not listened to; None where it is."""
+    if not on or not buses.get(url, BusConfig()).listen:
+        return "listening is turned off"
+    kind = url.partition(":")[0]
+    if kind not in _OPENED_TWICE:
+        return f"a bus of the kind {kind} cannot be opened by a second process"
+    return None
+
+
+def _ids(loops: Mapping[str, LoopConfig], off: Collection[str]) -> dict[str, dict[str, ChannelIds]]:
+    found: dict[str, dict[str, ChannelIds]] = {}
+    for tag, loop in loops.items():
+        if loop.bus not in off:
+            ids = channel_ids(loop.channel, loop.plant_node or PLANT_NODE, loop.controller_node)
+            found.setdefault(loop.bus, {})[tag] = ids
+    return found
+
+
+def _whole(stored: list[Rows], answer: HistoryAnswer | None, from_s: float, to_s: float, points: int) -> Rows:
+    """Returns what is stored and what is in memory as one."""
+    heard = answer is not None and len(answer.rows.bins) > 0
+    parts = [*stored, answer.rows] if answer is not None and heard else stored
+    rows = joined(parts)
+    if not len(rows.bins):
+        between_samples = answer is not None and answer.oldest_s <= from_s and answer.silent_from_s > from_s
+        return Rows() if between_samples else Rows(gaps=((from_s, to_s),))
+    found: list[tuple[float, float]] = []
+    last_s = from_s
+    for part in parts:
+        first_s = part.bins["at_s"][0].item()
+        begins = [end for begin, end in part.gaps if begin == -math.inf]
+        if begins or first_s - last_s > HOLE_S:
+            found.append((last_s, begins[0] if begins else first_s))
+        found += [gap for gap in part.gaps if gap[0] != -math.inf]
+        last_s = part.bins["until_s"][-1].item()
+    if answer is not None and heard:
+        missing_from_s = max(last_s, answer.silent_from_s)
+    else:
+        missing_from_s = last_s if to_s - last_s > HOLE_S else to_s
+    found.append((missing_from_s, to_s))
+    shortest_s = shortest_gap_s(len(rows.bins), from_s, to_s, points)
+    clipped = ((max(begin, from_s), min(end, to_s)) for begin, end in found if end - begin >= shortest_s)
+    whole = tuple(gap for gap in clipped if gap[1] > gap[0])
+    return Rows(thinned(rows.bins, from_s, to_s, points), rows.sets, whole)

@@ -1,0 +1,120 @@
+"""The history as the service puts it together, from the database and from the process that listens."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from loopwright.service.inputs.config import LoopConfig, parse_site
+from loopwright.service.listening.bins import GAP_BEFORE, Rows, packed
+from loopwright.service.listening.listening import HOLE_S, Listening
+from loopwright.service.listening.messages import HistoryAnswer
+from loopwright.service.listening.rings import Rings
+from loopwright.service.store import history
+from loopwright.service.store.history import HistoryBlock
+from loopwright.service.store.store import Store
+from tests.unit.service.fakes import TAG, loop_entry
+
+T0 = 1_769_860_800.0
+ONE = (1.5, 20.0, 0.0, 0.0, 1.0, 0.0)
+
+
+def config(**changes: Any) -> LoopConfig:
+    return LoopConfig.model_validate(loop_entry() | changes)
+
+
+def minute(n: int, first: bool = False) -> Rows:
+    """A minute of ten samples a second, in bins of 4 s."""
+    rings = Rings()
+    for k in range(600):
+        at = 600 * n + k
+        rings.put(T0 + 0.1 * at, at + 1, float(n), 40.0, 50.0, rings.number_of(ONE), 2, GAP_BEFORE if at < 1 else 0)
+    rows = rings.unsaved(all_of_it=True)
+    assert rows is not None
+    if first:
+        rows.bins["gap"][0] = GAP_BEFORE
+    return rows
+
+
+def block(n: int, first: bool = False) -> HistoryBlock:
+    rows = minute(n, first)
+    after_s = None if first or not n else minute(n - 1).bins["until_s"][-1].item()
+    first_s, last_s = rows.bins["at_s"][0].item(), rows.bins["until_s"][-1].item()
+    return HistoryBlock(TAG, after_s, first_s, last_s, len(rows.bins), packed(rows))
+
+
+@pytest.fixture
+def listening(store: Store) -> Listening:
+    return Listening({TAG: config()}, store, on=False)
+
+
+def heard(listening: Listening, monkeypatch: pytest.MonkeyPatch, rows: Rows, silent_from_s: float = math.inf) -> None:
+    """As if the process had these rows."""
+    oldest_s = rows.bins["at_s"][0].item() if len(rows.bins) else math.inf
+    answer = HistoryAnswer(1, rows, oldest_s, silent_from_s)
+    monkeypatch.setattr(listening, "_heard", lambda *_: (answer, None))
+
+
+@pytest.mark.parametrize("points", [10, 5000])
+def test_what_is_stored_and_what_is_in_memory_are_one(
+    listening: Listening, store: Store, monkeypatch: pytest.MonkeyPatch, points: int
+) -> None:
+    history.write(store, [block(n, first=n == 0) for n in range(5)])
+    heard(listening, monkeypatch, minute(4))  # the last minute is in both
+    found = listening.history(TAG, T0, T0 + 299.9, points).rows
+    assert len(found.bins) <= points and found.bins["count"].sum() == 3000
+    assert found.sets == (ONE,) and not found.gaps
+    assert found.bins["pv_mean"][-1] == 4.0 and found.bins["pv_min"][0] == 0.0
+
+
+def test_a_restart_is_a_gap_and_so_is_what_the_database_did_not_take(
+    listening: Listening, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    history.write(store, [block(0, first=True), block(1), block(4), block(6, first=True)])
+    heard(listening, monkeypatch, Rows(minute(9, first=True).bins, (ONE,), ((-math.inf, T0 + 540.0),)))
+    found = listening.history(TAG, T0 - 1000.0, T0 + 600.0, 5000).rows
+    assert found.gaps == tuple(
+        (pytest.approx(T0 + begin), pytest.approx(T0 + end))
+        for begin, end in ((-1000.0, 0.0), (119.9, 240.0), (299.9, 360.0), (419.9, 540.0))
+    )
+
+
+def test_a_damaged_block_is_a_gap(listening: Listening, store: Store, caplog: pytest.LogCaptureFixture) -> None:
+    history.write(store, [block(0), replace(block(1), data=b"?"), block(2)])
+    found = listening.history(TAG, T0, T0 + 179.0, 5000).rows
+    assert found.gaps == ((pytest.approx(T0 + 59.9), pytest.approx(T0 + 120.0)),)
+    assert "damaged" in caplog.text
+
+
+def test_a_loop_that_falls_silent_has_a_gap_at_the_end(listening: Listening, monkeypatch: pytest.MonkeyPatch) -> None:
+    heard(listening, monkeypatch, minute(0), silent_from_s=T0 + 59.9)
+    assert listening.history(TAG, T0, T0 + 100.0, 5000).rows.gaps == ((T0 + 59.9, T0 + 100.0),)
+
+
+def test_where_nothing_is_known_all_of_it_is_a_gap(listening: Listening, store: Store) -> None:
+    assert listening.history(TAG, T0, T0 + 100.0, 50).rows.gaps == ((T0, T0 + 100.0),)
+    history.write(store, [block(0)])
+    end_s = T0 + 60.0 + 2.0 * HOLE_S
+    assert listening.history(TAG, T0, end_s, 50).rows.gaps == ((pytest.approx(T0 + 59.9), end_s),)
+
+
+@pytest.mark.parametrize(
+    ("bus", "on", "listen", "why"),
+    [
+        ("socketcan:can0", False, True, "turned off"),
+        ("socketcan:can0", True, False, "turned off"),
+        ("slcan:/dev/ttyACM0", True, True, "kind slcan cannot be opened by a second process"),
+        ("virtual:demo", True, True, "kind virtual cannot"),
+        ("socketcan:can0", True, True, "has not begun"),
+    ],
+)
+def test_a_bus_that_is_not_listened_to_says_why(store: Store, bus: str, on: bool, listen: bool, why: str) -> None:
+    site = parse_site({"loops": [loop_entry() | {"bus": bus}], "buses": {bus: {"listen": listen}}}, "test")
+    listening = Listening(site.loops, store, None, site.buses, on)
+    found = listening.history(TAG, T0, T0 + 10.0, 10)
+    assert found.not_heard is not None and why in found.not_heard
+    assert (bus in listening.off) == (why != "has not begun")
+    assert "another host" in (listening.history("ELSEWHERE", T0, T0 + 10.0, 10).not_heard or "")
