@@ -17,7 +17,7 @@ from loopwright.protocol.tuner import Tuner
 from loopwright.service.loop_state import LoopState, same_gains
 from loopwright.service.loops.bus_connection import BusConnection, Read
 from loopwright.service.loops.bus_reading import BusReading
-from loopwright.service.loops.bus_restore import close_session, end_acceptance, restore
+from loopwright.service.loops.bus_restore import LOSSY_BUS_S, close_session, end_acceptance, restore
 from loopwright.service.loops.bus_samples import BLOCK, MAX_GAP, BusSamples
 from loopwright.service.loops.bus_session import BusSession
 from loopwright.service.loops.loop import Restored
@@ -25,6 +25,9 @@ from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Mode, Sample, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 
+BEGIN_PATIENCE_S = 2.0
+"""Wall time for which a node may leave a request unanswered before anything has moved, s: a gateway with one processor
+has other work while a test begins."""
 RELAY_LONGEST = 1_000_000  # samples; plans end their relays, and so does the lease
 
 
@@ -64,6 +67,7 @@ class BusLoop:
             reading = self._connection.reading(tuner)
             if not beside_tests:
                 return reading.state()
+        with self._connection.tuner() as tuner, tuner.retrying(BEGIN_PATIENCE_S, LOSSY_BUS_S):
             while True:
                 session = tuner.number("controller_session")
                 state = reading.beside_the_test() if session else reading.state()
@@ -78,7 +82,7 @@ class BusLoop:
         self._stop = stop
         self.session.number = 0
         try:
-            with self._connection.tuner() as tuner:
+            with self._connection.tuner() as tuner, tuner.retrying(BEGIN_PATIENCE_S, LOSSY_BUS_S):
                 self._connection.reading(tuner).identify()
                 self._connection.reading(tuner).compare_times()
                 self._samples.take_plant(tuner)

@@ -99,7 +99,11 @@ class BusSamples:
         self._first_n, self._left, self._passed = None, 0, 0
 
     def _halt(self, tuner: Tuner) -> None:
-        """Halts the plant. The order is repeated, because a plant that is reset meanwhile runs again."""
+        """Halts the plant. The order is repeated, because a plant that is reset meanwhile runs again.
+
+        The samples from before the halt are dropped at once: a plant at full speed leaves more of them, while a busy
+        gateway opens its session, than can be counted one by one in the time that a halt may take.
+        """
         give_up = self._station.monotonic() + HALT_S
         again_at = 0.0
         while True:
@@ -107,6 +111,7 @@ class BusSamples:
             if now >= again_at:
                 tuner.write("plant_samples_to_run", 0)
                 again_at = now + HALT_AGAIN_S
+            tuner.drain()
             if tuner.sample(_HALTED_S) is None:
                 return
             self._check_stop_request("while the plant was brought to a halt")

@@ -323,6 +323,25 @@ class TestWaiting:
         in_blocks.loop.begin()
         assert told == 2 and number
 
+    def test_samples_that_a_plant_at_full_speed_has_left_do_not_count_as_running_on(self, in_blocks: Site) -> None:
+        """A service that is slow, because its only processor is busy, still finds the plant halted."""
+        gateway, left = in_blocks.gateway, 20_000
+        written = in_blocks.plant.dictionary.on_write["plant_samples_to_run"]
+
+        def tell(sub: int, value: Value) -> None:
+            written(sub, value)
+            for number in range(left):
+                in_blocks.replay((channel_ids(1).pv, PV_FRAME.pack(50.0, number % 0x10000)))
+                in_blocks.replay((channel_ids(1).mv, MV_FRAME.pack(50.0, number % 0x10000)))
+            in_blocks.plant.dictionary.on_write["plant_samples_to_run"] = written
+
+        def slow(call: int) -> None:
+            in_blocks.wire.clock.now += 0.0005
+
+        in_blocks.plant.dictionary.on_write["plant_samples_to_run"] = tell
+        gateway.before = slow
+        assert in_blocks.loop.begin().mode is Mode.AUTOMATIC
+
     def test_what_is_read_during_anothers_test_is_what_that_comes_back_to(self, site: Site) -> None:
         site.begun()
         site.loop.step((SetSetpoint(50.2), SetGains(NEW)))
