@@ -77,8 +77,8 @@ ADVICE: dict[Reason, str] = {
     Reason.SATURATED: "MV is at a limit: move the operating point or widen the limits, then retune.",
     Reason.WRONG_MODE: "Put the loop in automatic with working gains before retuning.",
     Reason.LOOP_IN_USE: "Another tuner holds a session on this loop: wait for its end, then retune.",
-    Reason.SETPOINT_IS_DRIVEN: "Another controller or a ramp moves the set-point: open the outer loop or wait for the "
-    "ramp's end, then retune.",
+    Reason.SETPOINT_IS_DRIVEN: "Another controller or a ramp moves the set-point: put the loop to local set-point, or "
+    "wait for the ramp's end, then retune.",
     Reason.WRONG_SIGN: "Check the controller's action (direct/reverse) against the sign of the plant's gain.",
     Reason.NO_RESPONSE: "PV did not answer MV: check the valve, the sensor and that the right loop is selected.",
     Reason.CANNOT_OSCILLATE: "The plant has next to no dead time, or the sampling is too slow to see it "
@@ -97,7 +97,7 @@ ADVICE: dict[Reason, str] = {
     "says would be accepted.",
     Reason.DEVICE_MISMATCH: "The device is not the one the configuration describes; check node ids and firmware.",
     Reason.MV_LIMIT: "MV reached its limit during the test: permit more MV or a smaller set-point deviation.",
-    Reason.STALLED: "The relay did not go on switching: a load about as large as the relay holds PV. Wait until it is "
+    Reason.STALLED: "The test did not go on: a load about as large as what the test moves holds PV. Wait until it is "
     "over, or permit more MV.",
     Reason.UNEXPLAINED: "No linear model explains the record: look for a sticking valve, a limit, another loop or "
     "several changes of the load, then retune.",
@@ -105,7 +105,7 @@ ADVICE: dict[Reason, str] = {
     Reason.UNCERTAIN: "The record does not tell enough for this robustness: permit more MV, filter the measurement, or "
     "ask for a lower Ms.",
     Reason.AMBIGUOUS: "Several models explain the record and disagree: permit more MV, or retune in a steady time.",
-    Reason.MODEL_MISMATCH: "The loop behaved differently under the new gains than under the relay: look for changes of "
+    Reason.MODEL_MISMATCH: "The loop behaved differently under the new gains than before: look for changes of "
     "the load or of the plant, then retune.",
     Reason.DIVERGES: "PV ran away under the new gains, which were taken back: keep the present gains, and repeat.",
     Reason.LOCKED: "Somebody has locked the loop: ask them, or unlock it (loopwright unlock TAG), then ask again.",

@@ -21,6 +21,9 @@ MAX_NOISE = 0.10
 """Noise (standard deviation) as a share of the set-point step, above which no overshoot can be read."""
 MAX_AWAY = 0.05
 """PV off the set-point, and its drift, as a share of the set-point step, above which the loop is not at rest."""
+LISTENED_PARTS, MAX_PARTS_MOVED = 10, 5
+"""A set-point that moves in more of the equal parts of the listening is moved by another controller or a ramp. An outer
+loop may be sampled more slowly than this one."""
 MIN_ROOM = 0.05
 """Room for MV on both sides, as a share of its permitted range."""
 
@@ -41,7 +44,7 @@ def at_rest(
 
     after_s: the expected plant time of the stages that follow, s.
     min_samples: the smallest number of samples of a check.
-    Raises Refused: WRONG_MODE, NOT_AT_REST, NOISE_TOO_HIGH, SATURATED.
+    Raises Refused: WRONG_MODE, SETPOINT_IS_DRIVEN, NOT_AT_REST, NOISE_TOO_HIGH, SATURATED.
     """
     once_s = facts.T95_s / 2
     begin = (StageStarted(PREFLIGHT, once_s, after_s),)
@@ -66,8 +69,14 @@ def check_at_rest(facts: Facts, min_samples: int = MIN_LISTENED_SAMPLES) -> Plan
         raise Refused(Reason.WRONG_MODE, f"the controller is in mode {Mode(sample.mode).name.lower()}, not automatic")
     pv, mv = np.asarray(trace.pv), np.asarray(trace.mv)
     step = facts.sp_deviation
-    if float(np.ptp(trace.sp)) > 0:
-        raise Refused(Reason.NOT_AT_REST, f"the set-point moved by {np.ptp(trace.sp):.4g} while listening")
+    moved = np.diff(trace.sp) != 0.0
+    parts = sum(bool(part.any()) for part in np.array_split(moved, LISTENED_PARTS))
+    if parts:
+        text = (
+            f"the set-point moved at {np.count_nonzero(moved)} of {len(pv)} samples while listening, in {parts} of "
+            f"{LISTENED_PARTS} parts of the time, by {np.ptp(trace.sp):.4g}"
+        )
+        raise Refused(Reason.SETPOINT_IS_DRIVEN if parts > MAX_PARTS_MOVED else Reason.NOT_AT_REST, text)
     x = np.linspace(-0.5, 0.5, len(pv))
     drift = float(np.polyfit(x, pv, 1)[0])
     noise = float(np.std(np.diff(pv))) / math.sqrt(2)
@@ -91,4 +100,5 @@ def check_at_rest(facts: Facts, min_samples: int = MIN_LISTENED_SAMPLES) -> Plan
             f"within {trace.t[-1] - trace.t[0]:.3g} s PV drifted by {drift:+.3g}, is {away:+.3g} off the set-point and "
             f"varies by {spread:.3g} (noise {noise:.3g}); the step would be {step:.3g}",
         )
+    room = min(room, 0.5 * facts.mv_step_max)
     return OperatingPoint(sample.sp, float(pv.mean()), float(mv.mean()), noise, room), trace

@@ -26,6 +26,8 @@ class Facts:
     sp_deviation: the largest permitted set-point step, PV units, positive.
     old_gains: the accepted gains.
     reverse: True when MV must fall as PV rises (positive plant gain).
+    pv_low, pv_high: the limits within which PV must stay, absolute, PV units.
+    mv_step_max: the largest jump of MV that the test may make from one sample to the next, MV units.
     Raises Refused: BAD_INPUT, BAD_LIMITS, SAMPLING_TOO_SLOW.
     """
 
@@ -36,6 +38,9 @@ class Facts:
     sp_deviation: float
     old_gains: Gains
     reverse: bool = True
+    pv_low: float = -math.inf
+    pv_high: float = math.inf
+    mv_step_max: float = math.inf
 
     def __post_init__(self) -> None:
         for name in ("sample_time_s", "T95_s", "sp_deviation"):
@@ -56,7 +61,8 @@ class OperatingPoint:
 
     sp, pv, mv: the set-point and the means of PV and MV.
     noise: the standard deviation of PV, PV units.
-    room: the largest move of MV around `mv` that is permitted in both directions, MV units.
+    room: the largest move of MV around `mv` that is permitted in both directions, MV units: up to the nearer limit, and
+    half of the largest permitted jump, because a relay jumps from one side to the other.
     """
 
     sp: float

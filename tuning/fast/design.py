@@ -202,9 +202,10 @@ class GainDesign:
 
 
 def controller(w: Reals, Ti: float, Td: float, N: float) -> Complexes:
-    """The frequency response C(jw)/Kp of the controller; w in rad/s, Ti and Td in s, derivative filter Td/N."""
+    """The frequency response C(jw)/Kp of the controller; w in rad/s, Ti (0: no integral action) and Td in s, derivative
+    filter Td/N."""
     s = 1j * w
-    return np.asarray(1.0 + 1.0 / (s * Ti) + (s * Td / (1.0 + s * Td / N) if Td > 0.0 else 0.0))
+    return np.asarray(1.0 + (1.0 / (s * Ti) if Ti > 0.0 else 0.0) + (s * Td / (1.0 + s * Td / N) if Td > 0.0 else 0.0))
 
 
 def frequencies(period: float) -> Reals:

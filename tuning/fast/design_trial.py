@@ -87,6 +87,7 @@ def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal
         comparison=comparison,
         ultimate=ultimate(model),
         found=None,
+        known_before=None,
         verified=None,
         verification=shown,
         notes=(),

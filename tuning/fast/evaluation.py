@@ -22,7 +22,7 @@ the range of PV below which a residual is accepted in any case."""
 MAX_DURBIN_WATSON_RATIO = 1.35
 MAX_ROUNDED = 1.25
 """Residual, in average rounding errors, below which slow variations are accepted: rounding errors are not white."""
-MAX_UNCERTAINTY = {Excitation.RELAY: 0.10, Excitation.SETPOINT: 0.06}
+MAX_UNCERTAINTY = {Excitation.RELAY: 0.10, Excitation.SETPOINT: 0.06, Excitation.OPERATION: 0.06}
 """Largest accepted uncertainty of Ms, by the delta method and among rival models."""
 MAX_DIFFERENCE = 0.25
 """Largest difference of the gain above and below rest that the record of pulses may leave open, a fraction of the
@@ -85,7 +85,7 @@ def evaluate(record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | N
     found = chosen.best
     max_uncertainty = MAX_UNCERTAINTY[record.excitation]
     model = fit.model(found)
-    delay = 0.5 * record.Ts
+    delay = record.sampling_delay_s
     design = GainDesign(replace(model, L=model.L + delay), spec, record.period * record.Ts)
     best = design.best()
     spread = uncertainty_of_Ms(fit, found, best.gains, design.w, spec.N, delay)
@@ -110,11 +110,12 @@ def evaluate(record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | N
     elif rivals > max_uncertainty:
         reason = Reason.AMBIGUOUS
         detail = f"another model that explains the record as well gives an Ms off by {rivals:.2g}"
-    elif record.excitation is Excitation.SETPOINT and (shown := find_nonlinearity(fit, found)) is not None:
+    elif record.excitation is not Excitation.RELAY and (shown := find_nonlinearity(fit, found)) is not None:
         reason, detail = Reason.UNEXPLAINED, f"{shown.what}, +-{2.0 * shown.deviation:.2g}"
-    elif record.excitation is Excitation.SETPOINT and (unknown := unknown_difference(fit, found)) > MAX_DIFFERENCE:
+    elif record.excitation is not Excitation.RELAY and (unknown := unknown_difference(fit, found)) > MAX_DIFFERENCE:
         reason = Reason.UNCERTAIN
-        detail = f"the gain above and below the operating point may differ by {100.0 * unknown:.0f} %"
+        by = f"{100.0 * unknown:.0f} %" if unknown < 1.0 else "any factor"
+        detail = f"the gain above and below the operating point may differ by {by}, the record does not tell"
     elif earlier is not None:
         reason, detail = _model_mismatch(earlier, model, best.gains, spec, design, found.hypothesis.load_disturbances)
         if reason is None and (fault := find_valve_fault(fit, found)) is not None:

@@ -25,14 +25,15 @@ class Experiment:
     """The experiment of the fast procedure on one loop: its plans move the loop and extend its record.
 
     facts, point: what is known of the loop, and the operating point at rest.
-    listened: the samples at rest, with which the record begins.
+    record: the samples so far, with which the record begins.
+    at_rest: the number of samples at rest at its beginning; None where all of them are.
     """
 
-    def __init__(self, facts: Facts, point: OperatingPoint, listened: Trace) -> None:
-        self.facts, self.point, self.trace = facts, point, listened
-        self.listened = len(listened)
+    def __init__(self, facts: Facts, point: OperatingPoint, record: Trace, at_rest: int | None = None) -> None:
+        self.facts, self.point, self.trace = facts, point, record
+        self.listened = len(record) if at_rest is None else at_rest
         self.excited = 0
-        self.noise = noise_of(np.asarray(listened.pv))
+        self.noise = noise_of(np.asarray(record.pv[: self.listened]))
         self._follow_s = 0.0
         self._steps: list[int] = []
         self._commands: tuple[Command, ...] = ()

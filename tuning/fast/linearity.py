@@ -70,7 +70,7 @@ def score(fit: Fit[ExperimentRecord], found: Fitted, changed: Callable[[Reals], 
     changed: the further input of the alternative, from MV in its largest deviation; the size multiplies it.
     """
     structure, inputs = found.structure, found.structure.inputs
-    further = Fit(replace(fit.record, u=fit.record.input_range * changed(fit.u)))
+    further = Fit(replace(fit.record, u=fit.record.input_range * changed(fit.record.u / fit.record.input_range)))
     # a record's input range is its own: the scale of MV must stay that of the fit
     scale = further.record.input_range / fit.record.input_range
     columns = further.regressors(structure, UNDISTURBED, found.theta[None, : structure.searched])[0]

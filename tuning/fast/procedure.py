@@ -31,7 +31,7 @@ from loopwright.tuning.fast.relay_test import RelayTest
 from loopwright.tuning.plan import Note, Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
 
-__all__ = ["FAST", "FAST_STAGES", "FastOptions", "FastProposal", "fast"]
+__all__ = ["FAST", "FAST_STAGES", "FastOptions", "FastProposal", "by_relay", "fast"]
 
 FAST = "fast"
 FAST_STAGES = ("preflight", "relay", "design", "verify", "redesign")
@@ -63,23 +63,34 @@ def fast_stages(verify: bool) -> tuple[str, ...]:
     return FAST_STAGES if verify else FAST_STAGES[:3]
 
 
+def _expected_s(facts: Facts) -> dict[str, float]:
+    """The expected plant time of each stage, s."""
+    T95 = facts.T95_s
+    return {"preflight": T95 / 2, "relay": T95, "design": 0.0, "verify": 1.5 * T95, "redesign": 0.0}
+
+
 def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
     """The plan of the whole procedure, for a loop in automatic and at rest.
 
     Raises Refused. The plan restores nothing: the runner restores the loop.
     """
-    T95, spec = facts.T95_s, options.spec()
-    expected = {"preflight": T95 / 2, "relay": T95, "design": 0.0, "verify": 1.5 * T95, "redesign": 0.0}
-    todo = fast_stages(options.verify)
-
-    def started(stage: str) -> tuple[StageStarted]:
-        after = todo[todo.index(stage) + 1 :]
-        return (StageStarted(stage, expected[stage], sum(expected[s] for s in after)),)
-
-    after_s = sum(expected[stage] for stage in todo[1:])
+    expected = _expected_s(facts)
+    after_s = sum(expected[stage] for stage in fast_stages(options.verify)[1:])
     point, listened = yield from at_rest(facts, after_s, MIN_SAMPLES)
     experiment = RelayTest(facts, point, listened, options.amplitude)
     yield from experiment.report(StageDone("preflight", point))
+    return (yield from by_relay(facts, options, experiment))
+
+
+def by_relay(facts: Facts, options: FastOptions, experiment: RelayTest) -> Plan[FastProposal]:
+    """The plan of the procedure from the relay on. Raises Refused."""
+    spec = options.spec()
+    todo = fast_stages(options.verify)
+
+    def started(stage: str) -> tuple[StageStarted]:
+        expected = _expected_s(facts)
+        after = todo[todo.index(stage) + 1 :]
+        return (StageStarted(stage, expected[stage], sum(expected[s] for s in after)),)
 
     yield from experiment.report(*started("relay"))
     evaluation: Evaluation | None = None

@@ -22,6 +22,7 @@ from loopwright.tuning.experiments.step_test import StepResult
 from loopwright.tuning.fast.design import DesignSpec, OptimalGains
 from loopwright.tuning.fast.evaluation import Evaluation
 from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.robustness import KnownMs, known_Ms
 from loopwright.tuning.fast.uncertainty import fit_covariance
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.output_error import Fit, Fitted
@@ -175,6 +176,7 @@ class FastProposal:
     was asked for all the same.
     ultimate: the ultimate point of the model, None where the model has none.
     found: the evaluation of the record, None without a record.
+    known_before: Ms of the old gains with its uncertainty, None without a record.
     verified: the set-point step that followed the relay, None without one.
     verification: the set-point step from rest, None without one.
     notes: what the operator should know, one sentence each.
@@ -190,6 +192,7 @@ class FastProposal:
     comparison: Comparison
     ultimate: Ultimate | None
     found: EvaluationSummary | None
+    known_before: KnownMs | None
     verified: VerifiedStep | None
     verification: StepResult | None
     notes: tuple[str, ...]
@@ -197,19 +200,13 @@ class FastProposal:
 
 def evaluation_summary(evaluation: Evaluation) -> EvaluationSummary:
     """The figures of an evaluation as a job stores and shows them."""
-    fit, best = evaluation.fit, evaluation.chosen.best
-    record, structure, theta, c = fit.record, best.structure, best.theta, best.linear.coefficients
-    order, count = structure.order, best.hypothesis.load_disturbances
-    first = len(c) - order * count
+    best, record = evaluation.chosen.best, evaluation.fit.record
     loads = tuple(
-        LoadDisturbance(
-            (float(theta[structure.searched + i] - theta[structure.lags]) - record.listened) * record.Ts,
-            float(c[first + i * order] / c[0]) * record.input_range,
-        )
-        for i in range(count)
+        LoadDisturbance((entered - record.listened) * record.Ts, size)
+        for _, entered, size in load_disturbances(evaluation.fit, best)
     )
     return EvaluationSummary(
-        structure=structure.name,
+        structure=best.structure.name,
         num=evaluation.model.num,
         den=evaluation.model.den,
         L_s=evaluation.model.L,
@@ -225,6 +222,16 @@ def evaluation_summary(evaluation: Evaluation) -> EvaluationSummary:
         reason=evaluation.reason,
         detail=evaluation.detail,
     )
+
+
+def load_disturbances(fit: Fit[ExperimentRecord], found: Fitted) -> list[tuple[float, float, float]]:
+    """Of each load disturbance: the sample at which PV began to answer it, the sample at which it entered at the
+    plant's input, and its size there, MV units."""
+    structure, theta, c = found.structure, found.theta, found.linear.coefficients
+    first = fit.first_load(structure, found.hypothesis)
+    sizes = c[first :: structure.order][: found.hypothesis.load_disturbances] / c[0] * fit.record.input_range
+    seen = theta[structure.searched :]
+    return [(float(at), float(at - theta[structure.lags]), float(size)) for at, size in zip(seen, sizes, strict=True)]
 
 
 def identified_model(fit: Fit[ExperimentRecord], found: Fitted) -> IdentifiedModel:
@@ -338,6 +345,7 @@ def proposed(
         comparison=comparison,
         ultimate=ultimate(evaluation.model),
         found=found,
+        known_before=known_Ms(evaluation, facts.old_gains),
         verified=verified,
         verification=None,
         notes=tuple(notes),

@@ -7,28 +7,45 @@ goes from MV to PV, so that the controller need not be known.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+
 import numpy as np
 
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.experiment import STEP_BACK_FRACTION, VERIFICATION_PERIODS, Experiment
+from loopwright.tuning.fast.forecast import Past
 from loopwright.tuning.fast.proposal import PulseFigures
+from loopwright.tuning.fast.pulse_levels import MIN_FOLLOWED, PulseBounds, step_fits
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.models import Reals
-from loopwright.tuning.plan import Command, Plan, Sample, SetGains, SetSetpoint
+from loopwright.tuning.models import Model, Reals
+from loopwright.tuning.plan import Command, Note, Plan, Sample, SetGains, SetSetpoint
 from loopwright.tuning.reasons import Reason, Refused
 
-PULSES = (1.0, -1.0, 1.0)
-"""The levels of the set-point, in sizes of a pulse; the last level is held until the step home."""
-MIN_FOLLOWED, MIN_FOLLOWED_NOISES = 0.2, 5.0
-"""A pulse turns when PV has followed this fraction of the set-point's move, and this many standard deviations of the
-noise."""
+UP, DOWN = 1.0, -1.0
+"""The levels of the set-point, in sizes of a pulse: up, down as far as `pulse_levels` permits, and up again as far as
+it permits; the last level is held until the step home."""
+MAX_PV_DEVIATION = 1.5
+"""Largest deviation of PV from rest during the pulses, in permitted steps of the set-point."""
+MIN_FOLLOWED_NOISES = 5.0
+"""A pulse turns when PV has followed the fraction MIN_FOLLOWED of the set-point's move, and this many standard
+deviations of the noise."""
 SAMPLES_AVERAGED = 3
-LEVELS_APART = 2.0
+LEVELS_APART = UP - DOWN
 """The swing of the set-point from one level to the other, in sizes of a pulse."""
 MAX_T95 = 10.0
 """Longest time for PV to follow a pulse, in T95."""
+APPROACH_CHECKED, MAX_APPROACH = 0.25, 8.0
+"""How often it is asked whether the step home fits, and for how long at most, in periods of the model."""
+MAX_AT_LIMIT_T95, MAX_AT_LIMIT_PART = 0.5, 0.5
+"""Longest time for which MV may stand at a limit while no period is known: the longer of this number of T95 and this
+part of the time since the first pulse. Later it is the longer of the ultimate period and the time of two turns: under
+gains that overshoot MV leaves its limit within half a period."""
+HAIR = 1e-6
+"""Distance from a limit at which MV is at it, as a fraction of MV's range: a REAL32 on the bus."""
 
 
 class PulseTest(Experiment):
@@ -42,28 +59,49 @@ class PulseTest(Experiment):
         super().__init__(facts, point, listened)
         self.size = pulse_size(facts.sp_deviation, point.room, facts.old_gains)
         self.turns: list[int] = []  # samples at which the set-point moved; the first one is the start
+        self.levels: list[float] = []  # of the set-point, in sizes of a pulse
+        self._gains = facts.old_gains
+        self._at_limit = 0
         self.period = 0.0
         """The time scale of the record, in samples, from `first_period`."""
 
     def start(self) -> Plan[None]:
         """Makes the first move of the set-point."""
         self.listened = self.excited = len(self.trace)
-        self.turns.append(self.listened)
-        self._commands = (SetSetpoint(self.point.sp + PULSES[0] * self.size),)
+        yield from self.turn(UP)
+
+    def turn(self, level: float) -> Plan[None]:
+        """Moves the set-point to a level, in sizes of a pulse."""
+        self.turns.append(len(self.trace))
+        self.levels.append(level)
+        self._commands = (SetSetpoint(self.point.sp + level * self.size),)
         yield from self.sample()
+
+    def turn_within_bounds(self, level_of: Callable[[Past, int, float, PulseBounds], float]) -> Plan[None]:
+        """Turns the set-point to the level that this function finds, see `pulse_levels`."""
+        level = yield from self.computed(partial(level_of, self._past(), self.listened, self.size, self._bounds()))
+        if abs(level) < UP:
+            wanted, size = self.size, abs(level) * self.size
+            yield from self.report(
+                Note(f"a pulse of {size:.3g} in place of {wanted:.3g} keeps PV and MV within bounds")
+            )
+        yield from self.turn(level)
 
     def sample(self) -> Plan[None]:
         """Lets one sample pass."""
         self._commands = self._on_sample((yield self._commands))
 
-    def until_turned(self, turns: int) -> Plan[None]:
-        """Goes on until the set-point has turned this number of times. Raises Refused, NO_RESPONSE or WRONG_SIGN: PV
-        does not follow."""
+    def until_followed(self, max_T95: float = MAX_T95) -> Plan[None]:
+        """Goes on until PV has followed the last move of the set-point far enough to turn.
+
+        max_T95: the longest time for that, in T95.
+        Raises Refused, NO_RESPONSE or STALLED: PV does not follow.
+        """
         Ts = self.facts.sample_time_s
-        while len(self.turns) <= turns:
+        while not self._followed():
             yield from self.sample()
             passed = (len(self.trace) - self.turns[-1]) * Ts
-            if passed > max(MAX_T95 * self.facts.T95_s, 40 * Ts):
+            if passed > max(max_T95 * self.facts.T95_s, 40 * Ts):
                 raise self._not_followed(passed)
 
     def lasting(self, samples: float) -> Plan[None]:
@@ -76,6 +114,41 @@ class PulseTest(Experiment):
         """The number of samples since the first pulse."""
         return len(self.trace) - self.listened
 
+    def approach(self, models: Sequence[Model], gains: Gains, model_period: float) -> Plan[None]:
+        """Brings the set-point near enough to where the test began, under the present gains, that MV stays within its
+        limits when the new gains bring it home: their Kp may be many times the present one.
+
+        models: the models that explain the record. gains: the new gains. model_period: the ultimate period, s.
+        """
+        facts, point = self.facts, self.point
+        period = model_period / facts.sample_time_s
+        samples = int(VERIFICATION_PERIODS * period)
+
+        def fits() -> Plan[bool]:
+            kick = gains.b * gains.Kp * abs(self.trace.sp[-1] - point.sp)
+            if kick > facts.mv_step_max:
+                return False
+            past = self._past()
+            home = float(past.sp[-1]) + point.sp - self.trace.sp[-1]
+            return (yield from self.computed(partial(step_fits, past, models, gains, home, self.noise, samples)))
+
+        if (yield from fits()):
+            return
+        away = self.trace.sp[-1] - point.sp
+        near = math.copysign(min(abs(away), self._fitting(gains)), away)
+        yield from self.report(
+            Note(
+                f"Kp {gains.Kp:.4g} times a step of {abs(away):.3g} does not fit into MV's limits: the set-point is "
+                f"first brought to {abs(near):.3g} from where it was"
+            )
+        )
+        self._commands = (SetSetpoint(point.sp + near),)
+        begun = self.elapsed
+        while self.elapsed < begun + MAX_APPROACH * period:
+            yield from self.lasting(self.elapsed + max(1.0, APPROACH_CHECKED * period))
+            if (yield from fits()):
+                return
+
     def step(self, gains: Gains, model_period: float) -> Plan[None]:
         """Puts the new gains in effect without a bump, and the set-point back to where the test began.
 
@@ -86,6 +159,7 @@ class PulseTest(Experiment):
         output_range = self.experiment_record().output_range
         self._step = point.sp - self.trace.sp[-1]
         self.excited = len(self.trace)
+        self._gains = gains
         self._commands = ()
         yield from self._follow((SetGains(gains), SetSetpoint(point.sp)), output_range)
 
@@ -93,7 +167,7 @@ class PulseTest(Experiment):
         """Steps the set-point by half a pulse under the new gains and follows PV for half as long as after the first
         step."""
         self._follow_s *= STEP_BACK_FRACTION
-        target = self.point.sp + STEP_BACK_FRACTION * self.size
+        target = self.point.sp + min(STEP_BACK_FRACTION * self.size, self._fitting(self._gains))
         yield from self._follow((SetSetpoint(target),), self.experiment_record().output_range)
 
     def experiment_record(self) -> ExperimentRecord:
@@ -129,21 +203,66 @@ class PulseTest(Experiment):
         u, y = self._deviations()
         return u[self.listened :], y[self.listened :]
 
+    def _past(self) -> Past:
+        """The record so far for a forecast; PV, set-point and MV are deviations from rest."""
+        u, y = self._deviations()
+        facts, pv, mv = self.facts, self.trace.pv[-1] - float(y[-1]), self.trace.mv[-1] - float(u[-1])
+        return Past(
+            Ts=facts.sample_time_s,
+            sp=np.asarray(self.trace.sp) - pv,
+            pv=y,
+            mv=u,
+            low=facts.mv_low - mv,
+            high=facts.mv_high - mv,
+            action=self._direction,
+            gains=facts.old_gains,
+        )
+
+    def _bounds(self) -> PulseBounds:
+        """How far PV may move."""
+        facts, rest = self.facts, self.point.pv
+        maximum = MAX_PV_DEVIATION * facts.sp_deviation
+        return PulseBounds(max(-maximum, facts.pv_low - rest), min(maximum, facts.pv_high - rest), self.noise)
+
     def _on_sample(self, sample: Sample) -> tuple[Command, ...]:
         self._add(sample)
-        if self._stepping or not self.turns or len(self.turns) == len(PULSES):
-            return ()
+        return ()
+
+    def _add(self, sample: Sample) -> None:
+        super()._add(sample)
+        self._watch_limits(sample)
+
+    def _watch_limits(self, sample: Sample) -> None:
+        """Raises Refused, MV_LIMIT: MV stands at a limit, where PV is left to itself."""
+        facts = self.facts
+        hair = HAIR * (facts.mv_high - facts.mv_low)
+        at_limit = bool(self.turns) and not facts.mv_low + hair < sample.mv < facts.mv_high - hair
+        self._at_limit = self._at_limit + 1 if at_limit else 0
+        if self.period:
+            maximum = max(self.period, float(self.turns[-1] - self.listened))
+        else:
+            maximum = max(MAX_AT_LIMIT_T95 * facts.T95_s / facts.sample_time_s, MAX_AT_LIMIT_PART * self.elapsed)
+        if self._at_limit > maximum:
+            raise Refused(
+                Reason.MV_LIMIT,
+                f"MV has stood at its limit of {sample.mv:.4g} for {self._at_limit * facts.sample_time_s:.3g} s, PV is "
+                f"{sample.pv - self.point.pv:+.3g} away for a set-point {sample.sp - self.point.sp:+.3g} away: a load "
+                "disturbance, or a fault of the plant, asks for more MV than is permitted",
+            )
+
+    def _fitting(self, gains: Gains) -> float:
+        """The step of the set-point whose kick under these gains leaves room for MV, PV units."""
+        kick = gains.b * gains.Kp
+        return KICK_OF_ROOM * self.point.room / kick if kick > 0.0 else self.size
+
+    def _followed(self) -> bool:
         since = self.turns[-1]
         if len(self.trace) < since + SAMPLES_AVERAGED:
-            return ()
-        level = PULSES[len(self.turns) - 1]
-        move = self.size * (LEVELS_APART if len(self.turns) > 1 else 1.0)
+            return False
+        move = self.size * (self.levels[-1] - (self.levels[-2] if len(self.levels) > 1 else 0.0))
         begun = float(np.mean(self.trace.pv[max(since - SAMPLES_AVERAGED, 0) : since]))
-        followed = level * (float(np.mean(self.trace.pv[-SAMPLES_AVERAGED:])) - begun)
-        if followed < max(MIN_FOLLOWED * move, MIN_FOLLOWED_NOISES * self.noise):
-            return ()
-        self.turns.append(len(self.trace))
-        return (SetSetpoint(self.point.sp + PULSES[len(self.turns) - 1] * self.size),)
+        followed = math.copysign(1.0, move) * (float(np.mean(self.trace.pv[-SAMPLES_AVERAGED:])) - begun)
+        return followed >= max(MIN_FOLLOWED * abs(move), MIN_FOLLOWED_NOISES * self.noise)
 
     def _not_followed(self, passed: float) -> Refused:
         moved = float(np.mean(self.trace.pv[-SAMPLES_AVERAGED:])) - self.point.pv

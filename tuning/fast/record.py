@@ -19,11 +19,12 @@ class Excitation(StrEnum):
 
     RELAY = "relay"
     SETPOINT = "setpoint"
+    OPERATION = "operation"
 
     @property
     def in_words(self) -> str:
         """The excitation in the words of a sentence."""
-        return "relay" if self is Excitation.RELAY else "pulses"
+        return {"relay": "relay", "setpoint": "pulses", "operation": "first set-point change"}[self]
 
 
 MIN_LISTENED = 60
@@ -48,6 +49,9 @@ class ExperimentRecord:
     period: the time scale, in samples: the period of the relay oscillation, or the ultimate period of a first model.
     steps: the samples at which the set-point stepped under the new gains.
     excitation: what moved the loop.
+    lengths: the number of samples of each piece of the record, where there are several: the time at rest, then each
+    set-point change of normal operation. MV and PV are deviations from the rest before each change.
+    held_s: the time for which the controller holds MV, s; None where it is the sample time.
     Raises Refused: BAD_INPUT, NO_RESPONSE.
     """
 
@@ -61,6 +65,18 @@ class ExperimentRecord:
     period: float
     steps: tuple[int, ...] = ()
     excitation: Excitation = Excitation.RELAY
+    lengths: tuple[int, ...] = ()
+    held_s: float | None = None
+
+    @property
+    def sampling_delay_s(self) -> float:
+        """The delay that the sampling of the controller adds to the loop, s."""
+        return 0.5 * (self.Ts if self.held_s is None else self.held_s)
+
+    @property
+    def pieces(self) -> tuple[int, ...]:
+        """The number of samples of each piece."""
+        return self.lengths or (len(self.y),)
 
     def __post_init__(self) -> None:
         if self.listened < MIN_LISTENED:

@@ -42,9 +42,8 @@ def evaluate_excitation(record: ExperimentRecord, spec: DesignSpec) -> Evaluatio
     first = first_period(record.u[pulses], record.y[pulses], record.Ts)
     found = evaluate(replace(record, period=first), spec)
     for _ in range(MAX_REFITS):
-        own = found.period / record.Ts
-        low, high = PERIOD_IS_RIGHT
-        if low <= own / found.fit.period <= high:
+        own = own_period(found)
+        if own is None:
             break
         try:
             again = evaluate(replace(record, period=own), spec)
@@ -54,6 +53,13 @@ def evaluate_excitation(record: ExperimentRecord, spec: DesignSpec) -> Evaluatio
             break
         found = again
     return found
+
+
+def own_period(found: Evaluation) -> float | None:
+    """The ultimate period of the model, in samples, where it is another one than the time scale of its fit."""
+    own = found.period / found.fit.record.Ts
+    low, high = PERIOD_IS_RIGHT
+    return None if low <= own / found.fit.period <= high else own
 
 
 def evaluate_again(record: ExperimentRecord, spec: DesignSpec) -> Evaluation:

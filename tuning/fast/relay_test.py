@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -44,24 +45,37 @@ MIN_MODEL_PERIOD = 0.5
 """Fraction of the relay's period below which the ultimate period of a model is not used."""
 
 
-def max_amplitude(mv: float, mv_low: float, mv_high: float) -> float:
-    """The largest amplitude of the higher side of a relay around `mv` that keeps MV within its limits, MV units."""
-    return min(mv_high - mv, (mv - mv_low) / BIAS)
+def max_amplitude(mv: float, mv_low: float, mv_high: float, mv_step_max: float = math.inf) -> float:
+    """The largest amplitude of the higher side of a relay around `mv` that keeps MV within its limits, and its jumps
+    within the largest permitted one, MV units."""
+    return min(mv_high - mv, (mv - mv_low) / BIAS, mv_step_max / (1.0 + BIAS))
 
 
 class RelayTest(Experiment):
     """The relay test and the set-point step that follows it.
 
     facts, point: what is known of the loop, and the operating point at rest.
-    listened: the samples at rest, with which the record begins.
+    record: the samples so far, with which the record begins.
     amplitude: the amplitude of the relay's higher side, MV units; None for the default, adapted after the first wave.
+    at_rest: the number of samples at rest at the beginning of the record, where the relay follows another excitation;
+    None where it is the first one.
     Raises Refused, BAD_LIMITS: an amplitude that MV does not permit.
     """
 
-    def __init__(self, facts: Facts, point: OperatingPoint, listened: Trace, amplitude: float | None) -> None:
-        super().__init__(facts, point, listened)
+    def __init__(
+        self,
+        facts: Facts,
+        point: OperatingPoint,
+        record: Trace,
+        amplitude: float | None,
+        at_rest: int | None = None,
+    ) -> None:
+        super().__init__(facts, point, record, at_rest)
+        self._follows = at_rest is not None
+        self._begun = 0
+        """The number of samples before the relay."""
         self.switches: list[int] = []
-        self._max = max_amplitude(point.mv, facts.mv_low, facts.mv_high)
+        self._max = max_amplitude(point.mv, facts.mv_low, facts.mv_high, facts.mv_step_max)
         if amplitude is not None and not 0.0 < amplitude <= self._max:
             raise Refused(
                 Reason.BAD_LIMITS, f"a relay amplitude of {amplitude:g} is asked for; MV permits up to {self._max:.4g}"
@@ -90,8 +104,12 @@ class RelayTest(Experiment):
         Raises Refused: NO_RESPONSE, WRONG_SIGN, CANNOT_OSCILLATE up to the second switch, STALLED before the fourth.
         """
         if not self.excited:
-            self.listened = self.excited = len(self.trace)
-            self._commands = (self._relay_command(), SetMode(Mode.EXPERIMENT))
+            self._begun = len(self.trace)
+            if not self._follows:
+                self.listened = self._begun
+            self.excited = self.listened
+            home = (SetSetpoint(self.point.sp),) if self._follows else ()
+            self._commands = (*home, self._relay_command(), SetMode(Mode.EXPERIMENT))
         while len(self.switches) < switches:
             self._commands = self._on_sample((yield self._commands))
             if self._time_is_over():
@@ -117,7 +135,9 @@ class RelayTest(Experiment):
         # A bumpless transfer from the relay would start the integral at the relay's output, which acts like a load
         # disturbance. The output is set to the proportional part first, so that the integral starts at rest.
         error = (point.pv - self.trace.pv[-1]) * (1.0 if facts.reverse else -1.0)
-        output = min(max(point.mv + gains.Kp * error, facts.mv_low), facts.mv_high)
+        low = max(facts.mv_low, self.trace.mv[-1] - facts.mv_step_max)
+        high = min(facts.mv_high, self.trace.mv[-1] + facts.mv_step_max)
+        output = min(max(point.mv + gains.Kp * error, low), high)
         self._add((yield (SetMode(Mode.MANUAL), SetOutput(output), SetGains(gains))))
         self._step = size
         yield from self._follow((SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp + size)), output_range)
@@ -154,7 +174,7 @@ class RelayTest(Experiment):
                 self._sides = [BIAS, 1.0]
                 return (self._relay_command(),)
         elif len(self.switches) >= 2:
-            longest = max(np.diff([self.listened, *self.switches]))
+            longest = max(np.diff([self._begun, *self.switches]))
             since = at - max(self.switches[-1], self._raise_at)
             if since > STALLED * longest:
                 self._raise_at = at
@@ -171,7 +191,7 @@ class RelayTest(Experiment):
 
         Raises Refused, NO_RESPONSE: MV has switched, and PV stands still.
         """
-        seen = float(np.ptp(self.trace.pv[self.listened :]))
+        seen = float(np.ptp(self.trace.pv[self._begun :]))
         factor = 1.0
         if seen == 0.0:
             raise Refused(
@@ -197,7 +217,7 @@ class RelayTest(Experiment):
     def _time_is_over(self) -> bool:
         """Whether the time of the relay is over. The limit comes from T95 before the second switch, and from the half
         periods after it. Raises Refused before the second switch, see `no_oscillation`."""
-        passed = len(self.trace) - self.listened
+        passed = len(self.trace) - self._begun
         if len(self.switches) < 2:
             if passed * self.facts.sample_time_s > max(3.0 * self.facts.T95_s, 40 * self.facts.sample_time_s):
                 point = replace(self.point, room=self.amplitude)  # the message names the amplitude of the relay
@@ -208,11 +228,11 @@ class RelayTest(Experiment):
         return passed > MAX_PERIODS * max(known, 2.0 * float(np.max(halves)) if len(halves) < 3 else 0.0)
 
     def _since(self) -> Trace:
-        trace, at = self.trace, self.listened
+        trace, at = self.trace, self._begun
         return Trace(trace.t[at:], trace.sp[at:], trace.pv[at:], trace.mv[at:])
 
     def _stalled(self) -> Refused:
-        passed = (len(self.trace) - self.listened) * self.facts.sample_time_s
+        passed = (len(self.trace) - self._begun) * self.facts.sample_time_s
         return Refused(
             Reason.STALLED,
             f"the relay of {self.amplitude:.4g} switched {len(self.switches)} times in {passed:.4g} s, "

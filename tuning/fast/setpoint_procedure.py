@@ -14,7 +14,7 @@ from loopwright.tuning.analysis.comparison import Comparison
 from loopwright.tuning.experiments.preflight import at_rest
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.design import frequencies
-from loopwright.tuning.fast.evaluation import Evaluation
+from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY, Evaluation
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.outcome import OPEN_REASONS, evaluated
 from loopwright.tuning.fast.proposal import (
@@ -24,14 +24,16 @@ from loopwright.tuning.fast.proposal import (
     proposed,
     verified_step,
 )
+from loopwright.tuning.fast.pulse_levels import last_level, second_level
+from loopwright.tuning.fast.pulse_test import MAX_T95 as MAX_T95_TO_FOLLOW
 from loopwright.tuning.fast.pulse_test import PulseTest
-from loopwright.tuning.fast.record import MIN_LISTENED, ExperimentRecord
+from loopwright.tuning.fast.record import MIN_LISTENED, Excitation, ExperimentRecord
 from loopwright.tuning.fast.record_evaluation import first_period
 from loopwright.tuning.fast.uncertainty import peak
 from loopwright.tuning.plan import Note, Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
 
-__all__ = ["SETPOINT", "SETPOINT_STAGES", "setpoint"]
+__all__ = ["SETPOINT", "SETPOINT_STAGES", "TooLittleExcited", "setpoint"]
 
 SETPOINT = "setpoint"
 SETPOINT_STAGES = ("preflight", "pulses", "design", "verify", "redesign")
@@ -40,13 +42,34 @@ FIRST_LOOK = 1.5
 """Length of the record at the first look, in first periods."""
 NEXT_LOOK, NEXT_LOOK_PERIODS = 1.25, 0.35
 """Growth of the record from one look to the next: this factor, and this number of periods more."""
+LOOKS_OFTEN, LATER_LOOK = 5, 1.6
+"""After so many looks the record has to grow by this factor from one to the next: each costs more than the last."""
+MAX_MODELS = 4
+"""Number of models that are asked whether the step home fits into MV's limits."""
 MIN_OWN_PERIODS = 2.0
 """Smallest length of the record, in ultimate periods of its own model."""
 MAX_DISAGREEMENT = 0.08
 """Largest difference of Ms from the Ms asked for, of the gains of two successive looks on each other's model."""
 MAX_PERIODS, MAX_T95, MAX_TURNS = 12.0, 1.5, 2.5
 """Longest record: the longest of these numbers of ultimate periods, of T95, and of the time of the first two turns."""
-MAX_PERIODS_IN_ALL = 30.0
+MAX_PERIODS_IN_ALL, MAX_TURNS_IN_ALL = 30.0, 12.0
+"""The record is never longer than these numbers of ultimate periods and of the time of the first two turns. A load
+disturbance can make the first of them far too long."""
+RELAY_PERIODS = 4.0
+"""Time that the relay's record takes, in ultimate periods of the model: where the relay may follow and the pulses would
+take longer than that, they end."""
+
+NOT_FOLLOWED = (Reason.NO_RESPONSE, Reason.STALLED)
+MAX_T95_BEFORE_RELAY = 1.0
+"""Longest time for PV to follow a pulse, in T95, where the relay may follow."""
+
+
+class TooLittleExcited(Refused):
+    """The pulses end early, because the relay may follow and tells more. `test` holds their record."""
+
+    def __init__(self, refused: Refused, test: PulseTest) -> None:
+        super().__init__(refused.reason, refused.detail)
+        self.test = test
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,9 +91,13 @@ def setpoint_stages(verify: bool) -> tuple[str, ...]:
     return SETPOINT_STAGES if verify else SETPOINT_STAGES[:3]
 
 
-def setpoint(facts: Facts, options: DesignOptions) -> Plan[FastProposal]:
+def setpoint(
+    facts: Facts, options: DesignOptions, method: str = SETPOINT, relay_follows: bool = False
+) -> Plan[FastProposal]:
     """The plan of the whole procedure, for a loop in automatic and at rest.
 
+    method: the name of the procedure in the proposal.
+    relay_follows: TooLittleExcited is raised as soon as a relay would take less time than the pulses still need.
     Raises Refused. The plan restores nothing: the runner restores the loop.
     """
     T95, spec = facts.T95_s, options.spec()
@@ -85,10 +112,19 @@ def setpoint(facts: Facts, options: DesignOptions) -> Plan[FastProposal]:
     test = PulseTest(facts, point, listened)
     yield from test.report(StageDone("preflight", point), *started("pulses"))
     yield from test.start()
-    yield from test.until_turned(2)
+    longest_T95 = MAX_T95_BEFORE_RELAY if relay_follows else MAX_T95_TO_FOLLOW
+    try:
+        yield from test.until_followed(longest_T95)
+        yield from test.turn_within_bounds(second_level)
+        yield from test.until_followed(longest_T95)
+    except Refused as refused:
+        if relay_follows and refused.reason in NOT_FOLLOWED:
+            raise TooLittleExcited(refused, test) from None
+        raise
+    yield from test.turn_within_bounds(last_level)
     test.period = yield from test.computed(partial(first_period, *test.columns(), facts.sample_time_s))
     look = Look(test.period, None, Refused(Reason.STALLED, "the pulses came to nothing"))
-    turned_at = test.elapsed
+    turned_at, looks = test.elapsed, 0
     at = FIRST_LOOK * test.period
     while True:
         yield from test.lasting(at)
@@ -101,13 +137,21 @@ def setpoint(facts: Facts, options: DesignOptions) -> Plan[FastProposal]:
         own = look.period
         longest = min(
             max(MAX_PERIODS * own, MAX_T95 * facts.T95_s / facts.sample_time_s, MAX_TURNS * turned_at),
-            max(MAX_PERIODS_IN_ALL * own, turned_at),
+            MAX_PERIODS_IN_ALL * own,
+            MAX_TURNS_IN_ALL * turned_at,
         )
         if looked_at >= longest:
+            if not isinstance(look.outcome, Refused):
+                text = f"after {looked_at} samples two successive evaluations still disagree on the gains"
+                look = Look(look.period, look.evaluation, Refused(Reason.UNCERTAIN, text))
             break
         if isinstance(look.outcome, Refused):
+            if relay_follows and _relay_is_shorter(look, looked_at):
+                raise TooLittleExcited(look.outcome, test)
             yield from test.report(Note(f"after {looked_at} samples: {look.outcome.detail}"))
-        at = min(NEXT_LOOK * looked_at + NEXT_LOOK_PERIODS * own, longest)
+        looks += 1
+        growth = NEXT_LOOK if looks < LOOKS_OFTEN else LATER_LOOK
+        at = min(growth * looked_at + NEXT_LOOK_PERIODS * own, longest)
     evaluation, outcome = look.evaluation, look.outcome
     yield from test.report(StageDone("pulses", test.figures()), *started("design"))
     if evaluation is not None:
@@ -121,6 +165,8 @@ def setpoint(facts: Facts, options: DesignOptions) -> Plan[FastProposal]:
         yield from test.report(*started("verify"))
         first = evaluation
         tested = first.best.gains
+        models = [first.fit.model(each) for each in (first.chosen.best, *first.chosen.rivals)][:MAX_MODELS]
+        yield from test.approach(models, tested, first.period)
         yield from test.step(tested, first.period)
         evaluation, outcome = yield from test.computed(
             partial(evaluated, facts, options, test.experiment_record(), first)
@@ -137,7 +183,7 @@ def setpoint(facts: Facts, options: DesignOptions) -> Plan[FastProposal]:
         if isinstance(outcome, Refused):
             raise outcome
     begun_at_s = test.trace.t[test.listened]
-    return (yield from test.computed(partial(proposed, SETPOINT, facts, spec, evaluation, outcome, shown, begun_at_s)))
+    return (yield from test.computed(partial(proposed, method, facts, spec, evaluation, outcome, shown, begun_at_s)))
 
 
 def _settled(look: Look, last: Look, samples: int, asked: float) -> bool:
@@ -154,6 +200,19 @@ def _settled(look: Look, last: Look, samples: int, asked: float) -> bool:
         abs(peak(model.model, gains.best.gains, w, delay) - asked) <= MAX_DISAGREEMENT
         for model, gains in ((now, before), (before, now))
     )
+
+
+def _relay_is_shorter(look: Look, samples: int) -> bool:
+    """Whether a relay would take less time than the pulses still need.
+
+    The uncertainty of Ms falls at most with the root of the record's length, because the last level of the set-point
+    is held.
+    """
+    by_relay = samples + RELAY_PERIODS * look.period
+    if look.evaluation is None:
+        return samples > RELAY_PERIODS * look.period
+    open_by = max(look.evaluation.uncertainty, look.evaluation.ambiguity)
+    return samples * (open_by / MAX_UNCERTAINTY[Excitation.SETPOINT]) ** 2 > by_relay
 
 
 def _look(facts: Facts, options: DesignOptions, record: ExperimentRecord) -> Look:

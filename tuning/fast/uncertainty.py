@@ -52,11 +52,14 @@ def fit_covariance(fit: Fit[ExperimentRecord], found: Fitted) -> Reals:
 def unknown_columns(fit: Fit[ExperimentRecord], found: Fitted) -> Reals:
     """The sensitivities of PV to everything that the fit does not know beforehand, shape (rows, parameters and more).
 
-    A drift of PV and a start that was not at rest follow after theta and the linear coefficients.
+    A drift of PV and a start that was not at rest follow after theta and the linear coefficients. Several pieces have
+    a level and a start of their own already, which stand for a drift.
     """
+    if fit.starts_are_free:
+        return sensitivities(fit, found)
     other = DisturbanceHypothesis(drift=True, not_at_rest_initially=True)
     everything = fit.regressors(found.structure, other, found.theta[None, : found.structure.searched])[0]
-    first = found.structure.inputs + 1 + found.hypothesis.drift  # the level of PV is among the columns already
+    first = fit.first_load(found.structure, found.hypothesis)  # the level of PV is among the columns already
     return np.column_stack((sensitivities(fit, found), everything[:, first:]))
 
 
@@ -93,6 +96,24 @@ def uncertainty_of_Ms(
     N: the derivative filter is Td/N.
     delay: the delay of the sampling, s.
     """
+    structure = found.structure
+    distance, along = distance_from_instability(fit, found, gains, w, N, delay)
+    inputs = structure.inputs
+    whole = fit_covariance(fit, found)
+    kept = np.concatenate((np.arange(structure.searched), len(found.theta) + np.arange(inputs)))
+    sigma = np.sqrt(np.maximum(np.einsum("iw,ij,jw->w", along, whole[np.ix_(kept, kept)], along), 0.0))
+    near = distance < 1.0 / NEAR_THE_PEAK
+    worst = np.maximum(distance - STANDARD_DEVIATIONS * sigma, MIN_DISTANCE)[near]
+    return float(1.0 / worst.min() - 1.0 / distance.min()) if near.any() else 0.0
+
+
+def distance_from_instability(
+    fit: Fit[ExperimentRecord], found: Fitted, gains: Gains, w: Reals, N: float, delay: float
+) -> tuple[Reals, Reals]:
+    """|1 + L| at the frequencies w, and its slopes by the parameters of the plant: shapes (w,) and (parameters, w).
+
+    The parameters are theta without the times of loads, then the linear coefficients of MV. See `uncertainty_of_Ms`.
+    """
     structure, theta, c = found.structure, found.theta, found.linear.coefficients
     inputs = structure.inputs
     at = np.concatenate((theta[: structure.searched], c[:inputs]))
@@ -115,12 +136,7 @@ def uncertainty_of_Ms(
         slopes.append((loop(at + move) - loop(at - move)) / (2.0 * step))
     distance = np.abs(1.0 + nominal)
     along = np.real(np.array(slopes) * np.conj(1.0 + nominal) / distance)
-    whole = fit_covariance(fit, found)
-    kept = np.concatenate((np.arange(structure.searched), len(theta) + np.arange(inputs)))
-    sigma = np.sqrt(np.maximum(np.einsum("iw,ij,jw->w", along, whole[np.ix_(kept, kept)], along), 0.0))
-    near = distance < 1.0 / NEAR_THE_PEAK
-    worst = np.maximum(distance - STANDARD_DEVIATIONS * sigma, MIN_DISTANCE)[near]
-    return float(1.0 / worst.min() - 1.0 / distance.min()) if near.any() else 0.0
+    return distance, along
 
 
 def difference_of_rivals(
@@ -133,10 +149,14 @@ def difference_of_rivals(
 
 def peak(model: TransferFunction, gains: Gains, w: Reals, delay: float = 0.0) -> float:
     """Ms of the loop on the frequency grid w (rad/s), with a further delay (s)."""
-    N = gains.Td / gains.Tf if gains.Tf > 0.0 else 10.0
-    C = gains.Kp * controller(w, gains.Ti, gains.Td, N) * sign(model)
+    C = gains.Kp * controller(w, gains.Ti, gains.Td, filter_ratio(gains)) * sign(model)
     minimum = float(np.abs(1.0 + C * _delayed(model, w, delay)).min())
     return 1.0 / max(minimum, 1e-9) if math.isfinite(minimum) else math.inf
+
+
+def filter_ratio(gains: Gains) -> float:
+    """N of the derivative filter Td/N; it is without effect where there is no derivative."""
+    return gains.Td / gains.Tf if gains.Tf > 0.0 else 10.0
 
 
 def _delayed(model: TransferFunction, w: Reals, delay: float) -> Complexes:

@@ -212,6 +212,13 @@ def search_last_load_again(fit: Fit[S], found: Fitted) -> list[Fitted]:
     return _with_load_time(fit, found.structure, found.hypothesis.load_disturbances - 1, [found.theta[:-1]])
 
 
+def answer_to_load(structure: Structure, theta: Reals, samples: int, block: int) -> Reals:
+    """The states of the plant after a step at its input, each in its largest value, averaged, shape (rows, states)."""
+    monic = structure.monic(theta[: structure.searched])[None, :]
+    answer = averaged(pulses(monic, [0.0], structure.order).drive(np.ones(samples))[0], block)
+    return np.asarray(answer / np.max(np.abs(answer), axis=0))
+
+
 def _rss_by_load_time(fit: Fit[S], structure: Structure, theta: Reals, shifts: NDArray[np.int64]) -> Reals:
     """The residual sums of squares with one more load disturbance at each of these rows, shape (shifts,).
 
@@ -221,12 +228,11 @@ def _rss_by_load_time(fit: Fit[S], structure: Structure, theta: Reals, shifts: N
     base = fit.regressors(structure, DisturbanceHypothesis(len(theta) - structure.searched), theta[None])[0]
     q = np.linalg.qr(base)[0]
     rest = fit.y - q @ (q.T @ fit.y)
-    monic = structure.monic(theta[: structure.searched])[None, :]
-    answer = averaged(pulses(monic, [0.0], order).drive(np.ones(len(fit.u)))[0], fit.block)
-    answer = answer / np.max(np.abs(answer), axis=0)
+    answer = answer_to_load(structure, theta, len(fit.u), fit.block)
     shifted = np.zeros((len(shifts), fit.samples, order))
     for i, m in enumerate(shifts):
-        shifted[i, m:] = answer[: fit.samples - m]
+        end = fit.end_of_piece(int(m))
+        shifted[i, m:end] = answer[: end - m]
     across = np.einsum("nk,snj->skj", q, shifted, optimize=True)
     gram = np.swapaxes(shifted, 1, 2) @ shifted - np.swapaxes(across, 1, 2) @ across
     scale = np.maximum(np.einsum("sii->s", gram), 1e-12)[:, None, None]

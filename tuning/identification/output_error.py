@@ -4,12 +4,13 @@ needed."""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loopwright.tuning.analysis.zero_order_hold import pulses
 from loopwright.tuning.identification.structures import Structure
@@ -29,6 +30,8 @@ FIRST_STEPS, LONG_SEARCHES = 5, 2
 RELATIVE_DECREASE = 1e-6
 LOG_STEP = 1e-4
 MAX_LOG_STEP = 1.5
+GRID_TOGETHER = 24
+"""Points of the grid of starts that are evaluated at once where a record has many pieces, which bounds the memory."""
 
 
 class RecordToFit(Protocol):
@@ -40,6 +43,8 @@ class RecordToFit(Protocol):
     period: the time scale, in samples: about the period of an oscillation at the limit of stability.
     max_dead_time: the longest dead time, in samples.
     block: the number of samples that are averaged into one.
+    pieces: the number of samples of each piece of the record, N together. Each of several pieces has a level of its own
+    and begins in a state of its own.
     """
 
     @property
@@ -58,6 +63,8 @@ class RecordToFit(Protocol):
     def max_dead_time(self) -> float: ...
     @property
     def block(self) -> int: ...
+    @property
+    def pieces(self) -> Sequence[int]: ...
 
 
 S = TypeVar("S", bound=RecordToFit)
@@ -116,48 +123,96 @@ def count(fit: Fitted) -> int:
 
 
 class Fit(Generic[S]):
-    """The fits of one record. Time is in samples, MV in units of its range and PV in units of its range."""
+    """The fits of one record. Time is in samples, MV in units of its range and PV in units of its range.
+
+    Of each of several pieces, the samples at the end that fill no block are left out.
+    """
 
     def __init__(self, record: S) -> None:
         self.record = record
         self.block = record.block
-        self.u = record.u / record.input_range
-        self.y = averaged(record.y / record.output_range, self.block)
+        kept, self.pieces = _whole_blocks(record.pieces, self.block)
+        self.rows = [slice(piece.start // self.block, piece.stop // self.block) for piece in self.pieces]
+        self.u = record.u[kept] / record.input_range
+        self.y = averaged(record.y[kept] / record.output_range, self.block)
         self.samples = len(self.y)
         self.period = record.period
         self._step = np.ones(len(self.u))
-        self._always = averaged(np.column_stack((self._step, np.linspace(-1.0, 1.0, len(self.u)))), self.block)
+        self._level, self._slope = (
+            averaged(_of_each_piece(self.pieces, function), self.block)
+            for function in (np.ones, lambda length: np.linspace(-1.0, 1.0, length))
+        )
         self._rate = math.log(1.0 / self.period)
 
     # what is fitted
 
+    @property
+    def starts_are_free(self) -> bool:
+        """Whether every piece begins in a state of its own, under every disturbance hypothesis."""
+        return len(self.pieces) > 1
+
+    def first_load(self, structure: Structure, hypothesis: DisturbanceHypothesis) -> int:
+        """The first linear coefficient of the load disturbances; each of them has as many as the structure's order."""
+        return structure.inputs + len(self.pieces) * (1 + hypothesis.drift)
+
     def regressors(self, structure: Structure, hypothesis: DisturbanceHypothesis, thetas: Reals) -> Reals:
         """The regressors of all linear parameters for each theta, shape (thetas, rows, columns)."""
-        many, inputs = len(thetas), structure.zeros + 1
+        many, inputs, order = len(thetas), structure.zeros + 1, structure.order
         # one call serves MV and every load disturbance, as call overhead dominates
         times = thetas[:, structure.lags :].T
-        if hypothesis.not_at_rest_initially:
+        free = hypothesis.not_at_rest_initially or self.starts_are_free
+        if free:
             # a step of every state at the start represents any initial state, and a load disturbance
             times = np.append(times, np.zeros((1, many)), axis=0)
         steps = len(times) - 1
-        answers = pulses(np.tile(structure.monic(thetas), (1 + steps, 1)), times.ravel(), structure.order)
-        driven, loads = answers.of(slice(many)), answers.of(slice(many, None))
-        always = self._always[:, : 1 + hypothesis.drift]
-        out = np.empty((many, self.samples, structure.inputs + always.shape[1] + structure.order * steps))
-        out[:, :, :inputs] = averaged(driven.drive(self.u, inputs), self.block, 1)
+        loads = steps - free
+        answers = pulses(np.tile(structure.monic(thetas), (1 + steps, 1)), times.ravel(), order)
+        driven, stepped = answers.of(slice(many)), answers.of(slice(many, None))
+        always = (self._level, self._slope)[: 1 + hypothesis.drift]
+        width = self.first_load(structure, hypothesis) + order * (loads + free * len(self.pieces))
+        out = np.zeros((many, self.samples, width))
+        for rows, piece in zip(self.rows, self.pieces, strict=True):
+            out[:, rows, :inputs] = averaged(driven.drive(self.u[piece], inputs), self.block, 1)
         if structure.feed_through:
-            delayed = np.zeros((many, len(self.u)))
-            for row, delay in zip(delayed, driven.delay, strict=True):
-                row[delay + 1 :] = self.u[: len(self.u) - delay - 1]
-            out[:, :, inputs] = averaged(delayed, self.block, 1)
+            out[:, :, inputs] = averaged(self._delayed(driven.delay), self.block, 1)
         at = structure.inputs
-        out[:, :, at : at + always.shape[1]] = always
-        at += always.shape[1]
-        moved = averaged(loads.drive(self._step), self.block, 1) if steps else out[:0]
-        for k in range(steps):
-            out[:, :, at : at + structure.order] = moved[k * many : (k + 1) * many]
-            at += structure.order
+        for columns in always:
+            out[:, :, at : at + len(self.pieces)] = columns
+            at += len(self.pieces)
+        if not steps:
+            return out
+        moved = averaged(stepped.drive(self._step), self.block, 1)
+        for k in range(loads):
+            load = out[:, :, at : at + order]
+            load[:] = moved[k * many : (k + 1) * many]
+            if len(self.pieces) > 1:
+                self._end_with_piece(load, times[1 + k])
+            at += order
+        for rows in self.rows if free else ():
+            out[:, rows, at : at + order] = moved[loads * many :, : rows.stop - rows.start]
+            at += order
         return out
+
+    def end_of_piece(self, row: int) -> int:
+        """The row after the last one of the piece that this row belongs to."""
+        return int(next(rows.stop for rows in self.rows if row < rows.stop))
+
+    def _delayed(self, delay: NDArray[np.int64]) -> Reals:
+        """MV a sample and the whole samples of the dead time later, shape (plants, N); 0 before each piece."""
+        delayed = np.zeros((len(delay), len(self.u)))
+        for piece in self.pieces:
+            length = piece.stop - piece.start
+            for row, late in zip(delayed, delay, strict=True):
+                if late + 1 < length:
+                    row[piece.start + late + 1 : piece.stop] = self.u[piece.start : piece.stop - late - 1]
+        return delayed
+
+    def _end_with_piece(self, responses: Reals, times: Reals) -> None:
+        """Ends the responses to load disturbances, shape (plants, rows, states), with the piece that each begins in."""
+        ends = np.array([rows.stop for rows in self.rows])
+        begun = np.searchsorted([piece.stop for piece in self.pieces], times, side="right")
+        for response, end in zip(responses, ends[np.minimum(begun, len(ends) - 1)], strict=True):
+            response[end:] = 0.0
 
     def fitted(self, structure: Structure, hypothesis: DisturbanceHypothesis, theta: Reals) -> Fitted:
         """The fit at this theta: the linear parameters by least squares."""
@@ -165,7 +220,11 @@ class Fit(Generic[S]):
         linear = solve(columns, self.y)
         # the time of a load disturbance was chosen among many: it counts twice
         parameters = len(theta) + columns.shape[1] + hypothesis.load_disturbances
-        bic = self.samples * math.log(linear.rss / self.samples + FLOOR**2) + parameters * math.log(self.samples)
+        penalty = parameters * math.log(self.samples)
+        if self.starts_are_free:
+            # the states at the start of the pieces are of no interest: they count by what chance makes of them (AIC)
+            penalty -= structure.order * len(self.pieces) * (math.log(self.samples) - 2.0)
+        bic = self.samples * math.log(linear.rss / self.samples + FLOOR**2) + penalty
         return Fitted(structure, hypothesis, theta, columns, linear, bic)
 
     def search(
@@ -245,7 +304,9 @@ class Fit(Generic[S]):
         if load_at is not None:
             hypothesis = DisturbanceHypothesis(load_disturbances=1)
             thetas = [np.append(theta, load_at) for theta in thetas]
-        rss = sums_of_squares_left(self.regressors(structure, hypothesis, np.array(thetas)), self.y)
+        together = len(thetas) if len(self.pieces) == 1 else GRID_TOGETHER
+        parts = [np.array(thetas[i : i + together]) for i in range(0, len(thetas), together)]
+        rss = np.concatenate([sums_of_squares_left(self.regressors(structure, hypothesis, p), self.y) for p in parts])
         return self.distinct([thetas[i] for i in np.argsort(rss)], structure, keep)
 
     def distinct(self, ranked: Sequence[Reals], structure: Structure, keep: int) -> list[Reals]:
@@ -307,6 +368,28 @@ def sums_of_squares_left(columns: Reals, y: Reals) -> Reals:
     along = turned @ y
     weights = np.linalg.solve(gram, along[:, :, None])[:, :, 0]
     return np.asarray(y @ y - np.einsum("bi,bi->b", weights, along))
+
+
+def _whole_blocks(lengths: Sequence[int], block: int) -> tuple[slice | NDArray[np.int64], tuple[slice, ...]]:
+    """The samples of the pieces that fill whole blocks, and the place of each piece among these samples.
+
+    A record of one piece keeps all samples; `averaged` leaves out those that fill no block.
+    """
+    if len(lengths) == 1:
+        return slice(None), (slice(0, lengths[0]),)
+    ends = np.cumsum(lengths)
+    whole = [length // block * block for length in lengths]
+    kept = [np.arange(end - length, end - length + w) for end, length, w in zip(ends, lengths, whole, strict=True)]
+    stops = np.cumsum(whole)
+    return np.concatenate(kept), tuple(slice(int(stop - w), int(stop)) for stop, w in zip(stops, whole, strict=True))
+
+
+def _of_each_piece(pieces: Sequence[slice], function: Callable[[int], Reals]) -> Reals:
+    """One column for each piece, shape (N, pieces): the function of the piece's length there, 0 elsewhere."""
+    columns = np.zeros((pieces[-1].stop, len(pieces)))
+    for i, piece in enumerate(pieces):
+        columns[piece, i] = function(piece.stop - piece.start)
+    return columns
 
 
 def averaged(columns: Reals, block: int, axis: int = 0) -> Reals:

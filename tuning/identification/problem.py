@@ -63,6 +63,11 @@ class ScaledRecord:
     max_dead_time: float
     block: int
 
+    @property
+    def pieces(self) -> tuple[int, ...]:
+        """The record is one piece."""
+        return (len(self.y),)
+
 
 class IdentificationProblem:
     """The identification problem of one record: its fits, their residuals and their meaning.
@@ -216,7 +221,7 @@ class IdentificationProblem:
         first = len(fit.theta)
         found = []
         for i in range(fit.hypothesis.load_disturbances):
-            of_load = first + structure.inputs + 1 + fit.hypothesis.drift + i * structure.order
+            of_load = first + self.full_fit.first_load(structure, fit.hypothesis) + i * structure.order
 
             def values(at: Reals, i: int = i, of_load: int = of_load) -> Reals:
                 seen = at[structure.searched + i]

@@ -49,7 +49,7 @@ def recorded_test(t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | No
         raise _bad(f"t, u and y must be equally long; they have {len(time)}, {len(mv)} and {len(pv)} samples")
     if len(time) < MIN_SAMPLES:
         raise _bad(f"too few samples: {len(time)}; at least {MIN_SAMPLES} are needed")
-    Ts = _sample_time(time)
+    Ts = sample_time(time)
     before = float(mv[0]) if u_before is None else float(u_before)
     if not np.isfinite(before):
         raise _bad(f"u_before must be a finite number, not {before}")
@@ -84,7 +84,8 @@ def _column(name: str, values: ArrayLike) -> Reals:
     return column
 
 
-def _sample_time(t: Reals) -> float:
+def sample_time(t: Reals) -> float:
+    """The sample time of evenly spaced times, s. Raises Refused, BAD_INPUT, naming the sample that is not."""
     steps = np.diff(t)
     back = np.flatnonzero(steps <= 0.0)
     if len(back):

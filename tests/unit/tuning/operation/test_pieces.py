@@ -1,0 +1,88 @@
+"""A record of several pieces, each with a level and a start of its own: noise-free pieces give the plant exactly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, dlsim, tf2ss
+
+from loopwright.tuning.fast.record import Excitation, ExperimentRecord
+from loopwright.tuning.identification.disturbances import by_bic, fit_structures
+from loopwright.tuning.identification.output_error import UNDISTURBED, DisturbanceHypothesis, Fit
+from loopwright.tuning.identification.structures import FIRST, SECOND
+from loopwright.tuning.models import Reals
+
+K, T1, T2, DELAY, TS = 2.0, 8.0, 3.0, 6, 0.25
+LENGTHS = (301, 260, 347)
+
+
+def of_the_plant(u: Reals, load: Reals) -> Reals:
+    """PV of K/((T1 s + 1)(T2 s + 1)) with a dead time of whole samples, by scipy."""
+    system = cont2discrete(tf2ss([K], np.polymul([T1, 1.0], [T2, 1.0])), TS)
+    late = np.concatenate((np.zeros(DELAY), u[: len(u) - DELAY])) + load
+    return np.asarray(dlsim(system, late)[1][:, 0])
+
+
+def record(load: float = 0.0) -> ExperimentRecord:
+    """Three pieces cut from one simulation, so that none begins at rest; the levels are moved apart."""
+    random = np.random.default_rng(5)
+    u = np.repeat(random.choice((-1.0, 0.0, 1.0), size=60), 25)
+    step = np.where(np.arange(len(u)) >= 900, load, 0.0)
+    y = of_the_plant(u, step)
+    starts = (150, 500, 800)
+    cut = [slice(start, start + length) for start, length in zip(starts, LENGTHS, strict=True)]
+    y_of = [y[piece] + level for piece, level in zip(cut, (0.3, -0.2, 0.1), strict=True)]
+    # MV before a piece is taken for its first value, and what it had been is in the start of the piece
+    return ExperimentRecord(
+        Ts=TS, u=np.concatenate([u[piece] for piece in cut]), y=np.concatenate(y_of), direction=1.0,
+        listened=LENGTHS[0], excited=sum(LENGTHS), turns=2, period=60.0,
+        excitation=Excitation.OPERATION, lengths=LENGTHS,
+    )  # fmt: skip
+
+
+def test_the_plant_is_found_from_pieces_that_do_not_begin_at_rest() -> None:
+    fit = Fit(record())
+    best = min(fit_structures(fit, UNDISTURBED, structures=(FIRST, SECOND)), key=by_bic)
+    model = fit.model(best)
+    assert best.structure == SECOND
+    # MV of a piece before its first sample reaches PV for a dead time longer: the pieces' first samples are off by it
+    assert model.static_gain == pytest.approx(K, rel=0.02)
+    assert sorted(-1.0 / np.roots(model.den).real) == pytest.approx([T2, T1], rel=0.05)
+    assert pytest.approx(DELAY * TS, abs=0.5 * TS) == model.L
+
+
+def test_each_piece_keeps_whole_blocks() -> None:
+    fit = Fit(record())
+    assert fit.block == 1
+    longer = Fit(ExperimentRecord(**{**_fields(record()), "period": 260.0}))
+    assert longer.block == 3
+    assert [piece.stop - piece.start for piece in longer.pieces] == [300, 258, 345]
+    assert [rows.stop - rows.start for rows in longer.rows] == [100, 86, 115]
+
+
+def test_a_load_disturbance_ends_with_the_piece_that_it_begins_in() -> None:
+    fit = Fit(record())
+    at = LENGTHS[0] + 40.0
+    theta = np.array([np.log(1.0 / T1 + 1.0 / T2), np.log(1.0 / (T1 * T2)), DELAY, at])
+    hypothesis = DisturbanceHypothesis(load_disturbances=1)
+    columns = fit.regressors(SECOND, hypothesis, theta[None])[0]
+    first = fit.first_load(SECOND, hypothesis)
+    moved = np.flatnonzero(np.any(columns[:, first : first + SECOND.order] != 0.0, axis=1))
+    assert LENGTHS[0] + 40 <= moved[0] <= LENGTHS[0] + 42
+    assert moved[-1] == LENGTHS[0] + LENGTHS[1] - 1
+
+
+def test_levels_and_starts_belong_to_one_piece_each() -> None:
+    fit = Fit(record())
+    theta = np.array([[np.log(1.0 / T1), DELAY]])
+    columns = fit.regressors(FIRST, UNDISTURBED, theta)[0]
+    assert columns.shape == (sum(LENGTHS), 1 + 3 + 3)
+    for i, rows in enumerate(fit.rows):
+        for column in (columns[:, 1 + i], columns[:, 4 + i]):
+            assert np.all(column[: rows.start] == 0.0)
+            assert np.all(column[rows.stop :] == 0.0)
+        assert np.all(columns[rows, 1 + i] == 1.0)
+
+
+def _fields(found: ExperimentRecord) -> dict[str, object]:
+    return {name: getattr(found, name) for name in found.__dataclass_fields__}

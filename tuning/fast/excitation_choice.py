@@ -1,0 +1,75 @@
+"""The fast procedure chooses what moves the loop, among what the loop permits.
+
+    listen - pulses of the set-point - (where they tell too little: relay) - design - verify - design again
+
+The pulses come first, because they leave the loop in automatic. The choice is made at each look at their record: the
+relay follows as soon as it would take less time than the pulses still need. Present gains that are sluggish excite
+little around the ultimate frequency, above all for a PID. Pulses and relay are then one record.
+"""
+
+from __future__ import annotations
+
+from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.fast.procedure import FAST, FastOptions, by_relay, fast
+from loopwright.tuning.fast.proposal import FastProposal
+from loopwright.tuning.fast.pulse_test import PulseTest
+from loopwright.tuning.fast.record import Excitation
+from loopwright.tuning.fast.relay_test import BIAS, RelayTest
+from loopwright.tuning.fast.setpoint_procedure import SETPOINT_STAGES, TooLittleExcited, setpoint
+from loopwright.tuning.plan import Note, Plan
+
+__all__ = ["chosen_stages", "fast_by"]
+
+MAX_AWAY = 1.0 - 1.0 / (1.0 + BIAS)
+"""Largest distance of MV from rest with which a relay of the largest amplitude may begin, in permitted jumps of MV."""
+MAX_NEAR_T95 = 10.0
+"""Longest time for MV to come near enough to rest for the relay, in T95."""
+
+
+def chosen_stages(excitations: tuple[Excitation, ...], verify: bool) -> tuple[str, ...]:
+    """The stages that a run with these excitations may have, in their order; the relay's is left out where the pulses
+    tell enough."""
+    relay = ("relay",) if Excitation.RELAY in excitations else ()
+    pulses = ("pulses",) if Excitation.SETPOINT in excitations else ()
+    first, _, design, *last = SETPOINT_STAGES
+    return (first, *pulses, *relay, design, *(last if verify else ()))
+
+
+def fast_by(excitations: tuple[Excitation, ...], facts: Facts, options: FastOptions) -> Plan[FastProposal]:
+    """The plan of the fast procedure with the excitations that the loop permits, for a loop in automatic and at rest.
+
+    Raises Refused. The plan restores nothing: the runner restores the loop.
+    """
+    if Excitation.SETPOINT not in excitations:
+        return (yield from fast(facts, options))
+    relay_follows = Excitation.RELAY in excitations
+    try:
+        return (yield from setpoint(facts, options, FAST, relay_follows))
+    except TooLittleExcited as found:
+        test, refused = found.test, found
+    yield from test.report(Note(f"the relay follows, because the pulses tell too little: {refused.detail}"))
+    if not (yield from _near_rest(test, facts)):
+        raise refused
+    return (
+        yield from by_relay(facts, options, RelayTest(facts, test.point, test.trace, options.amplitude, test.listened))
+    )
+
+
+def _near_rest(test: PulseTest, facts: Facts) -> Plan[bool]:
+    """Brings MV so near to rest that the relay begins with a permitted jump: the integral may have moved MV far during
+    the pulses. Returns False if MV does not come near in time."""
+    maximum = MAX_AWAY * facts.mv_step_max
+
+    def away() -> float:
+        return abs(test.trace.mv[-1] - test.point.mv)
+
+    if away() <= maximum:
+        return True
+    yield from test.report(
+        Note(f"MV is {away():.4g} from rest: the set-point goes home first, so that the relay does not jump too far")
+    )
+    yield from test.turn(0.0)
+    longest = test.elapsed + MAX_NEAR_T95 * facts.T95_s / facts.sample_time_s
+    while away() > maximum and test.elapsed < longest:
+        yield from test.sample()
+    return away() <= maximum

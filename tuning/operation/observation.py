@@ -1,0 +1,213 @@
+"""What the set-point changes of normal operation tell of the plant, and of the gains that would be the best.
+
+Every set-point change is a piece of one record: one plant for all, a level and a start of its own for each. The gains
+are proposed when their Ms is known well enough and further checks agree: each change left out in turn, and what the
+set-point alone moved (`setpoint_alone`), which finds the bias that loads and noise in a closed loop cause. Source of
+the latter: P. Van den Hof, R. Schrama, Automatica 29, 1993.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from loopwright.tuning.fast.design import DesignSpec, frequencies
+from loopwright.tuning.fast.evaluation import Evaluation, evaluate
+from loopwright.tuning.fast.record import MIN_LISTENED, Excitation, ExperimentRecord, noise_of
+from loopwright.tuning.fast.record_evaluation import first_period, own_period
+from loopwright.tuning.fast.uncertainty import peak
+from loopwright.tuning.identification.output_error import Fit, Fitted
+from loopwright.tuning.models import Reals, TransferFunction
+from loopwright.tuning.operation.consistency import consistent
+from loopwright.tuning.operation.history import (
+    SetpointChange,
+    Stretch,
+    parts_at_rest,
+    require_operator,
+    setpoint_changes,
+)
+from loopwright.tuning.operation.setpoint_alone import Ms_by_setpoint_alone
+from loopwright.tuning.reasons import Reason, Refused
+
+BEFORE, AFTER = 1.0, 5.0
+"""Periods before and after its first move that a set-point change is looked at."""
+REST_PERIODS, REST_QUANTILE = (8.0, 4.0), 0.4
+"""Length of a quiet part, in periods, and the shorter one where there is no such part; the quantile of the noise of all
+quiet parts that is taken for the noise."""
+MIN_SIZE = 5.0
+"""Smallest set-point change that is looked at, in standard deviations of the noise."""
+MIN_CHANGES, MAX_CHANGES = 2, 12
+"""Smallest number of set-point changes that can check each other, and the largest number that are looked at together:
+the latest ones."""
+MAX_LEFT_OUT, MAX_BY_SETPOINT = 0.06, 0.08
+"""Largest difference of Ms with a change left out, and by the set-point alone."""
+REFITS = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """What operation tells.
+
+    reason: the reason why no gains are proposed; None where they are.
+    detail: what is missing or what speaks against them, in a sentence with the numbers.
+    evaluation: the evaluation of the record of all changes used, None without one.
+    used: the changes that belong to one plant.
+    dropped: further changes, which do not fit these.
+    """
+
+    reason: Reason | None
+    detail: str
+    evaluation: Evaluation | None = None
+    used: tuple[SetpointChange, ...] = ()
+    dropped: tuple[SetpointChange, ...] = ()
+
+
+def observe(stretches: Sequence[Stretch], reverse: bool, spec: DesignSpec) -> Observation:
+    """What the stretches of operation, oldest first and of one sample time, tell of the best gains.
+
+    reverse: the action of the controller, see `Facts`.
+    Raises Refused, SETPOINT_IS_DRIVEN.
+    """
+    known = [each for each in stretches if each.moves]
+    require_operator(list(stretches))
+    if not known:
+        return Observation(Reason.UNCERTAIN, "no set-point change has been heard yet")
+    try:
+        return _observed(known, stretches, reverse, spec)
+    except Refused as refused:
+        return Observation(refused.reason, refused.detail)
+
+
+def _observed(known: list[Stretch], stretches: Sequence[Stretch], reverse: bool, spec: DesignSpec) -> Observation:
+    period = _first_period(known)
+    found: Observation | None = None
+    for _ in range(1 + REFITS):
+        again = _at(period, stretches, reverse, spec)
+        if again.evaluation is None:
+            return found or again
+        found = again
+        own = own_period(again.evaluation)
+        if own is None:
+            break
+        period = own
+    assert found is not None
+    return found
+
+
+def _first_period(stretches: Sequence[Stretch]) -> float:
+    """The time scale of the largest set-point change, in samples. Raises Refused."""
+    sizes = [(abs(float(each.sp[k] - each.sp[k - 1])), each, k) for each in stretches for k in each.moves]
+    _, stretch, move = max(sizes, key=lambda each: each[0])
+    later = [k for k in stretch.moves if k > move]
+    before = max([k for k in stretch.moves if k < move], default=0)
+    end = later[0] if later else len(stretch.sp)
+    rest = slice(max(before, move - (end - move) // 2), move)
+    if rest.stop - rest.start < 1:
+        rest = slice(move - 1, move)
+    u = stretch.mv[move:end] - float(np.mean(stretch.mv[rest]))
+    y = stretch.pv[move:end] - float(np.mean(stretch.pv[rest]))
+    return first_period(u, y, stretch.Ts)
+
+
+def _at(period: float, stretches: Sequence[Stretch], reverse: bool, spec: DesignSpec) -> Observation:
+    """What the changes tell at a time scale, in samples."""
+    before, after = max(round(BEFORE * period), 2), max(round(AFTER * period), 20)
+    lengths = (max(round(each * period), MIN_LISTENED) for each in REST_PERIODS)
+    rest = next(filter(None, (_rest(stretches, length, after) for length in lengths)), None)
+    if rest is None:
+        text = f"the loop has not rested for {REST_PERIODS[-1]:g} ultimate periods with its set-point unmoved"
+        return Observation(Reason.UNCERTAIN, text)
+    stretch, part = rest
+    noise = noise_of(stretch.pv[part])
+    changes = [each for s in stretches for each in setpoint_changes(s, before, after, MIN_SIZE * noise)]
+    if not changes:
+        text = f"no set-point change of {MIN_SIZE * noise:.3g} or more, followed for {AFTER:g} ultimate periods"
+        return Observation(Reason.UNCERTAIN, text)
+    latest = changes[-MAX_CHANGES:]
+    used = [
+        latest[i]
+        for i in consistent(lambda which: _record(rest, [latest[i] for i in which], reverse, period), len(latest))
+    ]
+    evaluation = evaluate(_record(rest, used, reverse, period), spec)
+    dropped = tuple(each for each in latest if each not in used)
+    reason, detail = evaluation.reason, evaluation.detail
+    if reason is None and len(dropped) > len(used):
+        reason = Reason.DISTURBED
+        detail = f"one plant without disturbances explains only {len(used)} of {len(latest)} set-point changes"
+    if reason is None and len(used) < MIN_CHANGES:
+        reason, detail = Reason.UNCERTAIN, "one set-point change alone cannot be checked by another; wait for the next"
+    if reason is None:
+        reason, detail = _checked(evaluation, used, spec)
+    return Observation(reason, detail, evaluation, tuple(used), dropped)
+
+
+def _rest(stretches: Sequence[Stretch], length: int, after: int) -> tuple[Stretch, slice] | None:
+    """The quiet part whose noise is at the quantile of all quiet parts."""
+    parts = [(noise_of(each.pv[part]), each, part) for each in stretches for part in parts_at_rest(each, length, after)]
+    if not parts:
+        return None
+    parts.sort(key=lambda each: each[0])
+    _, stretch, part = parts[int(REST_QUANTILE * (len(parts) - 1))]
+    return stretch, part
+
+
+def _record(
+    rest: tuple[Stretch, slice], changes: Sequence[SetpointChange], reverse: bool, period: float
+) -> ExperimentRecord:
+    """The rest and the changes as one record of several pieces. Raises Refused as `ExperimentRecord`."""
+    stretch, part = rest
+    pieces = [(stretch, part, part), *((each.stretch, each.samples, slice(each.first, each.move)) for each in changes)]
+    u = [_deviation(s.mv, at, before) for s, at, before in pieces]
+    y = [_deviation(s.pv, at, before) for s, at, before in pieces]
+    lengths = tuple(map(len, u))
+    return ExperimentRecord(
+        Ts=stretch.Ts,
+        u=np.concatenate(u),
+        y=np.concatenate(y),
+        direction=1.0 if reverse else -1.0,
+        listened=lengths[0],
+        excited=sum(lengths),
+        turns=len(changes),
+        period=period,
+        excitation=Excitation.OPERATION,
+        lengths=lengths,
+        held_s=stretch.held_s,
+    )
+
+
+def _deviation(column: Reals, at: slice, before: slice) -> Reals:
+    """A part of a column as deviations from a value at rest; the values keep their resolution."""
+    rest = np.sort(column[before])
+    return np.asarray(column[at] - rest[len(rest) // 2])
+
+
+def _model_without(fit: Fit[ExperimentRecord], found: Fitted, piece: int) -> TransferFunction:
+    """The model of the same structure, fitted without one piece of the record."""
+    record, structure = fit.record, found.structure
+    end = int(np.sum(record.lengths[: piece + 1]))
+    left = np.delete(np.arange(len(record.u)), slice(end - record.lengths[piece], end))
+    lengths = record.lengths[:piece] + record.lengths[piece + 1 :]
+    fewer = Fit(replace(record, u=record.u[left], y=record.y[left], excited=len(left), lengths=lengths))
+    times, out = found.theta[structure.searched :], fit.pieces[piece]
+    times = times[(times < out.start) | (times >= out.stop)]
+    times = np.where(times >= out.stop, times - (out.stop - out.start), times)
+    hypothesis = replace(found.hypothesis, load_disturbances=len(times))
+    theta = np.append(found.theta[: structure.searched], times)
+    return fewer.model(fewer.search(structure, hypothesis, [theta]))
+
+
+def _checked(evaluation: Evaluation, changes: Sequence[SetpointChange], spec: DesignSpec) -> tuple[Reason | None, str]:
+    """The reason and the sentence where a check of the whole speaks against the gains."""
+    fit, best, gains = evaluation.fit, evaluation.chosen.best, evaluation.best.gains
+    w, delay = frequencies(evaluation.period), evaluation.design_delay
+    left = [_model_without(fit, best, piece) for piece in range(1, len(fit.pieces))]
+    worst = max(abs(peak(model, gains, w, delay) - evaluation.Ms) for model in left)
+    if worst > MAX_LEFT_OUT:
+        text = f"without one of the {len(changes)} set-point changes Ms would differ by {worst:.2g}"
+        return Reason.UNCERTAIN, text
+    alone = Ms_by_setpoint_alone(evaluation, changes, spec.N)
+    if abs(alone - evaluation.Ms) > MAX_BY_SETPOINT:
+        return Reason.DISTURBED, f"what the set-point alone moved gives Ms {alone:.2f} instead of {evaluation.Ms:.2f}"
+    return None, ""
