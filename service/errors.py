@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from loopwright.tuning.reasons import Reason, Refused
 
 
@@ -21,14 +23,28 @@ class Conflict(Exception):
     """The job or its loop is not as the wish supposes."""
 
 
-class Locked(Refused):
-    """Somebody has locked the loop: no test begins on it, and no decision writes to it."""
+class _OfOneReason(Refused):
+    """A refusal whose class says the reason."""
+
+    of: ClassVar[Reason]
 
     def __init__(self, detail: str) -> None:
-        super().__init__(Reason.LOCKED, detail)
+        super().__init__(self.of, detail)
 
-    def __reduce__(self) -> tuple[type[Locked], tuple[str]]:  # type: ignore[override]
+    def __reduce__(self) -> tuple[type[_OfOneReason], tuple[str]]:  # type: ignore[override]
         return type(self), (self.detail,)
+
+
+class Locked(_OfOneReason):
+    """Somebody has locked the loop: no test begins on it, and no decision writes to it."""
+
+    of = Reason.LOCKED
+
+
+class RemoteSetpoint(_OfOneReason):
+    """Another controller moves the set-point of the loop, so that the set-point cannot be pulsed."""
+
+    of = Reason.SETPOINT_IS_DRIVEN
 
 
 class LockedOtherwise(Locked):

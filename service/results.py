@@ -59,6 +59,44 @@ class GainsView(Figures):
         return cls(Kp=gains.Kp, Ti=gains.Ti, Td=gains.Td, Tf=gains.Tf, b=gains.b, c=gains.c)
 
 
+class KnownMsView(Figures):
+    """Ms of gains on a model, with what is known of it. Both are null where the loop is not stable on the model."""
+
+    Ms: float | None = Field(description="Maximum sensitivity on the model", examples=[1.9])
+    uncertainty: float | None = Field(
+        description="How far Ms may be off: by two standard deviations of the model, or on another model that explains "
+        "the record as well",
+        examples=[0.03],
+    )
+
+
+class KnownGainsView(Figures):
+    """Gains with what is known of their Ms on the plant."""
+
+    gains: GainsView
+    Ms: float | None = Field(description="Maximum sensitivity on the model; null: not known, or not stable on it")
+    uncertainty: float | None = Field(
+        description="How far Ms may be off: by two standard deviations of the model, or on another model that explains "
+        "the record as well; null: not known",
+        examples=[0.03],
+    )
+
+
+class RangeView(Figures):
+    """A range of a signal."""
+
+    low: float
+    high: float
+
+
+class FindingSource(StrEnum):
+    """What has told something of a loop."""
+
+    OPERATION = "operation"
+    JOB = "job"
+    TRIAL = "trial"
+
+
 class UltimateView(Figures):
     """The ultimate gain and period, measured or typed in."""
 
@@ -259,6 +297,60 @@ class StepView(Figures):
     duration_s: float
 
 
+class Finding(Figures):
+    """What a test, or normal operation, has told of a loop, as it is stored. Gains are those of that time."""
+
+    source: FindingSource
+    at: str = Field(description="UTC, ISO 8601, wall time")
+    changes: int | None = Field(default=None, description="Number of set-point changes, of normal operation")
+    last_change_s: float | None = Field(default=None, description="Time of the latest of them, seconds since 1970 UTC")
+    sample_s: float = Field(default=0.0, description="Length of one sample that was looked at, s")
+    job: str | None = Field(default=None, description="Id of the job; of a trial, the one that was accepted")
+    method: str | None = Field(default=None, description="Its method")
+    present: KnownGainsView = Field(description="The gains in effect, with Ms on the model")
+    proposed: KnownGainsView | None = Field(default=None, description="The gains proposed, or found no better")
+    Ms_asked: float | None = Field(default=None, description="Upper bound of Ms for which they were designed")
+    model: TransferModelView
+    sampling_delay_s: float = Field(description="Delay of the sampling that the loop has beside the model, s")
+    pv_range: RangeView | None = Field(description="Range of PV for which the model was found")
+    mv_range: RangeView | None = Field(description="Range of MV for which the model was found, percent")
+
+
+class KnowledgeView(Figures):
+    """What is known of a loop, from its tests and from normal operation: the best finding of the present plant."""
+
+    text: str = Field(
+        description="What is known, in words",
+        examples=["Ms known to +-0.03 from 3 set-point changes of normal operation"],
+    )
+    gains: GainsView = Field(description="The gains that Ms is of: those in effect, as far as they are known")
+    Ms: float | None = Field(description="Maximum sensitivity of these gains; null: not stable on the model")
+    uncertainty: float | None = Field(
+        description="How far Ms may be off; null: Ms is null, or these gains are neither those under which the model "
+        "was found nor those that were proposed then",
+        examples=[0.03],
+    )
+    source: FindingSource = Field(
+        description="operation: set-point changes of normal operation; job: a test; trial: operation or a test, whose "
+        "gains were then tried on the loop and accepted"
+    )
+    source_text: str = Field(description="The same in words", examples=["3 set-point changes of normal operation"])
+    changes: int | None = Field(description="Number of set-point changes of normal operation; null: it was a test")
+    job: str | None = Field(description="URL of the test or of the accepted trial", examples=["/jobs/4f0c2a9be113"])
+    at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
+    pv_range: RangeView | None = Field(description="Range of PV for which the model was found, PV units")
+    mv_range: RangeView | None = Field(description="Range of MV for which the model was found, percent")
+    model: TransferModelView
+    proposed: KnownGainsView | None = Field(
+        description="The gains that were proposed then, or found no better; null: none, or they are in effect"
+    )
+    Ms_asked: float | None = Field(description="Upper bound of Ms for which these were designed", examples=[1.6])
+    agreeing: int = Field(description="Number of further findings that agree", examples=[2])
+    older_plant: str | None = Field(
+        description="Why the latest earlier finding that does not agree is of an older plant; null: there is none"
+    )
+
+
 class _Result(Figures):
     """The fields of the results of both procedures. A field is null if the retune did not get that far."""
 
@@ -289,6 +381,9 @@ class FastResult(_Result):
         default=None, description="Predicted performance of the old gains; null: the loop is not stable with them"
     )
     evidence: EvidenceView | None = Field(default=None, description="Evidence from the record")
+    known_before: KnownMsView | None = Field(
+        default=None, description="Ms of the old gains; null: there is no record, or an earlier version has found it"
+    )
     verification: VerificationView | None = Field(default=None, description="Measured step that verifies the model")
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from loopwright.service.api import fleet, history, locks, openapi, operations, previews, problems, tunings
+from loopwright.service.api import fleet, history, locks, observation, openapi, operations, previews, problems, tunings
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.events import event_stream, still_permitted
 from loopwright.service.api.gate.access_log import Access
@@ -124,6 +124,8 @@ def create_app(
             **dict(shown),
             live=live_view(state) if state else None,
             not_confirmed_home=NotHomeView.of(not_home) if not_home else None,
+            disturbed_by=jobs.directory.disturbed_by(tag),
+            knowledge=jobs.knowledge.of(tag, state.gains if state else None),
         )
 
     @app.post(
@@ -243,9 +245,10 @@ def create_app(
         return view(jobs.decisions.rollback(job_id, (decision or Decision()).by))
 
     app.include_router(locks.router(jobs.locking))
-    app.include_router(
-        history.router(jobs.directory, listening or Listening(jobs.directory.loops, jobs.store, on=False))
-    )
+    listening = listening or Listening(jobs.directory.loops, jobs.store, on=False)
+    pool = pool or Pool()
+    app.include_router(history.router(jobs.directory, listening))
+    app.include_router(observation.router(jobs, readings, listening, pool))
     app.include_router(previews.router(jobs, many))
-    app.include_router(tunings.router(jobs, pool or Pool()))
+    app.include_router(tunings.router(jobs, pool))
     return app

@@ -34,6 +34,14 @@ class GapView(BaseModel):
     to_s: float = Field(description=f"The first sample after, {_UNIX}", examples=[1769860843.1])
 
 
+class DisturbedView(BaseModel):
+    """A time in which a neighbour was under test: what PV did then may be its doing."""
+
+    from_s: float = Field(description=f"Begin of its test, {_UNIX}", examples=[1769860830.5])
+    to_s: float = Field(description=f"End of its test, or of the time asked for, {_UNIX}", examples=[1769860913.1])
+    loop: str = Field(description="Tag of the neighbour", examples=["TIC-102"])
+
+
 class HistoryView(BaseModel):
     """The history of a loop as columns of equal length, one entry for each bin of consecutive samples. A bin of one
     sample has the values of that sample, as a job stores them."""
@@ -65,6 +73,10 @@ class HistoryView(BaseModel):
         description="Times in which samples are missing. Where bins were put together to keep to `points`, gaps that "
         "are shorter than a bin are left out (see `incomplete`); of a gap within a bin of the memory (4 s, or 32 s for "
         "what is older than 8 h) the time of the bin is given"
+    )
+    disturbed: list[DisturbedView] = Field(
+        description="Times in which neighbours were under test: loops of the same area, and those whose outer_loop "
+        "this loop is"
     )
     not_heard: str | None = Field(
         description="Why the loop is not heard at present; null: it is",
@@ -104,7 +116,8 @@ def router(directory: LoopDirectory, listening: Listening) -> APIRouter:
         if not 0.0 < to_s - from_s <= LONGEST_S:
             why = f"must be before `to` (and now), by {LONGEST_S / 86_400:g} days at most"
             raise RequestValidationError([{"loc": ("query", "from"), "msg": why}])
-        return _view(config, listening.history(tag, from_s, to_s, points), from_s, to_s)
+        disturbed = directory.disturbed(tag, from_s, to_s)
+        return _view(config, listening.history(tag, from_s, to_s, points), from_s, to_s, disturbed)
 
     return routes
 
@@ -115,7 +128,9 @@ def _seconds(at: datetime | None, default_s: float) -> float:
     return (at if at.tzinfo is not None else at.replace(tzinfo=UTC)).timestamp()
 
 
-def _view(config: LoopConfig, found: History, from_s: float, to_s: float) -> HistoryView:
+def _view(
+    config: LoopConfig, found: History, from_s: float, to_s: float, disturbed: list[tuple[float, float, str]]
+) -> HistoryView:
     bins = found.rows.bins
     names = {mode.value: mode.name.lower() for mode in Mode}
     return HistoryView(
@@ -134,6 +149,7 @@ def _view(config: LoopConfig, found: History, from_s: float, to_s: float) -> His
         gain_sets=[GainsView.of(Gains(*each)) for each in found.rows.sets],
         incomplete=(bins["gap"] > 0).tolist(),
         gaps=[GapView(from_s=round(begin, 3), to_s=round(end, 3)) for begin, end in found.rows.gaps],
+        disturbed=[DisturbedView(from_s=round(a, 3), to_s=round(b, 3), loop=loop) for a, b, loop in disturbed],
         not_heard=found.not_heard,
     )
 

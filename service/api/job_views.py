@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, Field
 
-from loopwright.service.inputs.config import Limits, LoopConfig
+from loopwright.service.inputs.config import Limits, LoopConfig, PermittedTest
 from loopwright.service.job_states import ACTIVE, JobState, shown
 from loopwright.service.jsonable import JsonObject
 from loopwright.service.loop_state import LoopState, gains_of
@@ -17,6 +17,7 @@ from loopwright.service.results import (
     FastResult,
     FiveStageResult,
     GainsView,
+    KnowledgeView,
     ModelView,
     PredictedView,
     RehearsedOnView,
@@ -62,6 +63,16 @@ class LoopView(BaseModel):
     pv_limits: Limits = Field(description="Permitted PV, PV units")
     t95_s: float = Field(description="Time in which the plant covers 95 % of a step, s", examples=[9.1])
     sp_deviation: float = Field(description="Permitted set-point step, PV units", examples=[2.0])
+    setpoint_from: Literal["operator", "remote"] = Field(
+        description="Who moves the set-point in normal operation: an operator, or (remote) another controller. Method "
+        "setpoint is refused for a remote set-point",
+        examples=["operator"],
+    )
+    outer_loop: str | None = Field(
+        description="Tag of the controller that moves a remote set-point; null: not named in loops.yaml",
+        examples=["TIC-100"],
+    )
+    test: PermittedTest = Field(description="What a test may do to the loop, from loops.yaml")
     area: str | None = Field(description="Area of the site, as named in loops.yaml", examples=["distillation"])
     notes: str = Field(description="Notes for the operator")
     host: str = Field(description="Name of the service that is connected to the bus of the loop", examples=["local"])
@@ -113,6 +124,14 @@ class LoopDetail(LoopView):
         "restoration is not confirmed"
     )
     not_confirmed_home: NotHomeView | None = Field(description="The unconfirmed restoration; null: there is none")
+    disturbed_by: str | None = Field(
+        description="Which neighbours are under test and may disturb the loop: loops of the same area, and those whose "
+        "outer_loop this loop is; null: none",
+        examples=["TIC-102 is under test (job 4f0c2a9be113)"],
+    )
+    knowledge: KnowledgeView | None = Field(
+        description="What is known of the loop from its tests and from normal operation; null: nothing is"
+    )
 
 
 class DismissedView(BaseModel):

@@ -15,7 +15,7 @@ from starlette.exceptions import HTTPException
 
 from loopwright.service.api.bodies import BadBody
 from loopwright.service.api.openapi_document import DocumentedResponse, MediaType
-from loopwright.service.errors import Conflict, Locked, Stopping, UnknownLoop
+from loopwright.service.errors import Conflict, Locked, RemoteSetpoint, Stopping, UnknownLoop
 from loopwright.service.execution.computing.pool import NotWanted
 from loopwright.service.inputs.model_json import BadModel
 from loopwright.service.inputs.request import BadLimits
@@ -26,7 +26,7 @@ from loopwright.service.offline.tunings import BadTuning
 from loopwright.service.store.claims import StillAnswering
 from loopwright.service.store.damage import is_damage
 from loopwright.service.store.store import Busy, FolderInUse, NoSuchJob
-from loopwright.tuning.reasons import ADVICE, Ended, Reason
+from loopwright.tuning.reasons import ADVICE, Ended, Reason, Refused
 
 MEDIA_TYPE = "application/problem+json"
 Responses = dict[int | str, dict[str, Any]]
@@ -147,7 +147,8 @@ def install(app: FastAPI) -> None:
         return Response(status_code=CLIENT_GONE)
 
     @app.exception_handler(Locked)
-    async def _locked(_request: Request, error: Locked) -> JSONResponse:
+    @app.exception_handler(RemoteSetpoint)
+    async def _not_permitted(_request: Request, error: Refused) -> JSONResponse:
         return problem(409, error.detail, reason=error.reason)
 
     @app.exception_handler(StillAnswering)

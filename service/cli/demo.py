@@ -1,20 +1,19 @@
-"""`loopwright demo`: retunes a badly tuned loop over a real bus, by real processes, through HTTP."""
+"""`loopwright demo`: retunes a badly tuned loop by each method, over a real bus, by real processes, through HTTP."""
 
 from __future__ import annotations
 
 import socket
 import tempfile
-import time
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
 import yaml
 
-from loopwright.service.api.job_views import JobView
 from loopwright.service.cli import job_tables
 from loopwright.service.cli.child_process import ChildProcess, NotReady
 from loopwright.service.cli.client import ApiError, Client
-from loopwright.service.job_states import JobState
+from loopwright.service.cli.demo_report import PLANT, PLANT_MODEL, demonstrate, report
 from loopwright.service.plots.job import NoPicture, job_picture
 
 TAG = "TIC-101"
@@ -63,21 +62,28 @@ def loops_yaml(bus: str) -> str:
     return str(yaml.safe_dump({"loops": [loop]}, sort_keys=False))
 
 
-def run_demo(folder: Path | None, speed: str, hub_only: bool) -> None:
-    """Runs the demo from the bus to the plot, and stops every process that it started. Raises DemoFailed."""
+def run_demo(folder: Path | None, speed: str, hub_only: bool, methods: Sequence[str]) -> None:
+    """Runs the demo from the bus to the plots, and stops every process that it started. Raises DemoFailed."""
     target = folder or Path(tempfile.mkdtemp(prefix="loopwright-demo-"))
     target.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         try:
             client = _start(stack, target, speed, hub_only)
-            job, seconds = _retune(client)
-            picture = target / "before-after.png"
-            job_picture(picture, client.samples_of(job.url), job, PV_UNIT)
+            shown = demonstrate(client, TAG, methods)
+            report(client, TAG, shown, PLANT_MODEL)
+            for job in shown.jobs:
+                job_picture(target / f"{job.method}.png", client.samples_of(job.url), job, PV_UNIT)
         except (NotReady, ApiError, NoPicture) as error:
             raise DemoFailed(f"{error}\n(logs are in {target})") from error
-    _report(job, seconds, target, picture)
-    if job.state is not JobState.PROPOSED:
-        raise DemoFailed(f"the job ended as {job.state}, not as a proposal")
+    lines = [
+        f"pictures         {', '.join(str(target / f'{job.method}.png') for job in shown.jobs)}",
+        f"jobs, samples    {target / 'data' / 'loopwright.sqlite'}",
+        f"configuration    {target / 'loops.yaml'}",
+        "next             docs/rest.md: the same by hand; docs/one-job.md: how it works",
+    ]
+    job_tables.console.print("\n".join(lines), highlight=False, soft_wrap=True)
+    if shown.without_proposal:
+        raise DemoFailed(f"not every retune ended as a proposal: {', '.join(shown.without_proposal)}")
 
 
 def _start(stack: ExitStack, folder: Path, speed: str, hub_only: bool) -> Client:
@@ -94,7 +100,7 @@ def _start(stack: ExitStack, folder: Path, speed: str, hub_only: bool) -> Client
     else:
         bus = process("hub", "loopwright.protocol.hub", "--port", "0").split()[1]
     ts = str(SAMPLE_TIME_S)
-    plant = ["--bus", bus, "--model", "model-14", "--ts", ts, "--speed", speed, "--noise", NOISE]
+    plant = ["--bus", bus, "--model", PLANT, "--ts", ts, "--speed", speed, "--noise", NOISE]
     kp, ti = BAD_GAINS
     # The plant starts last, because at full speed it takes all the processor time that is left.
     tuning = ["--kp", kp, "--ti", ti, "--sp", "50", "--ts", ts]
@@ -105,24 +111,3 @@ def _start(stack: ExitStack, folder: Path, speed: str, hub_only: bool) -> Client
     url = process("service", *serve).split()[1]
     process("plant", "loopwright.plantsim", *plant)
     return Client(url)
-
-
-def _retune(client: Client) -> tuple[JobView, float]:
-    job_tables.console.print(f"POST       {client.url}/loops/{TAG}/retune", highlight=False)
-    started = time.monotonic()
-    begun = JobView.model_validate(client.post(f"/loops/{TAG}/retune", {"requested_by": "demo"}))
-    job = job_tables.follow(client, begun.url)
-    return job, time.monotonic() - started
-
-
-def _report(job: JobView, seconds: float, folder: Path, picture: Path) -> None:
-    job_tables.job_report(job, PV_UNIT)
-    plant_s = job.plant_time_s
-    lines = [
-        f"{plant_s:.0f} s of plant time in {seconds:.1f} s of wall time: {plant_s / seconds:.0f} times as fast",
-        f"picture          {picture}",
-        f"jobs, samples    {folder / 'data' / 'loopwright.sqlite'}",
-        f"configuration    {folder / 'loops.yaml'}",
-        "next             docs/rest.md: the same by hand; docs/one-job.md: how it works",
-    ]
-    job_tables.console.print("\n".join(lines), highlight=False, soft_wrap=True)

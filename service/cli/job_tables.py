@@ -53,13 +53,13 @@ def follow(client: Client, job_url: str) -> JobView:
 
 def brief(result: Mapping[str, object] | None) -> str:
     """Returns the numbers and texts of a stage's result on one line."""
-    return ", ".join(f"{key} {number(value)}" for key, value in _leaves(result or {}))
+    return ", ".join(f"{key} {number(value)}" for key, value in leaves(result or {}))
 
 
-def _leaves(value: object, key: str = "") -> Iterator[tuple[str, int | float | str]]:
+def leaves(value: object, key: str = "") -> Iterator[tuple[str, int | float | str]]:
     if isinstance(value, dict):
         for name, item in value.items():
-            yield from _leaves(item, name)
+            yield from leaves(item, name)
     elif isinstance(value, int | float | str) and value != "":
         yield key, value
 
@@ -182,6 +182,8 @@ def loop_report(loop: LoopDetail) -> None:
     table = Table("", "now", "unit", title=f"loop {loop.tag}: {loop.description}")
     for label, value, of in (
         ("SP", figure(live, "sp"), unit),
+        ("SP from", ", ".join(filter(None, (loop.setpoint_from, loop.outer_loop))), ""),
+        ("fast moves it by", ", ".join(loop.test.excitations), ""),
         ("PV", figure(live, "pv"), unit),
         ("MV", figure(live, "mv"), "%"),
         ("mode", figure(live, "mode"), ""),
@@ -193,11 +195,29 @@ def loop_report(loop: LoopDetail) -> None:
         ("host", loop.host, ""),
         ("job", cell(job or (last and f"none; the last one: {last}")), ""),
         ("locked", cell(lock(loop.locked)), ""),
+        ("disturbed by", cell(loop.disturbed_by), ""),
     ):
         table.add_row(label, value, of)
     console.print(table)
+    for sentence in knowledge(loop):
+        console.print(sentence, highlight=False, markup=False, soft_wrap=True)
     if loop.not_confirmed_home:
         console.print(loop.not_confirmed_home.advice, highlight=False)
+
+
+def knowledge(loop: LoopDetail) -> list[str]:
+    """Returns what is known of a loop, in sentences."""
+    known = loop.knowledge
+    if known is None:
+        return ["Nothing is known of Ms as yet."]
+    sentences = [f"{known.text[0].upper()}{known.text[1:]}, at {known.at}."]
+    if known.Ms is not None:
+        sentences[0] = f"{sentences[0][:-1]}: {known.Ms:.3g}."
+    if known.pv_range is not None:
+        sentences.append(f"It holds for PV {known.pv_range.low:.5g} .. {known.pv_range.high:.5g} {loop.pv_unit}.")
+    if known.older_plant is not None:
+        sentences.append(f"Not used any more: {known.older_plant}.")
+    return sentences
 
 
 def lock(locked: LockView | None) -> str | None:

@@ -1,4 +1,4 @@
-"""`loopwright loop`, `loopwright lock` and `loopwright unlock`."""
+"""`loopwright loop`, `loopwright observe`, `loopwright lock` and `loopwright unlock`."""
 
 from __future__ import annotations
 
@@ -26,6 +26,36 @@ def one_loop(tag: Tag, url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
         print_json(found)
     else:
         job_tables.loop_report(LoopDetail.model_validate(found))
+
+
+@app.command()
+def observe(
+    tag: Tag,
+    ms: Annotated[float, typer.Option(help="Ms that is designed for: 1.2 robust .. 1.6 .. 2.0 fast.")] = 1.6,
+    derivative: Annotated[
+        bool, typer.Option("--derivative", help="Design a PID where it is better than a PI.")
+    ] = False,
+    url: Url = DEFAULT_URL,
+    as_json: AsJson = False,
+) -> None:
+    """Show what the set-point changes in the history of a loop tell of its gains. Nothing is moved or written on it.
+
+    Exit status 0: gains are proposed; 3: they are not, and why is said.
+    """
+    from loopwright.service.observing.observed import ObservationState, ObservationView
+
+    path = f"/loops/{quote(tag, safe='')}/observation"
+    found = Client(url).get(path, ms=ms, derivative=str(derivative).lower())
+    shown = ObservationView.model_validate(found)
+    if as_json:
+        print_json(found)
+    else:
+        from loopwright.service.cli import observation_tables
+        from loopwright.service.cli.job_tables import console
+
+        observation_tables.show(shown, console)
+    if shown.state is not ObservationState.PROPOSAL:
+        raise typer.Exit(3)
 
 
 @app.command()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -247,6 +247,9 @@ def retune(
         bool, typer.Option("--derivative", help="Design a PID where it is better than a PI.")
     ] = False,
     amplitude: Annotated[float | None, typer.Option(help="Relay amplitude for fast, percent of MV.")] = None,
+    excitations: Annotated[
+        str | None, typer.Option(help="What fast moves the loop by, of what loops.yaml permits: setpoint,relay.")
+    ] = None,
     careful: Annotated[
         bool, typer.Option("--careful", help="Let the relay of fast switch at least six times.")
     ] = False,
@@ -270,6 +273,7 @@ def retune(
     options: dict[str, object] = {
         "sp_deviation": sp_deviation, "mv_low": mv_low, "mv_high": mv_high, "dry_run": dry_run or None,
         "method": method, "ms": ms, "derivative": derivative or None, "amplitude_pct": amplitude,
+        "excitations": excitations.split(",") if excitations else None,
         "careful": careful or None, "verify": None if verify else False, "propose_anyway": propose_anyway or None,
         "pattern": loop if many else None,
     }  # fmt: skip
@@ -502,17 +506,22 @@ app.command("identify")(tuning.identify)
 @app.command()
 def demo(
     folder: Annotated[
-        Path | None, typer.Option(help="Folder for plot and data; default: a new temporary folder.")
+        Path | None, typer.Option(help="Folder for plots and data; default: a new temporary folder.")
     ] = None,
     speed: Annotated[str, typer.Option(help="Speed of the plant: max, or a factor of real time.")] = "max",
     hub_only: Annotated[
         bool, typer.Option("--hub", help="Use the loopback hub even if there is a vcan0 interface.")
     ] = False,
+    method: Annotated[
+        Literal["five-stage", "fast", "setpoint"] | None,
+        typer.Option(help="One of them alone; default: all, one after the other."),
+    ] = None,
 ) -> None:
     """Run a demo that retunes a badly tuned loop, with bus, plant, controller and service as processes."""
     from loopwright.service.cli.demo import DemoFailed, run_demo
+    from loopwright.service.cli.demo_report import METHODS
 
     try:
-        run_demo(folder, speed, hub_only)
+        run_demo(folder, speed, hub_only, [method] if method else METHODS)
     except DemoFailed as error:
         die(str(error), 1)

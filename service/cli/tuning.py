@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from loopwright.service.cli.output import AsJson, die, json_object, print_json, read_json_object
+
+if TYPE_CHECKING:
+    from loopwright.service.offline.csv_record import Record
 
 PICTURES = (".png", ".svg", ".pdf")
 Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Write a plot: .png, .svg or .pdf.")]
@@ -41,8 +45,7 @@ def tune(
     as_json: AsJson = False,
 ) -> None:
     """Tunes a process model by one method or all, and compares the gains. Exit status 0: gains found, 3: none."""
-    # threads of the linear algebra cost more than they save on small matrices
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    _one_thread()
     from loopwright.service.inputs.model_json import BadModel, parse_model
     from loopwright.service.offline import tunings
 
@@ -77,8 +80,33 @@ def identify(
     ] = None,
     plot: Plot = None,
     as_json: AsJson = False,
+    closed_loop: Annotated[
+        bool,
+        typer.Option(
+            "--closed-loop", help="The file is of normal operation in automatic, with a column sp; needs --kp."
+        ),
+    ] = False,
+    kp: Annotated[float | None, typer.Option(help="Kp in effect, ISA form; with --closed-loop.")] = None,
+    ti: Annotated[
+        float | None, typer.Option(help="Ti in effect, s, with --closed-loop; default: no integral action.")
+    ] = None,
+    td: Annotated[float | None, typer.Option(help="Td in effect, s, with --closed-loop; default: 0.")] = None,
+    b: Annotated[float | None, typer.Option(help="Set-point weight in effect, with --closed-loop; default: 1.")] = None,
+    ms: Annotated[
+        float | None, typer.Option(help="Ms that gains are designed for, with --closed-loop; default: 1.6.")
+    ] = None,
 ) -> None:
-    """Identifies a process model from a recorded test of any shape. Exit status 0: a model found, 3: none."""
+    """Identifies a process model from a recorded test of any shape. Exit status 0: a model found, 3: none.
+
+    With --closed-loop: gains from the set-point changes of normal operation, as `loopwright observe`. Exit status 0:
+    gains are proposed, 3: none.
+    """
+    _one_thread()
+    in_effect = (kp, ti, td, b, ms)
+    if closed_loop and (kp is None or mv_before is not None or plot is not None):
+        die("--closed-loop needs --kp, and takes neither --mv-before nor --plot", 2)
+    if not closed_loop and any(each is not None for each in in_effect):
+        die("--kp, --ti, --td, --b and --ms need --closed-loop", 2)
     from loopwright.service.offline.csv_record import RecordError, load_record
     from loopwright.service.offline.identification import identified, refused
     from loopwright.tuning.identification.identify import identify as fit
@@ -89,6 +117,10 @@ def identify(
         record = load_record(data)
     except RecordError as error:
         die(str(error), 2)
+    if kp is not None:
+        gains = (kp, ti or 0.0, td or 0.0, 1.0 if b is None else b)
+        _identify_operation(data, record, gains, 1.6 if ms is None else ms, as_json)
+        return
     try:
         found = fit(record.t, record.u, record.y, mv_before)
     except Refused as refusal:
@@ -111,6 +143,42 @@ def identify(
         from loopwright.service.cli import tuning_tables
 
         tuning_tables.identified(found, len(record.t))
+
+
+def _identify_operation(
+    data: Path, record: Record, gains: tuple[float, float, float, float], ms: float, as_json: bool
+) -> None:
+    from loopwright.service.observing.exported import exported
+    from loopwright.service.observing.observed import ObservationState
+    from loopwright.tuning.fast.design import DesignSpec
+    from loopwright.tuning.gains import Gains
+    from loopwright.tuning.reasons import Reason, Refused
+
+    kp, ti, td, b = gains
+    if not (math.isfinite(kp) and kp > 0.0 and math.isfinite(b) and all(0.0 <= each < math.inf for each in (ti, td))):
+        die(f"--kp must be positive, --ti and --td at least 0, not {kp:g}, {ti:g}, {td:g}", 2)
+    try:
+        spec = DesignSpec(ms)
+    except Refused as refusal:
+        die(f"--ms: {refusal.detail}", 2)
+    try:
+        found = exported(record, Gains(kp, ti, td, td / 10.0, b), spec)
+    except Refused as refusal:
+        die(f"{data}: {refusal.detail}", 2 if refusal.reason is Reason.BAD_INPUT else 3)
+    if as_json:
+        print_json(found.model_dump(mode="json"))
+    else:
+        from loopwright.service.cli import observation_tables
+        from loopwright.service.cli.job_tables import console
+
+        observation_tables.show_exported(found, console)
+    if found.state is not ObservationState.PROPOSAL:
+        raise typer.Exit(3)
+
+
+def _one_thread() -> None:
+    """Threads of the linear algebra cost more than they save on small matrices. To be called before numpy is loaded."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def check_plot(plot: Path | None) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.inputs.request import FastRetune, RetuneRequest, SetpointRetune
+from loopwright.service.inputs.request import FastRetune, RetuneRequest, SetpointRetune, excitations
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.service.planning.facts import facts_of, time_budget_s
@@ -110,7 +110,7 @@ def tune(
     )
     computing = ComputingLoop(loop, workers)
     ran = run(
-        plan(request, facts, hooks.earlier),
+        plan(config, request, facts, hooks.earlier),
         computing,
         limits=limits,
         on_event=hooks.on_event,
@@ -126,23 +126,26 @@ def tune(
     return Outcome(None if ran.value is None else result_of(ran.value), ended, ran.restored, dict(ran.plant_time_s))
 
 
-def plan(request: RetuneRequest, facts: Facts, earlier: Sequence[JobEvent] = ()) -> Plan[Any]:
+def plan(config: LoopConfig, request: RetuneRequest, facts: Facts, earlier: Sequence[JobEvent] = ()) -> Plan[Any]:
     """Returns the plan of the requested procedure.
 
+    config: the configuration with the limits of the job.
     earlier: events of interrupted attempts, after which the loop gets time to come to rest. The record of an
     interrupted fast procedure is not continued: relay and set-point step are one record of an otherwise untouched loop.
     """
-    procedure = _procedure(request, facts, earlier)
+    procedure = _procedure(config, request, facts, earlier)
     return after_settling(facts, procedure) if earlier else procedure
 
 
-def _procedure(request: RetuneRequest, facts: Facts, earlier: Sequence[JobEvent]) -> Plan[Any]:
+def _procedure(config: LoopConfig, request: RetuneRequest, facts: Facts, earlier: Sequence[JobEvent]) -> Plan[Any]:
     if isinstance(request, FastRetune):
         from loopwright.tuning.fast.design_trial import trial
-        from loopwright.tuning.fast.procedure import fast
+        from loopwright.tuning.fast.excitation_choice import fast_by
 
         known = _known_model(request)
-        return fast(facts, request.options) if known is None else trial(facts, request.options, known)
+        if known is not None:
+            return trial(facts, request.options, known)
+        return fast_by(excitations(config, request), facts, request.options)
     if isinstance(request, SetpointRetune):
         from loopwright.tuning.fast.setpoint_procedure import setpoint
 
@@ -163,7 +166,10 @@ def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcom
     hooks.on_event(Note(f"rehearsed on {on.plant_text}; {on.gains_text}; nothing is tested on the loop"))
     known = _known_model(request) if isinstance(request, FastRetune) else None
     # A model entered for a dry run is the plant itself; the procedure still starts where the request says.
-    found = rehearse_spec(spec, request.method, hooks.on_event, hooks.on_samples, model=known, asked=request.options)
+    found = rehearse_spec(
+        spec, request.method, hooks.on_event, hooks.on_samples, model=known, asked=request.options,
+        excitations=excitations(config, request),
+    )  # fmt: skip
     if found.ended is None or isinstance(found.ended, NoGain):
         return Outcome(found.result.model_copy(update={"rehearsed_on": on}), None, None, found.plant_time_s)
     return Outcome(empty_result(request.method, on), found.ended, None, found.plant_time_s)

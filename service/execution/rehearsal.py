@@ -37,9 +37,11 @@ from loopwright.service.loops.loop import Restored
 from loopwright.service.results import FastResult, FiveStageResult, UltimateView, empty_result
 from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.fast.design_trial import trial
+from loopwright.tuning.fast.excitation_choice import chosen_stages, fast_by
 from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.procedure import FAST, FAST_STAGES, FastOptions, FastProposal, fast
-from loopwright.tuning.fast.setpoint_procedure import SETPOINT, SETPOINT_STAGES, setpoint
+from loopwright.tuning.fast.procedure import FAST, FastOptions, FastProposal
+from loopwright.tuning.fast.record import Excitation
+from loopwright.tuning.fast.setpoint_procedure import SETPOINT, setpoint
 from loopwright.tuning.five_stage.procedure import STAGES, Facts, Options, Proposal, five_stage
 from loopwright.tuning.five_stage.ultimate_gain import UltimateResult
 from loopwright.tuning.gains import Gains
@@ -172,6 +174,7 @@ class PlantFile(BaseModel):
     noise_std: Size = Field(0.0, description="standard deviation of the measurement, PV units")
     seed: int = Field(1, ge=0)
     mv_limits: tuple[Value, Value] = (-0.5, 0.5)
+    mv_step_max: Annotated[Value, Field(gt=0)] | None = Field(None, description="largest jump of MV in the test")
     sp_deviation: Annotated[Value, Field(gt=0)] | None = None
     gains: PresentGains | None = Field(None, description="present gains of the loop")
     reverse_acting: bool | None = Field(None, description="the controller's action; left out: right for the plant")
@@ -279,6 +282,7 @@ def rehearse(
     on_samples: Callable[[list[Sample]], None] | None = None,
     model: Model | None = None,
     asked: DesignOptions | Options | None = None,
+    excitations: tuple[Excitation, ...] = (Excitation.RELAY,),
     **options: Any,
 ) -> Rehearsal:
     """Runs preflight to verification on a model in memory.
@@ -288,6 +292,7 @@ def rehearse(
     model: the model to design for; fast then needs no relay.
     options: those of `tuning.fast.procedure.FastOptions`, or of `tuning.five_stage.procedure.Options`.
     asked: the options as one of these two; in place of the options by name.
+    excitations: what fast may move the loop by.
     """
     results: dict[str, object] = {}
 
@@ -305,7 +310,7 @@ def rehearse(
         hear = on_samples or (lambda samples: None)
         asked = asked or _asked(method, model, options)
         if isinstance(asked, DesignOptions):
-            plan = _designing(facts, asked, model)
+            plan = _designing(facts, asked, model, excitations)
             outcome = run(plan, loop, limits=limits, on_event=listen, on_samples=hear)
         else:
             outcome = run(five_stage(facts, asked), loop, limits=limits, on_event=listen, on_samples=hear)
@@ -316,10 +321,12 @@ def rehearse(
     return _rehearsal(file, method, outcome, results, anyway=asked.propose_anyway)
 
 
-def _designing(facts: Facts, asked: DesignOptions, model: Model | None) -> Plan[FastProposal]:
+def _designing(
+    facts: Facts, asked: DesignOptions, model: Model | None, excitations: tuple[Excitation, ...]
+) -> Plan[FastProposal]:
     if not isinstance(asked, FastOptions):
         return setpoint(facts, asked)
-    return fast(facts, asked) if model is None else trial(facts, asked, model)
+    return fast_by(excitations, facts, asked) if model is None else trial(facts, asked, model)
 
 
 def _asked(method: str, model: Model | None, options: dict[str, Any]) -> DesignOptions | Options:
@@ -350,7 +357,7 @@ def _loop(file: PlantFile) -> tuple[RehearsedLoop, Facts]:
     settings = Settings(mv_low=low, mv_high=high, safe_output=0.0, pv_low=-span, pv_high=span, reverse=reverse)
     present = Gains(**gains.model_dump())
     channel = Channel(ts, settings, _parameters(present), 0.0, int(Mode.AUTOMATIC), 0.0)
-    facts = Facts(ts, t95, low, high, step, present, reverse)
+    facts = Facts(ts, t95, low, high, step, present, reverse, mv_step_max=file.mv_step_max or math.inf)
     return RehearsedLoop(plant, channel, ts), facts
 
 
@@ -381,7 +388,7 @@ def _rehearsal(
     proposal, ended = outcome.value, outcome.ended
     if proposal is not None and not proposal.comparison.gain and not anyway:
         ended = NoGain(Reason.NO_GAIN, proposal.comparison.verdict)
-    stages = dict.fromkeys((*STAGES, *FAST_STAGES, *SETPOINT_STAGES))
+    stages = dict.fromkeys((*STAGES, *chosen_stages(tuple(Excitation), verify=True)))
     times = {stage: outcome.plant_time_s[stage] for stage in stages if stage in outcome.plant_time_s}
     if proposal is not None:
         return Rehearsal(result_of(proposal), ended, times, results, file)

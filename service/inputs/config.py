@@ -9,14 +9,16 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from loopwright.service.inputs.plausible import Positive, Size, Time, Value, check_step
 
 Node = Annotated[int, Field(ge=1, le=127)]
+ExcitationName = Literal["setpoint", "relay"]
+Tag = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 
 _BUS_KINDS = ("socketcan", "socketcand", "virtual", "pcan", "kvaser", "ixxat", "vector", "slcan", "gs_usb")
 
@@ -44,12 +46,49 @@ class Limits(BaseModel):
         return self
 
 
-class LoopConfig(BaseModel):
-    """One loop. PV in `pv_unit`, MV in percent of the output range, times in plant seconds."""
+class PermittedTest(BaseModel):
+    """What a test may do to a loop; a request may narrow it, not widen it.
+
+    excitations: what method fast may move the loop by: the set-point under the present gains, or the controller's
+    relay. With both of them the relay follows only where pulses of the set-point tell too little.
+    mv_step_max: the largest jump of MV from one sample to the next, percent, of a test by any method; None: what
+    mv_limits permit.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    tag: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")
+    excitations: tuple[ExcitationName, ...] = Field(
+        default=("relay",),
+        min_length=1,
+        description="What method fast may move the loop by: the set-point under the present gains, or the relay",
+        examples=[["setpoint", "relay"]],
+    )
+    mv_step_max: Positive | None = Field(
+        default=None,
+        description="The largest jump of MV that a test by any method makes from one sample to the next, percent; "
+        "null: only the MV limits bound it",
+        examples=[10.0],
+    )
+
+    @field_validator("excitations")
+    @classmethod
+    def _once_each(cls, value: tuple[ExcitationName, ...]) -> tuple[ExcitationName, ...]:
+        if len(set(value)) < len(value):
+            raise ValueError(f"{', '.join(value)}: each excitation is named once")
+        return value
+
+
+class LoopConfig(BaseModel):
+    """One loop. PV in `pv_unit`, MV in percent of the output range, times in plant seconds.
+
+    setpoint_from: who moves the set-point in normal operation, an operator or (remote) another controller.
+    outer_loop: the tag of that controller.
+    test: what a test may do to the loop.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    tag: Tag
     description: str = ""
     bus: str
     controller_node: Node
@@ -61,7 +100,10 @@ class LoopConfig(BaseModel):
     t95_s: Time
     sp_deviation: Positive
     noise_std_hint: Size | None = None
+    setpoint_from: Literal["operator", "remote"] = "operator"
+    outer_loop: Tag | None = None
     area: str | None = Field(default=None, min_length=1, max_length=64)
+    test: PermittedTest = PermittedTest()
     notes: str = ""
 
     @model_validator(mode="after")
@@ -76,6 +118,10 @@ class LoopConfig(BaseModel):
         if 2 * self.sp_deviation > self.pv_limits.high - self.pv_limits.low:
             raise ValueError(f"sp_deviation {self.sp_deviation:g} needs at least twice that between the pv_limits")
         check_step(self.sp_deviation, self.pv_limits.low, self.pv_limits.high)
+        if self.outer_loop is not None and self.setpoint_from != "remote":
+            raise ValueError(f"outer_loop {self.outer_loop} moves the set-point: add setpoint_from: remote")
+        if self.outer_loop == self.tag:
+            raise ValueError(f"outer_loop {self.outer_loop} is this loop itself")
         return self
 
 

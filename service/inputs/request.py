@@ -17,7 +17,8 @@ from pydantic import (
     model_validator,
 )
 
-from loopwright.service.inputs.config import LoopConfig
+from loopwright.service.errors import RemoteSetpoint
+from loopwright.service.inputs.config import ExcitationName, LoopConfig, PermittedTest
 from loopwright.service.inputs.model_json import ModelForm
 from loopwright.service.inputs.plausible import (
     Finite,
@@ -35,6 +36,7 @@ from loopwright.service.inputs.plausible import (
 from loopwright.service.inputs.validation import branch, branch_of
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.procedure import FAST, FastOptions
+from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.fast.setpoint_procedure import SETPOINT
 from loopwright.tuning.five_stage.procedure import PROCEDURE, Options, rule_of
 from loopwright.tuning.models import FOPDT, SOPDT
@@ -46,6 +48,8 @@ if TYPE_CHECKING:
 else:
     RuleName = Literal[tuple(METHODS)]
 
+OBSERVE = "observe"
+"""The method that starts no job, see `service.observing`."""
 Percent = Annotated[float, Field(gt=0, lt=74, allow_inf_nan=False)]
 MIN_AMPLITUDE_PCT = 1e-3
 """Minimum amplitude of the relay, percent. A REAL32 of some ten percent hardly resolves a smaller one."""
@@ -203,6 +207,14 @@ class FastRetune(DesignRetune):
         description="Step of MV up under the relay, percent; the step down is half as large. The default is half of "
         "what the MV limits permit, adapted after the first period",
         examples=[10.0],
+    )
+    excitations: tuple[ExcitationName, ...] | None = Field(
+        default=None,
+        min_length=1,
+        description="What moves the loop, among what loops.yaml permits (test: excitations); the default is all of "
+        "that. setpoint: pulses under the present gains, in automatic; relay: the controller's relay, which follows "
+        "only where the pulses tell too little if both are given",
+        examples=[["setpoint"]],
     )
     careful: bool = Field(default=False, description="Use at least six switches of the relay, not four")
 
@@ -376,6 +388,8 @@ class FiveStageRetune(FiveStages):
 
 
 def _named(value: object) -> object:
+    if value == OBSERVE:
+        raise ValueError("observe starts no job: ask GET /loops/TAG/observation?ms=1.6 (loopwright observe TAG)")
     if not isinstance(value, str) or value not in METHODS:
         raise ValueError(f"method must be one of {FAST}, {SETPOINT}, {PROCEDURE}, {', '.join(METHODS)}, not {value!r}")
     return value
@@ -423,6 +437,36 @@ def within(loop: LoopConfig, request: RetuneRequest) -> LoopConfig:
     return narrowed
 
 
+def excitations(loop: LoopConfig, request: RetuneRequest) -> tuple[Excitation, ...]:
+    """What may move the loop during a retune by fast, in the order in which it is tried; empty where there is no such
+    choice. A set-point that another controller moves is left alone where the relay is permitted.
+
+    loop: the loop with the limits of the request.
+    """
+    if not isinstance(request, FastRetune) or request.start == "design":
+        return ()
+    permitted = loop.test.excitations
+    remote = loop.setpoint_from == "remote" and "relay" in permitted and not request.dry_run
+    tried = (Excitation.RELAY,) if remote else (Excitation.SETPOINT, Excitation.RELAY)
+    return tuple(each for each in tried if each in permitted)
+
+
+def check_setpoint_source(loop: LoopConfig, request: RetuneRequest) -> None:
+    """Raises RemoteSetpoint where the request would pulse a set-point that another controller moves.
+
+    loop: the loop with the limits of the request.
+    """
+    pulses = isinstance(request, SetpointRetune) or excitations(loop, request) == (Excitation.SETPOINT,)
+    if loop.setpoint_from == "operator" or not pulses or request.dry_run:
+        return
+    tag, outer = loop.tag, loop.outer_loop or "another controller"
+    raise RemoteSetpoint(
+        f"the set-point of {tag} comes from {outer} (setpoint_from: remote in loops.yaml): put {tag} to local "
+        f"set-point, and set setpoint_from: operator for as long; or put {outer} in manual and retune by fast, which "
+        "steps the set-point only to verify"
+    )
+
+
 def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[str]]:
     """The loop with the limits of the request, and the errors in those limits. With an error the loop is unchanged."""
     problems = []
@@ -447,6 +491,8 @@ def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[s
         )
     if amplitude is not None and amplitude < MIN_AMPLITUDE_PCT:
         problems.append(f"a relay of amplitude_pct {amplitude:g} moves nothing; at least {MIN_AMPLITUDE_PCT:g} %")
+    test, refused = _narrow_test(loop, request)
+    problems += refused
     deviation = request.sp_deviation or loop.sp_deviation
     if deviation > loop.sp_deviation:
         problems.append(f"sp_deviation {deviation:g} is more than the configured {loop.sp_deviation:g} {loop.pv_unit}")
@@ -459,7 +505,23 @@ def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[s
         problems.append(str(error))
     if problems:
         return loop, problems
-    return loop.model_copy(update={**limits, "sp_deviation": deviation}), []
+    return loop.model_copy(update={**limits, "sp_deviation": deviation, "test": test}), []
+
+
+def _narrow_test(loop: LoopConfig, request: RetuneRequest) -> tuple[PermittedTest, list[str]]:
+    """What the test may do by the request, and the errors in that."""
+    if not isinstance(request, FastRetune) or request.start == "design":
+        return loop.test, []
+    permitted = loop.test.excitations
+    asked = permitted if request.excitations is None else request.excitations
+    more = [each for each in asked if each not in permitted]
+    if more:
+        words = f"loops.yaml permits {', '.join(permitted)} (test: excitations)"
+        return loop.test, [f"excitations: {', '.join(more)} is asked for, {words}"]
+    of_relay = [name for name in ("amplitude_pct", "careful") if getattr(request, name)]
+    if of_relay and "relay" not in asked:
+        return loop.test, [f"{', '.join(of_relay)}: of a relay, which is not among the excitations {', '.join(asked)}"]
+    return loop.test.model_copy(update={"excitations": asked}), []
 
 
 def _given_dead_time_s(request: RetuneRequest) -> float:

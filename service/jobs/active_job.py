@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from loopwright.service.jobs.journal import Journal
 from loopwright.service.jobs.progress import Progress
@@ -43,6 +43,9 @@ class Running:
         self.over = threading.Event()
         """Set when the loop is released and the end is written."""
         self.before_s = before_s
+        self.pv_range: tuple[float, float] | None = None
+        self.mv_range: tuple[float, float] | None = None
+        """Ranges of the samples of this attempt."""
         self._journal = journal
         self._buffer: list[Sample] = []
         self._stage = "preflight"
@@ -73,6 +76,8 @@ class Running:
     def on_samples(self, samples: list[Sample]) -> None:
         """Splits samples at the times of the stages: the runner's blocks do not end where a stage does."""
         self._keep_time()
+        self.pv_range = _wider(self.pv_range, (sample.pv for sample in samples))
+        self.mv_range = _wider(self.mv_range, (sample.mv for sample in samples))
         for sample in samples:
             while self._boundaries and sample.t > self._boundaries[0][0]:
                 self.flush()
@@ -102,3 +107,12 @@ class Running:
     def tell(self, kind: str, data: Mapping[str, object], stage: str | None = None) -> None:
         """Stores an event of the job, and its stage where it is given, through the journal."""
         self._journal.put(event_of(self.job_id, kind, data, self.progress.plant_time_s, stage))
+
+
+def _wider(found: tuple[float, float] | None, values: Iterable[float]) -> tuple[float, float] | None:
+    """Returns the range that has these values too."""
+    known = [value for value in values if math.isfinite(value)]
+    if not known:
+        return found
+    low, high = min(known), max(known)
+    return (low, high) if found is None else (min(found[0], low), max(found[1], high))

@@ -10,6 +10,7 @@ from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.loop_state import gains_of, state_json
 from loopwright.service.loops.gain_change import ForeignGains, replace_accepted
+from loopwright.service.observing.kept_knowledge import KeptKnowledge
 from loopwright.service.store import loop_locks
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Busy, Store
@@ -24,8 +25,9 @@ second or two."""
 class Decisions:
     """Decides the jobs of the loops of this host."""
 
-    def __init__(self, store: Store, directory: LoopDirectory, machine: Machine) -> None:
+    def __init__(self, store: Store, directory: LoopDirectory, machine: Machine, knowledge: KeptKnowledge) -> None:
         self.store = store
+        self._knowledge = knowledge
         self._directory = directory
         self._machine = machine
         # By loop: an event that is set when a decision that writes to its controller has ended.
@@ -93,7 +95,10 @@ class Decisions:
             finally:
                 self._writes.pop(row.loop, None)
                 over.set()
-            return self.store.move(job_id, wanted, by=by, restored=state_json(state))
+            decided = self.store.move(job_id, wanted, by=by, restored=state_json(state))
+            if wanted is JobState.ACCEPTED:
+                self._knowledge.accepted(decided)
+            return decided
 
     def wait_for_writes(self, tag: str) -> bool:
         """Waits until a decision that writes to the loop has ended; returns False where it has not in WRITES_S."""

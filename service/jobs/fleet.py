@@ -16,7 +16,7 @@ from typing import Annotated, Any, Self
 from pydantic import BaseModel, Field, TypeAdapter, model_validator
 from sqlalchemy.exc import SQLAlchemyError
 
-from loopwright.service.errors import Locked, Stopping, UnknownLoop
+from loopwright.service.errors import Locked, RemoteSetpoint, Stopping, UnknownLoop
 from loopwright.service.inputs.config import BusConfig, LoopConfig
 from loopwright.service.inputs.request import (
     AnyRetune,
@@ -265,7 +265,7 @@ class Fleet:
             except (BadLimits, UnknownLoop) as error:
                 self._give_up(row, part, str(error))
                 continue
-            except Locked as error:
+            except (Locked, RemoteSetpoint) as error:
                 self._give_up(row, part, error.detail, error.reason)
                 continue
             except (Stopping, RetuneOver):

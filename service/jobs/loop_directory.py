@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import astuple, replace
+from datetime import UTC, datetime
 
 from loopwright.service.errors import UnknownLoop
 from loopwright.service.inputs.config import BusConfig, LoopConfig
@@ -14,7 +15,9 @@ from loopwright.service.jobs.registry import Registry
 from loopwright.service.listening.heard_loop import InEffect
 from loopwright.service.loop_state import LoopState, gains_of, loop_state
 from loopwright.service.loops.loop import Loop
+from loopwright.service.observing.neighbours import disturbers
 from loopwright.service.store.store import Store
+from loopwright.service.store.under_test import times_under_test
 
 LoopFactory = Callable[[LoopConfig], Loop]
 
@@ -71,6 +74,26 @@ class LoopDirectory:
         """Returns every loop of every host, those of this host first."""
         own = [(config, self.store.host) for config in self.loops.values()]
         return own + [(LoopConfig.model_validate(row.config), row.host) for row in self.store.foreign_loops()]
+
+    def disturbers(self, tag: str) -> list[str]:
+        """Returns the loops of any host whose tests disturb a loop. Raises UnknownLoop."""
+        return disturbers(self.config(tag), [config for config, _ in self.everywhere()])
+
+    def disturbed_by(self, tag: str) -> str | None:
+        """Returns in words which neighbours of a loop are under test; None: none is. Raises UnknownLoop."""
+        under_test = times_under_test(self.store, self.disturbers(tag))
+        found = [f"{each.loop} is under test (job {each.job_id})" for each in under_test if each.session]
+        return "; ".join(found) or None
+
+    def disturbed(self, tag: str, from_s: float, to_s: float) -> list[tuple[float, float, str]]:
+        """Returns begin and end, in seconds since 1970, of the times within this one in which neighbours of a loop
+        were under test, with their tags. Raises UnknownLoop."""
+        under_test = times_under_test(self.store, self.disturbers(tag), datetime.fromtimestamp(from_s, UTC))
+        return [
+            (*within, each.loop)
+            for each in under_test
+            if each.session and (within := each.within(from_s, to_s)) is not None
+        ]
 
     def live(self, tag: str) -> LoopState | None:
         """Returns the present state of a loop, from the running job or else from the bus; None on another host."""

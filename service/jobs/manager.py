@@ -14,7 +14,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.service.errors import Stopping
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.inputs.request import RetuneRequest, within
+from loopwright.service.inputs.request import RetuneRequest, check_setpoint_source, within
 from loopwright.service.job_states import ACTIVE, IllegalMove, JobState
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.aftercare import Aftercare
@@ -28,6 +28,7 @@ from loopwright.service.jobs.recovery import Recovery
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.until_answered import STOP_PATIENCE_S, UntilAnswered
 from loopwright.service.jobs.worker import Worker
+from loopwright.service.observing.kept_knowledge import KeptKnowledge
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.lock import CHECK_S
 from loopwright.service.store.store import FolderInUse, Store, WithJob
@@ -49,7 +50,7 @@ for the database). It is shorter than TimeoutStopSec of the unit, after which sy
 class Jobs:
     """Starts and stops jobs of this host's loops; shows, starts and aborts those of the other hosts.
 
-    decisions, locking: parts that the manager does not use itself; the API gets them together with the jobs.
+    decisions, locking, knowledge: parts that the manager does not use itself; the API gets them together with the jobs.
     machine: clock and threads.
     """
 
@@ -66,6 +67,7 @@ class Jobs:
         aftercare: Aftercare,
         recovery: Recovery,
         machine: Machine,
+        knowledge: KeptKnowledge,
     ) -> None:
         self.store = store
         self.engine = engine
@@ -76,6 +78,7 @@ class Jobs:
         self.decisions = decisions
         self.locking = locking
         self.aftercare = aftercare
+        self.knowledge = knowledge
         self._recovery = recovery
         self._machine = machine
         self._lasting = UntilAnswered(machine, registry)
@@ -156,12 +159,13 @@ class Jobs:
 
     # start and stop
     def start(self, tag: str, request: RetuneRequest, also: WithJob | None = None) -> Job:
-        """Queues a job on the host that has the loop. Raises UnknownLoop, BadLimits, Busy, Locked, Stopping.
+        """Queues a job on the host that has the loop. Raises UnknownLoop, BadLimits, RemoteSetpoint, Busy,
+        Locked, Stopping.
 
         also: writes in the same transaction; when it raises, there is no job.
         """
         config, host = self.directory.owner(tag)
-        within(config, request)
+        check_setpoint_source(within(config, request), request)
         if self.stopping:
             raise Stopping(self.why_stopping)
         asked = request.asked()

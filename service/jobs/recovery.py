@@ -6,9 +6,9 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from loopwright.service.errors import Locked
+from loopwright.service.errors import Locked, RemoteSetpoint
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.inputs.request import retune_request, within
+from loopwright.service.inputs.request import check_setpoint_source, retune_request, within
 from loopwright.service.job_states import JobState
 from loopwright.service.jobs.engine import WORKFLOW_VERSION
 from loopwright.service.loop_state import state_json
@@ -81,7 +81,10 @@ class Recovery:
         if row.attempt >= MAX_ATTEMPTS:
             return Reason.SERVICE_STOPPED, f"that was attempt {row.attempt} of at most {MAX_ATTEMPTS}"
         try:
-            within(config, retune_request(**row.request))
+            request = retune_request(**row.request)
+            check_setpoint_source(within(config, request), request)
+        except RemoteSetpoint as remote:
+            return remote.reason, f"the loop's configuration has changed: {remote.detail}"
         except ValueError as error:  # BadLimits too
             return Reason.BAD_LIMITS, f"the loop's configuration has changed: {error}"
         return None

@@ -17,7 +17,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.engine import Engine
-from loopwright.service.store import audit, history, hosts
+from loopwright.service.store import audit, history, hosts, knowledge
 from loopwright.service.store.clock import stamp
 from loopwright.service.store.clock_watch import ClockWatch, longest_stop
 from loopwright.service.store.store import FolderInUse, Store, append
@@ -41,7 +41,7 @@ class RetentionPolicy:
 
     jobs: the newest `jobs` of each loop keep them; None disables the criterion.
     days: jobs that ended in the last `days` keep them; None disables the criterion. With both None, all jobs keep them.
-    history_days: the stored history of the loops is kept for this time; None for ever.
+    history_days: the stored history of the loops, and what was known of them, is kept for this time; None for ever.
     """
 
     jobs: int | None = None
@@ -70,7 +70,7 @@ def delete_old_samples(
 
 
 def delete_old_history(store: Store, policy: RetentionPolicy, at: datetime, ages_from: datetime | None = None) -> int:
-    """Deletes the old history of this host's loops. Returns the number of blocks.
+    """Deletes the old history of this host's loops, and what was known of them before. Returns the number of blocks.
 
     at, ages_from: as for `delete_old_samples`.
     """
@@ -79,6 +79,7 @@ def delete_old_history(store: Store, policy: RetentionPolicy, at: datetime, ages
     before = at - timedelta(days=policy.history_days)
     if ages_from is not None and ages_from > before:
         return 0
+    knowledge.delete_older(store, stamp(before))
     return history.delete_older(store, before.timestamp())
 
 

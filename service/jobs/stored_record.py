@@ -94,7 +94,7 @@ def stored_record(columns: Columns) -> StoredRecord | None:
     before = np.searchsorted(number, whole, side="right") - 1
     pv = np.interp(whole, number, pv)
     sp, mv, mode, stage = sp[before], mv[before], mode[before], stage[before]
-    listened, excited, switches = _of_relay(mv, mode) if relay else _of_pulses(sp, stage)
+    listened, excited, switches = _of_relay(mv, mode, sp, stage) if relay else _of_pulses(sp, stage)
     excitation = Excitation.RELAY if relay else Excitation.SETPOINT
     return StoredRecord(Ts, (whole - listened) * Ts, sp, pv, mv, listened, excited, switches, excitation)
 
@@ -103,13 +103,16 @@ Parts = tuple[int, int, tuple[int, ...]]
 """The number of samples at rest, that up to the end of the excitation, and the samples of its turns."""
 
 
-def _of_relay(mv: Reals, mode: Reals) -> Parts:
-    listened = int(np.argmax(mode == Mode.EXPERIMENT))
-    after = np.flatnonzero(mode[listened:] != Mode.EXPERIMENT)
-    excited = listened + int(after[0]) if len(after) else len(mode)
+def _of_relay(mv: Reals, mode: Reals, sp: Reals, stage: NDArray[np.str_]) -> Parts:
+    begun = int(np.argmax(mode == Mode.EXPERIMENT))
+    after = np.flatnonzero(mode[begun:] != Mode.EXPERIMENT)
+    excited = begun + int(after[0]) if len(after) else len(mode)
+    # the relay may follow pulses of the set-point, which belong to the same record
+    pulses = 1 + np.flatnonzero(np.diff(sp[:begun]))
+    listened = int(pulses[0]) if np.any(stage[:begun] == "pulses") and len(pulses) else begun
     # the relay begins high
-    high = np.append(True, mv[listened:excited] > np.mean(mv[: max(listened, 1)]))
-    return listened, excited, tuple(int(i) + listened for i in np.flatnonzero(high[1:] != high[:-1]))
+    high = np.append(True, mv[begun:excited] > np.mean(mv[: max(listened, 1)]))
+    return listened, excited, tuple(int(i) + begun for i in np.flatnonzero(high[1:] != high[:-1]))
 
 
 def _of_pulses(sp: Reals, stage: NDArray[np.str_]) -> Parts:

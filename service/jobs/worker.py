@@ -12,7 +12,13 @@ from dataclasses import asdict
 from loopwright.service.errors import Locked
 from loopwright.service.execution.procedures import Hooks, Outcome, Rehearse, Tune
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.inputs.request import BadLimits, RetuneRequest, retune_request, within
+from loopwright.service.inputs.request import (
+    BadLimits,
+    RetuneRequest,
+    check_setpoint_source,
+    retune_request,
+    within,
+)
 from loopwright.service.job_states import ACTIVE, GOOD, JobState, state_after
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.journal import Journal
@@ -24,6 +30,7 @@ from loopwright.service.loop_state import LoopState, differences, loop_state, sa
 from loopwright.service.loops.loop import Loop
 from loopwright.service.loops.observed_loop import ObservedLoop
 from loopwright.service.loops.restoration import restore_abandoned
+from loopwright.service.observing.kept_knowledge import KeptKnowledge
 from loopwright.service.planning.known_loop import known
 from loopwright.service.store import looked_after
 from loopwright.service.store.jobs import Job, JobColumns
@@ -41,6 +48,7 @@ class Worker:
 
     tune: runs a job on the loop itself.
     rehearse: runs a dry run.
+    knowledge: keeps what the tests tell of their loops.
     """
 
     def __init__(
@@ -52,9 +60,11 @@ class Worker:
         tune: Tune,
         rehearse: Rehearse,
         machine: Machine,
+        knowledge: KeptKnowledge,
     ) -> None:
         self.store = store
         self.journal = journal
+        self._knowledge = knowledge
         self._directory = directory
         self._registry = registry
         self._tune = tune
@@ -107,6 +117,7 @@ class Worker:
         try:
             request = retune_request(**row.request)
             config = within(self._directory.config(row.loop), request)
+            check_setpoint_source(config, request)
             run = self._dry if row.dry_run else self._live
             return run(running, row, config, request)
         except Ended as ended:
@@ -211,7 +222,8 @@ class Worker:
         if outcome.ended is not None:
             state = state_after(outcome.ended)
             columns |= {"reason": outcome.ended.reason.value, "detail": outcome.ended.detail}
-        self._lasting(lambda: self.store.move(running.job_id, state, **columns))
+        job = self._lasting(lambda: self.store.move(running.job_id, state, **columns))
+        self._knowledge.tested(job, running.pv_range, running.mv_range)
         if outcome.ended is None:
             log.info("job is rehearsed" if dry_run else "job proposes new gains")
         else:

@@ -32,7 +32,6 @@ BLOCK_S = 60.0
 """Wall time after which the bins of a loop are handed over to be stored, s: a process that dies loses at most these."""
 _RECV_S = 0.5
 _JUMP_S = 0.1
-_NICENESS = 5
 _FIRST_TO_DIE = "500"
 
 Take = Callable[[bytes, float], None]
@@ -200,7 +199,6 @@ class Child:
 def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # the service alone ends it, by closing the connection
-    os.setpriority(os.PRIO_PROCESS, 0, max(_NICENESS, os.getpriority(os.PRIO_PROCESS, 0)))
     with suppress(OSError):  # where there is none, or it may not be written
         Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_DIE)
     logging.getLogger("can").setLevel(logging.ERROR)  # as in the service

@@ -6,6 +6,7 @@ It is a program of its own and not forked: the service has threads, and the proc
 from __future__ import annotations
 
 import logging
+import os
 import subprocess
 import sys
 import threading
@@ -30,6 +31,8 @@ _SAY_AGAIN_S = 60.0
 _WRITING_S = 1.0
 _HANGS_S = 30.0
 """Wall time without a report, of which there is one a second, after which the process is ended, s."""
+NICENESS = 10
+"""Priority of the process: its imports and its work make way for the sessions of the service."""
 ANSWER_S = 3.0
 """Wall time within which the process has to answer, s."""
 
@@ -147,6 +150,9 @@ class ListeningProcess:
                     command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, pass_fds=[theirs.fileno()]
                 )
             self.pid = process.pid
+            with suppress(ProcessLookupError):
+                own = os.getpriority(os.PRIO_PROCESS, process.pid)
+                os.setpriority(os.PRIO_PROCESS, process.pid, max(NICENESS, own))  # from its first import on
             try:
                 ours.send(Listen(self._loops))
                 self._connection = ours

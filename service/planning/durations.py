@@ -6,7 +6,9 @@ the time limits of the procedures.
 
 from __future__ import annotations
 
-from loopwright.service.inputs.request import FastRetune, RetuneRequest, SetpointRetune
+from collections.abc import Sequence
+
+from loopwright.service.inputs.request import FastRetune, FiveStages, RetuneRequest
 from loopwright.tuning.experiments.preflight import MAX_ATTEMPTS, MIN_LISTENED_SAMPLES
 from loopwright.tuning.fast.experiment import STEP_BACK_FRACTION, VERIFICATION_PERIODS
 from loopwright.tuning.fast.procedure import MIN_SAMPLES
@@ -20,36 +22,31 @@ PU_OF_T95 = (0.07, 0.95)
 Span = tuple[float, float]
 
 
-def durations(request: RetuneRequest, t95_s: float, sample_time_s: float | None, pu_s: float | None) -> dict[str, Span]:
+def durations(
+    request: RetuneRequest, stages: Sequence[str], t95_s: float, sample_time_s: float | None, pu_s: float | None
+) -> dict[str, Span]:
     """Returns the shortest and the longest time expected of each stage, s.
 
+    stages: the stages that the retune may have.
     pu_s: the ultimate period, s; None where no model is known.
     """
-    whole = isinstance(request, SetpointRetune) or (isinstance(request, FastRetune) and request.start == "relay")
-    minimum = MIN_SAMPLES if whole else MIN_LISTENED_SAMPLES
+    designed_only = isinstance(request, FastRetune) and request.start == "design"
+    whole_record = not designed_only and not isinstance(request, FiveStages)
+    minimum = MIN_SAMPLES if whole_record else MIN_LISTENED_SAMPLES
     look = max(0.5 * t95_s, minimum * (sample_time_s or 0.0))
     # a loop that is not at rest is given half a T95 before each further look
     listening = (look, MAX_ATTEMPTS * look + (MAX_ATTEMPTS - 1) * 0.5 * t95_s)
     low, high = (pu_s, pu_s) if pu_s else (PU_OF_T95[0] * t95_s, PU_OF_T95[1] * t95_s)
     nothing = (0.0, 0.0)
-    if isinstance(request, FastRetune) and request.start == "design":
+    if designed_only:
         return {"preflight": listening, "design": nothing, "verify": (0.6 * t95_s, 11.0 * t95_s)}
-    if isinstance(request, FastRetune):
-        return {
-            "preflight": listening,
-            "relay": (1.8 * low, MAX_PERIODS * high),
-            "design": nothing,
-            "verify": (VERIFICATION_PERIODS * low, (1.0 + STEP_BACK_FRACTION) * VERIFICATION_PERIODS * high),
-            "redesign": nothing,
-        }
-    if isinstance(request, SetpointRetune):
-        return {
-            "preflight": listening,
-            "pulses": (1.5 * low, max(MAX_PERIODS_OF_PULSES * high, MAX_T95 * t95_s)),
-            "design": nothing,
-            "verify": (VERIFICATION_PERIODS * low, (1.0 + STEP_BACK_FRACTION) * VERIFICATION_PERIODS * high),
-            "redesign": nothing,
-        }
+    if whole_record:
+        pulses = (1.5 * low, max(MAX_PERIODS_OF_PULSES * high, MAX_T95 * t95_s))
+        # the relay follows pulses only where they tell too little
+        relay = (0.0 if "pulses" in stages else 1.8 * low, MAX_PERIODS * high)
+        steps = (VERIFICATION_PERIODS * low, (1.0 + STEP_BACK_FRACTION) * VERIFICATION_PERIODS * high)
+        known = {"preflight": listening, "pulses": pulses, "relay": relay, "verify": steps}
+        return {stage: known.get(stage, nothing) for stage in stages}
     return {
         "preflight": listening,
         "baseline": (1.5 * t95_s, 7.0 * t95_s),

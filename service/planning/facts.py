@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.loop_state import LoopState
 from loopwright.tuning.experiments.primitives import Facts
@@ -27,6 +29,9 @@ def facts_of(config: LoopConfig, state: LoopState) -> Facts:
         sp_deviation=config.sp_deviation,
         old_gains=state.gains,
         reverse=state.reverse_acting,
+        mv_step_max=config.test.mv_step_max or math.inf,
+        pv_low=config.pv_limits.low,
+        pv_high=config.pv_limits.high,
     )
 
 

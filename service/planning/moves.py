@@ -7,15 +7,16 @@ controller's feedback may take MV farther; the limits of the test apply there to
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from loopwright.protocol.real32 import TOLERANCE
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.inputs.request import FastRetune, FiveStages, RetuneRequest, SetpointRetune
+from loopwright.service.inputs.request import FastRetune, FiveStages, RetuneRequest, SetpointRetune, excitations
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.design_trial import trial_stages
-from loopwright.tuning.fast.procedure import fast_stages
+from loopwright.tuning.fast.excitation_choice import chosen_stages
 from loopwright.tuning.fast.pulse_test import pulse_size
+from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.fast.relay_test import BIAS, FIRST_AMPLITUDE, MAX_OUTPUT_RANGE, MAX_RAISE, max_amplitude
 from loopwright.tuning.fast.setpoint_procedure import setpoint_stages
 from loopwright.tuning.five_stage.procedure import stages_of
@@ -33,7 +34,7 @@ class Moves:
     """What a stage moves.
 
     mv_down, mv_up: largest moves of MV from its present value, percent, both positive.
-    sp_up: largest step of the set-point, PV units.
+    sp_up, sp_down: largest moves of the set-point from its present value, PV units, both positive.
     pv: expected excursion of PV from the present set-point, PV units; None where it is not known.
     first_mv: initial amplitude of the relay, percent; None without a relay.
     """
@@ -43,14 +44,20 @@ class Moves:
     mv_down: float = 0.0
     mv_up: float = 0.0
     sp_up: float = 0.0
+    sp_down: float = 0.0
     pv: float | None = 0.0
     first_mv: float | None = None
 
 
-def stages_asked(request: RetuneRequest) -> tuple[str, ...]:
-    """Returns the stages of the retune in their order."""
+def stages_asked(config: LoopConfig, request: RetuneRequest) -> tuple[str, ...]:
+    """Returns the stages that the retune may have, in their order.
+
+    config: the configuration with the limits of the job.
+    """
     if isinstance(request, FastRetune):
-        return trial_stages(request.verify) if request.start == "design" else fast_stages(request.verify)
+        if request.start == "design":
+            return trial_stages(request.verify)
+        return chosen_stages(excitations(config, request), request.verify)
     if isinstance(request, SetpointRetune):
         return setpoint_stages(request.verify)
     return stages_of(request.start, request.options.baseline, request.verify)
@@ -67,7 +74,7 @@ def broken_limits(config: LoopConfig, request: RetuneRequest, sp: float) -> list
     hair = TOLERANCE * max(abs(sp), step)
     if not low - hair <= sp <= high + hair:
         return [f"the set-point {sp:.6g} {unit} is not within the PV limits {low:g} .. {high:g}"]
-    stages, broken = stages_asked(request), []
+    stages, broken = stages_asked(config, request), []
     share = 1.0
     if isinstance(request, FiveStages) and "zn_pi" in stages:
         share += request.overshoot_window_pct[0] / 100.0
@@ -119,7 +126,7 @@ def moves(config: LoopConfig, request: RetuneRequest, before: Before) -> list[Mo
     config: the configuration with the limits of the job, and the MV limits in effect.
     """
     found = []
-    for stage in stages_asked(request):
+    for stage in stages_asked(config, request):
         if stage == "preflight":
             found.append(Moves(stage, "Nothing is moved: the loop is observed in automatic until it is at rest."))
         elif stage in _COMPUTING:
@@ -134,12 +141,34 @@ def _moving(stage: str, config: LoopConfig, request: RetuneRequest, before: Befo
         return _setpoint(stage, config, before)
     if not isinstance(request, FastRetune):
         return _five_stage(stage, config, request, before)
-    return _trial(stage, config, before) if request.start == "design" else _fast(stage, config, request, before)
+    if request.start == "design":
+        return _trial(stage, config, before)
+    return _by_excitation(stage, config, request, before)
+
+
+def _by_excitation(stage: str, config: LoopConfig, request: FastRetune, before: Before) -> Moves:
+    """The moves of a stage of fast. Where relay or pulses may have made the record, the larger moves of the two."""
+    tried = excitations(config, request)
+    if Excitation.SETPOINT not in tried:
+        return _fast(stage, config, request, before)
+    if Excitation.RELAY not in tried or stage == "pulses":
+        return _setpoint(stage, config, before)
+    relay = _fast(stage, config, request, before)
+    if stage == "relay":
+        return replace(relay, what=f"Only where the pulses tell too little: {relay.what}")
+    pulses = _setpoint(stage, config, before)
+    what = f"After pulses: {pulses.what} After the relay: {relay.what}"
+    return Moves(
+        stage, what, max(pulses.mv_down, relay.mv_down), max(pulses.mv_up, relay.mv_up),
+        max(pulses.sp_up, relay.sp_up), max(pulses.sp_down, relay.sp_down), _UNDER_NEW_GAINS * config.sp_deviation,
+    )  # fmt: skip
 
 
 def _fast(stage: str, config: LoopConfig, request: FastRetune, before: Before) -> Moves:
     low, high, step, unit = config.mv_limits.low, config.mv_limits.high, config.sp_deviation, config.pv_unit
-    maximum = (high - low) / (1.0 + BIAS) if before.mv is None else max(0.0, max_amplitude(before.mv, low, high))
+    jump = config.test.mv_step_max or math.inf
+    mv = low + BIAS / (1.0 + BIAS) * (high - low) if before.mv is None else before.mv
+    maximum = max(0.0, max_amplitude(mv, low, high, jump))
     given = request.amplitude_pct
     first = given or FIRST_AMPLITUDE * maximum
     up = min(MAX_RAISE * given, maximum) if given else maximum
@@ -148,7 +177,7 @@ def _fast(stage: str, config: LoopConfig, request: FastRetune, before: Before) -
             f"The set-point is stepped up by up to {step:g} {unit} under the new gains, on trial; it is stepped back "
             "where the record is not conclusive."
         )
-        return Moves(stage, what, up, up, step, _UNDER_NEW_GAINS * step)
+        return Moves(stage, what, up, up, step, pv=_UNDER_NEW_GAINS * step)
     size, mean = "The size stays", 0.5 * (1.0 + BIAS)
     pv = _oscillation(mean * first, before.Ku)
     if given is None:
@@ -172,18 +201,18 @@ def _setpoint(stage: str, config: LoopConfig, before: Before) -> Moves:
             f"The set-point moves up, down and up again by up to {step:.4g} {unit} under the present gains; the loop "
             "stays in automatic."
         )
-        return Moves(stage, what, room, room, step, _UNDER_PRESENT_GAINS * step)
+        return Moves(stage, what, room, room, step, step, _UNDER_PRESENT_GAINS * step)
     what = (
         f"The set-point goes back by {step:.4g} {unit} to where it was, under the new gains, on trial; it is stepped "
         "once more, by half as much, where the record is not conclusive."
     )
-    return Moves(stage, what, room, room, step, _UNDER_NEW_GAINS * step)
+    return Moves(stage, what, room, room, step, pv=_UNDER_NEW_GAINS * step)
 
 
 def _trial(stage: str, config: LoopConfig, before: Before) -> Moves:
     kick, step = KICK_OF_ROOM * _room(config, before.mv), config.sp_deviation
     what = f"The set-point is stepped up by up to {step:g} {config.pv_unit} under the new gains, on trial, and back."
-    return Moves(stage, what, kick, kick, step, _UNDER_NEW_GAINS * step)
+    return Moves(stage, what, kick, kick, step, pv=_UNDER_NEW_GAINS * step)
 
 
 def _five_stage(stage: str, config: LoopConfig, request: FiveStages, before: Before) -> Moves:
@@ -200,19 +229,19 @@ def _five_stage(stage: str, config: LoopConfig, request: FiveStages, before: Bef
             "oscillates by itself; a run ends where MV reaches its limit. In between MV is held in manual."
         )
         run = RUN_MV_LIMIT * room
-        return Moves(stage, what, run, run, step, _UNDER_PRESENT_GAINS * step)
+        return Moves(stage, what, run, run, step, pv=_UNDER_PRESENT_GAINS * step)
     if stage == "zn_pi":
         low, high = request.overshoot_window_pct
         what = (
             f"Set-point steps of up to {step:g} {unit} under a Ziegler-Nichols PI, until PV overshoots by {low:g} to "
             f"{high:g} %."
         )
-        return Moves(stage, what, kick, kick, step, (1.0 + high / 100.0) * step)
+        return Moves(stage, what, kick, kick, step, pv=(1.0 + high / 100.0) * step)
     if gains is not None and gains.Kp > 0.0:
         step = min(step, kick / gains.Kp)  # `allowed_step` of the old gains bounds both steps
     which, farthest = ("present", _UNDER_PRESENT_GAINS) if stage == "baseline" else ("new", _UNDER_NEW_GAINS)
     what = f"The set-point is stepped up by up to {step:.4g} {unit} under the {which} gains, and back."
-    return Moves(stage, what, kick, kick, step, farthest * step)
+    return Moves(stage, what, kick, kick, step, pv=farthest * step)
 
 
 def _oscillation(amplitude: float, Ku: float | None) -> float | None:
@@ -221,6 +250,7 @@ def _oscillation(amplitude: float, Ku: float | None) -> float | None:
 
 
 def _room(config: LoopConfig, mv: float | None) -> float:
-    """Returns the room between MV and the nearer limit, percent."""
+    """Returns the room of MV for a test, percent, see `OperatingPoint.room`."""
     low, high = config.mv_limits.low, config.mv_limits.high
-    return 0.5 * (high - low) if mv is None else max(0.0, min(high - mv, mv - low))
+    room = 0.5 * (high - low) if mv is None else max(0.0, min(high - mv, mv - low))
+    return min(room, 0.5 * (config.test.mv_step_max or math.inf))

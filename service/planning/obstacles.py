@@ -6,8 +6,9 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
+from loopwright.service.errors import RemoteSetpoint
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.inputs.request import FastRetune, RetuneRequest, narrow
+from loopwright.service.inputs.request import FastRetune, RetuneRequest, check_setpoint_source, narrow
 from loopwright.service.loop_state import OPERATIONAL, LoopState
 from loopwright.service.planning.facts import facts_of
 from loopwright.service.planning.moves import broken_limits, stages_asked
@@ -71,6 +72,10 @@ def obstacles(config: LoopConfig, request: RetuneRequest, now: Now) -> list[Obst
         found.append(Obstacle(Occupied.BUSY, f"loop {config.tag} is busy with job {now.active_job}"))
     if now.locked is not None:
         found.append(Obstacle(Reason.LOCKED, now.locked))
+    try:
+        check_setpoint_source(narrowed, request)
+    except RemoteSetpoint as remote:
+        found.append(Obstacle(remote.reason, remote.detail))
     if now.silent is not None:
         found.append(Obstacle(now.silent.reason, now.silent.detail))
     if now.state is not None:
@@ -100,19 +105,19 @@ def _state_obstacles(config: LoopConfig, request: RetuneRequest, state: LoopStat
         return [*found, Obstacle(refused.reason, refused.detail)]
     if not math.isfinite(state.pv) or not math.isfinite(state.mv):
         return [*found, Obstacle(Reason.BAD_SAMPLE, f"PV is {state.pv}, MV is {state.mv}")]
-    mv = _mv_obstacles(request, state.mv, facts.mv_low, facts.mv_high)
+    mv = _mv_obstacles(config, request, state.mv, facts.mv_low, facts.mv_high)
     return found + mv + _pv_obstacles(config, request, state)
 
 
-def _mv_obstacles(request: RetuneRequest, mv: float, low: float, high: float) -> list[Obstacle]:
+def _mv_obstacles(config: LoopConfig, request: RetuneRequest, mv: float, low: float, high: float) -> list[Obstacle]:
     room, minimum = min(high - mv, mv - low), MIN_ROOM * (high - low)
     if room < minimum:
         text = f"MV {mv:.4g} leaves {room:.3g} of room within {low:.4g} .. {high:.4g}; at least {minimum:.3g} is needed"
         return [Obstacle(Reason.SATURATED, text)]
-    maximum = max_amplitude(mv, low, high)
+    maximum = max_amplitude(mv, low, high, config.test.mv_step_max or math.inf)
     asked = request.amplitude_pct if isinstance(request, FastRetune) else None
     fits_nowhere = asked is not None and (1.0 + BIAS) * asked > high - low  # `narrow` has reported this already
-    if asked is not None and asked > maximum and not fits_nowhere and "relay" in stages_asked(request):
+    if asked is not None and asked > maximum and not fits_nowhere and "relay" in stages_asked(config, request):
         text = (
             f"a relay of amplitude_pct {asked:g} moves MV from {mv:.4g} to {mv - BIAS * asked:.4g} and "
             f"{mv + asked:.4g} %, which is not within {low:.4g} .. {high:.4g}: at most {maximum:.4g} fits"

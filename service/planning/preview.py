@@ -13,7 +13,7 @@ from loopwright.service.inputs.request import FiveStages, RetuneRequest, narrow
 from loopwright.service.loop_state import LoopState
 from loopwright.service.planning.durations import Span, durations
 from loopwright.service.planning.facts import time_budget_s
-from loopwright.service.planning.moves import Before, Moves, moves
+from loopwright.service.planning.moves import Before, Moves, moves, stages_asked
 from loopwright.service.planning.obstacles import Now, Obstacle, Occupied, obstacles
 from loopwright.service.results import Result, TransferModelView
 from loopwright.tuning.gains import Gains
@@ -146,7 +146,8 @@ def preview(config: LoopConfig, request: RetuneRequest, now: Now, last: LastProp
     limited = narrowed.model_copy(update={"mv_limits": permitted})
     Ku, Pu_s = _entered(request)
     pu_s = Pu_s or (last.Pu_s if last else None)
-    times = durations(request, config.t95_s, state.sample_time_s if state else None, pu_s)
+    sample_time_s = state.sample_time_s if state else None
+    times = durations(request, stages_asked(narrowed, request), config.t95_s, sample_time_s, pu_s)
     mv, sp = (_finite(state.mv), _finite(state.sp)) if state else (None, None)
     before = Before(state.gains if state else None, mv, Ku or (last.Ku if last else None))
     moved = [] if request.dry_run else moves(limited, request, before)
@@ -196,7 +197,7 @@ def _stage(each: Moves, time: Span, mv_limits: Limits, mv: float | None, sp: flo
         mv_low_pct=_rounded(max(mv_limits.low, mv - each.mv_down)) if mv is not None and moves_mv else None,
         mv_high_pct=_rounded(min(mv_limits.high, mv + each.mv_up)) if mv is not None and moves_mv else None,
         mv_move_pct=_rounded(max(each.mv_down, each.mv_up)),
-        sp_low=sp if moves_sp else None,
+        sp_low=_rounded(sp - each.sp_down) if sp is not None and moves_sp else None,
         sp_high=_rounded(sp + each.sp_up) if sp is not None and moves_sp else None,
         sp_move=_rounded(each.sp_up),
         pv_move=None if each.pv is None else _rounded(each.pv),

@@ -40,7 +40,7 @@ def fast_job(path: Path, job: Shown, record: StoredRecord, pv_unit: str) -> None
     mv = figure.add_subplot(grid[2, 0])
     _record(pv, rest, mv, record, job.evidence, pv_unit)
     if proposed:
-        _before_after(figure.add_subplot(grid[0:2, 1]), figure.add_subplot(grid[2, 1]), job, pv_unit)
+        before_after(figure.add_subplot(grid[0:2, 1]), figure.add_subplot(grid[2, 1]), job, pv_unit)
     elif job.advice:
         figure.supxlabel("\n".join(textwrap.wrap(f"Advice: {job.advice}", 110)), fontsize=9)
     canvas.print_figure(path, dpi=80)
@@ -80,11 +80,12 @@ def _record(pv: Axes, rest: Axes, mv: Axes, record: StoredRecord, found: Evidenc
     mv.set_xlabel(f"plant time since the start of the {record.excitation.in_words}, s{taken_over}")
 
 
-def _before_after(top: Axes, bottom: Axes, job: Shown, pv_unit: str) -> None:
-    """Plots the set-point step of the size tested, computed on the model found."""
+def before_after(top: Axes, bottom: Axes, job: Shown, pv_unit: str) -> None:
+    """Plots a set-point step up of the size tested, computed on the model found."""
     assert job.model is not None and job.old_gains is not None and job.new_gains is not None
     model = job.model.process_model()
-    size = 1.0 if job.verification is None else job.verification.step or 1.0
+    # method setpoint steps home, which is mostly down
+    size = 1.0 if job.verification is None else abs(job.verification.step or 1.0)
     both = {"before": (job.old_gains, RED, "--"), "after": (job.new_gains, BLUE, "-")}
     gains = {label: _gains(shown) for label, (shown, _, _) in both.items()}
     settled = [f.settling_s for f in (assess(model, g).setpoint for g in gains.values()) if f and f.settling_s]

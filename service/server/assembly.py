@@ -17,6 +17,7 @@ from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.recovery import Recovery
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.worker import Worker
+from loopwright.service.observing.kept_knowledge import KeptKnowledge
 from loopwright.service.store.store import Store
 
 
@@ -42,17 +43,19 @@ def make_jobs(
     registry = Registry()
     journal = Journal(store, beside=machine.writes_beside)
     directory = LoopDirectory(loops, store, open_loop, registry, machine, buses)
-    decisions = Decisions(store, directory, machine)
+    knowledge = KeptKnowledge(store, machine.lock())
+    decisions = Decisions(store, directory, machine, knowledge)
     return Jobs(
         store=store,
         engine=engine,
         journal=journal,
         registry=registry,
         directory=directory,
-        worker=Worker(store, journal, directory, registry, tune, rehearse, machine),
+        worker=Worker(store, journal, directory, registry, tune, rehearse, machine, knowledge),
         decisions=decisions,
         locking=Locking(store, directory, decisions),
         aftercare=Aftercare(store, directory, machine),
         recovery=Recovery(loops, store, open_loop, resume, lambda: registry.stopping),
         machine=machine,
+        knowledge=knowledge,
     )

@@ -38,6 +38,7 @@ from loopwright.service.execution.procedures import tune as live
 from loopwright.service.execution.rehearsals import rehearsed_in_pool
 from loopwright.service.inputs.config import LoopConfig, load_site
 from loopwright.service.jobs.dbos_engine import POLL_S, DurableEngine
+from loopwright.service.jobs.looking import Looking
 from loopwright.service.jobs.loop_directory import LoopFactory
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.retention import Retention, RetentionPolicy
@@ -207,6 +208,9 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         checks = {**operations.checks(jobs), "samples": retention.note}
         listening = Listening(site.loops, store, jobs.directory.in_effect, site.buses, setup.listen)
         stack.callback(listening.close)
+        looking = stack.enter_context(
+            closing(Looking(jobs.directory, jobs.registry, store, listening, jobs.knowledge, pool))
+        )
         app = create_app(jobs, policy, checks, pool, station.sdo_retries, listening)
         server = _Server(server_config(app, setup, listener, descriptors), jobs, listening)
 
@@ -221,6 +225,8 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         jobs.boot()
         if not jobs.stopping:
             retention.start()
+            if setup.listen:
+                looking.start()
             server.run(sockets=[listener])
 
 

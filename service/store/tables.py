@@ -9,7 +9,7 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 from loopwright.service.job_states import JobState
 from loopwright.service.jsonable import JsonObject
-from loopwright.service.results import RESULT, FastResult, FiveStageResult
+from loopwright.service.results import RESULT, FastResult, Finding, FiveStageResult
 from loopwright.tuning.reasons import Reason
 
 
@@ -42,6 +42,19 @@ class ResultColumn(TypeDecorator[FastResult | FiveStageResult]):
 
     def process_result_value(self, value: JsonObject | None, dialect: Dialect) -> FastResult | FiveStageResult | None:
         return None if value is None else RESULT.validate_python(value)
+
+
+class FindingColumn(TypeDecorator[Finding]):
+    """What a test or normal operation has told of a loop, as JSON."""
+
+    impl = JSON
+    cache_ok = True
+
+    def process_bind_param(self, value: Finding | None, dialect: Dialect) -> JsonObject | None:
+        return None if value is None else value.model_dump(mode="json")
+
+    def process_result_value(self, value: JsonObject | None, dialect: Dialect) -> Finding | None:
+        return None if value is None else Finding.model_validate(value)
 
 
 class Base(DeclarativeBase):
@@ -173,6 +186,19 @@ class HistoryRow(Base):
     host: Mapped[str]
     count: Mapped[int]
     data: Mapped[bytes] = mapped_column(LargeBinary)
+
+
+class KnowledgeRow(Base):
+    """What a test or normal operation has told of a loop. older_plant: why it is no longer true; null: it is."""
+
+    __tablename__ = "loop_knowledge"
+    __table_args__ = (Index("loop_knowledge_by_loop", "loop", "number"),)
+
+    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    loop: Mapped[str]
+    at: Mapped[str]
+    finding: Mapped[Finding] = mapped_column(FindingColumn)
+    older_plant: Mapped[str | None]
 
 
 class RetuneRow(Base):

@@ -52,7 +52,7 @@ def kind_of(method: str, path: str) -> RequestKind | None:
     if path == "/healthz":
         return None
     last = path.rpartition("/")[2]
-    if path == "/tunings" or last == "alternatives":
+    if path == "/tunings" or last in ("alternatives", "observation"):
         return RequestKind.COMPUTATION
     if last == "preview":
         return RequestKind.BUS

@@ -17,17 +17,20 @@ class ComputationKind(IntEnum):
     LIVE = 0
     TUNING = 1
     DRY_RUN = 2
+    LOOK = 3
 
 
 WORDS = {
     ComputationKind.LIVE: "the computation of a loop under test",
     ComputationKind.TUNING: "the tuning",
     ComputationKind.DRY_RUN: "the dry run",
+    ComputationKind.LOOK: "the look at the history of a loop",
 }
 OPTIONS = {
     ComputationKind.LIVE: "--live-cpu-s",
     ComputationKind.TUNING: "--tuning-cpu-s",
     ComputationKind.DRY_RUN: "--dry-run-cpu-s",
+    ComputationKind.LOOK: "--tuning-cpu-s",
 }
 MEMORY_OPTION = "--computation-memory-mb"
 
@@ -51,6 +54,7 @@ class ComputingLimits:
             ComputationKind.LIVE: self.live_cpu_s,
             ComputationKind.TUNING: self.tuning_cpu_s,
             ComputationKind.DRY_RUN: self.dry_run_cpu_s,
+            ComputationKind.LOOK: self.tuning_cpu_s,
         }[kind]
 
 

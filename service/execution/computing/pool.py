@@ -36,7 +36,9 @@ from loopwright.tuning.reasons import Failed, Reason
 T = TypeVar("T")
 R = TypeVar("R")
 
-NICE = {ComputationKind.LIVE: 5, ComputationKind.TUNING: 10, ComputationKind.DRY_RUN: 10}
+NICE = {
+    ComputationKind.LIVE: 5, ComputationKind.TUNING: 10, ComputationKind.DRY_RUN: 10, ComputationKind.LOOK: 15,
+}  # fmt: skip
 _LOOK_S, _LOOK_WAITING_S = 0.1, 0.5
 """Wall time between two checks whether a running computation, or one that waits for its turn, is still wanted, s: fifty
 loops may wait at once, and each check takes the interpreter."""

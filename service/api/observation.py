@@ -1,0 +1,64 @@
+"""The route that answers what the history of a loop tells of its gains. Nothing is changed on the loop; what was found
+is kept."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Annotated
+
+from fastapi import APIRouter, Path, Query, Request
+from fastapi.concurrency import run_in_threadpool
+
+from loopwright.service.api import problems
+from loopwright.service.api.bodies import JsonRoute
+from loopwright.service.api.computed import computed
+from loopwright.service.errors import Conflict
+from loopwright.service.execution.computing.pool import Pool
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.listening.listening import Listening
+from loopwright.service.loop_state import LoopState
+from loopwright.service.loops.shared_reading import SharedReading
+from loopwright.service.observing.hearing import question
+from loopwright.service.observing.observed import ObservationView, Question, observed
+from loopwright.tuning.fast.design import DesignSpec
+
+
+def router(jobs: Jobs, readings: SharedReading[LoopState | None], listening: Listening, pool: Pool) -> APIRouter:
+    """A router with GET /loops/{tag}/observation. readings: the present states of loops.  pool: computes the answer."""
+    routes = APIRouter(tags=["loops"], route_class=JsonRoute)
+
+    @routes.get(
+        "/loops/{tag}/observation",
+        summary="Gains from the set-point changes that operators made: nothing is moved or written on the loop",
+        responses=problems.responses(404, 409, 422, 503),
+    )
+    async def observation(
+        http: Request,
+        tag: Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])],
+        ms: Annotated[
+            float,
+            Query(
+                ge=1.2, le=2.0, allow_inf_nan=False, examples=[1.4],
+                description="Maximum sensitivity for which gains are designed: 1.2 (robust) to 2.0 (fast)",
+            ),
+        ] = 1.6,
+        derivative: Annotated[bool, Query(description="Design a PID where a derivative improves the loop")] = False,
+    ) -> ObservationView:  # fmt: skip
+        asked = await run_in_threadpool(asked_of, tag, DesignSpec(ms, derivative))
+        found = await computed(pool, partial(observed, asked), http, lambda: jobs.stopping)
+        return await run_in_threadpool(kept, found, asked)
+
+    def kept(found: ObservationView, asked: Question) -> ObservationView:
+        """The answer with what is known of the loop, once this is kept too."""
+        jobs.knowledge.observed(found, asked.spec.Ms, asked.state.sample_time_s)
+        return found.model_copy(update={"knowledge": jobs.knowledge.of(found.loop, asked.state.gains)})
+
+    def asked_of(tag: str, spec: DesignSpec) -> Question:
+        """The question, with everything that it needs from the loop and its history."""
+        config, host = jobs.directory.owner(tag)
+        state = readings.of(tag)
+        if state is None:
+            raise Conflict(f"loop {tag} belongs to the host {host}, which listens to it: ask there")
+        return question(listening, jobs.store, config, state, spec, jobs.directory.disturbers(tag))
+
+    return routes

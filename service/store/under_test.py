@@ -1,0 +1,62 @@
+"""When loops were under test."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+
+from sqlalchemy import select
+
+from loopwright.service.job_states import ACTIVE
+from loopwright.service.store.clock import stamp
+from loopwright.service.store.store import Store
+from loopwright.service.store.tables import JobRow
+
+_ACTIVE = [state.value for state in ACTIVE]
+
+
+@dataclass(frozen=True, slots=True)
+class TimeUnderTest:
+    """A time in which a job had a loop, seconds since 1970 UTC. to_s: None where it still has it.
+
+    session: whether it has opened a session, before which it moves nothing.
+    """
+
+    loop: str
+    job_id: str
+    from_s: float
+    to_s: float | None
+    session: bool
+
+    def within(self, from_s: float, to_s: float) -> tuple[float, float] | None:
+        """Returns the part of it within another time; None where there is none."""
+        begin, end = max(self.from_s, from_s), to_s if self.to_s is None else min(self.to_s, to_s)
+        return (begin, end) if begin < end else None
+
+
+def times_under_test(store: Store, loops: Collection[str], since: datetime | None = None) -> Sequence[TimeUnderTest]:
+    """Returns the times in which jobs had these loops, of any host, oldest first; dry runs have none.
+
+    since: the end of the earliest one; None: only those that go on.
+    """
+    active = JobRow.state.in_(_ACTIVE)
+    going_on = active if since is None else active | (JobRow.ended_at >= stamp(since))
+    columns = JobRow.loop, JobRow.id, JobRow.created_at, JobRow.started_at, JobRow.ended_at, JobRow.session
+    wanted = select(*columns).where(JobRow.loop.in_(loops), JobRow.dry_run.is_(False), going_on)
+    with store.reading() as session:
+        rows = session.execute(wanted.order_by(JobRow.number)).all()
+    return [
+        TimeUnderTest(
+            row.loop,
+            row.id,
+            _seconds(row.started_at or row.created_at),
+            None if row.ended_at is None else _seconds(row.ended_at),
+            row.session is not None,
+        )
+        for row in rows
+    ]
+
+
+def _seconds(at: str) -> float:
+    return datetime.fromisoformat(at).timestamp()
