@@ -61,6 +61,7 @@ class Stage:
 _FIVE: dict[str, Any] = {"method": "five-stage"}
 _SOON = {**_FIVE, "baseline": False}
 _TO_VERIFY = {**_SOON, "start": "optimise", "model": {"K": 0.02, "T_s": 2.0, "L_s": 1.0}}
+_PULSES: dict[str, Any] = {"method": "setpoint"}
 STAGES = {
     "preflight": Stage("preflight", _TO_VERIFY, 0.3, untouched=True),
     "baseline": Stage("baseline", _FIVE),
@@ -71,6 +72,9 @@ STAGES = {
     "fast-preflight": Stage("preflight", {}, 0.3, untouched=True),
     "fast-relay": Stage("relay", {}),
     "fast-verify": Stage("verify", {}),
+    "setpoint-preflight": Stage("preflight", _PULSES, 0.3, untouched=True),
+    "setpoint-pulses": Stage("pulses", _PULSES),
+    "setpoint-verify": Stage("verify", _PULSES, 0.4),
 }
 """Of model 14."""
 

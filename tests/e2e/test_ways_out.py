@@ -199,7 +199,9 @@ def test_sigterm_of_the_service(here: Plantsite, stage: str) -> None:
     assert ended(here, url) == ("aborted", "service_stopped")
 
 
-@pytest.mark.parametrize("stage", [name for name, stage in STAGES.items() if not stage.untouched])
+@pytest.mark.parametrize(
+    "stage", [*(name for name, stage in STAGES.items() if not stage.untouched), "setpoint-preflight"]
+)
 def test_kill_9_of_the_service_leaves_the_controller_to_itself_and_the_job_resumes(here: Plantsite, stage: str) -> None:
     url = here.in_stage(STAGES[stage])
     here.service.kill()

@@ -175,7 +175,7 @@ def line(one: Ending) -> str:
     bad = f"  BAD: {one.unsafe or one.defects or 'still active'}" if one.bad else ""
     safe = "-" if one.safe_s is None else f"{one.safe_s:.1f} s"
     return (
-        f"{one.database:<11}{one.fault:<18}{one.stage:<10}{one.state} {one.reason or ''} "
+        f"{one.database:<11}{one.fault:<18}{one.stage:<20}{one.state} {one.reason or ''} "
         f"({one.attempts}), {one.kept} kept, {one.lost} lost, {one.missing} missing, "
         f"safe in {safe}, took {one.took_s:.0f} s{bad}"
     )

@@ -52,7 +52,9 @@ FAULTS = {
     "off-way-out": Fault("the operator's OFF on the way out", do.off_on_the_way_out),
     "pre-operational": Fault("a third node makes the controller pre-operational", do.pre_operational),
     "pv-gone": Fault("PV is no number for good", do.pv_gone),
-    "two-tuners": Fault("another tuner wants the loop", do.two_tuners, ("relay", "verify", "fast-relay")),
+    "two-tuners": Fault(
+        "another tuner wants the loop", do.two_tuners, ("relay", "verify", "fast-relay", "setpoint-pulses")
+    ),
     "second-gateway": Fault("`kill -9` at a slow sample time, beside another gateway", do.second_gateway),
     "deaf-listener": Fault("a listener that never reads", do.deaf_listener),
     "disk-full": Fault(f"disk full for {AWAY_S:.0f} s", do.disk_full, needs=Needs(small_disk=True)),

@@ -59,7 +59,8 @@ def proposal(folder: Path, size: float, at_s: float, **options: Any) -> tuple[di
     store, engine = Store(folder), ThreadEngine()
     jobs = make_jobs(loops, store, open_loop, tune, rehearse, engine=engine)
     jobs.boot()
-    row = jobs.start(TAG, retune_request(**{"amplitude_pct": AMPLITUDE, **options}))
+    asked = {name: value for name, value in {"amplitude_pct": AMPLITUDE, **options}.items() if value is not None}
+    row = jobs.start(TAG, retune_request(**asked))
     engine.join(100)
     jobs.stop()
     job = job_view(store.get(row.id), store.events(row.id), None).model_dump(mode="json")

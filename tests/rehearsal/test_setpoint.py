@@ -68,6 +68,43 @@ def test_the_pulses_leave_room_for_MV() -> None:
     assert max(abs(sample.mv) for sample in taken) < 1.0
 
 
+@pytest.mark.parametrize("name", ["first order", "three lags", "inverse response"])
+def test_PV_stays_within_one_and_a_half_steps_under_gains_that_are_nearly_unstable(name: str) -> None:
+    """Pulses of one size would move PV by 2 permitted steps and more. A forecast on so short a record may be off by a
+    tenth."""
+    plant = under(name, 0.75)
+    moved: list[float] = []
+    stages: list[str] = []
+
+    def hear(event: Event) -> None:
+        if isinstance(event, StageStarted):
+            stages.append(event.stage)
+
+    def take(samples: list[Sample]) -> None:
+        moved.extend(abs(sample.pv) for sample in samples if stages[-1:] == ["pulses"])
+
+    answer = rehearse(plant, method="setpoint", on_event=hear, on_samples=take, propose_anyway=True)
+    assert answer["outcome"] == "proposed", answer["detail"]
+    assert abs(true_Ms(plant, answer["new_gains"]) - 1.6) < 0.05
+    assert max(moved) <= 1.65 * answer["input"]["sp_deviation"]
+
+
+@pytest.mark.parametrize(("name", "part", "limit"), [("first order", 0.015, 0.08), ("three lags", 0.02, 0.15)])
+def test_the_set_point_is_brought_near_where_the_new_Kp_is_many_times_the_present_one(
+    name: str, part: float, limit: float
+) -> None:
+    """The step home from the pulse's level would take MV to its limit."""
+    taken: list[Sample] = []
+    plant = under(name, part, mv_limits=[-limit, limit], sp_deviation=0.1)
+    answer = rehearse(plant, method="setpoint", on_samples=taken.extend)
+    assert answer["outcome"] == "proposed", answer["detail"]
+    assert abs(true_Ms(plant, answer["new_gains"]) - 1.6) < 0.05
+    assert answer["new_gains"]["Kp"] > 8.0 * plant["gains"]["Kp"]
+    assert answer["new_gains"]["Kp"] * 0.1 > limit, "a full step would not fit"
+    assert abs(answer["verification"]["step"]) * answer["verification"]["Kp"] <= 0.71 * limit
+    assert max(abs(sample.mv) for sample in taken) < limit
+
+
 def test_a_plant_of_the_other_sign_is_refused() -> None:
     answer = rehearse(under("first order", 0.05, reverse_acting=False), method="setpoint")
     assert answer["outcome"] == "refused"

@@ -19,6 +19,7 @@ from loopwright.tuning.plan import Event, Mode, Plan, SetMode, SetOutput, StageS
 from loopwright.tuning.reasons import Reason
 
 TAG = "TIC-1"
+CONFIG = parse_site({"loops": [entry(TAG)]}, "test").loops[TAG]
 CUT_OFF = [JobEvent(job_id="cut", seq=1, at="", plant_time_s=0.0, kind="loop_found", data={})]
 
 
@@ -31,11 +32,10 @@ def _pushed(facts: Facts, working_output: float) -> Plan[None]:
 
 @pytest.fixture
 def swinging() -> tuple[Loop, Facts]:
-    config = parse_site({"loops": [entry(TAG)]}, "test").loops[TAG]
-    loop = open_loop(config)
+    loop = open_loop(CONFIG)
     state = loop.read()
     facts = Facts(
-        state.sample_time_s, config.t95_s, state.mv_low, state.mv_high, config.sp_deviation, state.gains,
+        state.sample_time_s, CONFIG.t95_s, state.mv_low, state.mv_high, CONFIG.sp_deviation, state.gains,
         state.reverse_acting,
     )  # fmt: skip
     run(_pushed(facts, state.mv), loop, limits=RunLimits())
@@ -49,7 +49,10 @@ def _attempt(loop: Loop, facts: Facts, earlier: list[JobEvent], method: str) -> 
         if isinstance(event, StageStarted):
             stages.append(event.stage)
 
-    return run(plan(retune_request(method=method), facts, earlier), loop, limits=RunLimits(), on_event=hear), stages
+    return (
+        run(plan(CONFIG, retune_request(method=method), facts, earlier), loop, limits=RunLimits(), on_event=hear),
+        stages,
+    )
 
 
 @pytest.mark.parametrize("method", ["fast", "five-stage"])

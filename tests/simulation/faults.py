@@ -449,14 +449,14 @@ def everything(world: World) -> None:
 # -- real procedures
 
 
-def _real(world: World, request: RetuneRequest, takes_s: float) -> None:
+def _real(world: World, request: RetuneRequest, takes_s: float, also: tuple[str, ...] = ()) -> None:
     random = world.random
     loop = world.loop
     world.tune = plans.real
     world.request = request
     world.plan_s = takes_s
     gateway = one_job(world, decisions=("accept", "rollback")[: random.randint(0, 2)])
-    what = random.choice((None, "kills", "kills", "operator", "pv", "frames", "restarts", "nmt", "away"))
+    what = random.choice((None, "kills", "kills", "operator", "pv", "frames", "restarts", "nmt", "away", *also))
     if what == "kills":
         killed(world, gateway)
     elif what == "operator":
@@ -471,11 +471,18 @@ def _real(world: World, request: RetuneRequest, takes_s: float) -> None:
         nmt(world)
     elif what == "away":
         away(world)
+    elif what == "plc":
+        plc(world)
     assert loop.wall_s <= 0.2
 
 
 def real_fast(world: World) -> None:
     _real(world, retune_request(method="fast", verify=world.random.random() < 0.7), 500 * world.loop.wall_s)
+
+
+def real_setpoint(world: World) -> None:
+    request = retune_request(method="setpoint", verify=world.random.random() < 0.7)
+    _real(world, request, 400 * world.loop.wall_s, ("plc",))
 
 
 def real_five_stage(world: World) -> None:

@@ -23,7 +23,7 @@ class Kind:
 
 KINDS: dict[str, Kind] = {
     "calm": Kind("nothing goes wrong, or a person aborts", 2, faults.calm),
-    "kills": Kind("the service is killed 1 to 3 times before any call, in recovery too", 16, faults.kills),
+    "kills": Kind("the service is killed 1 to 3 times before any call, in recovery too", 15, faults.kills),
     "frames": Kind("frames lost, doubled, late; kills", 6, faults.bad_frames),
     "away": Kind("the bus away, holding frames back, or its interface down; kills", 7, faults.bus_away),
     "held": Kind("the service dies while its frames are held back", 6, faults.held),
@@ -39,6 +39,7 @@ KINDS: dict[str, Kind] = {
     "power": Kind("power cuts of the controller, in a write of its disk too", 3, faults.power_cuts),
     "mixed": Kind("two to four of all that at once", 3, faults.everything),
     "fast": Kind("the real fast procedure, with one of all that", 1, faults.real_fast, real=True),
+    "setpoint": Kind("real pulses of the set-point, with one of all that", 1, faults.real_setpoint, real=True),
     "five_stage": Kind("the real five-stage procedure, with one of all that", 0, faults.real_five_stage, real=True),
     "trial": Kind("a real set-point trial, with one of all that", 1, faults.real_trial, real=True),
 }

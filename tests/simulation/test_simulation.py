@@ -31,7 +31,7 @@ def test_300_seeds_end_safe() -> None:
     assert not bad, "\n".join(bad)
 
 
-@pytest.mark.timeout(300)
+@pytest.mark.timeout(900)  # some four minutes on a machine that is busy with the other lanes
 def test_one_job_killed_at_each_call_of_the_bus_ends_safe() -> None:
     endings = list(every_call(RESTARTS_S, CORES, in_turn=True))
     assert len(endings) > 393
@@ -48,7 +48,7 @@ def test_a_seed_is_one_history() -> None:
 
 FOUND_BY = {
     # To search anew: python -m tests.simulation --seeds 2000 --bug NAME
-    "count-is-not-checked": ("stranger", 5),
+    "count-is-not-checked": ("stranger", 13),
     "set-point-stays": ("stalls", 1),
 }
 

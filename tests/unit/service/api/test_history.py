@@ -29,7 +29,7 @@ def test_the_stored_history_is_answered_in_columns(service: Service, client: Tes
     assert answer.status_code == 200, answer.text
     found = answer.json()
     columns = {name: values for name, values in found.items() if isinstance(values, list)}
-    lengths = {name: len(values) for name, values in columns.items() if name not in ("gain_sets", "gaps")}
+    lengths = {name: len(values) for name, values in columns.items() if name not in ("gain_sets", "gaps", "disturbed")}
     assert set(lengths.values()) == {len(rows.bins)} and sum(found["samples"]) == 600
     assert {50.05} == {*found["pv_min"], *found["pv_max"], *found["pv_mean"]} and set(found["mv_mean"]) == {41.3}
     assert (found["mode"][0], found["gains"][0]) == (None, None)

@@ -25,6 +25,8 @@ PLANT = {"num": [1.0], "den": [8.0, 6.0, 1.0], "dead_time_s": 1.0, "noise_std": 
 class Through:
     """The command line's client, on the service of the test."""
 
+    url = "http://service.of.the.test"
+
     def __init__(self, client: TestClient) -> None:
         self._client = client
         self.posted: list[dict[str, Any]] = []

@@ -15,8 +15,12 @@ from typer.testing import CliRunner, Result
 
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.cli.main import app
+from loopwright.tuning.analysis.margins import margins
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import Reals, TransferFunction
 from loopwright.tuning.reasons import Reason
 from loopwright.tuning.rules.registry import METHODS
+from tests.rehearsal.test_observe import LAG, PI, TS, changes, operated
 
 MODELS = {
     "lag-dominant": '{"K": 2, "T_s": 50, "L_s": 2}',
@@ -255,6 +259,41 @@ def test_identify_finds_an_inverse_response_and_a_load(tmp_path: Path) -> None:
     told = run("identify", str(file)).stdout
     assert "den[0]" in told and "a load" in told and "load disturbance" in told
     assert answer("tune", "--model", json.dumps(found["model"]), "--method", "simc")["methods"][0]["outcome"] == "tuned"
+
+
+def logged(file: Path, sp: Reals) -> Path:
+    """The file of a historian, of a loop whose set-point moved so."""
+    heard = operated(LAG, PI, sp)
+    rows = zip(TS * np.arange(len(sp)), heard.sp, heard.pv, heard.mv, strict=True)
+    file.write_text("time,SP,PV,MV\n" + "".join(f"{t:.1f},{sp:g},{pv:.4f},{mv:.4f}\n" for t, sp, pv, mv in rows))
+    return file
+
+
+def test_identify_of_normal_operation(tmp_path: Path) -> None:
+    file = logged(tmp_path / "operation.csv", changes([0.8, -0.3, 0.6], 200.0))
+    found = answer("identify", str(file), "--closed-loop", "--kp", "1", "--ti", "9")
+    assert found["state"] == "proposal" and len(found["changes_used"]) == 3
+    proposed = found["proposed"]["gains"]
+    true = TransferFunction(LAG.num, LAG.den, LAG.L + 0.5 * TS)
+    assert margins(true, Gains(proposed["Kp"], proposed["Ti"])).Ms == pytest.approx(1.6, abs=0.05)
+    shown = run("identify", str(file), "--closed-loop", "--kp", "1", "--ti", "9")
+    assert shown.exit_code == 0 and "from 3 set-point changes" in shown.stdout and "dead time" in shown.stdout
+    wrong = run("identify", str(file), "--closed-loop", "--kp", "2", "--ti", "9")
+    assert wrong.exit_code == 2 and "0.5 times as far" in wrong.stderr
+    for given, said in (
+        (["--closed-loop"], "needs --kp"),
+        (["--closed-loop", "--kp", "1", "--plot", "x.png"], "neither"),
+        (["--kp", "1"], "need --closed-loop"),
+        (["--ti", "9"], "need --closed-loop"),
+        (["--closed-loop", "--kp", "0"], "must be positive"),
+        (["--closed-loop", "--kp", "1", "--ti", "-3"], "at least 0"),
+        (["--closed-loop", "--kp", "1", "--ti", "9", "--ms", "0.9"], "--ms: "),
+    ):
+        refused = run("identify", str(file), *given)
+        assert refused.exit_code == 2 and said in refused.stderr, (given, refused.stderr)
+    driven = logged(tmp_path / "driven.csv", np.sin(np.arange(2000) / 200.0))
+    refused = run("identify", str(driven), "--closed-loop", "--kp", "1", "--ti", "9")
+    assert refused.exit_code == 3 and "another controller drives it" in refused.stderr
 
 
 def test_identify_on_a_terminal(record: Path) -> None:

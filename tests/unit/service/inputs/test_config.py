@@ -32,6 +32,9 @@ def test_every_error_is_listed_at_once() -> None:
         loop_entry(tag="F", sp_deviation=60.0, channel=6),
         loop_entry(tag="G", mv_limits={"low": -10, "high": 50}, channel=7),
         {"tag": "H"},
+        loop_entry(tag="I", channel=8, test={"excitations": ["relay", "relay"]}),
+        loop_entry(tag="J", channel=9, test={"excitations": []}),
+        loop_entry(tag="K", channel=10, test={"excitations": ["relays"]}),
         "nonsense",
     ]
     with pytest.raises(ConfigError) as caught:
@@ -41,7 +44,9 @@ def test_every_error_is_listed_at_once() -> None:
         "loops[0].t95_s (TIC-101)", "loops[0].colour (TIC-101)", "socketcan:vcan0",
         "low (5) must be less than high (5)",
         "loops[3].t95_s (D)", "loops[3].controller_node (D)", "are both 32", "twice", "0..100 percent",
-        "loops[7].pv_unit (H): Field required", "loops[8]", "extra: unknown key",
+        "loops[7].pv_unit (H): Field required",
+        "loops[8].test.excitations (I): relay, relay: each excitation is named once",
+        "loops[9].test.excitations (J)", "loops[10].test.excitations.0 (K)", "loops[11]", "extra: unknown key",
     ):  # fmt: skip
         assert words in text
 

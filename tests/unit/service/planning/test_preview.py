@@ -24,6 +24,7 @@ from loopwright.tuning.reasons import Failed, Reason, Refused
 from tests.unit.service.fakes import RESULT, TAG, FakeController, FakeLoop, Service, loop_entry
 
 STATE = FakeController().state
+EITHER = {"test": {"excitations": ["setpoint", "relay"]}}
 NARROW = {"pv_limits": {"low": 49.0, "high": 53.0}}
 
 
@@ -52,6 +53,49 @@ class TestMoves:
         assert found.first_mv_move_pct is not None and found.first_mv_move_pct <= 30.0
         assert (found.watched.pv.low, found.watched.pv.high, found.watched.max_time_s) == (0.0, 100.0, 900.0)
 
+    def test_the_largest_jump_of_mv_that_the_loop_permits_bounds_what_is_told(self) -> None:
+        """A relay jumps from one side to the other: by one and a half amplitudes, or by two where it is even."""
+        jump = {"test": {"mv_step_max": 6.0}}
+        assert told(config=jump).largest_mv_move_pct == 4.0
+        five_stages = {each.stage: each for each in told(config=jump, method="five-stage").stages}
+        assert five_stages["relay"].mv_move_pct == 3.0
+        asked = told(config=jump, amplitude_pct=5.0)
+        assert not asked.would_start and "at most 4 fits" in asked.obstacles[0].detail
+
+    def test_of_two_excitations_each_that_may_follow_is_told_before(self) -> None:
+        found = told(config=EITHER)
+        stages = {each.stage: each for each in found.stages}
+        assert list(stages) == ["preflight", "pulses", "relay", "design", "verify", "redesign"]
+        assert (stages["pulses"].sp_low, stages["pulses"].sp_high) == (48.0, 52.0)
+        assert stages["relay"].what.startswith("Only where the pulses tell too little") and found.first_mv_move_pct
+        assert stages["relay"].duration_low_s == 0.0 < stages["pulses"].duration_low_s
+        assert "After pulses" in stages["verify"].what and "After the relay" in stages["verify"].what
+        assert found.largest_mv_move_pct == told().largest_mv_move_pct, "the relay's"
+
+    def test_pulses_alone_are_told_as_those_of_method_setpoint(self) -> None:
+        alone = told(config=EITHER, excitations=["setpoint"])
+        assert [each.model_dump() for each in alone.stages] == [
+            each.model_dump() for each in told(method="setpoint").stages
+        ]
+
+    @pytest.mark.parametrize(
+        ("config", "options", "words"),
+        [
+            ({}, {"excitations": ["setpoint"]}, "setpoint is asked for, loops.yaml permits relay"),
+            (EITHER, {"excitations": ["setpoint"], "amplitude_pct": 5.0}, "amplitude_pct: of a relay, which is not"),
+            (EITHER | {"setpoint_from": "remote"}, {"excitations": ["setpoint"]}, "comes from another controller"),
+        ],
+    )
+    def test_a_request_does_not_widen_what_the_loop_permits(
+        self, config: dict[str, Any], options: dict[str, Any], words: str
+    ) -> None:
+        found = told(config=config, **options)
+        assert not found.would_start and words in found.obstacles[0].detail
+
+    def test_a_remote_set_point_is_left_alone_where_the_relay_is_permitted(self) -> None:
+        found = told(config=EITHER | {"setpoint_from": "remote"})
+        assert [each.stage for each in found.stages][1] == "relay" and found.would_start
+
     def test_an_amplitude_that_is_asked_for_is_the_one_told(self) -> None:
         found = told(amplitude_pct=10.0)
         assert found.first_mv_move_pct == 10.0
@@ -62,6 +106,12 @@ class TestMoves:
         found = told(replace(STATE, mv_high=70.0), mv_low=20.0)
         assert (found.watched.mv.low, found.watched.mv.high) == (20.0, 70.0)
         assert (found.stages[1].mv_low_pct, found.stages[1].mv_high_pct) == (25.0, 70.0)
+
+    def test_pulses_go_to_both_sides_of_the_set_point(self) -> None:
+        stages = {each.stage: each for each in told(method="setpoint").stages}
+        assert list(stages) == ["preflight", "pulses", "design", "verify", "redesign"]
+        assert (stages["pulses"].sp_low, stages["pulses"].sp_high, stages["pulses"].pv_move) == (48.0, 52.0, 4.0)
+        assert (stages["verify"].sp_low, stages["verify"].sp_high, stages["verify"].pv_move) == (50.0, 52.0, 2.8)
 
     def test_five_stage_tells_every_stage(self) -> None:
         found = told(method="five-stage")

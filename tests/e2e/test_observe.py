@@ -1,0 +1,75 @@
+"""An operator (a script) moves the set-point of a live loop on vcan0; the gains come from that alone."""
+
+from __future__ import annotations
+
+import json
+import time
+from contextlib import ExitStack
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from loopwright.service.results import GainsView
+from loopwright.tuning.analysis.margins import margins, ultimate_point
+from loopwright.tuning.models import TransferFunction
+from tests.e2e.plantsite import MODEL_14, NEEDS_VCAN, TAG, Plantsite
+
+pytestmark = NEEDS_VCAN
+SPEED = 10.0
+REST_S, BETWEEN_S = 60.0, 30.0
+MOVES = (50.1, 50.02, 50.1, 50.0)
+
+
+def last_sample(here: Plantsite) -> int:
+    """The number of the last sample that the listener has with known gains; 0 where there is none."""
+    found = here.http.get(f"/loops/{TAG}/history", params={"from": time.time() - 5.0, "points": 5000}).json()
+    known = [number for number, gains in zip(found["sample_number"], found["gains"], strict=True) if gains is not None]
+    return max(known, default=0)
+
+
+def operated(here: Plantsite, plant_time_s: float) -> None:
+    """Waits until the loop has worked for so long, as heard."""
+    deadline, first = time.monotonic() + 150.0, 0
+    while not first or last_sample(here) < first + plant_time_s / here.case.ts:
+        first = first or last_sample(here)
+        assert time.monotonic() < deadline, "nothing is heard"
+        time.sleep(0.1)  # each question costs the one processor of the guest some of what the loop needs
+
+
+def test_what_an_operator_does_gives_gains_that_are_right_on_the_plant(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        here = Plantsite(stack, tmp_path, MODEL_14, speed=str(SPEED))
+        here.write("plant_noise", 0.001)
+        operated(here, REST_S)
+        for sp in MOVES:
+            here.write("controller_setpoint", sp)
+            operated(here, BETWEEN_S)
+        answer = here.http.get(f"/loops/{TAG}/observation")
+        assert answer.status_code == 200, answer.text
+        found = answer.json()
+        assert found["state"] == "proposal", (found["known"], found["detail"])
+        assert len(found["changes_used"]) >= 2 and found["proposed"]["uncertainty"] < 0.06
+        models = json.loads((files("loopwright.plantsim") / "models-50.json").read_text())["models"]
+        plant = next(each for each in models if each["id"] == 14)
+        num = tuple(0.01 * each for each in plant["num"])  # on the bus MV is in percent
+        on_bus = TransferFunction(num, tuple(plant["den"]), plant["delay"])
+        assert ultimate_point(on_bus)[0] == pytest.approx(here.case.Ku, rel=0.01)
+        sampled = replace(on_bus, L=on_bus.L + 0.5 * here.case.ts)
+        gains = GainsView.model_validate(found["proposed"]["gains"]).gains()
+        assert margins(sampled, gains).Ms == pytest.approx(1.6, abs=0.1)
+        assert here.is_home() and here.http.get("/jobs").json() == [] and not here.read("controller_session")
+
+        known = here.http.get(f"/loops/{TAG}").json()["knowledge"]
+        assert (known["Ms"], known["changes"]) == (found["present"]["Ms"], len(found["changes_used"]))
+        assert known["source"] == "operation" and known["proposed"] == found["proposed"]
+
+        job = here.finished(here.retune(**found["retune"]))
+        assert job["state"] == "proposed", (job["reason"], job["detail"])
+        assert job["new_gains"]["Kp"] == pytest.approx(gains.Kp, rel=0.01) and job["after"]["settled"]
+        assert here.is_home()
+        here.http.post(f"{job['url']}/accept").raise_for_status()
+        known = here.http.get(f"/loops/{TAG}").json()["knowledge"]
+        assert known["source"] == "trial" and known["job"] == job["url"] and known["uncertainty"] < 0.06
+        assert known["Ms"] == pytest.approx(margins(sampled, gains).Ms, abs=0.1)

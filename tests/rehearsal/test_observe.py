@@ -1,0 +1,125 @@
+"""Set-point changes of normal operation, simulated: what is proposed from them on the true plant, and what is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from loopwright.controller.channel import Channel, Settings
+from loopwright.controller.pid import Parameters
+from loopwright.plantsim.plant import LinearPlant
+from loopwright.tuning.analysis.margins import margins
+from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import FOPDT, Reals, TransferFunction
+from loopwright.tuning.operation.history import SetpointChange, Stretch
+from loopwright.tuning.operation.observation import Observation, observe
+from loopwright.tuning.operation.setpoint_alone import mv_of_setpoint
+from loopwright.tuning.plan import Mode
+from loopwright.tuning.reasons import Reason, Refused
+
+TS = 0.2
+LAG = FOPDT(2.0, 10.0, 3.0)  # its ultimate period is about 11 s
+THIRD = TransferFunction((-1.5,), (24.0, 50.0, 14.0, 1.0), 2.0)
+PI = Gains(1.0, 9.0)
+NOISE = 0.01
+ASKED = DesignSpec(1.6)
+
+
+def operated(
+    plant: TransferFunction | FOPDT,
+    gains: Gains,
+    sp: Reals,
+    noise: float = NOISE,
+    load: Reals | None = None,
+) -> Stretch:
+    """The history of a loop under the product's controller, from rest."""
+    reverse = plant.static_gain > 0.0
+    process = LinearPlant(plant.num, plant.den, plant.L, TS, noise_std=noise, seed=3)
+    settings = Settings(mv_low=-1e9, mv_high=1e9, pv_low=-1e9, pv_high=1e9, reverse=reverse)
+    channel = Channel(TS, settings, Parameters(gains.Kp, gains.Ti), 0.0, int(Mode.AUTOMATIC), 0.0)
+    rows, pv = [], process.pv
+    for k, setpoint in enumerate(sp):
+        if setpoint != channel.setpoint:
+            channel.setpoint = float(setpoint)
+        mv = channel.step(pv)
+        rows.append((mv, pv))
+        pv = process.step(mv + (0.0 if load is None else float(load[k])))
+    mv_column, pv_column = np.array(rows).T
+    return Stretch(1000.0, TS, mv_column, pv_column, sp, gains)
+
+
+def changes(levels: list[float], seconds: float) -> Reals:
+    return np.repeat([0.0, *levels], round(seconds / TS))
+
+
+def true_Ms(plant: TransferFunction | FOPDT, found: Observation) -> float:
+    assert found.evaluation is not None
+    sampled = TransferFunction(plant.num, plant.den, plant.L + 0.5 * TS)
+    return margins(sampled, found.evaluation.best.gains).Ms
+
+
+@pytest.mark.parametrize(("plant", "gains"), [(LAG, PI), (LAG, Gains(0.4, 12.0)), (THIRD, Gains(0.5, 12.0))])
+def test_three_changes_give_the_gains_asked_for(plant: TransferFunction | FOPDT, gains: Gains) -> None:
+    history = operated(plant, gains, changes([0.8, -0.3, 0.6], 300.0))
+    found = observe([history], plant.static_gain > 0.0, ASKED)
+    assert found.reason is None, found.detail
+    assert len(found.used) == 3
+    assert found.used[0].t_s == pytest.approx(1300.0)
+    assert true_Ms(plant, found) == pytest.approx(1.6, abs=0.05)
+    assert found.evaluation is not None
+    assert found.evaluation.uncertainty < 0.06
+
+
+def test_a_change_with_a_load_disturbance_in_it_is_left_out() -> None:
+    sp = changes([0.8, -0.3, 0.6, 0.1], 200.0)
+    load = np.where(np.arange(len(sp)) * TS > 415.0, 0.4, 0.0)  # 15 s after the second change
+    found = observe([operated(LAG, PI, sp, load=load)], True, ASKED)
+    assert found.reason is None, found.detail
+    assert [each.t_s for each in found.used] == pytest.approx([1200.0, 1600.0, 1800.0])
+    assert len(found.dropped) == 1
+    assert true_Ms(LAG, found) == pytest.approx(1.6, abs=0.05)
+
+
+def test_changes_of_an_older_plant_are_left_out() -> None:
+    sp = changes([0.8, -0.3, 0.6], 200.0)
+    before = operated(LAG, PI, sp)
+    changed = replace(LAG, K=1.6 * LAG.K)
+    after = replace(operated(changed, PI, sp), t_s=5000.0)
+    found = observe([before, after], True, ASKED)
+    assert found.reason is None, found.detail
+    assert all(each.t_s > 5000.0 for each in found.used)
+    assert len(found.dropped) == 3
+    assert true_Ms(changed, found) == pytest.approx(1.6, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("sp", "noise", "said"),
+    [
+        (np.zeros(3000), NOISE, "no set-point change has been heard yet"),
+        (changes([0.8], 5.0), NOISE, "has not rested"),
+        (changes([0.02, -0.02], 300.0), NOISE, "no set-point change of 0.05"),
+        (changes([0.8], 300.0), 0.1, "Ms is known to"),
+    ],
+)
+def test_what_is_missing_is_said(sp: Reals, noise: float, said: str) -> None:
+    found = observe([operated(LAG, PI, sp, noise)], True, ASKED)
+    assert found.reason is not None
+    assert said in found.detail
+
+
+def test_a_driven_set_point_is_refused() -> None:
+    with pytest.raises(Refused, match="another controller drives it") as refused:
+        observe([operated(LAG, PI, np.sin(np.arange(3000) / 200.0))], True, ASKED)
+    assert refused.value.reason is Reason.SETPOINT_IS_DRIVEN
+
+
+def test_mv_of_the_set_point_alone_is_that_of_the_loop_without_noise() -> None:
+    sp = changes([0.8, -0.3], 60.0)
+    history = operated(LAG, PI, sp, noise=0.0)
+    change = SetpointChange(history, 290, 300, len(sp))
+    found = mv_of_setpoint(TransferFunction(LAG.num, LAG.den, LAG.L + 0.5 * TS), change)
+    # the model's controller acts at once, that of the loop at its samples
+    assert np.max(np.abs(found - history.mv[change.samples])) < 0.06 * np.max(np.abs(history.mv))
