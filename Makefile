@@ -24,8 +24,9 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
+# DEMO="--method fast" shows one method alone.
 demo: setup
-	$(BIN)/loopwright demo
+	$(BIN)/loopwright demo $(DEMO)
 
 # Installs the Debian packages that the tests need. Without root or apt-get it prints the line to type.
 system:
@@ -70,7 +71,7 @@ simulate: setup
 hostile: setup
 	$(BIN)/python -m tests.hostile $(HOSTILE)
 
-# Long; BENCH="--plants 20 --seeds 1" limits it.
+# Long; BENCH="--plants 20 --seeds 1" limits it, BENCH="--method setpoint" is for pulses of the set-point.
 bench-tuning: setup
 	$(BIN)/python -m benchmarks.tuning $(BENCH)
 

@@ -1,6 +1,7 @@
 """How well the fast procedure tunes: many plants, several seeds, noise and load steps, judged on the true plant.
 
     python -m benchmarks.tuning [--plants N] [--part I/N] [--seeds N] [--cases "PI 1 %;..."] [--save FILE] [--of FILE]
+    python -m benchmarks.tuning --method setpoint ...       # pulses of the set-point: `benchmarks.pulses`
 
 The plants are 70 of the Astrom-Hagglund batch, the 50 models of the five-stage paper and the linearised reactor (every
 n-th with --plants N). Each run is a rehearsal: listening, relay, fit, step, fit. Noise is white, its standard deviation
@@ -303,8 +304,19 @@ def runs_of(parser: argparse.ArgumentParser, given: argparse.Namespace, runs: It
 
 def main() -> None:
     parser = runs_parser(__doc__)
-    parser.add_argument("--cases", default=";".join(CASES), help="names, separated by ';', or 'further'")
+    parser.add_argument("--method", choices=("fast", "setpoint"), default="fast")
+    parser.add_argument("--cases", help="names, separated by ';', or 'further' (fast)")
+    apart = parser.add_mutually_exclusive_group()
+    apart.add_argument("--of-batch", action="store_true", help="setpoint: the plants of the batch alone")
+    apart.add_argument("--kept-apart", action="store_true", help="setpoint: the other plants alone")
+    parser.add_argument("--processes", type=int, default=2, help="setpoint: at the same time (default: %(default)s)")
     given = parser.parse_args()
+    if given.method == "setpoint":
+        from benchmarks import pulses  # it needs this module
+
+        pulses.main(parser, given)
+        return
+    given.cases = given.cases or ";".join(CASES)
     if given.cases == "further":
         given.cases = ";".join(FURTHER)
     check_names(parser, "case", given.cases.split(";"), CASES | FURTHER)
