@@ -1,4 +1,4 @@
-"""What is known of the loops: what tests and normal operation have told, and what of it is of an older plant."""
+"""What is known of the loops: what tests and normal operation have shown, and what of it is of an older plant."""
 
 from __future__ import annotations
 

@@ -20,8 +20,9 @@ from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.tuning.plan import Mode
 
-NEEDS_VCAN = [pytest.mark.vcan, pytest.mark.timeout(300)]
-BUS = "socketcan:vcan0"
+VCAN = "socketcan:vcan0"
+HUB, ON_VCAN = "hub", pytest.param("vcan", marks=pytest.mark.vcan)
+"""The parameters of the fixture `bus`."""
 TAG = "LOOP"
 
 
@@ -92,8 +93,8 @@ class Plantsite:
         stack: ExitStack,
         folder: Path,
         case: Case,
+        bus: str,
         more_loops: tuple[dict[str, Any], ...] = (),
-        bus: str = BUS,
         launcher: Sequence[str] = (),
         served_with: Sequence[str] = (),
         speed: str = "max",

@@ -26,7 +26,7 @@ def here(tmp_path: Path) -> Iterator[Plantsite]:
     with ExitStack() as stack:
         hub = ChildProcess("hub", ("loopwright.protocol.hub", "--port", "0"), tmp_path / "hub.log")
         stack.callback(hub.stop)
-        site = Plantsite(stack, tmp_path, MODEL_14, bus=hub.wait_ready().split()[1])
+        site = Plantsite(stack, tmp_path, MODEL_14, hub.wait_ready().split()[1])
         site.at_rest(5.0)
         yield site
 

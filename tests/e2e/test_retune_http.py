@@ -1,4 +1,4 @@
-"""A live loop on vcan0 retuned through HTTP as an operator would."""
+"""A live loop retuned through HTTP as an operator would."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from typing import Any
 
 import pytest
 
-from tests.e2e.plantsite import MODEL_14, MODEL_41, NEEDS_VCAN, REACTOR, SOPDT, Case, Plantsite
+from tests.e2e.plantsite import MODEL_14, MODEL_41, REACTOR, SOPDT, Case, Plantsite
 
-pytestmark = NEEDS_VCAN
+METHODS = ("fast", "setpoint", "five-stage")
+RUNS = {f"{case.model} {method}": (case, method) for case in (MODEL_14, MODEL_41) for method in METHODS}
 
 
 @pytest.fixture
-def site(tmp_path: Path) -> Iterator[Callable[[Case], Plantsite]]:
+def site(bus: str, tmp_path: Path) -> Iterator[Callable[[Case], Plantsite]]:
     with ExitStack() as stack:
-        yield lambda case: Plantsite(stack, tmp_path, case)
+        yield lambda case: Plantsite(stack, tmp_path, case, bus)
 
 
-@pytest.mark.parametrize("method", ["fast", "setpoint", "five-stage"])
-@pytest.mark.parametrize("case", [MODEL_14, MODEL_41], ids=lambda case: case.model)
-def test_a_live_loop_is_retuned_and_the_change_taken_back(
-    site: Callable[[Case], Plantsite], case: Case, method: str
-) -> None:
+@pytest.mark.on_vcan("model-14 five-stage", "model-41 fast")
+@pytest.mark.parametrize("run", RUNS)
+def test_a_live_loop_is_retuned_and_the_change_taken_back(site: Callable[[Case], Plantsite], run: str) -> None:
+    case, method = RUNS[run]
     here = site(case)
     url = here.retune(**({} if method == "fast" else {"method": method}))
     job = here.finished(url)
@@ -51,6 +51,7 @@ def test_a_live_loop_is_retuned_and_the_change_taken_back(
     assert here.is_home()
 
 
+@pytest.mark.on_vcan("imc-pid")
 @pytest.mark.parametrize("method", ["imc-pid", "direct-synthesis"])
 def test_another_method_on_a_model_of_the_jobs_own_samples(method: str, site: Callable[[Case], Plantsite]) -> None:
     here = site(SOPDT)

@@ -17,9 +17,7 @@ from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.plan import Mode
-from tests.e2e.plantsite import MODEL_14, NEEDS_VCAN, Plantsite
-
-pytestmark = NEEDS_VCAN
+from tests.e2e.plantsite import MODEL_14, Plantsite
 
 PLANTS = ("model-1", "model-7", "model-18", "model-28", "model-33", "model-41", "model-45", "five-lags", "sopdt",
           "inverse-response", "negative-gain")  # fmt: skip
@@ -57,10 +55,10 @@ def entry(number: int, name: str) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plantsite]:
+def site(bus: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plantsite]:
     with ExitStack() as stack:
         folder = tmp_path_factory.mktemp("site")
-        site = Plantsite(stack, folder, MODEL_14, tuple(entry(*each) for each in enumerate(PLANTS)))
+        site = Plantsite(stack, folder, MODEL_14, bus, tuple(entry(*each) for each in enumerate(PLANTS)))
         site.write("plant_samples_to_run", 0)
         yield site
 
@@ -111,6 +109,7 @@ def is_home(site: Plantsite, name: str, present: Gains) -> None:
     assert (state.gains.Kp, state.gains.Ti) == pytest.approx((present.Kp, present.Ti), rel=1e-6)
 
 
+@pytest.mark.on_vcan("model-7", "inverse-response", "negative-gain")
 @pytest.mark.parametrize("name", PLANTS)
 def test_it_gets_the_Ms_asked_and_never_leaves_automatic(site: Plantsite, name: str) -> None:
     with running(site, name, PART_OF_KU) as present:

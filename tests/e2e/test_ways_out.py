@@ -1,4 +1,4 @@
-"""Every way a retune can end early, on live processes on vcan0: its reason, and the loop as it was, read by SDO.
+"""Every way a retune can end early, on live processes: its reason, and the loop as it was, read by SDO.
 
 The processes are shared; each test finds the loop at rest and the plant at PACE times real time, slow enough that
 "in the middle of a stage" is no race.
@@ -19,9 +19,7 @@ import pytest
 
 from loopwright.protocol.profile import Mode
 from loopwright.protocol.tuner import FailureKind, TunerError
-from tests.e2e.plantsite import BUS, MODEL_14, NEEDS_VCAN, STAGES, TAG, Plantsite, Stage
-
-pytestmark = NEEDS_VCAN
+from tests.e2e.plantsite import MODEL_14, ON_VCAN, STAGES, TAG, Plantsite, Stage
 
 PACE = 5.0
 BACK_WITHIN_S = 2.5
@@ -39,9 +37,9 @@ MORE_LOOPS = (
 
 
 @pytest.fixture(scope="module")
-def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plantsite]:
+def processes(bus: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plantsite]:
     with ExitStack() as stack:
-        yield Plantsite(stack, tmp_path_factory.mktemp("site"), MODEL_14, MORE_LOOPS)
+        yield Plantsite(stack, tmp_path_factory.mktemp("site"), MODEL_14, bus, MORE_LOOPS)
 
 
 @pytest.fixture(params=EARLY)
@@ -156,6 +154,7 @@ def test_a_plant_that_falls_silent(here: Plantsite, early: Stage) -> None:
         os.kill(here.plant.pid, signal.SIGCONT)
 
 
+@pytest.mark.on_vcan("ultimate", "fast-verify", "setpoint-pulses")
 @pytest.mark.parametrize("stage", STAGES)
 def test_aborted_by_the_operator_in_each_stage(here: Plantsite, stage: str) -> None:
     url = here.in_stage(STAGES[stage])
@@ -173,6 +172,7 @@ def test_busy_then_aborted_by_the_operator(here: Plantsite) -> None:
     assert here.is_home()
 
 
+@pytest.mark.parametrize("bus", [ON_VCAN], indirect=True)
 @pytest.mark.parametrize("stage", ["baseline", "fast-preflight", "fast-relay", "fast-verify"])
 def test_a_bus_that_goes_down(here: Plantsite, stage: str) -> None:
     def link(state: str) -> None:
@@ -190,6 +190,7 @@ def test_a_bus_that_goes_down(here: Plantsite, stage: str) -> None:
     assert here.is_home()
 
 
+@pytest.mark.on_vcan("fast-relay")
 @pytest.mark.parametrize("stage", ["relay", "fast-relay"])
 def test_sigterm_of_the_service(here: Plantsite, stage: str) -> None:
     url = here.in_stage(STAGES[stage])
@@ -199,6 +200,7 @@ def test_sigterm_of_the_service(here: Plantsite, stage: str) -> None:
     assert ended(here, url) == ("aborted", "service_stopped")
 
 
+@pytest.mark.on_vcan("zn_pi", "fast-relay", "setpoint-verify")
 @pytest.mark.parametrize(
     "stage", [*(name for name, stage in STAGES.items() if not stage.untouched), "setpoint-preflight"]
 )
@@ -217,11 +219,12 @@ def test_kill_9_of_the_service_leaves_the_controller_to_itself_and_the_job_resum
     assert here.is_home()
 
 
+@pytest.mark.on_vcan("fast-relay")
 @pytest.mark.parametrize("stage", ["relay", "fast-relay"])
 def test_sample_times_that_differ_and_a_wrong_action(here: Plantsite, stage: str) -> None:
     """A second pair beside the first, whose plant is held."""
     here.write("plant_samples_to_run", 0)
-    own = ("--bus", BUS, "--ts", "0.05", "--node")
+    own = ("--bus", here.bus, "--ts", "0.05", "--node")
     controller = here.launch(
         "direct", "loopwright.controller", *own, "0x21", "--plant-node", "0x11", "--channels", "2",
         "--kp", "80", "--ti", "1.2", "--direct",

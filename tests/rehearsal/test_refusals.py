@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import pytest
 
-from benchmarks.refusals import cases, draw, rehearsed
+from benchmarks.refusals import Pictured, cases, draw, rehearsed
 from loopwright.service.jobs.stored_record import stored_record
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.record_evaluation import evaluate_again
@@ -16,9 +17,14 @@ PAGE = (Path(__file__).parents[2] / "docs" / "refusals.md").read_text(encoding="
 WITH_FIT = {"unexplained", "disturbed", "uncertain", "model_mismatch", "diverges"}
 
 
+@cache
+def job_of(reason: str) -> Pictured:
+    return rehearsed(reason, cases()[reason])
+
+
 @pytest.mark.parametrize("reason", cases())
 def test_a_fault_is_refused_with_its_reason_and_shown(reason: str, tmp_path: Path) -> None:
-    job = rehearsed(reason, cases()[reason])
+    job = job_of(reason)
     assert (job.state, job.reason) == ("refused", reason), job.detail
     assert job.detail and job.advice == ADVICE[Reason(reason)]
     # what the record came to is told wherever it was enough for a fit
@@ -35,7 +41,7 @@ def test_a_fault_is_refused_with_its_reason_and_shown(reason: str, tmp_path: Pat
 @pytest.mark.parametrize("Ms", [1.4, 1.6])
 def test_what_the_step_has_refuted_is_no_alternative_either(Ms: float) -> None:
     """The record as a whole fits well, with load disturbances added: only its parts tell."""
-    record = stored_record(rehearsed("model_mismatch", cases()["model_mismatch"]).samples)
+    record = stored_record(job_of("model_mismatch").samples)
     assert record is not None
     evidence = record.experiment_record()
     assert evidence is not None and len(evidence.steps) == 2

@@ -9,9 +9,8 @@ import pytest
 
 from loopwright.containers.vcan import NoVcan, make, remove
 from loopwright.service.cli.demo import vcan_usable
-from tests.e2e.plantsite import NEEDS_VCAN
 
-pytestmark = NEEDS_VCAN
+pytestmark = pytest.mark.vcan
 NAME = "vcan7"
 
 

@@ -34,6 +34,7 @@ def benched(number: int) -> Plant:
 
 
 @pytest.mark.timeout(240)
+@pytest.mark.on_vcan(1, 12, 24)
 @pytest.mark.parametrize("number", MODELS)
 def test_the_bus_gives_what_the_rehearsal_gives(start: Start, url: str, number: int) -> None:  # noqa: F811
     plant = benched(number)

@@ -69,7 +69,7 @@ def test_it_works_in_an_empty_environment(built: Path, tmp_path: Path) -> None:
     run(sys.executable, "-m", "venv", tmp_path / "empty", folder=tmp_path)
     programs = tmp_path / "empty" / "bin"
     constraints = f"--constraint={ROOT / 'constraints.txt'}"
-    run(programs / "python", "-m", "pip", "install", "--quiet", constraints, wheel, folder=tmp_path)
+    run(programs / "python", "-m", "pip", "install", "--quiet", "--no-compile", constraints, wheel, folder=tmp_path)
     model = json.dumps({"K": 2.0, "T_s": 10.0, "L_s": 1.0})
     found = json.loads(
         run(programs / "loopwright", "tune", "--model", model, "--method", "simc", "--json", folder=tmp_path)

@@ -1,0 +1,24 @@
+"""The two buses that the processes of these tests may speak on: the loopback hub, and vcan0."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import pytest
+
+from loopwright.service.cli.child_process import ChildProcess
+from tests.e2e.plantsite import HUB, ON_VCAN, VCAN
+
+
+@pytest.fixture(scope="module", params=[HUB, ON_VCAN])
+def bus(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The URL of a bus."""
+    with ExitStack() as stack:
+        if request.param == HUB:
+            log = tmp_path_factory.mktemp("hub") / "hub.log"
+            hub = ChildProcess("hub", ("loopwright.protocol.hub", "--port", "0"), log)
+            stack.callback(hub.stop)
+            yield hub.wait_ready().split()[1]
+        else:
+            yield VCAN
