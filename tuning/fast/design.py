@@ -198,7 +198,13 @@ class GainDesign:
 
     def _require_stable(self, best: OptimalGains) -> None:
         if not is_stable(self.model, best.gains):
-            raise Refused(Reason.NOT_ROBUST, "the best gains on the model are not stable by the exact count of poles")
+            model, gains = self.model, best.gains
+            raise Refused(
+                Reason.NOT_ROBUST,
+                f"by its frequency response Kp {gains.Kp:.4g}, Ti {gains.Ti:.4g} s, Td {gains.Td:.4g} s are the best "
+                f"gains on the model num {_numbers(model.num)}, den {_numbers(model.den)}, dead time {model.L:.4g} s, "
+                "and the exact count of the poles says that this loop is not stable",
+            )
 
 
 def controller(w: Reals, Ti: float, Td: float, N: float) -> Complexes:
@@ -225,6 +231,10 @@ def own_period(model: Model, relay_period: float) -> float:
     part = -G.imag[i] / (G.imag[i + 1] - G.imag[i])
     at = float(w[i] * (w[i + 1] / w[i]) ** part)
     return min(max(2.0 * math.pi / at, MIN_PERIOD_RATIO * relay_period), MAX_PERIOD_RATIO * relay_period)
+
+
+def _numbers(coefficients: tuple[float, ...]) -> str:
+    return ", ".join(f"{each:.4g}" for each in coefficients)
 
 
 def _value(best: OptimalGains) -> float:
