@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import gc
 import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -23,14 +22,10 @@ app = typer.Typer(
 app.add_typer(keys.app, name="key")
 app.add_typer(data.app)
 app.add_typer(loops.app)
-COLLECT_SELDOM = (10_000, 20, 50)
-"""Thresholds of the garbage collector. What a command imports stays; with the usual thresholds the collector takes a
-fifth of the time in which a service starts."""
 _HAND_OVER: dict[str, object] = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
 
 def main() -> None:
-    gc.set_threshold(*COLLECT_SELDOM)
     try:
         app()
     except ApiError as error:
