@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from loopwright.tuning.fast import excitation_choice
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.fast.relay_test import BIAS
 from loopwright.tuning.plan import Sample
@@ -37,11 +38,21 @@ def test_mv_jumps_no_further_than_is_permitted(method: str, name: str) -> None:
         assert abs(true_Ms(plant, answer["new_gains"]) - 1.6) < 0.05
 
 
-def test_a_relay_that_follows_pulses_begins_within_the_permitted_jump() -> None:
-    """The integral has moved MV during the pulses, up to a load disturbance or a bias; a relay of the largest amplitude
-    begins near rest all the same."""
+def relay_after_pulses() -> tuple[dict[str, Any], float]:
+    """A run whose integral has moved MV far from rest during the pulses."""
     plant = under("inverse response", 0.01, noise_std=0.0, mv_limits=[-1.0, 1.0], mv_step_max=0.5 * MAX_JUMP)
-    plant["gains"]["Ti"] *= 0.1  # an integral that moves MV far
+    plant["gains"]["Ti"] *= 0.1
     both = (Excitation.SETPOINT, Excitation.RELAY)
-    answer, largest = jumps("fast", plant, derivative=True, excitations=both, amplitude=0.5 * MAX_JUMP / (1.0 + BIAS))
+    return jumps("fast", plant, derivative=True, excitations=both, amplitude=0.5 * MAX_JUMP / (1.0 + BIAS))
+
+
+def test_a_relay_that_follows_pulses_begins_within_the_permitted_jump() -> None:
+    answer, largest = relay_after_pulses()
     assert "relay" in answer["stages"] and largest <= 1.02 * 0.5 * MAX_JUMP
+
+
+def test_where_mv_stays_far_from_rest_the_relay_does_not_follow(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(excitation_choice, "MAX_NEAR_T95", 0.0)
+    answer, largest = relay_after_pulses()
+    assert answer["outcome"] == "refused" and "the relay cannot follow: MV stays" in answer["detail"]
+    assert "relay" not in answer["stages"] and largest <= 1.02 * 0.5 * MAX_JUMP

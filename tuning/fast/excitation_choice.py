@@ -17,6 +17,7 @@ from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.fast.relay_test import BIAS, RelayTest
 from loopwright.tuning.fast.setpoint_procedure import SETPOINT_STAGES, TooLittleExcited, setpoint
 from loopwright.tuning.plan import Note, Plan
+from loopwright.tuning.reasons import Refused
 
 __all__ = ["chosen_stages", "fast_by"]
 
@@ -49,7 +50,12 @@ def fast_by(excitations: tuple[Excitation, ...], facts: Facts, options: FastOpti
         test, refused = found.test, found
     yield from test.report(Note(f"the relay follows, because the pulses tell too little: {refused.detail}"))
     if not (yield from _near_rest(test, facts)):
-        raise refused
+        away = test.trace.mv[-1] - test.point.mv
+        raise Refused(
+            refused.reason,
+            f"{refused.detail}; and the relay cannot follow: MV stays {away:+.4g} from rest, and a relay "
+            f"would jump further than the permitted {facts.mv_step_max:.4g}",
+        ) from refused
     return (
         yield from by_relay(facts, options, RelayTest(facts, test.point, test.trace, options.amplitude, test.listened))
     )
