@@ -90,7 +90,7 @@ class RangeView(Figures):
 
 
 class FindingSource(StrEnum):
-    """What has told something of a loop."""
+    """Where a finding of a loop comes from."""
 
     OPERATION = "operation"
     JOB = "job"
@@ -298,7 +298,7 @@ class StepView(Figures):
 
 
 class Finding(Figures):
-    """What a test, or normal operation, has told of a loop, as it is stored. Gains are those of that time."""
+    """What a test, or normal operation, has shown of a loop, as it is stored. Gains are those of that time."""
 
     source: FindingSource
     at: str = Field(description="UTC, ISO 8601, wall time")

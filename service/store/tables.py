@@ -45,7 +45,7 @@ class ResultColumn(TypeDecorator[FastResult | FiveStageResult]):
 
 
 class FindingColumn(TypeDecorator[Finding]):
-    """What a test or normal operation has told of a loop, as JSON."""
+    """What a test or normal operation has shown of a loop, as JSON."""
 
     impl = JSON
     cache_ok = True
@@ -189,7 +189,7 @@ class HistoryRow(Base):
 
 
 class KnowledgeRow(Base):
-    """What a test or normal operation has told of a loop. older_plant: why it is no longer true; null: it is."""
+    """What a test or normal operation has shown of a loop. older_plant: why it is no longer true; null: it is."""
 
     __tablename__ = "loop_knowledge"
     __table_args__ = (Index("loop_knowledge_by_loop", "loop", "number"),)

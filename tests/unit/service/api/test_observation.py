@@ -209,8 +209,8 @@ def test_an_observation_without_an_answer_leaves_nothing(service: Service, store
 def test_what_a_test_told_is_said_where_operation_tells_nothing(
     service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told = {"source": FindingSource.JOB, "changes": None, "last_change_s": None, "job": "j1", "method": "fast"}
-    knowledge.add(service.store, TAG, finding(1.7, 0.02, present=gains(LOOP.gains, 1.7, 0.02), **told), {})
+    found = {"source": FindingSource.JOB, "changes": None, "last_change_s": None, "job": "j1", "method": "fast"}
+    knowledge.add(service.store, TAG, finding(1.7, 0.02, present=gains(LOOP.gains, 1.7, 0.02), **found), {})
     with asked(service, heard({})) as client:
         found = client.get(f"/loops/{TAG}/observation").json()
         assert (found["state"], found["knowledge"]["Ms"]) == ("missing", 1.7)

@@ -82,9 +82,9 @@ def test_the_dead_time_is_found_from_samples_and_from_bins(together: int) -> Non
     cut = np.arange(0, len(bins), together)
     cut[1:] += np.random.default_rng(1).integers(-1, 2, len(cut) - 1) if together > 4 else 0
     found = heard_stretches(Rows(merged(bins, cut), (ONE,)), loop.Ts, together)
-    told = observe([each.stretch for each in found], True, DesignSpec())
-    assert told.evaluation is not None and len(told.used) == 4, told.detail
-    model = told.evaluation.model
+    observation = observe([each.stretch for each in found], True, DesignSpec())
+    assert observation.evaluation is not None and len(observation.used) == 4, observation.detail
+    model = observation.evaluation.model
     late = np.angle(model.frequency_response(np.array([0.7]))) - np.angle(
         Operated(Ts=0.0).plant.frequency_response(np.array([0.7]))
     )
