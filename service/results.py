@@ -70,16 +70,10 @@ class KnownMsView(Figures):
     )
 
 
-class KnownGainsView(Figures):
-    """Gains with what is known of their Ms on the plant."""
+class KnownGainsView(KnownMsView):
+    """Gains with what is known of their Ms on the plant. Ms is null, too, where nothing is known of it."""
 
     gains: GainsView
-    Ms: float | None = Field(description="Maximum sensitivity on the model; null: not known, or not stable on it")
-    uncertainty: float | None = Field(
-        description="How far Ms may be off: by two standard deviations of the model, or on another model that explains "
-        "the record as well; null: not known",
-        examples=[0.03],
-    )
 
 
 class RangeView(Figures):
