@@ -11,6 +11,7 @@ from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from loopwright.service.api import fleet, history, locks, observation, openapi, operations, previews, problems, tunings
+from loopwright.service.api import live as live_api
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.events import event_stream, still_permitted
 from loopwright.service.api.gate.access_log import Access
@@ -35,6 +36,7 @@ from loopwright.service.job_states import ACTIVE
 from loopwright.service.jobs.fleet import Fleet
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.listening import Listening
+from loopwright.service.live.live import Live
 from loopwright.service.loops.shared_reading import SharedReading
 from loopwright.service.security.principal import current
 from loopwright.service.store.idempotency import IdempotencyKeys
@@ -55,12 +57,13 @@ def create_app(
     pool: Pool | None = None,
     sdo_retries: Mapping[str, int] | None = None,
     listening: Listening | None = None,
+    live: Live | None = None,
 ) -> FastAPI:
     """The application for these jobs, which it stops when the server shuts down.
 
     checks: the parts of /readyz by name; None for the default ones.  pool: processes that compute tunings; None for a
     new pool.  sdo_retries: SDO retries by bus, as counted in this process.  listening: None for one that knows only
-    what is stored.
+    what is stored.  live: None for a stream of its own.
     """
 
     policy = policy or Policy()
@@ -249,6 +252,8 @@ def create_app(
     pool = pool or Pool()
     app.include_router(history.router(jobs.directory, listening))
     app.include_router(observation.router(jobs, readings, listening, pool))
+    live = live or Live(jobs, listening)
+    app.include_router(live_api.router(live, jobs.directory, keyring))
     app.include_router(previews.router(jobs, many))
     app.include_router(tunings.router(jobs, pool))
     return app
