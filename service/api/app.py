@@ -10,7 +10,18 @@ from typing import Annotated, Literal
 from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from loopwright.service.api import fleet, history, locks, observation, openapi, operations, previews, problems, tunings
+from loopwright.service.api import (
+    fleet,
+    history,
+    locks,
+    observation,
+    openapi,
+    operations,
+    previews,
+    problems,
+    sparklines,
+    tunings,
+)
 from loopwright.service.api import live as live_api
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.events import event_stream, still_permitted
@@ -251,6 +262,7 @@ def create_app(
     listening = listening or Listening(jobs.directory.loops, jobs.store, on=False)
     pool = pool or Pool()
     app.include_router(history.router(jobs.directory, listening))
+    app.include_router(sparklines.router(jobs.directory, listening))
     app.include_router(observation.router(jobs, readings, listening, pool))
     live = live or Live(jobs, listening)
     app.include_router(live_api.router(live, jobs.directory, keyring))

@@ -7,6 +7,7 @@ whatever the number of viewers; while the database is away, what was known of th
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
@@ -24,6 +25,8 @@ from loopwright.service.live.messages import Buses, BusView, Hello, Loops, event
 from loopwright.service.live.rows import Known, loop_row, samples_message
 from loopwright.service.live.viewer import Viewer
 from loopwright.service.store.keyring import REVOKED_WITHIN_S
+
+log = logging.getLogger(__name__)
 
 MOST_BACK_S = 600.0
 _PAST_POINTS = 3000
@@ -171,7 +174,9 @@ class Live:
                 await asyncio.to_thread(self._looked_up.look, watched, looks % _THOROUGHLY == 0)
             except SQLAlchemyError as error:
                 if not temporary(error):
-                    raise
+                    log.exception("the live jobs could not be looked up")
+            except Exception:  # the streams go on with what was known last
+                log.exception("defect while looking up the live jobs")
             looks += 1
             if before != {(job.id, job.state, job.stage, job.stopping) for job in self._looked_up.live} or looks == 1:
                 self._show("jobs", event("jobs", self._looked_up.message()))

@@ -40,7 +40,7 @@ _BRIEF = select(
 def live_jobs(store: Store) -> list[JobInBrief]:
     """Returns the jobs in an active state, of every host, dry runs included, oldest first."""
     with store.reading() as session:
-        rows = session.execute(_BRIEF.where(JobRow.state.in_(_ACTIVE)).order_by(JobRow.number)).tuples()
+        rows = session.execute(_BRIEF.where(JobRow.state.in_(_ACTIVE)).order_by(JobRow.number))
         return [JobInBrief(*row) for row in rows]
 
 
@@ -48,7 +48,7 @@ def latest_jobs(store: Store) -> dict[str, JobInBrief]:
     """Returns the latest job by loop, of every host; dry runs do not count."""
     last = select(func.max(JobRow.number)).where(JobRow.dry_run.is_(False)).group_by(JobRow.loop)
     with store.reading() as session:
-        rows = session.execute(_BRIEF.where(JobRow.number.in_(last))).tuples()
+        rows = session.execute(_BRIEF.where(JobRow.number.in_(last)))
         found = [JobInBrief(*row) for row in rows]
     return {job.loop: job for job in found}
 

@@ -45,6 +45,11 @@ class LiveViewer:
                 if each == name and wanted(message):
                     return message
 
+    def becomes(self, name: str, wanted: Callable[[dict[str, Any]], object]) -> None:
+        """Reads until the latest message of that name, which may have come before, is as wanted."""
+        while not wanted(next((message for each, message in reversed(self.messages) if each == name), {})):
+            assert self.read(), f"the stream ended before {name} came: {self.comments}"
+
     def row(self, tag: str, wanted: Callable[[dict[str, Any]], object] = lambda _: True) -> dict[str, Any]:
         """The row of a loop, once it is as wanted."""
 

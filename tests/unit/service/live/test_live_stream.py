@@ -72,10 +72,10 @@ def test_what_comes_first(screens: Screens) -> None:
         row = viewer.row(TAG)
         assert row["pv"] is row["sp"] is row["mv"] is row["mode"] is row["age_s"] is row["under_test"] is None
         assert row["not_heard"] == "listening is turned off"
-        viewer.until("jobs")
+        viewer.becomes("jobs", lambda message: message.get("jobs") == [])
+        viewer.becomes("buses", bool)
         found = dict(viewer.messages)
         assert found["buses"]["buses"] == [{"bus": "virtual:test", "up": None, "why": "listening is turned off"}]
-        assert found["jobs"] == {"jobs": []}
 
 
 def test_every_viewer_sees_a_test_from_its_first_event_to_its_decision(screens: Screens) -> None:
@@ -92,7 +92,7 @@ def test_every_viewer_sees_a_test_from_its_first_event_to_its_decision(screens: 
         assert early.row(TAG, lambda row: row["job"])["last_job"] == {"url": f"/jobs/{job}", "state": "running"}
         service.tune.hold.set()
         early.until("job", lambda each: each["data"].get("state") == "proposed")
-        assert early.until("jobs", lambda message: not message["jobs"])
+        early.becomes("jobs", lambda message: message.get("jobs") == [])
         service.jobs.decisions.rollback(job, "B. Berg")
         early.until("job", lambda each: each["data"].get("state") == "rolled_back")
         assert states(early) == ["queued", "running", "proposed", "rolled_back"]
@@ -114,7 +114,7 @@ def test_many_viewers_ask_the_database_as_often_as_one(screens: Screens) -> None
 
     @database_event.listens_for(screens.service.store.engine, "before_cursor_execute")
     def _(*arguments: object) -> None:
-        if "FROM jobs" in str(arguments[2]):
+        if "jobs.dry_run, jobs.requested_by" in str(arguments[2]):  # no other query has these side by side
             asked.append(time.monotonic())
 
     with viewing(screens.base) as first:
@@ -127,7 +127,7 @@ def test_many_viewers_ask_the_database_as_often_as_one(screens: Screens) -> None
             for _ in range(3):
                 first.until("loops")
             most = 2.0 * (time.monotonic() - begin) / module.LOOK_S + 2.0
-            assert len(asked) - before <= most
+            assert 0 < len(asked) - before <= most
         finally:
             for each in others:
                 each.__exit__(None, None, None)
