@@ -32,6 +32,7 @@ from loopwright.service.api.job_views import (
     Decision,
     DismissedView,
     JobView,
+    LiveErrorView,
     LoopDetail,
     NotHomeView,
     SamplesView,
@@ -52,6 +53,7 @@ from loopwright.service.loops.shared_reading import SharedReading
 from loopwright.service.security.principal import current
 from loopwright.service.store.idempotency import IdempotencyKeys
 from loopwright.service.store.jobs import Job
+from loopwright.service.store.live_jobs import acceptances, latest_jobs
 from loopwright.service.telemetry.lateness import watched_event_loop
 from loopwright.tuning.reasons import Ended
 
@@ -118,7 +120,8 @@ def create_app(
     def view(row: Job) -> JobView:
         return views([row])[0]
 
-    fleet.install(app, jobs, many, views)
+    listening = listening or Listening(jobs.directory.loops, jobs.store, on=False)
+    fleet.install(app, jobs, many, views, listening)
 
     @app.get(
         "/loops/{tag}", tags=["loops"], summary="A loop and its present state", responses=problems.responses(404, 503)
@@ -127,16 +130,22 @@ def create_app(
         config, host = jobs.directory.owner(tag)
         not_home = next(iter(jobs.aftercare.not_home(tag)), None)
         try:
-            state = readings.of(tag)
-        except Ended:
-            if not_home is None:
-                raise
-            state = None
-        of_it = jobs.store.busy().get(tag), jobs.store.last_states(tag).get(tag), jobs.locking.locks().get(tag)
-        shown = loop_view(config, host, *of_it)
+            state, away = readings.of(tag), None
+        except Ended as ended:
+            state, away = None, LiveErrorView.of(ended)
+        shown = loop_view(
+            config,
+            host,
+            jobs.store.busy().get(tag),
+            latest_jobs(jobs.store, tag).get(tag),
+            acceptances(jobs.store, tag).get(tag),
+            None if state is None or state.on_trial else state.gains,
+            jobs.locking.locks().get(tag),
+        )
         return LoopDetail(
             **dict(shown),
             live=live_view(state) if state else None,
+            live_error=away,
             not_confirmed_home=NotHomeView.of(not_home) if not_home else None,
             disturbed_by=jobs.directory.disturbed_by(tag),
             knowledge=jobs.knowledge.of(tag, state.gains if state else None),
@@ -259,7 +268,6 @@ def create_app(
         return view(jobs.decisions.rollback(job_id, (decision or Decision()).by))
 
     app.include_router(locks.router(jobs.locking))
-    listening = listening or Listening(jobs.directory.loops, jobs.store, on=False)
     pool = pool or Pool()
     app.include_router(history.router(jobs.directory, listening))
     app.include_router(sparklines.router(jobs.directory, listening))

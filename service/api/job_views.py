@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field
 from loopwright.service.inputs.config import Limits, LoopConfig, PermittedTest
 from loopwright.service.job_states import ACTIVE, JobState, shown
 from loopwright.service.jsonable import JsonObject
-from loopwright.service.loop_state import LoopState, gains_of
+from loopwright.service.loop_state import LoopState, gains_of, same_gains
 from loopwright.service.results import (
     ComparisonView,
     EvidenceView,
@@ -28,12 +28,14 @@ from loopwright.service.results import (
     empty_result,
 )
 from loopwright.tuning.five_stage.procedure import PROCEDURE
-from loopwright.tuning.reasons import ADVICE, Reason
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.reasons import ADVICE, Ended, Reason
 
 if TYPE_CHECKING:  # the command line reads views, and has no store
     from loopwright.service.jobs.active_job import Running
     from loopwright.service.jobs.aftercare import NotHome
     from loopwright.service.store.jobs import Job, JobEvent
+    from loopwright.service.store.live_jobs import Acceptance, JobInBrief
     from loopwright.service.store.tables import LoopLockRow
 
 
@@ -47,6 +49,50 @@ class LockView(BaseModel):
     @classmethod
     def of(cls, row: LoopLockRow) -> LockView:
         return cls(reason=row.reason, by=row.by, since=row.since)
+
+
+class LastJobView(BaseModel):
+    """The latest job of a loop; dry runs do not count."""
+
+    url: str = Field(examples=["/jobs/4f0c2a9be113"])
+    state: JobState
+    at: str = Field(
+        description="When the job ended, or else began, or was made: UTC, ISO 8601",
+        examples=["2026-01-31T12:00:00.000Z"],
+    )
+    reason: Reason | None = Field(description="Why there is no proposal; reason code from the closed list")
+    stage: str | None = Field(description="The present or last stage", examples=["relay"])
+
+    @classmethod
+    def of(cls, job: JobInBrief) -> LastJobView:
+        return cls(url=f"/jobs/{job.id}", state=job.state, at=job.at, reason=job.reason, stage=job.stage)
+
+
+class AcceptedView(BaseModel):
+    """The gains that were accepted last and not rolled back."""
+
+    url: str = Field(description="URL of the job that proposed them", examples=["/jobs/4f0c2a9be113"])
+    at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
+    by: str = Field(description="Who accepted, as given in the request", examples=["operator A"])
+    ms: float | None = Field(description="Maximum sensitivity asked for; null: there is none", examples=[1.6])
+    gains: GainsView
+
+    @classmethod
+    def of(cls, found: Acceptance) -> AcceptedView:
+        gains = GainsView.of(found.gains)
+        return cls(url=f"/jobs/{found.job_id}", at=found.at, by=found.by, ms=found.ms, gains=gains)
+
+
+class LiveErrorView(BaseModel):
+    """Why the present state of a loop cannot be read."""
+
+    reason: Reason = Field(description="Reason code from the closed list", examples=["node_lost"])
+    detail: str = Field(description="What happened, with the numbers")
+    advice: str = Field(description="What the operator should do")
+
+    @classmethod
+    def of(cls, ended: Ended) -> LiveErrorView:
+        return cls(reason=ended.reason, detail=ended.detail, advice=ended.advice)
 
 
 class LoopView(BaseModel):
@@ -78,6 +124,12 @@ class LoopView(BaseModel):
     host: str = Field(description="Name of the service that is connected to the bus of the loop", examples=["local"])
     active_job: str | None = Field(description="URL of the job that is using the loop", examples=["/jobs/4f0c2a9be113"])
     last_job_state: JobState | None = Field(description="State of the latest job of the loop; dry runs do not count")
+    last_job: LastJobView | None = Field(description="The latest job; null: there is none")
+    accepted: AcceptedView | None = Field(description="The gains accepted last; null: there are none")
+    gains_differ: bool | None = Field(
+        description="Whether the gains in effect, as read last, are other than `accepted`; null: none were accepted, or "
+        "those in effect are not known"
+    )
     locked: LockView | None = Field(description="The lock of the loop; null: the loop is not locked")
 
 
@@ -120,9 +172,9 @@ class NotHomeView(BaseModel):
 
 class LoopDetail(LoopView):
     live: LiveView | None = Field(
-        description="The present state; null: the loop belongs to another host, or it is not reached and its "
-        "restoration is not confirmed"
+        description="The present state; null: the loop belongs to another host, or it is not reached (`live_error`)"
     )
+    live_error: LiveErrorView | None = Field(description="Why the present state cannot be read; null: it is not so")
     not_confirmed_home: NotHomeView | None = Field(description="The unconfirmed restoration; null: there is none")
     disturbed_by: str | None = Field(
         description="Which neighbours are under test and may disturb the loop: loops of the same area, and those whose "
@@ -230,15 +282,24 @@ class Decision(BaseModel):
 
 
 def loop_view(
-    config: LoopConfig, host: str, active: str | None, last: str | None, lock: LoopLockRow | None
+    config: LoopConfig,
+    host: str,
+    active: str | None,
+    last: JobInBrief | None,
+    accepted: Acceptance | None,
+    in_effect: Gains | None,
+    lock: LoopLockRow | None,
 ) -> LoopView:
-    """active: the id of the job that is using the loop.  last: the state of the latest job of the loop."""
+    """active: the id of the job that is using the loop.  in_effect: None where the gains are not known, or on trial."""
     fields = config.model_dump(exclude={"noise_std_hint"})
     return LoopView(
         **fields,
         host=host,
         active_job=None if active is None else f"/jobs/{active}",
-        last_job_state=None if last is None else JobState(last),
+        last_job_state=None if last is None else last.state,
+        last_job=None if last is None else LastJobView.of(last),
+        accepted=None if accepted is None else AcceptedView.of(accepted),
+        gains_differ=None if accepted is None or in_effect is None else not same_gains(accepted.gains, in_effect),
         locked=None if lock is None else LockView.of(lock),
     )
 

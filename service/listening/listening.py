@@ -14,7 +14,17 @@ import numpy as np
 
 from loopwright.protocol.profile import PLANT_NODE, ChannelIds, channel_ids
 from loopwright.service.inputs.config import BusConfig, LoopConfig
-from loopwright.service.listening.bins import GAP_BEFORE, Rows, between, gaps, joined, shortest_gap_s, thinned, unpacked
+from loopwright.service.listening.bins import (
+    GAP_BEFORE,
+    GainSet,
+    Rows,
+    between,
+    gaps,
+    joined,
+    shortest_gap_s,
+    thinned,
+    unpacked,
+)
 from loopwright.service.listening.block_writer import BlockWriter
 from loopwright.service.listening.heard_loop import Heard, InEffect
 from loopwright.service.listening.messages import HistoryAnswer, Learn, NewSamples, Report
@@ -23,6 +33,7 @@ from loopwright.service.store import history
 from loopwright.service.store.history import HistoryBlock
 from loopwright.service.store.store import Store
 from loopwright.service.telemetry.metrics import FRAMES_HEARD, LISTENING_UP
+from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Ended
 
 log = logging.getLogger(__name__)
@@ -77,6 +88,8 @@ class Listening:
         self.process = ListeningProcess(_ids(loops, self.off), self._take, on_samples=self._take_samples)
         self.heard: Mapping[str, Heard] = {}
         """What was heard last, by tag: replaced as a whole once a second."""
+        self._gains: dict[str, GainSet] = {}
+        """The gains of each loop as they were read last."""
         self.on_report: Callable[[], None] = lambda: None
         """Called in another thread when `heard` or a bus may have changed."""
         self.on_samples: Callable[[NewSamples], None] = lambda _: None
@@ -127,6 +140,11 @@ class Listening:
         if url in self.off:
             return self.off[url]
         return self._down.get(url) if self._started else "listening has not begun yet"
+
+    def gains_of(self, tag: str) -> Gains | None:
+        """Returns the gains of a loop as they were read last; None where they are not known."""
+        gains = self._gains.get(tag)
+        return None if gains is None else Gains(*gains)
 
     def buses(self) -> dict[str, str | None]:
         """Returns the buses of this host, each with why it is not heard at present; None: it is heard."""
@@ -213,6 +231,10 @@ class Listening:
                     log.exception("defect while reading %s for the history", tag)
                     found = None
                 if found is not None:
+                    if found.gains is None:
+                        self._gains.pop(tag, None)
+                    else:
+                        self._gains[tag] = found.gains
                     self.process.learn(Learn(tag, found))
                 if self._over.wait(EACH_S):
                     return

@@ -11,6 +11,8 @@ from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.store.jobs import JobEvent
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import EventRow, JobRow
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.reasons import Reason
 
 _ACTIVE = [state.value for state in ACTIVE]
 _EVENTS_AT_ONCE = 2000
@@ -18,7 +20,11 @@ _EVENTS_AT_ONCE = 2000
 
 @dataclass(frozen=True, slots=True)
 class JobInBrief:
-    """A job without its request and its result. stopping: whether somebody has asked it to stop."""
+    """A job without its request and its result.
+
+    at: when it ended, or began, or was made: UTC, ISO 8601.
+    stopping: whether somebody has asked it to stop.
+    """
 
     id: str
     loop: str
@@ -29,11 +35,26 @@ class JobInBrief:
     stage: str | None
     plant_time_s: float
     stopping: bool
+    reason: Reason | None
+    at: str
+
+
+@dataclass(frozen=True, slots=True)
+class Acceptance:
+    """Gains that were accepted. at: UTC, ISO 8601.  by: as given in the request.  ms: the Ms asked for; None: the
+    method has none."""
+
+    job_id: str
+    at: str
+    by: str
+    gains: Gains
+    ms: float | None
 
 
 _BRIEF = select(
     JobRow.id, JobRow.loop, JobRow.host, JobRow.state, JobRow.dry_run, JobRow.requested_by, JobRow.stage,
-    JobRow.plant_time_s, JobRow.stop_reason.is_not(None),
+    JobRow.plant_time_s, JobRow.stop_reason.is_not(None), JobRow.reason,
+    func.coalesce(JobRow.ended_at, JobRow.started_at, JobRow.created_at),
 )  # fmt: skip
 
 
@@ -44,13 +65,38 @@ def live_jobs(store: Store) -> list[JobInBrief]:
         return [JobInBrief(*row) for row in rows]
 
 
-def latest_jobs(store: Store) -> dict[str, JobInBrief]:
-    """Returns the latest job by loop, of every host; dry runs do not count."""
+def latest_jobs(store: Store, loop: str | None = None) -> dict[str, JobInBrief]:
+    """Returns the latest job by loop, of every host or of one loop; dry runs do not count."""
     last = select(func.max(JobRow.number)).where(JobRow.dry_run.is_(False)).group_by(JobRow.loop)
+    if loop is not None:
+        last = last.where(JobRow.loop == loop)
     with store.reading() as session:
         rows = session.execute(_BRIEF.where(JobRow.number.in_(last)))
         found = [JobInBrief(*row) for row in rows]
     return {job.loop: job for job in found}
+
+
+def acceptances(store: Store, loop: str | None = None) -> dict[str, Acceptance]:
+    """Returns the acceptance that is in force by loop, of every host or of one loop: the latest that was not rolled
+    back."""
+    last = select(func.max(JobRow.number)).where(JobRow.state == JobState.ACCEPTED.value).group_by(JobRow.loop)
+    if loop is not None:
+        last = last.where(JobRow.loop == loop)
+    moves = (EventRow.job_id == JobRow.id, EventRow.kind == "state")
+    wanted = (
+        select(JobRow.loop, JobRow.id, JobRow.result, EventRow.at, EventRow.data)
+        .join(EventRow, and_(*moves))
+        .where(JobRow.number.in_(last))
+        .order_by(EventRow.seq)
+    )
+    found: dict[str, Acceptance] = {}
+    with store.reading() as session:
+        for row in session.execute(wanted):
+            if row.data.get("state") == JobState.ACCEPTED and row.result is not None and row.result.new_gains:
+                ms = row.result.chosen.get("Ms")
+                by = str(row.data.get("by", ""))
+                found[row.loop] = Acceptance(row.id, row.at, by, row.result.new_gains.gains(), ms)
+    return found
 
 
 def new_events(store: Store, after: Mapping[str, int]) -> Sequence[JobEvent]:

@@ -18,6 +18,7 @@ from loopwright.service.inputs.request import FastRetune
 from loopwright.service.listening.heard_loop import Heard
 from loopwright.service.listening.listening import Listening
 from loopwright.service.live import live as module
+from loopwright.service.live.jobs import LookedUpJobs
 from loopwright.service.live.live import Live
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.keyring import Keyring
@@ -144,14 +145,14 @@ def test_a_loop_that_is_heard_again_and_unknown_numbers(screens: Screens) -> Non
 
 def test_while_the_database_is_away_the_loops_are_shown(screens: Screens, monkeypatch: pytest.MonkeyPatch) -> None:
     away = threading.Event()
-    real = module.LookedUpJobs.look
+    real = LookedUpJobs.look
 
     def look(*arguments: object, **more: object) -> None:
         if away.is_set():
             raise OperationalError("SELECT", {}, Exception("the database is locked"))
         real(*arguments, **more)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(module.LookedUpJobs, "look", look)
+    monkeypatch.setattr(LookedUpJobs, "look", look)
     with viewing(screens.base) as viewer:
         viewer.until("loops")
         away.set()

@@ -18,7 +18,19 @@ from loopwright.tuning.plan import Mode
 
 T0 = 1_769_860_800.0
 HEARD = Heard(T0, False, float(np.float32(49.9)), float(np.float32(41.2)), 50.0, 2, False, True)
-JOB = JobInBrief("4f0c2a9be113", "A", "local", JobState.RUNNING, False, "A. Lind", "relay", 3.0, False)
+JOB = JobInBrief(
+    "4f0c2a9be113",
+    "A",
+    "local",
+    JobState.RUNNING,
+    False,
+    "A. Lind",
+    "relay",
+    3.0,
+    False,
+    None,
+    "2026-01-31T12:00:00.000Z",
+)
 HELD = LoopState(Mode.EXPERIMENT, 50.5, 49.0, math.nan, Gains(1.0, 2.0), True, 0.0, 100.0, 0.1, True)
 
 
