@@ -127,8 +127,8 @@ class LoopView(BaseModel):
     last_job: LastJobView | None = Field(description="The latest job; null: there is none")
     accepted: AcceptedView | None = Field(description="The gains accepted last; null: there are none")
     gains_differ: bool | None = Field(
-        description="Whether the gains in effect, as read last, are other than `accepted`; null: none were accepted, or "
-        "those in effect are not known"
+        description="Whether the gains in effect, as read last, are other than `accepted`; null: none were accepted, "
+        "or those in effect are not known"
     )
     locked: LockView | None = Field(description="The lock of the loop; null: the loop is not locked")
 

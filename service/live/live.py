@@ -22,7 +22,7 @@ from loopwright.service.listening.listening import Listening
 from loopwright.service.listening.messages import NewSamples
 from loopwright.service.live.jobs import LookedUpJobs
 from loopwright.service.live.messages import Buses, BusView, Hello, Loops, event
-from loopwright.service.live.rows import Known, loop_row, samples_message
+from loopwright.service.live.rows import LiveFacts, loop_row, samples_message
 from loopwright.service.live.viewer import Viewer
 from loopwright.service.store.keyring import REVOKED_WITHIN_S
 
@@ -195,7 +195,7 @@ class Live:
             running = None if job is None else self._jobs.running(job.id)
             held = running.loop.latest if running is not None and running.loop is not None else None
             deaf = self._listening.why_not_heard(tag)
-            rows.append(loop_row(tag, host, Known(heard.get(tag), deaf, held, job, found.latest.get(tag)), now_s))
+            rows.append(loop_row(tag, host, LiveFacts(heard.get(tag), deaf, held, job, found.latest.get(tag)), now_s))
         self._show("loops", event("loops", Loops(now_s=round(now_s, 3), loops=rows)))
         off = self._listening.off
         buses = [

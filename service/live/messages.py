@@ -26,7 +26,7 @@ class LastJob(BaseModel):
     state: JobState
 
 
-class LoopRow(BaseModel):
+class LiveLoopRow(BaseModel):
     """The present state of a loop."""
 
     tag: str
@@ -47,7 +47,7 @@ class Loops(BaseModel):
     """The present state of all loops, once a second."""
 
     now_s: float
-    loops: list[LoopRow]
+    loops: list[LiveLoopRow]
 
 
 class BusView(BaseModel):

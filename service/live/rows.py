@@ -10,7 +10,7 @@ import numpy as np
 from loopwright.protocol.profile import Mode
 from loopwright.service.listening.bins import Bins, decimals
 from loopwright.service.listening.heard_loop import Heard
-from loopwright.service.live.messages import LastJob, LoopRow, Samples
+from loopwright.service.live.messages import LastJob, LiveLoopRow, Samples
 from loopwright.service.loop_state import LoopState
 from loopwright.service.store.live_jobs import JobInBrief
 
@@ -18,7 +18,7 @@ _MODES = {mode.value: mode.name.lower() for mode in Mode}
 
 
 @dataclass(frozen=True)
-class Known:
+class LiveFacts:
     """What is known of a loop beside its name.
 
     heard: what was heard last; None: nothing.
@@ -34,11 +34,11 @@ class Known:
     last_job: JobInBrief | None = None
 
 
-def loop_row(tag: str, host: str, known: Known, now_s: float) -> LoopRow:
+def loop_row(tag: str, host: str, known: LiveFacts, now_s: float) -> LiveLoopRow:
     """Returns the row of a loop. Old values are left out; where a bus is not heard, those of the running job count."""
     heard, held = known.heard, known.held
     age_s = None if heard is None else max(0.0, now_s - heard.at_s)
-    row = LoopRow(
+    row = LiveLoopRow(
         tag=tag, host=host, pv=None, sp=None, mv=None, mode=None,
         age_s=None if age_s is None else round(age_s, 3),
         under_test=None, on_trial=None, not_heard=None,
