@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field
 
 from loopwright.service.inputs.config import Limits, LoopConfig, PermittedTest
 from loopwright.service.job_states import ACTIVE, JobState, shown
-from loopwright.service.jsonable import JsonObject
+from loopwright.service.jsonable import JsonObject, number
 from loopwright.service.loop_state import LoopState, gains_of, same_gains
 from loopwright.service.results import (
     ComparisonView,
@@ -202,6 +202,21 @@ class StageView(BaseModel):
     plant_time_s: float | None = Field(description="Plant time the stage took, s", examples=[120.5])
 
 
+class DecidedView(BaseModel):
+    """What was decided last about the proposal of a job."""
+
+    what: Literal["accept", "rollback"]
+    by: str = Field(description="Who decided, as given in the request", examples=["operator A"])
+    at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
+
+
+class StoppingView(BaseModel):
+    """The request by which somebody has stopped a job."""
+
+    by: str = Field(description="Who has stopped it, as given in the request", examples=["operator A"])
+    at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
+
+
 class JobView(BaseModel):
     """A job: its request, its progress and its result."""
 
@@ -261,6 +276,12 @@ class JobView(BaseModel):
     detail: str | None = Field(description="The numbers behind the reason")
     advice: str | None = Field(description="What the operator should do about the reason")
     restored: Mapping[str, object] | None = Field(description="State of the loop as read back at the end")
+    decided: DecidedView | None = Field(description="The latest decision; null: nothing was decided")
+    stopping: StoppingView | None = Field(description="The request to stop the job; null: there was none")
+    sample_time_s: float | None = Field(
+        description="Sampling period of the controller as the job found it, s; null: the job has not read the loop",
+        examples=[0.1],
+    )
 
 
 class SamplesView(BaseModel):
@@ -364,6 +385,9 @@ def job_view(row: Job, events: Sequence[JobEvent], running: Running | None) -> J
         detail=row.detail,
         advice=ADVICE[row.reason] if row.reason else None,
         restored=row.restored,
+        decided=_decided(events),
+        stopping=next((_stopping(event) for event in reversed(events) if event.kind == "abort_requested"), None),
+        sample_time_s=None if row.found is None else number(row.found["sample_time_s"]),
     )
 
 
@@ -424,6 +448,19 @@ def _stage_result(events: Sequence[JobEvent], stages: Sequence[str], field: str)
             if done and done.stage == stage and done.result and field in done.result:
                 return done.result
     return None
+
+
+def _decided(events: Sequence[JobEvent]) -> DecidedView | None:
+    for event in reversed(events):
+        state = event.data.get("state") if event.kind == "state" else None
+        if state in (JobState.ACCEPTED, JobState.ROLLED_BACK):
+            what: Literal["accept", "rollback"] = "accept" if state == JobState.ACCEPTED else "rollback"
+            return DecidedView(what=what, by=str(event.data.get("by", "")), at=event.at)
+    return None
+
+
+def _stopping(event: JobEvent) -> StoppingView:
+    return StoppingView(by=str(event.data.get("by", "")), at=event.at)
 
 
 def _finite(value: float) -> float | None:

@@ -74,6 +74,25 @@ def test_the_latest_job_and_the_gains_accepted_last(
         assert loop["last_job"]["url"] == f"/jobs/{later}" and loop["accepted"]["url"] == f"/jobs/{job}"
 
 
+def test_a_job_says_who_decided_and_who_stopped_it(service: Service, client: TestClient) -> None:
+    job = proposed(service)
+    found = client.get(f"/jobs/{job}").json()
+    assert found["decided"] is found["stopping"] is None and found["sample_time_s"] == 0.1
+    service.jobs.decisions.accept(job, "A. Lind")
+    decided = client.get(f"/jobs/{job}").json()["decided"]
+    assert (decided["what"], decided["by"]) == ("accept", "A. Lind") and decided["at"].endswith("Z")
+    service.jobs.decisions.rollback(job, "B. Berg")
+    decided = client.get(f"/jobs/{job}").json()["decided"]
+    assert (decided["what"], decided["by"]) == ("rollback", "B. Berg")
+
+    service.tune.hold.clear()
+    stopped = service.jobs.start(TAG, FastRetune()).id
+    until(lambda: service.store.get(stopped).state == "running")
+    service.jobs.abort(stopped, "C. Falk")
+    assert client.get(f"/jobs/{stopped}").json()["stopping"]["by"] == "C. Falk"
+    service.tune.hold.set()
+
+
 def test_gains_that_were_rolled_back_are_not_those_accepted(service: Service, client: TestClient) -> None:
     job = proposed(service)
     service.jobs.decisions.accept(job, "A. Lind")
