@@ -115,7 +115,9 @@ def create_app(
 
     def views(rows: Sequence[Job]) -> list[JobView]:
         events = jobs.store.events_by_job([row.id for row in rows], limit=MAX_EVENTS)
-        return [job_view(row, events[row.id], jobs.running(row.id)) for row in rows]
+        loops = {row.loop for row in rows}
+        latest = latest_jobs(jobs.store, loops.pop() if len(loops) == 1 else None)
+        return [job_view(row, events[row.id], jobs.running(row.id), latest.get(row.loop)) for row in rows]
 
     def view(row: Job) -> JobView:
         return views([row])[0]

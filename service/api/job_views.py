@@ -277,6 +277,11 @@ class JobView(BaseModel):
     advice: str | None = Field(description="What the operator should do about the reason")
     restored: Mapping[str, object] | None = Field(description="State of the loop as read back at the end")
     decided: DecidedView | None = Field(description="The latest decision; null: nothing was decided")
+    superseded_by: str | None = Field(
+        description="URL of the loop's latest job, where it came after this proposal and nothing was decided; null: "
+        "this is no such proposal",
+        examples=["/jobs/4f0c2a9be113"],
+    )
     stopping: StoppingView | None = Field(description="The request to stop the job; null: there was none")
     sample_time_s: float | None = Field(
         description="Sampling period of the controller as the job found it, s; null: the job has not read the loop",
@@ -342,9 +347,15 @@ def live_view(state: LoopState) -> LiveView:
     )
 
 
-def job_view(row: Job, events: Sequence[JobEvent], running: Running | None) -> JobView:
-    """The view of a job from its row and events, and from the live progress while it runs."""
+def job_view(
+    row: Job, events: Sequence[JobEvent], running: Running | None, latest: JobInBrief | None = None
+) -> JobView:
+    """The view of a job from its row and events, and from the live progress while it runs.
+
+    latest: the latest job of the loop, without dry runs.
+    """
     state = shown(row.state, row.dry_run)
+    later = latest is not None and latest.id != row.id and state is JobState.PROPOSED
     method = str(row.request.get("method", PROCEDURE))
     result = row.result or empty_result(method)
     progress, remaining, plant_time = _progress(state, row, events, running)
@@ -386,6 +397,7 @@ def job_view(row: Job, events: Sequence[JobEvent], running: Running | None) -> J
         advice=ADVICE[row.reason] if row.reason else None,
         restored=row.restored,
         decided=_decided(events),
+        superseded_by=f"/jobs/{latest.id}" if later and latest is not None else None,
         stopping=next((_stopping(event) for event in reversed(events) if event.kind == "abort_requested"), None),
         sample_time_s=None if row.found is None else number(row.found["sample_time_s"]),
     )

@@ -6,7 +6,6 @@ A stage lasts until FOLDER/go-STAGE (or FOLDER/go) is there; the controllers out
 With --hours-back its clock is set back as soon as FOLDER/clock-is-back is there. The loops of --on-bus are on a bus in
 memory, on which no node answers.
 Nothing is restored while FOLDER/TAG.held is there.
-With --hours-back its clock is set back as soon as FOLDER/clock-is-back is there.
 """
 
 from __future__ import annotations

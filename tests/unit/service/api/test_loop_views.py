@@ -69,7 +69,10 @@ def test_the_latest_job_and_the_gains_accepted_last(
     assert differ(OLD) == [True, True]
     assert differ(NEW, on_trial=True) == [None, None]
 
+    undecided = proposed(service)
     later = proposed(service)
+    superseded = {each: client.get(f"/jobs/{each}").json()["superseded_by"] for each in (job, undecided, later)}
+    assert superseded == {job: None, undecided: f"/jobs/{later}", later: None}, "an accepted one was decided"
     for loop in both(client):
         assert loop["last_job"]["url"] == f"/jobs/{later}" and loop["accepted"]["url"] == f"/jobs/{job}"
 
