@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 from sqlalchemy import event as database_event
@@ -163,6 +164,25 @@ def test_while_the_database_is_away_the_loops_are_shown(screens: Screens, monkey
         job = screens.service.jobs.start(TAG, FastRetune()).id
         assert viewer.until("jobs", lambda message: message["jobs"])["jobs"][0]["id"] == job
         screens.service.tune.hold.set()
+
+
+def test_rows_that_could_not_be_made_once_are_made_again(screens: Screens, monkeypatch: pytest.MonkeyPatch) -> None:
+    defects: list[str] = []
+    real = module.loop_row
+
+    def defective(tag: str, *arguments: Any) -> object:
+        if 0 < len(defects) < 3:
+            defects.append(tag)
+            raise ValueError("a defect")
+        return real(tag, *arguments)
+
+    monkeypatch.setattr(module, "loop_row", defective)
+    with viewing(screens.base) as viewer:
+        viewer.until("loops")
+        defects.append("from now on")
+        until(lambda: len(defects) == 3)
+        viewer.until("loops")
+        viewer.until("loops")
 
 
 def test_a_stream_ends_with_its_key(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
