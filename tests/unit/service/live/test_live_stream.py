@@ -21,6 +21,7 @@ from loopwright.service.listening.listening import Listening
 from loopwright.service.live import live as module
 from loopwright.service.live.jobs import LookedUpJobs
 from loopwright.service.live.live import Live
+from loopwright.service.live.rows import loop_row
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.keyring import Keyring
 from tests.unit.service.fakes import TAG, Service
@@ -168,15 +169,14 @@ def test_while_the_database_is_away_the_loops_are_shown(screens: Screens, monkey
 
 def test_rows_that_could_not_be_made_once_are_made_again(screens: Screens, monkeypatch: pytest.MonkeyPatch) -> None:
     defects: list[str] = []
-    real = module.loop_row
 
     def defective(tag: str, *arguments: Any) -> object:
         if 0 < len(defects) < 3:
             defects.append(tag)
             raise ValueError("a defect")
-        return real(tag, *arguments)
+        return loop_row(tag, *arguments)
 
-    monkeypatch.setattr(module, "loop_row", defective)
+    monkeypatch.setattr("loopwright.service.live.live.loop_row", defective)
     with viewing(screens.base) as viewer:
         viewer.until("loops")
         defects.append("from now on")
