@@ -25,6 +25,8 @@ from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.api.gate.limits import RequestLimits
 from loopwright.service.inputs.request import FastRetune
+from loopwright.service.listening.listening import Listening
+from loopwright.service.live.live import Live
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.keyring import Keyring
 from loopwright.tuning.reasons import Failed, Reason
@@ -88,7 +90,11 @@ class Site:
         keyring = Keyring(self.service.store.engine)
         limits = RequestLimits(rate_per_s=1e6, burst=10**6, bad_keys_per_s=1e6, bad_keys_burst=10**6)
         policy = Policy(keyring if authenticated else None, limits)
-        self.client = TestClient(create_app(self.service.jobs, policy), raise_server_exceptions=False)
+        listening = Listening(self.service.jobs.directory.loops, self.service.store, on=False)
+        live = Live(self.service.jobs, listening)
+        live.close()  # its streams, which would never end, end after their first messages
+        app = create_app(self.service.jobs, policy, listening=listening, live=live)
+        self.client = TestClient(app, raise_server_exceptions=False)
         self.keys = {scope.value: keyring.create(scope, scope)[1] for scope in Scope}
         self.keys["expired"] = keyring.create("old", Scope.ADMIN, timedelta(days=-1))[1]
         revoked, self.keys["revoked"] = keyring.create("revoked", Scope.ADMIN)
