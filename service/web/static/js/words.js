@@ -42,13 +42,13 @@ export function stagesOf(job) {
 export function stageFound(stage, pv) {
   const r = stage.result ?? {};
   const lines = [];
-  if (known(r.noise_std)) lines.push(`noise ${withUnit(significant(r.noise_std, 2), pv)}`);
-  if (known(r.switches)) lines.push(`${r.switches} switches`);
-  if (known(r.period_s)) lines.push(`period ${withUnit(significant(r.period_s, 3), "s")}`);
+  if (known(r.noise) && stage.stage === "preflight") lines.push(`noise ${withUnit(significant(r.noise, 2), pv)}`);
+  if (known(r.switches) && stage.stage === "relay") lines.push(`${r.switches} switches`, `period ${withUnit(significant(r.period_s, 3), "s")}`);
+  if (known(r.amplitude) && stage.stage === "relay") lines.push(`MV ±${fixed(r.amplitude, 0)} %`);
   if (known(r.Ku)) lines.push(`Ku ${significant(r.Ku)} %/${unit(pv)}`);
   if (known(r.Pu_s)) lines.push(`Pu ${withUnit(significant(r.Pu_s), "s")}`);
-  if (known(r.Ms)) lines.push(`Ms ${ms(r.Ms)}${known(r.uncertainty) ? ` ± ${msError(r.uncertainty)}` : ""}`);
-  const gains = r.gains ?? r;
+  const gains = r.gains ?? (stage.stage === "verify" ? {} : r);
+  if (known(r.Ms) && stage.stage !== "verify") lines.push(`Ms ${ms(r.Ms)}${known(r.uncertainty) ? ` ± ${msError(r.uncertainty)}` : ""}`);
   if (known(gains.Kp)) lines.push(`Kp ${significant(gains.Kp)}, Ti ${withUnit(significant(gains.Ti ?? gains.Ti_s), "s")}`);
   if (known(r.fit_pct)) lines.push(`${fixed(r.fit_pct, 1)} % explained`);
   if (known(r.overshoot_pct)) lines.push(`overshoot ${fixed(r.overshoot_pct, 0)} %`);
