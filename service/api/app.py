@@ -11,6 +11,7 @@ from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from loopwright.service.api import (
+    decisions,
     fleet,
     history,
     locks,
@@ -269,6 +270,7 @@ def create_app(
     def rollback(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
         return view(jobs.decisions.rollback(job_id, (decision or Decision()).by))
 
+    app.include_router(decisions.router(jobs))
     app.include_router(locks.router(jobs.locking))
     pool = pool or Pool()
     app.include_router(history.router(jobs.directory, listening))

@@ -162,8 +162,11 @@ class Live:
                 async with asyncio.timeout(_BEAT_S):
                     await self._reported.wait()
             self._reported.clear()
-            self._show_rows()
-            self._show("jobs", event("jobs", self._looked_up.message()))
+            try:
+                self._show_rows()
+                self._show("jobs", event("jobs", self._looked_up.message()))
+            except Exception:  # the next rows are shown all the same
+                log.exception("defect while showing the present state of the loops")
 
     async def _keep_jobs(self) -> None:
         looks = 0

@@ -282,7 +282,7 @@ def test_a_person_answers_for_it(service: Service, clock: Clock, client: TestCli
         answer = client.post(f"/loops/{TAG}/dismiss", json={"by": "night shift"})
         assert (answer.status_code, answer.json()) == (200, {"loop": TAG, "jobs": jobs})
     assert not service.store.get(row.id).look_after
-    entries = audit.trail(service.store.engine, 10, what="dismiss")
+    entries = audit.trail(service.store.engine, 10, what=["dismiss"])
     assert [(entry.subject, entry.loop, entry.said_by) for entry in entries] == [(row.id, TAG, "night shift")]
     assert [event.data for event in service.store.events(row.id) if event.kind == "dismissed"] == [
         {"by": "night shift"}

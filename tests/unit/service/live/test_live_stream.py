@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 from sqlalchemy import event as database_event
@@ -20,6 +21,7 @@ from loopwright.service.listening.listening import Listening
 from loopwright.service.live import live as module
 from loopwright.service.live.jobs import LookedUpJobs
 from loopwright.service.live.live import Live
+from loopwright.service.live.rows import loop_row
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.keyring import Keyring
 from tests.unit.service.fakes import TAG, Service
@@ -163,6 +165,24 @@ def test_while_the_database_is_away_the_loops_are_shown(screens: Screens, monkey
         job = screens.service.jobs.start(TAG, FastRetune()).id
         assert viewer.until("jobs", lambda message: message["jobs"])["jobs"][0]["id"] == job
         screens.service.tune.hold.set()
+
+
+def test_rows_that_could_not_be_made_once_are_made_again(screens: Screens, monkeypatch: pytest.MonkeyPatch) -> None:
+    defects: list[str] = []
+
+    def defective(tag: str, *arguments: Any) -> object:
+        if 0 < len(defects) < 3:
+            defects.append(tag)
+            raise ValueError("a defect")
+        return loop_row(tag, *arguments)
+
+    monkeypatch.setattr("loopwright.service.live.live.loop_row", defective)
+    with viewing(screens.base) as viewer:
+        viewer.until("loops")
+        defects.append("from now on")
+        until(lambda: len(defects) == 3)
+        viewer.until("loops")
+        viewer.until("loops")
 
 
 def test_a_stream_ends_with_its_key(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
