@@ -1,7 +1,7 @@
 """Writes the libraries of the operators' page into service/web/static/vendor: `python tools/vendor_page.py`.
 
-Needs `npm pack`. The packages have to be the ones named here, byte by byte. The result is committed; a unit test compares
-it with vendor/VERSIONS.
+Needs `npm pack`. The packages have to be the ones named here, byte by byte. The result is committed; a unit test
+compares the files with vendor/VERSIONS.
 """
 
 from __future__ import annotations
@@ -30,17 +30,38 @@ class Package:
 
 PACKAGES = (
     Package(
-        "preact", "11.2.0", "MIT", "3c4456766bd32b6b534d52bf4e9c2a29b33e7eedf6e96ed479300ba1a7888ebf",
+        "preact",
+        "11.2.0",
+        "MIT",
+        "3c4456766bd32b6b534d52bf4e9c2a29b33e7eedf6e96ed479300ba1a7888ebf",
         {"preact.js": "dist/preact.mjs", "hooks.js": "hooks/dist/hooks.mjs"},
     ),
     Package(
-        "@preact/signals-core", "1.14.5", "MIT", "94c421ac996214c94f532fb4c43d8ede048a16df0cd9538ffb965174dbe8daba",
+        "@preact/signals-core",
+        "1.14.5",
+        "MIT",
+        "94c421ac996214c94f532fb4c43d8ede048a16df0cd9538ffb965174dbe8daba",
         {"signals-core.js": "dist/signals-core.module.js"},
     ),
-    Package("@preact/signals", "2.11.4", "MIT", "66ea8221dd8aaa0da2365d49c3f116b071d56cfb63b2e16c072c6b4e08a928b7", {"signals.js": "dist/signals.module.js"}),
-    Package("htm", "3.1.1", "Apache-2.0", "2425b9bee11409177bcabc7f32e319926fc6690c1701c0b257c88bdff2d5ba90", {"htm.js": "dist/htm.module.js"}),
     Package(
-        "uplot", "1.6.32", "MIT", "4b8a8191e425658e3ea8c8c1314b0fc679c861ee3a1af2b20c7b16ba50b5133d",
+        "@preact/signals",
+        "2.11.4",
+        "MIT",
+        "66ea8221dd8aaa0da2365d49c3f116b071d56cfb63b2e16c072c6b4e08a928b7",
+        {"signals.js": "dist/signals.module.js"},
+    ),
+    Package(
+        "htm",
+        "3.1.1",
+        "Apache-2.0",
+        "2425b9bee11409177bcabc7f32e319926fc6690c1701c0b257c88bdff2d5ba90",
+        {"htm.js": "dist/htm.module.js"},
+    ),
+    Package(
+        "uplot",
+        "1.6.32",
+        "MIT",
+        "4b8a8191e425658e3ea8c8c1314b0fc679c861ee3a1af2b20c7b16ba50b5133d",
         {"uPlot.js": "dist/uPlot.esm.js", "uPlot.min.css": "dist/uPlot.min.css"},
     ),
 )  # fmt: skip
