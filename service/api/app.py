@@ -20,6 +20,7 @@ from loopwright.service.api import (
     operations,
     previews,
     problems,
+    sessions,
     sparklines,
     tunings,
 )
@@ -274,6 +275,7 @@ def create_app(
     if policy.keyring is None:  # with keys the page would need a way to sign in
         app.mount("/ui", Pages(), name="page")
         app.add_route("/", lambda _: RedirectResponse("/ui/"), include_in_schema=False)
+    app.include_router(sessions.router(jobs.store.host, policy.keyring is not None))
     app.include_router(decisions.router(jobs))
     app.include_router(locks.router(jobs.locking))
     pool = pool or Pool()

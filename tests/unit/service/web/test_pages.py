@@ -67,6 +67,17 @@ def test_where_keys_are_asked_for_there_is_no_page_yet(service: Service) -> None
         assert client.get("/ui/", headers={"Authorization": f"Bearer {key}"}).status_code == 404
 
 
+def test_the_page_learns_who_is_asking(service: Service, client: TestClient) -> None:
+    found = client.get("/session").json()
+    assert (found["name"], found["scope"], found["keys"], found["host"]) == ("local", "admin", False, "local")
+    keyring = Keyring(service.store.engine)
+    _, key = keyring.create("control room", Scope.OPERATE)
+    with TestClient(create_app(service.jobs, Policy(keyring))) as keyed:
+        assert keyed.get("/session").status_code == 401
+        found = keyed.get("/session", headers={"Authorization": f"Bearer {key}"}).json()
+        assert (found["name"], found["scope"], found["keys"]) == ("control room", "operate", True)
+
+
 def test_the_libraries_are_those_of_the_list() -> None:
     listed = dict(line.split()[:1] + line.split()[-1:] for line in (VENDOR / "VERSIONS").read_text().splitlines())
     files = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in VENDOR.iterdir()}
