@@ -8,7 +8,7 @@ from importlib.metadata import version
 from typing import Annotated, Literal
 
 from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
-from fastapi.responses import StreamingResponse
+from fastapi.responses import RedirectResponse, StreamingResponse
 
 from loopwright.service.api import (
     decisions,
@@ -20,6 +20,7 @@ from loopwright.service.api import (
     operations,
     previews,
     problems,
+    sessions,
     sparklines,
     tunings,
 )
@@ -56,6 +57,7 @@ from loopwright.service.store.idempotency import IdempotencyKeys
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.live_jobs import acceptances, latest_jobs
 from loopwright.service.telemetry.lateness import watched_event_loop
+from loopwright.service.web.pages import Pages
 from loopwright.tuning.reasons import Ended
 
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
@@ -270,6 +272,10 @@ def create_app(
     def rollback(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
         return view(jobs.decisions.rollback(job_id, (decision or Decision()).by))
 
+    if policy.keyring is None:  # with keys the page would need a way to sign in
+        app.mount("/ui", Pages(), name="page")
+        app.add_route("/", lambda _: RedirectResponse("/ui/"), include_in_schema=False)
+    app.include_router(sessions.router(jobs.store.host, policy.keyring is not None))
     app.include_router(decisions.router(jobs))
     app.include_router(locks.router(jobs.locking))
     pool = pool or Pool()

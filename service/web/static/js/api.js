@@ -1,0 +1,107 @@
+// @ts-check
+/** Requests to the public API. A question is asked again where the service says so; a command is sent once. */
+import { signal } from "../vendor/signals-core.js";
+
+/** What the service answered where it did not do what was asked. */
+export class Problem extends Error {
+  /** @param {number} status @param {any} body @param {number | null} retryAfter_s */
+  constructor(status, body, retryAfter_s = null) {
+    super(body?.detail ?? body?.title ?? (status ? `The service answers ${status}.` : "The service does not answer."));
+    this.status = status;
+    /** @type {string | null} */
+    this.reason = body?.reason ?? null;
+    /** @type {string | null} */
+    this.advice = body?.advice ?? null;
+    /** @type {string | null} */
+    this.job = body?.job ?? null;
+    /** @type {{where: string, why: string}[]} */
+    this.errors = body?.errors ?? [];
+    this.retryAfter_s = retryAfter_s;
+  }
+}
+
+/** True once an answer was 401: the sign-in view is shown. */
+export const signedOut = signal(false);
+
+/** @param {string} method @param {string} path @param {unknown} [body] @param {AbortSignal} [stop] */
+async function request(method, path, body, stop) {
+  /** @type {Record<string, string>} */
+  const headers = { Accept: "application/json" };
+  if (method !== "GET") headers["X-Loopwright"] = "1";
+  if (body !== undefined) headers["Content-Type"] = "application/json";
+  let answer;
+  try {
+    answer = await fetch(path, { method, headers, body: body === undefined ? undefined : JSON.stringify(body), signal: stop });
+  } catch (error) {
+    if (stop?.aborted) throw error;
+    throw new Problem(0, { detail: "The service does not answer." });
+  }
+  const text = await answer.text();
+  let found = null;
+  try {
+    found = text ? JSON.parse(text) : null;
+  } catch {
+    found = null;
+  }
+  if (answer.ok) return { found, headers: answer.headers };
+  if (answer.status === 401) signedOut.value = true;
+  const after = Number(answer.headers.get("Retry-After"));
+  throw new Problem(answer.status, found, after > 0 ? after : null);
+}
+
+/** @param {number} seconds @param {AbortSignal} [stop] */
+function pause(seconds, stop) {
+  return new Promise((done, failed) => {
+    const timer = setTimeout(done, seconds * 1000);
+    stop?.addEventListener("abort", () => {
+      clearTimeout(timer);
+      failed(new DOMException("stopped", "AbortError"));
+    });
+  });
+}
+
+/**
+ * Asks; where the service is busy (429, 503 with Retry-After), again, six times at most.
+ * @param {string} path @param {AbortSignal} [stop] @returns {Promise<any>}
+ */
+export async function ask(path, stop) {
+  for (let tries = 1; ; tries++) {
+    try {
+      return (await request("GET", path, undefined, stop)).found;
+    } catch (error) {
+      if (!(error instanceof Problem) || error.retryAfter_s === null || tries >= 6) throw error;
+      await pause(Math.min(error.retryAfter_s, 10), stop);
+    }
+  }
+}
+
+/** Asks for a list with all its pages. @param {string} path @param {AbortSignal} [stop] @returns {Promise<any[]>} */
+export async function askAll(path, stop) {
+  /** @type {any[]} */
+  const all = [];
+  /** @type {string | null} */
+  let next = path;
+  while (next) {
+    /** @type {{found: any, headers: Headers}} */
+    const { found, headers } = await request("GET", next, undefined, stop);
+    all.push(...found);
+    next = /<([^>]+)>;\s*rel="next"/.exec(headers.get("Link") ?? "")?.[1] ?? null;
+  }
+  return all;
+}
+
+/** A page of a list, and the path of the next one. @param {string} path @param {AbortSignal} [stop] */
+export async function askPage(path, stop) {
+  const { found, headers } = await request("GET", path, undefined, stop);
+  return { entries: found, next: /<([^>]+)>;\s*rel="next"/.exec(headers.get("Link") ?? "")?.[1] ?? null };
+}
+
+/** A question that has a body. @param {string} path @param {unknown} body @param {AbortSignal} [stop] @returns {Promise<any>} */
+export async function askWith(path, body, stop) {
+  return (await request("POST", path, body, stop)).found;
+}
+
+/** Sends a command, once. @param {string} path @param {unknown} [body] @param {string} [method] @returns {Promise<any>} */
+export async function command(path, body, method = "POST") {
+  return (await request(method, path, body)).found;
+}

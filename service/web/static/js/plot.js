@@ -1,0 +1,210 @@
+// @ts-check
+/** Plots on canvas: PV and SP above, MV below, one time axis and one cursor. Colours are tokens, read at each drawing. */
+import uPlot from "../vendor/uPlot.js";
+import { colour } from "./palette.js";
+import { tick, timeOfDay } from "./numbers.js";
+
+const FONT = "11px Inter, system-ui, sans-serif";
+const LEFT = 56;
+const RIGHT = 12;
+
+/** Distance of ticks, 1, 2 or 5 times a power of ten. @param {number} range @param {number} most */
+export function tickDistance(range, most) {
+  const raw = range / Math.max(1, most);
+  const power = 10 ** Math.floor(Math.log10(raw));
+  const m = raw / power;
+  return power * (m <= 1 ? 1 : m <= 2 ? 2 : m <= 5 ? 5 : 10);
+}
+
+/** @param {number} low @param {number} high @param {number} distance */
+function ticks(low, high, distance) {
+  const found = [];
+  for (let n = Math.ceil(low / distance - 1e-9); n * distance <= high + 1e-9 * distance; n++) found.push(n * distance);
+  return found;
+}
+
+/**
+ * A range of y that follows the data but is never narrower than `least`.
+ * @param {Iterable<ArrayLike<number>>} columns @param {number} least @returns {[number, number]}
+ */
+export function yRange(columns, least) {
+  let low = Infinity;
+  let high = -Infinity;
+  for (const column of columns) {
+    for (let n = 0; n < column.length; n++) {
+      const value = column[n];
+      if (value < low) low = value;
+      if (value > high) high = value;
+    }
+  }
+  if (!(low <= high)) return [0, least];
+  const middle = (low + high) / 2;
+  const half = Math.max((high - low) * 0.54, least / 2);
+  return [middle - half, middle + half];
+}
+
+/**
+ * @typedef {{label: string, colour: string, dash?: number[], width?: number, stepped?: boolean}} Line
+ * @typedef {{lines: Line[], height: number, withTime: boolean, zero?: () => number | null, beneath?: (u: any, ctx: CanvasRenderingContext2D) => void,
+ *   above?: (u: any, ctx: CanvasRenderingContext2D) => void, onCursor?: (u: any) => void, onSelect?: (from: number, to: number) => void, sync?: string}} Wish
+ */
+
+/**
+ * Makes a plot. Words are drawn in `draw`: `drawClear` comes before the grid.
+ * @param {HTMLElement} where @param {Wish} wish
+ */
+export function makePlot(where, wish) {
+  const axis = {
+    stroke: () => colour("ink-2"),
+    font: FONT,
+    ticks: { show: false },
+    grid: { stroke: () => colour("grid"), width: 1 },
+  };
+  const plot = new uPlot(
+    {
+      width: Math.max(200, where.clientWidth),
+      height: wish.height,
+      pxAlign: true,
+      legend: { show: false },
+      padding: [4, RIGHT, 0, 0],
+      cursor: { sync: wish.sync ? { key: wish.sync, setSeries: false, scales: ["x", null] } : undefined, points: { show: false }, y: false, drag: { x: true, y: false, setScale: false } },
+      scales: { x: { time: false, auto: false, range: (_u, low, high) => [low, high] }, y: { auto: false, range: (_u, low, high) => [low, high] } },
+      axes: [
+        {
+          ...axis,
+          show: true,
+          size: wish.withTime ? 24 : 0,
+          splits: (u, _n, low, high) => {
+            const zero = wish.zero?.() ?? 0;
+            const distance = tickDistance(high - low, Math.max(2, Math.floor(u.bbox.width / devicePixelRatio / 110)));
+            return ticks(low - zero, high - zero, distance).map((value) => value + zero);
+          },
+          values: (u, splits) => {
+            if (!wish.withTime) return splits.map(() => "");
+            const zero = wish.zero?.() ?? null;
+            const distance = splits.length > 1 ? splits[1] - splits[0] : 1;
+            return splits.map((value) => (zero === null ? timeOfDay(value) : `${tick(value - zero, distance)} s`));
+          },
+        },
+        {
+          ...axis,
+          size: LEFT,
+          gap: 6,
+          splits: (u, _n, low, high) => ticks(low, high, tickDistance(high - low, Math.max(2, Math.floor(u.bbox.height / devicePixelRatio / 34)))),
+          values: (_u, splits) => splits.map((value) => tick(value, splits.length > 1 ? splits[1] - splits[0] : Math.abs(value) || 1)),
+        },
+      ],
+      series: [
+        {},
+        ...wish.lines.map((line) => ({
+          label: line.label,
+          stroke: () => colour(line.colour),
+          width: line.width ?? 1.5,
+          dash: line.dash,
+          points: { show: false },
+          spanGaps: false,
+          paths: line.stepped ? uPlot.paths.stepped?.({ align: 1 }) : undefined,
+        })),
+      ],
+      hooks: {
+        drawClear: [
+          (u) => {
+            u.ctx.save();
+            u.ctx.fillStyle = colour("well");
+            u.ctx.fillRect(u.bbox.left, u.bbox.top, u.bbox.width, u.bbox.height);
+            u.ctx.beginPath();
+            u.ctx.rect(u.bbox.left, u.bbox.top, u.bbox.width, u.bbox.height);
+            u.ctx.clip();
+            wish.beneath?.(u, u.ctx);
+            u.ctx.restore();
+          },
+        ],
+        draw: [
+          (u) => {
+            if (!wish.above) return;
+            u.ctx.save();
+            u.ctx.beginPath();
+            u.ctx.rect(u.bbox.left, u.bbox.top, u.bbox.width, u.bbox.height);
+            u.ctx.clip();
+            wish.above(u, u.ctx);
+            u.ctx.restore();
+          },
+        ],
+        setCursor: [(u) => wish.onCursor?.(u)],
+        setSelect: [
+          (u) => {
+            if (u.select.width < 6) return;
+            const from = u.posToVal(u.select.left, "x");
+            const to = u.posToVal(u.select.left + u.select.width, "x");
+            u.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
+            wish.onSelect?.(from, to);
+          },
+        ],
+      },
+    },
+    [[], ...wish.lines.map(() => [])],
+    where,
+  );
+  const observer = new ResizeObserver(() => plot.setSize({ width: Math.max(200, where.clientWidth), height: plot.height }));
+  observer.observe(where);
+  return {
+    plot,
+    /** @param {ArrayLike<number>[]} data @param {[number, number]} x @param {[number, number]} y */
+    show(data, x, y) {
+      plot.batch(() => {
+        plot.setData(/** @type {any} */ (data), false);
+        plot.setScale("x", { min: x[0], max: x[1] });
+        plot.setScale("y", { min: y[0], max: y[1] });
+      });
+    },
+    redraw: () => plot.redraw(),
+    destroy() {
+      observer.disconnect();
+      plot.destroy();
+    },
+  };
+}
+
+/** A dashed line with a name, at a time. @param {any} u @param {CanvasRenderingContext2D} ctx @param {number} at @param {string} name */
+export function mark(u, ctx, at, name, row = 0) {
+  const x = Math.round(u.valToPos(at, "x", true)) + 0.5;
+  if (x < u.bbox.left - 1 || x > u.bbox.left + u.bbox.width) return;
+  const ratio = devicePixelRatio;
+  ctx.strokeStyle = colour("accent-soft");
+  ctx.setLineDash([4 * ratio, 3 * ratio]);
+  ctx.lineWidth = ratio;
+  ctx.beginPath();
+  ctx.moveTo(x, u.bbox.top);
+  ctx.lineTo(x, u.bbox.top + u.bbox.height);
+  ctx.stroke();
+  ctx.setLineDash([]);
+  if (!name) return;
+  ctx.fillStyle = colour("ink-2");
+  ctx.font = `${11 * ratio}px Inter, system-ui, sans-serif`;
+  ctx.textAlign = "left";
+  ctx.textBaseline = "top";
+  ctx.fillText(name, x + 5 * ratio, u.bbox.top + (4 + 14 * row) * ratio);
+}
+
+/** Hatched ground, beyond a limit. @param {any} u @param {CanvasRenderingContext2D} ctx @param {number} from @param {number} to */
+export function hatched(u, ctx, from, to) {
+  const a = u.valToPos(from, "y", true);
+  const b = u.valToPos(to, "y", true);
+  const top = Math.max(Math.min(a, b), u.bbox.top);
+  const bottom = Math.min(Math.max(a, b), u.bbox.top + u.bbox.height);
+  if (!(bottom > top)) return;
+  ctx.save();
+  ctx.beginPath();
+  ctx.rect(u.bbox.left, top, u.bbox.width, bottom - top);
+  ctx.clip();
+  ctx.strokeStyle = colour("hatch");
+  ctx.lineWidth = devicePixelRatio;
+  const step = 7 * devicePixelRatio;
+  ctx.beginPath();
+  for (let x = u.bbox.left - (bottom - top); x < u.bbox.left + u.bbox.width; x += step) {
+    ctx.moveTo(x, bottom);
+    ctx.lineTo(x + bottom - top, top);
+  }
+  ctx.stroke();
+  ctx.restore();
+}

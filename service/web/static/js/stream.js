@@ -1,0 +1,136 @@
+// @ts-check
+/** The one live stream of a page: opened anew with back-off, given up while the page is hidden. */
+import { batch } from "../vendor/signals-core.js";
+import { ask, signedOut } from "./api.js";
+import {
+  alarms, buses, jobs, newerVersion, now_s, clock_s, refreshLoops, service, setClock, silent_s, takeRows,
+} from "./state.js";
+
+const SILENT_S = 2.5;
+const HIDDEN_S = 60;
+const LONGEST_WAIT_S = 15;
+
+/** @typedef {{samples?: (found: any) => void, job?: (found: any) => void}} Listener */
+
+class Stream {
+  constructor() {
+    /** @type {EventSource | null} */
+    this.source = null;
+    this.tag = "";
+    this.back_s = 10;
+    /** @type {Set<Listener>} */
+    this.listeners = new Set();
+    this.heard_ms = performance.now();
+    this.tries = 0;
+    /** @type {ReturnType<typeof setTimeout> | undefined} */
+    this.retry = undefined;
+    /** @type {ReturnType<typeof setTimeout> | undefined} */
+    this.hidden = undefined;
+    this.given_up = false;
+    this.jobs_seen = "";
+  }
+
+  begin() {
+    this.open();
+    setInterval(() => this.tick(), 500);
+    document.addEventListener("visibilitychange", () => this.seen());
+  }
+
+  /** The loop whose samples and events are wanted. @param {string} tag @param {number} back_s @param {Listener} listener */
+  watch(tag, back_s, listener) {
+    this.listeners.add(listener);
+    this.tag = tag;
+    this.back_s = back_s;
+    this.open();
+    return () => {
+      this.listeners.delete(listener);
+      if (this.tag === tag && this.listeners.size === 0) {
+        this.tag = "";
+        this.open();
+      }
+    };
+  }
+
+  open() {
+    clearTimeout(this.retry);
+    this.source?.close();
+    const query = this.tag ? `?loops=${encodeURIComponent(this.tag)}&back_s=${this.back_s}` : "";
+    const source = new EventSource(`/live${query}`);
+    this.source = source;
+    /** @param {string} name @param {(found: any) => void} take */
+    const on = (name, take) =>
+      source.addEventListener(name, (event) => {
+        if (source !== this.source) return;
+        this.heard();
+        take(JSON.parse(/** @type {MessageEvent} */ (event).data));
+      });
+    on("hello", (found) => {
+      if (service.value && service.value.version !== found.version) newerVersion.value = true;
+      else service.value = { host: found.host, version: found.version };
+      setClock(found.now_s);
+    });
+    on("loops", (found) => {
+      setClock(found.now_s);
+      takeRows(found.loops);
+      const seen = found.loops.map((/** @type {any} */ row) => `${row.tag}${row.job}${row.last_job?.url}${row.last_job?.state}`).join();
+      if (seen !== this.jobs_seen) {
+        this.jobs_seen = seen;
+        void refreshLoops();
+      }
+    });
+    on("buses", (found) => (buses.value = found.buses));
+    on("jobs", (found) => (jobs.value = found.jobs));
+    on("alarms", (found) => (alarms.value = found.alarms));
+    on("samples", (found) => this.listeners.forEach((each) => each.samples?.(found)));
+    on("job", (found) => this.listeners.forEach((each) => each.job?.(found)));
+    source.addEventListener("error", () => {
+      if (source !== this.source) return;
+      source.close(); // it would give up for good after an HTTP error, and never say which
+      void this.later();
+    });
+  }
+
+  async later() {
+    this.tries++;
+    const wait_s = Math.min(LONGEST_WAIT_S, 0.5 * 2 ** (this.tries - 1)) * (0.8 + 0.4 * Math.random());
+    clearTimeout(this.retry);
+    this.retry = setTimeout(async () => {
+      try {
+        await ask("/loops?limit=1"); // says 401 where the key was revoked
+      } catch {
+        // The stream says more.
+      }
+      if (!signedOut.value) this.open();
+    }, wait_s * 1000);
+  }
+
+  heard() {
+    this.heard_ms = performance.now();
+    this.tries = 0;
+    if (silent_s.value) silent_s.value = 0;
+  }
+
+  tick() {
+    const quiet_s = (performance.now() - this.heard_ms) / 1000;
+    batch(() => {
+      now_s.value = Date.now() / 1000 + clock_s;
+      if (!this.given_up) silent_s.value = quiet_s > SILENT_S ? Math.max(1, Math.floor(quiet_s)) : 0;
+    });
+  }
+
+  seen() {
+    clearTimeout(this.hidden);
+    if (document.hidden) {
+      this.hidden = setTimeout(() => {
+        this.given_up = true;
+        this.source?.close();
+      }, HIDDEN_S * 1000);
+    } else if (this.given_up) {
+      this.given_up = false;
+      this.heard_ms = performance.now();
+      this.open();
+    }
+  }
+}
+
+export const stream = new Stream();

@@ -1,0 +1,174 @@
+// @ts-check
+/** Before and after: what can be had between robust and fast, steps, Nyquist, the table, and the decision. */
+import { useEffect, useMemo, useRef, useState } from "../../vendor/hooks.js";
+import { ask, command } from "../api.js";
+import { between, frequency, modelOf, slowness, step } from "../control.js";
+import { designsOf, fillDesigns } from "../designs.js";
+import { html } from "../html.js";
+import { change, fixed, known, ms as msText, msError, pvDecimals, significant, unit, withUnit } from "../numbers.js";
+import { isSilent, may, refreshLoops, sign, signature } from "../state.js";
+import { Curve, NyquistPlot, StepPlot } from "./figures.js";
+
+const LOAD_PCT = 10;
+
+/** @param {{loop: any, detail: any, job: any, latest: boolean, quiet: boolean, onChanged: (job: any) => void}} props */
+export function Choice({ loop, detail, job, latest, quiet, onChanged }) {
+  const model = useMemo(() => modelOf(job.model) ?? (job.rehearsed_on ? modelOf({ ...job.rehearsed_on }) : null), [job.id]);
+  const designed = (job.method === "fast" || job.method === "setpoint") && !job.dry_run && !!model;
+  const tested = job.chosen.Ms ?? job.predicted?.Ms ?? Number(job.request.ms ?? 1.6);
+  const [ms, setMs] = useState(/** @type {number} */ (tested));
+  const grid = designsOf(job.url).found.value;
+  useEffect(() => {
+    if (!designed) return;
+    const stop = new AbortController();
+    void fillDesigns(job.url, stop.signal);
+    return () => stop.abort();
+  }, [job.id]);
+  const own = { ms: tested, gains: job.new_gains, uncertainty: job.evidence?.uncertainty ?? null };
+  const designs = [...grid.filter((each) => Math.abs(each.ms - tested) > 0.02), own].sort((a, b) => a.ms - b.ms);
+  const atTested = Math.abs(ms - tested) < 0.0101;
+  const gains = atTested ? job.new_gains : (between(designs, ms) ?? job.new_gains);
+  const size = job.verification?.step ?? job.after?.step ?? loop.sp_deviation;
+  const horizon_s = useMemo(() => {
+    if (!model) return 10;
+    const settle = Math.max(job.comparison?.after.setpoint?.settling_s ?? 0, job.comparison?.after.load?.settling_s ?? 0);
+    return Math.max(settle * 1.3, 6 * slowness(model, job.new_gains));
+  }, [job.id]);
+  const before = useMemo(() => (model && job.old_gains ? pictures(model, job.old_gains, size, horizon_s) : null), [job.id]);
+  const after = useMemo(() => (model ? pictures(model, gains, size, horizon_s) : null), [job.id, gains.Kp, gains.Ti, gains.Td]);
+  const points = useMemo(() => (model ? designs.map((each) => ({ ms: each.ms, IAE: step(model, each.gains, { load: 1 }, horizon_s, 300).IAE })) : []), [job.id, grid.length]);
+  const stableBefore = job.comparison?.before.stable ?? true;
+
+  return html`<div class="card choice"><div class="body"><div>
+      ${designed && html`<div class="curve" key="curve"><div class="split"><span class="title">Faster or more robust</span><span>Ms <b>${msText(ms)}</b> <span class="quiet">${atTested ? "as asked and tested" : "not tested"}</span></span></div>
+        ${Curve(points, ms, tested, job.comparison?.before.Ms ?? null, model && job.old_gains && stableBefore ? step(model, job.old_gains, { load: 1 }, horizon_s, 300).IAE : null)}
+        <input type="range" min=${designs[0].ms} max=${designs[designs.length - 1].ms} step="0.01" value=${ms} disabled=${designs.length < 2} aria-label="Ms" aria-valuetext=${`Ms ${msText(ms)}${atTested ? ", as tested" : ""}`}
+          onInput=${(/** @type {any} */ e) => { const value = Number(e.target.value); setMs(Math.abs(value - tested) < 0.015 ? tested : value); }}
+          onDblClick=${() => setMs(tested)} onKeyDown=${(/** @type {any} */ e) => slide(e, ms, tested, designs, setMs)} />
+        <div class="ends"><span>${msText(designs[0].ms)} robust</span>${grid.length < 8 && html`<span class="quiet">designing on the record… ${grid.length} of 9</span>`}<span>fast ${msText(designs[designs.length - 1].ms)}</span></div></div>`}
+      ${after && html`<div class="small-plots" key="plots">
+        <figure><figcaption><b>Set-point step</b> PV, ${unit(loop.pv_unit)}</figcaption>${StepPlot(stableBefore ? before?.setpoint : null, after.setpoint, size, "Set-point step before and after")}</figure>
+        <figure><figcaption><b>Load step of ${LOAD_PCT} %</b> PV, ${unit(loop.pv_unit)}</figcaption>${StepPlot(stableBefore ? before?.load : null, after.load, 0, "Load step before and after")}</figure>
+        <figure><figcaption><b>Distance from −1</b> Nyquist</figcaption>${NyquistPlot(before?.freq ?? null, after.freq, atTested ? (job.comparison?.after.Ms ?? after.freq.Ms) : after.freq.Ms)}</figure></div>
+        <div class="legend" key="legend" style=${{ marginTop: "8px" }}><span class="old">before</span><span class="new">${atTested ? "proposed" : "chosen"}</span></div>`}
+    </div><div>${Table(loop, job, gains, before, after, atTested, size)}<p class="note" key="verdict">${job.comparison?.verdict}</p></div></div>
+    ${!quiet && html`<${Decide} key="decide" loop=${loop} detail=${detail} job=${job} latest=${latest} ms=${ms} tested=${tested} atTested=${atTested} back=${() => setMs(tested)} onChanged=${onChanged} />`}
+  </div>`;
+}
+
+/** @param {any} e @param {number} ms @param {number} tested @param {any[]} designs @param {(ms: number) => void} setMs */
+function slide(e, ms, tested, designs, setMs) {
+  const move = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[/** @type {string} */ (e.key)];
+  if (e.key === "Escape") {
+    e.preventDefault();
+    setMs(tested);
+  } else if (move) {
+    e.preventDefault();
+    const by = e.shiftKey ? 0.05 : 0.01;
+    let to = Math.round((ms + move * by) * 100) / 100;
+    if (Math.abs(to - tested) < 0.005) to = tested;
+    setMs(Math.min(designs[designs.length - 1].ms, Math.max(designs[0].ms, to)));
+  }
+}
+
+/** @param {any} model @param {any} gains @param {number} size @param {number} horizon_s */
+function pictures(model, gains, size, horizon_s) {
+  return { setpoint: step(model, gains, { setpoint: size }, horizon_s), load: step(model, gains, { load: LOAD_PCT }, horizon_s), freq: frequency(model, gains) };
+}
+
+/** @param {any} loop @param {any} job @param {any} gains @param {any} before @param {any} after @param {boolean} atTested @param {number} size */
+function Table(loop, job, gains, before, after, atTested, size) {
+  const u = unit(loop.pv_unit);
+  const old = job.old_gains;
+  const was = job.comparison?.before;
+  const will = atTested ? job.comparison?.after : null;
+  const drawn = (/** @type {any} */ p) => p && { Ms: p.freq.Ms, GM: p.freq.GM, PM_deg: p.freq.PM_deg, overshoot_pct: p.setpoint.overshoot_pct, setpoint: { settling_s: p.setpoint.settling_s }, load: { IAE: p.load.IAE / LOAD_PCT } };
+  const a = was ?? drawn(before) ?? {};
+  const b = will ?? drawn(after) ?? {};
+  const stable = was?.stable ?? true;
+  const uncertain = atTested ? job.evidence?.uncertainty : null;
+  /** @type {[any, string, number | null | undefined, number | null | undefined, (v: any) => string][]} */
+  const rows = [
+    [html`Gain Kp <small>%/${u}</small>`, "kp", old?.Kp, gains.Kp, significant],
+    [html`Integral time Ti <small>s</small>`, "ti", old?.Ti, gains.Ti, significant],
+    ...(old?.Td || gains.Td ? /** @type {any[]} */ ([[html`Derivative time Td <small>s</small>`, "td", old?.Td, gains.Td, significant]]) : []),
+    [html`Overshoot <small>%</small>`, "os", stable ? a.overshoot_pct : null, b.overshoot_pct, (v) => fixed(v, 0)],
+    [html`Settled within 5 % <small>s</small>`, "settle", stable ? a.setpoint?.settling_s : null, b.setpoint?.settling_s, (v) => significant(v, 2)],
+    [html`Load of 1 %, IAE <small>${u} s</small>`, "iae", stable ? a.load?.IAE : null, b.load?.IAE, (v) => significant(v, 3)],
+    [html`Largest sensitivity Ms ${known(uncertain) && html`<small>± ${msError(uncertain)}</small>`}`, "ms", stable ? a.Ms : null, b.Ms, msText],
+    [html`The plant's gain may grow`, "gm", stable ? a.GM : null, b.GM, (v) => (known(v) ? `× ${fixed(v, 2)}` : "–")],
+    [html`Its dead time may grow by <small>s</small>`, "dm", stable ? before?.freq.delay_margin_s : null, after?.freq.delay_margin_s, (v) => significant(v, 3)],
+    [html`Phase margin <small>°</small>`, "pm", stable ? a.PM_deg : null, b.PM_deg, (v) => fixed(v, 0)],
+  ];
+  return html`<table class="figures" key="table"><caption class="hidden-words">Before and after, for a set-point step of ${size} ${u}</caption>
+    <thead><tr><th></th><th class="num">before</th><th class="num">${atTested ? "proposed" : "chosen"}</th><th></th></tr></thead>
+    <tbody>${rows.map(([name, key, x, y, text]) => html`<tr key=${key}><td>${name}</td><td class="num">${key === "ti" && x === 0 ? "off" : text(x)}</td><td class="num after">${text(y)}</td><td class="num quiet">${change(x, y)}</td></tr>`)}</tbody></table>
+    ${!stable && html`<p class="note" key="unstable">With the gains before, the loop is not stable on this model.</p>`}`;
+}
+
+/** @param {{loop: any, detail: any, job: any, latest: boolean, ms: number, tested: number, atTested: boolean, back: () => void, onChanged: (job: any) => void}} props */
+function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChanged }) {
+  const [asking, setAsking] = useState("");
+  const [problem, setProblem] = useState(/** @type {any} */ (null));
+  const [sending, setSending] = useState(false);
+  const field = useRef(/** @type {HTMLInputElement | null} */ (null));
+  const opener = useRef(/** @type {Element | null} */ (null));
+  useEffect(() => {
+    if (asking) field.current?.focus();
+    const escape = (/** @type {KeyboardEvent} */ e) => {
+      if (e.key === "Escape") close();
+    };
+    if (asking) addEventListener("keydown", escape);
+    return () => removeEventListener("keydown", escape);
+  }, [asking]);
+  const close = () => {
+    setAsking("");
+    /** @type {HTMLElement | null} */ (opener.current)?.focus?.();
+  };
+  const open = (/** @type {string} */ what) => {
+    opener.current = document.activeElement;
+    setProblem(null);
+    setAsking(what);
+  };
+  const send = async (/** @type {() => Promise<any>} */ what) => {
+    setSending(true);
+    setProblem(null);
+    try {
+      const found = await what();
+      if (found?.url === job.url) onChanged(found);
+      setAsking("");
+      void refreshLoops();
+    } catch (error) {
+      setProblem(error);
+    }
+    setSending(false);
+  };
+  const by = () => ({ by: signature.value.trim() });
+  const tryIt = () =>
+    send(async () => {
+      const answer = await ask(`${job.url}/alternatives?ms=${ms.toFixed(2)}`);
+      const body = answer.methods[0]?.retune;
+      if (!body) throw new Error(answer.methods[0]?.detail ?? "The service has no gains for this Ms.");
+      return command(`/loops/${encodeURIComponent(loop.tag)}/retune`, { ...body, requested_by: signature.value.trim() });
+    });
+  const dead = sending || isSilent.value;
+  const gains = asking === "rollback" ? job.old_gains : job.new_gains;
+  const written = gains && `Kp ${significant(gains.Kp)} %/${unit(loop.pv_unit)}, Ti ${significant(gains.Ti)} s${gains.Td ? `, Td ${significant(gains.Td)} s` : ""}`;
+  const where = `${loop.tag}, node ${loop.controller_node.toString(16)}h channel ${loop.channel}`;
+  const Signed = (/** @type {string} */ action, /** @type {() => void} */ go) => html`<label key="by">Signed <input ref=${field} type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && signature.value.trim() && !dead) go(); }} /></label>
+    <button key="cancel" onClick=${close}>Cancel</button><button key="go" class="main" disabled=${dead || !signature.value.trim()} onClick=${go}>${action}</button>`;
+  let inside = null;
+  if (loop.locked) inside = html`<span class="say">Locked by ${loop.locked.by}: no decision until it is unlocked.</span>`;
+  else if (job.dry_run) inside = html`<span class="say">A rehearsal: nothing was moved, and there is nothing to accept.</span>`;
+  else if (!may.operate.value) inside = html`<span class="say">${job.state === "proposed" ? "The loop runs on its old gains. To accept the new ones needs the scope operate." : ""}</span>`;
+  else if (asking === "accept") inside = html`<span class="say">Write <b>${written}</b> into ${where}, for good.</span>${Signed(`Write to ${loop.tag}`, () => send(() => command(`${job.url}/accept`, by())))}`;
+  else if (asking === "keep") inside = html`<span class="say">Keep the old gains; the proposal is declined.</span>${Signed("Keep the old gains", () => send(() => command(`${job.url}/rollback`, by())))}`;
+  else if (asking === "rollback") inside = html`<span class="say">Write the old gains, <b>${written}</b>, back into ${where}.</span>${Signed(`Roll ${loop.tag} back`, () => send(() => command(`${job.url}/rollback`, by())))}`;
+  else if (asking === "try") inside = html`<span class="say">A trial listens, steps the set-point by <b>${withUnit(fixed(loop.sp_deviation, pvDecimals(loop.pv_limits)), loop.pv_unit)}</b> under the gains for Ms ${msText(ms)}, and ends as a proposal. No relay.</span>${Signed(`Try Ms ${msText(ms)} on ${loop.tag}`, tryIt)}`;
+  else if (!atTested) inside = html`<span class="say">These gains have not been on the loop.</span><button key="back" onClick=${back}>Back to Ms ${msText(tested)}</button><button key="try" class="main" disabled=${dead} onClick=${() => open("try")}>Try Ms ${msText(ms)} on ${loop.tag}…</button>`;
+  else if (job.state === "proposed" && latest) inside = html`<span class="say">The loop runs on its old gains until you accept.</span><button key="keep" disabled=${dead} onClick=${() => open("keep")}>Keep the old gains…</button><button key="accept" class="main" disabled=${dead} onClick=${() => open("accept")}>Accept the new gains…</button>`;
+  else if (job.state === "accepted" && latest) inside = html`<span class="say">Accepted by <b>${job.decided?.by ?? "–"}</b>${detail?.live ? html`; in effect now: Kp ${significant(detail.live.gains.Kp)}, Ti ${significant(detail.live.gains.Ti)} s` : ""}.</span><button key="rollback" disabled=${dead} onClick=${() => open("rollback")}>Roll back to the old gains…</button>`;
+  else if (job.state === "rolled_back") inside = html`<span class="say">The loop runs on its old gains${job.decided ? `; decided by ${job.decided.by}` : ""}.</span>`;
+  else inside = html`<span class="say">${job.state === "proposed" ? "Not decided; a later test came." : ""}</span>`;
+  return html`<div class="decide" role="group" aria-label="Decision">${inside}${problem && html`<p class="refusal" role="alert" key="problem">${problem.message} <span class="advice">${problem.advice ?? ""}</span></p>`}</div>`;
+}

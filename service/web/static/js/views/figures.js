@@ -1,0 +1,98 @@
+// @ts-check
+/** Small figures as SVG: the curve of Ms, steps, Nyquist. Axes do not change with the slider. */
+import { html } from "../html.js";
+import { fixed, ms as msText, tick } from "../numbers.js";
+import { tickDistance } from "../plot.js";
+
+/** @param {{ms: number, IAE: number}[]} points @param {number} ms @param {number} tested @param {number | null} msBefore @param {number | null} iaeBefore */
+export function Curve(points, ms, tested, msBefore, iaeBefore) {
+  const low = points[0]?.ms ?? 1.2;
+  const high = points[points.length - 1]?.ms ?? 2;
+  const range = high > low ? high - low : 1;
+  const x = (/** @type {number} */ value) => (high > low ? 8 + (584 * (value - low)) / range : 300);
+  const logs = points.map((each) => -Math.log(each.IAE));
+  const bottom = Math.min(...logs);
+  const top = Math.max(...logs);
+  const y = (/** @type {number} */ iae) => 108 - (top > bottom ? (78 * (-Math.log(iae) - bottom)) / (top - bottom) : 40);
+  const line = points.map((each, n) => `${n ? "L" : "M"}${x(each.ms).toFixed(1)} ${y(each.IAE).toFixed(1)}`).join("");
+  const after = points.findIndex((each) => each.ms >= ms - 1e-9);
+  const b = points[Math.max(0, after)];
+  const a = points[Math.max(0, after - 1)];
+  const part = b && a && b.ms > a.ms ? Math.min(1, Math.max(0, (ms - a.ms) / (b.ms - a.ms))) : 1;
+  const iae = a && b ? Math.exp(Math.log(a.IAE) + part * Math.log(b.IAE / a.IAE)) : 1;
+  const inside = msBefore !== null && iaeBefore !== null && msBefore >= low && msBefore <= high;
+  return html`<svg viewBox="0 0 600 130" preserveAspectRatio="none" role="img" aria-label="How soon a load is made good, for each Ms">
+    ${points.length > 1 && html`<path key="area" d=${`${line}L${x(high)} 126L${x(low)} 126Z`} class="f-band" /><path key="line" d=${line} class="s-new" />`}
+    <path d=${`M${x(tested)} 8V126`} class="s-pale" />
+    ${inside && html`<circle key="before" cx=${x(/** @type {number} */ (msBefore))} cy=${y(/** @type {number} */ (iaeBefore))} r="5" class="s-ink" />`}
+    ${points.length > 0 && html`<circle key="dot" cx=${x(ms)} cy=${y(iae)} r="6" class="f-new" />`}
+    <text x="12" y="14">a load is made good sooner ↑</text>
+    ${msBefore !== null && !inside && html`<text key="off" x=${msBefore > high ? 592 : 8} y="124" text-anchor=${msBefore > high ? "end" : "start"}>before: Ms ${msText(msBefore)} ${msBefore > high ? "→" : "←"}</text>`}
+  </svg>`;
+}
+
+/** @param {any} before @param {any} after @param {number} setpoint @param {string} label */
+export function StepPlot(before, after, setpoint, label) {
+  const [W, H, L, B] = [260, 170, 40, 20];
+  let low = Math.min(0, setpoint);
+  let high = Math.max(0, setpoint);
+  const consider = before ? [before, after] : [after];
+  for (const each of consider) for (const value of each.y) {
+    low = Math.min(low, value);
+    high = Math.max(high, value);
+  }
+  if (setpoint) {
+    low = Math.max(low, -Math.abs(setpoint));
+    high = Math.min(high, 2.2 * Math.abs(setpoint));
+  }
+  const pad = (high - low) * 0.06 || 1;
+  low -= pad;
+  high += pad;
+  const end = after.t[after.t.length - 1];
+  const x = (/** @type {number} */ t) => L + ((W - L - 4) * t) / end;
+  const y = (/** @type {number} */ v) => 6 + (H - B - 6) * (1 - (Math.min(high, Math.max(low, v)) - low) / (high - low));
+  const path = (/** @type {any} */ found) => {
+    let d = "";
+    for (let n = 0; n < found.t.length; n += 2) d += `${n ? "L" : "M"}${x(found.t[n]).toFixed(1)} ${y(found.y[n]).toFixed(1)}`;
+    return d;
+  };
+  const dy = tickDistance(high - low, 4);
+  const dx = tickDistance(end, 4);
+  const ys = [];
+  for (let n = Math.ceil(low / dy); n * dy <= high; n++) ys.push(n * dy);
+  const xs = [];
+  for (let n = 0; n * dx <= end; n++) xs.push(n * dx);
+  return html`<svg viewBox=${`0 0 ${W} ${H}`} role="img" aria-label=${label}>
+    ${ys.map((v) => html`<g key=${`y${v}`}><path d=${`M${L} ${y(v)}H${W - 4}`} class="s-grid" /><text x=${L - 4} y=${y(v) + 4} text-anchor="end">${tick(v, dy)}</text></g>`)}
+    ${xs.map((t) => html`<g key=${`x${t}`}><path d=${`M${x(t)} 6V${H - B}`} class="s-grid" /><text x=${x(t)} y=${H - 6} text-anchor="middle">${tick(t, dx)}</text></g>`)}
+    ${setpoint ? html`<path key="sp" d=${`M${L} ${y(setpoint)}H${W - 4}`} class="s-sp" />` : null}
+    ${before && html`<path key="before" d=${path(before)} class="s-old" />`}<path key="after" d=${path(after)} class="s-new" /></svg>`;
+}
+
+/** @param {any} before @param {any} after @param {number} Ms */
+export function NyquistPlot(before, after, Ms) {
+  const [W, H] = [200, 170];
+  const scale = 58;
+  const x = (/** @type {number} */ re) => 118 + scale * re;
+  const y = (/** @type {number} */ im) => 62 - scale * im;
+  const path = (/** @type {any} */ f) => {
+    let d = "";
+    let pen = false;
+    for (let n = 0; n < f.re.length; n += 2) {
+      const [px, py] = [x(f.re[n]), y(f.im[n])];
+      if (px < -60 || px > W + 60 || py < -60 || py > H + 60) {
+        pen = false;
+        continue;
+      }
+      d += `${pen ? "L" : "M"}${px.toFixed(1)} ${py.toFixed(1)}`;
+      pen = true;
+    }
+    return d;
+  };
+  return html`<svg viewBox=${`0 0 ${W} ${H}`} role="img" aria-label=${`Nyquist: the largest sensitivity Ms is ${fixed(Ms, 2)}`}>
+    <circle cx=${x(-1)} cy=${y(0)} r=${scale / Ms} class="f-band s-soft" /><circle cx=${x(0)} cy=${y(0)} r=${scale} class="s-pale" />
+    <path d=${`M0 ${y(0)}H${W}M${x(0)} 0V${H}`} class="s-grid" />
+    ${before && html`<path key="before" d=${path(before)} class="s-old" />`}<path key="after" d=${path(after)} class="s-new" />
+    <circle cx=${x(-1)} cy=${y(0)} r="2.5" class="f-ink" /><text x=${x(-1) - 5} y=${y(0) - 5} text-anchor="end">−1</text>
+    <text x=${x(-1)} y=${Math.min(H - 4, y(0) + scale / Ms + 13)} text-anchor="middle">1/Ms = ${fixed(1 / Ms, 2)}</text></svg>`;
+}

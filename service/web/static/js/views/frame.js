@@ -1,0 +1,96 @@
+// @ts-check
+/** What stands on every view: the bar, the banner, the dock with Abort. */
+import { signal } from "../../vendor/signals-core.js";
+import { abortJob, aborting, abortError } from "../aborting.js";
+import { command, signedOut } from "../api.js";
+import { html } from "../html.js";
+import { duration } from "../numbers.js";
+import { cyclePalette, palette } from "../palette.js";
+import { loopPath, path } from "../router.js";
+import { isSilent, jobs, may, newerVersion, service, session, silent_s } from "../state.js";
+import { AlarmSymbol } from "../symbols.js";
+import { stageName } from "../words.js";
+import { abnormalNow } from "../watching.js";
+
+const PLACES = [["/ui/", "Loops"], ["/ui/jobs", "Jobs"], ["/ui/retunes", "Retunes"]];
+
+export function Bar() {
+  const at = path.value;
+  const inside = (/** @type {string} */ to) => (to === "/ui/" ? at === "/ui/" || at.startsWith("/ui/loops") : at.startsWith(to));
+  const levels = /** @type {const} */ ([1, 2, 3]).map((level) => [level, abnormalNow.value.filter((each) => each.level === level).length]);
+  const some = levels.filter(([, count]) => count);
+  return html`<header class="bar">
+    <a class="mark" href="/ui/" aria-label="Loopwright, to the loops"><svg viewBox="0 0 32 18" aria-hidden="true"><path d="M1 15h7c4 0 4-12 9-12 3 0 3 5 6 5h8" /></svg><span>Loopwright</span></a>
+    <nav aria-label="Views">
+      ${PLACES.map(([to, name]) => html`<a key=${to} href=${to} aria-current=${inside(to) ? "page" : undefined}>${name}</a>`)}
+      ${may.admin.value && html`<a key="log" href="/ui/log" aria-current=${inside("/ui/log") ? "page" : undefined}>Log</a>`}
+    </nav>
+    <div class="right">
+      <a href="/ui/alarms" aria-label=${some.length ? `${abnormalNow.value.length} abnormal` : "Nothing abnormal"}>
+        ${some.length ? some.map(([level, count]) => html`<span key=${level} class="count">${AlarmSymbol(/** @type {1|2|3} */ (level))} ${count}</span>`) : html`<span class="calmness">Nothing abnormal</span>`}
+      </a>
+      <span class="who">${service.value?.host} ${session.value && html`<b>${session.value.name}</b> ${session.value.scope}`}</span>
+      <button class="plain" onClick=${cyclePalette} aria-label=${`Colours: ${palette.value}`}>◑ <span class="who">${palette.value}</span></button>
+      ${session.value?.keys && html`<button class="plain" onClick=${signOut}>Sign out</button>`}
+    </div>
+  </header>`;
+}
+
+async function signOut() {
+  try {
+    await command("/session", undefined, "DELETE");
+  } finally {
+    signedOut.value = true;
+  }
+}
+
+export function Banner() {
+  if (isSilent.value) {
+    return html`<div class="banner" role="alert" key="silent">${AlarmSymbol(2)}
+      <span><b>No word from the service for ${silent_s.value} s.</b> What is shown is old. Tests that run go on, guarded by the gateway and the controllers.</span></div>`;
+  }
+  if (newerVersion.value) {
+    return html`<div class="banner calm" role="status" key="newer"><span>Loopwright was updated.</span><button onClick=${() => location.reload()}>Reload</button></div>`;
+  }
+  return null;
+}
+
+/** The loop whose test stands alone in the dock: that of the page. */
+export const dockLoop = signal("");
+
+const MOST = 6;
+
+export function Dock() {
+  const all = jobs.value.filter((each) => !each.dry_run);
+  document.body.classList.toggle("docked", all.length > 0);
+  if (!all.length) return null;
+  const own = all.find((each) => each.loop === dockLoop.value);
+  const shown = own ? [own] : all.slice(0, MOST);
+  const more = all.length - shown.length;
+  return html`<section class=${`dock ${shown.length > 1 ? "many" : ""}`} aria-label="Under test">
+    ${shown.map((job) => html`<${Cell} key=${job.id} job=${job} />`)}
+    ${more > 0 && html`<a key="more" href="/ui/">${more} more under test</a>`}
+  </section>`;
+}
+
+/** @param {{job: any}} props */
+function Cell({ job }) {
+  const stopping = job.stopping || aborting.value.has(job.id);
+  const error = abortError.value.get(job.id);
+  const left = isSilent.value ? "" : stopping ? "" : job.remaining_plant_time_s === null ? "" : `${duration(job.remaining_plant_time_s)} left`;
+  const stage = stopping ? "stopping, the loop is being restored" : job.state === "queued" ? "waits for its turn" : stageName(job.stage);
+  return html`<div class="cell">
+    <a class="tag" href=${loopPath(job.loop)}>${job.loop}</a>
+    <span class="stage" aria-live="polite">${stage}</span>
+    ${Progress(job.progress, stopping)}
+    <span>${left}</span>
+    ${error && html`<b role="alert">${error}</b>`}
+    ${may.operate.value && html`<button class="abort" disabled=${stopping} onClick=${() => abortJob(job)}>${stopping ? "Aborting…" : html`Abort ${job.loop}`}</button>`}
+  </div>`;
+}
+
+/** @param {number | null} fraction @param {boolean} [stopping] */
+export function Progress(fraction, stopping = false) {
+  const done = Math.min(1, Math.max(0, fraction ?? 0));
+  return html`<span class=${`progress ${stopping ? "stopping" : ""}`} role="progressbar" aria-label="Progress of the test" aria-valuemin="0" aria-valuemax="100" aria-valuenow=${Math.round(done * 100)}><span style=${{ transform: `scaleX(${done.toFixed(4)})` }}></span></span>`;
+}

@@ -1,0 +1,1 @@
+export function LogView() { return null; }

@@ -1,0 +1,129 @@
+// @ts-check
+/** One loop: its face, trend, gains, limits, what is known of its plant, its tests; the test under way; the latest result. */
+import { useEffect, useState } from "../../vendor/hooks.js";
+import { ask, askPage } from "../api.js";
+import { html } from "../html.js";
+import { known, ms, period, pvDecimals, fixed, significant, unit, when } from "../numbers.js";
+import { jobPath } from "../router.js";
+import { isSilent, jobs, loops, loopsError, may, rowOf } from "../state.js";
+import { AlarmSymbol } from "../symbols.js";
+import { abnormalNow } from "../watching.js";
+import { stateWords } from "../words.js";
+import { Face } from "./face.js";
+import { dockLoop } from "./frame.js";
+import { Known } from "./known.js";
+import { Result } from "./result.js";
+import { RetuneForm } from "./retune.js";
+import { Trend } from "./trend.js";
+import { UnderTest } from "./undertest.js";
+
+const REREAD_MS = 60_000;
+
+/** @param {{tag: string}} props */
+export function LoopView({ tag }) {
+  const loop = loops.value?.get(tag);
+  const [detail, setDetail] = useState(/** @type {any} */ (null));
+  const [tests, setTests] = useState(/** @type {any[]} */ ([]));
+  const [result, setResult] = useState(/** @type {any} */ (null));
+  const [running, setRunning] = useState(/** @type {any} */ (null));
+  const [open, setOpen] = useState(/** @type {boolean | null} */ (null));
+  const job = jobs.value.find((each) => each.loop === tag && !each.dry_run) ?? null;
+  const row = rowOf(tag).value;
+  const mark = `${row?.job ?? ""} ${row?.last_job?.url ?? ""} ${row?.last_job?.state ?? ""} ${loop?.locked?.since ?? ""}`;
+
+  useEffect(() => {
+    document.title = `${tag} · Loopwright`;
+    dockLoop.value = tag;
+    return () => {
+      dockLoop.value = "";
+    };
+  }, [tag]);
+
+  useEffect(() => {
+    const stop = new AbortController();
+    const path = `/loops/${encodeURIComponent(tag)}`;
+    const read = () => ask(path, stop.signal).then(setDetail, () => {});
+    void read();
+    void askPage(`${path}/jobs?limit=8`, stop.signal).then(async ({ entries }) => {
+      setTests(entries);
+      const latest = entries.find((/** @type {any} */ each) => !each.dry_run && !["queued", "running"].includes(each.state));
+      setResult(latest ? await ask(latest.url, stop.signal) : null);
+    }, () => {});
+    const timer = setInterval(() => {
+      if (!document.hidden && !isSilent.peek()) void read();
+    }, REREAD_MS);
+    return () => {
+      stop.abort();
+      clearInterval(timer);
+    };
+  }, [tag, mark]);
+
+  useEffect(() => {
+    if (!job) {
+      setRunning(null);
+      return;
+    }
+    const stop = new AbortController();
+    void ask(job.url, stop.signal).then(setRunning, () => {});
+    return () => stop.abort();
+  }, [job?.id, job?.stage, job?.stopping]);
+
+  if (!loop) {
+    return html`<p class="calm" role="status">${loops.value ? `There is no loop ${tag} here.` : loopsError.value ? loopsError.value.message : "Asking for the loop…"}</p>`;
+  }
+  const onJob = (/** @type {any} */ event) => {
+    if (["stage_started", "stage_done", "note", "resumed", "state"].includes(event.kind)) void ask(`/jobs/${event.job}`).then((found) => {
+      if (["queued", "running"].includes(found.state)) setRunning(found);
+    }, () => {});
+  };
+  const formOpen = !job && (open ?? (!result && may.operate.value));
+  const mine = abnormalNow.value.filter((each) => each.loop === tag);
+  const height = Math.max(240, Math.min(430, innerHeight - (result && !job ? 520 : 460)));
+  return html`<div>
+    <div class="looptitle" key="title"><h1 class="tag">${tag}</h1><span class="what">${loop.description}</span>
+      <span class="where">${[loop.area, loop.bus, `node ${loop.controller_node.toString(16)}h`, `channel ${loop.channel}`, loop.host === "local" ? null : `by way of ${loop.host}`].filter(Boolean).join(" · ")}</span>
+      ${!job && !formOpen && may.operate.value && html`<button key="retune" onClick=${() => setOpen(true)}>Retune…</button>`}
+      ${!may.operate.value && html`<span key="may" class="quiet">Your key may read. To retune it needs the scope operate.</span>`}
+    </div>
+    ${mine.map((each) => html`<p class="abnormal" key=${each.key}>${AlarmSymbol(each.level)} <b>${each.words}</b></p>`)}
+    ${detail?.not_confirmed_home && html`<p class="refusal" key="home"><b>${detail.not_confirmed_home.detail}</b> ${detail.not_confirmed_home.advice}</p>`}
+    ${loop.locked && html`<p class="refusal" key="lock">Locked by ${loop.locked.by} since ${when(loop.locked.since)}: ${loop.locked.reason}. Tests and decisions wait until it is unlocked.</p>`}
+    <div class="loop" key="loop">
+      <aside key="aside"><${Face} key="face" loop=${loop} />${Settings(loop, detail)}<${Known} key="known" loop=${loop} detail=${detail} />${Tests(tests)}</aside>
+      <div key="right">
+        <${Trend} key="trend" loop=${loop} job=${job} height=${height} onJob=${onJob} />
+        ${formOpen && html`<${RetuneForm} key="form" loop=${loop} onClose=${result ? () => setOpen(false) : null} onStarted=${() => setOpen(false)} />`}
+        ${job && html`<${UnderTest} key="test" loop=${loop} live=${job} job=${running?.id === job.id ? running : null} />`}
+        ${!job && result && html`<${Result} key=${`result ${result.id}`} loop=${loop} detail=${detail} job=${result} quiet=${formOpen} onChanged=${setResult} />`}
+      </div>
+    </div>
+  </div>`;
+}
+
+/** @param {any} loop @param {any} detail */
+function Settings(loop, detail) {
+  const live = detail?.live;
+  const gains = live?.gains;
+  const decimals = Math.min(3, pvDecimals(loop.pv_limits));
+  const u = unit(loop.pv_unit);
+  return html`<section class="card" key="settings" aria-label="Gains and limits">
+    <h3 class="title" key="t1">Gains in effect</h3>
+    ${gains ? html`<dl class="pairs" key="gains"><dt>Kp</dt><dd>${significant(gains.Kp)} <span class="quiet">%/${u}</span></dd><dt>Ti</dt><dd>${gains.Ti ? significant(gains.Ti) : "off"} <span class="quiet">s</span></dd>
+      ${gains.Td > 0 && html`<dt key="td">Td</dt><dd key="tdv">${significant(gains.Td)} <span class="quiet">s</span></dd>`}
+      <dt>action</dt><dd>${live.reverse_acting ? "reverse" : "direct"}</dd><dt>sampled</dt><dd>every ${period(live.sample_time_s)}</dd></dl>`
+    : html`<p key="none" class="quiet">${detail?.live_error ? `${detail.live_error.detail}. ${detail.live_error.advice}` : detail ? "not known here" : "reading…"}</p>`}
+    ${loop.gains_differ && loop.accepted && html`<p class="note" key="differ">Accepted last: Kp ${significant(loop.accepted.gains.Kp)}, Ti ${significant(loop.accepted.gains.Ti)} s, by ${loop.accepted.by}, ${when(loop.accepted.at)}.</p>`}
+    <h3 class="title" key="t2">Permitted</h3>
+    <dl class="pairs" key="limits"><dt>PV</dt><dd>${fixed(loop.pv_limits.low, decimals)} … ${fixed(loop.pv_limits.high, decimals)} <span class="quiet">${u}</span></dd>
+      <dt>MV</dt><dd>${significant(loop.mv_limits.low, 3)} … ${significant(loop.mv_limits.high, 3)} <span class="quiet">%</span></dd>
+      <dt>SP step</dt><dd>± ${fixed(loop.sp_deviation, decimals)} <span class="quiet">${u}</span></dd><dt>test by</dt><dd>${loop.test.excitations.map((/** @type {string} */ each) => (each === "setpoint" ? "set-point" : each)).join(", ")}</dd></dl>
+    ${loop.notes && html`<p class="note" key="notes">${loop.notes}</p>`}
+  </section>`;
+}
+
+/** @param {any[]} tests */
+function Tests(tests) {
+  return html`<section class="card tests" key="tests"><h3 class="title">Earlier tests</h3>
+    ${tests.length ? html`<ul class="tests">${tests.slice(0, 6).map((each) => html`<li key=${each.id}><a href=${jobPath(each.url)}>${when(each.ended_at ?? each.created_at)}</a>
+      <small>${each.dry_run ? "rehearsal · " : ""}${stateWords(each)}${known(each.request.ms) ? ` · Ms ${ms(each.request.ms)}` : ""}</small></li>`)}</ul>` : html`<p class="quiet">none yet</p>`}</section>`;
+}

@@ -1,0 +1,120 @@
+// @ts-check
+/** The record of a job with the model driven by the measured MV, what the model leaves, and MV. */
+import { useEffect, useRef, useState } from "../../vendor/hooks.js";
+import { ask } from "../api.js";
+import { modelOf, Plant } from "../control.js";
+import { html } from "../html.js";
+import { pvDecimals, fixed, unit } from "../numbers.js";
+import { colour, shown } from "../palette.js";
+import { makePlot, mark, yRange } from "../plot.js";
+import { stageName } from "../words.js";
+
+const FEW = 20;
+
+/** @param {{loop: any, job: any}} props */
+export function Record({ loop, job }) {
+  const [record, setRecord] = useState(/** @type {any} */ (null));
+  const [words, setWords] = useState("Asking for the record…");
+  const [readout, setReadout] = useState("");
+  const pv = useRef(/** @type {HTMLElement | null} */ (null));
+  const left = useRef(/** @type {HTMLElement | null} */ (null));
+  const mv = useRef(/** @type {HTMLElement | null} */ (null));
+  useEffect(() => {
+    const stop = new AbortController();
+    ask(`${job.url}/samples`, stop.signal).then(
+      (found) => {
+        if (!found.t_s.length) setWords("There are no samples: the job ended before it had any, or they were deleted.");
+        else setRecord(withModel(found, modelOf(job.model), job));
+      },
+      (error) => {
+        if (!stop.signal.aborted) setWords(error.message);
+      },
+    );
+    return () => stop.abort();
+  }, [job.id]);
+  useEffect(() => {
+    if (!record || !pv.current || !mv.current) return;
+    const key = `record ${job.id}`;
+    const all = /** @type {[number, number]} */ ([record.t[0], record.t[record.t.length - 1]]);
+    let x = all;
+    const decimals = pvDecimals(loop.pv_limits);
+    const marks = (/** @type {any} */ u, /** @type {any} */ ctx, /** @type {boolean} */ named) => {
+      let last = -Infinity;
+      let row = 0;
+      for (const each of record.marks) {
+        const at = u.valToPos(each.t, "x", true);
+        row = at - last < 95 * devicePixelRatio ? row + 1 : 0;
+        last = at;
+        mark(u, ctx, each.t, named ? stageName(each.stage) : "", row);
+      }
+    };
+    const common = { zero: () => 0, sync: key, onSelect: (/** @type {number} */ from, /** @type {number} */ to) => { x = [from, to]; draw(); },
+      onCursor: (/** @type {any} */ u) => {
+        const n = u.cursor.idx;
+        setReadout(n === null || n === undefined || !(u.cursor.left >= 0) ? "" : `${fixed(record.t[n], 2)} s · PV ${fixed(record.pv[n], decimals)}${record.model ? ` · model ${fixed(record.model[n], decimals)}` : ""} · SP ${fixed(record.sp[n], decimals)} · MV ${fixed(record.mv[n], 1)} %`);
+      } };
+    const plots = [
+      makePlot(pv.current, { ...common, height: 210, withTime: false, lines: [{ label: "PV", colour: record.model ? "measured" : "pv", width: record.model ? 3 : 1.5 }, { label: "SP", colour: "sp", dash: [6, 4], width: 1.2, stepped: true }, { label: "model", colour: "new", width: 1.3 }], above: (u, ctx) => marks(u, ctx, true) }),
+      ...(record.model && left.current ? [makePlot(left.current, { ...common, height: 76, withTime: false, lines: [{ label: "left", colour: "measured", width: 1 }],
+        beneath: (u, ctx) => {
+          if (!record.noise) return;
+          const top = u.valToPos(2 * record.noise, "y", true);
+          ctx.fillStyle = colour("band");
+          ctx.fillRect(u.bbox.left, top, u.bbox.width, u.valToPos(-2 * record.noise, "y", true) - top);
+        } })] : []),
+      makePlot(mv.current, { ...common, height: 120, withTime: true, lines: [{ label: "MV", colour: "mv", stepped: true }], above: (u, ctx) => marks(u, ctx, false) }),
+    ];
+    const empty = record.t.map(() => NaN);
+    const draw = () => {
+      plots[0].show([record.t, record.pv, record.sp, record.model ?? empty], x, yRange([record.pv, record.sp], loop.sp_deviation * 0.5));
+      if (plots.length === 3) plots[1].show([record.t, record.left], x, yRange([record.left], 6 * (record.noise || 1e-6)));
+      plots[plots.length - 1].show([record.t, record.mv], x, yRange([record.mv], 10));
+    };
+    draw();
+    const whole = () => { x = all; draw(); };
+    for (const each of [pv.current, mv.current]) each.addEventListener("dblclick", whole);
+    const unsubscribe = shown.subscribe(() => plots.forEach((each) => each.redraw()));
+    return () => {
+      unsubscribe();
+      for (const each of plots) each.destroy();
+    };
+  }, [record]);
+  return html`<section class="card" aria-label="Record" style=${{ marginTop: "16px" }}>
+    <div class="split" key="top"><h2 class="title">What was measured${record?.model ? ", and the model found" : ""}</h2><span class="readout">${readout || (record ? "drag to zoom, double click for the whole" : "")}</span>
+      <span class="legend" aria-hidden="true"><span class=${record?.model ? "measured" : "pv"}>PV measured</span><span class="sp">SP</span>${record?.model && html`<span class="new">model</span>`}<span class="mv">MV</span></span></div>
+    ${!record && html`<p class="quiet" key="words" role="status">${words}</p>`}
+    ${record && html`<div key="plots"><span class="axis-name">PV, ${unit(loop.pv_unit)}</span><div class="plot" ref=${pv} role="img" aria-label="PV measured, set-point and model"></div>
+      ${record.model && html`<span key="n" class="axis-name">not explained, with the noise at rest (2 σ)</span><div key="p" class="plot" ref=${left} role="img" aria-label="What the model leaves"></div>`}
+      <span class="axis-name">MV, %</span><div class="plot" ref=${mv} role="img" aria-label="MV"></div><p class="quiet num">plant time since the test began, s</p></div>`}
+  </section>`;
+}
+
+/** The record, with the model driven by the measured MV from where the loop was at rest. @param {any} found @param {any} model @param {any} job */
+export function withModel(found, model, job) {
+  const start = found.t_s[0];
+  const t = found.t_s.map((/** @type {number} */ each) => each - start);
+  const marks = [];
+  for (let n = 0; n < t.length; n++) if (n === 0 || found.stage[n] !== found.stage[n - 1]) marks.push({ t: t[n], stage: found.stage[n] });
+  const base = { t, pv: found.pv, sp: found.sp, mv: found.mv, marks, noise: 0, model: /** @type {number[] | null} */ (null), left: /** @type {number[]} */ ([]) };
+  if (!model || t.length < 3 * FEW) return base;
+  const rest = found.stage.findIndex((/** @type {string} */ each) => each !== found.stage[0]);
+  const calm = Math.max(FEW, rest > 0 ? rest : FEW);
+  const mean = (/** @type {number[]} */ of) => of.reduce((sum, each) => sum + each, 0) / of.length;
+  const u0 = mean(found.mv.slice(0, calm));
+  const steps = t.slice(1).map((/** @type {number} */ each, /** @type {number} */ n) => each - t[n]).sort((/** @type {number} */ a, /** @type {number} */ b) => a - b);
+  const dt = steps[steps.length >> 1];
+  if (!(dt > 0)) return base;
+  const plant = new Plant(model, dt);
+  const answer = [0];
+  for (let n = 1; n < t.length; n++) {
+    const missed = Math.min(1000, Math.max(1, Math.round((t[n] - t[n - 1]) / dt)));
+    let value = 0;
+    for (let k = 0; k < missed; k++) value = plant.step(found.mv[n - 1] - u0);
+    answer.push(value);
+  }
+  const offset = mean(found.pv.map((/** @type {number} */ each, /** @type {number} */ n) => each - answer[n]));
+  if (!Number.isFinite(offset)) return base;
+  const shownModel = answer.map((each) => each + offset);
+  const noise = job.stages.map((/** @type {any} */ each) => each.result?.noise).find((/** @type {any} */ each) => typeof each === "number") ?? 0;
+  return { ...base, noise, model: shownModel, left: found.pv.map((/** @type {number} */ each, /** @type {number} */ n) => each - shownModel[n]) };
+}

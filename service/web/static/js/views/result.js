@@ -1,0 +1,72 @@
+// @ts-check
+/** The result of a job: headline, how far to trust it, before and after, what the loop is now, the record. */
+import { html } from "../html.js";
+import { duration, fixed, known, ms, msError, significant, unit, when, withError, withUnit } from "../numbers.js";
+import { jobPath } from "../router.js";
+import { headline, methodName } from "../words.js";
+import { Choice } from "./choice.js";
+import { Record } from "./record.js";
+import { Stages } from "./undertest.js";
+
+/**
+ * @param {{loop: any, detail: any, job: any, quiet?: boolean, own?: boolean, onChanged: (job: any) => void}} props
+ * quiet: another question is open. own: the page of the job itself.
+ */
+export function Result({ loop, detail, job, quiet = false, own = false, onChanged }) {
+  const trust = trustWords(job);
+  const latest = loop.last_job?.url === job.url;
+  return html`<section aria-label="Result">
+    <div class="headline" key="head"><div><h2>${headline(job)}</h2>${trust && html`<p>${trust}</p>`}</div>
+      <p class="facts">${when(job.ended_at ?? job.created_at)} · ${job.requested_by} · ${methodName(job.method)} · ${duration(job.plant_time_s)} of plant time<br />
+        ${job.decided && html`${job.decided.what === "accept" ? "accepted" : "old gains kept"} by ${job.decided.by}, ${when(job.decided.at)} · `}
+        <a href=${`${job.url}/report`} target="_blank">Report</a><a href=${`${job.url}/samples?format=csv`} target="_blank">Samples</a>${!own && html`<a href=${jobPath(job.url)}>job ${job.id}</a>`}</p></div>
+    ${job.reason && html`<div class="card" key="why"><p>${sentence(job.detail)}</p><p class="advice">${job.advice}</p>${After(job)}</div>`}
+    ${job.superseded_by && html`<p class="refusal" key="later">A later test came: <a href=${jobPath(job.superseded_by)}>its result</a>.</p>`}
+    ${job.new_gains && html`<${Choice} key="choice" loop=${loop} detail=${detail} job=${job} latest=${latest} quiet=${quiet} onChanged=${onChanged} />`}
+    ${!["fast", "setpoint"].includes(job.method) || own ? html`<div class="card" key="stages" style=${{ marginTop: "16px" }}><h2 class="title">Stages</h2>${Stages(job, loop.pv_unit)}</div>` : null}
+    ${!job.dry_run && html`<${Record} key="record" loop=${loop} job=${job} />`}
+    ${Numbers(loop, job)}
+    ${job.notes.length > 0 && html`<div class="card" key="notes"><h2 class="title">Notes</h2>${job.notes.map((/** @type {string} */ each) => html`<p key=${each}>${sentence(each)}</p>`)}</div>`}
+  </section>`;
+}
+
+/** @param {string | null} text */
+const sentence = (text) => (text ? text[0].toUpperCase() + text.slice(1) + (/[.!?]$/.test(text) ? "" : ".") : "");
+
+/** How far to trust it. @param {any} job */
+function trustWords(job) {
+  if (!job.new_gains) return null;
+  const parts = [];
+  if (job.verification) parts.push(html`The model explains <b>${fixed(job.verification.fit_pct, 1)} %</b> of the measured step. `);
+  if (job.evidence) parts.push(html`Ms <b>${ms(job.predicted?.Ms ?? job.evidence.Ms)}</b>${known(job.evidence.uncertainty) ? html`, known to within ${msError(job.evidence.uncertainty)}` : ""}. `);
+  if (job.rehearsed_on) parts.push(html`Computed on ${job.rehearsed_on.plant_text}; the loop was not moved. `);
+  if (job.after && !job.verification) parts.push(html`Measured with the new gains: overshoot <b>${fixed(job.after.overshoot_pct, 0)} %</b>, ${job.after.settled ? `settled in ${duration(job.after.settling_s)}` : "not settled"}. `);
+  return parts.length ? parts : null;
+}
+
+/** What the loop is now. @param {any} job */
+function After(job) {
+  const r = job.restored;
+  if (!r) return html`<p><b>The loop could not be read back: look at the controller.</b></p>`;
+  return html`<p class="quiet">The loop is in ${r.mode}, set-point ${significant(r.sp, 6)}${r.gains ? `, Kp ${significant(r.gains.Kp)}, Ti ${significant(r.gains.Ti)} s` : ""}, read back.</p>`;
+}
+
+/** @param {any} loop @param {any} job */
+function Numbers(loop, job) {
+  const u = unit(loop.pv_unit);
+  /** @type {[string, any][]} */
+  const rows = [];
+  const m = job.model;
+  const list = (/** @type {number[]} */ values, /** @type {number[] | null} */ errors) => values.map((value, n) => withError(value, errors?.[n])).join(", ");
+  if (m?.num) rows.push(["model", m.structure], ["numerator", list(m.num, m.num_errors)], ["denominator", list(m.den, m.den_errors)], ["dead time", withUnit(withError(m.dead_time_s, m.dead_time_error_s), "s")]);
+  else if (m) rows.push(["model", `K ${significant(m.K)} ${u}/%, T ${significant(m.T_s)} s, dead time ${significant(m.L_s)} s${known(m.zeta) ? `, damping ${significant(m.zeta)}` : ""}`]);
+  if (known(m?.fit_pct)) rows.push(["fit", `${fixed(m.fit_pct, 1)} %`]);
+  if (job.ultimate) rows.push(["ultimate point", `Ku ${significant(job.ultimate.Ku)} %/${u}, Pu ${significant(job.ultimate.Pu_s)} s`]);
+  if (job.evidence) rows.push(["excitation", `${job.evidence.switches} switches, period ${significant(job.evidence.period_s)} s`], ["not explained", known(job.evidence.residual) ? `${fixed(job.evidence.residual, 2)} times the noise at rest` : "–"]);
+  for (const [name, value] of Object.entries(job.chosen)) rows.push([name, significant(Number(value))]);
+  if (job.before) rows.push(["step before", `overshoot ${fixed(job.before.overshoot_pct, 0)} %, ${job.before.settled ? `settled in ${duration(job.before.settling_s)}` : "not settled"}`]);
+  if (job.after) rows.push(["step after", `overshoot ${fixed(job.after.overshoot_pct, 0)} %, ${job.after.settled ? `settled in ${duration(job.after.settling_s)}` : "not settled"}`]);
+  if (job.restored && !job.reason) rows.push(["loop afterwards", `${job.restored.mode}, SP ${significant(job.restored.sp, 6)}, read back`]);
+  rows.push(["gateway", job.host]);
+  return html`<div class="card" key="numbers"><h2 class="title">Numbers</h2><dl class="numbers">${rows.map(([name, value]) => html`<div key=${name}><dt>${name}</dt><dd>${value}</dd></div>`)}</dl></div>`;
+}

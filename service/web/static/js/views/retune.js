@@ -1,0 +1,145 @@
+// @ts-check
+/** The form of a retune: what will happen, before it starts. */
+import { useEffect, useRef, useState } from "../../vendor/hooks.js";
+import { ask, askWith, command } from "../api.js";
+import { html } from "../html.js";
+import { duration, entered, fixed, known, ms, pvDecimals, significant, unit, withUnit } from "../numbers.js";
+import { jobPath } from "../router.js";
+import { isSilent, rowOf, sign, signature } from "../state.js";
+
+/** @param {{loop: any, onClose: (() => void) | null, onStarted: (job: any) => void}} props */
+export function RetuneForm({ loop, onClose, onStarted }) {
+  const [wish, setWish] = useState(/** @type {Record<string, any>} */ ({ method: "fast", ms: 1.6 }));
+  const [more, setMore] = useState(false);
+  const [methods, setMethods] = useState(/** @type {any[]} */ ([]));
+  const [preview, setPreview] = useState(/** @type {any} */ (null));
+  const [problem, setProblem] = useState(/** @type {any} */ (null));
+  const [sending, setSending] = useState(false);
+  const first = useRef(/** @type {HTMLElement | null} */ (null));
+  const row = rowOf(loop.tag).value;
+  const { body, bad } = bodyOf(wish);
+  const asked = JSON.stringify(body);
+  const situation = `${row?.mode} ${row?.not_heard ? "silent" : ""} ${loop.locked?.since ?? ""}`;
+
+  useEffect(() => {
+    first.current?.focus({ preventScroll: true });
+    const escape = (/** @type {KeyboardEvent} */ event) => {
+      if (event.key === "Escape") onClose?.();
+    };
+    addEventListener("keydown", escape);
+    return () => removeEventListener("keydown", escape);
+  }, []);
+  useEffect(() => {
+    if (more && !methods.length) void ask("/methods").then(setMethods, () => {});
+  }, [more]);
+  useEffect(() => {
+    if (bad) return;
+    const stop = new AbortController();
+    const timer = setTimeout(async () => {
+      try {
+        setPreview(await askWith(`/loops/${encodeURIComponent(loop.tag)}/retune/preview`, JSON.parse(asked), stop.signal));
+        setProblem(null);
+      } catch (error) {
+        if (!stop.signal.aborted) setProblem(error);
+      }
+    }, 200);
+    return () => {
+      clearTimeout(timer);
+      stop.abort();
+    };
+  }, [asked, bad, situation]);
+
+  const set = (/** @type {string} */ name) => (/** @type {any} */ event) => {
+    const { type, checked, value } = event.target;
+    setWish({ ...wish, [name]: type === "checkbox" ? checked : value });
+  };
+  const start = async () => {
+    setSending(true);
+    setProblem(null);
+    try {
+      onStarted(await command(`/loops/${encodeURIComponent(loop.tag)}/retune`, { ...body, requested_by: signature.value.trim() }));
+    } catch (error) {
+      setProblem(error);
+      setSending(false);
+    }
+  };
+  const designed = wish.method === "fast" || wish.method === "setpoint";
+  const obstacle = preview?.obstacles[0];
+  const unsigned = !signature.value.trim();
+  const why = isSilent.value ? "The service is silent." : bad ? bad : obstacle ? "" : unsigned ? "Who signs?" : "";
+  const u = unit(loop.pv_unit);
+  return html`<section class="card" aria-label="Retune" style=${{ marginTop: "16px" }}>
+    <div class="split" key="top"><h2 class="title">Retune</h2>${onClose && html`<button class="plain" aria-label="Close the form" onClick=${onClose}>✕</button>`}</div>
+    <div class="two" key="two"><div class="explain" aria-live="polite">${preview ? What(preview, loop) : html`<p class="quiet">Asking what would happen…</p>`}</div>
+      <div>${designed && html`<label key="ms" class="field"><span>Robustness asked for <b>Ms ${ms(Number(wish.ms))}</b></span>
+        <input ref=${first} type="range" min="1.2" max="2" step="0.05" value=${wish.ms} onInput=${set("ms")} aria-valuetext=${`Ms ${ms(Number(wish.ms))}`} /></label>
+        <div class="ends" key="ends"><span>1.2 robust</span><span>1.6</span><span>fast 2.0</span></div>`}
+        <button key="more" class="plain" aria-expanded=${String(more)} onClick=${() => setMore(!more)}>${more ? "Fewer options" : "More options"}</button></div></div>
+    ${more && html`<div class="options" key="options">
+      <label class="field"><span>Procedure</span><select class="wide" value=${wish.method} onChange=${set("method")}>
+        <option value="fast">fast: one record</option><option value="setpoint">set-point pulses</option><option value="five-stage">five-stage</option>
+        ${methods.filter((each) => !["fast", "setpoint", "five-stage", "observe"].includes(each.method)).map((each) => html`<option key=${each.method} value=${each.method}>${each.title ?? each.method}</option>`)}</select></label>
+      ${wish.method === "fast" && Field("amplitude_pct", "Relay up by", "%", preview?.first_mv_move_pct, wish, set, problem)}
+      ${Field("mv_low", "MV not below", "%", loop.mv_limits.low, wish, set, problem)}${Field("mv_high", "MV not above", "%", loop.mv_limits.high, wish, set, problem)}
+      ${Field("pv_low", "Abort below", u, loop.pv_limits.low, wish, set, problem)}${Field("pv_high", "Abort above", u, loop.pv_limits.high, wish, set, problem)}
+      ${Field("sp_deviation", "SP step", u, loop.sp_deviation, wish, set, problem)}
+      ${designed && html`<label class="check"><input type="checkbox" checked=${!!wish.derivative} onChange=${set("derivative")} /> derivative, where it pays</label>`}
+      ${wish.method === "fast" && html`<label class="check"><input type="checkbox" checked=${!!wish.careful} onChange=${set("careful")} /> careful: six switches at least</label>`}
+      <label class="check"><input type="checkbox" checked=${!!wish.dry_run} onChange=${set("dry_run")} /> rehearsal: computed in memory, nothing is moved</label>
+    </div>`}
+    ${preview?.obstacles.map((/** @type {any} */ each) => html`<div class="refusal" key=${each.reason}><p>${sentence(each.detail)} <span class="advice">${each.advice}</span> ${each.job && html`<a href=${jobPath(each.job)}>to that job</a>`}</p></div>`)}
+    ${problem && html`<div class="refusal" role="alert" key="problem"><p>${sentence(problem.message)} <span class="advice">${problem.advice}</span> ${problem.job && html`<a href=${jobPath(problem.job)}>to that job</a>`}</p></div>`}
+    <div class="foot" key="foot"><label class="left">Signed <input type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} /></label>
+      <span class="quiet" role="status">${why}</span>
+      <button class="main" disabled=${sending || !!why || !!obstacle} onClick=${start}>${wish.dry_run ? "Rehearse" : "Retune"} ${loop.tag}</button></div>
+  </section>`;
+}
+
+/** @param {string} text */
+const sentence = (text) => (text ? text[0].toUpperCase() + text.slice(1) + (/[.!?]$/.test(text) ? "" : ".") : "");
+
+/** @param {string} name @param {string} label @param {string} u @param {number | null | undefined} usual @param {any} wish @param {any} set @param {any} problem */
+function Field(name, label, u, usual, wish, set, problem) {
+  const wrong = problem?.errors?.find((/** @type {any} */ each) => each.where.endsWith(name)) || Number.isNaN(entered(wish[name] ?? ""));
+  return html`<label class="field" key=${name}><span>${label}</span><span><input type="text" inputmode="decimal" value=${wish[name] ?? ""} placeholder=${known(usual) ? significant(usual) : ""} aria-invalid=${wrong ? "true" : undefined} onInput=${set(name)} /> ${u}</span></label>`;
+}
+
+const NUMBERS = ["mv_low", "mv_high", "pv_low", "pv_high", "sp_deviation"];
+
+/** The body of a request, and what is wrong with the fields. @param {Record<string, any>} wish */
+function bodyOf(wish) {
+  /** @type {Record<string, any>} */
+  const body = { method: wish.method };
+  let bad = "";
+  const names = wish.method === "fast" ? [...NUMBERS, "amplitude_pct"] : NUMBERS;
+  for (const name of names) {
+    const value = entered(String(wish[name] ?? ""));
+    if (Number.isNaN(value)) bad = "A field is not a number.";
+    else if (value !== null) body[name] = value;
+  }
+  if (wish.method === "fast" || wish.method === "setpoint") {
+    body.ms = Number(wish.ms);
+    if (wish.derivative) body.derivative = true;
+  }
+  if (wish.method === "fast" && wish.careful) body.careful = true;
+  if (wish.dry_run) body.dry_run = true;
+  return { body, bad };
+}
+
+/** What will happen, in the loop's own numbers. @param {any} p @param {any} loop */
+function What(p, loop) {
+  if (p.dry_run) return p.summary.map((/** @type {string} */ line) => html`<p key=${line}>${line}</p>`);
+  const decimals = pvDecimals(loop.pv_limits);
+  const stage = (/** @type {string} */ name) => p.stages.find((/** @type {any} */ each) => each.stage === name);
+  const relay = stage("relay");
+  const pulses = stage("pulses");
+  const verify = stage("verify");
+  const step = verify ?? stage("zn_pi");
+  const pv = (/** @type {number} */ value) => withUnit(fixed(value, decimals), loop.pv_unit);
+  return html`<p key="what">The loop is tested around where it is now.
+      ${pulses && html` The set-point is pulsed by <b>${pv(pulses.sp_move)}</b> under the present gains.`}
+      ${relay && p.first_mv_move_pct !== null && p.mv !== null && html` ${pulses ? "Where that tells too little, MV" : "MV"} goes by about <b>${fixed(p.first_mv_move_pct, 0)} %</b> from ${fixed(p.mv, 0)} %, in turn up and down a few times, within <b>${fixed(relay.mv_low_pct, 0)} … ${fixed(relay.mv_high_pct, 0)} %</b>.`}
+      ${step && known(step.sp_move) && step.sp_move > 0 && html` Then the set-point steps by <b>${pv(step.sp_move)}</b>${verify ? " under the new gains" : ""}.`}</p>
+    <p key="ends">It ends by itself if PV leaves <b>${fixed(p.watched.pv.low, Math.min(3, decimals))} … ${pv(p.watched.pv.high)}</b>, if anybody else moves the loop, or when you abort. Then, as at its end, the loop has its mode, set-point and gains back. New gains are a proposal until you accept them.</p>
+    <p key="time" class="quiet">It takes ${duration(p.duration_low_s)} to ${duration(p.duration_high_s)} of plant time, estimated from ${p.duration_basis}.</p>`;
+}

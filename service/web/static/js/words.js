@@ -1,0 +1,115 @@
+// @ts-check
+/** The words for stages, states and reasons. */
+import { fixed, known, significant, unit, withUnit, duration, ms, msError } from "./numbers.js";
+
+/** @type {Record<string, [name: string, what: string]>} */
+const STAGES = {
+  preflight: ["At rest?", "Is the loop at rest, and how large is the noise?"],
+  settle: ["Settling", "The loop comes to rest first"],
+  pulses: ["Pulses", "The set-point is pulsed under the present gains, until what would be proposed is certain"],
+  relay: ["Relay", "MV is switched up and down until what would be proposed is certain"],
+  design: ["Model and gains", "A model is fitted to the record, and gains are designed on it"],
+  verify: ["Step", "The set-point steps under the new gains"],
+  redesign: ["Whole record", "The model is fitted anew to all that was recorded"],
+  baseline: ["Step before", "The set-point steps under the old gains"],
+  ultimate: ["Ultimate gain", "The gain at which the loop oscillates is sought"],
+  zn_pi: ["First PI", "The set-point steps under a first PI"],
+  estimate: ["Model", "A model is found from the step"],
+  optimise: ["Gains", "The gains are computed on the model"],
+};
+/** @param {string | null | undefined} stage */
+export const stageName = (stage) => (stage ? (STAGES[stage]?.[0] ?? stage.replaceAll("_", " ")) : "");
+/** @param {string} stage */
+export const stageWhat = (stage) => STAGES[stage]?.[1] ?? "";
+
+/** The stages that a request leads to, in order. @param {any} job */
+export function stagesOf(job) {
+  const done = job.stages.map((/** @type {any} */ each) => each.stage);
+  const { method, request } = job;
+  /** @type {string[]} */
+  let expected;
+  if (method === "fast" && request.start === "design") expected = ["preflight", "design", "verify"];
+  else if (method === "setpoint") expected = ["preflight", "pulses", "design", "verify", "redesign"];
+  else if (method === "fast") expected = ["preflight", done.includes("pulses") && !done.includes("relay") ? "pulses" : "relay", "design", "verify", "redesign"];
+  else expected = ["preflight", ...(request.baseline === false ? [] : ["baseline"]), "relay", "ultimate", "zn_pi", "estimate", "optimise", "verify"];
+  if (request.verify === false) expected = expected.filter((each) => each !== "verify" && each !== "redesign");
+  const seen = [...new Set(done)];
+  const last = Math.max(-1, ...seen.map((each) => expected.indexOf(each)));
+  return [...seen, ...expected.slice(last + 1).filter((each) => !seen.includes(each))];
+}
+
+/** What a stage found, in a few words. @param {any} stage @param {string} pv */
+export function stageFound(stage, pv) {
+  const r = stage.result ?? {};
+  const lines = [];
+  if (known(r.noise) && stage.stage === "preflight") lines.push(`noise ${withUnit(significant(r.noise, 2), pv)}`);
+  if (known(r.switches) && stage.stage === "relay") lines.push(`${r.switches} switches`, `period ${withUnit(significant(r.period_s, 3), "s")}`);
+  if (known(r.amplitude) && stage.stage === "relay") lines.push(`MV ±${fixed(r.amplitude, 0)} %`);
+  if (known(r.Ku)) lines.push(`Ku ${significant(r.Ku)} %/${unit(pv)}`);
+  if (known(r.Pu_s)) lines.push(`Pu ${withUnit(significant(r.Pu_s), "s")}`);
+  const gains = r.gains ?? (stage.stage === "verify" ? {} : r);
+  if (known(r.Ms) && stage.stage !== "verify") lines.push(`Ms ${ms(r.Ms)}${known(r.uncertainty) ? ` ± ${msError(r.uncertainty)}` : ""}`);
+  if (known(gains.Kp)) lines.push(`Kp ${significant(gains.Kp)}, Ti ${withUnit(significant(gains.Ti ?? gains.Ti_s), "s")}`);
+  if (known(r.fit_pct)) lines.push(`${fixed(r.fit_pct, 1)} % explained`);
+  if (known(r.overshoot_pct)) lines.push(`overshoot ${fixed(r.overshoot_pct, 0)} %`);
+  if (known(r.settling_s)) lines.push(`settled in ${duration(r.settling_s)}`);
+  return lines.slice(0, 4);
+}
+
+/** @type {Record<string, string>} */
+const REASONS = {
+  operator: "stopped by an operator",
+  service_stopped: "the service was stopped",
+  sp_changed: "set-point changed",
+  setpoint_changed: "set-point changed",
+  setpoint_is_driven: "set-point is driven by another controller",
+  pv_limit: "PV left its limits",
+  mv_limit: "MV at its limit",
+  node_lost: "node lost",
+  bus_lost: "bus lost",
+  internal: "an error inside the service",
+};
+/** @param {string | null | undefined} reason */
+export const reasonWords = (reason) => (reason ? (REASONS[reason] ?? reason.replaceAll("_", " ")) : "");
+
+/** The headline of a job. @param {any} job */
+export function headline(job) {
+  const why = reasonWords(job.reason);
+  switch (job.state) {
+    case "queued": return "Waits for its turn";
+    case "running": return job.stopping ? "Stopping, the loop is being restored" : "Under test";
+    case "proposed": return job.superseded_by ? "Proposed, not decided, a later test came" : "New gains are proposed";
+    case "accepted": return "Accepted";
+    case "rolled_back": return job.decided?.what === "rollback" && job.stages.length && job.was_accepted ? "Rolled back" : "Old gains kept";
+    case "no_gain": return "The loop is tuned as well as asked already";
+    case "rehearsed": return "Rehearsed: gains found without a test of the loop";
+    case "refused": return `No result to trust: ${why}`;
+    case "aborted": return `Stopped: ${why}`;
+    case "failed": return `Failed: ${why}`;
+    case "interrupted": return `Interrupted: ${why || "the service ended in the middle"}`;
+    default: return String(job.state).replaceAll("_", " ");
+  }
+}
+
+/** A state in a table. @param {any} job */
+export function stateWords(job) {
+  switch (job.state) {
+    case "proposed": return job.superseded_by ? "not decided, a later test came" : "decision waits";
+    case "rolled_back": return "old gains kept";
+    case "no_gain": return "tuned already";
+    case "refused": return `refused: ${reasonWords(job.reason)}`;
+    case "aborted": return `stopped: ${reasonWords(job.reason)}`;
+    case "failed": return `failed: ${reasonWords(job.reason)}`;
+    case "queued": return "waits for its turn";
+    case "running": return "under test";
+    default: return String(job.state).replaceAll("_", " ");
+  }
+}
+
+/** @type {Record<string, string>} */
+const MODES = { automatic: "AUTO", manual: "MAN", off: "OFF", experiment: "TEST" };
+/** @param {string | null | undefined} mode */
+export const modeWord = (mode) => (mode ? (MODES[mode] ?? mode.toUpperCase()) : "–");
+
+/** @param {string} method */
+export const methodName = (method) => method.replaceAll("-", " ");

@@ -1,0 +1,103 @@
+"""The files of the operators' page, as a browser gets them."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator
+
+import pytest
+from fastapi.testclient import TestClient
+
+from loopwright.service.api.app import create_app
+from loopwright.service.api.gate.gate import Policy
+from loopwright.service.security.keys import Scope
+from loopwright.service.store.keyring import Keyring
+from loopwright.service.web.pages import FILES
+from tests.unit.service.fakes import TAG, Service
+
+VENDOR = FILES / "vendor"
+OURS = sorted(path for path in FILES.rglob("*") if path.is_file() and VENDOR not in path.parents)
+
+
+@pytest.fixture
+def client(service: Service) -> Iterator[TestClient]:
+    with TestClient(create_app(service.jobs)) as client:
+        yield client
+
+
+@pytest.mark.parametrize("path", ["/", "/ui", "/ui/", f"/ui/loops/{TAG}", "/ui/jobs/4f0c2a9be113", "/ui/index.html"])
+def test_every_place_is_answered_with_the_page(client: TestClient, path: str) -> None:
+    answer = client.get(path)
+    assert answer.status_code == 200 and answer.headers["content-type"].startswith("text/html")
+    assert answer.text == (FILES / "index.html").read_text()
+
+
+def test_the_policy_lets_nothing_in_from_elsewhere(client: TestClient) -> None:
+    for path in ("/ui/", "/ui/js/main.js", "/ui/app.css"):
+        policy = client.get(path).headers["content-security-policy"].split("; ")
+        assert {"default-src 'none'", "script-src 'self'", "style-src 'self'", "connect-src 'self'"} <= set(policy)
+        assert {"frame-ancestors 'none'", "base-uri 'none'", "trusted-types 'none'"} <= set(policy)
+        assert not re.search(r"unsafe|https?:|\*", " ".join(policy))
+        assert client.get(path).headers["x-content-type-options"] == "nosniff"
+
+
+def test_a_file_that_did_not_change_is_not_sent_again(client: TestClient) -> None:
+    first = client.get("/ui/js/main.js")
+    assert first.headers["content-type"].partition(";")[0] in ("text/javascript", "application/javascript")
+    assert first.headers["cache-control"] == "no-cache"
+    again = client.get("/ui/js/main.js", headers={"If-None-Match": first.headers["etag"]})
+    assert again.status_code == 304 and not again.content
+    assert again.headers["content-security-policy"] == first.headers["content-security-policy"]
+
+
+@pytest.mark.parametrize(
+    "path", ["/ui/js/none.js", "/ui/../pages.py", "/ui/%2e%2e/pages.py", "/ui/..%2fpages.py", "/ui/js/../../pages.py"]
+)
+def test_only_files_of_the_page_are_sent(client: TestClient, path: str) -> None:
+    answer = client.get(path)
+    assert answer.status_code == 404 and "StaticFiles" not in answer.text
+
+
+def test_where_keys_are_asked_for_there_is_no_page_yet(service: Service) -> None:
+    keyring = Keyring(service.store.engine)
+    _, key = keyring.create("a", Scope.READ)
+    with TestClient(create_app(service.jobs, Policy(keyring))) as client:
+        assert client.get("/ui/").status_code == 401
+        assert client.get("/ui/", headers={"Authorization": f"Bearer {key}"}).status_code == 404
+
+
+def test_the_page_learns_who_is_asking(service: Service, client: TestClient) -> None:
+    found = client.get("/session").json()
+    assert (found["name"], found["scope"], found["keys"], found["host"]) == ("local", "admin", False, "local")
+    keyring = Keyring(service.store.engine)
+    _, key = keyring.create("control room", Scope.OPERATE)
+    with TestClient(create_app(service.jobs, Policy(keyring))) as keyed:
+        assert keyed.get("/session").status_code == 401
+        found = keyed.get("/session", headers={"Authorization": f"Bearer {key}"}).json()
+        assert (found["name"], found["scope"], found["keys"]) == ("control room", "operate", True)
+
+
+def test_the_libraries_are_those_of_the_list() -> None:
+    listed = dict(line.split()[:1] + line.split()[-1:] for line in (VENDOR / "VERSIONS").read_text().splitlines())
+    files = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in VENDOR.iterdir()}
+    licences = files.pop("LICENSES"), files.pop("VERSIONS")
+    assert all(licences) and files == listed
+    text = (VENDOR / "LICENSES").read_text()
+    for line in (VENDOR / "VERSIONS").read_text().splitlines():
+        assert f"{line.split()[1]} {line.split()[2]}" in text
+
+
+@pytest.mark.parametrize("path", OURS, ids=lambda path: path.name)
+def test_our_files_ask_for_nothing_from_elsewhere(path: str) -> None:
+    text = (FILES / path).read_text()
+    assert not re.search(r"(?:https?:)?//[a-z0-9-]+\.[a-z]{2,}", text.replace("http://www.w3.org/2000/svg", ""))
+    assert "innerHTML" not in text and "eval(" not in text
+
+
+@pytest.mark.parametrize("path", [path for path in OURS if path.suffix == ".js"], ids=lambda path: path.name)
+def test_every_module_that_is_imported_exists(path: str) -> None:
+    module = FILES / path
+    for name in re.findall(r"""(?:from|import)\s+["']([^"']+)["']""", module.read_text()):
+        assert name.startswith("."), f"a browser does not resolve the bare name {name}"
+        assert (module.parent / name).resolve().is_file(), name
