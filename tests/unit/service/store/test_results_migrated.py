@@ -41,6 +41,12 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     store.close()
 
 
+def with_later_fields(golden: dict[str, Any]) -> dict[str, Any]:
+    """The golden job with what is shown of it since: nobody has decided, and a live test knows how fast it sampled."""
+    sample_time_s = None if golden["dry_run"] else 0.1
+    return golden | {"decided": None, "superseded_by": None, "stopping": None, "sample_time_s": sample_time_s}
+
+
 def shown(store: Store, job_id: str) -> dict[str, Any]:
     return job_view(store.get(job_id), store.events(job_id), None).model_dump(mode="json")
 
@@ -48,7 +54,7 @@ def shown(store: Store, job_id: str) -> dict[str, Any]:
 @pytest.mark.parametrize("name", GOLDEN["jobs"])
 def test_every_figure_is_shown_as_before(store: Store, name: str) -> None:
     golden = GOLDEN["jobs"][name]
-    assert shown(store, golden["id"]) == golden
+    assert shown(store, golden["id"]) == with_later_fields(golden)
 
 
 def test_the_old_database_has_what_the_migration_is_about() -> None:
@@ -103,7 +109,7 @@ def test_the_same_on_a_postgresql_server(store: Store, postgres: Server, tmp_pat
         migrate(to, "head")
     try:
         for golden in GOLDEN["jobs"].values():
-            assert shown(new, golden["id"]) == golden
+            assert shown(new, golden["id"]) == with_later_fields(golden)
     finally:
         new.close()
 
