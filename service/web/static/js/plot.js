@@ -79,7 +79,7 @@ export function makePlot(where, wish) {
             const distance = tickDistance(high - low, Math.max(2, Math.floor(u.bbox.width / devicePixelRatio / 110)));
             return ticks(low - zero, high - zero, distance).map((value) => value + zero);
           },
-          values: (u, splits) => {
+          values: (_u, splits) => {
             if (!wish.withTime) return splits.map(() => "");
             const zero = wish.zero?.() ?? null;
             const distance = splits.length > 1 ? splits[1] - splits[0] : 1;

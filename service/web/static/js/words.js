@@ -58,9 +58,8 @@ export function stageFound(stage, pv) {
 
 /** @type {Record<string, string>} */
 const REASONS = {
-  operator: "stopped by an operator",
-  service_stopped: "the service was stopped",
-  sp_changed: "set-point changed",
+  operator: "by an operator",
+  service_stopped: "the service ended",
   setpoint_changed: "set-point changed",
   setpoint_is_driven: "set-point is driven by another controller",
   pv_limit: "PV left its limits",

@@ -166,6 +166,7 @@ export function Trend({ loop, job, height, onJob }) {
           if (it.stagesOf !== event.job || event.kind === "resumed") it.stages = [];
           it.stagesOf = event.job;
           if (event.kind !== "resumed" && !it.stages.some((/** @type {any} */ each) => each.at_s === at_s)) it.stages = [...it.stages, { at_s, stage: event.data.stage }];
+          if (it.stages.length === 1) it.began_s = it.stages[0].at_s;
           it.dirty = true;
         }
         onJob(event);
