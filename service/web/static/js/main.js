@@ -64,7 +64,7 @@ addEventListener("keydown", (event) => {
   after = event.key;
 });
 
-async function begin() {
+function begin() {
   beginPalette();
   beginRouting();
   beginWatching();
@@ -79,4 +79,4 @@ async function begin() {
   });
 }
 
-void begin();
+begin();

@@ -66,7 +66,7 @@ export function makePlot(where, wish) {
       height: wish.height,
       pxAlign: true,
       legend: { show: false },
-      padding: [4, RIGHT, 0, 0],
+      padding: [8, RIGHT, wish.withTime ? 0 : 8, 0],
       cursor: { sync: wish.sync ? { key: wish.sync, setSeries: false, scales: ["x", null] } : undefined, points: { show: false }, y: false, drag: { x: true, y: false, setScale: false } },
       scales: { x: { time: false, auto: false, range: (_u, low, high) => [low, high] }, y: { auto: false, range: (_u, low, high) => [low, high] } },
       axes: [
@@ -79,7 +79,7 @@ export function makePlot(where, wish) {
             const distance = tickDistance(high - low, Math.max(2, Math.floor(u.bbox.width / devicePixelRatio / 110)));
             return ticks(low - zero, high - zero, distance).map((value) => value + zero);
           },
-          values: (u, splits) => {
+          values: (_u, splits) => {
             if (!wish.withTime) return splits.map(() => "");
             const zero = wish.zero?.() ?? null;
             const distance = splits.length > 1 ? splits[1] - splits[0] : 1;
@@ -90,7 +90,7 @@ export function makePlot(where, wish) {
           ...axis,
           size: LEFT,
           gap: 6,
-          splits: (u, _n, low, high) => ticks(low, high, tickDistance(high - low, Math.max(2, Math.floor(u.bbox.height / devicePixelRatio / 34)))),
+          splits: (u, _n, low, high) => ticks(low, high, tickDistance(high - low, Math.max(3, Math.round(u.bbox.height / devicePixelRatio / 30)))),
           values: (_u, splits) => splits.map((value) => tick(value, splits.length > 1 ? splits[1] - splits[0] : Math.abs(value) || 1)),
         },
       ],

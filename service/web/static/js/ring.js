@@ -7,15 +7,16 @@ export class Ring {
   /** @param {number} room */
   constructor(room = ROOM) {
     this.room = room;
-    this.clear();
+    // Twice the room: the newest are always in one piece.
+    this.at = new Float64Array(2 * room);
+    this.pv = new Float64Array(2 * room);
+    this.sp = new Float64Array(2 * room);
+    this.mv = new Float64Array(2 * room);
+    this.begin = 0;
+    this.end = 0;
   }
 
   clear() {
-    /** Twice the room: the newest are always in one piece. */
-    this.at = new Float64Array(2 * this.room);
-    this.pv = new Float64Array(2 * this.room);
-    this.sp = new Float64Array(2 * this.room);
-    this.mv = new Float64Array(2 * this.room);
     this.begin = 0;
     this.end = 0;
   }

@@ -86,11 +86,11 @@ class Stream {
     source.addEventListener("error", () => {
       if (source !== this.source) return;
       source.close(); // it would give up for good after an HTTP error, and never say which
-      void this.later();
+      this.later();
     });
   }
 
-  async later() {
+  later() {
     this.tries++;
     const wait_s = Math.min(LONGEST_WAIT_S, 0.5 * 2 ** (this.tries - 1)) * (0.8 + 0.4 * Math.random());
     clearTimeout(this.retry);

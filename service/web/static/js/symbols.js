@@ -11,9 +11,9 @@ export function AlarmSymbol(level) {
 }
 
 export function TestSign() {
-  return html`<svg class="symbol" viewBox="0 0 20 20" role="img" aria-label="Under test"><circle cx="10" cy="10" r="7" class="sign" /><path d="M10 3a7 7 0 0 0 0 14z" class="sign-fill" /></svg>`;
+  return html`<svg class="symbol" viewBox="0 0 20 20" role="img" aria-label="Under test"><circle cx="10" cy="10" r="7" class="s-sign" /><path d="M10 3a7 7 0 0 0 0 14z" class="sign-fill" /></svg>`;
 }
 
 export function DecisionSign() {
-  return html`<svg class="symbol" viewBox="0 0 20 20" role="img" aria-label="A decision waits"><path d="M10 2 18 10 10 18 2 10Z" class="sign" /><path d="M10 7 13 10 10 13 7 10Z" class="sign-fill" /></svg>`;
+  return html`<svg class="symbol" viewBox="0 0 20 20" role="img" aria-label="A decision waits"><path d="M10 2 18 10 10 18 2 10Z" class="s-sign" /><path d="M10 7 13 10 10 13 7 10Z" class="sign-fill" /></svg>`;
 }

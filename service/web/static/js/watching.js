@@ -4,8 +4,7 @@ import { effect, signal } from "../vendor/signals-core.js";
 import { abnormal } from "./alarms.js";
 import { alarms, beat, buses, isSilent, loops, now_s, rowOf } from "./state.js";
 
-/** @type {{value: import("./alarms.js").Alarm[]}} */
-export const abnormalNow = signal([]);
+export const abnormalNow = signal(/** @type {import("./alarms.js").Alarm[]} */ ([]));
 
 export function beginWatching() {
   effect(() => {

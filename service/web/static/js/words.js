@@ -58,9 +58,8 @@ export function stageFound(stage, pv) {
 
 /** @type {Record<string, string>} */
 const REASONS = {
-  operator: "stopped by an operator",
-  service_stopped: "the service was stopped",
-  sp_changed: "set-point changed",
+  operator: "by an operator",
+  service_stopped: "the service ended",
   setpoint_changed: "set-point changed",
   setpoint_is_driven: "set-point is driven by another controller",
   pv_limit: "PV left its limits",
@@ -80,7 +79,7 @@ export function headline(job) {
     case "running": return job.stopping ? "Stopping, the loop is being restored" : "Under test";
     case "proposed": return job.superseded_by ? "Proposed, not decided, a later test came" : "New gains are proposed";
     case "accepted": return "Accepted";
-    case "rolled_back": return job.decided?.what === "rollback" && job.stages.length && job.was_accepted ? "Rolled back" : "Old gains kept";
+    case "rolled_back": return "The old gains are in effect";
     case "no_gain": return "The loop is tuned as well as asked already";
     case "rehearsed": return "Rehearsed: gains found without a test of the loop";
     case "refused": return `No result to trust: ${why}`;
@@ -95,7 +94,7 @@ export function headline(job) {
 export function stateWords(job) {
   switch (job.state) {
     case "proposed": return job.superseded_by ? "not decided, a later test came" : "decision waits";
-    case "rolled_back": return "old gains kept";
+    case "rolled_back": return "old gains in effect";
     case "no_gain": return "tuned already";
     case "refused": return `refused: ${reasonWords(job.reason)}`;
     case "aborted": return `stopped: ${reasonWords(job.reason)}`;

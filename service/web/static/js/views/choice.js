@@ -102,7 +102,7 @@ function Table(loop, job, gains, before, after, atTested, size) {
   ];
   return html`<table class="figures" key="table"><caption class="hidden-words">Before and after, for a set-point step of ${size} ${u}</caption>
     <thead><tr><th></th><th class="num">before</th><th class="num">${atTested ? "proposed" : "chosen"}</th><th></th></tr></thead>
-    <tbody>${rows.map(([name, key, x, y, text]) => html`<tr key=${key}><td>${name}</td><td class="num">${key === "ti" && x === 0 ? "off" : text(x)}</td><td class="num after">${text(y)}</td><td class="num quiet">${change(x, y)}</td></tr>`)}</tbody></table>
+    <tbody>${rows.map(([name, key, x, y, text]) => html`<tr key=${key}><td>${name}</td><td class="num">${key === "ti" && x === 0 ? "off" : text(x)}</td><td class="num after">${text(y)}</td><td class="num quiet">${key === "os" ? "" : change(x, y)}</td></tr>`)}</tbody></table>
     ${!stable && html`<p class="note" key="unstable">With the gains before, the loop is not stable on this model.</p>`}`;
 }
 

@@ -18,6 +18,8 @@ import { Trend } from "./trend.js";
 import { UnderTest } from "./undertest.js";
 
 const REREAD_MS = 60_000;
+/** Chosen once: a test with its stages is seen whole, and a trend that was made anew would be empty for a while. */
+const TREND_PX = Math.max(240, Math.min(400, innerHeight - 560));
 
 /** @param {{tag: string}} props */
 export function LoopView({ tag }) {
@@ -78,7 +80,7 @@ export function LoopView({ tag }) {
   };
   const formOpen = !job && (open ?? (!result && may.operate.value));
   const mine = abnormalNow.value.filter((each) => each.loop === tag);
-  const height = Math.max(240, Math.min(430, innerHeight - (result && !job ? 520 : 460)));
+  const height = TREND_PX;
   return html`<div>
     <div class="looptitle" key="title"><h1 class="tag">${tag}</h1><span class="what">${loop.description}</span>
       <span class="where">${[loop.area, loop.bus, `node ${loop.controller_node.toString(16)}h`, `channel ${loop.channel}`, loop.host === "local" ? null : `by way of ${loop.host}`].filter(Boolean).join(" · ")}</span>

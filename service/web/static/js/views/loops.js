@@ -143,7 +143,7 @@ function Tuning(loop, job) {
   if (loop.gains_differ) return html`<span class="tuning">gains differ from the accepted</span>`;
   if (last.state === "proposed") return html`<span class="tuning"><b>decision waits</b> ${at}</span>`;
   if (last.state === "accepted") return html`<span class="tuning">${known(loop.accepted?.ms) ? `Ms ${ms(loop.accepted.ms)}` : "accepted"} ${at}</span>`;
-  if (last.state === "rolled_back") return html`<span class="tuning">old gains kept ${at}</span>`;
+  if (last.state === "rolled_back") return html`<span class="tuning">old gains in effect ${at}</span>`;
   if (last.state === "no_gain") return html`<span class="tuning">tuned already ${at}</span>`;
   const word = last.state === "aborted" ? "stopped" : last.state;
   return html`<span class="tuning">${word}${last.reason ? `: ${reasonWords(last.reason)}` : ""} ${at}</span>`;

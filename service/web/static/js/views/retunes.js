@@ -1,1 +1,126 @@
-export function RetunesView() { return null; }
+// @ts-check
+/** Retunes of many loops: the list, one retune with its loops, the form. */
+import { useEffect, useState } from "../../vendor/hooks.js";
+import { ask, askPage, askWith, command } from "../api.js";
+import { html } from "../html.js";
+import { entered, ms, when } from "../numbers.js";
+import { go, jobPath, loopPath } from "../router.js";
+import { isSilent, jobs, may, sign, signature } from "../state.js";
+import { reasonWords, stageName } from "../words.js";
+
+/** @param {{id: string}} props */
+export function RetunesView({ id }) {
+  return id ? html`<${One} key=${id} id=${id} />` : html`<${All} key="all" />`;
+}
+
+/** @param {Record<string, number>} counts */
+const countWords = (counts) => Object.entries(counts).filter(([, n]) => n).map(([state, n]) => `${n} ${state.replaceAll("_", " ")}`).join(" · ");
+
+function All() {
+  const [rows, setRows] = useState(/** @type {any[] | null} */ (null));
+  const [next, setNext] = useState(/** @type {string | null} */ (null));
+  const [problem, setProblem] = useState("");
+  useEffect(() => {
+    document.title = "Retunes · Loopwright";
+    askPage("/retunes?limit=50").then((found) => {
+      setRows(found.entries);
+      setNext(found.next);
+    }, (error) => setProblem(error.message));
+  }, []);
+  return html`<div><div class="pagehead" key="head"><h1>Retunes of many loops</h1></div>
+    ${may.operate.value && html`<${Form} key="form" />`}
+    ${problem && html`<p class="refusal" role="alert" key="problem">${problem}</p>`}
+    ${rows && (rows.length ? html`<div class="table" key="table" style=${{ marginTop: "16px" }}><table><thead><tr><th>Date</th><th>Asked by</th><th>State</th><th>Loops</th></tr></thead><tbody>
+      ${rows.map((each) => html`<tr class="row" key=${each.id} onClick=${() => go(`/ui${each.url}`)}><td><a href=${`/ui${each.url}`}>${when(each.created_at)}</a></td><td>${each.requested_by}</td><td>${each.state}</td><td>${countWords(each.counts)}</td></tr>`)}</tbody></table></div>` : html`<p class="calm" key="none">No retune of many loops was asked for yet.</p>`)}
+    ${next && html`<p class="foot" key="more"><button onClick=${async () => { const found = await askPage(next); setRows([...(rows ?? []), ...found.entries]); setNext(found.next); }}>More</button></p>`}</div>`;
+}
+
+function Form() {
+  const [pattern, setPattern] = useState("");
+  const [asked, setAsked] = useState("1.6");
+  const [perBus, setPerBus] = useState("");
+  const [perArea, setPerArea] = useState("");
+  const [failures, setFailures] = useState("3");
+  const [preview, setPreview] = useState(/** @type {any} */ (null));
+  const [problem, setProblem] = useState(/** @type {any} */ (null));
+  const [sending, setSending] = useState(false);
+  /** @type {Record<string, any>} */
+  const body = { method: "fast", ms: Number(asked), pattern: pattern.trim() || null };
+  for (const [name, text] of [["at_once_per_bus", perBus], ["at_once_per_area", perArea], ["stop_after_failures", failures]]) {
+    const value = entered(text);
+    if (value !== null && Number.isInteger(value)) body[name] = value;
+  }
+  const text = JSON.stringify(body);
+  useEffect(() => {
+    if (!pattern.trim()) {
+      setPreview(null);
+      return;
+    }
+    const stop = new AbortController();
+    const timer = setTimeout(() => askWith("/retunes/preview", JSON.parse(text), stop.signal).then((found) => { setPreview(found); setProblem(null); }, (error) => { if (!stop.signal.aborted) { setPreview(null); setProblem(error); } }), 300);
+    return () => {
+      clearTimeout(timer);
+      stop.abort();
+    };
+  }, [text]);
+  const start = async () => {
+    setSending(true);
+    try {
+      const found = await command("/retunes", { ...body, requested_by: signature.value.trim() });
+      go(`/ui${found.url}`);
+    } catch (error) {
+      setProblem(error);
+      setSending(false);
+    }
+  };
+  const on = (/** @type {(v: string) => void} */ set) => (/** @type {any} */ e) => set(e.target.value);
+  return html`<section class="card" aria-label="Retune many loops"><h2 class="title" key="t">Retune many</h2>
+    <div class="options" key="fields" style=${{ borderTop: 0, marginTop: 0 }}>
+      <label class="field"><span>Loops, as TIC-*</span><input type="text" class="wide" value=${pattern} onInput=${on(setPattern)} /></label>
+      <label class="field"><span>Ms asked for: <b>${ms(Number(asked))}</b></span><input type="range" min="1.2" max="2" step="0.05" value=${asked} onInput=${on(setAsked)} /></label>
+      <label class="field"><span>at once per bus</span><input type="text" inputmode="numeric" value=${perBus} onInput=${on(setPerBus)} /></label>
+      <label class="field"><span>at once per area</span><input type="text" inputmode="numeric" value=${perArea} onInput=${on(setPerArea)} /></label>
+      <label class="field"><span>stop after failures</span><input type="text" inputmode="numeric" value=${failures} onInput=${on(setFailures)} /></label></div>
+    ${preview?.summary.map((/** @type {string} */ line) => html`<p key=${line}>${line}</p>`)}
+    ${preview?.loops.filter((/** @type {any} */ each) => !each.would_start).map((/** @type {any} */ each) => html`<p class="note" key=${each.loop}><b>${each.loop}</b> ${each.obstacles[0]?.detail}. ${each.obstacles[0]?.advice}</p>`)}
+    ${problem && html`<p class="refusal" role="alert" key="problem">${problem.message} <span class="advice">${problem.advice}</span></p>`}
+    <div class="foot" key="foot"><label class="left">Signed <input type="text" maxlength="100" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} /></label>
+      <button class="main" disabled=${sending || isSilent.value || !preview?.would_start || !signature.value.trim()} onClick=${start}>${preview ? `Retune ${preview.would_start} loops` : "Retune"}</button></div></section>`;
+}
+
+/** @param {{id: string}} props */
+function One({ id }) {
+  const [found, setFound] = useState(/** @type {any} */ (null));
+  const [asking, setAsking] = useState(false);
+  const [problem, setProblem] = useState("");
+  const mark = jobs.value.map((each) => `${each.id}${each.state}${each.stage}`).join();
+  useEffect(() => {
+    document.title = `Retune ${id} · Loopwright`;
+    const stop = new AbortController();
+    const look = () => ask(`/retunes/${encodeURIComponent(id)}`, stop.signal).then(setFound, (error) => { if (!stop.signal.aborted) setProblem(error.message); });
+    void look();
+    const timer = setInterval(look, 5000);
+    return () => {
+      stop.abort();
+      clearInterval(timer);
+    };
+  }, [id, mark]);
+  if (!found) return html`<p class="calm" role="status">${problem || "Asking for the retune…"}</p>`;
+  const going = found.state === "running" || found.state === "stopping";
+  const abort = async () => {
+    setAsking(false);
+    try {
+      setFound(await command(`${found.url}/abort`, { by: signature.value || "operators' page" }));
+    } catch (error) {
+      setProblem(/** @type {Error} */ (error).message);
+    }
+  };
+  return html`<div><div class="pagehead" key="head"><h1>Retune of ${found.loops.length} loops</h1><span class="quiet">${when(found.created_at)} · ${found.requested_by} · ${found.state}</span><span class="sentence">${countWords(found.counts)}</span></div>
+    ${found.detail && html`<p class="refusal" key="detail">${found.detail}</p>`}${problem && html`<p class="refusal" role="alert" key="problem">${problem}</p>`}
+    ${going && may.operate.value && html`<p class="foot" key="abort">${asking ? html`<span key="q">This ends the retune of all ${found.loops.length} loops.</span><button key="no" onClick=${() => setAsking(false)}>Go on</button><button key="yes" class="abort" onClick=${abort}>Abort all ${found.loops.length}</button>` : html`<button key="ask" class="abort" onClick=${() => setAsking(true)}>Abort all ${found.loops.length}…</button>`}</p>`}
+    <div class="table" key="table"><table><thead><tr><th>Loop</th><th>State</th><th>Result</th><th></th></tr></thead><tbody>
+      ${found.loops.map((/** @type {any} */ each) => {
+        const live = jobs.value.find((job) => job.url === each.job);
+        return html`<tr key=${each.loop}><td><a class="tag" href=${loopPath(each.loop)}>${each.loop}</a></td><td>${each.state.replaceAll("_", " ")}${live ? `, ${stageName(live.stage)}` : ""}</td><td>${reasonWords(each.reason)} <span class="quiet">${each.detail}</span></td><td>${each.job && html`<a href=${jobPath(each.job)}>job</a>`}</td></tr>`;
+      })}</tbody></table></div></div>`;
+}

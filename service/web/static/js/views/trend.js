@@ -14,6 +14,8 @@ import { stageName } from "../words.js";
 
 const WINDOWS = /** @type {const} */ ([["30 s", 30], ["2 min", 120], ["10 min", 600], ["30 min", 1800]]);
 const LONGEST_S = 1800;
+/** Between what the service keeps and the first live sample: longer is a gap. */
+const GAP_S = 3;
 /** Not more than ten drawings a second: a process is not smoother at sixty. */
 const DRAW_MS = 100;
 
@@ -138,7 +140,10 @@ export function Trend({ loop, job, height, onJob }) {
       const begin = waiting[0]?.at_s[0] ?? Infinity;
       it.ring.clear();
       if (past) takeHistory(it.ring, past, begin);
-      for (const each of waiting) it.ring.take(each);
+      for (const each of waiting) {
+        if (each.at_s.length && each.at_s[0] - it.ring.last > GAP_S) it.ring.gap();
+        it.ring.take(each);
+      }
       waiting = [];
       it.dirty = true;
     };
@@ -161,6 +166,7 @@ export function Trend({ loop, job, height, onJob }) {
           if (it.stagesOf !== event.job || event.kind === "resumed") it.stages = [];
           it.stagesOf = event.job;
           if (event.kind !== "resumed" && !it.stages.some((/** @type {any} */ each) => each.at_s === at_s)) it.stages = [...it.stages, { at_s, stage: event.data.stage }];
+          if (it.stages.length === 1) it.began_s = it.stages[0].at_s;
           it.dirty = true;
         }
         onJob(event);

@@ -16,7 +16,7 @@ export function UnderTest({ loop, live, job }) {
       <span>${stopping ? "stopping, the loop is being restored" : live.remaining_plant_time_s !== null && !isSilent.value ? html`about <b>${duration(live.remaining_plant_time_s)}</b> left <span class="quiet">of plant time, ${duration(live.plant_time_s)} so far</span>` : ""}
         ${foreign && html`<span class="quiet">by way of ${live.host}, stages only</span>`}</span></div>
     ${Progress(live.progress, stopping)}
-    ${job ? Stages(job, loop.pv_unit, live.stage) : html`<p class="quiet" key="asking">Asking for the stages…</p>`}
+    ${job ? Stages(job, loop.pv_unit, live.stage ?? "") : html`<p class="quiet" key="asking">Asking for the stages…</p>`}
     ${job?.attempts > 1 && html`<p class="note" key="resumed">Resumed after a restart of the service: the stages begin anew.</p>`}
     ${job?.notes.map((/** @type {string} */ note) => html`<p class="note" key=${note}>${note}</p>`)}
     <p class="quiet" key="who">Asked for by ${live.requested_by}.</p>
@@ -28,8 +28,8 @@ export function Stages(job, pv, now = null) {
   const found = new Map(job.stages.map((/** @type {any} */ each) => [each.stage, each]));
   return html`<ol class="stages" key="stages" aria-live="polite">${stagesOf(job).map((name) => {
     const stage = found.get(name);
-    const running = stage ? stage.state === "running" : name === now;
-    const done = stage && stage.state !== "running";
+    const running = now !== null && name === now; // a stage that another has followed is done, whether it said so or not
+    const done = stage && !running;
     return html`<li key=${name} class=${done ? "done" : running ? "now" : ""} aria-current=${running ? "step" : undefined}>
       <b>${done ? (stage.state === "ended" ? "✕ " : "✓ ") : ""}${stageName(name)}</b>
       ${running ? html`<small>${stageWhat(name)}</small>` : done ? stageFound(stage, pv).map((line) => html`<small key=${line}>${line}</small>`) : null}</li>`;
