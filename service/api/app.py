@@ -10,7 +10,20 @@ from typing import Annotated, Literal
 from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from loopwright.service.api import fleet, history, locks, observation, openapi, operations, previews, problems, tunings
+from loopwright.service.api import (
+    decisions,
+    fleet,
+    history,
+    locks,
+    observation,
+    openapi,
+    operations,
+    previews,
+    problems,
+    sparklines,
+    tunings,
+)
+from loopwright.service.api import live as live_api
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.events import event_stream, still_permitted
 from loopwright.service.api.gate.access_log import Access
@@ -20,6 +33,7 @@ from loopwright.service.api.job_views import (
     Decision,
     DismissedView,
     JobView,
+    LiveErrorView,
     LoopDetail,
     NotHomeView,
     SamplesView,
@@ -35,10 +49,12 @@ from loopwright.service.job_states import ACTIVE
 from loopwright.service.jobs.fleet import Fleet
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.listening import Listening
+from loopwright.service.live.live import Live
 from loopwright.service.loops.shared_reading import SharedReading
 from loopwright.service.security.principal import current
 from loopwright.service.store.idempotency import IdempotencyKeys
 from loopwright.service.store.jobs import Job
+from loopwright.service.store.live_jobs import acceptances, latest_jobs
 from loopwright.service.telemetry.lateness import watched_event_loop
 from loopwright.tuning.reasons import Ended
 
@@ -55,12 +71,13 @@ def create_app(
     pool: Pool | None = None,
     sdo_retries: Mapping[str, int] | None = None,
     listening: Listening | None = None,
+    live: Live | None = None,
 ) -> FastAPI:
     """The application for these jobs, which it stops when the server shuts down.
 
     checks: the parts of /readyz by name; None for the default ones.  pool: processes that compute tunings; None for a
     new pool.  sdo_retries: SDO retries by bus, as counted in this process.  listening: None for one that knows only
-    what is stored.
+    what is stored.  live: None for a stream of its own.
     """
 
     policy = policy or Policy()
@@ -99,12 +116,15 @@ def create_app(
 
     def views(rows: Sequence[Job]) -> list[JobView]:
         events = jobs.store.events_by_job([row.id for row in rows], limit=MAX_EVENTS)
-        return [job_view(row, events[row.id], jobs.running(row.id)) for row in rows]
+        loops = {row.loop for row in rows}
+        latest = latest_jobs(jobs.store, loops.pop() if len(loops) == 1 else None)
+        return [job_view(row, events[row.id], jobs.running(row.id), latest.get(row.loop)) for row in rows]
 
     def view(row: Job) -> JobView:
         return views([row])[0]
 
-    fleet.install(app, jobs, many, views)
+    listening = listening or Listening(jobs.directory.loops, jobs.store, on=False)
+    fleet.install(app, jobs, many, views, listening)
 
     @app.get(
         "/loops/{tag}", tags=["loops"], summary="A loop and its present state", responses=problems.responses(404, 503)
@@ -113,16 +133,22 @@ def create_app(
         config, host = jobs.directory.owner(tag)
         not_home = next(iter(jobs.aftercare.not_home(tag)), None)
         try:
-            state = readings.of(tag)
-        except Ended:
-            if not_home is None:
-                raise
-            state = None
-        of_it = jobs.store.busy().get(tag), jobs.store.last_states(tag).get(tag), jobs.locking.locks().get(tag)
-        shown = loop_view(config, host, *of_it)
+            state, away = readings.of(tag), None
+        except Ended as ended:
+            state, away = None, LiveErrorView.of(ended)
+        shown = loop_view(
+            config,
+            host,
+            jobs.store.busy().get(tag),
+            latest_jobs(jobs.store, tag).get(tag),
+            acceptances(jobs.store, tag).get(tag),
+            None if state is None or state.on_trial else state.gains,
+            jobs.locking.locks().get(tag),
+        )
         return LoopDetail(
             **dict(shown),
             live=live_view(state) if state else None,
+            live_error=away,
             not_confirmed_home=NotHomeView.of(not_home) if not_home else None,
             disturbed_by=jobs.directory.disturbed_by(tag),
             knowledge=jobs.knowledge.of(tag, state.gains if state else None),
@@ -244,11 +270,14 @@ def create_app(
     def rollback(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
         return view(jobs.decisions.rollback(job_id, (decision or Decision()).by))
 
+    app.include_router(decisions.router(jobs))
     app.include_router(locks.router(jobs.locking))
-    listening = listening or Listening(jobs.directory.loops, jobs.store, on=False)
     pool = pool or Pool()
     app.include_router(history.router(jobs.directory, listening))
+    app.include_router(sparklines.router(jobs.directory, listening))
     app.include_router(observation.router(jobs, readings, listening, pool))
+    live = live or Live(jobs, listening)
+    app.include_router(live_api.router(live, jobs.directory, keyring))
     app.include_router(previews.router(jobs, many))
     app.include_router(tunings.router(jobs, pool))
     return app

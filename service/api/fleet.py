@@ -17,7 +17,9 @@ from loopwright.service.api.paging import LINK, Cursor, Limit, more
 from loopwright.service.job_states import JobState
 from loopwright.service.jobs.fleet import BadFleet, Fleet, FleetRequest
 from loopwright.service.jobs.manager import Jobs
+from loopwright.service.listening.listening import Listening
 from loopwright.service.store.jobs import Job
+from loopwright.service.store.live_jobs import acceptances, latest_jobs
 from loopwright.service.store.retunes import NoSuchRetune, Part, RetuneOver, RetuneState, StopReason
 from loopwright.service.store.tables import RetuneRow
 from loopwright.tuning.reasons import Reason
@@ -68,8 +70,10 @@ class RetuneView(RetuneSummary):
     loops: list[RetuneLoopView] = Field(description="In the order in which they are begun")
 
 
-def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Job]], list[JobView]]) -> None:
-    """Adds the routes. views: makes the API's view of each job."""
+def install(
+    app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Job]], list[JobView]], listening: Listening
+) -> None:
+    """Adds the routes. views: makes the API's view of each job.  listening: knows the gains that were read last."""
     router = APIRouter(route_class=JsonRoute)
 
     @router.get(
@@ -89,18 +93,20 @@ def install(app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Jo
             str | None, Query(max_length=64, description="Cursor from the URL of the next page, unchanged")
         ] = None,
     ) -> list[LoopView]:
-        busy, last, locks = jobs.store.busy(), jobs.store.last_states(), jobs.locking.locks()
+        busy, last, locks = jobs.store.busy(), latest_jobs(jobs.store), jobs.locking.locks()
+        accepted = acceptances(jobs.store)
         found: list[LoopView] = []
         for config, host in sorted(jobs.directory.everywhere(), key=lambda one: one[0].tag):
             if cursor is not None and config.tag <= cursor:
                 continue
-            if not _is(state, config.tag in busy, last.get(config.tag)):
+            job = last.get(config.tag)
+            if not _is(state, config.tag in busy, None if job is None else job.state):
                 continue
             if len(found) == limit:
                 more(response, "/loops", found[-1].tag, state=state, limit=limit)
                 break
-            of_it = busy.get(config.tag), last.get(config.tag), locks.get(config.tag)
-            found.append(loop_view(config, host, *of_it))
+            of_it = busy.get(config.tag), job, accepted.get(config.tag), listening.gains_of(config.tag)
+            found.append(loop_view(config, host, *of_it, locks.get(config.tag)))
         return found
 
     @router.get(

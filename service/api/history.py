@@ -16,7 +16,7 @@ from loopwright.service.api import problems
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.jobs.loop_directory import LoopDirectory
-from loopwright.service.listening.bins import Bins
+from loopwright.service.listening.bins import Bins, decimals
 from loopwright.service.listening.listening import History, Listening
 from loopwright.service.results import GainsView
 from loopwright.tuning.gains import Gains
@@ -142,8 +142,8 @@ def _view(
         until_s=_milliseconds(bins, "until_s"),
         sample_number=bins["n"].tolist(),
         samples=bins["count"].tolist(),
-        **{name: _decimals(bins, name) for name in ("pv_min", "pv_max", "pv_mean", "mv_min", "mv_max", "mv_mean")},
-        sp=_decimals(bins, "sp"),
+        **{name: decimals(bins, name) for name in ("pv_min", "pv_max", "pv_mean", "mv_min", "mv_max", "mv_mean")},
+        sp=decimals(bins, "sp"),
         mode=[names.get(mode) for mode in bins["mode"].tolist()],
         gains=[number - 1 if number else None for number in bins["gains"].tolist()],
         gain_sets=[GainsView.of(Gains(*each)) for each in found.rows.sets],
@@ -157,9 +157,3 @@ def _view(
 def _milliseconds(bins: Bins, name: str) -> list[float]:
     values: list[float] = np.round(bins[name], 3).tolist()
     return values
-
-
-def _decimals(bins: Bins, name: str) -> list[float | None]:
-    """Returns the shortest decimals that are these float32, as the samples of a job have them; null for no number."""
-    values: list[float] = bins[name].astype(str).astype(np.float64).tolist()
-    return [value if np.isfinite(value) else None for value in values]

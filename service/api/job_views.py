@@ -9,8 +9,8 @@ from pydantic import BaseModel, Field
 
 from loopwright.service.inputs.config import Limits, LoopConfig, PermittedTest
 from loopwright.service.job_states import ACTIVE, JobState, shown
-from loopwright.service.jsonable import JsonObject
-from loopwright.service.loop_state import LoopState, gains_of
+from loopwright.service.jsonable import JsonObject, number
+from loopwright.service.loop_state import LoopState, gains_of, same_gains
 from loopwright.service.results import (
     ComparisonView,
     EvidenceView,
@@ -28,12 +28,14 @@ from loopwright.service.results import (
     empty_result,
 )
 from loopwright.tuning.five_stage.procedure import PROCEDURE
-from loopwright.tuning.reasons import ADVICE, Reason
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.reasons import ADVICE, Ended, Reason
 
 if TYPE_CHECKING:  # the command line reads views, and has no store
     from loopwright.service.jobs.active_job import Running
     from loopwright.service.jobs.aftercare import NotHome
     from loopwright.service.store.jobs import Job, JobEvent
+    from loopwright.service.store.live_jobs import Acceptance, JobInBrief
     from loopwright.service.store.tables import LoopLockRow
 
 
@@ -47,6 +49,50 @@ class LockView(BaseModel):
     @classmethod
     def of(cls, row: LoopLockRow) -> LockView:
         return cls(reason=row.reason, by=row.by, since=row.since)
+
+
+class LastJobView(BaseModel):
+    """The latest job of a loop; dry runs do not count."""
+
+    url: str = Field(examples=["/jobs/4f0c2a9be113"])
+    state: JobState
+    at: str = Field(
+        description="When the job ended, or else began, or was made: UTC, ISO 8601",
+        examples=["2026-01-31T12:00:00.000Z"],
+    )
+    reason: Reason | None = Field(description="Why there is no proposal; reason code from the closed list")
+    stage: str | None = Field(description="The present or last stage", examples=["relay"])
+
+    @classmethod
+    def of(cls, job: JobInBrief) -> LastJobView:
+        return cls(url=f"/jobs/{job.id}", state=job.state, at=job.at, reason=job.reason, stage=job.stage)
+
+
+class AcceptedView(BaseModel):
+    """The gains that were accepted last and not rolled back."""
+
+    url: str = Field(description="URL of the job that proposed them", examples=["/jobs/4f0c2a9be113"])
+    at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
+    by: str = Field(description="Who accepted, as given in the request", examples=["operator A"])
+    ms: float | None = Field(description="Maximum sensitivity asked for; null: there is none", examples=[1.6])
+    gains: GainsView
+
+    @classmethod
+    def of(cls, found: Acceptance) -> AcceptedView:
+        gains = GainsView.of(found.gains)
+        return cls(url=f"/jobs/{found.job_id}", at=found.at, by=found.by, ms=found.ms, gains=gains)
+
+
+class LiveErrorView(BaseModel):
+    """Why the present state of a loop cannot be read."""
+
+    reason: Reason = Field(description="Reason code from the closed list", examples=["node_lost"])
+    detail: str = Field(description="What happened, with the numbers")
+    advice: str = Field(description="What the operator should do")
+
+    @classmethod
+    def of(cls, ended: Ended) -> LiveErrorView:
+        return cls(reason=ended.reason, detail=ended.detail, advice=ended.advice)
 
 
 class LoopView(BaseModel):
@@ -78,6 +124,12 @@ class LoopView(BaseModel):
     host: str = Field(description="Name of the service that is connected to the bus of the loop", examples=["local"])
     active_job: str | None = Field(description="URL of the job that is using the loop", examples=["/jobs/4f0c2a9be113"])
     last_job_state: JobState | None = Field(description="State of the latest job of the loop; dry runs do not count")
+    last_job: LastJobView | None = Field(description="The latest job; null: there is none")
+    accepted: AcceptedView | None = Field(description="The gains accepted last; null: there are none")
+    gains_differ: bool | None = Field(
+        description="Whether the gains in effect, as read last, are other than `accepted`; null: none were accepted, "
+        "or those in effect are not known"
+    )
     locked: LockView | None = Field(description="The lock of the loop; null: the loop is not locked")
 
 
@@ -120,9 +172,9 @@ class NotHomeView(BaseModel):
 
 class LoopDetail(LoopView):
     live: LiveView | None = Field(
-        description="The present state; null: the loop belongs to another host, or it is not reached and its "
-        "restoration is not confirmed"
+        description="The present state; null: the loop belongs to another host, or it is not reached (`live_error`)"
     )
+    live_error: LiveErrorView | None = Field(description="Why the present state cannot be read; null: it is not so")
     not_confirmed_home: NotHomeView | None = Field(description="The unconfirmed restoration; null: there is none")
     disturbed_by: str | None = Field(
         description="Which neighbours are under test and may disturb the loop: loops of the same area, and those whose "
@@ -148,6 +200,21 @@ class StageView(BaseModel):
     state: str = Field(description="running, done or ended", examples=["done"])
     result: Mapping[str, object] | None = Field(description="Result of the stage; times in s, gains in ISA form")
     plant_time_s: float | None = Field(description="Plant time the stage took, s", examples=[120.5])
+
+
+class DecidedView(BaseModel):
+    """What was decided last about the proposal of a job."""
+
+    what: Literal["accept", "rollback"]
+    by: str = Field(description="Who decided, as given in the request", examples=["operator A"])
+    at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
+
+
+class StoppingView(BaseModel):
+    """The request by which somebody has stopped a job."""
+
+    by: str = Field(description="Who has stopped it, as given in the request", examples=["operator A"])
+    at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
 
 
 class JobView(BaseModel):
@@ -209,6 +276,17 @@ class JobView(BaseModel):
     detail: str | None = Field(description="The numbers behind the reason")
     advice: str | None = Field(description="What the operator should do about the reason")
     restored: Mapping[str, object] | None = Field(description="State of the loop as read back at the end")
+    decided: DecidedView | None = Field(description="The latest decision; null: nothing was decided")
+    superseded_by: str | None = Field(
+        description="URL of the loop's latest job, where it came after this proposal and nothing was decided; null: "
+        "this is no such proposal",
+        examples=["/jobs/4f0c2a9be113"],
+    )
+    stopping: StoppingView | None = Field(description="The request to stop the job; null: there was none")
+    sample_time_s: float | None = Field(
+        description="Sampling period of the controller as the job found it, s; null: the job has not read the loop",
+        examples=[0.1],
+    )
 
 
 class SamplesView(BaseModel):
@@ -230,15 +308,24 @@ class Decision(BaseModel):
 
 
 def loop_view(
-    config: LoopConfig, host: str, active: str | None, last: str | None, lock: LoopLockRow | None
+    config: LoopConfig,
+    host: str,
+    active: str | None,
+    last: JobInBrief | None,
+    accepted: Acceptance | None,
+    in_effect: Gains | None,
+    lock: LoopLockRow | None,
 ) -> LoopView:
-    """active: the id of the job that is using the loop.  last: the state of the latest job of the loop."""
+    """active: the id of the job that is using the loop.  in_effect: None where the gains are not known, or on trial."""
     fields = config.model_dump(exclude={"noise_std_hint"})
     return LoopView(
         **fields,
         host=host,
         active_job=None if active is None else f"/jobs/{active}",
-        last_job_state=None if last is None else JobState(last),
+        last_job_state=None if last is None else last.state,
+        last_job=None if last is None else LastJobView.of(last),
+        accepted=None if accepted is None else AcceptedView.of(accepted),
+        gains_differ=None if accepted is None or in_effect is None else not same_gains(accepted.gains, in_effect),
         locked=None if lock is None else LockView.of(lock),
     )
 
@@ -260,9 +347,15 @@ def live_view(state: LoopState) -> LiveView:
     )
 
 
-def job_view(row: Job, events: Sequence[JobEvent], running: Running | None) -> JobView:
-    """The view of a job from its row and events, and from the live progress while it runs."""
+def job_view(
+    row: Job, events: Sequence[JobEvent], running: Running | None, latest: JobInBrief | None = None
+) -> JobView:
+    """The view of a job from its row and events, and from the live progress while it runs.
+
+    latest: the latest job of the loop, without dry runs.
+    """
     state = shown(row.state, row.dry_run)
+    later = latest is not None and latest.id != row.id and state is JobState.PROPOSED
     method = str(row.request.get("method", PROCEDURE))
     result = row.result or empty_result(method)
     progress, remaining, plant_time = _progress(state, row, events, running)
@@ -303,6 +396,10 @@ def job_view(row: Job, events: Sequence[JobEvent], running: Running | None) -> J
         detail=row.detail,
         advice=ADVICE[row.reason] if row.reason else None,
         restored=row.restored,
+        decided=_decided(events),
+        superseded_by=f"/jobs/{latest.id}" if later and latest is not None else None,
+        stopping=next((_stopping(event) for event in reversed(events) if event.kind == "abort_requested"), None),
+        sample_time_s=None if row.found is None else number(row.found["sample_time_s"]),
     )
 
 
@@ -363,6 +460,19 @@ def _stage_result(events: Sequence[JobEvent], stages: Sequence[str], field: str)
             if done and done.stage == stage and done.result and field in done.result:
                 return done.result
     return None
+
+
+def _decided(events: Sequence[JobEvent]) -> DecidedView | None:
+    for event in reversed(events):
+        state = event.data.get("state") if event.kind == "state" else None
+        if state in (JobState.ACCEPTED, JobState.ROLLED_BACK):
+            what: Literal["accept", "rollback"] = "accept" if state == JobState.ACCEPTED else "rollback"
+            return DecidedView(what=what, by=str(event.data.get("by", "")), at=event.at)
+    return None
+
+
+def _stopping(event: JobEvent) -> StoppingView:
+    return StoppingView(by=str(event.data.get("by", "")), at=event.at)
 
 
 def _finite(value: float) -> float | None:

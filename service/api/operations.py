@@ -192,7 +192,7 @@ def install(app: FastAPI, jobs: Jobs, parts: Mapping[str, Check], sdo_retries: M
         what: Annotated[str | None, Query(description="Only this kind of change", examples=["accept"])] = None,
         loop: Annotated[str | None, Query(description="Only changes of this loop", examples=["TIC-101"])] = None,
     ) -> AuditPage:
-        rows = audit.trail(jobs.store.engine, limit + 1, before, what, loop)
+        rows = audit.trail(jobs.store.engine, limit + 1, before, None if what is None else [what], loop)
         page_of = rows[:limit]
         more = None
         if len(rows) > limit:

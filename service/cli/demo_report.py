@@ -80,6 +80,7 @@ def report(client: Client, tag: str, shown: Demonstration, plant: TransferFuncti
     live = loop.live
     if live is None:
         why = loop.not_confirmed_home.advice if loop.not_confirmed_home else "it belongs to another host"
+        why = f"{loop.live_error.detail}. {loop.live_error.advice}" if loop.live_error else why
         raise ApiError(f"the loop {tag} cannot be read: {why}")
     for job in shown.jobs:
         if len(shown.jobs) == 1 or job.state is not JobState.PROPOSED:

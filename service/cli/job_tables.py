@@ -203,6 +203,9 @@ def loop_report(loop: LoopDetail) -> None:
     console.print(table)
     for sentence in knowledge(loop):
         console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+    if loop.live_error:
+        error = loop.live_error
+        console.print(f"The loop cannot be read: {error.detail}. {error.advice}", highlight=False, markup=False)
     if loop.not_confirmed_home:
         console.print(loop.not_confirmed_home.advice, highlight=False)
 

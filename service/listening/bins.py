@@ -142,6 +142,12 @@ def joined(parts: Sequence[Rows]) -> Rows:
     return Rows(whole, sets, tuple(gap for part in parts for gap in part.gaps))
 
 
+def decimals(bins: Bins, name: str) -> list[float | None]:
+    """Returns the shortest decimals that are these float32, as the samples of a job have them; None for no number."""
+    values: list[float] = bins[name].astype(str).astype(np.float64).tolist()
+    return [value if math.isfinite(value) else None for value in values]
+
+
 def packed(rows: Rows) -> bytes:
     """Returns bins and sets as a compressed block: column by column, then the sets, zlib."""
     columns: list[Any] = [np.ascontiguousarray(rows.bins[name]).tobytes() for name in BIN.names or ()]

@@ -21,13 +21,26 @@ from pathlib import Path
 
 from loopwright.protocol.bus import Bus, BusError, open_bus
 from loopwright.protocol.profile import ChannelIds
-from loopwright.service.listening.bins import packed
-from loopwright.service.listening.heard_loop import HeardLoop
-from loopwright.service.listening.messages import Finish, FinishedBlock, HistoryAnswer, Learn, Listen, Query, Report
+from loopwright.service.listening.bins import Bins, packed
+from loopwright.service.listening.heard_loop import Heard, HeardLoop
+from loopwright.service.listening.messages import (
+    Finish,
+    FinishedBlock,
+    HistoryAnswer,
+    Learn,
+    Listen,
+    NewSamples,
+    Query,
+    Report,
+    Watch,
+)
+from loopwright.service.listening.rings import Rings
 
 AGAIN_S = 2.0
 """Wall time between two tries to open a bus, s."""
 REPORT_S = 1.0
+TELL_S = 0.1
+"""Wall time between two messages of new samples, s."""
 BLOCK_S = 60.0
 """Wall time after which the bins of a loop are handed over to be stored, s: a process that dies loses at most these."""
 _RECV_S = 0.5
@@ -130,6 +143,8 @@ class Child:
         first_s = clock.now()
         spread = enumerate(self._of_tag, 1)
         self._last_s: dict[str, float] = {}
+        self._told: dict[str, tuple[Rings, int]] = {}
+        """The loops that are watched: their rings, and how many of their samples were told."""
         self._saved_s = {tag: first_s - BLOCK_S + BLOCK_S * n / len(self._of_tag) for n, tag in spread}
 
     def start(self) -> None:
@@ -138,17 +153,24 @@ class Child:
 
     def serve(self, connection: Connection) -> None:
         """Serves until the service asks for the end. Raises EOFError, OSError when the service is gone."""
-        due = time.monotonic() + REPORT_S
+        due = tell_due = time.monotonic() + REPORT_S
         while True:
-            if connection.poll(max(0.0, due - time.monotonic())):
+            next_s = min(due, tell_due) if self._told else due
+            if connection.poll(max(0.0, next_s - time.monotonic())):
                 message = connection.recv()
                 if isinstance(message, Query):
                     connection.send(self.answer(message))
                 elif isinstance(message, Learn):
                     self.learn(message)
+                elif isinstance(message, Watch):
+                    self.watch(message)
                 elif isinstance(message, Finish):
                     connection.send(self.report(finished=True))
                     return
+            if self._told and time.monotonic() >= tell_due:
+                if (new := self.new_samples()).samples:
+                    connection.send(new)
+                tell_due = time.monotonic() + TELL_S
             if time.monotonic() >= due:
                 connection.send(self.report())
                 due = time.monotonic() + REPORT_S
@@ -165,6 +187,37 @@ class Child:
         with bus.lock:
             bus.loops[message.tag].learn(message.found, self._clock.now())
 
+    def watch(self, message: Watch) -> None:
+        told = {}
+        for tag in message.tags:
+            bus = self._of_tag[tag]
+            with bus.lock:
+                rings = bus.loops[tag].rings
+                told[tag] = self._told.get(tag, (rings, rings.count))
+        self._told = told
+
+    def new_samples(self) -> NewSamples:
+        """Returns the samples of the watched loops that were not returned before."""
+        found: dict[str, Bins] = {}
+        for tag, (rings, count) in self._told.items():
+            bus = self._of_tag[tag]
+            with bus.lock:
+                present = bus.loops[tag].rings
+                new = present.since(count if present is rings else 0)
+                self._told[tag] = (present, present.count)
+            if len(new):
+                found[tag] = new
+        return NewSamples(found)
+
+    def _heard(self, now_s: float) -> dict[str, Heard]:
+        found: dict[str, Heard] = {}
+        for tag, bus in self._of_tag.items():
+            with bus.lock:
+                latest = bus.loops[tag].latest(now_s)
+            if latest is not None:
+                found[tag] = latest
+        return found
+
     def report(self, finished: bool = False) -> Report:
         if self._clock.set_back():
             for bus in self.buses.values():
@@ -179,6 +232,7 @@ class Child:
             to_read=to_read,
             blocks=[block for tag in self._of_tag if (block := self._block(tag, now_s, finished)) is not None],
             finished=finished,
+            heard=self._heard(now_s),
         )
 
     def _block(self, tag: str, now_s: float, finished: bool) -> FinishedBlock | None:

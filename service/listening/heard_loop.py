@@ -36,6 +36,25 @@ class InEffect:
     gains: GainSet | None
 
 
+@dataclass(frozen=True)
+class Heard:
+    """What was heard last of a loop. Numbers that are not known are NaN, the mode UNKNOWN_MODE, the rest None.
+
+    at_s: time of the last sample, s.
+    silent: whether further samples are due and do not come.
+    session: whether a tuner has a session open on the controller.
+    """
+
+    at_s: float
+    silent: bool
+    pv: float
+    mv: float
+    sp: float
+    mode: int
+    on_trial: bool | None
+    session: bool | None
+
+
 class HeardLoop:
     """Takes the frames of one loop. The methods that take a frame raise struct.error for a foreign one."""
 
@@ -50,7 +69,7 @@ class HeardLoop:
     def _forget(self, at_s: float) -> None:
         self._changed_s = at_s
         self._sp, self._mode, self._gains = math.nan, UNKNOWN_MODE, 0
-        self._status_known = False
+        self._status_known = self._session_known = False
         self._to_read = True
 
     def interrupted(self) -> None:
@@ -92,7 +111,8 @@ class HeardLoop:
             self._gains, self._to_read = 0, True
         self._sp = status.sp
         self._mode = status.mode if status.mode in _MODES else UNKNOWN_MODE
-        self._status_known, self._changed_s = True, at_s
+        self._status_known = self._session_known = True
+        self._changed_s = at_s
 
     def learn(self, found: InEffect, now_s: float) -> None:
         """Takes a reading. One that something has overtaken meanwhile is dropped, and the loop is read again."""
@@ -110,6 +130,22 @@ class HeardLoop:
         """Returns whether the loop is heard and is to be read."""
         heard = self.silent_from_s(now_s) > now_s
         return heard and (self._to_read or now_s - self._read_s >= READ_AGAIN_S)
+
+    def latest(self, now_s: float) -> Heard | None:
+        """Returns what was heard last; None before the first sample."""
+        rows = self.rings.since(self.rings.count - 1)
+        if not len(rows):
+            return None
+        return Heard(
+            at_s=self._heard_s,
+            silent=self.silent_from_s(now_s) < math.inf,
+            pv=rows["pv"][-1].item(),
+            mv=rows["mv"][-1].item(),
+            sp=self._sp,
+            mode=self._mode,
+            on_trial=self._data.on_trial if self._status_known else None,
+            session=self._data.session_is_open if self._session_known else None,
+        )
 
     def silent_from_s(self, now_s: float) -> float:
         """Returns the time of the last sample where further ones are due; infinite while they come."""

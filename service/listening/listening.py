@@ -14,15 +14,26 @@ import numpy as np
 
 from loopwright.protocol.profile import PLANT_NODE, ChannelIds, channel_ids
 from loopwright.service.inputs.config import BusConfig, LoopConfig
-from loopwright.service.listening.bins import GAP_BEFORE, Rows, between, gaps, joined, shortest_gap_s, thinned, unpacked
+from loopwright.service.listening.bins import (
+    GAP_BEFORE,
+    GainSet,
+    Rows,
+    between,
+    gaps,
+    joined,
+    shortest_gap_s,
+    thinned,
+    unpacked,
+)
 from loopwright.service.listening.block_writer import BlockWriter
-from loopwright.service.listening.heard_loop import InEffect
-from loopwright.service.listening.messages import HistoryAnswer, Learn, Report
+from loopwright.service.listening.heard_loop import Heard, InEffect
+from loopwright.service.listening.messages import HistoryAnswer, Learn, NewSamples, Report
 from loopwright.service.listening.process import ListeningProcess, NotListening
 from loopwright.service.store import history
 from loopwright.service.store.history import HistoryBlock
 from loopwright.service.store.store import Store
 from loopwright.service.telemetry.metrics import FRAMES_HEARD, LISTENING_UP
+from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Ended
 
 log = logging.getLogger(__name__)
@@ -74,7 +85,15 @@ class Listening:
         """Buses that are not listened to, with the reason."""
         self._down: Mapping[str, str] = {}
         self._writer = BlockWriter(store)
-        self.process = ListeningProcess(_ids(loops, self.off), self._take)
+        self.process = ListeningProcess(_ids(loops, self.off), self._take, on_samples=self._take_samples)
+        self.heard: Mapping[str, Heard] = {}
+        """What was heard last, by tag: replaced as a whole once a second."""
+        self._gains: dict[str, GainSet] = {}
+        """The gains of each loop as they were read last."""
+        self.on_report: Callable[[], None] = lambda: None
+        """Called in another thread when `heard` or a bus may have changed."""
+        self.on_samples: Callable[[NewSamples], None] = lambda _: None
+        """Called in another thread with the new samples of the loops that are watched."""
         self._to_read: Collection[str] = ()
         self._over = threading.Event()
         self._reader = threading.Thread(target=self._read_loops, name="listening: readings", daemon=True)
@@ -101,12 +120,42 @@ class Listening:
     def history(self, tag: str, from_s: float, to_s: float, points: int) -> History:
         """Returns at most `points` bins of a loop of any host, from memory and from the database. Raises
         SQLAlchemyError."""
-        answer, not_heard = self._heard(tag, from_s, to_s, points)
+        answer, not_heard = self._memory(tag, from_s, to_s, points)
         oldest_s = math.inf if answer is None else answer.oldest_s
         stored = self._stored(tag, from_s, min(to_s, oldest_s), points) if from_s < oldest_s else []
         return History(_whole(stored, answer, from_s, to_s, points), not_heard)
 
-    def _heard(self, tag: str, from_s: float, to_s: float, points: int) -> tuple[HistoryAnswer | None, str | None]:
+    def watch(self, tags: Collection[str]) -> None:
+        """Asks for the new samples of these loops, which `on_samples` gets."""
+        if self._started:
+            self.process.watch(
+                frozenset(tag for tag in tags if tag in self._loops and self._loops[tag].bus not in self.off)
+            )
+
+    def why_not_heard(self, tag: str) -> str | None:
+        """Returns why a loop is not heard at present, as far as its bus is the reason; None: its bus is heard."""
+        if tag not in self._loops:
+            return "the loop belongs to another host"
+        url = self._loops[tag].bus
+        if url in self.off:
+            return self.off[url]
+        return self._down.get(url) if self._started else "listening has not begun yet"
+
+    def gains_of(self, tag: str) -> Gains | None:
+        """Returns the gains of a loop as they were read last; None where they are not known."""
+        gains = self._gains.get(tag)
+        return None if gains is None else Gains(*gains)
+
+    def buses(self) -> dict[str, str | None]:
+        """Returns the buses of this host, each with why it is not heard at present; None: it is heard."""
+        return {self._loops[tag].bus: self.why_not_heard(tag) for tag in self._loops}
+
+    def memory(self, tag: str, from_s: float, to_s: float, points: int) -> Rows:
+        """Returns at most `points` bins of a loop from memory alone; none where the loop is not heard."""
+        answer, _ = self._memory(tag, from_s, to_s, points)
+        return Rows() if answer is None else answer.rows
+
+    def _memory(self, tag: str, from_s: float, to_s: float, points: int) -> tuple[HistoryAnswer | None, str | None]:
         """Returns what is in memory, and why the loop is not heard."""
         if tag not in self._loops:
             return None, "the loop belongs to another host, which stores its history once a minute"
@@ -152,7 +201,7 @@ class Listening:
     # -- beside the process
 
     def _take(self, report: Report) -> None:
-        self._down = report.down
+        self._down, self.heard = report.down, report.heard
         for url, frames in report.frames.items():
             FRAMES_HEARD.labels(url).inc(frames)
             LISTENING_UP.labels(url).set(0 if url in report.down else 1)
@@ -161,6 +210,10 @@ class Listening:
             HistoryBlock(block.tag, block.after_s, block.first_s, block.last_s, block.count, block.data)
             for block in report.blocks
         )
+        self.on_report()
+
+    def _take_samples(self, new: NewSamples) -> None:
+        self.on_samples(new)
 
     def _read_loops(self) -> None:
         """Reads the loops that the process names, one after the other."""
@@ -178,6 +231,10 @@ class Listening:
                     log.exception("defect while reading %s for the history", tag)
                     found = None
                 if found is not None:
+                    if found.gains is None:
+                        self._gains.pop(tag, None)
+                    else:
+                        self._gains[tag] = found.gains
                     self.process.learn(Learn(tag, found))
                 if self._over.wait(EACH_S):
                     return

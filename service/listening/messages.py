@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from loopwright.protocol.profile import ChannelIds
-from loopwright.service.listening.bins import Rows
-from loopwright.service.listening.heard_loop import InEffect
+from loopwright.service.listening.bins import Bins, Rows
+from loopwright.service.listening.heard_loop import Heard, InEffect
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,13 @@ class Learn:
 
     tag: str
     found: InEffect
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Asks for the new samples of these loops, as they come, instead of those asked for before."""
+
+    tags: frozenset[str]
 
 
 @dataclass(frozen=True)
@@ -71,6 +78,13 @@ class FinishedBlock:
 
 
 @dataclass(frozen=True)
+class NewSamples:
+    """The new samples of the loops that are watched, by tag: rows of `bins.SAMPLE`."""
+
+    samples: Mapping[str, Bins]
+
+
+@dataclass(frozen=True)
 class Report:
     """What there is to tell, once a second.
 
@@ -78,6 +92,7 @@ class Report:
     frames: number of frames since the last report, by bus.
     to_read: loops whose set-point, mode and gains are to be read.
     finished: whether this is the last report.
+    heard: what was heard last, by tag; without the loops of which nothing was heard.
     """
 
     down: Mapping[str, str]
@@ -85,3 +100,4 @@ class Report:
     to_read: Sequence[str] = ()
     blocks: Sequence[FinishedBlock] = field(default=())
     finished: bool = False
+    heard: Mapping[str, Heard] = field(default_factory=dict)

@@ -18,7 +18,7 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 
 from loopwright.protocol.profile import ChannelIds
-from loopwright.service.listening.messages import Finish, HistoryAnswer, Learn, Listen, Query, Report
+from loopwright.service.listening.messages import Finish, HistoryAnswer, Learn, Listen, NewSamples, Query, Report, Watch
 from loopwright.service.telemetry.metrics import LISTENER_RESTARTS
 
 log = logging.getLogger(__name__)
@@ -50,6 +50,7 @@ class ListeningProcess:
 
     loops: what it listens to, by bus and tag.
     on_report: receives its reports, in that thread.
+    on_samples: receives the new samples of the loops that are watched, in that thread.
     """
 
     def __init__(
@@ -57,8 +58,11 @@ class ListeningProcess:
         loops: Mapping[str, Mapping[str, ChannelIds]],
         on_report: Callable[[Report], None],
         first_pause_s: float = FIRST_PAUSE_S,
+        on_samples: Callable[[NewSamples], None] = lambda _: None,
     ) -> None:
         self._loops, self._on_report, self._first_pause_s = loops, on_report, first_pause_s
+        self._on_samples = on_samples
+        self._watched: frozenset[str] = frozenset()
         self._over = threading.Event()
         self._guard = threading.Lock()
         self._writing = threading.Lock()
@@ -88,6 +92,12 @@ class ListeningProcess:
         """Passes a reading on; it is dropped where there is no process."""
         with suppress(NotListening):
             self._send(message)
+
+    def watch(self, tags: frozenset[str]) -> None:
+        """Asks for the new samples of these loops, as they come; a process that is started later is asked too."""
+        self._watched = tags
+        with suppress(NotListening):
+            self._send(Watch(tags))
 
     def ask(self, tag: str, from_s: float, to_s: float, points: int) -> HistoryAnswer:
         """Asks for rows of a loop. Raises NotListening."""
@@ -156,6 +166,7 @@ class ListeningProcess:
             try:
                 ours.send(Listen(self._loops))
                 self._connection = ours
+                self.watch(self._watched)
                 self._receive(ours)
             except (EOFError, OSError):
                 pass
@@ -195,6 +206,8 @@ class ListeningProcess:
                     asked = self._asked.pop(message.number, None)
                 if asked is not None:
                     asked.set_result(message)
+            elif isinstance(message, NewSamples):
+                self._on_samples(message)
             elif isinstance(message, Report):
                 self._on_report(message)
                 if message.finished:

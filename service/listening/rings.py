@@ -59,6 +59,11 @@ class Ring:
         return np.concatenate([self._rows[begin:], self._rows[:end]])
 
     @property
+    def count(self) -> int:
+        """Returns how many rows were ever put."""
+        return self._put
+
+    @property
     def first_s(self) -> float:
         """Returns the time of the oldest row, s; infinite where there is none."""
         if not self._put:
@@ -92,6 +97,15 @@ class Rings:
     def oldest_s(self) -> float:
         """Returns the time of the oldest row, s; infinite where there is none."""
         return min(ring.first_s for ring in self._rings)
+
+    @property
+    def count(self) -> int:
+        """Returns how many samples were ever put."""
+        return self._rings[0].count
+
+    def since(self, count: int) -> Bins:
+        """Returns the samples that were put after the first `count` ones, as far as they are still kept."""
+        return self._rings[0].last(self.count - count)
 
     def number_of(self, gains: GainSet) -> int:
         """Returns the number under which samples name these gains."""

@@ -43,6 +43,7 @@ from loopwright.service.jobs.loop_directory import LoopFactory
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.retention import Retention, RetentionPolicy
 from loopwright.service.listening.listening import Listening
+from loopwright.service.live.live import Live
 from loopwright.service.loops.loop import Loop
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.server.signals import Signals
@@ -62,14 +63,19 @@ class _Server(uvicorn.Server):
     """An HTTP server that prints when it is ready. It does not handle signals: uvicorn would raise each signal again
     after its shutdown, and take a second SIGINT as permission to abort."""
 
-    def __init__(self, config: uvicorn.Config, jobs: Jobs, listening: Listening) -> None:
+    def __init__(self, config: uvicorn.Config, jobs: Jobs, listening: Listening, live: Live) -> None:
         super().__init__(config)
         self._jobs = jobs
         self._listening = listening
+        self._live = live
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         yield
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        self._live.close()  # nothing else ends these streams, and the server waits for its connections
+        await super().shutdown(sockets)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
@@ -212,8 +218,9 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         looking = stack.enter_context(
             closing(Looking(jobs.directory, jobs.registry, store, listening, jobs.knowledge, pool))
         )
-        app = create_app(jobs, policy, checks, pool, station.sdo_retries, listening)
-        server = _Server(server_config(app, setup, listener, descriptors), jobs, listening)
+        live_stream = Live(jobs, listening)
+        app = create_app(jobs, policy, checks, pool, station.sdo_retries, listening, live_stream)
+        server = _Server(server_config(app, setup, listener, descriptors), jobs, listening, live_stream)
 
         def end() -> None:
             """Ends jobs and server: the server waits for its connections, and event streams end with their jobs."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
-from sqlalchemy import Engine, select
+from sqlalchemy import Engine, or_, select
 from sqlalchemy.orm import Session
 
 from loopwright.service.security.principal import current
@@ -34,15 +34,29 @@ def record(
 
 
 def trail(
-    engine: Engine, limit: int, before: int | None = None, what: str | None = None, loop: str | None = None
+    engine: Engine,
+    limit: int,
+    before: int | None = None,
+    what: Collection[str] | None = None,
+    loop: str | None = None,
+    who: str | None = None,
+    from_at: str | None = None,
 ) -> Sequence[AuditRow]:
-    """The latest rows first; before: only those with a smaller number."""
+    """Returns the latest rows first.
+
+    before: only those with a smaller number.  what: only these kinds.  who: only those with this name, of the key or as
+    given in the request.  from_at: only those from this time on, UTC, as in the table.
+    """
     wanted = select(AuditRow).order_by(AuditRow.number.desc()).limit(limit)
     if before is not None:
         wanted = wanted.where(AuditRow.number < before)
     if what is not None:
-        wanted = wanted.where(AuditRow.what == what)
+        wanted = wanted.where(AuditRow.what.in_(what))
     if loop is not None:
         wanted = wanted.where(AuditRow.loop == loop)
+    if who is not None:
+        wanted = wanted.where(or_(AuditRow.who == who, AuditRow.said_by == who))
+    if from_at is not None:
+        wanted = wanted.where(AuditRow.at >= from_at)
     with Session(engine) as session:
         return session.scalars(wanted).all()

@@ -362,15 +362,6 @@ class Store:
                 session, what, job_id, before={"state": row.state}, after={"error": detail}, loop=row.loop, said_by=by
             )
 
-    def last_states(self, loop: str | None = None) -> dict[str, JobState]:
-        """The state of the latest job by loop, of every host or of one loop; dry runs do not count."""
-        last = select(func.max(JobRow.number)).where(JobRow.dry_run.is_(False)).group_by(JobRow.loop)
-        if loop is not None:
-            last = last.where(JobRow.loop == loop)
-        with self._session() as session:
-            found = session.execute(select(JobRow.loop, JobRow.state).where(JobRow.number.in_(last)))
-            return {row.loop: row.state for row in found}
-
     def last_models(self, loop: str | None = None) -> dict[str, Job]:
         """The latest job by loop, of every host or of one loop, that has found a model on the live loop."""
         ended = (JobState.PROPOSED.value, JobState.ACCEPTED.value, JobState.ROLLED_BACK.value)

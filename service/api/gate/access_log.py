@@ -72,7 +72,7 @@ class Access:
         # The template, not the path: a label must not have as many values as there are jobs.
         route = str(getattr(scope.get("route"), "path", _NO_ROUTE))
         REQUESTS.labels(method, route, str(status)).inc()
-        if not route.endswith("/events"):
+        if not route.endswith(("/events", "/live")):
             REQUEST_SECONDS.labels(route).observe(seconds)
         client = scope.get("client")
         address = client[0] if client else None

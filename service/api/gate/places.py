@@ -60,7 +60,7 @@ def kind_of(method: str, path: str) -> RequestKind | None:
         return _LAST_WORDS.get(last, RequestKind.COMMAND)
     if path in _WATCHED:
         return RequestKind.WATCH
-    if last == "events":
+    if last == "events" or path == "/live":
         return RequestKind.STREAM
     return RequestKind.BUS if path.startswith("/loops/") and path.count("/") == 2 else RequestKind.READ
 

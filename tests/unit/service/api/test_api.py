@@ -131,7 +131,11 @@ def test_every_other_end_has_reason_and_advice(
 
 def test_absent_node(service: Service, client: TestClient) -> None:
     service.controller.absent = Reason.NODE_LOST
-    assert assert_problem(client.get(f"/loops/{TAG}"), 503)["reason"] == "node_lost"
+    answer = client.get(f"/loops/{TAG}")
+    assert answer.status_code == 200 and answer.json()["live"] is None
+    assert answer.json()["live_error"] == {
+        "reason": "node_lost", "detail": "node 32 does not answer", "advice": ADVICE[Reason.NODE_LOST],
+    }  # fmt: skip
     job = finished(service, client)
     assert job["state"] == "failed" and job["reason"] == "node_lost"
 

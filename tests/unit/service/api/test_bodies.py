@@ -99,7 +99,10 @@ def test_the_last_event_there_can_be(client: TestClient, service: Service) -> No
     assert client.get(f"/jobs/{job}/events", headers={"Last-Event-ID": str(2**53)}).status_code == 204
 
 
-@pytest.mark.parametrize("path", ["/loops/%00", "/jobs/a%00b", "/jobs?loop=%00", "/audit?loop=%00", "/retunes/%00"])
+@pytest.mark.parametrize(
+    "path",
+    ["/loops/%00", "/jobs/a%00b", "/jobs?loop=%00", "/audit?loop=%00", "/decisions?by=%00", "/retunes/%00"],
+)
 def test_text_that_no_database_keeps(path: str, tmp_path: Path, postgres: Server) -> None:
     store = Store(tmp_path, postgres.database())
     try:

@@ -55,7 +55,7 @@ def heard(listening: Listening, monkeypatch: pytest.MonkeyPatch, rows: Rows, sil
     """As if the process had these rows."""
     oldest_s = rows.bins["at_s"][0].item() if len(rows.bins) else math.inf
     answer = HistoryAnswer(1, rows, oldest_s, silent_from_s)
-    monkeypatch.setattr(listening, "_heard", lambda *_: (answer, None))
+    monkeypatch.setattr(listening, "_memory", lambda *_: (answer, None))
 
 
 @pytest.mark.parametrize("points", [10, 5000])

@@ -1,0 +1,100 @@
+"""The live jobs, the latest job of each loop, and the events of the loops that somebody watches, as looked up last."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+
+from loopwright.service.job_states import ACTIVE
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.live.messages import JobHappening, LiveJob, LiveJobs, event
+from loopwright.service.live.viewer import Viewer
+from loopwright.service.store.jobs import JobEvent
+from loopwright.service.store.live_jobs import JobInBrief, latest_jobs, live_jobs, new_events
+
+
+@dataclass
+class _Followed:
+    """A job whose events are kept. active: whether the job was active when it was last looked up."""
+
+    loop: str
+    active: bool
+    last: int = 0
+    events: list[tuple[int, str]] = field(default_factory=list)
+
+
+class LookedUpJobs:
+    """What the database said last. `look` is called in a thread, the rest reads what it has put there as a whole."""
+
+    def __init__(self, jobs: Jobs) -> None:
+        self._jobs = jobs
+        self.live: list[JobInBrief] = []
+        self.latest: dict[str, JobInBrief] = {}
+        self.loops: list[tuple[str, str]] = [(tag, jobs.store.host) for tag in jobs.directory.loops]
+        """Tag and host of every loop."""
+        self._followed: dict[str, _Followed] = {}
+
+    def look(self, watched: Collection[str], thoroughly: bool) -> None:
+        """Asks the database. Raises SQLAlchemyError.
+
+        watched: loops whose events are wanted.
+        thoroughly: whether the latest jobs and the loops of other hosts are asked for too.
+        """
+        store = self._jobs.store
+        live = live_jobs(store)
+        if thoroughly or {job.id for job in live} != {job.id for job in self.live}:
+            self.latest = latest_jobs(store)
+            self.loops = sorted((config.tag, host) for config, host in self._jobs.directory.everywhere())
+        self.live = live
+        wanted = {job.id: job for job in (*self.latest.values(), *live) if job.loop in watched}
+        after = {job_id: self._followed[job_id].last if job_id in self._followed else 0 for job_id in wanted}
+        new: dict[str, list[JobEvent]] = {}
+        for each in new_events(store, after):
+            new.setdefault(each.job_id, []).append(each)
+        followed: dict[str, _Followed] = {}
+        for job_id, job in wanted.items():
+            before = self._followed.get(job_id, _Followed(job.loop, False))
+            texts = [(each.seq, _happening(job.loop, each)) for each in new.get(job_id, [])]
+            last = texts[-1][0] if texts else before.last
+            followed[job_id] = _Followed(job.loop, job.state in ACTIVE, last, before.events + texts)
+        self._followed = followed
+
+    def events_for(self, viewer: Viewer) -> Iterator[str]:
+        """Yields the events that a viewer has not had yet. Of a job that was over when it began, only later ones."""
+        for job_id, job in self._followed.items():
+            if job.loop not in viewer.tags:
+                continue
+            after = viewer.after.setdefault(job_id, 0 if job.active else job.last)
+            viewer.after[job_id] = max(after, job.last)
+            yield from (text for seq, text in job.events if seq > after)
+
+    def message(self) -> LiveJobs:
+        """Returns the live jobs, with the progress of those of this service."""
+        return LiveJobs(jobs=[self._live_job(job) for job in self.live])
+
+    def _live_job(self, job: JobInBrief) -> LiveJob:
+        running = self._jobs.running(job.id)
+        progress = None if running is None else running.progress_now()
+        remaining_s = None if progress is None else progress.remaining_s
+        return LiveJob(
+            id=job.id,
+            url=f"/jobs/{job.id}",
+            loop=job.loop,
+            host=job.host,
+            state=job.state,
+            dry_run=job.dry_run,
+            requested_by=job.requested_by,
+            stage=job.stage if progress is None or progress.stage is None else progress.stage,
+            progress=None if progress is None else round(progress.fraction, 4),
+            remaining_plant_time_s=None if remaining_s is None else round(remaining_s, 1),
+            plant_time_s=round(job.plant_time_s if progress is None else progress.plant_time_s, 1),
+            stopping=job.stopping or (running is not None and running.stop_reason is not None),
+        )
+
+
+def _happening(loop: str, found: JobEvent) -> str:
+    message = JobHappening(
+        job=found.job_id, loop=loop, seq=found.seq, kind=found.kind, at=found.at, plant_time_s=found.plant_time_s,
+        data=found.data,
+    )  # fmt: skip
+    return event("job", message, f"{found.job_id}.{found.seq}")

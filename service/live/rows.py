@@ -1,0 +1,83 @@
+"""What the messages say of loops: from what was heard, from the running job, from the jobs. Pure: time is handed in."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopwright.protocol.profile import Mode
+from loopwright.service.listening.bins import Bins, decimals
+from loopwright.service.listening.heard_loop import Heard
+from loopwright.service.live.messages import LastJob, LiveLoopRow, Samples
+from loopwright.service.loop_state import LoopState
+from loopwright.service.store.live_jobs import JobInBrief
+
+_MODES = {mode.value: mode.name.lower() for mode in Mode}
+
+
+@dataclass(frozen=True)
+class LiveFacts:
+    """What is known of a loop beside its name.
+
+    heard: what was heard last; None: nothing.
+    deaf: why its bus is not heard; None: it is.
+    held: the state that the running job of this service has; None: no such job has read the loop.
+    job, last_job: the job that has the loop, and the latest one.
+    """
+
+    heard: Heard | None = None
+    deaf: str | None = None
+    held: LoopState | None = None
+    job: JobInBrief | None = None
+    last_job: JobInBrief | None = None
+
+
+def loop_row(tag: str, host: str, known: LiveFacts, now_s: float) -> LiveLoopRow:
+    """Returns the row of a loop. Old values are left out; where a bus is not heard, those of the running job count."""
+    heard, held = known.heard, known.held
+    age_s = None if heard is None else max(0.0, now_s - heard.at_s)
+    row = LiveLoopRow(
+        tag=tag, host=host, pv=None, sp=None, mv=None, mode=None,
+        age_s=None if age_s is None else round(age_s, 3),
+        under_test=None, on_trial=None, not_heard=None,
+        job=None if known.job is None else f"/jobs/{known.job.id}",
+        last_job=None if known.last_job is None else LastJob(
+            url=f"/jobs/{known.last_job.id}", state=known.last_job.state
+        ),
+    )  # fmt: skip
+    if heard is not None and not heard.silent:
+        row.pv, row.sp, row.mv = (_finite(value) for value in (heard.pv, heard.sp, heard.mv))
+        row.mode = _MODES.get(heard.mode)
+        row.under_test, row.on_trial = heard.session, heard.on_trial
+    elif held is not None and known.deaf is not None:
+        row.pv, row.sp, row.mv = (_finite(value) for value in (held.pv, held.sp, held.mv))
+        row.mode, row.on_trial = held.mode.name.lower(), held.on_trial
+    else:
+        row.not_heard = known.deaf or ("no sample has come yet" if age_s is None else f"no data for {age_s:.0f} s")
+    if row.under_test is None and held is not None:
+        row.under_test = True
+    return row
+
+
+def samples_message(tag: str, bins: Bins, past: bool) -> Samples:
+    """Returns bins as columns: a bin of one sample is that sample; one of several has the time of its last and the
+    means."""
+    at_s: list[float] = np.round(bins["until_s"], 3).tolist()
+    return Samples(
+        tag=tag,
+        past=past,
+        n=bins["n"].tolist(),
+        at_s=at_s,
+        sp=decimals(bins, "sp"),
+        pv=decimals(bins, "pv_mean"),
+        mv=decimals(bins, "mv_mean"),
+        mode=[mode if mode in _MODES else None for mode in bins["mode"].tolist()],
+        gap_before=np.flatnonzero(bins["gap"]).tolist(),
+    )
+
+
+def _finite(value: float) -> float | None:
+    """Returns the shortest decimals of a REAL32; None for what is no number."""
+    return float(str(np.float32(value))) if math.isfinite(value) else None

@@ -1,0 +1,63 @@
+"""The live stream of a real site: samples as they come, a plant that stops, a bus that goes, a service that stops."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE
+from loopwright.protocol.tuner import Tuner
+from tests.unit.service.fakes import TAG
+from tests.unit.service.heard_site import Site
+from tests.unit.service.live_viewer import viewing
+
+pytestmark = pytest.mark.timeout(600)
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    with ExitStack() as stack:
+        yield Site(stack, tmp_path)
+
+
+def test_samples_come_once_and_what_stops_is_no_longer_shown(site: Site) -> None:
+    base = str(site.http.base_url)
+    site.until(lambda found: len(found["at_s"]) > 20)
+    with viewing(base, f"/live?loops={TAG}&back_s=60") as viewer:
+        past = viewer.until("samples")
+        assert past["past"] and len(past["n"]) > 20 and past["gap_before"] == [0]
+        numbers, times = list(past["n"]), list(past["at_s"])
+        while len(numbers) < len(past["n"]) + 30:
+            new = viewer.until("samples")
+            assert not new["past"] and not new["gap_before"]
+            numbers += new["n"]
+            times += new["at_s"]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), "each once, in order"
+        assert times == sorted(set(times))
+
+        row = viewer.row(TAG, lambda row: row["mode"])
+        assert (row["mode"], row["sp"], row["not_heard"], row["on_trial"]) == ("automatic", 50.0, None, False)
+        assert row["age_s"] < 3.0 and row["pv"] is not None and row["mv"] is not None
+        buses = [message for name, message in viewer.messages if name == "buses"]
+        assert buses[-1] == {"buses": [{"bus": site.bus, "up": True, "why": None}]}
+
+        tuner = Tuner(site.bus, CONTROLLER_NODE, PLANT_NODE)
+        tuner.write("controller_setpoint", 50.5)
+        tuner.close()
+        assert viewer.until("samples", lambda new: new["sp"][-1] == 50.5)
+
+        site.plant.stop()
+        row = viewer.row(TAG, lambda row: row["pv"] is None)
+        assert row["sp"] is row["mv"] is row["mode"] is None and row["age_s"] > 3.0
+        assert row["not_heard"].startswith("no data for ")
+
+        site.hub.stop()
+        down = viewer.until("buses", lambda message: message["buses"][0]["up"] is False)
+        assert down["buses"][0]["why"]
+        row = viewer.row(TAG, lambda row: site.bus in row["not_heard"])
+        assert row["pv"] is None
+        assert site.service.stop() == 0
+        viewer.rest()
