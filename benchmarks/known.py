@@ -37,7 +37,7 @@ from loopwright.service.execution.runner import run
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.excitation_choice import fast_by
-from loopwright.tuning.fast.known_plant import KnownPlant, NothingKnown
+from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
 from loopwright.tuning.fast.known_procedure import TrialFigures
 from loopwright.tuning.fast.procedure import FastOptions
 from loopwright.tuning.fast.record import Excitation
@@ -107,24 +107,24 @@ class KnownRun:
         return math.inf if self.Ms is None else abs(self.Ms - ASKED)
 
 
-def observed(plant: Plant, present: str, seed: int) -> tuple[Gains, int, KnownPlant | NothingKnown]:
+def observed(plant: Plant, present: str, seed: int) -> tuple[Gains, int, ObservedPlant | NothingKnown]:
     """The gains in effect, and what operation shows after the fewest changes that suffice."""
     random = np.random.default_rng([seed, len(plant.name), int(1e6 * plant.Pu), list(PRESENT).index(present)])
     gains = present_gains(plant, present, random)
     whole = operation(plant, gains, KINDS["quiet"], random, LOOKS[-1])
-    known: KnownPlant | NothingKnown = NothingKnown("")
+    known: ObservedPlant | NothingKnown = NothingKnown("")
     for looks in LOOKS:
         until = min((looks + 1) * round(SPACING * SAMPLES), len(whole.sp)) - 2
         part = replace(whole, mv=whole.mv[:until], pv=whole.pv[:until], sp=whole.sp[:until])
         known = known_plant(observe([part], sign(plant.model()) > 0.0, PI), plant.Ts, 0.0)
-        if isinstance(known, KnownPlant):
+        if isinstance(known, ObservedPlant):
             # the test begins at rest at another place than where operation ended, in deviation variables
             return gains, looks, replace(known, pv=(-1e9, 1e9), mv=(-1e9, 1e9))
     return gains, LOOKS[-1], known
 
 
 def retuned(
-    plant: Plant, gains: Gains, known: KnownPlant | NothingKnown, change: str, seed: int
+    plant: Plant, gains: Gains, known: ObservedPlant | NothingKnown, change: str, seed: int
 ) -> tuple[Plant, list[Sample], list[TrialFigures], list[str], Gains | None, str | None]:
     """The plant as it is now, the samples, trials and notes, and the gains proposed or the reason against them."""
     now = CHANGES[change].of(plant)

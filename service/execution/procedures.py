@@ -18,7 +18,7 @@ from loopwright.service.store.jobs import JobEvent
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.settle import after_settling
 from loopwright.tuning.fast.excitation_choice import NOT_ASKED
-from loopwright.tuning.fast.known_plant import KnownPlant, NothingKnown
+from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
 from loopwright.tuning.models import Model
 from loopwright.tuning.plan import Event, Note, Plan, Sample
 from loopwright.tuning.reasons import Ended, NoGain, Reason, Refused
@@ -50,7 +50,7 @@ class Hooks:
     note_session: Callable[[int], None] = lambda session: None
     on_home: Callable[[LoopState], None] = lambda home: None
     ground: Ground = field(default_factory=Ground)
-    plant: KnownPlant | NothingKnown = NOT_ASKED
+    plant: ObservedPlant | NothingKnown = NOT_ASKED
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def plan(
     request: RetuneRequest,
     facts: Facts,
     earlier: Sequence[JobEvent] = (),
-    plant: KnownPlant | NothingKnown = NOT_ASKED,
+    plant: ObservedPlant | NothingKnown = NOT_ASKED,
 ) -> Plan[Any]:
     """Returns the plan of the requested procedure.
 
@@ -153,7 +153,7 @@ def _procedure(
     request: RetuneRequest,
     facts: Facts,
     earlier: Sequence[JobEvent],
-    plant: KnownPlant | NothingKnown,
+    plant: ObservedPlant | NothingKnown,
 ) -> Plan[Any]:
     if isinstance(request, FastRetune):
         from loopwright.tuning.fast.design_trial import trial

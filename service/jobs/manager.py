@@ -24,7 +24,7 @@ from loopwright.service.jobs.journal import Journal
 from loopwright.service.jobs.locking import Locking
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.machine import Machine
-from loopwright.service.jobs.operation import Operation
+from loopwright.service.jobs.operation import OperationHeard
 from loopwright.service.jobs.recovery import Recovery
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.until_answered import STOP_PATIENCE_S, UntilAnswered
@@ -70,7 +70,7 @@ class Jobs:
         recovery: Recovery,
         machine: Machine,
         knowledge: KeptKnowledge,
-        operation: Operation,
+        operation: OperationHeard,
     ) -> None:
         self.store = store
         self.engine = engine

@@ -22,7 +22,7 @@ from loopwright.service.store import job_knowledge
 from loopwright.service.store.jobs import Job, JobEvent
 from loopwright.service.store.store import Store
 from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.known_plant import KnownPlant, NothingKnown
+from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
 from loopwright.tuning.fast.known_procedure import TRIAL
 from loopwright.tuning.reasons import Ended
 
@@ -37,7 +37,7 @@ class Ears:
     pool: Pool
 
 
-class Operation:
+class OperationHeard:
     """What normal operation has shown of the loops of this host.
 
     wall: the wall clock, s since 1970 UTC, and so the clock of the history.
@@ -59,7 +59,7 @@ class Operation:
 
     def known(
         self, job: Job, config: LoopConfig, spec: DesignSpec, unwanted: Callable[[], bool]
-    ) -> KnownPlant | NothingKnown:
+    ) -> ObservedPlant | NothingKnown:
         """Returns what is known of the plant as the job begins; of a resumed job, what was known as it began. Takes
         seconds. Raises SQLAlchemyError.
 
@@ -72,7 +72,9 @@ class Operation:
         job_knowledge.keep(self._store, job.id, job.loop, pack(found))
         return found
 
-    def _heard(self, config: LoopConfig, spec: DesignSpec, unwanted: Callable[[], bool]) -> KnownPlant | NothingKnown:
+    def _heard(
+        self, config: LoopConfig, spec: DesignSpec, unwanted: Callable[[], bool]
+    ) -> ObservedPlant | NothingKnown:
         if self._ears is None:
             return NothingKnown("the service does not listen to its loops")
         listening, pool = self._ears.listening, self._ears.pool

@@ -26,7 +26,7 @@ from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.journal import Journal
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.machine import Machine
-from loopwright.service.jobs.operation import Operation, outdated_by
+from loopwright.service.jobs.operation import OperationHeard, outdated_by
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.until_answered import STOP_PATIENCE_S, UntilAnswered
 from loopwright.service.loop_state import LoopState, differences, loop_state, same_gains, state_json
@@ -41,7 +41,7 @@ from loopwright.service.store.lock import FolderInUse
 from loopwright.service.store.store import NoSuchJob, Store
 from loopwright.service.telemetry.logs import about
 from loopwright.tuning.fast.excitation_choice import NOT_ASKED
-from loopwright.tuning.fast.known_plant import KnownPlant, NothingKnown
+from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.plan import Event
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
@@ -68,7 +68,7 @@ class Worker:
         rehearse: Rehearse,
         machine: Machine,
         knowledge: KeptKnowledge,
-        operation: Operation,
+        operation: OperationHeard,
     ) -> None:
         self.store = store
         self.journal = journal
@@ -161,7 +161,7 @@ class Worker:
 
     def _plant_known(
         self, running: Running, row: Job, config: LoopConfig, request: RetuneRequest
-    ) -> KnownPlant | NothingKnown:
+    ) -> ObservedPlant | NothingKnown:
         """Returns what operation has shown of the plant, where the test may begin with it."""
         if not isinstance(request, FastRetune) or Excitation.OBSERVE not in excitations(config, request):
             return NOT_ASKED
@@ -170,9 +170,7 @@ class Worker:
         if why is not None:
             return NothingKnown(f"an earlier attempt has tried gains from operation: {why}")
         spec = request.options.spec()
-        return self._lasting(
-            lambda: self._operation.known(row, config, spec, lambda: running.stop_reason is not None)
-        )
+        return self._lasting(lambda: self._operation.known(row, config, spec, lambda: running.stop_reason is not None))
 
     def _note_home(self, job_id: str, read: LoopState, home: LoopState) -> None:
         """Stores the state before the test as the controller noted it at the opening, where it changed after the

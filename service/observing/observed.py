@@ -30,7 +30,7 @@ from loopwright.service.results import (
 from loopwright.tuning.analysis.comparison import Comparison, predicted
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.evaluation import Evaluation
-from loopwright.tuning.fast.known_plant import KnownPlant, NothingKnown
+from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
 from loopwright.tuning.fast.procedure import FAST
 from loopwright.tuning.fast.proposal import comparison_of, identified_model, load_disturbances, ultimate
 from loopwright.tuning.fast.robustness import known_Ms
@@ -180,7 +180,7 @@ def observed(question: Question) -> ObservationView:
     return _observed(question, question.heard())[0]
 
 
-def observed_plant(question: Question, now_s: float) -> tuple[ObservationView, KnownPlant | NothingKnown]:
+def observed_plant(question: Question, now_s: float) -> tuple[ObservationView, ObservedPlant | NothingKnown]:
     """The answer, and the plant as a test may take it as known; a computation of seconds.
 
     now_s: wall time, s since 1970 UTC.

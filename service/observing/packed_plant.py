@@ -8,14 +8,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from loopwright.service.results import GainsView
-from loopwright.tuning.fast.known_plant import KnownPlant, NothingKnown
+from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 
 UNREADABLE = NothingKnown("what was known of the loop as the job began cannot be read again")
 
 
 class PackedPlant(BaseModel):
-    """The fields of `KnownPlant` and of its record. why: where nothing is known, the reason; the rest is then null."""
+    """The fields of `ObservedPlant` and of its record. why: the reason why nothing is known; the rest is then empty."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -36,7 +36,7 @@ class PackedPlant(BaseModel):
     source: str = ""
 
 
-def pack(known: KnownPlant | NothingKnown) -> bytes:
+def pack(known: ObservedPlant | NothingKnown) -> bytes:
     """What is known as bytes."""
     if isinstance(known, NothingKnown):
         packed = PackedPlant(why=known.why)
@@ -61,7 +61,7 @@ def pack(known: KnownPlant | NothingKnown) -> bytes:
     return zlib.compress(packed.model_dump_json().encode())
 
 
-def unpack(data: bytes) -> KnownPlant | NothingKnown:
+def unpack(data: bytes) -> ObservedPlant | NothingKnown:
     """What is known, from these bytes."""
     try:
         packed = PackedPlant.model_validate_json(zlib.decompress(data))
@@ -83,4 +83,4 @@ def unpack(data: bytes) -> KnownPlant | NothingKnown:
         held_s=packed.held_s,
     )
     gains = packed.gains.gains()
-    return KnownPlant(record, packed.together, gains, packed.pv, packed.mv, packed.age_s, packed.source)
+    return ObservedPlant(record, packed.together, gains, packed.pv, packed.mv, packed.age_s, packed.source)

@@ -14,7 +14,7 @@ from loopwright.service.jobs.locking import Locking
 from loopwright.service.jobs.loop_directory import LoopDirectory, LoopFactory
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.jobs.operation import Operation
+from loopwright.service.jobs.operation import OperationHeard
 from loopwright.service.jobs.recovery import Recovery
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.worker import Worker
@@ -45,7 +45,7 @@ def make_jobs(
     journal = Journal(store, beside=machine.writes_beside)
     directory = LoopDirectory(loops, store, open_loop, registry, machine, buses)
     knowledge = KeptKnowledge(store, machine.lock())
-    operation = Operation(store, directory, knowledge)
+    operation = OperationHeard(store, directory, knowledge)
     decisions = Decisions(store, directory, machine, knowledge)
     return Jobs(
         store=store,

@@ -14,8 +14,8 @@ from __future__ import annotations
 
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.settle import after_settling
-from loopwright.tuning.fast.known_plant import KnownPlant, NothingKnown
-from loopwright.tuning.fast.known_procedure import KNOWN_STAGES, TRIAL, KnownPlantFails, by_known_plant
+from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
+from loopwright.tuning.fast.known_procedure import KNOWN_STAGES, TRIAL, ObservedPlantFails, by_known_plant
 from loopwright.tuning.fast.procedure import FAST, FastOptions, by_relay, fast
 from loopwright.tuning.fast.proposal import FastProposal
 from loopwright.tuning.fast.pulse_test import PulseTest
@@ -50,7 +50,7 @@ def fast_by(
     excitations: tuple[Excitation, ...],
     facts: Facts,
     options: FastOptions,
-    known: KnownPlant | NothingKnown = NOT_ASKED,
+    known: ObservedPlant | NothingKnown = NOT_ASKED,
 ) -> Plan[FastProposal]:
     """The plan of the fast procedure with the excitations that the loop permits, for a loop in automatic and at rest.
 
@@ -61,9 +61,9 @@ def fast_by(
         return (yield from _moved_by(excitations, facts, options))
     try:
         if isinstance(known, NothingKnown):
-            raise KnownPlantFails(Reason.UNCERTAIN, known.why)
+            raise ObservedPlantFails(Reason.UNCERTAIN, known.why)
         return (yield from by_known_plant(facts, options, known, FAST))
-    except KnownPlantFails as failed:
+    except ObservedPlantFails as failed:
         others = tuple(each for each in excitations if each is not Excitation.OBSERVE)
         what = "the trial of gains from operation failed" if failed.moved else "operation does not give gains to try"
         if not others:

@@ -22,7 +22,7 @@ SAME_GAINS = 1e-5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class KnownPlant:
+class ObservedPlant:
     """What normal operation has shown of the plant of a loop, well enough known to design gains on it.
 
     record: the record of the set-point changes; its sample time is `together` sample times of the controller.

@@ -19,7 +19,7 @@ from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.agreement import Agreement, agreement
 from loopwright.tuning.fast.evaluation import NEGLIGIBLE_RESIDUAL, Evaluation, evaluate
 from loopwright.tuning.fast.experiment import STEP_BACK_FRACTION, VERIFICATION_PERIODS, Experiment
-from loopwright.tuning.fast.known_plant import KnownPlant
+from loopwright.tuning.fast.known_plant import ObservedPlant
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.outcome import OPEN_REASONS, outcome_of
 from loopwright.tuning.fast.proposal import FastProposal, VerifiedStep, evaluation_summary, proposed, verified_step
@@ -28,7 +28,7 @@ from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Note, Plan, Sample, SetGains, SetSetpoint, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
 
-__all__ = ["KNOWN_STAGES", "TRIAL", "KnownPlantFails", "TrialFigures", "by_known_plant"]
+__all__ = ["KNOWN_STAGES", "TRIAL", "ObservedPlantFails", "TrialFigures", "by_known_plant"]
 
 TRIAL = "trial"
 KNOWN_STAGES = (PREFLIGHT, "design", TRIAL, "redesign")
@@ -54,7 +54,7 @@ OUTDATED = (
 """Reasons for a refusal of the step that speak against the known plant; the others against the time of the step."""
 
 
-class KnownPlantFails(Refused):
+class ObservedPlantFails(Refused):
     """The known plant does not give gains. moved: the loop was moved and is not at rest."""
 
     def __init__(self, reason: Reason, detail: str, moved: bool = False) -> None:
@@ -91,7 +91,7 @@ class TrialFigures:
 class KnownTrial(Experiment):
     """The set-point step under gains designed on the known plant, from rest, and its record."""
 
-    def __init__(self, facts: Facts, point: OperatingPoint, listened: Trace, known: KnownPlant) -> None:
+    def __init__(self, facts: Facts, point: OperatingPoint, listened: Trace, known: ObservedPlant) -> None:
         super().__init__(facts, point, listened)
         self._known = known
         self._period = 0.0
@@ -126,18 +126,18 @@ class KnownTrial(Experiment):
         return ()
 
 
-def by_known_plant(facts: Facts, options: DesignOptions, known: KnownPlant, method: str) -> Plan[FastProposal]:
+def by_known_plant(facts: Facts, options: DesignOptions, known: ObservedPlant, method: str) -> Plan[FastProposal]:
     """The plan of the procedure, for a loop in automatic and at rest.
 
     method: the name of the procedure in the proposal.
-    Raises Refused where the loop is not at rest, else KnownPlantFails. The plan restores nothing but the present gains
-    and the set-point before KnownPlantFails is raised: the runner restores the loop.
+    Raises Refused where the loop is not at rest, else ObservedPlantFails. The plan restores nothing but the present
+    gains and the set-point before ObservedPlantFails is raised: the runner restores the loop.
     """
     why = known.not_for(facts)
     if why is None and not options.verify:
         why = "without the step under the new gains (verify: false) gains from operation are not proposed"
     if why is not None:
-        raise KnownPlantFails(Reason.UNCERTAIN, why)
+        raise ObservedPlantFails(Reason.UNCERTAIN, why)
     expected = {PREFLIGHT: facts.T95_s / 2, "design": 0.0, TRIAL: 1.5 * facts.T95_s, "redesign": 0.0}
 
     def started(stage: str) -> tuple[StageStarted]:
@@ -148,11 +148,11 @@ def by_known_plant(facts: Facts, options: DesignOptions, known: KnownPlant, meth
     test = KnownTrial(facts, point, listened, known)
     yield from test.report(StageDone(PREFLIGHT, point), *started("design"))
     if (why := known.not_at(point)) is not None:
-        raise KnownPlantFails(Reason.UNCERTAIN, why)
+        raise ObservedPlantFails(Reason.UNCERTAIN, why)
     first, outcome = yield from test.computed(partial(_designed, facts, options, known))
     yield from test.report(StageDone("design", evaluation_summary(first)))
     if isinstance(outcome, Refused):
-        raise KnownPlantFails(outcome.reason, outcome.detail)
+        raise ObservedPlantFails(outcome.reason, outcome.detail)
     shown: VerifiedStep | None = None
     evaluation = first
     if outcome.gain or options.propose_anyway:
@@ -170,9 +170,9 @@ def by_known_plant(facts: Facts, options: DesignOptions, known: KnownPlant, meth
 
 
 def _tried(
-    facts: Facts, options: DesignOptions, known: KnownPlant, test: KnownTrial, first: Evaluation
+    facts: Facts, options: DesignOptions, known: ObservedPlant, test: KnownTrial, first: Evaluation
 ) -> Plan[tuple[Evaluation, VerifiedStep]]:
-    """Tries the gains of the first evaluation. Raises KnownPlantFails."""
+    """Tries the gains of the first evaluation. Raises ObservedPlantFails."""
     tested = first.best.gains
     looked: _Look | None = None
     try:
@@ -189,7 +189,7 @@ def _tried(
     yield from test.report(StageDone(TRIAL, _figures(known, test, tested, looked, outdated)))
     if refused is not None:
         yield (SetGains(facts.old_gains), SetSetpoint(test.point.sp))
-        raise KnownPlantFails(refused.reason, refused.detail, moved=True)
+        raise ObservedPlantFails(refused.reason, refused.detail, moved=True)
     assert looked is not None and looked.evaluation is not None
     return looked.evaluation, verified_step(looked.evaluation, tested, *test.stepped)
 
@@ -203,13 +203,13 @@ class _Look:
     refused: Refused | None
 
 
-def _designed(facts: Facts, options: DesignOptions, known: KnownPlant) -> tuple[Evaluation, Refused | Comparison]:
-    """The evaluation of the record of operation with what follows from it. Raises KnownPlantFails."""
+def _designed(facts: Facts, options: DesignOptions, known: ObservedPlant) -> tuple[Evaluation, Refused | Comparison]:
+    """The evaluation of the record of operation with what follows from it. Raises ObservedPlantFails."""
     try:
         evaluation = evaluate(known.record, options.spec())
         return evaluation, outcome_of(facts, options, evaluation)
     except Refused as refused:
-        raise KnownPlantFails(refused.reason, refused.detail) from None
+        raise ObservedPlantFails(refused.reason, refused.detail) from None
 
 
 def _look(facts: Facts, options: DesignOptions, record: ExperimentRecord, first: Evaluation) -> _Look:
@@ -247,7 +247,7 @@ def _another_plant(evaluation: Evaluation, compared: Agreement) -> Refused | Non
 
 
 def _figures(
-    known: KnownPlant, test: KnownTrial, tested: Gains, looked: _Look | None, outdated: str | None
+    known: ObservedPlant, test: KnownTrial, tested: Gains, looked: _Look | None, outdated: str | None
 ) -> TrialFigures:
     size, duration_s = test.stepped
     compared = looked.agreement if looked else None

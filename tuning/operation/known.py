@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from loopwright.tuning.fast.known_plant import KnownPlant, NothingKnown
+from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
 from loopwright.tuning.models import Reals
 from loopwright.tuning.operation.observation import Observation
 
 
-def known_plant(found: Observation, sample_time_s: float, age_s: float) -> KnownPlant | NothingKnown:
+def known_plant(found: Observation, sample_time_s: float, age_s: float) -> ObservedPlant | NothingKnown:
     """The known plant, where the observation is good enough to propose gains.
 
     sample_time_s: the sample time of the controller, s. age_s: the plant time since the latest set-point change, s.
@@ -19,7 +19,7 @@ def known_plant(found: Observation, sample_time_s: float, age_s: float) -> Known
     evaluation, used = found.evaluation, found.used
     record = evaluation.fit.record
     uncertainty = max(evaluation.uncertainty, evaluation.ambiguity)
-    return KnownPlant(
+    return ObservedPlant(
         record=record,
         together=max(1, round(record.Ts / sample_time_s)),
         gains=used[-1].stretch.gains,
