@@ -374,6 +374,12 @@ class FastResult(_Result):
     predicted_before: PredictedView | None = Field(
         default=None, description="Predicted performance of the old gains; null: the loop is not stable with them"
     )
+    model_from: str | None = Field(
+        default=None,
+        description="Where the model comes from, in words; null: there is none, or an earlier version has found it",
+        examples=["3 set-point changes of normal operation, from which Ms is known to +-0.03, and the step under the "
+                  "new gains"],
+    )  # fmt: skip
     evidence: EvidenceView | None = Field(default=None, description="Evidence from the record")
     known_before: KnownMsView | None = Field(
         default=None, description="Ms of the old gains; null: there is no record, or an earlier version has found it"

@@ -265,6 +265,11 @@ class JobView(BaseModel):
         description="Predicted performance of the old gains on the same model, only for method fast; null: the loop is "
         "not stable with them. `comparison` has more figures, for every method"
     )
+    model_from: str | None = Field(
+        description="Where the model of method fast or setpoint comes from, in words; null: there is none, or an "
+        "earlier version has found it",
+        examples=["pulses of the set-point, and the set-point step under the new gains"],
+    )
     evidence: EvidenceView | None = Field(description="Evidence from the record of method fast, also for a refused job")
     verification: VerificationView | None = Field(description="Measured step that verifies the model of method fast")
     before: StepView | None = Field(description="Measured set-point step with the old gains; only for five-stage")
@@ -387,6 +392,7 @@ def job_view(
         rehearsed_on=result.rehearsed_on,
         predicted=result.predicted,
         predicted_before=result.predicted_before if isinstance(result, FastResult) else None,
+        model_from=result.model_from if isinstance(result, FastResult) else None,
         evidence=_evidence(result, events),
         verification=_verification(result, events),
         before=result.before if isinstance(result, FiveStageResult) else None,

@@ -34,7 +34,9 @@ def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
     def retune_preview(tag: Tag, options: Annotated[RetuneRequest | None, Body()] = None) -> Preview:
         request = options or FastRetune()
         config, _ = jobs.directory.owner(tag)
-        return preview(config, request, _now(jobs, tag, request), _last(jobs.store.last_models(tag).get(tag)))
+        now = _now(jobs, tag, request)
+        known = jobs.knowledge.of(tag, None if now.state is None else now.state.gains)
+        return preview(config, request, now, _last(jobs.store.last_models(tag).get(tag)), known)
 
     @routes.post(
         "/retunes/preview",

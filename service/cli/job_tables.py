@@ -165,6 +165,8 @@ def _with_error(value: float, error: float | None) -> str:
 def _certainty(job: JobView) -> Iterator[tuple[str, str, str]]:
     """Yields lines of the table on how certain the result of fast is: label, value, unit."""
     found, step = job.evidence, job.verification
+    if job.model_from is not None:
+        yield "model from", job.model_from, ""
     if found is not None:
         yield "uncertainty of Ms", cell(found.uncertainty), "(2 std. dev.)"
         yield "Ms, other models", cell(found.ambiguity), "(max. diff.)"

@@ -17,6 +17,8 @@ from loopwright.service.results import Result, empty_result
 from loopwright.service.store.jobs import JobEvent
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.settle import after_settling
+from loopwright.tuning.fast.excitation_choice import NOT_ASKED
+from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
 from loopwright.tuning.models import Model
 from loopwright.tuning.plan import Event, Note, Plan, Sample
 from loopwright.tuning.reasons import Ended, NoGain, Reason, Refused
@@ -38,6 +40,7 @@ class Hooks:
     note_session: receives the number of a session before it is opened.
     on_home: receives the state of the loop before the test.
     ground: known facts of the loop, for a rehearsal.
+    plant: what operation has shown of the plant.
     """
 
     on_event: Callable[[Event], None]
@@ -47,6 +50,7 @@ class Hooks:
     note_session: Callable[[int], None] = lambda session: None
     on_home: Callable[[LoopState], None] = lambda home: None
     ground: Ground = field(default_factory=Ground)
+    plant: ObservedPlant | NothingKnown = NOT_ASKED
 
 
 @dataclass(frozen=True)
@@ -110,7 +114,7 @@ def tune(
     )
     computing = ComputingLoop(loop, workers)
     ran = run(
-        plan(config, request, facts, hooks.earlier),
+        plan(config, request, facts, hooks.earlier, hooks.plant),
         computing,
         limits=limits,
         on_event=hooks.on_event,
@@ -126,18 +130,31 @@ def tune(
     return Outcome(None if ran.value is None else result_of(ran.value), ended, ran.restored, dict(ran.plant_time_s))
 
 
-def plan(config: LoopConfig, request: RetuneRequest, facts: Facts, earlier: Sequence[JobEvent] = ()) -> Plan[Any]:
+def plan(
+    config: LoopConfig,
+    request: RetuneRequest,
+    facts: Facts,
+    earlier: Sequence[JobEvent] = (),
+    plant: ObservedPlant | NothingKnown = NOT_ASKED,
+) -> Plan[Any]:
     """Returns the plan of the requested procedure.
 
     config: the configuration with the limits of the job.
     earlier: events of interrupted attempts, after which the loop gets time to come to rest. The record of an
     interrupted fast procedure is not continued: relay and set-point step are one record of an otherwise untouched loop.
+    plant: what operation has shown of the plant.
     """
-    procedure = _procedure(config, request, facts, earlier)
+    procedure = _procedure(config, request, facts, earlier, plant)
     return after_settling(facts, procedure) if earlier else procedure
 
 
-def _procedure(config: LoopConfig, request: RetuneRequest, facts: Facts, earlier: Sequence[JobEvent]) -> Plan[Any]:
+def _procedure(
+    config: LoopConfig,
+    request: RetuneRequest,
+    facts: Facts,
+    earlier: Sequence[JobEvent],
+    plant: ObservedPlant | NothingKnown,
+) -> Plan[Any]:
     if isinstance(request, FastRetune):
         from loopwright.tuning.fast.design_trial import trial
         from loopwright.tuning.fast.excitation_choice import fast_by
@@ -145,7 +162,7 @@ def _procedure(config: LoopConfig, request: RetuneRequest, facts: Facts, earlier
         known = _known_model(request)
         if known is not None:
             return trial(facts, request.options, known)
-        return fast_by(excitations(config, request), facts, request.options)
+        return fast_by(excitations(config, request), facts, request.options, plant)
     if isinstance(request, SetpointRetune):
         from loopwright.tuning.fast.setpoint_procedure import setpoint
 

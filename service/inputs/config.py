@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from loopwright.service.inputs.plausible import Positive, Size, Time, Value, check_step
 
 Node = Annotated[int, Field(ge=1, le=127)]
-ExcitationName = Literal["setpoint", "relay"]
+ExcitationName = Literal["observe", "setpoint", "relay"]
 Tag = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 
 _BUS_KINDS = ("socketcan", "socketcand", "virtual", "pcan", "kvaser", "ixxat", "vector", "slcan", "gs_usb")
@@ -49,8 +49,9 @@ class Limits(BaseModel):
 class PermittedTest(BaseModel):
     """What a test may do to a loop; a request may narrow it, not widen it.
 
-    excitations: what method fast may move the loop by: the set-point under the present gains, or the controller's
-    relay. With both of them the relay follows only where pulses of the set-point tell too little.
+    excitations: what method fast may learn the plant from: normal operation (observe), after which only the gains
+    found are tried; pulses of the set-point under the present gains; the controller's relay. They are tried in this
+    order, each where those before it tell too little.
     mv_step_max: the largest jump of MV from one sample to the next, percent, of a test by any method; None: what
     mv_limits permit.
     """
@@ -60,8 +61,9 @@ class PermittedTest(BaseModel):
     excitations: tuple[ExcitationName, ...] = Field(
         default=("relay",),
         min_length=1,
-        description="What method fast may move the loop by: the set-point under the present gains, or the relay",
-        examples=[["setpoint", "relay"]],
+        description="What method fast may learn the plant from: normal operation (observe), after which only the gains "
+        "found are tried, pulses of the set-point under the present gains, or the relay",
+        examples=[["setpoint", "relay"], ["observe", "setpoint", "relay"]],
     )
     mv_step_max: Positive | None = Field(
         default=None,

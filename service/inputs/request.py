@@ -212,9 +212,10 @@ class FastRetune(DesignRetune):
         default=None,
         min_length=1,
         description="What moves the loop, among what loops.yaml permits (test: excitations); the default is all of "
-        "that. setpoint: pulses under the present gains, in automatic; relay: the controller's relay, which follows "
-        "only where the pulses tell too little if both are given",
-        examples=[["setpoint"]],
+        "that. observe: where normal operation has shown the plant well enough, only the new gains are tried; "
+        "setpoint: pulses under the present gains, in automatic; relay: the controller's relay. Each follows only "
+        "where those before it tell too little",
+        examples=[["setpoint"], ["observe", "setpoint"]],
     )
     careful: bool = Field(default=False, description="Use at least six switches of the relay, not four")
 
@@ -439,7 +440,8 @@ def within(loop: LoopConfig, request: RetuneRequest) -> LoopConfig:
 
 def excitations(loop: LoopConfig, request: RetuneRequest) -> tuple[Excitation, ...]:
     """What may move the loop during a retune by fast, in the order in which it is tried; empty where there is no such
-    choice. A set-point that another controller moves is left alone where the relay is permitted.
+    choice. A set-point that another controller moves is left alone where the relay is permitted. A dry run has no
+    history of operation: `observe` is left out where something else is permitted.
 
     loop: the loop with the limits of the request.
     """
@@ -447,8 +449,11 @@ def excitations(loop: LoopConfig, request: RetuneRequest) -> tuple[Excitation, .
         return ()
     permitted = loop.test.excitations
     remote = loop.setpoint_from == "remote" and "relay" in permitted and not request.dry_run
-    tried = (Excitation.RELAY,) if remote else (Excitation.SETPOINT, Excitation.RELAY)
-    return tuple(each for each in tried if each in permitted)
+    if remote:
+        return (Excitation.RELAY,)
+    tried = (Excitation.OBSERVE, Excitation.SETPOINT, Excitation.RELAY)
+    found = tuple(each for each in tried if each in permitted)
+    return found[1:] if request.dry_run and len(found) > 1 and found[0] is Excitation.OBSERVE else found
 
 
 def check_setpoint_source(loop: LoopConfig, request: RetuneRequest) -> None:
@@ -456,7 +461,8 @@ def check_setpoint_source(loop: LoopConfig, request: RetuneRequest) -> None:
 
     loop: the loop with the limits of the request.
     """
-    pulses = isinstance(request, SetpointRetune) or excitations(loop, request) == (Excitation.SETPOINT,)
+    tried = excitations(loop, request)
+    pulses = isinstance(request, SetpointRetune) or (tried and Excitation.RELAY not in tried)
     if loop.setpoint_from == "operator" or not pulses or request.dry_run:
         return
     tag, outer = loop.tag, loop.outer_loop or "another controller"
@@ -521,6 +527,9 @@ def _narrow_test(loop: LoopConfig, request: RetuneRequest) -> tuple[PermittedTes
     of_relay = [name for name in ("amplitude_pct", "careful") if getattr(request, name)]
     if of_relay and "relay" not in asked:
         return loop.test, [f"{', '.join(of_relay)}: of a relay, which is not among the excitations {', '.join(asked)}"]
+    if asked == ("observe",) and not request.verify:
+        words = "gains from operation are proposed only after the step under them"
+        return loop.test, [f"verify: false, with observe as the only excitation: {words}; leave verify out"]
     return loop.test.model_copy(update={"excitations": asked}), []
 
 

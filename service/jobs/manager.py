@@ -24,6 +24,7 @@ from loopwright.service.jobs.journal import Journal
 from loopwright.service.jobs.locking import Locking
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.machine import Machine
+from loopwright.service.jobs.operation import OperationHeard
 from loopwright.service.jobs.recovery import Recovery
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.until_answered import STOP_PATIENCE_S, UntilAnswered
@@ -50,7 +51,8 @@ for the database). It is shorter than TimeoutStopSec of the unit, after which sy
 class Jobs:
     """Starts and stops jobs of this host's loops; shows, starts and aborts those of the other hosts.
 
-    decisions, locking, knowledge: parts that the manager does not use itself; the API gets them together with the jobs.
+    decisions, locking, knowledge, operation: parts that the manager does not use itself; the API and the server get
+    them together with the jobs.
     machine: clock and threads.
     """
 
@@ -68,6 +70,7 @@ class Jobs:
         recovery: Recovery,
         machine: Machine,
         knowledge: KeptKnowledge,
+        operation: OperationHeard,
     ) -> None:
         self.store = store
         self.engine = engine
@@ -79,6 +82,7 @@ class Jobs:
         self.locking = locking
         self.aftercare = aftercare
         self.knowledge = knowledge
+        self.operation = operation
         self._recovery = recovery
         self._machine = machine
         self._lasting = UntilAnswered(machine, registry)

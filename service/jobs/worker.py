@@ -14,8 +14,10 @@ from loopwright.service.execution.procedures import Hooks, Outcome, Rehearse, Tu
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import (
     BadLimits,
+    FastRetune,
     RetuneRequest,
     check_setpoint_source,
+    excitations,
     retune_request,
     within,
 )
@@ -24,6 +26,7 @@ from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.journal import Journal
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.machine import Machine
+from loopwright.service.jobs.operation import OperationHeard, outdated_by
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.until_answered import STOP_PATIENCE_S, UntilAnswered
 from loopwright.service.loop_state import LoopState, differences, loop_state, same_gains, state_json
@@ -37,6 +40,9 @@ from loopwright.service.store.jobs import Job, JobColumns
 from loopwright.service.store.lock import FolderInUse
 from loopwright.service.store.store import NoSuchJob, Store
 from loopwright.service.telemetry.logs import about
+from loopwright.tuning.fast.excitation_choice import NOT_ASKED
+from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
+from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.plan import Event
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
 
@@ -49,6 +55,7 @@ class Worker:
     tune: runs a job on the loop itself.
     rehearse: runs a dry run.
     knowledge: keeps what the tests tell of their loops.
+    operation: tells what operation has shown of them before.
     """
 
     def __init__(
@@ -61,10 +68,12 @@ class Worker:
         rehearse: Rehearse,
         machine: Machine,
         knowledge: KeptKnowledge,
+        operation: OperationHeard,
     ) -> None:
         self.store = store
         self.journal = journal
         self._knowledge = knowledge
+        self._operation = operation
         self._directory = directory
         self._registry = registry
         self._tune = tune
@@ -130,6 +139,8 @@ class Worker:
 
     def _live(self, running: Running, row: Job, config: LoopConfig, request: RetuneRequest) -> Outcome:
         self._check_stop_request(running)
+        plant = self._plant_known(running, row, config, request)
+        self._check_stop_request(running)
         loop = ObservedLoop(self._directory.open_loop(config))
         try:
             running.loop = loop
@@ -142,11 +153,24 @@ class Worker:
             hooks = Hooks(
                 running.on_event, running.on_samples, lambda: running.stop_reason, earlier,
                 lambda session: self._lasting(lambda: self.store.note_session(row.id, session)),
-                lambda home: self._note_home(row.id, state, home),
+                lambda home: self._note_home(row.id, state, home), plant=plant,
             )  # fmt: skip
             return self._tune(config, request, loop, state, hooks)
         finally:
             loop.close()
+
+    def _plant_known(
+        self, running: Running, row: Job, config: LoopConfig, request: RetuneRequest
+    ) -> ObservedPlant | NothingKnown:
+        """Returns what operation has shown of the plant, where the test may begin with it."""
+        if not isinstance(request, FastRetune) or Excitation.OBSERVE not in excitations(config, request):
+            return NOT_ASKED
+        earlier = self._lasting(lambda: self.store.events(row.id)) if row.found is not None else ()
+        why = outdated_by(earlier)
+        if why is not None:
+            return NothingKnown(f"an earlier attempt has tried gains from operation: {why}")
+        spec = request.options.spec()
+        return self._lasting(lambda: self._operation.known(row, config, spec, lambda: running.stop_reason is not None))
 
     def _note_home(self, job_id: str, read: LoopState, home: LoopState) -> None:
         """Stores the state before the test as the controller noted it at the opening, where it changed after the
@@ -223,6 +247,7 @@ class Worker:
             state = state_after(outcome.ended)
             columns |= {"reason": outcome.ended.reason.value, "detail": outcome.ended.detail}
         job = self._lasting(lambda: self.store.move(running.job_id, state, **columns))
+        self._lasting(lambda: self._operation.outdated(job, self.store.events(job.id)))
         self._knowledge.tested(job, running.pv_range, running.mv_range)
         if outcome.ended is None:
             log.info("job is rehearsed" if dry_run else "job proposes new gains")

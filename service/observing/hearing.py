@@ -12,6 +12,7 @@ from loopwright.service.listening.listening import History, Listening
 from loopwright.service.loop_state import LoopState
 from loopwright.service.observing.observed import Question
 from loopwright.service.observing.resolution import FIRST_S, resolution
+from loopwright.service.store.job_knowledge import outdated_until_s
 from loopwright.service.store.store import Store
 from loopwright.service.store.under_test import TimeUnderTest, times_under_test
 from loopwright.tuning.fast.design import DesignSpec
@@ -46,6 +47,9 @@ def question(
     own = _tests(store, (config.tag,), from_s)
     theirs = [each for each in _tests(store, disturbers, from_s) if each.session]
     times = [each.within(from_s, now_s) for each in (*own, *theirs)]
+    until_s = outdated_until_s(store, config.tag)
+    if until_s is not None:  # what was heard before is of another plant
+        times.append((from_s, until_s))
     return Question(
         config,
         state,

@@ -61,6 +61,14 @@ class KeptKnowledge:
         """Keeps that a trial was accepted."""
         self._keep(job.loop, lambda findings: knowledge.of_trial(job, findings, self._now()))
 
+    def outdated(self, job: Job, why: str) -> None:
+        """Keeps that what operation has shown of a loop before a job is of an older plant. why: in words. Raises
+        SQLAlchemyError."""
+        with self._lock:
+            findings = stored.read(self._store, job.loop)
+            text = f"job {job.id} has tried gains from operation, and {why}"
+            stored.mark_older(self._store, dict.fromkeys(knowledge.of_operation(findings), text))
+
     def _keep(self, tag: str, make: Callable[[list[stored.Known]], Finding | None]) -> None:
         try:
             with self._lock:

@@ -160,6 +160,11 @@ def _repeats(newer: Finding, older: Finding) -> bool:
     return abs(older.last_change_s - newer.last_change_s) <= max(SAME_CHANGE_S, 2.0 * newer.sample_s)
 
 
+def of_operation(findings: Sequence[Known]) -> list[int]:
+    """The numbers of the findings that come from normal operation, tried on the loop or not, and count still."""
+    return [each.number for each in findings if each.finding.changes is not None and each.older_plant is None]
+
+
 # -- what of them is in effect
 
 

@@ -14,6 +14,7 @@ from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.jsonable import json_object
 from loopwright.service.listening.bins import Rows
 from loopwright.service.loop_state import LoopState
+from loopwright.service.observing.resolution import wall_period_s
 from loopwright.service.observing.stretches import HeardStretch, heard_stretches
 from loopwright.service.planning.facts import facts_of
 from loopwright.service.results import (
@@ -29,11 +30,13 @@ from loopwright.service.results import (
 from loopwright.tuning.analysis.comparison import Comparison, predicted
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.evaluation import Evaluation
+from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
 from loopwright.tuning.fast.procedure import FAST
 from loopwright.tuning.fast.proposal import comparison_of, identified_model, load_disturbances, ultimate
 from loopwright.tuning.fast.robustness import known_Ms
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.operation.history import SetpointChange
+from loopwright.tuning.operation.known import known_plant
 from loopwright.tuning.operation.observation import Observation, observe
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -174,14 +177,33 @@ class Question:
 
 def observed(question: Question) -> ObservationView:
     """The answer; a computation of seconds."""
+    return _observed(question, question.heard())[0]
+
+
+def observed_plant(question: Question, now_s: float) -> tuple[ObservationView, ObservedPlant | NothingKnown]:
+    """The answer, and the plant as a test may take it as known; a computation of seconds.
+
+    now_s: wall time, s since 1970 UTC.
+    """
     heard = question.heard()
+    view, found = _observed(question, heard)
+    if found.reason is not None:
+        return view, NothingKnown(view.detail)
+    latest = max(_at_s(each, heard, each.move) for each in found.used)
+    sample_time_s = question.state.sample_time_s
+    # a simulated plant runs faster than the wall clock
+    period_s = wall_period_s(question.rows.bins) or sample_time_s
+    return view, known_plant(found, sample_time_s, (now_s - latest) / period_s * sample_time_s)
+
+
+def _observed(question: Question, heard: Sequence[HeardStretch]) -> tuple[ObservationView, Observation]:
     if question.config.setpoint_from == "remote":
         outer = question.config.outer_loop or "another controller"
         text = f"the set-point comes from {outer} (setpoint_from: remote in loops.yaml), which follows what PV does"
-        return _answer(question, heard, Observation(Reason.SETPOINT_IS_DRIVEN, text), None)
+        return _answered(question, heard, Observation(Reason.SETPOINT_IS_DRIVEN, text), None)
     if not heard:
         why = f"{question.not_heard}" if question.not_heard else "nothing in automatic under known gains was heard yet"
-        return _answer(question, heard, Observation(Reason.UNCERTAIN, why), None)
+        return _answered(question, heard, Observation(Reason.UNCERTAIN, why), None)
     try:
         facts = facts_of(question.config, question.state)
         found = observe([each.stretch for each in heard], question.state.reverse_acting, question.spec)
@@ -189,8 +211,14 @@ def observed(question: Question) -> ObservationView:
         if found.reason is None and found.evaluation is not None:
             compared = comparison_of(found.evaluation, facts, question.spec, False)
     except Refused as refused:
-        return _answer(question, heard, Observation(refused.reason, refused.detail), None)
-    return _answer(question, heard, found, compared)
+        return _answered(question, heard, Observation(refused.reason, refused.detail), None)
+    return _answered(question, heard, found, compared)
+
+
+def _answered(
+    question: Question, heard: Sequence[HeardStretch], found: Observation, compared: Comparison | None
+) -> tuple[ObservationView, Observation]:
+    return _answer(question, heard, found, compared), found
 
 
 def _answer(

@@ -3,11 +3,7 @@
 A stretch ends where samples are missing, the loop is not in automatic, set-point or gains are not known, other gains
 take effect, or a test of this service begins.
 
-Bins are brought to means of equal numbers of samples first, by interpolation of the running sums of PV and MV, so that
-PV and MV are averaged alike: the plant cannot tell. A mean of PV over a bin is the mean at the bin's end of what PV was
-during the bin's length. Between the ends of two bins the running mean of MV moves from one value to the other, so half
-the sum of both is held meanwhile, and the dead time of the plant stays what it is. Held from its bin on, a mean of MV
-would come half a bin late, and the dead time be found half a bin too short.
+Bins are brought to means of equal numbers of samples first: see `tuning.identification.means`.
 """
 
 from __future__ import annotations
@@ -21,6 +17,7 @@ from numpy.typing import NDArray
 from loopwright.protocol.profile import Mode
 from loopwright.service.listening.bins import GAP_BEFORE, GAP_INSIDE, Bins, Rows
 from loopwright.tuning.gains import Gains
+from loopwright.tuning.identification.means import means_alike
 from loopwright.tuning.models import Reals
 from loopwright.tuning.operation.history import Stretch
 
@@ -86,21 +83,12 @@ def _of_samples(bins: Bins, Ts: float, gains: Gains) -> Stretch:
 
 
 def _of_bins(bins: Bins, Ts: float, together: int, gains: Gains) -> tuple[Stretch, Reals]:
-    """The stretch of means, and its wall times. PV of a sample is measured as MV begins to be held: its running sum is
-    read half a sample later, so that both are means over the same time."""
+    """The stretch of means, and its wall times."""
     edges = np.append(0, np.cumsum(bins["count"].astype(np.int64)))
-    ends: Reals = np.arange(0.0, float(edges[-1]) + 1.0, together)
-    pv, mv = _means(edges, bins["pv_mean"], ends + 0.5), _means(edges, bins["mv_mean"], ends)
+    pv, mv, ends = means_alike(edges, bins["pv_mean"], bins["mv_mean"], together)
     at_s = np.interp(ends, edges, np.append(bins["at_s"], bins["until_s"][-1]))
     sp = _decimals(bins["sp"])[np.searchsorted(edges, ends[1:], side="left") - 1]
-    held = 0.5 * (mv[1:] + mv[:-1])
-    return Stretch(float(at_s[0]), together * Ts, held, pv[:-1], sp[1:], gains, held_s=Ts), at_s[1:-1]
-
-
-def _means(edges: NDArray[np.int64], means: NDArray[np.float32], at: Reals) -> Reals:
-    """The means between the times `at` of what has these means between the edges; times in samples."""
-    whole = np.append(0.0, np.cumsum(means * np.diff(edges).astype(np.float64)))
-    return np.asarray(np.diff(np.interp(at, edges, whole)) / np.diff(at))
+    return Stretch(float(at_s[0]), together * Ts, mv, pv, sp[1:], gains, held_s=Ts), at_s[1:-1]
 
 
 def _decimals(values: NDArray[np.float32]) -> Reals:

@@ -41,11 +41,14 @@ def durations(
     if designed_only:
         return {"preflight": listening, "design": nothing, "verify": (0.6 * t95_s, 11.0 * t95_s)}
     if whole_record:
-        pulses = (1.5 * low, max(MAX_PERIODS_OF_PULSES * high, MAX_T95 * t95_s))
+        # where operation has shown the plant only the trial moves the loop, else the trial is left out
+        may_be_known = "trial" in stages
+        pulses = (0.0 if may_be_known else 1.5 * low, max(MAX_PERIODS_OF_PULSES * high, MAX_T95 * t95_s))
         # the relay follows pulses only where they tell too little
-        relay = (0.0 if "pulses" in stages else 1.8 * low, MAX_PERIODS * high)
+        relay = (0.0 if may_be_known or "pulses" in stages else 1.8 * low, MAX_PERIODS * high)
         steps = (VERIFICATION_PERIODS * low, (1.0 + STEP_BACK_FRACTION) * VERIFICATION_PERIODS * high)
-        known = {"preflight": listening, "pulses": pulses, "relay": relay, "verify": steps}
+        verify = (0.0 if may_be_known else steps[0], steps[1])
+        known = {"preflight": listening, "trial": steps, "pulses": pulses, "relay": relay, "verify": verify}
         return {stage: known.get(stage, nothing) for stage in stages}
     return {
         "preflight": listening,

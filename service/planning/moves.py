@@ -15,6 +15,7 @@ from loopwright.service.inputs.request import FastRetune, FiveStages, RetuneRequ
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.design_trial import trial_stages
 from loopwright.tuning.fast.excitation_choice import chosen_stages
+from loopwright.tuning.fast.known_procedure import FARTHEST
 from loopwright.tuning.fast.pulse_test import pulse_size
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.fast.relay_test import BIAS, FIRST_AMPLITUDE, MAX_OUTPUT_RANGE, MAX_RAISE, max_amplitude
@@ -24,7 +25,7 @@ from loopwright.tuning.five_stage.ultimate_gain import RUN_MV_LIMIT
 from loopwright.tuning.gains import Gains
 
 _COMPUTING = ("design", "redesign", "estimate", "optimise")
-_STEPPING = ("baseline", "ultimate", "zn_pi", "verify")
+_STEPPING = ("baseline", "ultimate", "zn_pi", "verify", "trial")
 _UNDER_PRESENT_GAINS, _UNDER_NEW_GAINS = 2.0, 1.4
 """Largest excursion of PV per set-point step: in a loop that is just stable, and as far as `verification` permits."""
 
@@ -149,6 +150,8 @@ def _moving(stage: str, config: LoopConfig, request: RetuneRequest, before: Befo
 def _by_excitation(stage: str, config: LoopConfig, request: FastRetune, before: Before) -> Moves:
     """The moves of a stage of fast. Where relay or pulses may have made the record, the larger moves of the two."""
     tried = excitations(config, request)
+    if stage == "trial":
+        return _known_trial(config, before)
     if Excitation.SETPOINT not in tried:
         return _fast(stage, config, request, before)
     if Excitation.RELAY not in tried or stage == "pulses":
@@ -207,6 +210,16 @@ def _setpoint(stage: str, config: LoopConfig, before: Before) -> Moves:
         "once more, by half as much, where the record is not conclusive."
     )
     return Moves(stage, what, room, room, step, pv=_UNDER_NEW_GAINS * step)
+
+
+def _known_trial(config: LoopConfig, before: Before) -> Moves:
+    kick, step = KICK_OF_ROOM * _room(config, before.mv), config.sp_deviation
+    what = (
+        f"Only where operation has shown the plant well enough: the set-point is stepped up by up to {step:g} "
+        f"{config.pv_unit} under the gains that follow from it, on trial, and home where the record is not conclusive. "
+        "A plant that is another one by now shows in it; the present gains then take over again."
+    )
+    return Moves("trial", what, kick, kick, step, pv=FARTHEST * step)
 
 
 def _trial(stage: str, config: LoopConfig, before: Before) -> Moves:

@@ -12,10 +12,11 @@ from loopwright.service.inputs.config import Limits, LoopConfig
 from loopwright.service.inputs.request import FiveStages, RetuneRequest, narrow
 from loopwright.service.loop_state import LoopState
 from loopwright.service.planning.durations import Span, durations
+from loopwright.service.planning.excitation_preview import ExcitationPreview, excitation_previews
 from loopwright.service.planning.facts import time_budget_s
 from loopwright.service.planning.moves import Before, Moves, moves, stages_asked
 from loopwright.service.planning.obstacles import Now, Obstacle, Occupied, obstacles
-from loopwright.service.results import Result, TransferModelView
+from loopwright.service.results import KnowledgeView, Result, TransferModelView
 from loopwright.tuning.gains import Gains
 
 
@@ -132,11 +133,21 @@ class Preview(BaseModel):
     at_the_end: str = Field(description="State of the loop after the test")
     on_abort: str = Field(description="State of the loop after an abort, a limit or a failure")
     known: KnownPlant
+    excitations: list[ExcitationPreview] = Field(
+        description="Method fast: the excitations that may follow each other, and what each would tell; else empty"
+    )
 
 
-def preview(config: LoopConfig, request: RetuneRequest, now: Now, last: LastProposal | None) -> Preview:
+def preview(
+    config: LoopConfig,
+    request: RetuneRequest,
+    now: Now,
+    last: LastProposal | None,
+    knowledge: KnowledgeView | None = None,
+) -> Preview:
     """Returns the preview of one loop.
 
+    knowledge: what is known of the loop from its tests and from operation.
     now: without a state in it the figures are the largest that the configured limits permit.
     last: the last retune of the loop that ended in a proposal; None where there is none.
     """
@@ -175,6 +186,7 @@ def preview(config: LoopConfig, request: RetuneRequest, now: Now, last: LastProp
         at_the_end=_at_the_end(request),
         on_abort=_on_abort(request, state, config.pv_unit),
         known=_known(config, last),
+        excitations=excitation_previews(limited, request, state, knowledge),
     )
     return found.model_copy(update={"summary": _summary(found, config.pv_unit)})
 
@@ -294,9 +306,19 @@ def _summary(found: Preview, unit: str) -> list[str]:
         f"After an abort, a limit or a failure: {found.on_abort}",
         f"At the end: {found.at_the_end}",
     ]
+    lines += [f"{each.excitation}: {_told(each)}" for each in found.excitations if len(found.excitations) > 1]
     if found.mv is None:
         lines.insert(1, "The loop could not be read: these are the largest moves that the configured limits permit.")
     return lines
+
+
+def _told(each: ExcitationPreview) -> str:
+    if each.duration_s is None or each.Ms_uncertainty is None:
+        return each.when
+    return (
+        f"{each.when} It would tell Ms to +-{each.Ms_uncertainty:.2g} in {duration_text(0.0, each.duration_s)} "
+        f"({each.information_per_pu:.3g} of information per ultimate period)."
+    )
 
 
 def duration_text(low_s: float, high_s: float) -> str:

@@ -14,6 +14,7 @@ from loopwright.service.jobs.locking import Locking
 from loopwright.service.jobs.loop_directory import LoopDirectory, LoopFactory
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.manager import Jobs
+from loopwright.service.jobs.operation import OperationHeard
 from loopwright.service.jobs.recovery import Recovery
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.worker import Worker
@@ -44,6 +45,7 @@ def make_jobs(
     journal = Journal(store, beside=machine.writes_beside)
     directory = LoopDirectory(loops, store, open_loop, registry, machine, buses)
     knowledge = KeptKnowledge(store, machine.lock())
+    operation = OperationHeard(store, directory, knowledge)
     decisions = Decisions(store, directory, machine, knowledge)
     return Jobs(
         store=store,
@@ -51,11 +53,12 @@ def make_jobs(
         journal=journal,
         registry=registry,
         directory=directory,
-        worker=Worker(store, journal, directory, registry, tune, rehearse, machine, knowledge),
+        worker=Worker(store, journal, directory, registry, tune, rehearse, machine, knowledge, operation),
         decisions=decisions,
         locking=Locking(store, directory, decisions),
         aftercare=Aftercare(store, directory, machine),
         recovery=Recovery(loops, store, open_loop, resume, lambda: registry.stopping),
         machine=machine,
         knowledge=knowledge,
+        operation=operation,
     )

@@ -214,6 +214,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         checks = {**operations.checks(jobs), "samples": retention.note}
         listening = Listening(site.loops, store, jobs.directory.in_effect, site.buses, setup.listen)
         stack.callback(listening.close)
+        jobs.operation.connect(listening, pool)
         looking = stack.enter_context(
             closing(Looking(jobs.directory, jobs.registry, store, listening, jobs.knowledge, pool))
         )

@@ -48,6 +48,13 @@ def add(store: Store, loop: str, finding: Finding, older: Mapping[int, str], ins
         session.execute(delete(KnowledgeRow).where(of_loop, KnowledgeRow.number.not_in(latest)))
 
 
+def mark_older(store: Store, older: Mapping[int, str]) -> None:
+    """Stores that findings are of an older plant. older: the reasons, by number."""
+    with store.writing() as session:
+        for number, why in older.items():
+            session.execute(update(KnowledgeRow).where(KnowledgeRow.number == number).values(older_plant=why))
+
+
 def delete_older(store: Store, before: str) -> int:
     """Deletes the findings before this time, UTC as ISO 8601, but the latest of each loop, which is what is known of
     it. Loops of other hosts are left alone. Returns the number of findings."""

@@ -201,6 +201,19 @@ class KnowledgeRow(Base):
     older_plant: Mapped[str | None]
 
 
+class JobKnowledgeRow(Base):
+    """What was known of a loop from operation as a job began, see service.observing.packed_plant for the layout of
+    `data`; null: deleted with the samples. outdated_at: when the job has shown another plant; null: it has not."""
+
+    __tablename__ = "job_knowledge"
+    __table_args__ = (Index("job_knowledge_by_loop", "loop", "outdated_at"),)
+
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
+    loop: Mapped[str]
+    data: Mapped[bytes | None] = mapped_column(LargeBinary)
+    outdated_at: Mapped[str | None]
+
+
 class RetuneRow(Base):
     """A retune of many loops. Its host begins their jobs, whatever hosts these are on."""
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import httpx
@@ -85,7 +86,7 @@ class Plantsite:
 
     more_loops: further entries of loops.yaml, what they change of the first.  launcher: a module that starts the
     service.  served_with: more options of the service.  speed: of the plant as it starts; one that starts at "max"
-    makes way for others on its processor.  on_answer: told of each answer.
+    makes way for others on its processor.  on_answer: told of each answer.  changes: of the entry of the first loop.
     """
 
     def __init__(
@@ -99,10 +100,12 @@ class Plantsite:
         served_with: Sequence[str] = (),
         speed: str = "max",
         on_answer: Callable[[httpx.Response], None] = lambda answer: None,
+        changes: Mapping[str, object] = MappingProxyType({}),
     ) -> None:
         self.case, self.bus = case, bus
         self._stack, self._folder, self._more_loops = stack, folder, more_loops
         self._launcher, self._served_with, self._speed, self._on_answer = launcher, served_with, speed, on_answer
+        self._changes = changes
         self.data = folder / "data"
         self.start_controller()
         self._service = self.launch_service()
@@ -141,6 +144,7 @@ class Plantsite:
         loop = {
             "tag": TAG, "bus": self.bus, "controller_node": 0x20, "plant_node": 0x10, "pv_unit": "unit",
             "pv_limits": {"low": low, "high": high}, "t95_s": case.t95_s, "sp_deviation": case.sp_deviation,
+            **self._changes,
         }  # fmt: skip
         loops = self._folder / "loops.yaml"
         loops.write_text(yaml.safe_dump({"loops": [loop, *(loop | change for change in self._more_loops)]}))

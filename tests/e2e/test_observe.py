@@ -14,6 +14,7 @@ import pytest
 from loopwright.service.results import GainsView
 from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.models import TransferFunction
+from loopwright.tuning.plan import Mode
 from tests.e2e.plantsite import MODEL_14, TAG, Plantsite
 
 SPEED = 10.0
@@ -37,10 +38,28 @@ def operated(here: Plantsite, plant_time_s: float) -> None:
         time.sleep(0.1)  # each question costs the one processor of the guest some of what the loop needs
 
 
+def only_the_step(here: Plantsite, sampled: TransferFunction) -> None:
+    """fast finds what operation has shown, and moves the set-point once. sampled: the plant with its sampling."""
+    told = here.http.post(f"/loops/{TAG}/retune/preview", json={}).json()
+    assert [stage["stage"] for stage in told["stages"]][:3] == ["preflight", "trial", "pulses"]
+    url = here.retune()
+    job = here.finished(url)
+    assert job["state"] == "proposed", (job["reason"], job["detail"], job["notes"])
+    assert [stage["stage"] for stage in job["stages"]] == ["preflight", "design", "trial", "redesign"]
+    assert "set-point changes of normal operation" in job["model_from"]
+    samples = here.http.get(f"{url}/samples").json()
+    assert set(samples["mode"]) == {int(Mode.AUTOMATIC)}
+    assert len(set(samples["sp"])) == 2, "at rest, and one step"
+    new = GainsView.model_validate(job["new_gains"]).gains()
+    assert margins(sampled, new).Ms == pytest.approx(1.6, abs=0.1)
+    assert here.is_home()
+
+
 @pytest.mark.on_vcan()
 def test_what_an_operator_does_gives_gains_that_are_right_on_the_plant(bus: str, tmp_path: Path) -> None:
     with ExitStack() as stack:
-        here = Plantsite(stack, tmp_path, MODEL_14, bus, speed=str(SPEED))
+        permitted = {"test": {"excitations": ["observe", "setpoint"]}}
+        here = Plantsite(stack, tmp_path, MODEL_14, bus, speed=str(SPEED), changes=permitted)
         here.write("plant_noise", 0.001)
         operated(here, REST_S)
         for sp in MOVES:
@@ -64,6 +83,8 @@ def test_what_an_operator_does_gives_gains_that_are_right_on_the_plant(bus: str,
         known = here.http.get(f"/loops/{TAG}").json()["knowledge"]
         assert (known["Ms"], known["changes"]) == (found["present"]["Ms"], len(found["changes_used"]))
         assert known["source"] == "operation" and known["proposed"] == found["proposed"]
+
+        only_the_step(here, sampled)
 
         job = here.finished(here.retune(**found["retune"]))
         assert job["state"] == "proposed", (job["reason"], job["detail"])

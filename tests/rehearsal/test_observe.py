@@ -34,12 +34,13 @@ def operated(
     sp: Reals,
     noise: float = NOISE,
     load: Reals | None = None,
+    Ts: float = TS,
 ) -> Stretch:
     """The history of a loop under the product's controller, from rest."""
     reverse = plant.static_gain > 0.0
-    process = LinearPlant(plant.num, plant.den, plant.L, TS, noise_std=noise, seed=3)
+    process = LinearPlant(plant.num, plant.den, plant.L, Ts, noise_std=noise, seed=3)
     settings = Settings(mv_low=-1e9, mv_high=1e9, pv_low=-1e9, pv_high=1e9, reverse=reverse)
-    channel = Channel(TS, settings, Parameters(gains.Kp, gains.Ti), 0.0, int(Mode.AUTOMATIC), 0.0)
+    channel = Channel(Ts, settings, Parameters(gains.Kp, gains.Ti), 0.0, int(Mode.AUTOMATIC), 0.0)
     rows, pv = [], process.pv
     for k, setpoint in enumerate(sp):
         if setpoint != channel.setpoint:
@@ -48,7 +49,7 @@ def operated(
         rows.append((mv, pv))
         pv = process.step(mv + (0.0 if load is None else float(load[k])))
     mv_column, pv_column = np.array(rows).T
-    return Stretch(1000.0, TS, mv_column, pv_column, sp, gains)
+    return Stretch(1000.0, Ts, mv_column, pv_column, sp, gains)
 
 
 def changes(levels: list[float], seconds: float) -> Reals:

@@ -91,4 +91,5 @@ def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal
         verified=None,
         verification=shown,
         notes=(),
+        model_from="the request",
     )

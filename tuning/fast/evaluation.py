@@ -22,7 +22,7 @@ the range of PV below which a residual is accepted in any case."""
 MAX_DURBIN_WATSON_RATIO = 1.35
 MAX_ROUNDED = 1.25
 """Residual, in average rounding errors, below which slow variations are accepted: rounding errors are not white."""
-MAX_UNCERTAINTY = {Excitation.RELAY: 0.10, Excitation.SETPOINT: 0.06, Excitation.OPERATION: 0.06}
+MAX_UNCERTAINTY = {Excitation.RELAY: 0.10, Excitation.SETPOINT: 0.06, Excitation.OBSERVE: 0.06}
 """Largest accepted uncertainty of Ms, by the delta method and among rival models."""
 MAX_DIFFERENCE = 0.25
 """Largest difference of the gain above and below rest that the record of pulses may leave open, a fraction of the

@@ -79,8 +79,12 @@ class Experiment:
     def _stepping(self) -> bool:
         return self.excited > self.listened
 
-    def _follow(self, commands: tuple[Command, ...], output_range: float) -> Plan[None]:
-        """Follows PV after a set-point step. Raises Refused, DIVERGES."""
+    def _follow(self, commands: tuple[Command, ...], output_range: float, diverged: float = DIVERGED) -> Plan[None]:
+        """Follows PV after a set-point step.
+
+        output_range: by how much the test has moved PV, PV units. diverged: how many times that PV may go from rest.
+        Raises Refused, DIVERGES.
+        """
         self._steps.append(len(self.trace))
         sample = yield commands
         self._add(sample)
@@ -88,7 +92,7 @@ class Experiment:
         while sample.t < end:
             sample = yield ()
             self._add(sample)
-            if abs(sample.pv - self.point.pv) > DIVERGED * output_range:
+            if abs(sample.pv - self.point.pv) > diverged * output_range:
                 raise Refused(
                     Reason.DIVERGES,
                     f"PV is {sample.pv - self.point.pv:+.4g} away; the test had moved it by {output_range:.4g}",

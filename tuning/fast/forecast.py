@@ -16,7 +16,7 @@ import numpy as np
 from loopwright.tuning.analysis.exponential import exponentials
 from loopwright.tuning.analysis.state_space import canonical_form
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.models import Model, Reals, monic
+from loopwright.tuning.models import Model, Reals, monic, sign
 
 OFFSET_SAMPLES, OFFSET_OF_HORIZON = 3, 0.02
 """The deviation of PV from the model is the mean of this number of samples, or of this part of the horizon."""
@@ -154,3 +154,26 @@ def forecast(
             passed = pv[k] >= turn.at if turn.up else pv[k] <= turn.at
             setpoints = np.where(passed, turn.setpoints, setpoints)
     return Course(pv, mv)
+
+
+def pv_of(model: Model, mv: Reals, Ts: float) -> Reals:
+    """PV that MV makes by a model, from rest. mv: as a deviation from rest, shape (N,). Ts: the sample time, s."""
+    return _Plant(model, Ts).past(mv)[0]
+
+
+def oscillation(model: Model, Ts: float, high: float, low: float, samples: int) -> Reals:
+    """MV of a relay without hysteresis, as a deviation from rest, shape (samples,); it begins with its higher side.
+
+    high, low: the amplitudes of the two sides, MV units, both positive.
+    """
+    plant, rising = _Plant(model, Ts), sign(model) > 0.0
+    x = np.zeros(len(plant.C))
+    held = np.zeros(samples + plant.delay + 2)
+    mv, side = np.empty(samples), True
+    for k in range(samples):
+        pv = float(plant.C @ x + plant.D * held[k + 1])
+        if pv:
+            side = (pv < 0.0) is rising
+        mv[k] = held[k + plant.delay + 2] = high if side else -low
+        x = plant.A @ x + plant.now * held[k + 2] + plant.before * held[k + 1]
+    return mv

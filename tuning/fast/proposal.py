@@ -21,7 +21,7 @@ from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.step_test import StepResult
 from loopwright.tuning.fast.design import DesignSpec, OptimalGains
 from loopwright.tuning.fast.evaluation import Evaluation
-from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.fast.robustness import KnownMs, known_Ms
 from loopwright.tuning.fast.uncertainty import fit_covariance
 from loopwright.tuning.gains import Gains
@@ -180,6 +180,7 @@ class FastProposal:
     verified: the set-point step that followed the relay, None without one.
     verification: the set-point step from rest, None without one.
     notes: what the operator should know, one sentence each.
+    model_from: where the model comes from, in words.
     """
 
     method: str
@@ -196,13 +197,14 @@ class FastProposal:
     verified: VerifiedStep | None
     verification: StepResult | None
     notes: tuple[str, ...]
+    model_from: str
 
 
 def evaluation_summary(evaluation: Evaluation) -> EvaluationSummary:
     """The figures of an evaluation as a job stores and shows them."""
     best, record = evaluation.chosen.best, evaluation.fit.record
     loads = tuple(
-        LoadDisturbance((entered - record.listened) * record.Ts, size)
+        LoadDisturbance((entered - record.begun) * record.Ts, size)
         for _, entered, size in load_disturbances(evaluation.fit, best)
     )
     return EvaluationSummary(
@@ -272,7 +274,7 @@ def verified_step(evaluation: Evaluation, tested: Gains, size: float, duration_s
     duration_s: the time since the step, s.
     """
     fit, residual = evaluation.fit, evaluation.chosen.best.linear.residual
-    first = fit.record.excited // fit.block
+    first = fit.rows[-1].start if fit.starts_are_free else fit.record.excited // fit.block
     rest, shown = residual[first:], fit.y[first:]
     spread = float(np.linalg.norm(shown - shown.mean()))
     return VerifiedStep(
@@ -313,11 +315,13 @@ def proposed(
     comparison: Comparison,
     verified: VerifiedStep | None,
     begun_at_s: float,
+    known_from: str | None = None,
 ) -> FastProposal:
     """The proposal of the gains of an evaluation.
 
     method: the name of the procedure.
-    begun_at_s: the plant time at which the relay or the pulses began, s.
+    begun_at_s: the plant time at which the relay, the pulses or (observe) the step under the new gains began, s.
+    known_from: from what the plant was known before the test, in words.
     """
     found, gains = evaluation_summary(evaluation), evaluation.best.gains
     moved_by = evaluation.fit.record.excitation.in_words
@@ -325,6 +329,7 @@ def proposed(
         f"A load disturbance of {load.size:+.3g} at the plant's input was found {load.t_s:.4g} s after the start of "
         f"the {moved_by} (at {begun_at_s + load.t_s:.4g} s), and allowed for."
         for load in found.loads
+        if not known_from or load.t_s >= 0.0
     ]
     input_range = evaluation.fit.record.input_range
     if any(abs(load.size) > input_range for load in found.loads):
@@ -349,7 +354,16 @@ def proposed(
         verified=verified,
         verification=None,
         notes=tuple(notes),
+        model_from=_model_from(evaluation.fit.record, known_from),
     )
+
+
+def _model_from(record: ExperimentRecord, known_from: str | None) -> str:
+    """Where the model of a record comes from, in words."""
+    if known_from is not None:
+        return f"{known_from}{', and the step under the new gains' if record.steps else ''}"
+    moved = "a relay" if record.excitation is Excitation.RELAY else "pulses of the set-point"
+    return f"{moved}{', and the set-point step under the new gains' if record.steps else ''}"
 
 
 def delayed(model: Model, delay: float) -> TransferFunction:

@@ -15,16 +15,16 @@ from loopwright.tuning.reasons import Reason, Refused
 
 
 class Excitation(StrEnum):
-    """What moves the loop during a test."""
+    """What moves the loop so that its plant shows: a test, or (observe) operators before it."""
 
     RELAY = "relay"
     SETPOINT = "setpoint"
-    OPERATION = "operation"
+    OBSERVE = "observe"
 
     @property
     def in_words(self) -> str:
         """The excitation in the words of a sentence."""
-        return {"relay": "relay", "setpoint": "pulses", "operation": "first set-point change"}[self]
+        return {"relay": "relay", "setpoint": "pulses", "observe": "step under the new gains"}[self]
 
 
 MIN_LISTENED = 60
@@ -72,6 +72,11 @@ class ExperimentRecord:
     def sampling_delay_s(self) -> float:
         """The delay that the sampling of the controller adds to the loop, s."""
         return 0.5 * (self.Ts if self.held_s is None else self.held_s)
+
+    @property
+    def begun(self) -> int:
+        """The sample from which times in the record count: the start of the excitation, or (observe) of the step."""
+        return self.steps[0] if self.excitation is Excitation.OBSERVE and self.steps else self.listened
 
     @property
     def pieces(self) -> tuple[int, ...]:

@@ -78,10 +78,13 @@ def find_valve_fault(fit: Fit[ExperimentRecord], best: Fitted) -> ValveFault | N
     # The position of the valve within its backlash is unknown at rest; it acts as a load disturbance from the start of
     # the relay.
     slack = DisturbanceHypothesis(load_disturbances=1)
+    # every piece begins at rest
+    pieces = np.split(record.u / record.input_range, np.cumsum(record.pieces)[:-1])
     start = np.append(best.theta[: structure.searched], record.listened)
 
     def fitted_with(fault: Callable[[Reals, float], Reals], size: float, theta: Reals, steps: int) -> Fitted:
-        moved = Fit(replace(record, u=record.input_range * fault(fit.u, size)))
+        positions = [record.input_range * fault(u, size) for u in pieces]
+        moved = Fit(replace(record, u=np.concatenate(positions)))
         return moved.search(structure, slack, [theta], steps)
 
     tried = [

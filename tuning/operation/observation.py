@@ -171,7 +171,7 @@ def _record(
         excited=sum(lengths),
         turns=len(changes),
         period=period,
-        excitation=Excitation.OPERATION,
+        excitation=Excitation.OBSERVE,
         lengths=lengths,
         held_s=stretch.held_s,
     )

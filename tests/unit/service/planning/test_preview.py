@@ -13,15 +13,19 @@ from loopwright.service.execution.procedures import Hooks, tune
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import FastRetune, retune_request, within
 from loopwright.service.loop_state import LoopState
+from loopwright.service.observing.knowledge import known
 from loopwright.service.planning.moves import broken_limits
 from loopwright.service.planning.obstacles import Now
 from loopwright.service.planning.preview import LastProposal, Preview, duration_text, preview
-from loopwright.service.results import UltimateView
+from loopwright.service.results import Finding, FindingSource, KnowledgeView, UltimateView
 from loopwright.service.security.keys import Scope
+from loopwright.service.store.knowledge import Known
 from loopwright.service.store.store import Store
+from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Failed, Reason, Refused
 from tests.unit.service.fakes import RESULT, TAG, FakeController, FakeLoop, Service, loop_entry
+from tests.unit.service.observing.findings import OTHER, PRESENT, PROPOSED, finding, gains
 
 STATE = FakeController().state
 EITHER = {"test": {"excitations": ["setpoint", "relay"]}}
@@ -35,6 +39,63 @@ def told(state: LoopState | None = STATE, config: dict[str, Any] | None = None, 
 
 def reasons(found: Preview) -> list[str]:
     return [each.reason for each in found.obstacles]
+
+
+ALL = {"test": {"excitations": ["observe", "setpoint", "relay"]}}
+
+
+def known_of(found: Finding, gains: Gains = PRESENT) -> KnowledgeView:
+    view = known([Known(1, found, None)], gains)
+    assert view is not None
+    return view
+
+
+class TestExcitations:
+    """The plant of `findings`: a lag of 8 s with a gain of 1 and a dead time of 0.95 s, so that Pu is about 4 s."""
+
+    def told(self, knowledge: KnowledgeView | None, noise: float | None = 0.02, **options: Any) -> Preview:
+        loop = LoopConfig.model_validate(loop_entry(**ALL, noise_std_hint=noise))
+        state = replace(STATE, gains=PRESENT)
+        return preview(loop, retune_request(**options), Now(state), None, knowledge)
+
+    def test_with_a_model_it_is_predicted_what_each_tells(self) -> None:
+        found = self.told(known_of(finding()))
+        assert [each.excitation for each in found.excitations] == ["observe", "setpoint", "relay"]
+        step, pulses, relay = found.excitations
+        assert "only the step under the new gains moves the loop" in step.when and "Ms known to +-0.05" in step.when
+        assert relay.when.startswith("Only where what comes before tells too little")
+        for each in found.excitations:
+            assert each.Ms_uncertainty is not None and 0.0 < each.Ms_uncertainty < 0.1
+            assert each.information_per_pu is not None and each.duration_s is not None
+            periods = each.duration_s / 3.9  # Pu of K = 1, T = 8 s, L = 1 s, by w L + atan(w T) = pi
+            assert 1.8 < periods < 12.5
+            assert each.information_per_pu == pytest.approx(4.0 / each.Ms_uncertainty**2 / periods, rel=0.1)
+        assert any(line.startswith("setpoint: Only where") and "It would tell Ms to +-" in line for line in found.summary)
+
+    def test_twice_the_noise_leaves_twice_the_uncertainty(self) -> None:
+        few, many = (self.told(known_of(finding()), noise).excitations[0] for noise in (0.01, 0.02))
+        assert many.Ms_uncertainty == pytest.approx(2.0 * (few.Ms_uncertainty or 0.0), rel=0.02)
+
+    @pytest.mark.parametrize(
+        ("knowledge", "said"),
+        [
+            (None, "Operation has not shown the plant yet"),
+            (known_of(finding(), OTHER), "under other gains"),
+            (known_of(finding(proposed=gains(PROPOSED, 1.42, 0.2))), "more than 0.06 for the new gains"),
+            (known_of(finding(source=FindingSource.JOB, changes=None, job="1")), "Operation has not shown"),
+        ],
+    )
+    def test_why_operation_does_not_do_is_told(self, knowledge: KnowledgeView | None, said: str) -> None:
+        observe = self.told(knowledge).excitations[0]
+        assert said in observe.when and "looked at again as the job begins" in observe.when
+
+    def test_without_a_model_or_the_noise_nothing_is_predicted(self) -> None:
+        for found in (self.told(None), self.told(known_of(finding()), None)):
+            assert {each.information_per_pu for each in found.excitations} == {None}
+
+    def test_other_methods_and_dry_runs_have_no_such_choice(self) -> None:
+        assert self.told(None, method="five-stage").excitations == []
+        assert [each.excitation for each in self.told(None, dry_run=True).excitations] == ["setpoint", "relay"]
 
 
 class TestMoves:
@@ -71,6 +132,16 @@ class TestMoves:
         assert stages["relay"].duration_low_s == 0.0 < stages["pulses"].duration_low_s
         assert "After pulses" in stages["verify"].what and "After the relay" in stages["verify"].what
         assert found.largest_mv_move_pct == told().largest_mv_move_pct, "the relay's"
+
+    def test_of_a_plant_that_operation_may_have_shown_the_trial_is_told_first(self) -> None:
+        found = told(config={"test": {"excitations": ["observe", "setpoint"]}})
+        stages = {each.stage: each for each in found.stages}
+        assert list(stages) == ["preflight", "trial", "pulses", "design", "verify", "redesign"]
+        assert stages["trial"].what.startswith("Only where operation has shown the plant well enough")
+        assert (stages["trial"].sp_low, stages["trial"].sp_high, stages["trial"].pv_move) == (50.0, 52.0, 4.0)
+        assert stages["pulses"].duration_low_s == 0.0 < stages["trial"].duration_low_s
+        alone = told(config={"test": {"excitations": ["observe"]}})
+        assert [each.stage for each in alone.stages] == ["preflight", "design", "trial", "redesign"]
 
     def test_pulses_alone_are_told_as_those_of_method_setpoint(self) -> None:
         alone = told(config=EITHER, excitations=["setpoint"])

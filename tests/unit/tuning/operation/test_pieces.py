@@ -36,7 +36,7 @@ def record(load: float = 0.0) -> ExperimentRecord:
     return ExperimentRecord(
         Ts=TS, u=np.concatenate([u[piece] for piece in cut]), y=np.concatenate(y_of), direction=1.0,
         listened=LENGTHS[0], excited=sum(LENGTHS), turns=2, period=60.0,
-        excitation=Excitation.OPERATION, lengths=LENGTHS,
+        excitation=Excitation.OBSERVE, lengths=LENGTHS,
     )  # fmt: skip
 
 
