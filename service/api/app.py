@@ -14,12 +14,14 @@ from loopwright.service.api import (
     decisions,
     fleet,
     history,
+    job_figures,
     locks,
     observation,
     openapi,
     operations,
     previews,
     problems,
+    reports,
     sessions,
     sparklines,
     tunings,
@@ -48,6 +50,7 @@ from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.inputs.request import FastRetune, RetuneRequest
 from loopwright.service.job_states import ACTIVE
 from loopwright.service.jobs.fleet import Fleet
+from loopwright.service.jobs.kept_figures import KeptFigures
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.listening import Listening
 from loopwright.service.live.live import Live
@@ -74,12 +77,13 @@ def create_app(
     sdo_retries: Mapping[str, int] | None = None,
     listening: Listening | None = None,
     live: Live | None = None,
+    figures: KeptFigures | None = None,
 ) -> FastAPI:
     """The application for these jobs, which it stops when the server shuts down.
 
     checks: the parts of /readyz by name; None for the default ones.  pool: processes that compute tunings; None for a
     new pool.  sdo_retries: SDO retries by bus, as counted in this process.  listening: None for one that knows only
-    what is stored.  live: None for a stream of its own.
+    what is stored.  live: None for a stream of its own.  figures: None for those that this pool computes when asked.
     """
 
     policy = policy or Policy()
@@ -239,7 +243,8 @@ def create_app(
     ) -> StreamingResponse:
         jobs.store.get(job_id)
         of = Reading(jobs.store, job_id, stage)
-        text, media_type = (csv_text(of), "text/csv") if format == "csv" else (json_text(of), "application/json")
+        as_csv = format == "csv"
+        text, media_type = (csv_text(of.blocks()), "text/csv") if as_csv else (json_text(of), "application/json")
         compress = takes_gzip(accept_encoding)
         headers = {"Vary": "Accept-Encoding"} | ({"Content-Encoding": "gzip"} if compress else {})
         return StreamingResponse(parts(text, compress), media_type=media_type, headers=headers)
@@ -286,4 +291,7 @@ def create_app(
     app.include_router(live_api.router(live, jobs.directory, keyring))
     app.include_router(previews.router(jobs, many))
     app.include_router(tunings.router(jobs, pool))
+    figures = figures or KeptFigures(jobs.store, pool)
+    app.include_router(job_figures.router(jobs, figures))
+    app.include_router(reports.router(jobs, figures, pool, view))
     return app

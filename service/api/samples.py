@@ -11,12 +11,8 @@ import re
 import zlib
 from collections.abc import Iterable, Iterator
 
-import numpy as np
-
-from loopwright.service.jobs.stored_record import Columns
 from loopwright.service.store.sample_blocks import COLUMNS, Block
 from loopwright.service.store.store import Store
-from loopwright.tuning.models import Reals
 
 _PART = 1 << 16
 """Characters of a part that is handed to the server."""
@@ -69,10 +65,10 @@ def _json_values(block: Block, column: str) -> Iterable[str]:
     return ["null" if text in _NO_NUMBERS else text for text in texts] if column != "mode" else texts
 
 
-def csv_text(of: Reading) -> Iterator[str]:
+def csv_text(blocks: Iterable[Block]) -> Iterator[str]:
     """CSV text: a header, then a row for each sample."""
     yield ",".join(("stage", *COLUMNS)) + "\n"
-    for block in of.blocks():
+    for block in blocks:
         columns = (block.texts(column) for column in COLUMNS)
         rows = zip([block.stage] * block.count, *columns, strict=True)
         yield "".join(",".join(row) + "\n" for row in rows)
@@ -110,14 +106,3 @@ def takes_gzip(accept_encoding: str) -> bool:
         if name.strip() == "gzip":
             return re.fullmatch(r"\s*q\s*=\s*0(\.0*)?\s*", weight) is None
     return False
-
-
-def record_columns(blocks: Iterable[Block]) -> Columns:
-    """All samples as one array for each column, 48 bytes a sample, for computations."""
-    stages: list[str] = []
-    numbers: dict[str, list[Reals]] = {column: [np.empty(0)] for column in COLUMNS}
-    for block in blocks:
-        stages += [block.stage] * block.count
-        for column in COLUMNS:
-            numbers[column].append(block.values(column))
-    return {"stage": stages} | {column: np.concatenate(found) for column, found in numbers.items()}

@@ -12,12 +12,11 @@ from fastapi.concurrency import run_in_threadpool
 from loopwright.service.api import problems
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.computed import computed
-from loopwright.service.api.samples import record_columns
 from loopwright.service.api.tuning_views import AlternativesView, MethodView, TuningRequest, TuningsView
 from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.jobs.alternatives import alternatives, redesigned
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.jobs.stored_record import stored_record
+from loopwright.service.jobs.stored_record import record_columns, stored_record
 from loopwright.service.offline import tunings
 from loopwright.service.results import DESIGNED
 from loopwright.tuning.fast.procedure import FAST

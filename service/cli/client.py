@@ -40,6 +40,12 @@ class Client:
         """Returns the JSON of the answer; a query of None is left out."""
         return _json(self._answer("GET", path, {k: v for k, v in query.items() if v is not None}))
 
+    def file(self, path: str) -> tuple[str, str]:
+        """Returns the file name that the service gives to a text, and the text."""
+        answer = self._answer("GET", path)
+        _, _, name = answer.headers.get("Content-Disposition", "").partition('filename="')
+        return name.partition('"')[0].rpartition("/")[2] or "answer", answer.text
+
     def samples_of(self, job_url: str) -> Callable[[str | None], ShownSamples]:
         """Returns a function that gets the samples of a job, those of one stage or (None) all."""
         from loopwright.service.plots.shown import ShownSamples

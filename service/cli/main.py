@@ -433,6 +433,30 @@ def one_job(
         job_tables.job_report(job)
 
 
+@app.command("report")
+def report_of_job(
+    job_id: Annotated[str, typer.Argument(metavar="ID", help="Id of the job.")],
+    output: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="File to write; default: loopwright-LOOP-ID.html in this folder; -: print."),
+    ] = None,
+    url: Url = DEFAULT_URL,
+) -> None:
+    """Write the report of a job that is over: one HTML file, to be printed or filed."""
+    name, text = Client(url).file(f"/jobs/{job_id}/report")
+    if output == Path("-"):
+        print(text, end="")
+        return
+    file = output or Path(name)
+    if output is None and file.exists():
+        die(f"{file} exists already: name another file with --output, or the same to replace it", 2)
+    try:
+        file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        die(f"{file}: {error.strerror}", 2)
+    print(file)
+
+
 @app.command("alternatives")
 def alternatives_of_job(
     job_id: Annotated[str, typer.Argument(metavar="ID", help="Id of the job.")],

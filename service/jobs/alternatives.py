@@ -51,8 +51,7 @@ def alternatives(row: Job, events: Sequence[JobEvent], method: str | None = None
 
     Raises Conflict for a job that has no model (yet) or has disproved it, BadTuning for an unknown method.
     """
-    model = job_model(row, events)
-    _not_disproved(row, DISPROVED)
+    model = designable(row, events, has_record=False)
     names = [method] if method else [name for name, each in METHODS.items() if not each.slow]
     results = tune_each(model, names)
     body = answer(model, results)
@@ -70,10 +69,9 @@ def redesigned(
     the job's model.
     Raises Conflict as `alternatives` does; a record is evaluated again.
     """
-    model = job_model(row, events)
     doubt: dict[str, float | None] = {"uncertainty": None, "ambiguity": None}
     evidence = record.experiment_record() if record and row.request.get("method") in DESIGNED else None
-    _not_disproved(row, (Reason.WRONG_SIGN,) if evidence else DISPROVED)
+    model = designable(row, events, evidence is not None)
     try:
         if evidence is not None:
             evaluation = evaluate_again(evidence, DesignSpec(ms, derivative))
@@ -112,6 +110,16 @@ def job_model(row: Job, events: Sequence[JobEvent]) -> FoundModel:
     if model is not None:
         return model
     raise Conflict(f"job {row.id} ended as {row.state} before it had a model")
+
+
+def designable(row: Job, events: Sequence[JobEvent], has_record: bool) -> FoundModel:
+    """Returns the model of a job, if gains may be designed on it. Raises Conflict as `alternatives` does.
+
+    has_record: whether the record is evaluated again; then its evaluation finds what else speaks against the model.
+    """
+    model = job_model(row, events)
+    _not_disproved(row, (Reason.WRONG_SIGN,) if has_record else DISPROVED)
+    return model
 
 
 def _typed_in(row: Job) -> FoundModel | None:

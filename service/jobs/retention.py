@@ -21,7 +21,7 @@ from loopwright.service.store import audit, history, hosts, knowledge
 from loopwright.service.store.clock import stamp
 from loopwright.service.store.clock_watch import ClockWatch, longest_stop
 from loopwright.service.store.store import FolderInUse, Store, append
-from loopwright.service.store.tables import ChunkRow, JobKnowledgeRow, JobRow
+from loopwright.service.store.tables import ChunkRow, JobFiguresRow, JobKnowledgeRow, JobRow
 from loopwright.service.telemetry.metrics import CLOCK_JUMPS
 
 log = logging.getLogger(__name__)
@@ -111,6 +111,7 @@ def _some(store: Store, policy: RetentionPolicy, at: datetime) -> list[JobRow]:
             samples = session.scalar(select(func.sum(ChunkRow.count)).where(of_them))
             session.execute(delete(ChunkRow).where(of_them))
             session.execute(update(JobKnowledgeRow).where(JobKnowledgeRow.job_id.in_(ids)).values(data=None))
+            session.execute(update(JobFiguresRow).where(JobFiguresRow.job_id.in_(ids)).values(record=None))
             for row in rows:
                 append(session, row.id, "samples_deleted", {"text": _why(policy)}, row.plant_time_s)
             before = {"jobs": ids, "samples": samples}

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.service.store.sample_blocks import COLUMNS, Block
 from loopwright.tuning.fast.record import MIN_LISTENED, MIN_SWITCHES, Excitation, ExperimentRecord, oscillation_period
 from loopwright.tuning.fast.record_evaluation import first_period
 from loopwright.tuning.models import Reals
@@ -76,27 +77,68 @@ class StoredRecord:
         return bool(np.mean(self.mv[self.listened : self.switches[0]]) > mv)
 
 
-def stored_record(columns: Columns) -> StoredRecord | None:
-    """Returns the record of these columns; None where neither a relay nor pulses of the set-point were run."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Attempt:
+    """The samples of the last attempt of a job. Missing samples are filled: PV is interpolated, the rest held.
+
+    Ts: the sample time, s.
+    taken: the places of the samples that are not missing, from 0.
+    sp, pv, mv, mode, stage: as recorded.
+    """
+
+    Ts: float
+    taken: NDArray[np.int64]
+    sp: Reals
+    pv: Reals
+    mv: Reals
+    mode: Reals
+    stage: NDArray[np.str_]
+
+
+def last_attempt(columns: Columns) -> Attempt | None:
+    """Returns the last attempt of these columns; None where it has less than two samples."""
     stages = columns["stage"]
     first = max(
         (i for i, name in enumerate(stages) if name == "preflight" and stages[max(i - 1, 0)] != name), default=0
     )
     t, sp, pv, mv, mode = (np.asarray(columns[name][first:], dtype=float) for name in ("t_s", "sp", "pv", "mv", "mode"))
     stage = np.asarray(stages[first:], dtype=str)
-    relay = bool(np.any(mode == Mode.EXPERIMENT))
-    if len(t) < 2 or not (relay or np.any(np.diff(sp[stage == "pulses"]))):
+    if len(t) < 2:
         return None
     Ts = float(np.median(np.diff(t)))
-    # missing samples are filled: PV interpolated, the rest held
     number = np.round((t - t[0]) / Ts).astype(np.int64)
     whole = np.arange(number[-1] + 1)
     before = np.searchsorted(number, whole, side="right") - 1
-    pv = np.interp(whole, number, pv)
-    sp, mv, mode, stage = sp[before], mv[before], mode[before], stage[before]
+    return Attempt(Ts, number, sp[before], np.interp(whole, number, pv), mv[before], mode[before], stage[before])
+
+
+def stored_record(columns: Columns) -> StoredRecord | None:
+    """Returns the record of these columns; None where neither a relay nor pulses of the set-point were run."""
+    attempt = last_attempt(columns)
+    return None if attempt is None else record_of(attempt)
+
+
+def record_of(attempt: Attempt) -> StoredRecord | None:
+    """Returns the record of an attempt; None where neither a relay nor pulses of the set-point were run."""
+    sp, mv, mode, stage, Ts = attempt.sp, attempt.mv, attempt.mode, attempt.stage, attempt.Ts
+    relay = bool(np.any(mode == Mode.EXPERIMENT))
+    if not (relay or np.any(np.diff(sp[stage == "pulses"]))):
+        return None
     listened, excited, switches = _of_relay(mv, mode, sp, stage) if relay else _of_pulses(sp, stage)
     excitation = Excitation.RELAY if relay else Excitation.SETPOINT
-    return StoredRecord(Ts, (whole - listened) * Ts, sp, pv, mv, listened, excited, switches, excitation)
+    t = (np.arange(len(sp)) - listened) * Ts
+    return StoredRecord(Ts, t, sp, attempt.pv, mv, listened, excited, switches, excitation)
+
+
+def record_columns(blocks: Iterable[Block]) -> Columns:
+    """Returns all samples as one array for each column, 48 bytes a sample, for computations."""
+    stages: list[str] = []
+    numbers: dict[str, list[Reals]] = {column: [np.empty(0)] for column in COLUMNS}
+    for block in blocks:
+        stages += [block.stage] * block.count
+        for column in COLUMNS:
+            numbers[column].append(block.values(column))
+    return {"stage": stages} | {column: np.concatenate(found) for column, found in numbers.items()}
 
 
 Parts = tuple[int, int, tuple[int, ...]]

@@ -7,6 +7,7 @@ reports go to the journal, which another thread writes.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import asdict
 
 from loopwright.service.errors import Locked
@@ -56,6 +57,7 @@ class Worker:
     rehearse: runs a dry run.
     knowledge: keeps what the tests tell of their loops.
     operation: tells what operation has shown of them before.
+    ended: called with each job at its end, when its loop is restored and the end is stored; it returns at once.
     """
 
     def __init__(
@@ -69,11 +71,13 @@ class Worker:
         machine: Machine,
         knowledge: KeptKnowledge,
         operation: OperationHeard,
+        ended: Callable[[Job], None] = lambda job: None,
     ) -> None:
         self.store = store
         self.journal = journal
         self._knowledge = knowledge
         self._operation = operation
+        self._ended = ended
         self._directory = directory
         self._registry = registry
         self._tune = tune
@@ -249,6 +253,7 @@ class Worker:
         job = self._lasting(lambda: self.store.move(running.job_id, state, **columns))
         self._lasting(lambda: self._operation.outdated(job, self.store.events(job.id)))
         self._knowledge.tested(job, running.pv_range, running.mv_range)
+        self._ended(job)
         if outcome.ended is None:
             log.info("job is rehearsed" if dry_run else "job proposes new gains")
         else:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from loopwright.service.execution.procedures import Rehearse, Tune
 from loopwright.service.inputs.config import BusConfig, LoopConfig
@@ -19,6 +19,7 @@ from loopwright.service.jobs.recovery import Recovery
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.worker import Worker
 from loopwright.service.observing.kept_knowledge import KeptKnowledge
+from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
 
 
@@ -33,12 +34,14 @@ def make_jobs(
     buses: Mapping[str, BusConfig] | None = None,
     resume: bool = True,
     machine: Machine | None = None,
+    ended: Callable[[Job], None] = lambda job: None,
 ) -> Jobs:
     """Makes the jobs of this host's loops, without starting them.
 
     buses: the configuration of their buses.
     resume: whether jobs of a dead service are resumed at the next start.
     machine: clock and threads.
+    ended: called with each job at its end, when its loop is restored; it returns at once.
     """
     machine = machine or Machine()
     registry = Registry()
@@ -53,7 +56,7 @@ def make_jobs(
         journal=journal,
         registry=registry,
         directory=directory,
-        worker=Worker(store, journal, directory, registry, tune, rehearse, machine, knowledge, operation),
+        worker=Worker(store, journal, directory, registry, tune, rehearse, machine, knowledge, operation, ended),
         decisions=decisions,
         locking=Locking(store, directory, decisions),
         aftercare=Aftercare(store, directory, machine),

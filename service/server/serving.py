@@ -38,6 +38,7 @@ from loopwright.service.execution.procedures import tune as live
 from loopwright.service.execution.rehearsals import rehearsed_in_pool
 from loopwright.service.inputs.config import LoopConfig, load_site
 from loopwright.service.jobs.dbos_engine import POLL_S, DurableEngine
+from loopwright.service.jobs.kept_figures import KeptFigures
 from loopwright.service.jobs.looking import Looking
 from loopwright.service.jobs.loop_directory import LoopFactory
 from loopwright.service.jobs.manager import Jobs
@@ -199,6 +200,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         policy = Policy(keyring, setup.limits, local_only=True)
         engine = DurableEngine(setup.data, store.engine if store.shared else None, store.host, setup.poll_s)
         station = Station(setup.node)
+        figures = stack.enter_context(closing(KeptFigures(store, pool)))
         jobs = make_jobs(
             site.loops,
             store,
@@ -208,6 +210,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
             engine=engine,
             buses=site.buses,
             resume=setup.resume,
+            ended=figures.ended,
         )
         stack.callback(jobs.stop)
         retention = stack.enter_context(closing(Retention(store, engine, setup.keep)))
@@ -219,7 +222,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
             closing(Looking(jobs.directory, jobs.registry, store, listening, jobs.knowledge, pool))
         )
         live_stream = Live(jobs, listening)
-        app = create_app(jobs, policy, checks, pool, station.sdo_retries, listening, live_stream)
+        app = create_app(jobs, policy, checks, pool, station.sdo_retries, listening, live_stream, figures)
         server = _Server(server_config(app, setup, listener, descriptors), jobs, listening, live_stream)
 
         def end() -> None:

@@ -214,6 +214,18 @@ class JobKnowledgeRow(Base):
     outdated_at: Mapped[str | None]
 
 
+class JobFiguresRow(Base):
+    """What was computed of a job after its end: see service.jobs.job_figures. version: of the computation.
+    record: packed; null: there is none, or it was deleted with the samples.  designs: null: there are none."""
+
+    __tablename__ = "job_figures"
+
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
+    version: Mapped[int]
+    record: Mapped[bytes | None] = mapped_column(LargeBinary)
+    designs: Mapped[bytes | None] = mapped_column(LargeBinary)
+
+
 class RetuneRow(Base):
     """A retune of many loops. Its host begins their jobs, whatever hosts these are on."""
 

@@ -7,6 +7,8 @@ from importlib import import_module
 LOADED = (
     "scipy.signal",  # tuning imports it at its first use
     "loopwright.service.jobs.alternatives",
+    "loopwright.service.jobs.job_figures",
+    "loopwright.service.api.report.paper",
     "loopwright.service.cli.main",  # the script `loopwright` imports it, and each process imports what the script does
     "loopwright.service.execution.rehearsals",
     "loopwright.service.execution.rehearsal",

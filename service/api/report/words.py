@@ -1,0 +1,155 @@
+"""The words of a report for states, stages, reasons and events."""
+
+from __future__ import annotations
+
+from loopwright.service.api.job_views import JobView, StageView
+from loopwright.service.api.report.numbers import Ms_error, duration, fixed, significant, with_unit
+from loopwright.service.job_states import JobState
+from loopwright.service.store.jobs import JobEvent
+from loopwright.tuning.reasons import Reason
+
+STAGES = {
+    "preflight": "At rest?",
+    "settle": "Settling",
+    "pulses": "Pulses of the set-point",
+    "relay": "Relay",
+    "design": "Model and gains",
+    "verify": "Step under the new gains",
+    "redesign": "Model of the whole record",
+    "baseline": "Step under the old gains",
+    "ultimate": "Ultimate gain",
+    "zn_pi": "First PI",
+    "estimate": "Model",
+    "optimise": "Gains",
+}
+_REASONS = {
+    Reason.OPERATOR: "by an operator",
+    Reason.SERVICE_STOPPED: "the service ended",
+    Reason.SETPOINT_CHANGED: "the set-point was changed",
+    Reason.NODE_LOST: "the node was lost",
+    Reason.BUS_LOST: "the bus was lost",
+    Reason.INTERNAL: "an error inside the service",
+}
+_ENDS = {
+    JobState.QUEUED: "Waits for its turn",
+    JobState.RUNNING: "Under test",
+    JobState.PROPOSED: "New gains are proposed",
+    JobState.ACCEPTED: "The new gains were accepted",
+    JobState.ROLLED_BACK: "The old gains were kept",
+    JobState.NO_GAIN: "The loop is tuned as well as asked already",
+    JobState.REHEARSED: "Rehearsed: gains were found without a test of the loop",
+    JobState.REFUSED: "No result to trust",
+    JobState.ABORTED: "Stopped",
+    JobState.FAILED: "Failed",
+    JobState.INTERRUPTED: "Interrupted",
+}
+_WITH_REASON = (JobState.REFUSED, JobState.ABORTED, JobState.FAILED, JobState.INTERRUPTED)
+
+
+def stage_name(stage: str | None) -> str:
+    """Returns the name of a stage."""
+    return "" if stage is None else STAGES.get(stage, stage.replace("_", " "))
+
+
+def reason_words(reason: Reason) -> str:
+    """Returns a reason in words."""
+    return _REASONS.get(reason, reason.value.replace("_", " "))
+
+
+def headline(job: JobView) -> str:
+    """Returns how the job ended."""
+    text = _ENDS.get(job.state, job.state.value.replace("_", " "))
+    if job.state is JobState.PROPOSED and job.superseded_by:
+        return f"{text}, not decided; a later test came"
+    if job.reason is not None and job.state in _WITH_REASON:
+        return f"{text}: {reason_words(job.reason)}"
+    return text
+
+
+def sentence(text: str | None) -> str:
+    """Returns a text as a sentence."""
+    if not text:
+        return ""
+    return text[0].upper() + text[1:] + ("" if text[-1] in ".!?" else ".")
+
+
+def trust(job: JobView) -> list[str]:
+    """Returns how far the result is to be trusted, in sentences."""
+    said = []
+    if job.model_from:
+        said.append(f"The model comes from {job.model_from}.")
+    if job.verification is not None:
+        said.append(f"The model explains {fixed(job.verification.fit_pct, 1)} % of the step that was measured.")
+    if job.evidence is not None and job.new_gains is not None:
+        Ms = job.predicted.Ms if job.predicted else job.evidence.Ms
+        within = job.evidence.uncertainty
+        said.append(f"Ms is {fixed(Ms, 2)}" + (f", known to within {Ms_error(within)}." if within is not None else "."))
+    if job.rehearsed_on is not None:
+        said.append(f"Computed on {job.rehearsed_on.plant_text}; the loop was not moved.")
+    if job.after is not None and job.verification is None:
+        settled = f"settled in {duration(job.after.settling_s)}" if job.after.settled else "not settled"
+        overshoot = fixed(job.after.overshoot_pct, 0)
+        said.append(f"A step under the new gains was measured: overshoot {overshoot} %, {settled}.")
+    return said
+
+
+def stage_found(stage: StageView, pv_unit: str) -> str:
+    """Returns what a stage found, in a few words."""
+    result = dict(stage.result or {})
+
+    def value(name: str) -> float | None:
+        found = result.get(name)
+        return float(found) if isinstance(found, int | float) and not isinstance(found, bool) else None
+
+    said = []
+    if (noise := value("noise")) is not None and stage.stage == "preflight":
+        said.append(f"noise {with_unit(significant(noise, 2), pv_unit)}")
+    if (switches := value("switches")) is not None:
+        said.append(f"{switches:.0f} switches, period {with_unit(significant(value('period_s'), 3), 's')}")
+    if (turns := value("turns")) is not None:
+        said.append(f"{turns:.0f} turns of the set-point")
+    if (Ku := value("Ku")) is not None:
+        said.append(f"Ku {significant(Ku)}, Pu {with_unit(significant(value('Pu_s')), 's')}")
+    if (Ms := value("Ms")) is not None and stage.stage != "verify":
+        unsure = value("uncertainty")
+        said.append(f"Ms {fixed(Ms, 2)}" + (f" ± {Ms_error(unsure)}" if unsure is not None else ""))
+    gains = result.get("gains")
+    of = gains if isinstance(gains, dict) else result
+    if stage.stage != "verify" and isinstance(Kp := of.get("Kp"), int | float):
+        Ti = of.get("Ti", of.get("Ti_s"))
+        said.append(f"Kp {significant(Kp)}" + (f", Ti {significant(Ti)} s" if isinstance(Ti, int | float) else ""))
+    if (fit := value("fit_pct")) is not None:
+        said.append(f"{fixed(fit, 1)} % of the step explained")
+    if (overshoot := value("overshoot_pct")) is not None:
+        said.append(f"overshoot {fixed(overshoot, 0)} %, settled in {duration(value('settling_s'))}")
+    reason = result.get("reason")
+    if isinstance(reason, str) and reason in set(Reason):
+        said.append(f"not enough: {reason_words(Reason(reason))}")
+    return ", ".join(said)
+
+
+def event_words(event: JobEvent) -> tuple[str, str] | None:
+    """Returns what happened and by whom, for the events that the record of decisions shows; None for another."""
+    data = event.data
+    by, text = str(data.get("by", "")), str(data.get("text", data.get("detail", "")))
+    if event.kind == "state":
+        state = str(data.get("state"))
+        what = {
+            "queued": "asked for",
+            "running": "begun",
+            "accepted": "new gains accepted, written to the controller",
+            "rolled_back": "old gains kept or written back",
+            "proposed": "ended with a proposal",
+        }.get(state, f"ended: {state.replace('_', ' ')}")
+        reason = data.get("reason")
+        return (f"{what} ({str(reason).replace('_', ' ')})" if reason else what), by
+    words = {
+        "abort_requested": "stop asked for",
+        "accept_failed": f"an acceptance ended in an error: {text}",
+        "rollback_failed": f"a rollback ended in an error: {text}",
+        "resumed": f"resumed after a restart of the service: {text}",
+        "loop_found": f"the loop was looked at again: {text}",
+        "dismissed": "responsibility for the loop taken over",
+        "samples_deleted": f"samples deleted: {text}",
+    }
+    return (words[event.kind], by) if event.kind in words else None

@@ -1,0 +1,152 @@
+"""The gains of fast from robust to fast: what can be had for each Ms on a job's model. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from pydantic import Field
+
+from loopwright.service.jsonable import json_object
+from loopwright.service.loop_state import gains_of, loop_state
+from loopwright.service.results import Figures, GainsView, WorthView
+from loopwright.service.store.jobs import Job
+from loopwright.tuning.analysis.comparison import loop_performance
+from loopwright.tuning.fast.design import DesignSpec, GainDesign
+from loopwright.tuning.fast.design_trial import designed_on
+from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY, Evaluation
+from loopwright.tuning.fast.procedure import FastOptions
+from loopwright.tuning.fast.proposal import delayed
+from loopwright.tuning.fast.robustness import known_Ms
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import Model
+from loopwright.tuning.reasons import ADVICE, Ended, Reason, Refused
+
+GRID = tuple(round(1.2 + 0.05 * n, 2) for n in range(17))
+"""The values of Ms, 1.2 (robust) to 2.0 (fast), for which gains are designed."""
+
+
+class DesignPoint(Figures):
+    """The gains for one Ms, or why there are none."""
+
+    Ms_asked: float = Field(description="Upper bound of Ms for which the gains are designed", examples=[1.6])
+    gains: GainsView | None = Field(description="The gains; null: there are none (`reason`)")
+    uncertainty: float | None = Field(
+        description="How far Ms of these gains may be off on the plant; null: not known, the job has no record",
+        examples=[0.03],
+    )
+    worth: WorthView | None = Field(description="Performance of the gains on the model; null: there are no gains")
+    reason: Reason | None = Field(description="Why there are no gains; reason code from the closed list")
+    detail: str | None = Field(description="The numbers behind the reason")
+    advice: str | None = Field(description="What the operator should do about the reason")
+
+
+class DesignCurve(Figures):
+    """The gains that fast designs on one model for Ms from 1.2 (robust) to 2.0 (fast), with what each costs."""
+
+    designed_on: str = Field(
+        description="What the gains are designed on, in words", examples=["one fit to the job's record"]
+    )
+    derivative: bool = Field(description="Whether fast may design a PID, as the job asked")
+    num: list[float] = Field(description="Numerator of the model, highest power of s first, PV units per MV percent")
+    den: list[float] = Field(description="Denominator of the model, highest power of s first")
+    dead_time_s: float = Field(description="Dead time of the model, s")
+    sampling_delay_s: float = Field(
+        description="Delay of the sampling, which the figures have beside the dead time, s", examples=[0.05]
+    )
+    before: WorthView | None = Field(description="Performance of the gains before the job; null: not known")
+    after: WorthView | None = Field(description="Performance of the gains of the job; null: it has none")
+    designs: list[DesignPoint] = Field(description="One entry for each Ms, in rising order")
+
+
+@dataclass(frozen=True, slots=True)
+class _Designing:
+    """The design of gains on one model.
+
+    model: with the delay of the sampling in its dead time.
+    Ts: the sample time, s.
+    """
+
+    model: Model
+    Ts: float
+    gains: Callable[[float], Gains]
+    uncertainty: Callable[[Gains], float | None]
+    largest: float
+
+    def point(self, Ms: float) -> DesignPoint:
+        try:
+            gains = self.gains(Ms)
+            unsure = self.uncertainty(gains)
+            if unsure is not None and unsure > self.largest:
+                raise Refused(Reason.UNCERTAIN, f"Ms of these gains is known to +-{unsure:.2g} only")
+        except Ended as refusal:
+            return _refused(Ms, refusal)
+        return DesignPoint(
+            Ms_asked=Ms, gains=GainsView.of(gains), uncertainty=unsure, worth=self.worth(gains),
+            reason=None, detail=None, advice=None,
+        )  # fmt: skip
+
+    def worth(self, gains: Gains) -> WorthView:
+        found = json_object(loop_performance(self.model, gains, self.Ts))
+        return WorthView.model_validate(found)
+
+
+def design_curve(row: Job, model: Model, evaluation: Evaluation | None) -> DesignCurve:
+    """Returns the gains for each Ms of GRID.
+
+    model: the job's model.
+    evaluation: that of the job's record, whose model is then taken: one fit for all gains; None without a record.
+    """
+    derivative = bool(row.request.get("derivative"))
+    if evaluation is not None:
+        designing = _on_record(evaluation, derivative)
+        model, delay_s, words = evaluation.model, evaluation.design_delay, "one fit to the job's record"
+    else:
+        Ts = loop_state(row.found).sample_time_s if row.found else 0.0
+        designing = _on_model(model, Ts, derivative)
+        delay_s, words = 0.5 * Ts, "the job's model"
+    if evaluation is not None and evaluation.reason is not None:
+        refusal = Refused(evaluation.reason, evaluation.detail)
+        points = [_refused(Ms, refusal) for Ms in GRID]
+    else:
+        points = [designing.point(Ms) for Ms in GRID]
+    old = None if not row.old_gains else gains_of(row.old_gains)
+    new = None if row.result is None or row.result.new_gains is None else row.result.new_gains.gains()
+    return DesignCurve(
+        designed_on=words,
+        derivative=derivative,
+        num=list(model.num),
+        den=list(model.den),
+        dead_time_s=model.L,
+        sampling_delay_s=delay_s,
+        before=None if old is None else designing.worth(old),
+        after=None if new is None else designing.worth(new),
+        designs=points,
+    )
+
+
+def _on_record(evaluation: Evaluation, derivative: bool) -> _Designing:
+    record = evaluation.fit.record
+    model = replace(evaluation.model, L=evaluation.model.L + evaluation.design_delay)
+
+    def gains(Ms: float) -> Gains:
+        return GainDesign(model, DesignSpec(Ms, derivative), record.period * record.Ts).best().gains
+
+    def uncertainty(of: Gains) -> float | None:
+        return known_Ms(evaluation, of).uncertainty
+
+    return _Designing(model, record.Ts, gains, uncertainty, MAX_UNCERTAINTY[record.excitation])
+
+
+def _on_model(model: Model, Ts: float, derivative: bool) -> _Designing:
+    def gains(Ms: float) -> Gains:
+        return designed_on(model, FastOptions(Ms=Ms, derivative=derivative), Ts).gains
+
+    return _Designing(delayed(model, 0.5 * Ts), Ts, gains, lambda _: None, 0.0)
+
+
+def _refused(Ms: float, refusal: Ended) -> DesignPoint:
+    return DesignPoint(
+        Ms_asked=Ms, gains=None, uncertainty=None, worth=None,
+        reason=refusal.reason, detail=refusal.detail, advice=ADVICE[refusal.reason],
+    )  # fmt: skip

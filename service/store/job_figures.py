@@ -1,0 +1,35 @@
+"""What was computed of a job after its end, as bytes: its record with the model, and the designs."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from sqlalchemy import select
+
+from loopwright.service.store.store import Store
+from loopwright.service.store.tables import ChunkRow, JobFiguresRow
+
+
+class PackedFigures(NamedTuple):
+    """The record and the designs of a job, packed; None where there is none."""
+
+    record: bytes | None
+    designs: bytes | None
+
+
+def keep(store: Store, job_id: str, version: int, figures: PackedFigures) -> None:
+    """Stores the figures. The record is left out where the samples were deleted meanwhile.
+
+    version: that of the computation.
+    """
+    with store.writing() as session:
+        has_samples = session.scalar(select(ChunkRow.seq).where(ChunkRow.job_id == job_id).limit(1)) is not None
+        record = figures.record if has_samples else None
+        session.merge(JobFiguresRow(job_id=job_id, version=version, record=record, designs=figures.designs))
+
+
+def kept(store: Store, job_id: str, version: int) -> PackedFigures | None:
+    """Returns the figures that this version of the computation has stored; None where there are none."""
+    with store.reading() as session:
+        row = session.get(JobFiguresRow, job_id)
+        return None if row is None or row.version != version else PackedFigures(row.record, row.designs)
