@@ -95,7 +95,7 @@ def router(jobs: Jobs, figures: KeptFigures) -> APIRouter:
     )
     async def job_record(
         job_id: JobId,
-        points: Annotated[int, Query(ge=1, le=MAX_POINTS, description="Maximum number of bins", examples=[600])] = 1500,
+        points: Annotated[int, Query(ge=1, le=MAX_POINTS, description="Maximum number of bins", examples=[600])] = 600,
     ) -> RecordView:
         row, found = await figures_of(jobs, figures, job_id)
         if found.record is None:
@@ -125,7 +125,12 @@ def _record_view(row: Job, record: JobRecord) -> RecordView:
     bins, explained = record.measured, record.explained
     names = {mode.value: mode.name.lower() for mode in Mode}
     return RecordView(
-        **dict(record.facts),
+        sample_time_s=record.facts.sample_time_s,
+        recorded=record.facts.recorded,
+        marks=record.facts.marks,
+        model_from=record.facts.model_from,
+        noise=record.facts.noise,
+        loads=record.facts.loads,
         job=row.id,
         loop=row.loop,
         at_s=_rounded(bins, "at_s"),
@@ -133,13 +138,20 @@ def _record_view(row: Job, record: JobRecord) -> RecordView:
         samples=bins["count"].tolist(),
         sp=decimals(bins, "sp"),
         mode=[names.get(mode) for mode in bins["mode"].tolist()],
-        **{f"{x}_{kind}": decimals(bins, f"{x}_{kind}") for x in ("pv", "mv") for kind in ("min", "max", "mean")},
+        pv_min=decimals(bins, "pv_min"),
+        pv_max=decimals(bins, "pv_max"),
+        pv_mean=decimals(bins, "pv_mean"),
+        mv_min=decimals(bins, "mv_min"),
+        mv_max=decimals(bins, "mv_max"),
+        mv_mean=decimals(bins, "mv_mean"),
         gap_before=(bins["gap"] & GAP_BEFORE > 0).tolist(),
         explained=None
         if explained is None
         else ExplainedView(
             model=decimals(explained, "pv_mean"),
-            **{f"residual_{kind}": decimals(explained, f"mv_{kind}") for kind in ("min", "max", "mean")},
+            residual_min=decimals(explained, "mv_min"),
+            residual_max=decimals(explained, "mv_max"),
+            residual_mean=decimals(explained, "mv_mean"),
         ),
     )
 

@@ -91,7 +91,7 @@ def _evaluated(row: Job, record: StoredRecord) -> Evaluation | None:
         return None
     asked = row.request.get("ms")
     derivative = bool(row.request.get("derivative"))
-    for Ms in (float(asked) if isinstance(asked, int | float) else DesignSpec.Ms, _HIGHEST_MS):
+    for Ms in (float(asked) if isinstance(asked, int | float) else DesignSpec().Ms, _HIGHEST_MS):
         try:
             return evaluate_again(evidence, DesignSpec(Ms, derivative))
         except Ended as ended:

@@ -163,7 +163,7 @@ def driven(model: Model, attempt: Attempt) -> Reals:
     """Returns the PV of the model driven by the recorded MV from rest, PV units; its level is that at which it leaves
     least of the record."""
     u = attempt.mv - attempt.mv[0]
-    num, den, _ = cont2discrete((model.num, model.den), attempt.Ts, method="zoh")
+    num, den, _ = cont2discrete((np.array(model.num), np.array(model.den)), attempt.Ts, method="zoh")
     t = np.arange(len(u)) * attempt.Ts
     answer: Reals = np.interp(t - model.L, t, lfilter(num.ravel(), den, u), left=0.0)
     level = float(np.mean(attempt.pv - answer))

@@ -126,7 +126,7 @@ def record_of(attempt: Attempt) -> StoredRecord | None:
         return None
     listened, excited, switches = _of_relay(mv, mode, sp, stage) if relay else _of_pulses(sp, stage)
     excitation = Excitation.RELAY if relay else Excitation.SETPOINT
-    t = (np.arange(len(sp)) - listened) * Ts
+    t: Reals = (np.arange(len(sp), dtype=np.float64) - listened) * Ts
     return StoredRecord(Ts, t, sp, attempt.pv, mv, listened, excited, switches, excitation)
 
 

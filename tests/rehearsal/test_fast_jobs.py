@@ -12,11 +12,11 @@ from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.api.job_views import job_view
-from loopwright.service.api.samples import record_columns
 from loopwright.service.execution.procedures import rehearse, tune
 from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.inputs.config import LoopConfig, parse_site
 from loopwright.service.inputs.request import retune_request
+from loopwright.service.jobs.stored_record import record_columns
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.tuning.analysis.margins import margins

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,6 +15,9 @@ from loopwright.tuning.models import Reals
 LEFT, RIGHT, TOP, BOTTOM = 52.0, 8.0, 8.0, 20.0
 _TICK_APART = 70.0
 _FARTHEST = 1e5
+_NAME_WIDTH = 130.0
+"""Width that the name of a line may take, px."""
+Place = TypeVar("Place", float, Reals)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,11 +83,11 @@ class Picture:
     def inner_height(self) -> float:
         return self.height - TOP - (BOTTOM if self.named_x else 4.0)
 
-    def at_x(self, x: float) -> float:
+    def at_x(self, x: Place) -> Place:
         """Returns the place of a value, px."""
         return LEFT + self.inner_width * (x - self.x[0]) / (self.x[1] - self.x[0])
 
-    def at_y(self, y: float) -> float:
+    def at_y(self, y: Place) -> Place:
         """Returns the place of a value, px."""
         return TOP + self.inner_height * (self.y[1] - y) / (self.y[1] - self.y[0])
 
@@ -108,7 +112,9 @@ class Picture:
         px = self.at_x(x)
         self.paths.append(Path(f"M{px:.1f} {TOP:.1f}V{TOP + self.inner_height:.1f}", look))
         if text:
-            self.labels.append(Label(px + 3.0, TOP + 10.0 + 11.0 * row, text))
+            at_the_end = px > LEFT + self.inner_width - _NAME_WIDTH
+            place = px - 3.0 if at_the_end else px + 3.0
+            self.labels.append(Label(place, TOP + 10.0 + 11.0 * row, text, "end" if at_the_end else "note"))
 
     def band(self, low: float, high: float) -> None:
         """Adds a band of y."""

@@ -25,6 +25,7 @@ from loopwright.service.api.report.words import (
     trust,
 )
 from loopwright.service.inputs.config import LoopConfig
+from loopwright.service.job_states import GOOD, JobState
 from loopwright.service.jobs.design_curve import DesignCurve
 from loopwright.service.jobs.job_record import FITTED, JobRecord
 from loopwright.service.results import GainsView, StepWorthView, TransferModelView, WorthView
@@ -90,10 +91,9 @@ def paper(source: ReportSource) -> str:
         detail=sentence(job.detail),
         description="" if loop is None else loop.description,
         head=_head(source),
-        trust=trust(job),
+        trust=" ".join(trust(job)),
         verdict=sentence(None if job.comparison is None else job.comparison.verdict),
-        decided=_decided(job),
-        afterwards=_afterwards(job, decimals, pv_unit),
+        decided=f"{_decided(job)} {_afterwards(job, decimals, pv_unit)}".strip(),
         table=_table(old, new, before, after, job, pv_unit),
         has_before=old is not None,
         has_after=new is not None,
@@ -112,6 +112,7 @@ def paper(source: ReportSource) -> str:
         designs=_designs(source.designs),
         designed_on="" if source.designs is None else source.designs.designed_on,
         with_td=_with_td(source.designs),
+        with_error=_with_error(source.designs),
         asked=_asked(source),
         stages=[
             (stage_name(each.stage), each.state, stage_found(each, pv_unit), n.duration(each.plant_time_s))
@@ -164,9 +165,7 @@ def _step_size(source: ReportSource) -> float:
 
 
 def _after_name(job: JobView) -> str:
-    return {"accepted": "accepted", "proposed": "proposed", "rehearsed": "rehearsed", "no_gain": "no better"}.get(
-        job.state.value, "designed"
-    )
+    return "no better" if job.state is JobState.NO_GAIN else job.state.value if job.state in GOOD else "designed"
 
 
 def _head(source: ReportSource) -> list[Row]:
@@ -189,7 +188,9 @@ def _decided(job: JobView) -> str:
     if job.decided is not None:
         what = "The new gains were accepted" if job.decided.what == "accept" else "The old gains were kept"
         return f"{what} by {job.decided.by}, {n.date(job.decided.at)} UTC."
-    if job.state.value == "proposed":
+    if job.superseded_by is not None:
+        return f"Nothing was decided before the later test, {job.superseded_by}."
+    if job.state is JobState.PROPOSED:
         return "Nothing is decided: the loop runs on its old gains."
     return ""
 
@@ -245,8 +246,7 @@ def _table(
     if before is None and after is None:
         return rows
     if any(each is not None and not each.stable for each in (before, after)):
-        stable = ["–" if each is None else "stable" if each.stable else "not stable" for each in (before, after)]
-        rows.append(("Loop on the model", "", *stable, ""))
+        rows.append(("Loop on the model", "", _stable(before), _stable(after), ""))
 
     def figure(name: str) -> tuple[float | None, float | None]:
         return (None if before is None else getattr(before, name), None if after is None else getattr(after, name))
@@ -267,11 +267,20 @@ def _table(
     row("IAE of a load step of 1 %", f"{pv_unit} s", *figure_step("IAE", "load"))
     row("Largest deviation after it", pv_unit, *figure_step("peak", "load"))
     if job.before is not None or job.after is not None:
-        a, b = job.before, job.after
-        row("Overshoot, measured", "%", a and a.overshoot_pct, b and b.overshoot_pct, 0)
-        row("Settling, measured", "s", a and a.settling_s, b and b.settling_s)
-        row("IAE, measured", f"{pv_unit} s", a and a.IAE, b and b.IAE)
+        measured = (job.before, job.after)
+
+        def both(name: str) -> tuple[float | None, float | None]:
+            found = [None if each is None else getattr(each, name) for each in measured]
+            return found[0], found[1]
+
+        row("Overshoot, measured", "%", *both("overshoot_pct"), 0)
+        row("Settling, measured", "s", *both("settling_s"))
+        row("IAE, measured", f"{pv_unit} s", *both("IAE"))
     return rows
+
+
+def _stable(worth: WorthView | None) -> str:
+    return n.DASH if worth is None else "stable" if worth.stable else "not stable"
 
 
 def _record_note(record: JobRecord | None, decimals: int, pv_unit: str) -> str:
@@ -335,6 +344,10 @@ def _with_td(curve: DesignCurve | None) -> bool:
     return curve is not None and any(each.gains is not None and each.gains.Td > 0.0 for each in curve.designs)
 
 
+def _with_error(curve: DesignCurve | None) -> bool:
+    return curve is not None and any(each.uncertainty is not None for each in curve.designs)
+
+
 def _designs(curve: DesignCurve | None) -> list[list[str]]:
     if curve is None:
         return []
@@ -349,7 +362,7 @@ def _designs(curve: DesignCurve | None) -> list[list[str]]:
                 n.significant(each.gains.Kp),
                 n.significant(each.gains.Ti),
                 *([n.significant(each.gains.Td)] if _with_td(curve) else []),
-                n.Ms_error(each.uncertainty),
+                *([n.Ms_error(each.uncertainty)] if _with_error(curve) else []),
                 n.fixed(worth.GM, 2),
                 n.fixed(worth.PM_deg, 0),
                 n.fixed(worth.overshoot_pct, 0),
@@ -373,8 +386,7 @@ def _asked(source: ReportSource) -> list[Row]:
         pv, mv = loop.pv_limits, loop.mv_limits
         low = _number(job.request.get("mv_low"), mv.low)
         high = _number(job.request.get("mv_high"), mv.high)
-        limits = f"PV {n.significant(pv.low)} to {n.significant(pv.high)} {n.unit(loop.pv_unit)}, "
-        limits += f"MV {n.significant(low)} to {n.significant(high)} %"
+        limits = f"PV {pv.low:g} to {pv.high:g} {n.unit(loop.pv_unit)}, MV {low:g} to {high:g} %"
         rows.append(("limits", limits, True))
     if job.attempts > 1:
         rows.append(("attempts", f"{job.attempts}: the service was restarted meanwhile", False))
@@ -389,9 +401,9 @@ def _value(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int | float):
-        return n.significant(float(value))
+        return f"{value:g}"
     if isinstance(value, list | tuple):
-        return " then ".join(_value(each) for each in value)
+        return ", ".join(_value(each) for each in value)
     if isinstance(value, dict):
         return "(" + ", ".join(f"{name} {_value(each)}" for name, each in value.items()) + ")"
     return str(value)

@@ -20,9 +20,9 @@ from loopwright.tuning.reasons import Ended
 
 WIDTH = 690.0
 _SMALL = (225.0, 190.0)
-_POINTS = 700
+_POINTS = 450
 _SHOWN_SETTLINGS = 1.6
-_LABEL_APART = 92.0
+_LABEL_APART = 120.0
 LOAD_PCT = 10.0
 """Size of the load step that is drawn, percent of MV."""
 
@@ -51,9 +51,10 @@ def record_pictures(record: JobRecord, pv_step: float) -> list[Picture]:
     _, mv = _extremes(bins, "mv")
     sp = np.asarray(bins["sp"], float)
     at = np.asarray(bins["at_s"], float)
-    top = Picture(
-        "pv", "PV measured, set-point and model", x, around([pv, sp], 0.5 * pv_step, 0.1), WIDTH, 190.0, named_x=False
-    )
+    rows = _rows(record, x)
+    low, high = around([pv, sp], 0.5 * pv_step, 0.06)
+    high += (high - low) * 0.07 * (1 + max(rows, default=0))  # room for the names of the stages
+    top = Picture("pv", "PV measured, set-point and model", x, (low, high), WIDTH, 190.0, named_x=False)
     top.curve(at, sp, "sp", stepped=True)
     top.curve(t, pv, "measured" if explained is not None else "pv")
     if explained is not None:
@@ -63,7 +64,7 @@ def record_pictures(record: JobRecord, pv_step: float) -> list[Picture]:
         _, left = _extremes(explained, "mv")
         noise = record.facts.noise or 0.0
         rest = Picture(
-            "left", "What the model leaves", x, around([left], 6.0 * noise), WIDTH, 70.0, named_x=False, y_apart=22.0
+            "left", "What the model leaves", x, around([left], 6.0 * noise), WIDTH, 70.0, named_x=False, y_apart=15.0
         )
         if noise > 0.0:
             rest.band(-2.0 * noise, 2.0 * noise)
@@ -72,17 +73,24 @@ def record_pictures(record: JobRecord, pv_step: float) -> list[Picture]:
     bottom = Picture("mv", "MV", x, around([mv], 5.0), WIDTH, 110.0)
     bottom.curve(t, mv, "mv", stepped=True)
     pictures.append(bottom)
-    row, last = 0, -math.inf
-    for mark in record.facts.marks:
-        place = top.at_x(mark.at_s)
-        row = row + 1 if place - last < _LABEL_APART else 0
-        last = place
+    for mark, row in zip(record.facts.marks, rows, strict=True):
         for picture in pictures:
             picture.line_at(mark.at_s, "mark", stage_name(mark.stage) if picture is top else "", row)
     for load in record.facts.loads:
         for picture in pictures:
-            picture.line_at(load.t_s, "load", f"load {load.size:+.3g} %" if picture is top else "", 3)
+            picture.line_at(load.t_s, "load", f"load {load.size:+.3g} %" if picture is top else "", max(rows) + 1)
     return pictures
+
+
+def _rows(record: JobRecord, x: tuple[float, float]) -> list[int]:
+    """Returns the row in which the name of each stage stands, so that no two names overlap."""
+    rows: list[int] = []
+    last = -math.inf
+    for mark in record.facts.marks:
+        place = WIDTH * (mark.at_s - x[0]) / (x[1] - x[0])
+        rows.append(rows[-1] + 1 if place - last < _LABEL_APART and rows else 0)
+        last = place
+    return rows
 
 
 def _extremes(bins: Bins, name: str) -> tuple[Reals, Reals]:
@@ -143,12 +151,11 @@ def step_pictures(
 
 def _nyquist(model: Model, loops: list[tuple[Gains, str]], Ms: float | None) -> Picture:
     width, height = _SMALL
-    y = (-1.7, 0.5)
+    y = (-1.55, 1.0)
     # the same scale on both axes
     picture = Picture("nyquist", "Nyquist plot", (0.0, 1.0), y, width, height, x_apart=36.0)
     per_px = (y[1] - y[0]) / picture.inner_height
-    picture.x = (-2.1, -2.1 + per_px * picture.inner_width)
-    picture.paths.clear()
+    picture.x = (-2.0, -2.0 + per_px * picture.inner_width)
     picture.curve(picture.x, [0.0, 0.0], "axis")
     picture.curve([0.0, 0.0], y, "axis")
     angle = np.linspace(0.0, 2.0 * np.pi, 121)
@@ -163,7 +170,7 @@ def _nyquist(model: Model, loops: list[tuple[Gains, str]], Ms: float | None) -> 
             continue
         s = 1j * w
         loop = np.polyval(N, s) / np.polyval(D, s) * np.exp(-model.L * s)
-        shown = np.abs(loop) < 4.0
+        shown = (np.abs(loop) < 4.0) & (np.abs(loop) > 0.03)
         picture.curve(np.where(shown, loop.real, np.nan), np.where(shown, loop.imag, np.nan), look)
     minus_one = (picture.at_x(-1.0), picture.at_y(0.0))
     picture.labels.append(Label(minus_one[0] - 7.0, minus_one[1] + 4.0, "+", "point"))

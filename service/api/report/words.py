@@ -14,9 +14,9 @@ STAGES = {
     "pulses": "Pulses of the set-point",
     "relay": "Relay",
     "design": "Model and gains",
-    "verify": "Step under the new gains",
-    "redesign": "Model of the whole record",
-    "baseline": "Step under the old gains",
+    "verify": "Step, new gains",
+    "redesign": "Whole record",
+    "baseline": "Step, old gains",
     "ultimate": "Ultimate gain",
     "zn_pi": "First PI",
     "estimate": "Model",
@@ -26,6 +26,9 @@ _REASONS = {
     Reason.OPERATOR: "by an operator",
     Reason.SERVICE_STOPPED: "the service ended",
     Reason.SETPOINT_CHANGED: "the set-point was changed",
+    Reason.SETPOINT_IS_DRIVEN: "the set-point is driven by another controller",
+    Reason.PV_LIMIT: "PV left its limits",
+    Reason.MV_LIMIT: "MV at its limit",
     Reason.NODE_LOST: "the node was lost",
     Reason.BUS_LOST: "the bus was lost",
     Reason.INTERNAL: "an error inside the service",
@@ -121,7 +124,9 @@ def stage_found(stage: StageView, pv_unit: str) -> str:
     if (fit := value("fit_pct")) is not None:
         said.append(f"{fixed(fit, 1)} % of the step explained")
     if (overshoot := value("overshoot_pct")) is not None:
-        said.append(f"overshoot {fixed(overshoot, 0)} %, settled in {duration(value('settling_s'))}")
+        settled = value("settling_s")
+        how = f"settled in {duration(settled)}" if settled is not None else "not settled"
+        said.append(f"overshoot {fixed(overshoot, 0)} %, {how}")
     reason = result.get("reason")
     if isinstance(reason, str) and reason in set(Reason):
         said.append(f"not enough: {reason_words(Reason(reason))}")

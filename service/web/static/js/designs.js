@@ -1,34 +1,32 @@
 // @ts-check
-/** The gains that the service designs on a job's record for other Ms, asked for one after the other and kept. */
+/** The gains from robust to fast that the service has designed on a job's model, asked for once and kept. */
 import { signal } from "../vendor/signals-core.js";
 import { ask } from "./api.js";
 
-const ORDER = [1.4, 2.0, 1.2, 1.8, 1.3, 1.5, 1.7, 1.9, 1.6];
-
-/** @type {Map<string, {found: import("../vendor/signals-core.js").Signal<{ms: number, gains: any, uncertainty: number | null}[]>, asked: boolean}>} */
+/** @type {Map<string, {found: import("../vendor/signals-core.js").Signal<{ms: number, gains: any, uncertainty: number | null}[]>, state: import("../vendor/signals-core.js").Signal<"" | "asked" | "done">}>} */
 const kept = new Map();
 
 /** @param {string} job its URL */
 export function designsOf(job) {
   let it = kept.get(job);
-  if (!it) kept.set(job, (it = { found: signal(/** @type {any[]} */ ([])), asked: false }));
+  if (!it) kept.set(job, (it = { found: signal(/** @type {any[]} */ ([])), state: signal(/** @type {"" | "asked" | "done"} */ ("")) }));
   return it;
 }
 
-/** Asks for those that are missing. @param {string} job @param {AbortSignal} stop */
+/** Asks for them, if they are not known. @param {string} job @param {AbortSignal} stop */
 export async function fillDesigns(job, stop) {
   const it = designsOf(job);
-  for (const ms of ORDER) {
+  if (it.state.value === "done") return;
+  it.state.value = "asked";
+  try {
+    const answer = await ask(`${job}/designs`, stop);
+    it.found.value = answer.designs
+      .filter((/** @type {any} */ each) => each.gains)
+      .map((/** @type {any} */ each) => ({ ms: each.Ms_asked, gains: each.gains, uncertainty: each.uncertainty }));
+    it.state.value = "done";
+  } catch (error) {
     if (stop.aborted) return;
-    if (it.found.value.some((each) => each.ms === ms)) continue;
-    try {
-      const answer = await ask(`${job}/alternatives?ms=${ms}`, stop);
-      const found = answer.methods[0];
-      if (found?.outcome === "tuned") it.found.value = [...it.found.value, { ms, gains: found.gains, uncertainty: found.uncertainty }].sort((a, b) => a.ms - b.ms);
-    } catch (error) {
-      if (stop.aborted) return;
-      const { status } = /** @type {any} */ (error);
-      if (status === 404 || status === 409 || status === 422) return;
-    }
+    const { status } = /** @type {any} */ (error);
+    it.state.value = status === 404 || status === 409 || status === 422 ? "done" : "";
   }
 }

@@ -22,7 +22,8 @@ from sqlalchemy import delete
 from sqlalchemy.pool import QueuePool
 
 from loopwright.service.api.app import create_app
-from loopwright.service.api.samples import Gone, Reading, csv_text, json_text, parts, record_columns, takes_gzip
+from loopwright.service.api.samples import Gone, Reading, csv_text, json_text, parts, takes_gzip
+from loopwright.service.jobs.stored_record import record_columns
 from loopwright.service.store import sample_blocks
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import ChunkRow

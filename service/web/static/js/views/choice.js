@@ -18,6 +18,15 @@ export function Choice({ loop, detail, job, latest, quiet, onChanged }) {
   const tested = job.chosen.Ms ?? job.predicted?.Ms ?? Number(job.request.ms ?? 1.6);
   const [ms, setMs] = useState(/** @type {number} */ (tested));
   const grid = designsOf(job.url).found.value;
+  const asked = designsOf(job.url).state.value === "asked";
+  const curve = useRef(/** @type {HTMLElement | null} */ (null));
+  const [width, setWidth] = useState(760);
+  useEffect(() => {
+    if (!curve.current) return;
+    const watch = new ResizeObserver(([entry]) => setWidth(Math.max(240, Math.round(entry.contentRect.width))));
+    watch.observe(curve.current);
+    return () => watch.disconnect();
+  }, [designed]);
   useEffect(() => {
     if (!designed) return;
     const stop = new AbortController();
@@ -40,12 +49,12 @@ export function Choice({ loop, detail, job, latest, quiet, onChanged }) {
   const stableBefore = job.comparison?.before.stable ?? true;
 
   return html`<div class="card choice"><div class="body"><div>
-      ${designed && html`<div class="curve" key="curve"><div class="split"><span class="title">Faster or more robust</span><span>Ms <b>${msText(ms)}</b> <span class="quiet">${atTested ? "as asked and tested" : "not tested"}</span></span></div>
-        ${Curve(points, ms, tested, job.comparison?.before.Ms ?? null, model && job.old_gains && stableBefore ? step(model, job.old_gains, { load: 1 }, horizon_s, 300).IAE : null)}
+      ${designed && html`<div class="curve" key="curve" ref=${curve}><div class="split"><span class="title">Faster or more robust</span><span>Ms <b>${msText(ms)}</b> <span class="quiet">${atTested ? "as asked and tested" : "not tested"}</span></span></div>
+        ${Curve(width, points, ms, tested, job.comparison?.before.Ms ?? null, model && job.old_gains && stableBefore ? step(model, job.old_gains, { load: 1 }, horizon_s, 300).IAE : null)}
         <input type="range" min=${designs[0].ms} max=${designs[designs.length - 1].ms} step="0.01" value=${ms} disabled=${designs.length < 2} aria-label="Ms" aria-valuetext=${`Ms ${msText(ms)}${atTested ? ", as tested" : ""}`}
           onInput=${(/** @type {any} */ e) => { const value = Number(e.target.value); setMs(Math.abs(value - tested) < 0.015 ? tested : value); }}
           onDblClick=${() => setMs(tested)} onKeyDown=${(/** @type {any} */ e) => slide(e, ms, tested, designs, setMs)} />
-        <div class="ends"><span>${msText(designs[0].ms)} robust</span>${grid.length < 8 && html`<span class="quiet">designing on the record… ${grid.length} of 9</span>`}<span>fast ${msText(designs[designs.length - 1].ms)}</span></div></div>`}
+        <div class="ends"><span>${msText(designs[0].ms)} robust</span>${asked && html`<span class="quiet">asking for the designs…</span>`}<span>fast ${msText(designs[designs.length - 1].ms)}</span></div></div>`}
       ${after && html`<div class="small-plots" key="plots">
         <figure><figcaption><b>Set-point step</b> PV, ${unit(loop.pv_unit)}</figcaption>${StepPlot(stableBefore ? before?.setpoint : null, after.setpoint, size, "Set-point step before and after")}</figure>
         <figure><figcaption><b>Load step of ${LOAD_PCT} %</b> PV, ${unit(loop.pv_unit)}</figcaption>${StepPlot(stableBefore ? before?.load : null, after.load, 0, "Load step before and after")}</figure>

@@ -1,15 +1,12 @@
 // @ts-check
-/** The record of a job with the model driven by the measured MV, what the model leaves, and MV. */
+/** The record of a job with its model, what the model leaves, and MV, as the service has stored them. */
 import { useEffect, useRef, useState } from "../../vendor/hooks.js";
 import { ask } from "../api.js";
-import { modelOf, Plant } from "../control.js";
 import { html } from "../html.js";
 import { pvDecimals, fixed, unit } from "../numbers.js";
 import { colour, shown } from "../palette.js";
 import { makePlot, mark, yRange } from "../plot.js";
 import { stageName } from "../words.js";
-
-const FEW = 20;
 
 /** @param {{loop: any, job: any}} props */
 export function Record({ loop, job }) {
@@ -21,11 +18,8 @@ export function Record({ loop, job }) {
   const mv = useRef(/** @type {HTMLElement | null} */ (null));
   useEffect(() => {
     const stop = new AbortController();
-    ask(`${job.url}/samples`, stop.signal).then(
-      (found) => {
-        if (!found.t_s.length) setWords("There are no samples: the job ended before it had any, or they were deleted.");
-        else setRecord(withModel(found, modelOf(job.model), job));
-      },
+    ask(`${job.url}/record?points=1500`, stop.signal).then(
+      (found) => setRecord(columns(found)),
       (error) => {
         if (!stop.signal.aborted) setWords(error.message);
       },
@@ -89,32 +83,21 @@ export function Record({ loop, job }) {
   </section>`;
 }
 
-/** The record, with the model driven by the measured MV from where the loop was at rest. @param {any} found @param {any} model @param {any} job */
-export function withModel(found, model, job) {
-  const start = found.t_s[0];
-  const t = found.t_s.map((/** @type {number} */ each) => each - start);
-  const marks = [];
-  for (let n = 0; n < t.length; n++) if (n === 0 || found.stage[n] !== found.stage[n - 1]) marks.push({ t: t[n], stage: found.stage[n] });
-  const base = { t, pv: found.pv, sp: found.sp, mv: found.mv, marks, noise: 0, model: /** @type {number[] | null} */ (null), left: /** @type {number[]} */ ([]) };
-  if (!model || t.length < 3 * FEW) return base;
-  const rest = found.stage.findIndex((/** @type {string} */ each) => each !== found.stage[0]);
-  const calm = Math.max(FEW, rest > 0 ? rest : FEW);
-  const mean = (/** @type {number[]} */ of) => of.reduce((sum, each) => sum + each, 0) / of.length;
-  const u0 = mean(found.mv.slice(0, calm));
-  const steps = t.slice(1).map((/** @type {number} */ each, /** @type {number} */ n) => each - t[n]).sort((/** @type {number} */ a, /** @type {number} */ b) => a - b);
-  const dt = steps[steps.length >> 1];
-  if (!(dt > 0)) return base;
-  const plant = new Plant(model, dt);
-  const answer = [0];
-  for (let n = 1; n < t.length; n++) {
-    const missed = Math.min(1000, Math.max(1, Math.round((t[n] - t[n - 1]) / dt)));
-    let value = 0;
-    for (let k = 0; k < missed; k++) value = plant.step(found.mv[n - 1] - u0);
-    answer.push(value);
+/** The record as columns for a plot: of a bin of several samples its smallest and its largest value. @param {any} found */
+export function columns(found) {
+  const it = { t: /** @type {number[]} */ ([]), pv: /** @type {number[]} */ ([]), sp: /** @type {number[]} */ ([]), mv: /** @type {number[]} */ ([]), left: /** @type {number[]} */ ([]), model: /** @type {number[] | null} */ (found.explained ? [] : null),
+    noise: found.noise ?? 0, marks: found.marks.map((/** @type {any} */ each) => ({ t: each.at_s, stage: each.stage })) };
+  const put = (/** @type {number} */ n, /** @type {number} */ t, /** @type {"min" | "max"} */ which) => {
+    it.t.push(t);
+    it.pv.push(found[`pv_${which}`][n] ?? NaN);
+    it.mv.push(found[`mv_${which}`][n] ?? NaN);
+    it.sp.push(found.sp[n] ?? NaN);
+    it.model?.push(found.explained.model[n] ?? NaN);
+    it.left.push(found.explained?.[`residual_${which}`][n] ?? NaN);
+  };
+  for (let n = 0; n < found.at_s.length; n++) {
+    put(n, found.at_s[n], "min");
+    if (found.until_s[n] > found.at_s[n]) put(n, found.until_s[n], "max");
   }
-  const offset = mean(found.pv.map((/** @type {number} */ each, /** @type {number} */ n) => each - answer[n]));
-  if (!Number.isFinite(offset)) return base;
-  const shownModel = answer.map((each) => each + offset);
-  const noise = job.stages.map((/** @type {any} */ each) => each.result?.noise).find((/** @type {any} */ each) => typeof each === "number") ?? 0;
-  return { ...base, noise, model: shownModel, left: found.pv.map((/** @type {number} */ each, /** @type {number} */ n) => each - shownModel[n]) };
+  return it;
 }
