@@ -25,7 +25,7 @@ from loopwright.service.api.report.words import (
     trust,
 )
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.job_states import GOOD, JobState
+from loopwright.service.job_states import JobState
 from loopwright.service.jobs.design_curve import DesignCurve
 from loopwright.service.jobs.job_record import FITTED, JobRecord
 from loopwright.service.results import GainsView, StepWorthView, TransferModelView, WorthView
@@ -165,7 +165,8 @@ def _step_size(source: ReportSource) -> float:
 
 
 def _after_name(job: JobView) -> str:
-    return "no better" if job.state is JobState.NO_GAIN else job.state.value if job.state in GOOD else "designed"
+    named = (JobState.PROPOSED, JobState.ACCEPTED, JobState.REHEARSED)
+    return "no better" if job.state is JobState.NO_GAIN else job.state.value if job.state in named else "designed"
 
 
 def _head(source: ReportSource) -> list[Row]:

@@ -128,7 +128,7 @@ def step_pictures(
                 response = step_response(model, gains, horizon, load=load)
             except Ended:
                 continue
-            at = np.linspace(0.0, horizon, 400)
+            at = np.linspace(0.0, horizon, 240)
             found.append((at, factor * np.interp(at, response.t, response.y), look))
         answers[load] = found
     target = np.asarray([0.0, size])
@@ -162,7 +162,7 @@ def _nyquist(model: Model, loops: list[tuple[Gains, str]], Ms: float | None) -> 
     if Ms is not None and Ms > 1.0:
         picture.curve(-1.0 + np.cos(angle) / Ms, np.sin(angle) / Ms, "circle")
     scale = model.L + float(np.sum(time_constants(model)))
-    w = np.geomspace(1e-3, 1e3, 4000) / (scale or 1.0)
+    w = np.geomspace(1e-3, 1e3, 1500) / (scale or 1.0)
     for gains, look in loops:
         try:
             N, D = open_loop(model, gains)
@@ -170,7 +170,7 @@ def _nyquist(model: Model, loops: list[tuple[Gains, str]], Ms: float | None) -> 
             continue
         s = 1j * w
         loop = np.polyval(N, s) / np.polyval(D, s) * np.exp(-model.L * s)
-        shown = (np.abs(loop) < 4.0) & (np.abs(loop) > 0.03)
+        shown = (np.abs(loop) < 4.0) & (np.abs(loop) > 0.08)
         picture.curve(np.where(shown, loop.real, np.nan), np.where(shown, loop.imag, np.nan), look)
     minus_one = (picture.at_x(-1.0), picture.at_y(0.0))
     picture.labels.append(Label(minus_one[0] - 7.0, minus_one[1] + 4.0, "+", "point"))

@@ -31,9 +31,14 @@ export function Curve(width, points, ms, tested, msBefore, iaeBefore) {
   </svg>`;
 }
 
-/** @param {any} before @param {any} after @param {number} setpoint @param {string} label */
-export function StepPlot(before, after, setpoint, label) {
-  const [W, H, L, B] = [260, 170, 40, 20];
+/** The height of a small figure: that of its neighbours, and not taller than a small screen shows. @param {number} width */
+function heightOf(width) {
+  return Math.round(Math.min(240, Math.max(150, 0.65 * width)));
+}
+
+/** @param {number} W width in pixels @param {any} before @param {any} after @param {number} setpoint @param {string} label */
+export function StepPlot(W, before, after, setpoint, label) {
+  const [H, L, B] = [heightOf(W), 46, 20];
   let low = Math.min(0, setpoint);
   let high = Math.max(0, setpoint);
   const consider = before ? [before, after] : [after];
@@ -69,12 +74,12 @@ export function StepPlot(before, after, setpoint, label) {
     ${before && html`<path key="before" d=${path(before)} class="s-old" />`}<path key="after" d=${path(after)} class="s-new" /></svg>`;
 }
 
-/** @param {any} before @param {any} after @param {number} Ms */
-export function NyquistPlot(before, after, Ms) {
-  const [W, H] = [200, 170];
-  const scale = 58;
-  const x = (/** @type {number} */ re) => 118 + scale * re;
-  const y = (/** @type {number} */ im) => 62 - scale * im;
+/** @param {number} width in pixels @param {any} before @param {any} after @param {number} Ms */
+export function NyquistPlot(width, before, after, Ms) {
+  const [W, H] = [width, heightOf(width * 1.25)];
+  const scale = 0.34 * Math.min(H, W);
+  const x = (/** @type {number} */ re) => 0.59 * W + scale * re;
+  const y = (/** @type {number} */ im) => 0.365 * H - scale * im;
   const path = (/** @type {any} */ f) => {
     let d = "";
     let pen = false;

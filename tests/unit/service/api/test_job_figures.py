@@ -1,0 +1,247 @@
+"""GET /jobs/{id}/record and GET /jobs/{id}/designs: once computed and stored, the same for all who ask."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+
+from benchmarks.rehearsed import MIDDLE, TS, entry
+from loopwright.controller.channel import Channel, Settings
+from loopwright.controller.pid import Parameters
+from loopwright.plantsim.plant import LinearPlant
+from loopwright.service.api.app import create_app
+from loopwright.service.execution.computing.limits import ComputationKind
+from loopwright.service.execution.computing.pool import Pool
+from loopwright.service.execution.procedures import rehearse, tune
+from loopwright.service.execution.rehearsal import RehearsedLoop
+from loopwright.service.inputs.config import LoopConfig, parse_site
+from loopwright.service.inputs.request import retune_request
+from loopwright.service.jobs import job_figures
+from loopwright.service.jobs.kept_figures import KeptFigures
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.jobs.retention import RetentionPolicy, delete_old_samples
+from loopwright.service.server.assembly import make_jobs
+from loopwright.service.store.store import Store
+from loopwright.tuning.plan import Mode
+from tests.unit.service.api.test_api import assert_problem, finished, start
+from tests.unit.service.fakes import Service, ThreadEngine
+
+LOOP = "TIC-1"
+K, T, L = 2.0, 6.0, 1.5
+
+
+class Counting(Pool):
+    """A pool that counts what it computes, and computes in this process. hold: cleared, it waits."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+        self.hold = threading.Event()
+        self.hold.set()
+
+    def run(self, kind: ComputationKind, work: Any, **_: Any) -> Any:
+        assert kind is ComputationKind.TUNING
+        if work.func is job_figures.job_figures:
+            assert self.hold.wait(60.0)
+            self.count += 1
+        return work()
+
+
+class Here:
+    """Jobs on a plant in memory, and the pool that computes their figures."""
+
+    def __init__(self, folder: Path) -> None:
+        def open_loop(_: LoopConfig) -> RehearsedLoop:
+            settings = Settings(0.0, 100.0, safe_output=MIDDLE, pv_low=-200.0, pv_high=200.0, reverse=True)
+            channel = Channel(TS, settings, Parameters(0.2, 6.0), 0.0, int(Mode.AUTOMATIC), MIDDLE)
+            return RehearsedLoop(Offset(), channel, TS)
+
+        loops = parse_site({"loops": [entry(LOOP) | {"sp_deviation": 5.0}]}, "test").loops
+        self.store, self.engine, self.pool = Store(folder), ThreadEngine(), Counting()
+        self.figures = KeptFigures(self.store, self.pool)
+        self.jobs: Jobs = make_jobs(
+            loops, self.store, open_loop, tune, rehearse, engine=self.engine, ended=self.figures.ended
+        )
+        self.jobs.boot()
+
+    def finished(self, **options: Any) -> str:
+        row = self.jobs.start(LOOP, retune_request(**options))
+        self.engine.join(120.0)
+        return row.id
+
+    def client(self) -> TestClient:
+        return TestClient(create_app(self.jobs, pool=self.pool, figures=self.figures), raise_server_exceptions=False)
+
+
+class Offset:
+    def __init__(self) -> None:
+        self._plant = LinearPlant([K], [T, 1.0], L, TS, noise_std=0.05, seed=3)
+
+    @property
+    def pv(self) -> float:
+        return self._plant.pv
+
+    def step(self, mv: float) -> float:
+        return self._plant.step(mv - MIDDLE)
+
+
+@pytest.fixture(scope="module")
+def here(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Here]:
+    here = Here(tmp_path_factory.mktemp("figures"))
+    yield here
+    here.jobs.stop()
+    here.figures.close()
+    here.store.close()
+
+
+@pytest.fixture(scope="module")
+def job(here: Here) -> str:
+    return here.finished()
+
+
+def peak_of_sensitivity(curve: dict[str, Any], gains: dict[str, Any]) -> float:
+    """Ms on a fine grid by python-control, which `tuning` does not use; the dead time is exact."""
+    plant = control.tf(curve["num"], curve["den"])
+    dead_time = curve["dead_time_s"] + curve["sampling_delay_s"]
+    w = np.geomspace(1e-3, 1e2, 40_000)
+    s = 1j * w
+    loop = plant(s) * np.exp(-dead_time * s) * gains["Kp"] * (1.0 + 1.0 / (gains["Ti"] * s))
+    return float(np.max(1.0 / np.abs(1.0 + loop)))
+
+
+def test_the_designs_have_the_Ms_asked_for_by_another_way(here: Here, job: str) -> None:
+    with here.client() as client:
+        found = client.get(f"/jobs/{job}/designs").json()
+    assert (found["job"], found["loop"]) == (job, LOOP)
+    designs = found["designs"]
+    assert [each["Ms_asked"] for each in designs] == pytest.approx(np.arange(1.2, 2.001, 0.05).tolist())
+    for each in designs:
+        assert each["reason"] is None and 0.0 < each["uncertainty"] < 0.1
+        assert peak_of_sensitivity(found, each["gains"]) == pytest.approx(each["Ms_asked"], abs=0.01)
+        assert each["worth"]["Ms"] == pytest.approx(each["Ms_asked"], abs=0.01)
+    # faster: a load is made good sooner, and the margins shrink
+    assert np.all(np.diff([each["worth"]["load"]["IAE"] for each in designs]) < 0.0)
+    assert np.all(np.diff([each["worth"]["GM"] for each in designs]) < 0.0)
+    # with integral action the integral of the error after a unit load is Ti/Kp; here PV does not cross its set-point
+    slow = designs[0]
+    assert slow["worth"]["load"]["IAE"] == pytest.approx(slow["gains"]["Ti"] / slow["gains"]["Kp"], rel=0.02)
+
+
+def test_the_designs_are_those_of_alternatives(here: Here, job: str) -> None:
+    with here.client() as client:
+        designs = client.get(f"/jobs/{job}/designs").json()
+        asked = client.get(f"/jobs/{job}/alternatives?ms=1.4").json()["methods"][0]
+        proposed = client.get(f"/jobs/{job}").json()
+    (point,) = [each for each in designs["designs"] if each["Ms_asked"] == 1.4]
+    for name in ("Kp", "Ti", "Td"):
+        assert point["gains"][name] == pytest.approx(asked["gains"][name], rel=1e-6)
+    assert designs["after"]["Ms"] == pytest.approx(proposed["predicted"]["Ms"], abs=0.02)
+    assert designs["before"]["Ms"] == pytest.approx(proposed["comparison"]["before"]["Ms"], abs=0.05)
+
+
+def test_the_record_has_the_samples_and_what_the_model_leaves(here: Here, job: str) -> None:
+    with here.client() as client:
+        found = client.get(f"/jobs/{job}/record?points=5000").json()
+        samples = client.get(f"/jobs/{job}/samples").json()
+    assert found["samples"] == [1] * len(samples["t_s"]) and found["recorded"] == len(samples["t_s"])
+    for name, column in (("pv_mean", "pv"), ("mv_min", "mv"), ("sp", "sp")):
+        assert found[name] == pytest.approx(samples[column], abs=1e-4)
+    assert np.diff(found["at_s"]) == pytest.approx(np.diff(samples["t_s"]), abs=1e-6)
+    assert [each["stage"] for each in found["marks"]] == list(dict.fromkeys(samples["stage"]))
+    assert found["model_from"] == "fitted" and found["noise"] == pytest.approx(0.05, rel=0.3)
+    residual = np.asarray(found["explained"]["residual_mean"])
+    assert residual == pytest.approx(np.subtract(found["pv_mean"], found["explained"]["model"]), abs=1e-4)
+    # the plant is linear: the model leaves the noise alone
+    assert np.std(residual) == pytest.approx(0.05, rel=0.15)
+
+
+def test_thinning_keeps_the_extremes(here: Here, job: str) -> None:
+    with here.client() as client:
+        whole = client.get(f"/jobs/{job}/record?points=5000").json()
+        few = client.get(f"/jobs/{job}/record?points=40").json()
+        assert_problem(client.get(f"/jobs/{job}/record?points=0"), 422)
+    assert len(few["at_s"]) <= 40 and sum(few["samples"]) == whole["recorded"]
+    assert max(few["pv_max"]) == max(whole["pv_max"]) and min(few["mv_min"]) == min(whole["mv_min"])
+    assert len({len(values) for values in few["explained"].values()} | {len(few["sp"])}) == 1
+
+
+def test_the_end_of_the_job_computes_them_once_for_all_who_ask(tmp_path: Path) -> None:
+    here = Here(tmp_path)
+    here.pool.hold.clear()
+    job = here.finished()
+    assert here.store.get(job).ended_at is not None  # the end of the job did not wait for its figures
+    with here.client() as client, ThreadPoolExecutor(6) as askers:
+        asked = [askers.submit(client.get, f"/jobs/{job}/{what}") for what in 3 * ("record", "designs")]
+        here.pool.hold.set()
+        assert [each.result().status_code for each in asked] == 6 * [200]
+        assert here.pool.count == 1
+    # another process of the service finds them in the store
+    later = Counting()
+    assert KeptFigures(here.store, later).kept(job) is not None and later.count == 0
+    here.figures.close()
+    here.jobs.stop()
+    here.store.close()
+
+
+def test_of_an_older_job_they_are_computed_when_somebody_asks(
+    here: Here, job: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with here.client() as client:
+        before = client.get(f"/jobs/{job}/designs").json()
+        count = here.pool.count
+        monkeypatch.setattr("loopwright.service.jobs.kept_figures.VERSION", job_figures.VERSION + 1)
+        assert client.get(f"/jobs/{job}/designs").json() == before and here.pool.count == count + 1
+        assert client.get(f"/jobs/{job}/record").status_code == 200 and here.pool.count == count + 1
+
+
+def test_the_record_goes_with_the_samples_and_the_designs_stay(tmp_path: Path) -> None:
+    here = Here(tmp_path)
+    first, second = here.finished(), here.finished()
+    with here.client() as client:
+        designs = client.get(f"/jobs/{first}/designs").json()
+        here.jobs.decisions.rollback(first, "A")
+        assert delete_old_samples(here.store, RetentionPolicy(jobs=1)) == 1
+        told = assert_problem(client.get(f"/jobs/{first}/record"), 409)["detail"]
+        assert told == f"job {first} has no record: its samples were deleted"
+        assert client.get(f"/jobs/{first}/designs").json() == designs
+        assert client.get(f"/jobs/{second}/record").status_code == 200
+        report = client.get(f"/jobs/{first}/report")
+        assert report.status_code == 200 and "samples of this job were deleted" in report.text
+    here.figures.close()
+    here.jobs.stop()
+    here.store.close()
+
+
+def test_a_job_of_five_stages_has_the_designs_of_its_model(service: Service, client: TestClient) -> None:
+    job = finished(service, client)
+    found = client.get(f"{job['url']}/designs").json()
+    assert found["designed_on"] == "the job's model" and len(found["designs"]) == 17
+    for each in found["designs"]:
+        assert each["uncertainty"] is None
+        assert peak_of_sensitivity(found, each["gains"]) == pytest.approx(each["Ms_asked"], abs=0.01)
+
+
+def test_a_job_without_them_says_why(service: Service, client: TestClient) -> None:
+    assert_problem(client.get("/jobs/none/record"), 404)
+    assert_problem(client.get("/jobs/none/designs"), 404)
+    rehearsed = finished(service, client, dry_run=True)["id"]
+    told = assert_problem(client.get(f"/jobs/{rehearsed}/record"), 409)["detail"]
+    assert told == f"job {rehearsed} has no record: it ended as rehearsed before it had any samples"
+    service.tune.hold.clear()
+    running = start(client)
+    assert service.tune.inside.wait(20.0)
+    for what in ("record", "designs", "report"):
+        assert "is not over" in assert_problem(client.get(f"/jobs/{running}/{what}"), 409)["detail"]
+    client.post(f"/jobs/{running}/abort")
+    service.wait(running)
+    assert client.get(f"/jobs/{running}/record").status_code == 200
+    told = assert_problem(client.get(f"/jobs/{running}/designs"), 409)["detail"]
+    assert told == f"job {running} ended as aborted before it had a model"
