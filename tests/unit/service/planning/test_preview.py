@@ -61,7 +61,7 @@ class TestExcitations:
     def test_with_a_model_it_is_predicted_what_each_tells(self) -> None:
         found = self.told(known_of(finding()))
         assert [each.excitation for each in found.excitations] == ["observe", "setpoint", "relay"]
-        step, pulses, relay = found.excitations
+        step, _, relay = found.excitations
         assert "only the step under the new gains moves the loop" in step.when and "Ms known to +-0.05" in step.when
         assert relay.when.startswith("Only where what comes before tells too little")
         for each in found.excitations:
@@ -70,7 +70,8 @@ class TestExcitations:
             periods = each.duration_s / 3.9  # Pu of K = 1, T = 8 s, L = 1 s, by w L + atan(w T) = pi
             assert 1.8 < periods < 12.5
             assert each.information_per_pu == pytest.approx(4.0 / each.Ms_uncertainty**2 / periods, rel=0.1)
-        assert any(line.startswith("setpoint: Only where") and "It would tell Ms to +-" in line for line in found.summary)
+        pulses_told = next(line for line in found.summary if line.startswith("setpoint: Only where"))
+        assert "It would tell Ms to +-" in pulses_told
 
     def test_twice_the_noise_leaves_twice_the_uncertainty(self) -> None:
         few, many = (self.told(known_of(finding()), noise).excitations[0] for noise in (0.01, 0.02))

@@ -44,7 +44,13 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
 def with_later_fields(golden: dict[str, Any]) -> dict[str, Any]:
     """The golden job with what is shown of it since: nobody has decided, and a live test knows how fast it sampled."""
     sample_time_s = None if golden["dry_run"] else 0.1
-    return golden | {"decided": None, "superseded_by": None, "stopping": None, "sample_time_s": sample_time_s}
+    return golden | {
+        "decided": None,
+        "superseded_by": None,
+        "stopping": None,
+        "model_from": None,
+        "sample_time_s": sample_time_s,
+    }
 
 
 def shown(store: Store, job_id: str) -> dict[str, Any]:
