@@ -10,7 +10,6 @@ from functools import cache
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
-from markupsafe import Markup
 
 from loopwright.service.api.job_views import JobView
 from loopwright.service.api.report import numbers as n
@@ -84,7 +83,7 @@ def paper(source: ReportSource) -> str:
     return _template().render(
         job=job,
         policy=_IN_FILE,
-        style=Markup(STYLE),
+        style=STYLE,
         version=source.version,
         made_at=n.date(source.made_at),
         headline=headline(job),

@@ -7,11 +7,13 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import control
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy.exc import SQLAlchemyError
 
 from benchmarks.rehearsed import MIDDLE, TS, entry
 from loopwright.controller.channel import Channel, Settings
@@ -19,18 +21,21 @@ from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.api.app import create_app
 from loopwright.service.execution.computing.limits import ComputationKind
-from loopwright.service.execution.computing.pool import Pool
+from loopwright.service.execution.computing.pool import NotWanted, Pool
 from loopwright.service.execution.procedures import rehearse, tune
 from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.inputs.config import LoopConfig, parse_site
 from loopwright.service.inputs.request import retune_request
 from loopwright.service.jobs import job_figures
+from loopwright.service.jobs.job_record import job_record, unpack
 from loopwright.service.jobs.kept_figures import KeptFigures
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.retention import RetentionPolicy, delete_old_samples
+from loopwright.service.jobs.stored_record import last_attempt, record_columns
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.tuning.plan import Mode
+from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.api.test_api import assert_problem, finished, start
 from tests.unit.service.fakes import Service, ThreadEngine
 
@@ -218,6 +223,55 @@ def test_the_record_goes_with_the_samples_and_the_designs_stay(tmp_path: Path) -
     here.figures.close()
     here.jobs.stop()
     here.store.close()
+
+
+def test_what_cannot_be_computed_or_stored_is_said_and_tried_again(
+    here: Here, job: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row, kept = here.store.get(job), KeptFigures(here.store, here.pool)
+    monkeypatch.setattr("loopwright.service.jobs.kept_figures.VERSION", job_figures.VERSION + 2)
+    monkeypatch.setattr(here.pool, "run", Mock(side_effect=Failed(Reason.COMPUTATION_LIMIT, "60 s")))
+    with here.client() as client:
+        assert assert_problem(client.get(f"/jobs/{job}/designs"), 422)["reason"] == "computation_limit"
+    with pytest.raises(Failed):
+        kept.asked(row).result(60.0)
+    kept.ended(row)  # the end of a test is not troubled by it
+    monkeypatch.undo()
+    monkeypatch.setattr("loopwright.service.jobs.kept_figures.VERSION", job_figures.VERSION + 3)
+    monkeypatch.setattr("loopwright.service.store.job_figures.keep", Mock(side_effect=SQLAlchemyError("no room")))
+    assert kept.asked(row).result(60.0).designs is not None
+    assert kept.kept(job) is None
+    kept.close()
+    monkeypatch.setattr(here.pool, "run", Mock(side_effect=NotWanted()))
+    with here.client() as client:
+        assert assert_problem(client.get(f"/jobs/{job}/record"), 503)["reason"] == "service_stopped"
+
+
+def test_a_defect_in_a_fit_takes_neither_the_record_nor_the_job(
+    here: Here, job: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row, events = here.store.get(job), here.store.events(job)
+    blocks = list(here.store.blocks(job))
+    monkeypatch.setattr(job_figures, "evaluate_again", Mock(side_effect=ZeroDivisionError))
+    found = job_figures.job_figures(row, events, blocks)
+    assert found.record is not None and found.record.facts.model_from == "driven"
+    assert found.designs is not None and found.designs.designed_on == "the job's model"
+    # the model driven by MV leaves hardly more than the one that was fitted to the record
+    assert found.record.explained is not None
+    assert np.std(found.record.explained["mv_mean"]) == pytest.approx(0.05, rel=0.3)
+    monkeypatch.setattr(job_figures, "design_curve", Mock(side_effect=ValueError))
+    found = job_figures.job_figures(row, events, blocks)
+    assert found.record is not None and found.designs is None
+
+
+def test_missing_samples_are_a_gap_and_no_line(here: Here, job: str) -> None:
+    columns = record_columns(here.store.blocks(job))
+    kept = [n for n in range(len(columns["t_s"])) if not 100 <= n < 130]
+    attempt = last_attempt({name: [values[n] for n in kept] for name, values in columns.items()})
+    assert attempt is not None
+    bins = job_record(attempt, None, None, (), None).measured
+    assert len(bins) == len(kept) and np.flatnonzero(bins["gap"]).tolist() == [100]
+    assert unpack(job_record(attempt, None, None, (), 0.1).pack()).measured.tolist() == bins.tolist()
 
 
 def test_a_job_of_five_stages_has_the_designs_of_its_model(service: Service, client: TestClient) -> None:

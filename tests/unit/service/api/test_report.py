@@ -9,6 +9,7 @@ import re
 from html.parser import HTMLParser
 from typing import Any
 
+import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
@@ -192,8 +193,6 @@ def test_no_job_no_report(client: TestClient) -> None:
 def test_ticks_and_ranges() -> None:
     assert [text for _, text in ticks(0.0, 1.0, 5.0)] == ["0.0", "0.2", "0.4", "0.6", "0.8", "1.0"]
     assert [text for _, text in ticks(-30.0, 40.0, 4.0)] == ["−20", "0", "20", "40"]
-    import numpy as np
-
     low, high = around([np.asarray([1e6, 1e6])], 0.0)
     assert low < 1e6 < high
     assert around([np.asarray([np.nan])], 2.0)[0] < 0.0

@@ -144,7 +144,7 @@ def many(store: Store, blocks: int) -> str:
     return job
 
 
-@pytest.mark.parametrize("writer", [json_text, csv_text])
+@pytest.mark.parametrize("writer", [json_text, lambda of: csv_text(of.blocks())], ids=["json", "csv"])
 def test_the_samples_are_never_all_in_memory(service: Service, writer: Any) -> None:
     """So many took 22 MB, and 1.5 million 806 MB. The blocks that are read at once are 1 MB, and so is their text."""
     job = many(service.store, 10)

@@ -14,7 +14,7 @@ from fastapi.testclient import TestClient
 from typer.testing import CliRunner, Result
 
 from loopwright.service.cli import main as cli
-from loopwright.service.cli.client import Client
+from loopwright.service.cli.client import ApiError, Client
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import NoGain, Reason, Refused
 from tests.unit.service.fakes import TAG, FakeLoop, Service
@@ -36,6 +36,13 @@ class Through:
         return self._checked(self._client.get(path, params={k: v for k, v in query.items() if v is not None}))
 
     samples_of = Client.samples_of
+    file = Client.file
+
+    def _answer(self, method: str, path: str) -> Any:
+        answer = self._client.request(method, path)
+        if not answer.is_success:
+            raise ApiError(answer.text)
+        return answer
 
     def post(self, path: str, body: dict[str, Any] | None = None) -> Any:
         self.posted.append(body or {})
@@ -193,6 +200,24 @@ def test_a_job_and_its_picture_and_another_Ms(rehearsed: str, tmp_path: Path) ->
     told = run("alternatives", rehearsed, "--ms", "1.4")
     assert told.exit_code == 0 and '"start": "design"' in told.output.replace("\n", " ")
     assert run("job", rehearsed, "--plot", "job.doc").exit_code == 2
+
+
+def test_the_report_of_a_job(rehearsed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    named = tmp_path / "filed.html"
+    written = run("report", rehearsed, "--output", str(named))
+    assert written.exit_code == 0, written.output
+    text = named.read_text(encoding="utf-8")
+    assert text.startswith("<!doctype html>") and rehearsed in text and "<script" not in text
+    # without a name it has that of the loop and the job, and nothing is replaced
+    by_itself = tmp_path / f"loopwright-{TAG}-{rehearsed}.html"
+    assert run("report", rehearsed).exit_code == 0 and by_itself.exists()
+    again = run("report", rehearsed)
+    assert again.exit_code == 2 and "exists already" in again.output
+    assert run("report", rehearsed, "--output", "-").stdout.startswith("<!doctype html>")
+    lost = run("report", rehearsed, "--output", str(tmp_path / "none" / "file.html"))
+    assert lost.exit_code == 2 and "file.html" in lost.output
+    assert isinstance(run("report", "none").exception, ApiError)
 
 
 def test_a_job_without_a_record_has_no_picture(service: Service, through: Through, tmp_path: Path) -> None:
