@@ -108,7 +108,7 @@ def router(jobs: Jobs, figures: KeptFigures) -> APIRouter:
     @routes.get(
         "/jobs/{job_id}/designs",
         summary="The gains of fast for each Ms from robust to fast, with their figures, on one model",
-        responses=problems.responses(404, 409, 503),
+        responses=problems.responses(404, 409, 422, 503),
     )
     async def job_designs(job_id: JobId) -> DesignsView:
         row, found = await figures_of(jobs, figures, job_id)

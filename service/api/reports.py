@@ -24,6 +24,7 @@ from loopwright.service.jobs.kept_figures import KeptFigures
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.store.clock import now
 from loopwright.service.store.jobs import Job
+from loopwright.tuning.reasons import Failed
 
 _HEADERS = {
     "Content-Security-Policy": POLICY,
@@ -47,17 +48,22 @@ def router(jobs: Jobs, figures: KeptFigures, pool: Pool, view: Callable[[Job], J
         response_class=HTMLResponse,
         responses={
             200: {"content": {"text/html": {}}, "description": "The report, which needs no other file"},
-            **problems.responses(404, 409, 503),
+            **problems.responses(404, 409, 422, 503),
         },
     )
     async def job_report(job_id: JobId, http: Request) -> HTMLResponse:
-        row, found = await figures_of(jobs, figures, job_id)
-        source = await run_in_threadpool(source_of, row, found)
+        not_computed = None
+        try:
+            row, found = await figures_of(jobs, figures, job_id)
+        except Failed as failed:  # all else is shown
+            row, found = await run_in_threadpool(jobs.store.get, job_id), JobFigures(None, None)
+            not_computed = failed.detail
+        source = await run_in_threadpool(source_of, row, found, not_computed)
         text = await computed(pool, partial(paper, source), http, lambda: jobs.stopping)
         name = f'inline; filename="loopwright-{row.loop}-{row.id}.html"'
         return HTMLResponse(text, headers=_HEADERS | {"Content-Disposition": name})
 
-    def source_of(row: Job, found: JobFigures) -> ReportSource:
+    def source_of(row: Job, found: JobFigures, not_computed: str | None) -> ReportSource:
         """All that the report shows, with everything that it needs from the store."""
         loop: LoopConfig | None = None
         try:
@@ -66,6 +72,16 @@ def router(jobs: Jobs, figures: KeptFigures, pool: Pool, view: Callable[[Job], J
             loop = None
         blocks = list(jobs.store.blocks(row.id))
         events = jobs.store.events(row.id)
-        return ReportSource(view(row), loop, events, found.record, found.designs, blocks, version("loopwright"), now())
+        return ReportSource(
+            job=view(row),
+            loop=loop,
+            events=events,
+            record=found.record,
+            designs=found.designs,
+            blocks=blocks,
+            version=version("loopwright"),
+            made_at=now(),
+            not_computed=not_computed,
+        )
 
     return routes

@@ -55,6 +55,7 @@ class ReportSource:
     loop: the configuration of the loop; None where the loop is no longer configured.
     events: those of the job.  record, designs: None where the job has none.  blocks: the samples.
     version: of the service.  made_at: UTC, ISO 8601.
+    not_computed: why record and designs could not be computed.
     """
 
     job: JobView
@@ -65,6 +66,7 @@ class ReportSource:
     blocks: Sequence[Block]
     version: str
     made_at: str
+    not_computed: str | None = None
 
 
 def paper(source: ReportSource) -> str:
@@ -298,6 +300,8 @@ def _record_note(record: JobRecord | None, decimals: int, pv_unit: str) -> str:
 
 
 def _no_record(source: ReportSource) -> str:
+    if source.not_computed is not None:
+        return f"The record could not be evaluated: {source.not_computed}. GET /jobs/{source.job.id}/samples has it."
     if any(event.kind == "samples_deleted" for event in source.events):
         return "The samples of this job were deleted, as the service was told to."
     return "There are no samples: the job ended before it had any."

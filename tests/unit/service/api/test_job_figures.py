@@ -20,6 +20,7 @@ from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.api.app import create_app
+from loopwright.service.api.report.paper import paper
 from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.computing.pool import NotWanted, Pool
 from loopwright.service.execution.procedures import rehearse, tune
@@ -230,9 +231,16 @@ def test_what_cannot_be_computed_or_stored_is_said_and_tried_again(
 ) -> None:
     row, kept = here.store.get(job), KeptFigures(here.store, here.pool)
     monkeypatch.setattr("loopwright.service.jobs.kept_figures.VERSION", job_figures.VERSION + 2)
-    monkeypatch.setattr(here.pool, "run", Mock(side_effect=Failed(Reason.COMPUTATION_LIMIT, "60 s")))
+    limit = Mock(side_effect=Failed(Reason.COMPUTATION_LIMIT, "60 s"))
+    monkeypatch.setattr(here.pool, "run", limit)
     with here.client() as client:
         assert assert_problem(client.get(f"/jobs/{job}/designs"), 422)["reason"] == "computation_limit"
+        run = Mock(side_effect=[Failed(Reason.COMPUTATION_LIMIT, "60 s"), "<!doctype html>"])
+        monkeypatch.setattr(here.pool, "run", run)
+        assert client.get(f"/jobs/{job}/report").text == "<!doctype html>"
+        (source,) = run.call_args.args[1].args
+        assert "The record could not be evaluated: 60 s." in paper(source)
+    monkeypatch.setattr(here.pool, "run", limit)
     with pytest.raises(Failed):
         kept.asked(row).result(60.0)
     kept.ended(row)  # the end of a test is not troubled by it
