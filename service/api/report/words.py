@@ -11,7 +11,7 @@ from loopwright.tuning.reasons import Reason
 STAGES = {
     "preflight": "At rest?",
     "settle": "Settling",
-    "pulses": "Pulses of the set-point",
+    "pulses": "Set-point pulses",
     "relay": "Relay",
     "design": "Model and gains",
     "verify": "Step, new gains",
