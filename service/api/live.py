@@ -22,9 +22,7 @@ MOST_LOOPS = 8
 _EVENT_ID = re.compile(r"([0-9a-f]{1,32})\.([0-9]{1,9})")
 
 
-def router(
-    live: Live, directory: LoopDirectory, keyring: Keyring | None, sessions: BrowserSessions
-) -> APIRouter:
+def router(live: Live, directory: LoopDirectory, keyring: Keyring | None, sessions: BrowserSessions) -> APIRouter:
     """A router with GET /live. keyring: None where no keys are asked for."""
     routes = APIRouter(tags=["live"], route_class=JsonRoute)
 

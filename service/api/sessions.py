@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from importlib.metadata import version
 
 from fastapi import APIRouter, HTTPException, Request, Response
@@ -66,7 +67,7 @@ class _Refusals:
         if self._of_address.take(address) or self._of_all.take("all"):
             self._unwritten += 1
             return
-        after = {"key": name, "why": why, "not_written_before": self._unwritten}
+        after: Mapping[str, object] = {"key": name, "why": why, "not_written_before": self._unwritten}
         self._unwritten = 0
         who = Principal(_UNKNOWN, Scope.READ, address=address)
         try:
@@ -150,7 +151,7 @@ async def _row(checks: KeyChecks, key: str, address: str, refusals: _Refusals) -
     return row
 
 
-def _write(store: Store, who: Principal, what: str, subject: str, after: dict[str, object]) -> None:
+def _write(store: Store, who: Principal, what: str, subject: str, after: Mapping[str, object]) -> None:
     token = current.set(who)
     try:
         with store.writing() as writing:

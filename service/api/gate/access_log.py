@@ -23,8 +23,9 @@ _METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"
 
 
 class Access:
-    """Wraps the application. An answer that does not say otherwise is kept by no cache. The query is not logged, because it may hold secrets. Refusals that a client can provoke
-    without end are logged at most once a second for each address."""
+    """Wraps the application. An answer that does not say otherwise is kept by no cache. The query is not logged, because
+    it may hold secrets. Refusals that a client can provoke without end are logged at most once a second for each
+    address."""
 
     def __init__(self, app: ASGIApp, wall: Callable[[], float] = time.monotonic) -> None:
         self._app, self._wall = app, wall

@@ -30,6 +30,7 @@ export function SignIn() {
   };
   return html`<main><form class="card signin" onSubmit=${send}><h1 key="title">Sign in to Loopwright</h1>
     ${wasIn && html`<p key="over" role="status">The session is over: it has ended, or its key was revoked. Tests that run go on.</p>`}
+    <input key="user" class="hidden-words" type="text" name="username" autocomplete="username" value="Loopwright" readonly tabindex="-1" aria-hidden="true" />
     <label key="key" class="field"><span>API key</span><input ref=${field} name="key" type="password" autocomplete="current-password" spellcheck="false" required
       aria-invalid=${problem ? "true" : undefined} aria-describedby=${problem ? "signin-problem" : undefined} /></label>
     <p key="how" class="quiet">An administrator makes a key with <code>loopwright key create</code>.</p>
