@@ -23,7 +23,7 @@ _METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"
 
 
 class Access:
-    """Wraps the application. An answer that does not say otherwise is kept by no cache. The query is not logged, because
+    """Wraps the application. No cache keeps an answer that does not say otherwise. The query is not logged, because
     it may hold secrets. Refusals that a client can provoke without end are logged at most once a second for each
     address."""
 
