@@ -31,6 +31,7 @@ from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.events import event_stream, still_permitted
 from loopwright.service.api.gate.access_log import Access
 from loopwright.service.api.gate.gate import Gate, Policy
+from loopwright.service.api.gate.key_checks import KeyChecks
 from loopwright.service.api.idempotency import Idempotent
 from loopwright.service.api.job_views import (
     Decision,
@@ -113,7 +114,8 @@ def create_app(
     )
     app.router.route_class = JsonRoute
     app.add_middleware(Idempotent, keys=IdempotencyKeys(jobs.store))
-    app.add_middleware(Gate, policy=policy)
+    key_checks = None if keyring is None else KeyChecks(keyring, policy.limits)
+    app.add_middleware(Gate, policy=policy, checks=key_checks)
     app.add_middleware(Access)
     problems.install(app)
     openapi.install(app)
@@ -218,8 +220,8 @@ def create_app(
         over = row.state not in ACTIVE
         if over and last_event_id and not jobs.store.events(job_id, last_event_id, limit=1):
             return Response(status_code=204)
-        stream = event_stream(jobs, job_id, last_event_id, still_permitted(keyring, current.get().key_id))
-        return StreamingResponse(stream, media_type="text/event-stream", headers={"Cache-Control": "no-cache"})
+        stream = event_stream(jobs, job_id, last_event_id, still_permitted(keyring, policy.sessions, current.get()))
+        return StreamingResponse(stream, media_type="text/event-stream", headers={"Cache-Control": "no-store"})
 
     @app.get(
         "/jobs/{job_id}/samples",
@@ -277,10 +279,9 @@ def create_app(
     def rollback(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
         return view(jobs.decisions.rollback(job_id, (decision or Decision()).by))
 
-    if policy.keyring is None:  # with keys the page would need a way to sign in
-        app.mount("/ui", Pages(), name="page")
-        app.add_route("/", lambda _: RedirectResponse("/ui/"), include_in_schema=False)
-    app.include_router(sessions.router(jobs.store.host, policy.keyring is not None))
+    app.mount("/ui", Pages(), name="page")
+    app.add_route("/", lambda _: RedirectResponse("/ui/"), include_in_schema=False)
+    app.include_router(sessions.router(jobs.store, key_checks, policy.sessions))
     app.include_router(decisions.router(jobs))
     app.include_router(locks.router(jobs.locking))
     pool = pool or Pool()
@@ -288,7 +289,7 @@ def create_app(
     app.include_router(sparklines.router(jobs.directory, listening))
     app.include_router(observation.router(jobs, readings, listening, pool))
     live = live or Live(jobs, listening)
-    app.include_router(live_api.router(live, jobs.directory, keyring))
+    app.include_router(live_api.router(live, jobs.directory, keyring, policy.sessions))
     app.include_router(previews.router(jobs, many))
     app.include_router(tunings.router(jobs, pool))
     figures = figures or KeptFigures(jobs.store, pool)

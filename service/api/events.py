@@ -17,6 +17,8 @@ from sqlalchemy.exc import SQLAlchemyError
 from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.journal import temporary
 from loopwright.service.jobs.manager import Jobs
+from loopwright.service.security.principal import Principal
+from loopwright.service.security.sessions import BrowserSessions
 from loopwright.service.store.keyring import REVOKED_WITHIN_S, Keyring
 
 _POLL_S = 0.2
@@ -25,11 +27,15 @@ _EVENTS_AT_ONCE = 200
 _KEEP_ALIVE_POLLS = 75  # 15 s: proxies close a silent connection after 30 s or more
 
 
-def still_permitted(keyring: Keyring | None, key_id: str | None) -> Callable[[], bool]:
-    """A function that tells whether the key of a request is still valid; always true without keys."""
+def still_permitted(keyring: Keyring | None, sessions: BrowserSessions, who: Principal) -> Callable[[], bool]:
+    """A function that tells whether the key of a request is still valid, and its session, which counts as used then;
+    always true without keys."""
+    key_id, session = who.key_id, who.session
     if keyring is None or key_id is None:
         return lambda: True
-    return lambda: keyring.still_valid(key_id)
+    if session is None:
+        return lambda: keyring.still_valid(key_id)
+    return lambda: sessions.use(session) is not None and keyring.still_valid(key_id)
 
 
 async def event_stream(

@@ -36,6 +36,8 @@ HEADER = "Idempotency-Key"
 MAX_CHARACTERS = 128
 _CHARACTERS = rf"[A-Za-z0-9._~:+/=-]{{1,{MAX_CHARACTERS}}}"
 PATTERN = rf'^(?:{_CHARACTERS}|"{_CHARACTERS}")$'
+_NEVER_KEPT = "/session"
+"""Its answer holds the token of a session."""
 _AT_ONCE = 4
 """Threads reserved for keys, so that requests which wait for a silent node cannot delay the key of an abort."""
 _WORDS = f"letters, digits and . _ ~ : + / = -, 1 to {MAX_CHARACTERS} of them, with or without quotes around"
@@ -50,7 +52,8 @@ class Idempotent:
         self._threads = anyio.CapacityLimiter(_AT_ONCE)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        given = Headers(scope=scope).getlist(HEADER) if scope["type"] == "http" and scope["method"] == "POST" else []
+        taken = scope["type"] == "http" and scope["method"] == "POST" and scope["path"] != _NEVER_KEPT
+        given = Headers(scope=scope).getlist(HEADER) if taken else []
         if not given:
             await self._app(scope, receive, send)
             return

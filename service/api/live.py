@@ -15,13 +15,14 @@ from loopwright.service.api.events import still_permitted
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.live.live import MOST_BACK_S, Live
 from loopwright.service.security.principal import current
+from loopwright.service.security.sessions import BrowserSessions
 from loopwright.service.store.keyring import Keyring
 
 MOST_LOOPS = 8
 _EVENT_ID = re.compile(r"([0-9a-f]{1,32})\.([0-9]{1,9})")
 
 
-def router(live: Live, directory: LoopDirectory, keyring: Keyring | None) -> APIRouter:
+def router(live: Live, directory: LoopDirectory, keyring: Keyring | None, sessions: BrowserSessions) -> APIRouter:
     """A router with GET /live. keyring: None where no keys are asked for."""
     routes = APIRouter(tags=["live"], route_class=JsonRoute)
 
@@ -67,8 +68,8 @@ def router(live: Live, directory: LoopDirectory, keyring: Keyring | None) -> API
             directory.owner(tag)
         known = _EVENT_ID.fullmatch(last_event_id)
         after = {known[1]: int(known[2])} if known else {}
-        stream = live.stream(tags, back_s, after, still_permitted(keyring, current.get().key_id))
-        headers = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}
+        stream = live.stream(tags, back_s, after, still_permitted(keyring, sessions, current.get()))
+        headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
         return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
     return routes

@@ -72,7 +72,8 @@ class AuditView(BaseModel):
     said_by: str | None = Field(description="Name of the person, as given in the request", examples=["night shift"])
     what: str = Field(
         description="retune, abort, accept, rollback, accept_failed, rollback_failed, retune_many, retune_many_abort, "
-        "dismiss, lock, unlock, samples_delete, clock_jump, restore, key_create, key_revoke",
+        "dismiss, lock, unlock, samples_delete, clock_jump, restore, key_create, key_revoke, "
+        "sign_in, sign_out, sign_in_refused",
         examples=["accept"],
     )
     subject: str = Field(

@@ -14,12 +14,14 @@ class Principal:
 
     name: the name of the key, or a general name for callers without one.
     address: the network address, where there is one.
+    session: id of the browser's session, where the caller has signed in.
     """
 
     name: str
     scope: Scope
     key_id: str | None = None
     address: str | None = None
+    session: str | None = None
 
 
 SERVICE = Principal("service", Scope.ADMIN)

@@ -103,6 +103,12 @@ class Keyring:
             row = session.get(KeyRow, key_id)
         return row is not None and valid(row)
 
+    def name_of(self, key_id: str) -> str | None:
+        """The name of the key with this id, also of one that is not valid; None: there is none. One query."""
+        with self._session() as session:
+            row = session.get(KeyRow, key_id)
+        return None if row is None else row.name
+
     def check(self, key: str) -> KeyRow | None:
         """The row of a valid key, else None. One query, and a hash where no key of that id was found right before."""
         key_id = key_id_of(key)

@@ -23,8 +23,9 @@ _METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"
 
 
 class Access:
-    """Wraps the application. The query is not logged, because it may hold secrets. Refusals that a client can provoke
-    without end are logged at most once a second for each address."""
+    """Wraps the application. No cache keeps an answer that does not say otherwise. The query is not logged, because
+    it may hold secrets. Refusals that a client can provoke without end are logged at most once a second for each
+    address."""
 
     def __init__(self, app: ASGIApp, wall: Callable[[], float] = time.monotonic) -> None:
         self._app, self._wall = app, wall
@@ -41,8 +42,11 @@ class Access:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
+                headers = list(message.get("headers", ()))
+                if not any(name.lower() == b"cache-control" for name, _ in headers):
+                    headers.append((b"cache-control", b"no-store"))
                 message["headers"] = [
-                    *message.get("headers", ()),
+                    *headers,
                     (b"x-request-id", request.encode()),
                     (b"x-content-type-options", b"nosniff"),
                 ]

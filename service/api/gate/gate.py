@@ -18,6 +18,7 @@ from starlette.types import Scope as AsgiScope
 
 from loopwright.service.api import problems
 from loopwright.service.api.gate.bodies import Bodies, BodyRefused, begins_with
+from loopwright.service.api.gate.cookies import not_proved, token_of
 from loopwright.service.api.gate.key_checks import KeyChecks, TooOften
 from loopwright.service.api.gate.limits import Buckets, RequestLimits, retry_after
 from loopwright.service.api.gate.places import (
@@ -28,27 +29,35 @@ from loopwright.service.api.gate.places import (
     RequestKind,
     Turn,
     changes_nothing,
+    is_page,
     kind_of,
 )
 from loopwright.service.loops.shared_reading import asked_at
 from loopwright.service.security.keys import Scope
 from loopwright.service.security.principal import LOCAL, Principal, current
+from loopwright.service.security.sessions import BrowserSessions
 from loopwright.service.store.database import urgent
-from loopwright.service.store.keyring import Keyring
+from loopwright.service.store.keyring import REVOKED_WITHIN_S, Keyring
 
 log = logging.getLogger(__name__)
 
 PUBLIC = frozenset({"/healthz", "/docs", "/openapi.json"})
-"""Paths that need no key, because their answers say nothing about this installation."""
+"""Paths that need no key, because their answers say nothing about this installation. So do the files of the page;
+POST /session checks the key in its body."""
 ALWAYS = frozenset({"/healthz", "/readyz", "/metrics"})
 """Paths that are answered however busy the service is, because then operators ask for them."""
 _ADMIN = ("/audit",)
+_SMALL = (*DECIDES, RequestKind.SIGN_IN, RequestKind.PAGE)
+
+_KEYS_AWAY = "the database with the keys does not answer"
 
 
 def scope_for(method: str, path: str) -> Scope | None:
     """The scope that a request needs; None for a public path."""
-    if path in PUBLIC:
+    if path in PUBLIC or is_page(path) or (path == "/session" and method == "POST"):
         return None
+    if path == "/session":
+        return Scope.READ
     if path.startswith(_ADMIN):
         return Scope.ADMIN
     return Scope.READ if method in SAFE_METHODS or changes_nothing(path) else Scope.OPERATE
@@ -56,11 +65,13 @@ def scope_for(method: str, path: str) -> Scope | None:
 
 @dataclass(frozen=True)
 class Policy:
-    """keyring: None to ask for no keys. local_only: without keys, refuse host names other than this machine's."""
+    """keyring: None to ask for no keys. local_only: without keys, refuse host names other than this machine's.
+    sessions: of the browsers that have signed in with a key."""
 
     keyring: Keyring | None = None
     limits: RequestLimits = field(default_factory=RequestLimits)
     local_only: bool = False
+    sessions: BrowserSessions = field(default_factory=BrowserSessions)
 
 
 class Gate:
@@ -70,13 +81,13 @@ class Gate:
     of the same kind. A body that does not arrive therefore takes nobody's place.
     """
 
-    def __init__(self, app: ASGIApp, policy: Policy) -> None:
+    def __init__(self, app: ASGIApp, policy: Policy, checks: KeyChecks | None) -> None:
         self._app = app
         self._policy = policy
         limits = policy.limits
         # Decisions have buckets of their own: a client that reads too much may still stop a test.
         self._asked, self._decided = (Buckets(limits.rate_per_s, limits.burst) for _ in range(2))
-        self._checks = None if policy.keyring is None else KeyChecks(policy.keyring, limits)
+        self._checks = checks
         self._bodies = Bodies(limits)
         self._places = Places(limits)
 
@@ -104,7 +115,7 @@ class Gate:
         try:
             self._refuse_often(kind, client)
             self._places.check(kind, client)
-            body = await self._bodies.whole(scope, receive, client, small=kind in DECIDES)
+            body = await self._bodies.whole(scope, receive, client, small=kind in _SMALL)
             if body is not None:
                 receive = begins_with(body, receive)
             async with self._places.taken(kind, client) as turn:
@@ -122,10 +133,10 @@ class Gate:
 
     async def _who(self, scope: AsgiScope) -> Principal | Response:
         """The principal of the request, or the refusal. scope["principal"] gets the name for the log."""
-        headers, keyring = Headers(scope=scope), self._policy.keyring
+        headers = Headers(scope=scope)
         client = scope.get("client")
         anyone = Principal(LOCAL, Scope.ADMIN, address=client[0] if client else None)
-        if keyring is None:
+        if self._checks is None:
             if self._policy.local_only and (why := _not_local(headers)):
                 return problems.problem(403, why)
             scope["principal"] = anyone.name
@@ -133,27 +144,50 @@ class Gate:
         needed = scope_for(scope["method"], scope["path"])
         if needed is None:
             return replace(anyone, scope=Scope.READ)
+        if not headers.get("authorization") and (token := token_of(headers, scope["scheme"])):
+            return await self._signed_in(token, headers, scope, needed, anyone.address)
         kind, _, key = headers.get("authorization", "").partition(" ")
         if kind.lower() != "bearer" or not key:
             return _unauthorized("this needs an API key: Authorization: Bearer KEY")
-        assert self._checks is not None
         try:
             row = await self._checks.row(key, anyone.address or "unknown")
         except TooOften as often:
             return _refusal(429, str(often), often.wait_s)
         except SQLAlchemyError:
             log.exception("the keys cannot be read")
-            return _refusal(503, "the database with the keys does not answer", 5.0)
+            return _refusal(503, _KEYS_AWAY, 5.0)
         if row is None:
             return _unauthorized("this key is not known, was revoked or has expired")
         scope["principal"], has = row.name, Scope(row.scope)
         if not has.includes(needed):
-            return problems.problem(
-                403,
-                f"this needs the scope {needed.value}; the key {row.name!r} has {has.value}",
-                headers={"WWW-Authenticate": f'Bearer error="insufficient_scope", scope="{needed.value}"'},
-            )
+            return _insufficient(needed, row.name, has)
         return Principal(row.name, has, row.id, anyone.address)
+
+    async def _signed_in(
+        self, token: str, headers: Headers, scope: AsgiScope, needed: Scope, address: str | None
+    ) -> Principal | Response:
+        """The principal of a request with the cookie of a session, or the refusal."""
+        sessions = self._policy.sessions
+        session = sessions.of(token)
+        if session is not None and sessions.unchecked_s(session) > REVOKED_WITHIN_S:
+            assert self._checks is not None
+            try:
+                if await self._checks.still_valid(session.key_id):
+                    sessions.checked(session)
+                else:
+                    sessions.end_of_key(session.key_id)
+                    session = None
+            except SQLAlchemyError:
+                log.exception("the keys cannot be read")
+                return _refusal(503, _KEYS_AWAY, 5.0)
+        if session is None:
+            return _unauthorized("this session is over, or its key is no longer valid: sign in again at /ui/")
+        scope["principal"] = session.name
+        if scope["method"] not in SAFE_METHODS and (why := not_proved(headers, session.csrf)):
+            return problems.problem(403, why)
+        if not session.scope.includes(needed):
+            return _insufficient(needed, session.name, session.scope)
+        return Principal(session.name, session.scope, session.key_id, address, session.id)
 
 
 def _until_it_begins(send: Send, turn: Turn) -> Send:
@@ -186,6 +220,14 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
         return False
+
+
+def _insufficient(needed: Scope, name: str, has: Scope) -> Response:
+    return problems.problem(
+        403,
+        f"this needs the scope {needed.value}; the key {name!r} has {has.value}",
+        headers={"WWW-Authenticate": f'Bearer error="insufficient_scope", scope="{needed.value}"'},
+    )
 
 
 def _unauthorized(why: str) -> Response:

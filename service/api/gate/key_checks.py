@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
+from typing import TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -20,6 +21,8 @@ from loopwright.service.api.gate.limits import Buckets, RequestLimits
 from loopwright.service.security.keys import key_id_of
 from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.tables import KeyRow
+
+T = TypeVar("T")
 
 
 class TooOften(Exception):
@@ -52,6 +55,15 @@ class KeyChecks:
         self._refuse_early(address)
         async with self._turn(address):
             return self._keyring.known(key) or await self._guess(key, address)
+
+    async def still_valid(self, key_id: str) -> bool:
+        """Whether a key that was checked before is valid now. Raises SQLAlchemyError."""
+        return await self._look(lambda: self._keyring.still_valid(key_id))
+
+    async def name_of(self, key: str) -> str | None:
+        """The name of the key that has the id of this one; None: there is none. Raises SQLAlchemyError."""
+        key_id = key_id_of(key)
+        return None if key_id is None else await self._look(lambda: self._keyring.name_of(key_id))
 
     async def _guess(self, key: str, address: str) -> KeyRow | None:
         # Many guesses at a key id do not refuse an address without wrong guesses of late: it may be the key's owner.
@@ -88,6 +100,9 @@ class KeyChecks:
             self._waiting[address] -= 1
             if not self._waiting[address]:
                 del self._waiting[address], self._turns[address]
+
+    async def _look(self, look: Callable[[], T]) -> T:
+        return await asyncio.get_running_loop().run_in_executor(self._looking, look)
 
     async def _in(self, threads: ThreadPoolExecutor, key: str) -> KeyRow | None:
         return await asyncio.get_running_loop().run_in_executor(threads, self._keyring.check, key)

@@ -32,6 +32,8 @@ class RequestKind(StrEnum):
     COMPUTATION = "computations"
     STREAM = "event streams"
     WATCH = "requests of /readyz and /metrics"
+    PAGE = "files of the page"
+    SIGN_IN = "sign-ins"
 
 
 DECIDES = (RequestKind.ABORT, RequestKind.DECISION)
@@ -47,10 +49,19 @@ def changes_nothing(path: str) -> bool:
     return path == "/tunings" or _PREVIEW.fullmatch(path) is not None
 
 
+def is_page(path: str) -> bool:
+    """Whether the path is one of the operators' page, whose files say nothing of the installation."""
+    return path in ("/", "/ui") or path.startswith("/ui/")
+
+
 def kind_of(method: str, path: str) -> RequestKind | None:
     """The kind of a request; None for /healthz, which costs nothing and is always answered."""
     if path == "/healthz":
         return None
+    if is_page(path):
+        return RequestKind.PAGE
+    if path == "/session" and method not in SAFE_METHODS:
+        return RequestKind.SIGN_IN
     last = path.rpartition("/")[2]
     if path == "/tunings" or last in ("alternatives", "observation"):
         return RequestKind.COMPUTATION
@@ -94,6 +105,8 @@ def rooms(limits: RequestLimits) -> dict[RequestKind, Room]:
         RequestKind.COMPUTATION: Room(limits.computations_at_once, limits.computations_at_once),
         RequestKind.STREAM: Room(limits.streams_at_once, 2),
         RequestKind.WATCH: Room(16, 2),
+        RequestKind.PAGE: Room(64, 4),
+        RequestKind.SIGN_IN: Room(32, 8),
     }
 
 

@@ -22,12 +22,16 @@ export class Problem extends Error {
 
 /** True once an answer was 401: the sign-in view is shown. */
 export const signedOut = signal(false);
+/** What a change shows beside the cookie of the session; empty: there is no session. */
+export const csrf = signal("");
+/** Counts answers that were 403: another key may have signed in, in another tab. */
+export const forbidden = signal(0);
 
 /** @param {string} method @param {string} path @param {unknown} [body] @param {AbortSignal} [stop] */
 async function request(method, path, body, stop) {
   /** @type {Record<string, string>} */
   const headers = { Accept: "application/json" };
-  if (method !== "GET") headers["X-Loopwright"] = "1";
+  if (method !== "GET" && csrf.value) headers["X-Loopwright-CSRF"] = csrf.value;
   if (body !== undefined) headers["Content-Type"] = "application/json";
   let answer;
   try {
@@ -44,7 +48,8 @@ async function request(method, path, body, stop) {
     found = null;
   }
   if (answer.ok) return { found, headers: answer.headers };
-  if (answer.status === 401) signedOut.value = true;
+  if (answer.status === 401 && !(method === "POST" && path === "/session")) signedOut.value = true;
+  if (answer.status === 403) forbidden.value++;
   const after = Number(answer.headers.get("Retry-After"));
   throw new Problem(answer.status, found, after > 0 ? after : null);
 }

@@ -4,7 +4,7 @@ import { render } from "../vendor/preact.js";
 import "../vendor/signals.js";
 import { effect } from "../vendor/signals-core.js";
 import { abortJob } from "./aborting.js";
-import { signedOut } from "./api.js";
+import { forbidden, signedOut } from "./api.js";
 import { html } from "./html.js";
 import { beginPalette } from "./palette.js";
 import { beginRouting, go, path } from "./router.js";
@@ -71,11 +71,19 @@ function begin() {
   render(html`<${Page} />`, /** @type {Element} */ (document.getElementById("page")));
   let begun = false;
   effect(() => {
-    if (signedOut.value || begun) return;
-    begun = true;
-    void refreshSession();
-    void refreshLoops();
-    stream.begin();
+    if (signedOut.value) stream.end(); // signing in loads the page again
+    else if (!begun) {
+      begun = true;
+      // Who is asking comes first: without a session the rest would be refused.
+      void refreshSession().then(() => {
+        if (signedOut.value) return;
+        void refreshLoops();
+        stream.begin();
+      });
+    }
+  });
+  effect(() => {
+    if (forbidden.value) void refreshSession();
   });
 }
 

@@ -1,7 +1,7 @@
 // @ts-check
 /** What many places of the page show, as signals. */
 import { batch, computed, signal } from "../vendor/signals-core.js";
-import { ask, askAll } from "./api.js";
+import { ask, askAll, csrf } from "./api.js";
 
 /** Who is signed in: name, scope (read, operate, admin), whether keys are asked for. null: not known yet. */
 export const session = signal(/** @type {{name: string, scope: string, keys: boolean} | null} */ (null));
@@ -106,13 +106,13 @@ export async function refreshLoops() {
   }
 }
 
-/** Asks who is signed in. A service that has no sessions asks for no keys here. */
+/** Asks who is signed in, and for what a change shows beside the cookie. */
 export async function refreshSession() {
   try {
     const found = await ask("/session");
-    session.value = { name: found.name, scope: found.scope, keys: found.keys ?? found.keys_asked ?? true };
-  } catch (error) {
-    if (/** @type {any} */ (error).status === 404) session.value = { name: "local", scope: "admin", keys: false };
-    else if (/** @type {any} */ (error).status === 401) session.value = null;
+    csrf.value = found.csrf ?? "";
+    session.value = { name: found.name, scope: found.scope, keys: found.keys };
+  } catch {
+    // After 401 the sign-in view is shown; the stream says when the service is silent.
   }
 }

@@ -52,6 +52,7 @@ class Stream {
   }
 
   open() {
+    if (signedOut.value) return;
     clearTimeout(this.retry);
     this.source?.close();
     const query = this.tag ? `?loops=${encodeURIComponent(this.tag)}&back_s=${this.back_s}` : "";
@@ -90,13 +91,20 @@ class Stream {
     });
   }
 
+  /** Gives the stream up for good. */
+  end() {
+    clearTimeout(this.retry);
+    this.source?.close();
+    this.source = null;
+  }
+
   later() {
     this.tries++;
     const wait_s = Math.min(LONGEST_WAIT_S, 0.5 * 2 ** (this.tries - 1)) * (0.8 + 0.4 * Math.random());
     clearTimeout(this.retry);
     this.retry = setTimeout(async () => {
       try {
-        await ask("/loops?limit=1"); // says 401 where the key was revoked
+        await ask("/session"); // says 401 where the session is over or the key was revoked
       } catch {
         // The stream says more.
       }

@@ -59,12 +59,12 @@ def test_only_files_of_the_page_are_sent(client: TestClient, path: str) -> None:
     assert answer.status_code == 404 and "StaticFiles" not in answer.text
 
 
-def test_where_keys_are_asked_for_there_is_no_page_yet(service: Service) -> None:
-    keyring = Keyring(service.store.engine)
-    _, key = keyring.create("a", Scope.READ)
-    with TestClient(create_app(service.jobs, Policy(keyring))) as client:
-        assert client.get("/ui/").status_code == 401
-        assert client.get("/ui/", headers={"Authorization": f"Bearer {key}"}).status_code == 404
+def test_where_keys_are_asked_for_the_page_comes_without_one(service: Service) -> None:
+    with TestClient(create_app(service.jobs, Policy(Keyring(service.store.engine)))) as client:
+        for path in ("/", "/ui", "/ui/", f"/ui/loops/{TAG}", "/ui/js/main.js"):
+            assert client.get(path).status_code == 200
+        assert client.post("/ui/").status_code == 405
+        assert client.get("/ui/../loops").status_code == client.get("/uix").status_code == 401
 
 
 def test_the_page_learns_who_is_asking(service: Service, client: TestClient) -> None:

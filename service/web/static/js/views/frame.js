@@ -31,16 +31,23 @@ export function Bar() {
       </a>
       <span class="who">${service.value?.host} ${session.value && html`<b>${session.value.name}</b> ${session.value.scope}`}</span>
       <button class="plain" onClick=${cyclePalette} aria-label=${`Colours: ${palette.value}`}>◑ <span class="who">${palette.value}</span></button>
-      ${session.value?.keys && html`<button class="plain" onClick=${signOut}>Sign out</button>`}
+      ${signOutError.value && html`<span key="error" role="alert">${signOutError.value}</span>`}
+      ${session.value?.keys && html`<button key="out" class="plain" onClick=${signOut} aria-label=${`Sign out ${session.value.name}`}>Sign out</button>`}
     </div>
   </header>`;
 }
 
+const signOutError = signal("");
+
+/** The page shows that nobody is signed in only once the service has ended the session. */
 async function signOut() {
+  signOutError.value = "";
   try {
     await command("/session", undefined, "DELETE");
-  } finally {
+    session.value = null;
     signedOut.value = true;
+  } catch (error) {
+    signOutError.value = `Still signed in: ${/** @type {Error} */ (error).message}`;
   }
 }
 

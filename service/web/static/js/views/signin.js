@@ -1,34 +1,46 @@
 // @ts-check
-/** Signing in with an API key. The key is sent once, a cookie is kept. */
-import { useState } from "../../vendor/hooks.js";
-import { signedOut } from "../api.js";
+/** Signing in with an API key. The key is sent once; the browser keeps the cookie of the session, the page keeps nothing. */
+import { useEffect, useRef, useState } from "../../vendor/hooks.js";
+import { command } from "../api.js";
 import { html } from "../html.js";
+import { session } from "../state.js";
 
 export function SignIn() {
   const [problem, setProblem] = useState("");
   const [sending, setSending] = useState(false);
+  const field = useRef(/** @type {HTMLInputElement | null} */ (null));
+  const wasIn = session.peek() !== null;
+  useEffect(() => {
+    document.title = "Sign in · Loopwright";
+    document.body.classList.remove("docked");
+    field.current?.focus();
+  }, []);
   const send = async (/** @type {any} */ event) => {
     event.preventDefault();
-    const key = String(new FormData(event.target).get("key") ?? "").trim();
     setSending(true);
     setProblem("");
     try {
-      const answer = await fetch("/session", { method: "POST", headers: { Authorization: `Bearer ${key}`, "X-Loopwright": "1" } });
-      if (answer.ok) {
-        signedOut.value = false;
-        location.reload(); // to where one was
-        return;
-      }
-      const found = await answer.json().catch(() => null);
-      setProblem(answer.status === 401 ? "This key is not known, was revoked or has expired." : (found?.detail ?? `The service answers ${answer.status}.`));
-    } catch {
-      setProblem("The service does not answer.");
+      await command("/session", { key: field.current?.value.trim() ?? "" });
+      location.reload(); // to where one was
+    } catch (error) {
+      setProblem(words(/** @type {import("../api.js").Problem} */ (error)));
+      setSending(false);
+      field.current?.select();
     }
-    setSending(false);
   };
-  return html`<main><form class="card signin" onSubmit=${send}><h1>Sign in to Loopwright</h1>
-    <label class="field"><span>API key</span><input name="key" type="password" autocomplete="current-password" required autofocus /></label>
-    <p class="quiet">An administrator makes a key with <code>loopwright keys create</code>.</p>
-    ${problem && html`<p class="refusal" role="alert" key="problem">${problem}</p>`}
-    <p class="foot"><button class="main" disabled=${sending}>Sign in</button></p></form></main>`;
+  return html`<main><form class="card signin" onSubmit=${send}><h1 key="title">Sign in to Loopwright</h1>
+    ${wasIn && html`<p key="over" role="status">The session is over: it has ended, or its key was revoked. Tests that run go on.</p>`}
+    <input key="user" class="hidden-words" type="text" name="username" autocomplete="username" value="Loopwright" readonly tabindex="-1" aria-hidden="true" />
+    <label key="key" class="field"><span>API key</span><input ref=${field} name="key" type="password" autocomplete="current-password" spellcheck="false" required
+      aria-invalid=${problem ? "true" : undefined} aria-describedby=${problem ? "signin-problem" : undefined} /></label>
+    <p key="how" class="quiet">An administrator makes a key with <code>loopwright key create</code>.</p>
+    ${problem && html`<p class="refusal" role="alert" id="signin-problem" key="problem">${problem}</p>`}
+    <p key="foot" class="foot"><button class="main" disabled=${sending}>${sending ? "Signing in…" : "Sign in"}</button></p></form></main>`;
+}
+
+/** @param {import("../api.js").Problem} problem */
+function words(problem) {
+  if (problem.status === 401) return "This key is not known, was revoked or has expired.";
+  if (problem.status === 429 && problem.retryAfter_s) return `Too many wrong keys from here: try again in ${problem.retryAfter_s} s.`;
+  return problem.message;
 }
