@@ -241,9 +241,9 @@ def test_what_cannot_be_computed_or_stored_is_said_and_tried_again(
         (source,) = run.call_args.args[1].args
         assert "The record could not be evaluated: 60 s." in paper(source)
     monkeypatch.setattr(here.pool, "run", limit)
+    kept.ended(row)  # the end of a test is not troubled by it
     with pytest.raises(Failed):
         kept.asked(row).result(60.0)
-    kept.ended(row)  # the end of a test is not troubled by it
     monkeypatch.undo()
     monkeypatch.setattr("loopwright.service.jobs.kept_figures.VERSION", job_figures.VERSION + 3)
     monkeypatch.setattr("loopwright.service.store.job_figures.keep", Mock(side_effect=SQLAlchemyError("no room")))

@@ -27,6 +27,7 @@ from loopwright.service.telemetry.metrics import SAMPLES_LOST
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.api.test_api import finished, start
 from tests.unit.service.fakes import TAG, Service
+from tests.unit.service.processes import until
 
 
 def test_alive(client: TestClient) -> None:
@@ -218,6 +219,7 @@ def test_lines_of_a_job_carry_job_and_loop(
         job = finished(service, client)["id"]
         service.tune.ends = ValueError("a defect")
         bad = finished(service, client)["id"]
+        until(lambda: any(line["message"].startswith("job failed") for line in lines))  # it is told after it is stored
     finally:
         logging.getLogger().removeHandler(keep)
     told = [
