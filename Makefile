@@ -45,6 +45,8 @@ check: setup
 	$(BIN)/ruff check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/deno check --quiet service/web/static/js
+	$(BIN)/deno lint --quiet
 	$(BIN)/python tools/audit_dependencies.py
 
 # Without them the others are measured, and the table says what was not.
