@@ -1,7 +1,8 @@
-"""Writes the libraries of the operators' page into service/web/static/vendor: `python tools/vendor_page.py`.
+"""Writes the libraries of the operators' page into service/web/static/vendor, and what the tests in a browser use into
+tests/browser/vendor: `python tools/vendor_page.py`.
 
-Needs `npm pack`. The packages have to be the ones named here, byte by byte. The result is committed; a unit test
-compares the files with vendor/VERSIONS.
+Needs `npm pack`. The packages have to be the ones named here, byte by byte. The result is committed; tests compare the
+files with VERSIONS beside them.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-VENDOR = Path(__file__).parents[1] / "service/web/static/vendor"
+ROOT = Path(__file__).parents[1]
+OF_THE_PAGE = ROOT / "service/web/static/vendor"
+OF_THE_TESTS = ROOT / "tests/browser/vendor"
 
 
 @dataclass(frozen=True)
@@ -28,7 +31,7 @@ class Package:
     files: dict[str, str]
 
 
-PACKAGES = (
+PAGE = (
     Package(
         "preact",
         "11.2.0",
@@ -65,6 +68,15 @@ PACKAGES = (
         {"uPlot.js": "dist/uPlot.esm.js", "uPlot.min.css": "dist/uPlot.min.css"},
     ),
 )  # fmt: skip
+TESTS = (
+    Package(
+        "axe-core",
+        "4.14.1",
+        "MPL-2.0",
+        "e6b0ce02b84d892e2e33e403485e7f3d6c29e2be6df65daf44d89ba564139745",
+        {"axe.min.js": "axe.min.js"},
+    ),
+)  # fmt: skip
 BARE = {
     "preact": "./preact.js",
     "preact/hooks": "./hooks.js",
@@ -74,19 +86,20 @@ BARE = {
 
 def main() -> None:
     """Fetches the packages, checks them, and writes the files. Raises SystemExit where a package is another one."""
-    VENDOR.mkdir(parents=True, exist_ok=True)
-    versions, licences = [], []
-    with tempfile.TemporaryDirectory() as folder:
-        for package in PACKAGES:
-            archive = _packed(package, Path(folder))
-            for name, path in package.files.items():
-                text = _read(archive, path)
-                (VENDOR / name).write_text(_without_bare_imports(text))
-                digest = hashlib.sha256((VENDOR / name).read_bytes()).hexdigest()
-                versions.append(f"{name} {package.name} {package.version} {package.licence} {digest}")
-            licences.append(f"{package.name} {package.version}\n\n{_read(archive, 'LICENSE').strip()}\n")
-    (VENDOR / "VERSIONS").write_text("\n".join(versions) + "\n")
-    (VENDOR / "LICENSES").write_text(f"\n{'-' * 72}\n\n".join(licences))
+    for vendor, packages in ((OF_THE_PAGE, PAGE), (OF_THE_TESTS, TESTS)):
+        vendor.mkdir(parents=True, exist_ok=True)
+        versions, licences = [], []
+        with tempfile.TemporaryDirectory() as folder:
+            for package in packages:
+                archive = _packed(package, Path(folder))
+                for name, path in package.files.items():
+                    text = _read(archive, path)
+                    (vendor / name).write_text(text if packages is TESTS else _without_bare_imports(text))
+                    digest = hashlib.sha256((vendor / name).read_bytes()).hexdigest()
+                    versions.append(f"{name} {package.name} {package.version} {package.licence} {digest}")
+                licences.append(f"{package.name} {package.version}\n\n{_read(archive, 'LICENSE').strip()}\n")
+        (vendor / "VERSIONS").write_text("\n".join(versions) + "\n")
+        (vendor / "LICENSES").write_text(f"\n{'-' * 72}\n\n".join(licences))
 
 
 def _packed(package: Package, folder: Path) -> Path:
