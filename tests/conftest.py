@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import shutil
 import sys
 from collections import Counter
 from functools import cache
@@ -52,11 +53,15 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """A test that wants vcan0 is skipped where there is none; where the tests must be complete, it fails."""
+    """A test that wants vcan0 or a browser is skipped where there is none, and fails where all must run."""
     if item.get_closest_marker("vcan") and not vcan_usable():
         if os.environ.get("LOOPWRIGHT_REQUIRE_VCAN"):
             pytest.fail("no vcan0")
         pytest.skip("no vcan0: run under tools/with-vcan")
+    if item.get_closest_marker("browser") and not shutil.which("chromium"):
+        if os.environ.get("LOOPWRIGHT_REQUIRE_BROWSER"):
+            pytest.fail("no chromium")
+        pytest.skip("no chromium: the Debian package of that name has it")
 
 
 def _by_hub_alone(item: pytest.Function) -> bool:

@@ -106,6 +106,7 @@ class Plantsite:
         self._stack, self._folder, self._more_loops = stack, folder, more_loops
         self._launcher, self._served_with, self._speed, self._on_answer = launcher, served_with, speed, on_answer
         self._changes = changes
+        self.tag = str(changes.get("tag", TAG))
         self.data = folder / "data"
         self.start_controller()
         self._service = self.launch_service()
@@ -142,7 +143,7 @@ class Plantsite:
         case = self.case
         low, high = case.pv_limits
         loop = {
-            "tag": TAG, "bus": self.bus, "controller_node": 0x20, "plant_node": 0x10, "pv_unit": "unit",
+            "tag": self.tag, "bus": self.bus, "controller_node": 0x20, "plant_node": 0x10, "pv_unit": "unit",
             "pv_limits": {"low": low, "high": high}, "t95_s": case.t95_s, "sp_deviation": case.sp_deviation,
             **self._changes,
         }  # fmt: skip
@@ -196,8 +197,8 @@ class Plantsite:
         assert (job["state"], job["stage"]) == ("running", stage.stage)
         return url
 
-    def retune(self, tag: str = TAG, **options: Any) -> str:
-        answer = self.http.post(f"/loops/{tag}/retune", json=options)
+    def retune(self, tag: str | None = None, **options: Any) -> str:
+        answer = self.http.post(f"/loops/{tag or self.tag}/retune", json=options)
         assert answer.status_code == 202, answer.text
         return answer.headers["location"]
 

@@ -30,7 +30,7 @@ def tool(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     module = module_from_spec(spec)
     monkeypatch.setitem(sys.modules, "run_tests", module)
     loader.exec_module(module)
-    for name in ("LOOPWRIGHT_REQUIRE_VCAN", "OPENBLAS_NUM_THREADS"):
+    for name in ("LOOPWRIGHT_REQUIRE_VCAN", "LOOPWRIGHT_REQUIRE_BROWSER", "OPENBLAS_NUM_THREADS"):
         monkeypatch.setenv(name, "1")  # so that it is as before when this test is over
     return module
 

@@ -1,0 +1,53 @@
+"""What the page is looked at with: a hub, a plant, a controller and a service, and a loop with bad gains."""
+
+from __future__ import annotations
+
+import logging
+import socket
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from loopwright.service.cli.child_process import ChildProcess
+from tests.e2e.plantsite import MODEL_14, Plantsite
+
+CASE = replace(MODEL_14, ts=0.05)
+TAG = "TIC-101"
+"""Of the loop that has its plant and its controller."""
+LOOP = MappingProxyType({"tag": TAG, "description": "Jacket of reactor 1", "area": "Reactor", "pv_unit": "degC"})
+ABSENT = MappingProxyType(
+    {"tag": "FIC-205", "description": "Feed to column 2", "area": "Column", "pv_unit": "m3/h", "controller_node": 0x55}
+)
+"""An entry of loops.yaml that no controller answers for."""
+
+# python-can's socketcand client warns of every frame that TCP splits, which is what TCP does.
+logging.getLogger("can").setLevel(logging.ERROR)
+
+
+class Site(Plantsite):
+    """A hub of its own, and a service that comes back at the same port, as one does whose page is open.
+
+    The plant runs as fast as it can until somebody calls at_rest(pace).
+    """
+
+    def __init__(
+        self,
+        stack: ExitStack,
+        folder: Path,
+        more_loops: tuple[Mapping[str, Any], ...] = (ABSENT,),
+        served_with: Sequence[str] = (),
+    ) -> None:
+        self.hub = ChildProcess("hub", ("loopwright.protocol.hub", "--port", "0"), folder / "hub.log")
+        stack.callback(self.hub.stop)
+        bus = self.hub.wait_ready().split()[1]
+        port = ("--port", str(_free_port()))
+        more = tuple(dict(each) for each in more_loops)
+        super().__init__(stack, folder, CASE, bus, more, served_with=(*port, *served_with), changes=LOOP)
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as found:
+        return int(found.getsockname()[1])
