@@ -17,9 +17,12 @@ class NotReady(Exception):
 
 
 class ChildProcess:
-    """Runs python -m MODULE ARGS with its output in a log file; `ready` is the line that starts with "ready"."""
+    """Runs python -m MODULE ARGS with its output in a log file; `ready` is the line that starts with "ready".
 
-    def __init__(self, name: str, arguments: Sequence[str], log: Path) -> None:
+    own_group: whether it is in a process group of its own, which Ctrl-C in the terminal does not reach.
+    """
+
+    def __init__(self, name: str, arguments: Sequence[str], log: Path, own_group: bool = False) -> None:
         self.name = name
         self._log = log
         self._ready = threading.Event()
@@ -27,7 +30,12 @@ class ChildProcess:
         command = [sys.executable, "-u", "-m", *arguments]
         self._errors = log.open("ab")
         self._process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=self._errors, text=True
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            text=True,
+            process_group=0 if own_group else None,
         )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -46,9 +54,12 @@ class ChildProcess:
     def wait_ready(self, timeout_s: float = 90.0) -> str:
         """Returns the ready line. Raises NotReady."""
         if not self._ready.wait(timeout_s) or not self.ready:
-            last = self._log.read_text(errors="replace").strip().splitlines()[-5:]
-            raise NotReady(f"the {self.name} did not start: " + (" / ".join(last) or "no output"))
+            raise NotReady(f"the {self.name} did not start: {self.last_lines()}")
         return self.ready
+
+    def last_lines(self) -> str:
+        """Returns the end of the log on one line."""
+        return " / ".join(self._log.read_text(errors="replace").strip().splitlines()[-5:]) or "no output"
 
     @property
     def pid(self) -> int:

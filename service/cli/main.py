@@ -532,7 +532,9 @@ def demo(
     folder: Annotated[
         Path | None, typer.Option(help="Folder for plots and data; default: a new temporary folder.")
     ] = None,
-    speed: Annotated[str, typer.Option(help="Speed of the plant: max, or a factor of real time.")] = "max",
+    speed: Annotated[
+        str, typer.Option(help="Speed of the plant: a factor of real time, or max, which is real time after the table.")
+    ] = "max",
     hub_only: Annotated[
         bool, typer.Option("--hub", help="Use the loopback hub even if there is a vcan0 interface.")
     ] = False,
@@ -540,12 +542,26 @@ def demo(
         Literal["five-stage", "fast", "setpoint"] | None,
         typer.Option(help="One of them alone; default: all, one after the other."),
     ] = None,
+    once: Annotated[
+        bool, typer.Option("--once", help="End after the table, as without a terminal, instead of serving the page.")
+    ] = False,
+    port: Annotated[
+        int | None,
+        typer.Option(help="Port of the page; default: 8080 if it is free, else any free one.", min=0, max=65535),
+    ] = None,
 ) -> None:
-    """Run a demo that retunes a badly tuned loop, with bus, plant, controller and service as processes."""
-    from loopwright.service.cli.demo import DemoFailed, run_demo
-    from loopwright.service.cli.demo_report import METHODS
+    """Run a demo that retunes a badly tuned loop, with bus, plant, controller and service as processes.
 
+    In a terminal it goes on after its table, with the loop on the page, until Ctrl-C.
+    """
+    from loopwright.service.cli.demo import DemoFailed, DemoOptions, run_demo
+    from loopwright.service.cli.demo_report import METHODS
+    from loopwright.service.cli.interruption import Interrupted
+
+    goes_on = not once and on_terminal() and sys.stdout.isatty()
     try:
-        run_demo(folder, speed, hub_only, [method] if method else METHODS)
+        run_demo(DemoOptions([method] if method else METHODS, speed, hub_only, goes_on, folder, port))
     except DemoFailed as error:
         die(str(error), 1)
+    except Interrupted as error:
+        die(f"{error}: the demo is not through; its processes are stopped", 128 + error.number)
