@@ -101,7 +101,7 @@ def run_demo(options: DemoOptions) -> None:
 
     Raises DemoFailed, and Interrupted for a signal before the demo is through.
     """
-    port = _port(options)
+    port = port_of(options)
     with Interruption() as interruption:
         demo = _Demo(options, interruption)
         try:
@@ -117,7 +117,7 @@ def run_demo(options: DemoOptions) -> None:
         raise DemoFailed(f"not every retune ended as a proposal: {', '.join(demo.shown.without_proposal)}")
 
 
-def _port(options: DemoOptions) -> int:
+def port_of(options: DemoOptions) -> int:
     """Returns the port for the service, 0 for any free one. Raises DemoFailed for one that was named and is taken."""
     wanted = (PAGE_PORT if options.goes_on else 0) if options.port is None else options.port
     try:

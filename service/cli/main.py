@@ -11,7 +11,7 @@ import typer
 
 from loopwright.service.cli import data, keys, loops, tuning
 from loopwright.service.cli.client import DEFAULT_URL, ApiError, Client
-from loopwright.service.cli.output import AsJson, Url, die, on_terminal, print_json, read_json_object
+from loopwright.service.cli.output import AsJson, Url, die, on_terminal, print_json, read_json_object, shown_on_terminal
 
 app = typer.Typer(
     help="Retunes PI loops automatically over CANopen, and restores the loop whatever fails.",
@@ -558,7 +558,7 @@ def demo(
     from loopwright.service.cli.demo_report import METHODS
     from loopwright.service.cli.interruption import Interrupted
 
-    goes_on = not once and on_terminal() and sys.stdout.isatty()
+    goes_on = not once and on_terminal() and shown_on_terminal()
     try:
         run_demo(DemoOptions([method] if method else METHODS, speed, hub_only, goes_on, folder, port))
     except DemoFailed as error:

@@ -33,6 +33,11 @@ def on_terminal() -> bool:
     return sys.stdin.isatty()
 
 
+def shown_on_terminal() -> bool:
+    """Returns whether what is printed goes to a terminal, where somebody may read it at once."""
+    return sys.stdout.isatty()
+
+
 def die(text: str, status: int) -> NoReturn:
     print(f"loopwright: {text}", file=sys.stderr)
     raise typer.Exit(status)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from datetime import datetime
 from functools import partial
 
-from compose_test.loop import FULL_SPEED, Look, at_rest_soon, ended, in_automatic, in_mid_stage, pace
+from compose_test.loop import FULL_SPEED, TAG, Look, at_rest_soon, ended, in_automatic, in_mid_stage, pace
 from compose_test.shell import check, read_all, tell, until
 from compose_test.stack import (
     DEVICES,
@@ -79,6 +79,9 @@ def _demonstrate(up_s: float) -> None:
     seconds = time.monotonic() - started
     tell(logs("demo").rstrip())
     check(f"demo proposed, {up_s + seconds:.0f} s from up to its proof", status == 0, f"exit status {status}")
+    page = f"http://127.0.0.1:{os.environ['LOOPWRIGHT_PORT']}/ui/loops/{TAG}"
+    check("the demo names the page", page in logs("demo"), logs("demo"))
+    pace(FULL_SPEED)  # the demo has left it in real time, and the loop still swings
 
 
 def _killed_in_mid_stage() -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+import socket
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,14 @@ from fastapi.testclient import TestClient
 from rich.console import Console
 
 from loopwright.containers import demo as container_demo
+from loopwright.containers import keeper
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.catalogue import find
 from loopwright.service.api.app import create_app
 from loopwright.service.api.job_views import JobView
-from loopwright.service.cli import demo, job_tables
+from loopwright.service.cli import demo, demo_live, job_tables
+from loopwright.service.cli import main as cli
 from loopwright.service.cli.client import Client
 from loopwright.service.cli.demo_report import METHODS, PLANT, PLANT_MODEL, demonstrate, report
 from loopwright.service.execution.procedures import tune
@@ -169,3 +172,82 @@ def test_a_bad_method_is_refused_before_anything_starts(
     assert result.exit_code == 2
     for method in METHODS:
         assert method in result.output and method in said
+
+
+TERMINAL, NO_TERMINAL = (lambda: True), (lambda: False)
+
+
+@pytest.mark.parametrize(
+    ("keyboard", "screen_is", "more", "goes_on"),
+    [
+        (TERMINAL, TERMINAL, (), True),
+        (TERMINAL, TERMINAL, ("--once",), False),
+        (TERMINAL, NO_TERMINAL, (), False),
+        (NO_TERMINAL, TERMINAL, (), False),
+    ],
+)
+def test_it_goes_on_in_a_terminal_alone_and_not_with_once(
+    keyboard: Callable[[], bool],
+    screen_is: Callable[[], bool],
+    more: tuple[str, ...],
+    goes_on: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    started: list[demo.DemoOptions] = []
+    monkeypatch.setattr(demo, "run_demo", started.append)
+    monkeypatch.setattr(cli, "on_terminal", keyboard)
+    monkeypatch.setattr(cli, "shown_on_terminal", screen_is)
+    assert run("demo", *more).exit_code == 0
+    assert [each.goes_on for each in started] == [goes_on]
+
+
+def test_the_port_of_the_page_is_said_where_it_is_another(screen: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server((demo.ADDRESS, 0)) as taken:
+        monkeypatch.setattr(demo, "PAGE_PORT", taken.getsockname()[1])
+        assert demo.port_of(demo.DemoOptions(goes_on=True)) == 0
+        assert f"port {demo.PAGE_PORT} of 127.0.0.1" in screen.getvalue()
+        with pytest.raises(demo.DemoFailed, match="--port"):
+            demo.port_of(demo.DemoOptions(port=demo.PAGE_PORT))
+    assert demo.port_of(demo.DemoOptions(goes_on=True)) == demo.PAGE_PORT
+    assert demo.port_of(demo.DemoOptions()) == 0
+
+
+def test_the_command_that_accepts_is_the_one_that_was_typed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    program = tmp_path / "loopwright"
+    program.touch(0o755)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["./loopwright", "demo"])
+    monkeypatch.setenv("PATH", "/nowhere")
+    assert demo_live.accept_command("http://127.0.0.1:8080", "ab12") == ["./loopwright", "job", "ab12", "--accept"]
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert demo_live.accept_command("http://127.0.0.1:9", "ab12") == [
+        "loopwright", "job", "ab12", "--accept", "--url", "http://127.0.0.1:9"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("options", "speed", "paces"),
+    [((), "max", [0.0, 1.0]), (("--once",), "max", [0.0]), ((), "5", [])],
+)
+def test_in_containers_it_ends_and_leaves_the_plant_in_real_time_with_the_page_named(
+    options: tuple[str, ...],
+    speed: str,
+    paces: list[float],
+    in_memory: Through,
+    screen: io.StringIO,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    found: list[float] = []
+    monkeypatch.setenv("LOOPWRIGHT_SPEED", speed)
+    monkeypatch.setenv("LOOPWRIGHT_PORT", "8123")
+    monkeypatch.setattr(container_demo, "Client", lambda url: in_memory)
+    monkeypatch.setattr(in_memory, "pages", in_memory.get, raising=False)
+    monkeypatch.setattr(keeper, "join", lambda patience_s: ("virtual:demo", socket.socket()))
+    monkeypatch.setattr(demo_live, "set_pace", lambda bus, pace: found.append(pace))
+    assert container_demo.main(["--method", "fast", *options]) == 0
+    said = capsys.readouterr().out
+    job = JobView.model_validate(in_memory.get("/jobs")[0])
+    assert found == paces
+    named = ("http://127.0.0.1:8123/ui/loops/TIC-101", f"docker compose exec service loopwright job {job.id} --accept")
+    assert all((each in said) is not bool(options) for each in named)
