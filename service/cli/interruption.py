@@ -27,7 +27,7 @@ class Interruption:
 
     After `ignore` further signals change nothing: what is being ended is ended. They also change nothing after the
     context once a signal has come, so that a second one does not turn the end into an error.
-    A signal that this process was started to ignore, as by nohup, stays ignored.
+    SIGHUP stays ignored where this process was started to ignore it, as by nohup.
     """
 
     def __init__(self) -> None:
@@ -37,7 +37,8 @@ class Interruption:
 
     def __enter__(self) -> Self:
         for each in _SIGNALS:
-            if (before := signal.getsignal(each)) is not signal.SIG_IGN:
+            before = signal.getsignal(each)
+            if each != signal.SIGHUP or before is not signal.SIG_IGN:
                 self._before[each] = before
                 signal.signal(each, self._hear)
         return self
