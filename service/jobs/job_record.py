@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydantic import Field
-from scipy.signal import cont2discrete, lfilter
 
 from loopwright.service.jobs.stored_record import Attempt, StoredRecord
 from loopwright.service.listening.bins import BIN, GAP_BEFORE, SAMPLE, Bins, of_samples, thinned
 from loopwright.service.results import Figures, LoadStepView
+from loopwright.tuning.analysis.zero_order_hold import states
 from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.identification.output_error import Fit, Fitted, averaged
-from loopwright.tuning.models import Model, Reals
+from loopwright.tuning.models import Model, Reals, monic
 
 MAX_POINTS = 5000
 """Largest number of points that is stored of a job, and that is answered."""
@@ -163,8 +163,13 @@ def driven(model: Model, attempt: Attempt) -> Reals:
     """Returns the PV of the model driven by the recorded MV from rest, PV units; its level is that at which it leaves
     least of the record."""
     u = attempt.mv - attempt.mv[0]
-    num, den, _ = cont2discrete((np.array(model.num), np.array(model.den)), attempt.Ts, method="zoh")
-    t = np.arange(len(u)) * attempt.Ts
-    answer: Reals = np.interp(t - model.L, t, lfilter(num.ravel(), den, u), left=0.0)
+    num, den = monic(model)
+    in_samples = attempt.Ts ** np.arange(len(den))  # the coefficients with the sample time as unit of time
+    num, den, L = num * in_samples, den * in_samples, model.L / attempt.Ts
+    order = len(den) - 1
+    answer = states(den[1:], L, u, order) @ (num[1:] - num[0] * den[1:])[::-1]
+    if num[0]:  # a bi-proper model passes MV on at once, after its dead time
+        at = np.arange(len(u)) - math.ceil(L)
+        answer += num[0] * np.where(at < 0, 0.0, u[np.maximum(at, 0)])
     level = float(np.mean(attempt.pv - answer))
     return answer + level

@@ -13,6 +13,7 @@ import control
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
+from scipy.signal import cont2discrete, dlsim, tf2ss
 from sqlalchemy.exc import SQLAlchemyError
 
 from benchmarks.rehearsed import MIDDLE, TS, entry
@@ -28,13 +29,14 @@ from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.inputs.config import LoopConfig, parse_site
 from loopwright.service.inputs.request import retune_request
 from loopwright.service.jobs import job_figures
-from loopwright.service.jobs.job_record import job_record, unpack
+from loopwright.service.jobs.job_record import driven, job_record, unpack
 from loopwright.service.jobs.kept_figures import KeptFigures
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.retention import RetentionPolicy, delete_old_samples
-from loopwright.service.jobs.stored_record import last_attempt, record_columns
+from loopwright.service.jobs.stored_record import Attempt, last_attempt, record_columns
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
+from loopwright.tuning.models import FOPDT, Integrating, Model, TransferFunction
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.api.test_api import assert_problem, finished, start
@@ -270,6 +272,27 @@ def test_a_defect_in_a_fit_takes_neither_the_record_nor_the_job(
     monkeypatch.setattr(job_figures, "design_curve", Mock(side_effect=ValueError))
     found = job_figures.job_figures(row, events, blocks)
     assert found.record is not None and found.designs is None
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        FOPDT(2.0, 6.0, 1.5),
+        Integrating(0.3, 0.8),
+        TransferFunction((1.0, 3.0), (4.0, 5.0, 1.0), 0.0),
+        TransferFunction((0.5, 1.0), (2.0, 1.0), 1.0),  # bi-proper: MV goes through at once
+    ],
+)
+def test_a_driven_model_is_that_of_scipy_at_the_samples(model: Model) -> None:
+    Ts, count = 0.1, 400
+    mv = 50.0 + np.repeat(np.random.default_rng(3).normal(size=count // 20), 20)
+    system = cont2discrete(tf2ss(model.num, model.den), Ts, "zoh")
+    _, answer, _ = dlsim(system, mv - mv[0])
+    delay = round(model.L / Ts)
+    expected = np.concatenate((np.zeros(delay), np.ravel(answer)))[:count] + 20.0
+    nothing = np.zeros(count)
+    attempt = Attempt(Ts, np.arange(count), nothing, expected, mv, nothing, np.full(count, "relay"))
+    assert driven(model, attempt) == pytest.approx(expected, abs=1e-9)
 
 
 def test_missing_samples_are_a_gap_and_no_line(here: Here, job: str) -> None:
