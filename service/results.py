@@ -13,6 +13,8 @@ from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
 
 DESIGNED = ("fast", "setpoint")
 """The methods that fit a model to one record and design the gains on it."""
+FIVE_STAGE = "five-stage"
+"""The name of the procedure of five stages, which requests without a method mean."""
 TYPED_IN = "typed in"
 """The structure, or the source of the gain, of a model that a person has typed in."""
 

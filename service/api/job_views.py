@@ -12,6 +12,7 @@ from loopwright.service.job_states import ACTIVE, JobState, shown
 from loopwright.service.jsonable import JsonObject, number
 from loopwright.service.loop_state import LoopState, gains_of, same_gains
 from loopwright.service.results import (
+    FIVE_STAGE,
     ComparisonView,
     EvidenceView,
     FastResult,
@@ -27,7 +28,6 @@ from loopwright.service.results import (
     VerificationView,
     empty_result,
 )
-from loopwright.tuning.five_stage.procedure import PROCEDURE
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import ADVICE, Ended, Reason
 
@@ -361,7 +361,7 @@ def job_view(
     """
     state = shown(row.state, row.dry_run)
     later = latest is not None and latest.id != row.id and state is JobState.PROPOSED
-    method = str(row.request.get("method", PROCEDURE))
+    method = str(row.request.get("method", FIVE_STAGE))
     result = row.result or empty_result(method)
     progress, remaining, plant_time = _progress(state, row, events, running)
     return JobView(

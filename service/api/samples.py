@@ -10,9 +10,12 @@ import json
 import re
 import zlib
 from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING
 
 from loopwright.service.store.sample_blocks import COLUMNS, Block
-from loopwright.service.store.store import Store
+
+if TYPE_CHECKING:  # a report is computed without the store
+    from loopwright.service.store.store import Store
 
 _PART = 1 << 16
 """Characters of a part that is handed to the server."""

@@ -15,8 +15,8 @@ from loopwright.service.jobs.job_record import FittedRecord, JobRecord, job_reco
 from loopwright.service.jobs.stored_record import StoredRecord, last_attempt, record_columns, record_of
 from loopwright.service.planning.found_model import FoundModel
 from loopwright.service.results import DESIGNED, FastResult, LoadStepView
-from loopwright.service.store.job_figures import PackedFigures
 from loopwright.service.store.jobs import Job, JobEvent
+from loopwright.service.store.packed_figures import PackedFigures
 from loopwright.service.store.sample_blocks import Block
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.evaluation import Evaluation

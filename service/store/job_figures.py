@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 from sqlalchemy import select
 
+from loopwright.service.store.packed_figures import PackedFigures
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import ChunkRow, JobFiguresRow
-
-
-class PackedFigures(NamedTuple):
-    """The record and the designs of a job, packed; None where there is none."""
-
-    record: bytes | None
-    designs: bytes | None
 
 
 def keep(store: Store, job_id: str, version: int, figures: PackedFigures) -> None:

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from enum import StrEnum
-from typing import NamedTuple, TypedDict, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypedDict, TypeVar
 
 from loopwright.service.job_states import JobState
 from loopwright.service.jsonable import JsonObject, number
 from loopwright.service.results import FastResult, FiveStageResult
-from loopwright.service.store.tables import EventRow, JobRow
 from loopwright.tuning.reasons import Reason
+
+if TYPE_CHECKING:  # computations and commands know jobs, and have no store
+    from loopwright.service.store.tables import EventRow, JobRow
 
 Word = TypeVar("Word", bound=StrEnum)
 

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-
-from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
+from typing import TYPE_CHECKING
 
 from loopwright.service.api.job_views import JobView
 from loopwright.service.api.report import numbers as n
@@ -33,6 +32,9 @@ from loopwright.service.store.sample_blocks import Block
 from loopwright.tuning.fast.proposal import delayed
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Model, TransferFunction
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 _HERE = Path(__file__).parent
 STYLE = (_HERE / "report.css").read_text(encoding="utf-8")
@@ -129,6 +131,8 @@ def paper(source: ReportSource) -> str:
 
 @cache
 def _template() -> Template:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined  # in the process that writes a report alone
+
     environment = Environment(
         loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
