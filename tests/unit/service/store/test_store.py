@@ -4,17 +4,20 @@ import os
 import threading
 from contextlib import ExitStack
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from alembic import command
 from alembic.autogenerate import compare_metadata
 from alembic.config import Config
 from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, inspect, text
 from sqlalchemy.exc import IntegrityError, StatementError
 
 from loopwright.service.job_states import MOVES, IllegalMove, JobState, check
 from loopwright.service.results import FiveStageResult, GainsView
+from loopwright.service.store import database as opening
 from loopwright.service.store import lock
 from loopwright.service.store.database import USUAL, BadDatabase, urgent
 from loopwright.service.store.jobs import UnknownWord
@@ -31,6 +34,19 @@ def test_migrations_make_the_tables_of_the_code(store: Store) -> None:
     with store.engine.connect() as connection:
         differences = compare_metadata(MigrationContext.configure(connection), Base.metadata)
     assert differences == []
+
+
+def test_a_present_database_is_opened_without_migrations(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = Config()
+    config.set_main_option("script_location", "loopwright.service.store:migrations")
+    head = ScriptDirectory.from_config(config).get_current_head()
+    assert opening.revision(store.engine) == opening.present_revision() == head
+    monkeypatch.setattr(command, "upgrade", Mock(side_effect=AssertionError("migrated again")))
+    opening.migrate(store.engine)
+    with store.engine.begin() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = '0012'"))
+    with pytest.raises(AssertionError, match="migrated again"):
+        opening.migrate(store.engine)
 
 
 def test_a_word_that_is_not_known_names_its_job(store: Store) -> None:
