@@ -159,17 +159,20 @@ def serve(
     from argparse import ArgumentTypeError
     from ipaddress import ip_network
 
-    from sqlalchemy.exc import SQLAlchemyError
+    from loopwright.service.server.loading import loading
 
-    from loopwright.protocol.device_process import node_id
-    from loopwright.service.api.gate.limits import RequestLimits
-    from loopwright.service.execution.computing.limits import ComputingLimits
-    from loopwright.service.inputs.config import ConfigError
-    from loopwright.service.jobs.retention import RetentionPolicy
-    from loopwright.service.server.serving import NotSafe, Setup
-    from loopwright.service.server.serving import serve as run
-    from loopwright.service.store.database import BadDatabase
-    from loopwright.service.store.store import FolderInUse, ForeignLoop
+    with loading():
+        from sqlalchemy.exc import SQLAlchemyError
+
+        from loopwright.protocol.device_process import node_id
+        from loopwright.service.api.gate.limits import RequestLimits
+        from loopwright.service.execution.computing.limits import ComputingLimits
+        from loopwright.service.inputs.config import ConfigError
+        from loopwright.service.jobs.retention import RetentionPolicy
+        from loopwright.service.server.serving import NotSafe, Setup
+        from loopwright.service.server.serving import serve as run
+        from loopwright.service.store.database import BadDatabase
+        from loopwright.service.store.store import FolderInUse, ForeignLoop
 
     if log_format not in ("text", "json"):
         die(f"--log-format must be text or json, not {log_format!r}", 2)

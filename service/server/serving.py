@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
+from importlib import import_module
 from ipaddress import IPv4Network, IPv6Network, ip_address
 from pathlib import Path
 from typing import cast
@@ -98,13 +99,28 @@ def tell_systemd(state: str) -> None:
             notify.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
 
 
-def _load() -> None:
+_OF_JOBS = (
+    "encodings.idna",  # the first look-up of a host name
+    "multiprocessing.popen_forkserver",
+    "loopwright.service.execution.beside",
+    "loopwright.service.execution.checkpoints",
+    "loopwright.service.execution.guard",
+    "loopwright.service.execution.result",
+    "loopwright.service.execution.runner",
+    "loopwright.service.loops.bus_loop",
+    "loopwright.tuning.fast.design_trial",
+    "loopwright.tuning.fast.excitation_choice",
+    "loopwright.tuning.fast.setpoint_procedure",
+    "loopwright.tuning.five_stage.procedure",
+)
+"""What is imported where it is used, and used by jobs."""
+
+
+def load() -> None:
     """Imports all modules that jobs need and runs a full garbage collection beforehand: done in a job, either would
     block all threads and delay the loops of the others (by seconds, and by 0.1 s of processor time each)."""
-    import loopwright.service.loops.bus_loop
-    import loopwright.tuning.fast.design_trial
-    import loopwright.tuning.five_stage.procedure  # noqa: F401
-
+    for name in _OF_JOBS:
+        import_module(name)
     gc.collect()
     gc.freeze()
 
@@ -232,7 +248,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
             server.should_exit = True
 
         signals.tell(end, partial(_awaited, jobs))
-        _load()
+        load()
         jobs.boot()
         if not jobs.stopping:
             retention.start()

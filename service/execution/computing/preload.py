@@ -5,21 +5,23 @@ import os
 from importlib import import_module
 
 LOADED = (
-    "scipy.signal",  # tuning imports it at its first use
     "loopwright.service.jobs.alternatives",
     "loopwright.service.jobs.job_figures",
     "loopwright.service.api.report.paper",
     "loopwright.service.cli.main",  # the script `loopwright` imports it, and each process imports what the script does
     "loopwright.service.execution.rehearsals",
     "loopwright.service.execution.rehearsal",
+    "loopwright.service.observing.observed",
     "loopwright.service.offline.tunings",
     "loopwright.tuning.fast.procedure",
     "loopwright.tuning.fast.design_trial",
     "loopwright.tuning.five_stage.procedure",
 )
 
+gc.disable()  # while modules are loaded next to nothing becomes garbage
 # Set before numpy is imported: a computation uses one processor, and a process with threads should not be forked.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 for name in LOADED:
     import_module(name)
+gc.enable()
 gc.freeze()  # the objects loaded so far stay shared, because no collection writes to them
