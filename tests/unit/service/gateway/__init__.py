@@ -197,7 +197,3 @@ def main() -> None:
         return FileLoop(asked.folder, config.tag)
 
     serve(setup, open_loop, tune_in(asked.folder))
-
-
-if __name__ == "__main__":
-    main()
