@@ -167,7 +167,7 @@ def driven(model: Model, attempt: Attempt) -> Reals:
     in_samples = attempt.Ts ** np.arange(len(den))  # the coefficients with the sample time as unit of time
     num, den, L = num * in_samples, den * in_samples, model.L / attempt.Ts
     order = len(den) - 1
-    answer = states(den[1:], L, u, order) @ (num[1:] - num[0] * den[1:])[::-1]
+    answer: Reals = states(den[1:], L, u, order) @ (num[1:] - num[0] * den[1:])[::-1]
     if num[0]:  # a bi-proper model passes MV on at once, after its dead time
         at = np.arange(len(u)) - math.ceil(L)
         answer += num[0] * np.where(at < 0, 0.0, u[np.maximum(at, 0)])

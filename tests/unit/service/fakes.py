@@ -7,7 +7,9 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
@@ -28,6 +30,7 @@ from loopwright.service.results import (
     UltimateView,
 )
 from loopwright.service.server.assembly import make_jobs
+from loopwright.service.store.database import FILE
 from loopwright.service.store.store import Store, block_of
 from loopwright.tuning.analysis.comparison import Predicted
 from loopwright.tuning.experiments.step_test import StepResult
@@ -283,13 +286,29 @@ class ThreadEngine:
         self._run = None
 
 
+@cache
+def _made_tables() -> bytes:
+    """The file of a new store, as its migrations make it: once for all tests of this process."""
+    with TemporaryDirectory() as folder:
+        Store(Path(folder)).close()
+        return (Path(folder) / FILE).read_bytes()
+
+
+def store_in(folder: Path) -> Store:
+    """The store in a folder; a new one does not go through all migrations again."""
+    if not (folder / FILE).exists():
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        (folder / FILE).write_bytes(_made_tables())
+    return Store(folder)
+
+
 class Service:
     """Everything of a service that a test wants to put a hand on."""
 
     def __init__(self, folder: Path, **options: Any) -> None:
         self.controller = FakeController()
         self.tune = FakeTune()
-        self.store = Store(folder)
+        self.store = store_in(folder)
         self.loops = parse_site({"loops": [loop_entry(), loop_entry(tag="FIC-2", channel=2)]}, "test").loops
         self.jobs = self.more_jobs(lambda config: FakeLoop(self.controller), **options)
 
