@@ -44,6 +44,7 @@ class Case:
 
 PLAIN = Case("", 0.0)
 ONE, TWO = Disturbance(loads=1), Disturbance(loads=2)
+TWO_SIDED = (0.5, 0.7, 0.85, 1.2, 1.5, 2.0)
 CASES = {
     case.name: case
     for case in (
@@ -88,6 +89,9 @@ FURTHER = {
         Case("gain doubles with the new gains", 0.01, Disturbance(gain=2.0)),
         Case("gain falls to 0.4 with them", 0.01, Disturbance(gain=0.4)),
         Case("dead time 0.25 Pu longer with them", 0.01, Disturbance(later=0.25)),
+        *(Case(f"gain below {below:g} of that above", 0.01, Disturbance(below=below)) for below in TWO_SIDED),
+        *(Case(f"equal percentage, R {R:g}", 0.01, Disturbance(rangeability=R), amplitude=10.0) for R in (10, 30, 50)),
+        *(Case(f"root valve, {at:g} % open", 0.01, Disturbance(opening=at), amplitude=10.0) for at in (15, 25, 50)),
         Case("Mt at most 1.05", 0.01, Mt=1.05),
         Case("noise gain at most 0.25 Ku", 0.01, noise_gain=0.25),
         Case("PID, noise gain at most 2 Ku", 0.01, derivative=True, noise_gain=2.0),

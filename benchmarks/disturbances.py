@@ -1,4 +1,5 @@
-"""What an ideal plant leaves out: loads, drift, noise with a colour, spikes, a coarse sensor, a valve that sticks."""
+"""What an ideal plant leaves out: loads, drift, noise with a colour, spikes, a coarse sensor, a valve that sticks or is
+curved."""
 
 from __future__ import annotations
 
@@ -24,6 +25,10 @@ class Disturbance:
     samples.  stiction: the valve stays where it is until MV is off by so much, then jumps there; dead_band: it follows
     so far behind; both in amplitudes of the relay.  ends: how far the actuator goes, amplitudes.
 
+    below: the plant's gain below rest over that above.  rangeability: of a valve with an equal-percentage
+    characteristic.  opening: of a valve at rest, percent, whose flow goes with the root of its opening.  Of these two,
+    MV is in percent, and the gain at rest stays that of the plant.
+
     gain, later: as the new gains take over, the plant's gain becomes so many times what it was, its dead time longer
     by so many Pu.
     """
@@ -37,8 +42,29 @@ class Disturbance:
     stiction: float = 0.0
     dead_band: float = 0.0
     ends: float = math.inf
+    below: float = 1.0
+    rangeability: float = 1.0
+    opening: float = math.inf
     gain: float = 1.0
     later: float = 0.0
+
+    def flow(self, mv: float) -> float:
+        """What the characteristic makes of MV, both as deviations from rest, MV units."""
+        if self.below != 1.0:
+            return mv if mv > 0.0 else self.below * mv
+        if self.rangeability != 1.0:
+            rate = math.log(self.rangeability) / 100.0
+            return math.expm1(rate * mv) / rate
+        if self.opening < math.inf:
+            return 2.0 * self.opening * (math.sqrt(max(1.0 + mv / self.opening, 0.0)) - 1.0)
+        return mv
+
+    def steepest(self, low: float, high: float) -> float:
+        """The largest slope of the characteristic between two values of MV, over that at rest; above rest it is 1 for
+        a gain that differs below."""
+        if self.opening < math.inf:
+            return 1.0 / math.sqrt(max(1.0 + low / self.opening, 1e-3))
+        return max(1.0, self.below, math.exp(math.log(self.rangeability) / 100.0 * high))
 
 
 class Disturbed:
@@ -115,7 +141,7 @@ class Disturbed:
         away = mv + self._slack - self._position
         if abs(away) > self._stiction:
             self._position += away if self._stiction else math.copysign(max(abs(away) - self._dead_band, 0.0), away)
-        self._line.append(self._gain * min(max(self._position, -self._ends), self._ends))
+        self._line.append(self._gain * self._how.flow(min(max(self._position, -self._ends), self._ends)))
         self._line.popleft()
         return self._line[0]
 

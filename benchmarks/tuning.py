@@ -217,8 +217,10 @@ def measure(case: Case, plant: Plant, seed: int) -> Ran:
         if again.reason is not None:
             return replace(ran, reason=again.reason, detail=again.detail)
         gains = again.best.gains
-    # a plant that has changed is judged as it is now
-    now = replace(plant, num=tuple(case.how.gain * c for c in plant.num), L=plant.L + case.how.later * plant.Pu)
+    # a plant that has changed is judged as it is now, a curved one where the test found it steepest
+    moved = [each.mv for each in loop.taken]
+    gain = case.how.gain * case.how.steepest(min(moved), max(moved))
+    now = replace(plant, num=tuple(gain * c for c in plant.num), L=plant.L + case.how.later * plant.Pu)
     return evaluated(ran, now, gains, case.spec(plant))
 
 
