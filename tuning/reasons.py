@@ -99,8 +99,9 @@ ADVICE: dict[Reason, str] = {
     Reason.MV_LIMIT: "MV reached its limit during the test: permit more MV or a smaller set-point deviation.",
     Reason.STALLED: "The test did not go on: a load about as large as what the test moves holds PV. Wait until it is "
     "over, or permit more MV.",
-    Reason.UNEXPLAINED: "No linear model explains the record: look for a sticking valve, a limit, another loop or "
-    "several changes of the load, then retune.",
+    Reason.UNEXPLAINED: "No linear model explains the record: look for a sticking valve, a limit, a gain that changes "
+    "with MV (linearise the valve's characteristic, or permit less MV), another loop or several changes of the load, "
+    "then retune.",
     Reason.DISTURBED: "Something slow moved PV during the test: wait for a steady time, then retune.",
     Reason.UNCERTAIN: "The record does not tell enough for this robustness: permit more MV, filter the measurement, or "
     "ask for a lower Ms.",

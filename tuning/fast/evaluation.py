@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 from loopwright.tuning.fast.design import DesignSpec, GainDesign, OptimalGains
-from loopwright.tuning.fast.linearity import find_nonlinearity, unknown_difference
+from loopwright.tuning.fast.linearity import LinearityTest
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.fast.structure_choice import StructureChoice, choose_structure
 from loopwright.tuning.fast.uncertainty import difference_of_rivals, durbin_watson_ratio, peak, uncertainty_of_Ms
@@ -25,8 +25,7 @@ MAX_ROUNDED = 1.25
 MAX_UNCERTAINTY = {Excitation.RELAY: 0.10, Excitation.SETPOINT: 0.06, Excitation.OBSERVE: 0.06}
 """Largest accepted uncertainty of Ms, by the delta method and among rival models."""
 MAX_DIFFERENCE = 0.25
-"""Largest difference of the gain above and below rest that the record of pulses may leave open, a fraction of the
-gain."""
+"""Largest difference of the gain above and below rest that a record may leave open, a fraction of the gain."""
 MAX_MODEL_MISMATCH, MAX_MODEL_MISMATCH_OF_TWO_LOADS = 0.5, 0.2
 """Largest accepted difference of Ms from the Ms asked for, of the tested gains on the new model and of the new gains on
 the earlier model; the second value holds where the model has two load disturbances."""
@@ -73,16 +72,22 @@ class Evaluation:
     period: float
 
 
-def evaluate(record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | None = None) -> Evaluation:
+def evaluate(
+    record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | None = None, test_follows: bool = False
+) -> Evaluation:
     """Identifies the model, designs the gains and assesses both.
 
     spec: the design specification.
     earlier: the evaluation of the first part of the record, whose gains were tested in the rest of it.
+    test_follows: whether the gains are to be tested next. The record of a relay alone is then not asked whether the
+    plant is linear: a load disturbance or backlash can look like a gain that differs above and below rest there, and
+    the test tells them apart.
     Raises Refused, NOT_ROBUST, where the model permits no such controller.
     """
     fit = Fit(record)
     chosen = choose_structure(fit, earlier.chosen.fits if earlier else ())
     found = chosen.best
+    by_relay = record.excitation is Excitation.RELAY
     max_uncertainty = MAX_UNCERTAINTY[record.excitation]
     model = fit.model(found)
     delay = record.sampling_delay_s
@@ -110,16 +115,14 @@ def evaluate(record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | N
     elif rivals > max_uncertainty:
         reason = Reason.AMBIGUOUS
         detail = f"another model that explains the record as well gives an Ms off by {rivals:.2g}"
-    elif record.excitation is not Excitation.RELAY and (shown := find_nonlinearity(fit, found)) is not None:
-        reason, detail = Reason.UNEXPLAINED, f"{shown.what}, +-{2.0 * shown.deviation:.2g}"
-    elif record.excitation is not Excitation.RELAY and (unknown := unknown_difference(fit, found)) > MAX_DIFFERENCE:
-        reason = Reason.UNCERTAIN
-        by = f"{100.0 * unknown:.0f} %" if unknown < 1.0 else "any factor"
-        detail = f"the gain above and below the operating point may differ by {by}, the record does not tell"
+    elif (not by_relay or (earlier is None and not test_follows)) and (shown := _nonlinearity(fit, found)) is not None:
+        reason, detail = shown
     elif earlier is not None:
         reason, detail = _model_mismatch(earlier, model, best.gains, spec, design, found.hypothesis.load_disturbances)
         if reason is None and (fault := find_valve_fault(fit, found)) is not None:
             reason, detail = Reason.UNEXPLAINED, f"{fault.fault} explains the record better, or the plant is not linear"
+        if reason is None and by_relay:
+            reason, detail = _nonlinearity(fit, found) or (None, "")
         if reason is None:
             reason, detail = _load_with_the_step(fit, found, earlier, best.gains)
     return Evaluation(
@@ -137,6 +140,18 @@ def evaluate(record: ExperimentRecord, spec: DesignSpec, earlier: Evaluation | N
         design_delay=delay,
         period=design.period,
     )
+
+
+def _nonlinearity(fit: Fit[ExperimentRecord], found: Fitted) -> tuple[Reason, str] | None:
+    """The reason and the detail where the record shows a plant that is not linear, or leaves that open."""
+    test = LinearityTest(fit, found)
+    if (shown := test.nonlinearity()) is not None:
+        return Reason.UNEXPLAINED, f"{shown.what}, +-{2.0 * shown.deviation:.2g}"
+    if (unknown := test.unknown_difference()) > MAX_DIFFERENCE:
+        by = f"{100.0 * unknown:.0f} %" if unknown < 1.0 else "any factor"
+        what = f"the gain above and below the operating point may differ by {by}"
+        return Reason.UNCERTAIN, f"{what}, the record does not tell"
+    return None
 
 
 def _load_with_the_step(

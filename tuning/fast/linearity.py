@@ -48,49 +48,58 @@ def squared(u: Reals) -> Reals:
     return np.square(u)
 
 
-def find_nonlinearity(fit: Fit[ExperimentRecord], found: Fitted) -> Nonlinearity | None:
-    """The clearest alternative to a linear plant, None where the record shows none of a size that matters for Ms."""
-    shown = []
-    for changed, minimum, words in ALTERNATIVES:
-        size, deviation = score(fit, found, changed)
-        if abs(size) > max(minimum, STANDARD_DEVIATIONS * deviation):
-            shown.append(Nonlinearity(words(size), size, deviation))
-    return max(shown, key=lambda each: abs(each.size) / each.deviation, default=None)
+class LinearityTest:
+    """The score tests of one fit. What the fit can explain by itself is computed once for all of them."""
 
+    def __init__(self, fit: Fit[ExperimentRecord], found: Fitted) -> None:
+        self._fit, self._found = fit, found
+        known = unknown_columns(fit, found)
+        lengths = np.linalg.norm(known, axis=0)
+        basis, singular, _ = np.linalg.svd(known[:, lengths > 0.0] / lengths[lengths > 0.0], full_matrices=False)
+        self._basis = basis[:, singular > NEGLIGIBLE_DIRECTION * singular[0]]
+        residual = found.linear.residual
+        self._unexplained = self._without_known(residual)
+        self._variance = found.linear.rss / max(fit.samples - found.parameters, 1) * durbin_watson_ratio(residual)
 
-def unknown_difference(fit: Fit[ExperimentRecord], found: Fitted) -> float:
-    """By how much the gain may differ above and below rest without a trace in the record, as a fraction of the gain:
-    two standard deviations. Load disturbances in the model can stand for such a difference."""
-    return 2.0 * score(fit, found, above_rest)[1]
+    def nonlinearity(self) -> Nonlinearity | None:
+        """The clearest alternative to a linear plant, None where the record shows none of a size that matters for
+        Ms."""
+        shown = []
+        for changed, minimum, words in ALTERNATIVES:
+            size, deviation = self.score(changed)
+            if abs(size) > max(minimum, STANDARD_DEVIATIONS * deviation):
+                shown.append(Nonlinearity(words(size), size, deviation))
+        return max(shown, key=lambda each: abs(each.size) / each.deviation, default=None)
 
+    def unknown_difference(self) -> float:
+        """By how much the gain may differ above and below rest without a trace in the record, as a fraction of the
+        gain: two standard deviations. Load disturbances in the model can stand for such a difference."""
+        return 2.0 * self.score(above_rest)[1]
 
-def score(fit: Fit[ExperimentRecord], found: Fitted, changed: Callable[[Reals], Reals]) -> tuple[float, float]:
-    """The size of an alternative, as a fraction of the plant's gain, and its standard deviation.
+    def score(self, changed: Callable[[Reals], Reals]) -> tuple[float, float]:
+        """The size of an alternative, as a fraction of the plant's gain, and its standard deviation.
 
-    changed: the further input of the alternative, from MV in its largest deviation; the size multiplies it.
-    """
-    structure, inputs = found.structure, found.structure.inputs
-    further = Fit(replace(fit.record, u=fit.record.input_range * changed(fit.record.u / fit.record.input_range)))
-    # a record's input range is its own: the scale of MV must stay that of the fit
-    scale = further.record.input_range / fit.record.input_range
-    columns = further.regressors(structure, UNDISTURBED, found.theta[None, : structure.searched])[0]
-    response = scale * (columns[:, :inputs] @ found.linear.coefficients[:inputs])
-    known = unknown_columns(fit, found)
-    lengths = np.linalg.norm(known, axis=0)
-    basis, singular, _ = np.linalg.svd(known[:, lengths > 0.0] / lengths[lengths > 0.0], full_matrices=False)
-    basis = basis[:, singular > NEGLIGIBLE_DIRECTION * singular[0]]
-    response = response - basis @ (basis.T @ response)
-    residual = found.linear.residual
-    left = residual - basis @ (basis.T @ residual)
-    power = float(response @ response)
-    if power <= 0.0:
-        return 0.0, math.inf
-    variance = found.linear.rss / max(fit.samples - found.parameters, 1) * durbin_watson_ratio(residual)
-    return float(response @ left) / power, math.sqrt(variance / power)
+        changed: the further input of the alternative, from MV in its largest deviation; the size multiplies it.
+        """
+        fit, found = self._fit, self._found
+        structure, inputs = found.structure, found.structure.inputs
+        further = Fit(replace(fit.record, u=fit.record.input_range * changed(fit.record.u / fit.record.input_range)))
+        # a record's input range is its own: the scale of MV must stay that of the fit
+        scale = further.record.input_range / fit.record.input_range
+        columns = further.regressors(structure, UNDISTURBED, found.theta[None, : structure.searched])[0]
+        response = self._without_known(scale * (columns[:, :inputs] @ found.linear.coefficients[:inputs]))
+        power = float(response @ response)
+        if power <= 0.0:
+            return 0.0, math.inf
+        return float(response @ self._unexplained) / power, math.sqrt(self._variance / power)
+
+    def _without_known(self, values: Reals) -> Reals:
+        """What is left of a column of the record, shape (rows,), by everything that the fit can explain."""
+        return np.asarray(values - self._basis @ (self._basis.T @ values))
 
 
 def _sides(size: float) -> str:
-    return f"the plant's gain above the operating point is {1.0 + size:.2g} times that below"
+    return f"the plant's gain above the operating point is {max(1.0 + size, 0.0):.2g} times that below"
 
 
 def _curve(size: float) -> str:

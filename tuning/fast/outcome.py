@@ -34,7 +34,10 @@ def evaluated(
     Raises Refused, NOT_ROBUST.
     """
     spec = options.spec()
-    evaluation = evaluate_excitation(record, spec) if first is None else evaluate(record, spec, first)
+    if first is None:
+        evaluation = evaluate_excitation(record, spec, test_follows=options.verify)
+    else:
+        evaluation = evaluate(record, spec, first)
     return evaluation, outcome_of(facts, options, evaluation)
 
 

@@ -30,14 +30,16 @@ MIN_PERIOD = 8.0
 """Shortest time scale of a record, in samples; the longest is the record."""
 
 
-def evaluate_excitation(record: ExperimentRecord, spec: DesignSpec) -> Evaluation:
+def evaluate_excitation(record: ExperimentRecord, spec: DesignSpec, test_follows: bool = False) -> Evaluation:
     """Evaluates the record of an excitation without the steps that follow it. Raises Refused as `evaluate`.
+
+    test_follows: whether the gains are to be tested next, see `evaluate`.
 
     Under pulses of the set-point the time scale of the record is found first, and found again where the model's own
     ultimate period is another one.
     """
     if record.excitation is Excitation.RELAY:
-        return evaluate(record, spec)
+        return evaluate(record, spec, test_follows=test_follows)
     pulses = slice(record.listened, record.excited)
     first = first_period(record.u[pulses], record.y[pulses], record.Ts)
     found = evaluate(replace(record, period=first), spec)
@@ -70,7 +72,8 @@ def evaluate_again(record: ExperimentRecord, spec: DesignSpec) -> Evaluation:
     if not record.steps:
         return evaluate_excitation(record, spec)
     until = slice(record.excited)
-    first = evaluate_excitation(replace(record, u=record.u[until], y=record.y[until], steps=()), spec)
+    excitation = replace(record, u=record.u[until], y=record.y[until], steps=())
+    first = evaluate_excitation(excitation, spec, test_follows=True)
     return evaluate(replace(record, period=first.fit.period), spec, first)
 
 

@@ -53,8 +53,12 @@ def record(
     load: float = 0.0,
     load_at: int = 0,
     drift: float = 0.0,
+    below: float = 1.0,
 ) -> ExperimentRecord:
-    """Amplitudes +1, -1/2. noise: PV units.  load: MV units, from the sample load_at on.  drift: of PV, per sample."""
+    """Amplitudes +1, -1/2. noise: PV units.  load: MV units, from the sample load_at on.  drift: of PV, per sample.
+
+    below: the plant's gain below rest, as a part of that above.
+    """
     plant = LinearPlant(bench.num, bench.den, bench.L, bench.Ts, noise_std=noise, seed=seed)
     channel = Channel(
         bench.Ts, Settings(-5.0, 5.0, 0.0, reverse=sign(bench.model) > 0.0), Parameters(1.0), 0.0, Mode.MANUAL
@@ -72,7 +76,7 @@ def record(
         u.append(channel.step(y[-1]))
         if k > LISTENED and u[-1] != u[-2]:
             switched.append(k)
-        plant.step(u[-1])
+        plant.step(u[-1] if u[-1] > 0.0 else below * u[-1])
     return ExperimentRecord(
         bench.Ts, np.array(u), np.array(y), sign(bench.model), LISTENED, len(u), len(switched),
         oscillation_period(switched),
