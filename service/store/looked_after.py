@@ -11,7 +11,7 @@ from sqlalchemy import distinct, func, select
 from sqlalchemy.orm import Session
 
 from loopwright.service.jsonable import json_object
-from loopwright.service.store import audit
+from loopwright.service.store import alarms, audit
 from loopwright.service.store.jobs import Job, JobColumns
 from loopwright.service.store.store import Store, Write, append, set_columns
 from loopwright.service.store.tables import JobRow
@@ -69,6 +69,7 @@ def dismissed(store: Store, loop: str, by: str) -> list[str]:
             append(session, row.id, "dismissed", {"by": by}, row.plant_time_s)
             before = {"look_after": True, "reason": row.reason}
             audit.record(session, "dismiss", row.id, before=before, after={"look_after": False}, loop=loop, said_by=by)
+            alarms.restoration_signed_off(session, row, by)
         return [row.id for row in found]
 
 

@@ -75,6 +75,8 @@ class JobRow(Base):
         ),
         Index("jobs_by_loop", "loop", "number"),
         Index("jobs_by_host", "host", "state"),
+        Index("jobs_by_reason", "reason"),
+        Index("jobs_looked_after", "look_after"),
     )
 
     number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
@@ -224,6 +226,24 @@ class JobFiguresRow(Base):
     version: Mapped[int]
     record: Mapped[bytes | None] = mapped_column(LargeBinary)
     designs: Mapped[bytes | None] = mapped_column(LargeBinary)
+
+
+class AlarmSignOffRow(Base):
+    """An alarm that somebody has signed off, as it was shown then. job_id: the test it is about; null: about none."""
+
+    __tablename__ = "alarm_sign_offs"
+    __table_args__ = (Index("alarm_sign_offs_by_job", "job_id"),)
+
+    alarm_id: Mapped[str] = mapped_column(primary_key=True)
+    level: Mapped[int]
+    kind: Mapped[str]
+    host: Mapped[str]
+    loop: Mapped[str | None]
+    job_id: Mapped[str | None] = mapped_column(ForeignKey("jobs.id"))
+    text: Mapped[str]
+    since: Mapped[str]
+    by: Mapped[str]
+    at: Mapped[str]
 
 
 class RetuneRow(Base):

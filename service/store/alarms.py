@@ -1,0 +1,124 @@
+"""What the database tells of alarms: tests whose loop was not confirmed to be as before, and what was signed off."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from sqlalchemy import func, or_, select
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
+
+from loopwright.service.store import audit, claims
+from loopwright.service.store.clock import now
+from loopwright.service.store.store import Store
+from loopwright.service.store.tables import AlarmSignOffRow, JobRow
+from loopwright.tuning.reasons import Reason
+
+NOT_RESTORED = "not_restored"
+"""The kind of the alarm that a loop is not confirmed to be as before a test."""
+NOT_RESTORED_TEXT = "It was not confirmed after the test that the loop is as before it"
+
+
+class SignedOffAlready(Exception):
+    """Somebody has signed the alarm off before."""
+
+    def __init__(self, row: AlarmSignOffRow) -> None:
+        super().__init__(f"alarm {row.alarm_id} was signed off by {row.by} at {row.at}: {row.text}")
+
+
+@dataclass(frozen=True, slots=True)
+class UnconfirmedJob:
+    """A test at whose end the loop was not confirmed to be as before, and that nobody has signed off.
+
+    at: when it ended: UTC, ISO 8601.
+    looked_after: whether the loop is still looked at until it is as before.
+    """
+
+    id: str
+    loop: str
+    host: str
+    at: str
+    reason: Reason | None
+    looked_after: bool
+
+
+def alarm_id(*parts: str) -> str:
+    """Returns the id of an alarm: the same on every gateway, and after a restart. parts: kind and subject."""
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:12]
+
+
+def unconfirmed(store: Store) -> list[UnconfirmedJob]:
+    """Returns those of every host, oldest first. Raises SQLAlchemyError."""
+    signed = select(AlarmSignOffRow.job_id).where(
+        AlarmSignOffRow.job_id == JobRow.id, AlarmSignOffRow.kind == NOT_RESTORED
+    )
+    wanted = (
+        select(
+            JobRow.id, JobRow.loop, JobRow.host, func.coalesce(JobRow.ended_at, JobRow.created_at), JobRow.reason,
+            JobRow.look_after,
+        )
+        .where(
+            or_(JobRow.reason == Reason.RESTORE_UNCONFIRMED, JobRow.look_after.is_(True)),
+            JobRow.dry_run.is_(False),
+            ~signed.exists(),
+        )
+        .order_by(JobRow.number)
+    )  # fmt: skip
+    with store.reading() as session:
+        return [UnconfirmedJob(*row) for row in session.execute(wanted)]
+
+
+def signed_off(store: Store, alarms: Collection[str], jobs: Collection[str]) -> tuple[set[str], set[str]]:
+    """Returns which of these alarms were signed off, and of which of these jobs the restoration was. Raises
+    SQLAlchemyError."""
+    by_id = select(AlarmSignOffRow.alarm_id).where(AlarmSignOffRow.alarm_id.in_(alarms))
+    by_job = select(AlarmSignOffRow.job_id).where(
+        AlarmSignOffRow.job_id.in_(jobs), AlarmSignOffRow.kind == NOT_RESTORED
+    )
+    with store.reading() as session:
+        return set(session.scalars(by_id)), {job_id for job_id in session.scalars(by_job) if job_id is not None}
+
+
+def find(store: Store, wanted: str) -> AlarmSignOffRow | None:
+    """Returns an alarm that was signed off; None: it was not."""
+    with store.reading() as session:
+        return session.get(AlarmSignOffRow, wanted)
+
+
+def sign_off(store: Store, row: AlarmSignOffRow) -> AlarmSignOffRow:
+    """Stores that an alarm is signed off, with its entry in the audit log. Raises SignedOffAlready."""
+    try:
+        with store.writing() as session:
+            earlier = session.get(AlarmSignOffRow, row.alarm_id)
+            if earlier is not None:
+                raise SignedOffAlready(earlier)
+            _add(session, row)
+            claims.changed(session, f"/alarms/{row.alarm_id}")
+    except IntegrityError:  # another gateway was faster by a moment
+        faster = find(store, row.alarm_id)
+        if faster is None:
+            raise
+        raise SignedOffAlready(faster) from None
+    return row
+
+
+def restoration_signed_off(session: Session, job: JobRow, by: str) -> None:
+    """Signs the restoration off within a transaction in which a person answers for the loop, unless it was before."""
+    of_it = select(AlarmSignOffRow).where(AlarmSignOffRow.job_id == job.id, AlarmSignOffRow.kind == NOT_RESTORED)
+    if session.scalars(of_it).first() is None:
+        _add(
+            session,
+            AlarmSignOffRow(
+                alarm_id=alarm_id(NOT_RESTORED, job.id), level=1, kind=NOT_RESTORED, host=job.host, loop=job.loop,
+                job_id=job.id, text=NOT_RESTORED_TEXT, since=job.ended_at or job.created_at, by=by, at=now(),
+            ),
+        )  # fmt: skip
+
+
+def _add(session: Session, row: AlarmSignOffRow) -> None:
+    session.add(row)
+    session.flush()
+    before = {"level": row.level, "kind": row.kind, "text": row.text, "since": row.since, "job": row.job_id}
+    audit.record(session, "alarm_sign_off", row.alarm_id, before=before, loop=row.loop, said_by=row.by)
