@@ -14,15 +14,16 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 
 from loopwright.protocol.bus import Bus, BusError, open_bus
-from loopwright.protocol.profile import ChannelIds
+from loopwright.protocol.profile import ChannelIds, heartbeat_id
 from loopwright.service.listening.bins import Bins, packed
 from loopwright.service.listening.heard_loop import Heard, HeardLoop
+from loopwright.service.listening.heard_node import HeardHeartbeat, HeardNode
 from loopwright.service.listening.messages import (
     Finish,
     FinishedBlock,
@@ -69,11 +70,19 @@ class Clock:
 
 
 class HeardBus:
-    """Listens to one bus, in a thread. `lock` guards the loops."""
+    """Listens to one bus, in a thread. `lock` guards the loops and the nodes."""
 
-    def __init__(self, url: str, ids: Mapping[str, ChannelIds], clock: Clock, open_bus: Callable[[str], Bus]) -> None:
+    def __init__(
+        self,
+        url: str,
+        ids: Mapping[str, ChannelIds],
+        clock: Clock,
+        open_bus: Callable[[str], Bus],
+        nodes: Collection[int] = (),
+    ) -> None:
         self.lock = threading.Lock()
         self.loops = {tag: HeardLoop() for tag in ids}
+        self.nodes = {node: HeardNode() for node in nodes}
         self.down: str | None = "not opened yet"
         self._url, self._clock, self._open = url, clock, open_bus
         self._frames = self._reported = 0
@@ -85,6 +94,7 @@ class HeardBus:
             )  # fmt: skip
             for can_id, take in each:  # plant I/O may feed several controllers
                 self._takes[can_id] = (*self._takes.get(can_id, ()), take)
+        self._heartbeats = {heartbeat_id(node): heard.take for node, heard in self.nodes.items()}
 
     def run(self) -> None:
         """Listens for ever; a bus that is down is opened again."""
@@ -92,7 +102,7 @@ class HeardBus:
             try:
                 bus = self._open(self._url)
                 try:
-                    bus.set_filters(self._takes)
+                    bus.set_filters((*self._takes, *self._heartbeats))
                     self.down = None
                     self._listen(bus)
                 finally:
@@ -115,17 +125,19 @@ class HeardBus:
     def take(self, can_id: int, data: bytes) -> None:
         """Takes a frame."""
         takes = self._takes.get(can_id)
-        if takes is None:  # a frame from before the filter
-            return
+        if takes is None:  # a heartbeat, or a frame from before the filter
+            heartbeat = self._heartbeats.get(can_id)
+            takes = () if heartbeat is None else (heartbeat,)
+        else:
+            self._frames += 1
         now_s = self._clock.now()
-        self._frames += 1
         with self.lock:
             for take in takes:
                 with suppress(struct.error):  # a foreign frame with this identifier
                     take(data, now_s)
 
     def new_frames(self) -> int:
-        """Returns the number of frames since this was asked last."""
+        """Returns the number of frames of process data since this was asked last."""
         frames, self._reported = self._frames - self._reported, self._frames
         return frames
 
@@ -134,10 +146,15 @@ class Child:
     """The process: it answers the service, and reports to it."""
 
     def __init__(
-        self, loops: Mapping[str, Mapping[str, ChannelIds]], clock: Clock, open_bus: Callable[[str], Bus] = open_bus
+        self,
+        loops: Mapping[str, Mapping[str, ChannelIds]],
+        clock: Clock,
+        open_bus: Callable[[str], Bus] = open_bus,
+        nodes: Mapping[str, Collection[int]] | None = None,
     ) -> None:
         self._clock = clock
-        self.buses = {url: HeardBus(url, ids, clock, open_bus) for url, ids in loops.items()}
+        nodes = nodes or {}
+        self.buses = {url: HeardBus(url, ids, clock, open_bus, nodes.get(url, ())) for url, ids in loops.items()}
         self._of_tag = {tag: bus for bus in self.buses.values() for tag in bus.loops}
         # Spread over the time of a block, so that they are not all packed at once.
         first_s = clock.now()
@@ -218,12 +235,23 @@ class Child:
                 found[tag] = latest
         return found
 
+    def _nodes(self, now_s: float) -> dict[tuple[str, int], HeardHeartbeat]:
+        found: dict[tuple[str, int], HeardHeartbeat] = {}
+        for url, bus in self.buses.items():
+            with bus.lock:
+                for node, heard in bus.nodes.items():
+                    if (latest := heard.latest(now_s)) is not None:
+                        found[url, node] = latest
+        return found
+
     def report(self, finished: bool = False) -> Report:
         if self._clock.set_back():
             for bus in self.buses.values():
                 with bus.lock:
                     for loop in bus.loops.values():
                         loop.began_anew()
+                    for node in bus.nodes.values():
+                        node.began_anew()
         now_s = self._clock.now()
         to_read = [tag for tag, bus in self._of_tag.items() if bus.loops[tag].to_read(now_s)]
         return Report(
@@ -233,6 +261,7 @@ class Child:
             blocks=[block for tag in self._of_tag if (block := self._block(tag, now_s, finished)) is not None],
             finished=finished,
             heard=self._heard(now_s),
+            nodes=self._nodes(now_s),
         )
 
     def _block(self, tag: str, now_s: float, finished: bool) -> FinishedBlock | None:
@@ -260,7 +289,7 @@ def main() -> None:
     with suppress(EOFError, OSError):
         first = connection.recv()
         assert isinstance(first, Listen)
-        child = Child(first.loops, Clock())
+        child = Child(first.loops, Clock(), nodes=first.nodes)
         child.start()
         child.serve(connection)
     os._exit(0)  # the threads of the buses wait for frames

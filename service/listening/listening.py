@@ -27,6 +27,7 @@ from loopwright.service.listening.bins import (
 )
 from loopwright.service.listening.block_writer import BlockWriter
 from loopwright.service.listening.heard_loop import Heard, InEffect
+from loopwright.service.listening.heard_node import HeardHeartbeat
 from loopwright.service.listening.messages import HistoryAnswer, Learn, NewSamples, Report
 from loopwright.service.listening.process import ListeningProcess, NotListening
 from loopwright.service.store import history
@@ -85,11 +86,15 @@ class Listening:
         """Buses that are not listened to, with the reason."""
         self._down: Mapping[str, str] = {}
         self._writer = BlockWriter(store)
-        self.process = ListeningProcess(_ids(loops, self.off), self._take, on_samples=self._take_samples)
+        self.process = ListeningProcess(
+            _ids(loops, self.off), self._take, on_samples=self._take_samples, nodes=_nodes(loops, self.off)
+        )
         self.heard: Mapping[str, Heard] = {}
         """What was heard last, by tag: replaced as a whole once a second."""
-        self._gains: dict[str, GainSet] = {}
-        """The gains of each loop as they were read last."""
+        self.nodes: Mapping[tuple[str, int], HeardHeartbeat] = {}
+        """The heartbeats heard last, by bus and node: replaced as a whole once a second."""
+        self._gains: dict[str, tuple[GainSet, float]] = {}
+        """The gains of each loop as they were read last, and when that reading began, s."""
         self.on_report: Callable[[], None] = lambda: None
         """Called in another thread when `heard` or a bus may have changed."""
         self.on_samples: Callable[[NewSamples], None] = lambda _: None
@@ -143,8 +148,14 @@ class Listening:
 
     def gains_of(self, tag: str) -> Gains | None:
         """Returns the gains of a loop as they were read last; None where they are not known."""
-        gains = self._gains.get(tag)
-        return None if gains is None else Gains(*gains)
+        found = self.gains_read(tag)
+        return None if found is None else found[0]
+
+    def gains_read(self, tag: str) -> tuple[Gains, float] | None:
+        """Returns the gains of a loop as they were read last, and when that reading began, wall time, s; None where
+        they are not known."""
+        found = self._gains.get(tag)
+        return None if found is None else (Gains(*found[0]), found[1])
 
     def buses(self) -> dict[str, str | None]:
         """Returns the buses of this host, each with why it is not heard at present; None: it is heard."""
@@ -201,7 +212,7 @@ class Listening:
     # -- beside the process
 
     def _take(self, report: Report) -> None:
-        self._down, self.heard = report.down, report.heard
+        self._down, self.heard, self.nodes = report.down, report.heard, report.nodes
         for url, frames in report.frames.items():
             FRAMES_HEARD.labels(url).inc(frames)
             LISTENING_UP.labels(url).set(0 if url in report.down else 1)
@@ -234,7 +245,7 @@ class Listening:
                     if found.gains is None:
                         self._gains.pop(tag, None)
                     else:
-                        self._gains[tag] = found.gains
+                        self._gains[tag] = found.gains, found.began_s
                     self.process.learn(Learn(tag, found))
                 if self._over.wait(EACH_S):
                     return
@@ -256,6 +267,15 @@ def _ids(loops: Mapping[str, LoopConfig], off: Collection[str]) -> dict[str, dic
         if loop.bus not in off:
             ids = channel_ids(loop.channel, loop.plant_node or PLANT_NODE, loop.controller_node)
             found.setdefault(loop.bus, {})[tag] = ids
+    return found
+
+
+def _nodes(loops: Mapping[str, LoopConfig], off: Collection[str]) -> dict[str, set[int]]:
+    found: dict[str, set[int]] = {}
+    for loop in loops.values():
+        if loop.bus not in off:
+            named = (loop.controller_node, loop.plant_node)
+            found.setdefault(loop.bus, set()).update(node for node in named if node is not None)
     return found
 
 

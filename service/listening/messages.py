@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from loopwright.protocol.profile import ChannelIds
 from loopwright.service.listening.bins import Bins, Rows
 from loopwright.service.listening.heard_loop import Heard, InEffect
+from loopwright.service.listening.heard_node import HeardHeartbeat
 
 
 @dataclass(frozen=True)
 class Listen:
-    """The first message: the loops to listen to, by bus and tag."""
+    """The first message: the loops to listen to, by bus and tag, and the nodes, by bus."""
 
     loops: Mapping[str, Mapping[str, ChannelIds]]
+    nodes: Mapping[str, Collection[int]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,7 @@ class Report:
     to_read: loops whose set-point, mode and gains are to be read.
     finished: whether this is the last report.
     heard: what was heard last, by tag; without the loops of which nothing was heard.
+    nodes: the heartbeats heard last, by bus and node; without the nodes of which none was heard.
     """
 
     down: Mapping[str, str]
@@ -101,3 +104,4 @@ class Report:
     blocks: Sequence[FinishedBlock] = field(default=())
     finished: bool = False
     heard: Mapping[str, Heard] = field(default_factory=dict)
+    nodes: Mapping[tuple[str, int], HeardHeartbeat] = field(default_factory=dict)

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future
 from contextlib import suppress
 from multiprocessing import Pipe
@@ -49,6 +49,7 @@ class ListeningProcess:
     """Keeps the process going, in a thread.
 
     loops: what it listens to, by bus and tag.
+    nodes: the nodes whose heartbeats it hears, by bus.
     on_report: receives its reports, in that thread.
     on_samples: receives the new samples of the loops that are watched, in that thread.
     """
@@ -59,8 +60,10 @@ class ListeningProcess:
         on_report: Callable[[Report], None],
         first_pause_s: float = FIRST_PAUSE_S,
         on_samples: Callable[[NewSamples], None] = lambda _: None,
+        nodes: Mapping[str, Collection[int]] | None = None,
     ) -> None:
         self._loops, self._on_report, self._first_pause_s = loops, on_report, first_pause_s
+        self._nodes = nodes or {}
         self._on_samples = on_samples
         self._watched: frozenset[str] = frozenset()
         self._over = threading.Event()
@@ -164,7 +167,7 @@ class ListeningProcess:
                 own = os.getpriority(os.PRIO_PROCESS, process.pid)
                 os.setpriority(os.PRIO_PROCESS, process.pid, max(NICENESS, own))  # from its first import on
             try:
-                ours.send(Listen(self._loops))
+                ours.send(Listen(self._loops, self._nodes))
                 self._connection = ours
                 self.watch(self._watched)
                 self._receive(ours)

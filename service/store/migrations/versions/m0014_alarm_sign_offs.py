@@ -1,5 +1,5 @@
-"""Alarms that were signed off. A test that was followed by another one of the loop counts as signed off: nobody could do
-so before, and the later test has read the loop."""
+"""Alarms that were signed off. A test that was followed by another one of the loop counts as signed off: nobody could
+do it before, and the later test has read the loop."""
 
 from __future__ import annotations
 

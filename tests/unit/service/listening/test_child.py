@@ -11,7 +11,7 @@ import pytest
 
 from loopwright.protocol.bus import BusError, Frame
 from loopwright.protocol.bus_state import BusState
-from loopwright.protocol.profile import MV_FRAME, PV_FRAME, Mode, channel_ids
+from loopwright.protocol.profile import MV_FRAME, PV_FRAME, Mode, NmtState, channel_ids
 from loopwright.service.listening import child as module
 from loopwright.service.listening.bins import unpacked
 from loopwright.service.listening.child import BLOCK_S, Child, Clock
@@ -184,3 +184,25 @@ def test_a_clock_that_is_put_forward_is_followed_and_one_that_is_put_back_begins
     child.report()
     take(child, "A", 4)
     assert samples(child, time) == [4]
+
+
+def test_heartbeats_of_the_nodes_are_heard_beside_the_process_data(clock: Clock, time: Time) -> None:
+    bus = Frames()
+    child = Child({URL: IDS}, clock, lambda url: bus, {URL: (16, 32)})
+    child.start()
+    until(lambda: not child.report().down)
+    process_data = {each for ids in IDS.values() for each in (ids.pv, ids.mv, ids.status)}
+    assert bus.wanted == process_data | {0x710, 0x720}
+    bus.queue.put((0x720, bytes([127])))
+    until(lambda: (URL, 32) in child.report().nodes)
+    bus.queue.put((0x720, b"foreign"))
+    time.pass_by(0.5)
+    bus.queue.put((0x720, bytes([5])))
+    until(lambda: child.report().nodes[URL, 32].state is NmtState.OPERATIONAL)
+    report = child.report()
+    assert set(report.nodes) == {(URL, 32)} and not report.nodes[URL, 32].silent
+    assert child.buses[URL].new_frames() == 0, "heartbeats are no process data"
+    time.pass_by(2.1)
+    assert child.report().nodes[URL, 32].silent
+    time.wall -= 3600.0
+    assert not child.report().nodes, "a clock that was put back makes no age"
