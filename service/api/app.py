@@ -10,6 +10,8 @@ from typing import Annotated, Literal
 from fastapi import Body, FastAPI, Header, Path, Query, Request, Response
 from fastapi.responses import RedirectResponse, StreamingResponse
 
+from loopwright.service.alarms.watch import AlarmWatch
+from loopwright.service.api import alarms as alarms_api
 from loopwright.service.api import (
     decisions,
     fleet,
@@ -79,12 +81,14 @@ def create_app(
     listening: Listening | None = None,
     live: Live | None = None,
     figures: KeptFigures | None = None,
+    alarms: AlarmWatch | None = None,
 ) -> FastAPI:
     """The application for these jobs, which it stops when the server shuts down.
 
     checks: the parts of /readyz by name; None for the default ones.  pool: processes that compute tunings; None for a
     new pool.  sdo_retries: SDO retries by bus, as counted in this process.  listening: None for one that knows only
     what is stored.  live: None for a stream of its own.  figures: None for those that this pool computes when asked.
+    alarms: None for one that looks only when it is asked.
     """
 
     policy = policy or Policy()
@@ -120,7 +124,10 @@ def create_app(
     problems.install(app)
     openapi.install(app)
     checks = operations.checks(jobs) if checks is None else checks
-    operations.install(app, jobs, checks, {} if sdo_retries is None else sdo_retries)
+    listening = listening or Listening(jobs.directory.loops, jobs.store, on=False)
+    alarms = alarms or AlarmWatch(jobs, listening)
+    operations.install(app, jobs, checks, {} if sdo_retries is None else sdo_retries, alarms)
+    alarms_api.install(app, alarms)
 
     def views(rows: Sequence[Job]) -> list[JobView]:
         events = jobs.store.events_by_job([row.id for row in rows], limit=MAX_EVENTS)
@@ -131,7 +138,6 @@ def create_app(
     def view(row: Job) -> JobView:
         return views([row])[0]
 
-    listening = listening or Listening(jobs.directory.loops, jobs.store, on=False)
     fleet.install(app, jobs, many, views, listening)
 
     @app.get(
@@ -288,7 +294,7 @@ def create_app(
     app.include_router(history.router(jobs.directory, listening))
     app.include_router(sparklines.router(jobs.directory, listening))
     app.include_router(observation.router(jobs, readings, listening, pool))
-    live = live or Live(jobs, listening)
+    live = live or Live(jobs, listening, alarms)
     app.include_router(live_api.router(live, jobs.directory, keyring, policy.sessions))
     app.include_router(previews.router(jobs, many))
     app.include_router(tunings.router(jobs, pool))

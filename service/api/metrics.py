@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter as Tally
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -12,6 +12,7 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
+from loopwright.service.alarms.alarm import Level
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.job_states import ACTIVE, JobState, shown
 from loopwright.service.store import looked_after
@@ -20,6 +21,19 @@ from loopwright.service.store.tables import JobRow
 from loopwright.service.telemetry.metrics import OF_THIS_PROCESS
 
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+
+
+class _Alarms(Collector):
+    def __init__(self, counts: Callable[[], Mapping[Level, int]]) -> None:
+        self._counts = counts
+
+    def collect(self) -> Iterable[Metric]:
+        found = GaugeMetricFamily(
+            "loopwright_alarms", "Alarms of the loops and buses of this gateway, 1 is the worst level", labels=["level"]
+        )
+        for level, count in self._counts().items():
+            found.add_metric([str(level)], count)
+        yield found
 
 
 class _OfTheStore(Collector):
@@ -69,10 +83,16 @@ class _OfTheStore(Collector):
         return found
 
 
-def registry(loops: Mapping[str, LoopConfig], store: Store, sdo_retries: Mapping[str, int]) -> CollectorRegistry:
-    """The registry of the metrics of a service. sdo_retries: SDO retries by bus, as counted in this process."""
+def registry(
+    loops: Mapping[str, LoopConfig],
+    store: Store,
+    sdo_retries: Mapping[str, int],
+    alarms: Callable[[], Mapping[Level, int]] = dict,
+) -> CollectorRegistry:
+    """The registry of the metrics of a service. sdo_retries: SDO retries by bus, as counted in this process.
+    alarms: returns the number of alarms by level, 0 included."""
     found = CollectorRegistry()
-    for collector in (*OF_THIS_PROCESS, _OfTheStore(loops, store, sdo_retries)):
+    for collector in (*OF_THIS_PROCESS, _OfTheStore(loops, store, sdo_retries), _Alarms(alarms)):
         found.register(collector)
     return found
 

@@ -15,6 +15,7 @@ from fastapi import APIRouter, FastAPI, Query, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import BaseModel, Field
 
+from loopwright.service.alarms.watch import AlarmWatch
 from loopwright.service.api import metrics, problems
 from loopwright.service.api.docs_page import POLICY, page
 from loopwright.service.api.openapi_document import as_document
@@ -72,12 +73,12 @@ class AuditView(BaseModel):
     said_by: str | None = Field(description="Name of the person, as given in the request", examples=["night shift"])
     what: str = Field(
         description="retune, abort, accept, rollback, accept_failed, rollback_failed, retune_many, retune_many_abort, "
-        "dismiss, lock, unlock, samples_delete, clock_jump, restore, key_create, key_revoke, "
+        "dismiss, alarm_sign_off, lock, unlock, samples_delete, clock_jump, restore, key_create, key_revoke, "
         "sign_in, sign_out, sign_in_refused",
         examples=["accept"],
     )
     subject: str = Field(
-        description="Id of the job, the key or the retune of many loops, or the tag of the loop",
+        description="Id of the job, the key, the alarm or the retune of many loops, or the tag of the loop",
         examples=["4f0c2a9be113"],
     )
     loop: str | None = Field(examples=["TIC-101"])
@@ -155,11 +156,13 @@ def loops_looked_after(jobs: Jobs) -> dict[str, Check]:
     return {f"loop {found.loop}": part(found) for found in jobs.aftercare.not_home()}
 
 
-def install(app: FastAPI, jobs: Jobs, parts: Mapping[str, Check], sdo_retries: Mapping[str, int]) -> None:
+def install(
+    app: FastAPI, jobs: Jobs, parts: Mapping[str, Check], sdo_retries: Mapping[str, int], alarms: AlarmWatch
+) -> None:
     """Adds the routes. parts: the checks of /readyz.  sdo_retries: SDO retries by bus."""
     router = APIRouter(tags=["operations"])
     readiness = Readiness(parts, lambda: loops_looked_after(jobs))
-    counted = metrics.registry(jobs.directory.loops, jobs.store, sdo_retries)
+    counted = metrics.registry(jobs.directory.loops, jobs.store, sdo_retries, alarms.counts)
 
     @router.get("/healthz", summary="Whether the process is alive")
     async def healthz() -> Alive:

@@ -115,6 +115,11 @@ class Listening:
             if self._read is not None:
                 self._reader.start()
 
+    @property
+    def begun(self) -> bool:
+        """Returns whether any bus is listened to by now."""
+        return self._started
+
     def close(self) -> None:
         self._over.set()
         if self._started:

@@ -15,6 +15,9 @@ from importlib.metadata import version
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from loopwright.service.alarms.alarm import Alarms
+from loopwright.service.alarms.watch import LOOK_S as ALARM_LOOK_S
+from loopwright.service.alarms.watch import AlarmWatch
 from loopwright.service.jobs.journal import temporary
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.bins import of_samples
@@ -33,6 +36,8 @@ _PAST_POINTS = 3000
 """Samples from before the stream at most, by loop: older ones are thinned."""
 LOOK_S = 0.25
 """Wall time between two looks at the jobs, s."""
+ALARMS_S = 2.0 * ALARM_LOOK_S
+"""Age of the last look at the alarms up to which none is made here, s: they are looked at without viewers too."""
 _THOROUGHLY = 4
 """Every so many looks the latest jobs and the loops of other hosts are asked for too."""
 _BEAT_S = 1.2
@@ -42,10 +47,12 @@ _FIRST_LOOK_S = 1.0
 
 
 class Live:
-    """The methods belong to one event loop, that of the server. listening: calls back in threads of its own."""
+    """The methods belong to one event loop, that of the server. listening: calls back in threads of its own.
+    alarms: so does it; None for one that looks only when it is asked."""
 
-    def __init__(self, jobs: Jobs, listening: Listening) -> None:
+    def __init__(self, jobs: Jobs, listening: Listening, alarms: AlarmWatch | None = None) -> None:
         self._jobs, self._listening = jobs, listening
+        self._alarms = alarms or AlarmWatch(jobs, listening)
         self._looked_up = LookedUpJobs(jobs)
         self._viewers: set[Viewer] = set()
         self._working: tuple[asyncio.Task[None], ...] = ()
@@ -133,6 +140,7 @@ class Live:
             here = asyncio.get_running_loop()
             self._listening.on_report = lambda: _soon(here, self._reported.set)
             self._listening.on_samples = lambda new: _soon(here, self._share, new)
+            self._alarms.on_change = lambda: _soon(here, self._show_alarms)
             self._working = tuple(asyncio.create_task(work()) for work in (self._keep_rows, self._keep_jobs))
         self._watch()
 
@@ -180,15 +188,25 @@ class Live:
                     log.exception("the live jobs could not be looked up")
             except Exception:  # the streams go on with what was known last
                 log.exception("defect while looking up the live jobs")
+            try:
+                await asyncio.to_thread(self._alarms.look, ALARMS_S)
+            except Exception:
+                log.exception("defect while looking for what is abnormal")
             looks += 1
             if before != {(job.id, job.state, job.stage, job.stopping) for job in self._looked_up.live} or looks == 1:
                 self._show("jobs", event("jobs", self._looked_up.message()))
+            self._show_alarms()
             self._looked.set()
             for viewer in self._viewers:
                 viewer.wake()
             await asyncio.sleep(LOOK_S)
 
+    def _show_alarms(self) -> None:
+        if self._alarms.latest is not None:
+            self._show("alarms", event("alarms", Alarms(alarms=list(self._alarms.latest))))
+
     def _show_rows(self) -> None:
+        self._show_alarms()
         now_s = time.time()
         found, heard = self._looked_up, self._listening.heard
         job_of = {job.loop: job for job in found.live if not job.dry_run}

@@ -21,6 +21,7 @@ from fastapi import FastAPI
 
 from loopwright.protocol.profile import TUNER_NODE
 from loopwright.protocol.station import Station
+from loopwright.service.alarms.watch import AlarmWatch
 from loopwright.service.api import operations
 from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.connections import (
@@ -65,11 +66,14 @@ class _Server(uvicorn.Server):
     """An HTTP server that prints when it is ready. It does not handle signals: uvicorn would raise each signal again
     after its shutdown, and take a second SIGINT as permission to abort."""
 
-    def __init__(self, config: uvicorn.Config, jobs: Jobs, listening: Listening, live: Live) -> None:
+    def __init__(
+        self, config: uvicorn.Config, jobs: Jobs, listening: Listening, live: Live, alarms: AlarmWatch
+    ) -> None:
         super().__init__(config)
         self._jobs = jobs
         self._listening = listening
         self._live = live
+        self._alarms = alarms
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -86,6 +90,7 @@ class _Server(uvicorn.Server):
             print(f"ready http://{f'[{host}]' if ':' in host else host}:{port}", flush=True)
             tell_systemd("READY=1")
             self._listening.start()
+            self._alarms.start()
             if (every_s := interval_s()) is not None:
                 watchdog = Watchdog(self._jobs.unwatched_s, self._jobs.store.ping, tell_systemd)
                 self._watchdog = asyncio.create_task(watchdog.run(every_s))
@@ -237,9 +242,10 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         looking = stack.enter_context(
             closing(Looking(jobs.directory, jobs.registry, store, listening, jobs.knowledge, pool))
         )
-        live_stream = Live(jobs, listening)
-        app = create_app(jobs, policy, checks, pool, station.sdo_retries, listening, live_stream, figures)
-        server = _Server(server_config(app, setup, listener, descriptors), jobs, listening, live_stream)
+        alarms = stack.enter_context(closing(AlarmWatch(jobs, listening)))
+        live_stream = Live(jobs, listening, alarms)
+        app = create_app(jobs, policy, checks, pool, station.sdo_retries, listening, live_stream, figures, alarms)
+        server = _Server(server_config(app, setup, listener, descriptors), jobs, listening, live_stream, alarms)
 
         def end() -> None:
             """Ends jobs and server: the server waits for its connections, and event streams end with their jobs."""

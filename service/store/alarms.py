@@ -70,15 +70,11 @@ def unconfirmed(store: Store) -> list[UnconfirmedJob]:
         return [UnconfirmedJob(*row) for row in session.execute(wanted)]
 
 
-def signed_off(store: Store, alarms: Collection[str], jobs: Collection[str]) -> tuple[set[str], set[str]]:
-    """Returns which of these alarms were signed off, and of which of these jobs the restoration was. Raises
-    SQLAlchemyError."""
-    by_id = select(AlarmSignOffRow.alarm_id).where(AlarmSignOffRow.alarm_id.in_(alarms))
-    by_job = select(AlarmSignOffRow.job_id).where(
-        AlarmSignOffRow.job_id.in_(jobs), AlarmSignOffRow.kind == NOT_RESTORED
-    )
+def signed_off(store: Store, alarms: Collection[str]) -> frozenset[str]:
+    """Returns which of these alarms were signed off. Raises SQLAlchemyError."""
     with store.reading() as session:
-        return set(session.scalars(by_id)), {job_id for job_id in session.scalars(by_job) if job_id is not None}
+        wanted = select(AlarmSignOffRow.alarm_id).where(AlarmSignOffRow.alarm_id.in_(alarms))
+        return frozenset(session.scalars(wanted))
 
 
 def find(store: Store, wanted: str) -> AlarmSignOffRow | None:

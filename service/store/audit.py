@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
-from sqlalchemy import Engine, or_, select
+from sqlalchemy import Engine, func, or_, select
 from sqlalchemy.orm import Session
 
 from loopwright.service.security.principal import current
@@ -31,6 +31,11 @@ def record(
             subject=subject, loop=loop, before=before, after=after,
         )
     )  # fmt: skip
+
+
+def latest(session: Session) -> int:
+    """Returns the number of the latest row; 0: there is none."""
+    return session.scalar(select(func.max(AuditRow.number))) or 0
 
 
 def trail(

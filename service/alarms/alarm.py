@@ -1,0 +1,95 @@
+"""An alarm, and the closed list of its kinds, each with level and delays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Level = Literal[1, 2, 3]
+LEVELS: tuple[Level, ...] = (1, 2, 3)
+
+
+class AlarmKind(StrEnum):
+    """The value is what the API shows and the database holds."""
+
+    NOT_RESTORED = "not_restored"
+    BUS_DOWN = "bus_down"
+    NODE_LOST = "node_lost"
+    NODE_NOT_OPERATIONAL = "node_not_operational"
+    NO_DATA = "no_data"
+    PV_OUTSIDE_LIMITS = "pv_outside_limits"
+    FOREIGN_TEST = "foreign_test"
+    TEST_FAILED = "test_failed"
+    GAINS_DIFFER = "gains_differ"
+
+
+@dataclass(frozen=True)
+class KindRule:
+    """How alarms of a kind come and go.
+
+    level: 1 is the worst.
+    on_s, off_s: on-delay and off-delay, s.
+    to_sign: whether a person may sign it off; an alarm that goes with its condition needs nobody.
+    """
+
+    level: Level
+    on_s: float
+    off_s: float
+    to_sign: bool
+
+
+RULES: dict[AlarmKind, KindRule] = {
+    AlarmKind.NOT_RESTORED: KindRule(1, 0.0, 0.0, True),
+    AlarmKind.BUS_DOWN: KindRule(2, 3.0, 3.0, False),
+    AlarmKind.NODE_LOST: KindRule(2, 3.0, 3.0, False),
+    AlarmKind.NODE_NOT_OPERATIONAL: KindRule(2, 3.0, 3.0, False),
+    AlarmKind.NO_DATA: KindRule(2, 3.0, 3.0, False),
+    AlarmKind.PV_OUTSIDE_LIMITS: KindRule(2, 3.0, 3.0, False),
+    AlarmKind.FOREIGN_TEST: KindRule(2, 5.0, 3.0, False),
+    AlarmKind.TEST_FAILED: KindRule(3, 0.0, 0.0, True),
+    AlarmKind.GAINS_DIFFER: KindRule(3, 0.0, 0.0, True),
+}
+
+
+class SignOff(BaseModel):
+    """Who has signed an alarm off."""
+
+    model_config = ConfigDict(frozen=True)
+
+    by: str = Field(description="Who has signed it off, as given in the request", examples=["operator A"])
+    at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
+
+
+class Alarm(BaseModel):
+    """Something abnormal."""
+
+    model_config = ConfigDict(frozen=True)
+
+    id: str = Field(
+        description="The same on every gateway, and as long as the alarm lasts", examples=["0f3ac2d9be11"]
+    )
+    level: Level = Field(description="1: look now, and sign off; 2: soon; 3: when there is time")
+    kind: AlarmKind
+    subject: str = Field(
+        description="The loop, the bus or the node", examples=["TIC-101", "node 20h on socketcan:can0"]
+    )
+    text: str = Field(description="What is abnormal", examples=["PV is above its limit of 51 degC"])
+    advice: str = Field(description="What the operator should do")
+    since: str = Field(description="When it began: UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
+    host: str = Field(description="Name of the gateway that has the loop or the bus", examples=["local"])
+    loop: str | None = Field(description="Tag of the loop; null: it is about a bus or a node", examples=["TIC-101"])
+    loops: list[str] = Field(description="Tags of all loops that it concerns", examples=[["TIC-101"]])
+    job: str | None = Field(description="URL of the test that it is about", examples=["/jobs/4f0c2a9be113"])
+    to_sign: bool = Field(
+        description="Whether it may be signed off; one that may not goes by itself when its cause is gone"
+    )
+    signed_off: SignOff | None = Field(description="Who has signed it off, and when; null: nobody has")
+
+
+class Alarms(BaseModel):
+    """Everything that is abnormal, the worst first."""
+
+    alarms: list[Alarm]

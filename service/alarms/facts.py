@@ -1,0 +1,124 @@
+"""Gathers what is known at one moment, from the listening, the running jobs and the database.
+
+While the database does not answer, what it has said last stays: buses and loops are looked at all the same.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from loopwright.service.alarms.conditions import BusFacts, Facts, LoopFacts, to_be_asked
+from loopwright.service.jobs.journal import temporary
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.listening.listening import Listening
+from loopwright.service.loop_state import LoopState
+from loopwright.service.store import alarms, audit
+from loopwright.service.store.alarms import UnconfirmedJob
+from loopwright.service.store.live_jobs import Acceptance, JobInBrief, acceptances, latest_tests
+from loopwright.service.store.store import Store
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """What the database has said. audited: number of the latest entry of the audit log, which every decision writes."""
+
+    busy: Mapping[str, str] = field(default_factory=dict)
+    tests: Sequence[JobInBrief] = ()
+    unconfirmed: Sequence[UnconfirmedJob] = ()
+    accepted: Mapping[str, Acceptance] = field(default_factory=dict)
+    audited: int | None = None
+
+
+class FactSource:
+    """One thread at a time may gather."""
+
+    def __init__(self, jobs: Jobs, listening: Listening) -> None:
+        self._jobs, self._listening = jobs, listening
+        self._stored = _Stored()
+        self._signed: frozenset[str] = frozenset()
+        self._up_s: dict[str, float] = {}
+
+    def gather(self, now_s: float) -> Facts:
+        """Returns what is known. now_s: the present time, wall time, s."""
+        store = self._jobs.store
+        try:
+            self._stored = _asked(store, self._stored)
+        except SQLAlchemyError as error:
+            _report(error)
+        known = Facts(
+            host=store.host,
+            buses=self._buses(now_s),
+            loops=self._loops(),
+            nodes=dict(self._listening.nodes),
+            tests=self._stored.tests,
+            unconfirmed=self._stored.unconfirmed,
+        )
+        candidates = to_be_asked(known)
+        if not candidates:
+            return known
+        try:
+            self._signed = alarms.signed_off(store, candidates)
+        except SQLAlchemyError as error:
+            _report(error)
+        return replace(known, signed=self._signed)
+
+    def _buses(self, now_s: float) -> list[BusFacts]:
+        if not self._listening.begun:
+            return []
+        found = []
+        for url, why in self._listening.buses().items():
+            if url in self._listening.off:
+                continue
+            if why is not None:
+                self._up_s.pop(url, None)
+            up_s = min(now_s, self._up_s.setdefault(url, now_s)) if why is None else now_s
+            found.append(BusFacts(url, why, up_s))
+        return found
+
+    def _loops(self) -> list[LoopFacts]:
+        heard, stored = self._listening.heard, self._stored
+        held = self._held()
+        return [
+            LoopFacts(
+                config=config,
+                heard=heard.get(tag),
+                held=held.get(tag, (None, None))[1],
+                job=held[tag][0] if tag in held else stored.busy.get(tag),
+                gains=self._listening.gains_read(tag),
+                accepted=stored.accepted.get(tag),
+            )
+            for tag, config in self._jobs.directory.loops.items()
+        ]
+
+    def _held(self) -> dict[str, tuple[str, LoopState | None]]:
+        """Returns the jobs that work on loops here, with the state of the loop as far as they have read it."""
+        found: dict[str, tuple[str, LoopState | None]] = {}
+        for job_id in self._jobs.under_test():
+            running = self._jobs.running(job_id)
+            if running is not None and running.loop is not None:
+                found[running.tag] = job_id, running.loop.latest
+        return found
+
+
+def _asked(store: Store, before: _Stored) -> _Stored:
+    """Asks the database. Raises SQLAlchemyError."""
+    with store.reading() as session:
+        audited = audit.latest(session)
+    return _Stored(
+        busy=store.busy(),
+        tests=list(latest_tests(store).values()),
+        unconfirmed=alarms.unconfirmed(store),
+        accepted=before.accepted if audited == before.audited else acceptances(store),
+        audited=audited,
+    )
+
+
+def _report(error: SQLAlchemyError) -> None:
+    if not temporary(error):
+        log.error("the database could not be asked what is abnormal: %s", error)

@@ -1,0 +1,149 @@
+"""Looks once a second at what is abnormal, and takes sign-offs."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+
+from loopwright.service.alarms.alarm import LEVELS, RULES, Alarm, AlarmKind, Level, SignOff
+from loopwright.service.alarms.conditions import conditions
+from loopwright.service.alarms.delays import Delays
+from loopwright.service.alarms.facts import FactSource
+from loopwright.service.errors import Conflict
+from loopwright.service.jobs.manager import Jobs
+from loopwright.service.listening.listening import Listening
+from loopwright.service.store import alarms as stored
+from loopwright.service.store.alarms import NOT_RESTORED, SignedOffAlready
+from loopwright.service.store.clock import now
+from loopwright.service.store.tables import AlarmSignOffRow
+
+log = logging.getLogger(__name__)
+
+LOOK_S = 1.0
+"""Wall time between two looks, s."""
+FRESH_S = 0.25
+"""Age up to which a look is used again, s, so that frequent questions cost no more."""
+_STOP_S = 5.0
+
+
+class NoSuchAlarm(Exception):
+    """No alarm of that id."""
+
+    def __init__(self, alarm_id: str) -> None:
+        super().__init__(
+            f"there is no alarm {alarm_id}: it has gone by itself, or never was; GET /alarms has those there are"
+        )
+
+
+class AlarmWatch:
+    """The alarms of this gateway, and those of tests of every gateway of the database.
+
+    clock: the wall time, s.
+    """
+
+    def __init__(self, jobs: Jobs, listening: Listening, clock: Callable[[], float] = time.time) -> None:
+        self._store = jobs.store
+        self._source = FactSource(jobs, listening)
+        self._clock = clock
+        self._delays = Delays()
+        self._looking = threading.Lock()
+        self._looked = 0.0
+        self.latest: Sequence[Alarm] | None = None
+        """The alarms as they were seen last, the worst first, replaced as a whole; None before the first look."""
+        self.on_change: Callable[[], None] = lambda: None
+        """Called in another thread when `latest` is another list than before."""
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="alarms", daemon=True)
+
+    def start(self) -> None:
+        """Looks from now on by itself, in the background."""
+        self._thread.start()
+
+    def close(self) -> None:
+        self._over.set()
+        if self._thread.is_alive():
+            self._thread.join(_STOP_S)
+
+    def look(self, fresh_s: float = 0.0) -> Sequence[Alarm]:
+        """Looks now, unless the last look is no older than this, s. Returns the alarms, the worst first."""
+        with self._looking:
+            before = self.latest
+            if before is not None and time.monotonic() - self._looked < fresh_s:
+                return before
+            now_s = self._clock()
+            found = tuple(self._delays.step(conditions(self._source.gather(now_s)), now_s))
+            self.latest, self._looked = found, time.monotonic()
+        if found != before:
+            self.on_change()
+        return found
+
+    def counts(self) -> dict[Level, int]:
+        """Returns how many alarms of each level this gateway has, as they were seen last; those of others are left out,
+        so that the sum over all gateways has each once."""
+        found = Counter(alarm.level for alarm in self.latest or () if alarm.host == self._store.host)
+        return {level: found[level] for level in LEVELS}
+
+    def find(self, alarm_id: str) -> Alarm:
+        """Returns an alarm, also one that was signed off. Raises NoSuchAlarm, SQLAlchemyError."""
+        alarm = _of(self.look(FRESH_S), alarm_id)
+        if alarm is not None:
+            return alarm
+        row = stored.find(self._store, alarm_id)
+        if row is None:
+            raise NoSuchAlarm(alarm_id)
+        return _signed(row)
+
+    def sign_off(self, alarm_id: str, by: str) -> Alarm:
+        """Signs an alarm off: a person answers for it, and it ends. Raises NoSuchAlarm, Conflict (it may not be signed
+        off, or was already), SQLAlchemyError."""
+        alarm = _of(self.look(), alarm_id)
+        if alarm is None:
+            row = stored.find(self._store, alarm_id)
+            if row is None:
+                raise NoSuchAlarm(alarm_id)
+            raise Conflict(str(SignedOffAlready(row)))
+        if not alarm.to_sign:
+            raise Conflict(
+                f"an alarm of level {alarm.level} is not signed off: it goes by itself {RULES[alarm.kind].off_s:g} s "
+                f"after its cause has gone. {alarm.subject}: {alarm.text}"
+            )
+        row = AlarmSignOffRow(
+            alarm_id=alarm.id, level=alarm.level, kind=alarm.kind.value, host=alarm.host, loop=alarm.loop,
+            job_id=None if alarm.job is None else alarm.job.rpartition("/")[2],
+            text=alarm.text, since=alarm.since, by=by, at=now(),
+        )  # fmt: skip
+        try:
+            stored.sign_off(self._store, row)
+        except SignedOffAlready as error:
+            raise Conflict(str(error)) from error
+        self.look()
+        return alarm.model_copy(update={"signed_off": SignOff(by=row.by, at=row.at)})
+
+    def _run(self) -> None:
+        while not self._over.is_set():
+            try:
+                self.look(0.5 * LOOK_S)
+            except Exception:  # the next look may see more
+                log.exception("defect while looking for what is abnormal")
+            self._over.wait(LOOK_S)
+
+
+def _of(alarms: Iterable[Alarm], alarm_id: str) -> Alarm | None:
+    return next((alarm for alarm in alarms if alarm.id == alarm_id), None)
+
+
+def _signed(row: AlarmSignOffRow) -> Alarm:
+    loops = [] if row.loop is None else [row.loop]
+    return Alarm(
+        id=row.alarm_id, level=_LEVELS[row.level], kind=AlarmKind(row.kind), subject=row.loop or row.host,
+        text=row.text, advice="Nothing is left to do: it was signed off.", since=row.since, host=row.host,
+        loop=row.loop, loops=loops, job=None if row.job_id is None else f"/jobs/{row.job_id}", to_sign=True,
+        signed_off=SignOff(by=row.by, at=row.at),
+    )  # fmt: skip
+
+
+_LEVELS: dict[int, Level] = {level: level for level in LEVELS}
+assert NOT_RESTORED == AlarmKind.NOT_RESTORED
