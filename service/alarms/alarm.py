@@ -68,9 +68,7 @@ class Alarm(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    id: str = Field(
-        description="The same on every gateway, and as long as the alarm lasts", examples=["0f3ac2d9be11"]
-    )
+    id: str = Field(description="The same on every gateway, and as long as the alarm lasts", examples=["0f3ac2d9be11"])
     level: Level = Field(description="1: look now, and sign off; 2: soon; 3: when there is time")
     kind: AlarmKind
     subject: str = Field(

@@ -120,7 +120,7 @@ class AlarmWatch:
         except SignedOffAlready as error:
             raise Conflict(str(error)) from error
         self.look()
-        return alarm.model_copy(update={"signed_off": SignOff(by=row.by, at=row.at)})
+        return _signed(row)
 
     def _run(self) -> None:
         while not self._over.is_set():

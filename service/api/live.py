@@ -33,8 +33,8 @@ def router(live: Live, directory: LoopDirectory, keyring: Keyring | None, sessio
         responses={
             200: {
                 "content": {"text/event-stream": {}},
-                "description": "Messages: hello, loops, buses, alarms, samples, jobs, job. docs/rest.md has an example of "
-                "each",
+                "description": "Messages: hello, loops, buses, alarms, samples, jobs, job. docs/rest.md has an example "
+                "of each",
             },
             **problems.responses(404, 422),
         },

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from loopwright.service.cli import data, keys, loops, tuning
+from loopwright.service.cli import alarms, data, keys, loops, tuning
 from loopwright.service.cli.client import DEFAULT_URL, ApiError, Client
 from loopwright.service.cli.output import AsJson, Url, die, on_terminal, print_json, read_json_object, shown_on_terminal
 
@@ -22,6 +22,7 @@ app = typer.Typer(
 app.add_typer(keys.app, name="key")
 app.add_typer(data.app)
 app.add_typer(loops.app)
+app.add_typer(alarms.app)
 _HAND_OVER: dict[str, object] = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
 

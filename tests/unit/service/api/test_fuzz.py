@@ -102,6 +102,7 @@ class Site:
         self.keys["wrong"] = self.keys["admin"][:-4] + "AAAA"
         self.jobs = [self.ended(None), self.ended(None), self.ended(Failed(Reason.NODE_LOST, "silent"))]
         self.retunes: list[str] = []
+        self.alarms: list[str] = []
         self.cases = 0
 
     def ended(self, how: Exception | None) -> str:
@@ -127,6 +128,12 @@ class Site:
         if new or not self.retunes:
             self.retunes.append(self.client.post("/retunes", json={"pattern": "*"}).json()["id"])
         return self.retunes[-1]
+
+    def alarm(self) -> str:
+        """An alarm that may be signed off, or where there is none one that was."""
+        for each in self.client.get("/alarms").json()["alarms"]:
+            self.alarms.append(each["id"])
+        return self.alarms[-1]
 
     def send(self, case: Any, **headers: str) -> Any:
         """The case as a request; its answer, checked against the document."""
@@ -169,7 +176,9 @@ def test_what_the_document_allows(label: str, site: Site) -> None:
         site.service.jobs.locking.unlock(TAG, "nobody")  # what an example before may have locked
         if known:  # else nearly every answer would be a 404
             retune = site.retune(label == ABORT_MANY) if "retune_id" in case.path_parameters else ""
-            names = {"tag": TAG, "job_id": site.running() if label == ABORT else site.jobs[pick], "retune_id": retune}
+            alarm = site.alarm() if "alarm_id" in case.path_parameters else ""
+            job = site.running() if label == ABORT else site.jobs[pick]
+            names = {"alarm_id": alarm, "tag": TAG, "job_id": job, "retune_id": retune}
             if label in RETUNES_MANY:
                 case.body.pop("loops", None)
                 case.body["pattern"] = "*"

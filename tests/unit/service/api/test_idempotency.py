@@ -25,7 +25,7 @@ from loopwright.service.store.claims import Claim, StillAnswering
 from loopwright.service.store.idempotency import MAX_BYTES, Answer, IdempotencyKeys, OtherRequest
 from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Store
-from loopwright.tuning.reasons import Reason
+from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.api.test_api import GOLDEN, assert_problem
 from tests.unit.service.fakes import NEW, TAG, Service, held_acceptances
 from tests.unit.service.postgres import Server
@@ -118,10 +118,17 @@ def an_unlock(service: Service, client: TestClient) -> tuple[str, dict[str, Any]
     return f"/loops/{TAG}/unlock", {}
 
 
+def a_sign_off(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]:
+    service.tune.ends = Failed(Reason.NODE_LOST, "silent")
+    service.wait(service.jobs.start(TAG, FastRetune()).id)
+    (alarm,) = client.get("/alarms").json()["alarms"]
+    return f"/alarms/{alarm['id']}/sign-off", {"by": "me"}
+
+
 Asked = Callable[[Service, TestClient], tuple[str, dict[str, Any]]]
 EVERY: list[Asked] = [
     a_retune, a_dry_run, a_retune_of_many, an_acceptance, a_rollback, an_abort, an_abort_of_many, a_tuning, a_dismissal,
-    a_lock, an_unlock,
+    a_lock, an_unlock, a_sign_off,
 ]  # fmt: skip
 
 

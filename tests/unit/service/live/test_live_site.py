@@ -49,15 +49,21 @@ def test_samples_come_once_and_what_stops_is_no_longer_shown(site: Site) -> None
         tuner.close()
         assert viewer.until("samples", lambda new: new["sp"][-1] == 50.5)
 
+        viewer.becomes("alarms", lambda message: message.get("alarms") == [])
         site.plant.stop()
         row = viewer.row(TAG, lambda row: row["pv"] is None)
         assert row["sp"] is row["mv"] is row["mode"] is None and row["age_s"] > 3.0
         assert row["not_heard"].startswith("no data for ")
+        viewer.becomes("alarms", lambda message: [each["kind"] for each in message.get("alarms", [])] == ["node_lost"])
+        (alarm,) = site.http.get("/alarms").json()["alarms"]
+        assert (alarm["level"], alarm["subject"], alarm["loops"]) == (2, f"node 10h on {site.bus}", [TAG])
+        assert site.metric('loopwright_alarms{level="2"}') == 1.0
 
         site.hub.stop()
         down = viewer.until("buses", lambda message: message["buses"][0]["up"] is False)
         assert down["buses"][0]["why"]
         row = viewer.row(TAG, lambda row: site.bus in row["not_heard"])
         assert row["pv"] is None
+        viewer.becomes("alarms", lambda message: [each["kind"] for each in message.get("alarms", [])] == ["bus_down"])
         assert site.service.stop() == 0
         viewer.rest()

@@ -13,6 +13,7 @@ import pytest
 from sqlalchemy import event as database_event
 from sqlalchemy.exc import OperationalError
 
+from loopwright.service.alarms.watch import AlarmWatch
 from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.inputs.request import FastRetune
@@ -24,6 +25,7 @@ from loopwright.service.live.live import Live
 from loopwright.service.live.rows import loop_row
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.keyring import Keyring
+from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.fakes import TAG, Service
 from tests.unit.service.live_viewer import LiveViewer, viewing
 from tests.unit.service.processes import until
@@ -33,8 +35,8 @@ from tests.unit.service.served import served
 class Screens:
     """A service behind a real server, and its live stream."""
 
-    def __init__(self, service: Service, live: Live, listening: Listening, port: int) -> None:
-        self.service, self.live, self.listening = service, live, listening
+    def __init__(self, service: Service, live: Live, listening: Listening, alarms: AlarmWatch, port: int) -> None:
+        self.service, self.live, self.listening, self.alarms = service, live, listening, alarms
         self.base = f"http://127.0.0.1:{port}"
 
     def viewers(self) -> int:
@@ -44,10 +46,11 @@ class Screens:
 @contextmanager
 def screens_of(service: Service, policy: Policy | None = None) -> Iterator[Screens]:
     listening = Listening(service.jobs.directory.loops, service.store, on=False)
-    live = Live(service.jobs, listening)
-    with served(create_app(service.jobs, policy, listening=listening, live=live)) as door:
+    alarms = AlarmWatch(service.jobs, listening)
+    live = Live(service.jobs, listening, alarms)
+    with served(create_app(service.jobs, policy, listening=listening, live=live, alarms=alarms)) as door:
         try:
-            yield Screens(service, live, listening, door.port)
+            yield Screens(service, live, listening, alarms, door.port)
         finally:
             live.close()
 
@@ -110,6 +113,23 @@ def test_every_viewer_sees_a_test_from_its_first_event_to_its_decision(screens: 
         later.until("loops")
         later.until("loops")
         assert not later.ids, "what was over before is not told"
+
+
+def test_alarms_come_first_and_on_every_change_as_a_whole(screens: Screens) -> None:
+    service = screens.service
+    with viewing(screens.base) as viewer:
+        viewer.becomes("alarms", lambda message: message.get("alarms") == [])
+        service.tune.ends = Failed(Reason.NODE_LOST, "silent")
+        service.wait(service.jobs.start(TAG, FastRetune()).id)
+        (alarm,) = viewer.until("alarms")["alarms"]
+        assert (alarm["level"], alarm["loop"], alarm["text"]) == (3, TAG, "The last test failed: node lost")
+        with viewing(screens.base) as later:
+            later.becomes("alarms", lambda message: message.get("alarms") == [alarm])
+            screens.alarms.sign_off(alarm["id"], "A. Lind")
+            for each in (viewer, later):
+                each.becomes("alarms", lambda message: message.get("alarms") == [])
+        seen = [message for name, message in viewer.messages if name == "alarms"]
+        assert seen == [{"alarms": []}, {"alarms": [alarm]}, {"alarms": []}]
 
 
 def test_many_viewers_ask_the_database_as_often_as_one(screens: Screens) -> None:
