@@ -1,51 +1,34 @@
 // @ts-check
-/** What is abnormal, as far as this page sees it. Pure, but for the times at which each began. */
-import { duration, fixed, pvDecimals, unit } from "./numbers.js";
-
-/** @typedef {{key: string, level: 1 | 2 | 3, loop: string | null, words: string, since_s: number}} Alarm */
-
-const DELAY_S = { 1: 0, 2: 3, 3: 0 };
-/** @type {Map<string, {since_s: number, left_s: number | null}>} */
-const began = new Map();
+/** What is abnormal: what the service says, and that it says nothing, which this browser alone can know. */
+import { computed } from "../vendor/signals-core.js";
+import { alarms, isSilent, now_s, silent_s } from "./state.js";
 
 /**
- * @param {Iterable<any>} loops as GET /loops has them
- * @param {(tag: string) => any} rowOf
- * @param {{bus: string, up: boolean | null, why: string | null}[]} buses
- * @param {number} now_s
- * @returns {Alarm[]} worst first
+ * As GET /alarms has them.
+ * @typedef {{id: string, level: 1 | 2 | 3, subject: string, text: string, advice: string, since: string, loop: string | null,
+ *   loops: string[], job: string | null, to_sign: boolean}} Alarm
  */
-export function abnormal(loops, rowOf, buses, now_s) {
-  /** @type {Map<string, Omit<Alarm, "since_s">>} */
+
+const silence = computed(() => {
+  if (!isSilent.value) return null;
+  return /** @type {Alarm} */ ({
+    id: "silent", level: 2, subject: "this browser", text: "No word from the service",
+    advice: "What is shown is old. The page asks again by itself.",
+    since: new Date(1000 * (now_s.peek() - silent_s.peek())).toISOString(), loop: null, loops: [], job: null, to_sign: false,
+  });
+});
+
+/** The worst first; null: the service has not said yet. */
+export const abnormalNow = computed(() => {
+  const said = /** @type {Alarm[] | null} */ (alarms.value);
+  if (silence.value) return [silence.value, ...(said ?? [])];
+  return said;
+});
+
+/** The worst alarm of each loop, by tag. */
+export const worstOf = computed(() => {
+  /** @type {Map<string, Alarm>} */
   const found = new Map();
-  /** @param {1|2|3} level @param {string | null} loop @param {string} what @param {string} words */
-  const add = (level, loop, what, words) => found.set(`${loop ?? ""}/${what}`, { key: `${loop ?? ""}/${what}`, level, loop, words });
-  const down = new Set(buses.filter((each) => each.up === false).map((each) => each.bus));
-  for (const each of buses) if (each.up === false) add(2, null, `bus ${each.bus}`, `Bus ${each.bus} is down${each.why ? `: ${each.why}` : ""}`);
-  for (const loop of loops) {
-    const row = rowOf(loop.tag);
-    if (loop.last_job?.reason === "restore_unconfirmed") add(1, loop.tag, "restore", "Not confirmed that the loop is as before the test: look at the controller now");
-    if (["failed", "interrupted"].includes(loop.last_job?.state)) add(3, loop.tag, "test", `The last test ${loop.last_job.state === "failed" ? "failed" : "was interrupted"}`);
-    if (loop.gains_differ) add(3, loop.tag, "gains", "Gains differ from those accepted last");
-    if (!row) continue;
-    if (down.has(loop.bus)) add(2, loop.tag, "bus", "Bus down");
-    else if (row.not_heard && row.age_s !== null) add(2, loop.tag, "data", `No data for ${duration(row.age_s)}`);
-    const decimals = pvDecimals(loop.pv_limits);
-    if (row.pv !== null && row.pv < loop.pv_limits.low) add(2, loop.tag, "pv", `PV below ${fixed(loop.pv_limits.low, Math.min(2, decimals))} ${unit(loop.pv_unit)}`);
-    if (row.pv !== null && row.pv > loop.pv_limits.high) add(2, loop.tag, "pv", `PV above ${fixed(loop.pv_limits.high, Math.min(2, decimals))} ${unit(loop.pv_unit)}`);
-    if ((row.on_trial || row.under_test) && !row.job) add(2, loop.tag, "trial", row.on_trial ? "Gains on trial that no job here has begun" : "A test that no job here has begun");
-  }
-  for (const [key, each] of began) {
-    if (found.has(key)) each.left_s = null;
-    else if (each.left_s === null) each.left_s = now_s;
-    else if (now_s - each.left_s > 3) began.delete(key);
-  }
-  /** @type {Alarm[]} */
-  const shown = [];
-  for (const [key, each] of found) {
-    const seen = began.get(key) ?? { since_s: now_s, left_s: null };
-    began.set(key, seen);
-    if (now_s - seen.since_s >= (key.endsWith("/trial") ? 5 : DELAY_S[each.level])) shown.push({ ...each, since_s: seen.since_s });
-  }
-  return shown.sort((a, b) => a.level - b.level || (a.loop ?? "").localeCompare(b.loop ?? ""));
-}
+  for (const each of abnormalNow.value ?? []) for (const tag of each.loops) if (!found.has(tag)) found.set(tag, each);
+  return found;
+});

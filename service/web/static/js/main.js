@@ -20,7 +20,6 @@ import { LoopView } from "./views/loop.js";
 import { LoopsView } from "./views/loops.js";
 import { RetunesView } from "./views/retunes.js";
 import { SignIn } from "./views/signin.js";
-import { beginWatching } from "./watching.js";
 
 function View() {
   const at = path.value;
@@ -67,7 +66,6 @@ addEventListener("keydown", (event) => {
 function begin() {
   beginPalette();
   beginRouting();
-  beginWatching();
   render(html`<${Page} />`, /** @type {Element} */ (document.getElementById("page")));
   let begun = false;
   effect(() => {

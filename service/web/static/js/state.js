@@ -16,8 +16,6 @@ export const loopsError = signal(/** @type {Error | null} */ (null));
 
 /** Rows of the live stream, by tag: one signal each, so that a row is drawn for itself. @type {Map<string, any>} */
 const rows = new Map();
-/** Counts each snapshot. */
-export const beat = signal(0);
 /** @param {string} tag @returns {import("../vendor/signals-core.js").Signal<any>} the live row of a loop; null: none has come. */
 export function rowOf(tag) {
   let found = rows.get(tag);
@@ -28,14 +26,13 @@ export function rowOf(tag) {
 export function takeRows(found) {
   batch(() => {
     for (const row of found) rowOf(row.tag).value = row;
-    beat.value++;
   });
 }
 
 export const buses = signal(/** @type {{bus: string, up: boolean | null, why: string | null}[]} */ ([]));
 /** Live jobs. */
 export const jobs = signal(/** @type {any[]} */ ([]));
-/** Alarms as the service says; null: it does not say any, the page derives them from what it sees. */
+/** What is abnormal, as the service says, the worst first; null: it has not said yet. */
 export const alarms = signal(/** @type {any[] | null} */ (null));
 
 /** The present, wall time of the service, s, renewed each second. */

@@ -1,16 +1,17 @@
 // @ts-check
 /** What is abnormal, and nothing else. Meant to stay open. */
 import { useEffect } from "../../vendor/hooks.js";
+import { abnormalNow } from "../alarms.js";
 import { html } from "../html.js";
 import { duration, when } from "../numbers.js";
-import { loopPath } from "../router.js";
-import { loops, now_s } from "../state.js";
+import { jobPath, loopPath } from "../router.js";
+import { isSilent, loops, now_s } from "../state.js";
 import { AlarmSymbol } from "../symbols.js";
-import { abnormalNow } from "../watching.js";
+import { asking, SignOffButton, SignOffQuestion } from "./signoff.js";
 
 export function AbnormalView() {
   const all = abnormalNow.value;
-  document.title = `${all.length ? `(${all.length}) ` : ""}Abnormal · Loopwright`;
+  document.title = all?.length ? `(${all.length}) Loopwright` : "Loopwright";
   useEffect(() => {
     /** @type {any} */
     let lock = null;
@@ -28,12 +29,26 @@ export function AbnormalView() {
       lock?.release();
     };
   }, []);
-  if (!loops.value) return html`<p class="calm" role="status">Asking for the loops…</p>`;
-  if (!all.length) return html`<p class="calm">Nothing is abnormal.</p>`;
-  return html`<div><div class="pagehead" key="head"><h1>Abnormal</h1></div><div class="table" key="table"><table><thead><tr><th>Level</th><th>Loop</th><th>What</th><th>Since</th><th>Description</th><th>Area</th></tr></thead>
-    <tbody>${all.map((each) => {
+  if (!all) return html`<p class="calm" role="status">Asking what is abnormal…</p>`;
+  if (!all.length) return html`<p class="calm" role="status">Nothing is abnormal.</p>`;
+  return html`<div><div class="pagehead" key="head"><h1>Abnormal</h1></div><div class="table alarms" key="table"><table><thead><tr><th>Level</th><th>Of</th><th>What</th><th>Since</th><th class="c-description">Description</th><th class="c-area">Area</th><th><span class="hidden-words">Sign off</span></th></tr></thead>
+    <tbody>${all.flatMap((each) => {
       const loop = each.loop ? loops.value?.get(each.loop) : null;
-      return html`<tr key=${each.key}><td>${AlarmSymbol(each.level)}</td><td>${each.loop ? html`<a class="tag" href=${loopPath(each.loop)}>${each.loop}</a>` : ""}</td><td><b>${each.words}</b></td>
-        <td title=${when(new Date(each.since_s * 1000).toISOString())}>${duration(Math.max(0, now_s.value - each.since_s))}</td><td>${loop?.description}</td><td>${loop?.area}</td></tr>`;
+      const old = isSilent.value && each.id !== "silent";
+      const row = html`<tr key=${each.id} class=${old ? "old" : ""}><td>${AlarmSymbol(each.level)}</td><td>${Subject(each)}</td>
+        <td class="what"><b>${each.text}</b>${each.job && html`<a key="job" href=${jobPath(each.job)}>the test</a>`}<small key="advice">${each.advice}</small></td>
+        <td class="since" title=${when(each.since)}>${old ? when(each.since) : duration(Math.max(0, now_s.value - Date.parse(each.since) / 1000))}</td>
+        <td class="c-description">${loop?.description}</td><td class="c-area">${loop?.area}</td><td class="do">${SignOffButton(each)}</td></tr>`;
+      return asking.value === each.id ? [row, html`<tr key=${`sign ${each.id}`} class="question"><td colspan="7"><${SignOffQuestion} alarm=${each} /></td></tr>`] : [row];
     })}</tbody></table></div></div>`;
 }
+
+/** A loop; or a bus or a node, with the loops that it concerns. @param {import("../alarms.js").Alarm} alarm */
+function Subject(alarm) {
+  if (alarm.loop) return html`<a class="tag" href=${loopPath(alarm.loop)}>${alarm.loop}</a>`;
+  const shown = alarm.loops.slice(0, MOST);
+  const more = alarm.loops.length - shown.length;
+  return html`<span key="of">${alarm.subject}</span>${shown.length > 0 && html`<small key="loops">${shown.map((tag, n) => html`${n ? ", " : ""}<a class="tag" href=${loopPath(tag)}>${tag}</a>`)}${more > 0 ? ` and ${more} more` : ""}</small>`}`;
+}
+
+const MOST = 6;

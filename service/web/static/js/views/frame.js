@@ -2,6 +2,7 @@
 /** What stands on every view: the bar, the banner, the dock with Abort. */
 import { signal } from "../../vendor/signals-core.js";
 import { abortJob, aborting, abortError } from "../aborting.js";
+import { abnormalNow } from "../alarms.js";
 import { command, signedOut } from "../api.js";
 import { html } from "../html.js";
 import { duration } from "../numbers.js";
@@ -10,14 +11,14 @@ import { loopPath, path } from "../router.js";
 import { isSilent, jobs, may, newerVersion, service, session, silent_s } from "../state.js";
 import { AlarmSymbol } from "../symbols.js";
 import { stageName } from "../words.js";
-import { abnormalNow } from "../watching.js";
 
 const PLACES = [["/ui/", "Loops"], ["/ui/jobs", "Jobs"], ["/ui/retunes", "Retunes"]];
 
 export function Bar() {
   const at = path.value;
   const inside = (/** @type {string} */ to) => (to === "/ui/" ? at === "/ui/" || at.startsWith("/ui/loops") : at.startsWith(to));
-  const levels = /** @type {const} */ ([1, 2, 3]).map((level) => [level, abnormalNow.value.filter((each) => each.level === level).length]);
+  const all = abnormalNow.value;
+  const levels = /** @type {const} */ ([1, 2, 3]).map((level) => [level, (all ?? []).filter((each) => each.level === level).length]);
   const some = levels.filter(([, count]) => count);
   return html`<header class="bar">
     <a class="mark" href="/ui/" aria-label="Loopwright, to the loops"><svg viewBox="0 0 32 18" aria-hidden="true"><path d="M1 15h7c4 0 4-12 9-12 3 0 3 5 6 5h8" /></svg><span>Loopwright</span></a>
@@ -26,8 +27,8 @@ export function Bar() {
       ${may.admin.value && html`<a key="log" href="/ui/log" aria-current=${inside("/ui/log") ? "page" : undefined}>Log</a>`}
     </nav>
     <div class="right">
-      <a href="/ui/alarms" aria-label=${some.length ? `${abnormalNow.value.length} abnormal` : "Nothing abnormal"}>
-        ${some.length ? some.map(([level, count]) => html`<span key=${level} class="count">${AlarmSymbol(/** @type {1|2|3} */ (level))} ${count}</span>`) : html`<span class="calmness">Nothing abnormal</span>`}
+      <a href="/ui/alarms" aria-label=${!all ? "What is abnormal" : some.length ? `${all.length} abnormal` : "Nothing abnormal"}>
+        ${some.length ? some.map(([level, count]) => html`<span key=${level} class="count">${AlarmSymbol(/** @type {1|2|3} */ (level))} ${count}</span>`) : html`<span class="calmness">${all ? "Nothing abnormal" : "…"}</span>`}
       </a>
       <span class="who">${service.value?.host} ${session.value && html`<b>${session.value.name}</b> ${session.value.scope}`}</span>
       <button class="plain" onClick=${cyclePalette} aria-label=${`Colours: ${palette.value}`}>◑ <span class="who">${palette.value}</span></button>

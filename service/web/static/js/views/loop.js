@@ -1,19 +1,20 @@
 // @ts-check
 /** One loop: its face, trend, gains, limits, what is known of its plant, its tests; the test under way; the latest result. */
 import { useEffect, useState } from "../../vendor/hooks.js";
+import { abnormalNow } from "../alarms.js";
 import { ask, askPage } from "../api.js";
 import { html } from "../html.js";
 import { known, ms, period, pvDecimals, fixed, significant, unit, when } from "../numbers.js";
 import { jobPath } from "../router.js";
 import { isSilent, jobs, loops, loopsError, may, rowOf } from "../state.js";
 import { AlarmSymbol } from "../symbols.js";
-import { abnormalNow } from "../watching.js";
 import { stateWords } from "../words.js";
 import { Face } from "./face.js";
 import { dockLoop } from "./frame.js";
 import { Known } from "./known.js";
 import { Result } from "./result.js";
 import { RetuneForm } from "./retune.js";
+import { asking, SignOffButton, SignOffQuestion } from "./signoff.js";
 import { Trend } from "./trend.js";
 import { UnderTest } from "./undertest.js";
 
@@ -79,7 +80,7 @@ export function LoopView({ tag }) {
     }, () => {});
   };
   const formOpen = !job && (open ?? (!result && may.operate.value));
-  const mine = abnormalNow.value.filter((each) => each.loop === tag);
+  const mine = (abnormalNow.value ?? []).filter((each) => each.loops.includes(tag));
   const height = TREND_PX;
   return html`<div>
     <div class="looptitle" key="title"><h1 class="tag">${tag}</h1><span class="what">${loop.description}</span>
@@ -87,7 +88,8 @@ export function LoopView({ tag }) {
       ${!job && !formOpen && may.operate.value && html`<button key="retune" onClick=${() => setOpen(true)}>Retune…</button>`}
       ${!may.operate.value && html`<span key="may" class="quiet">Your key may read. To retune it needs the scope operate.</span>`}
     </div>
-    ${mine.map((each) => html`<p class="abnormal" key=${each.key}>${AlarmSymbol(each.level)} <b>${each.words}</b></p>`)}
+    ${mine.map((each) => html`<div class="abnormal" key=${each.id}>${AlarmSymbol(each.level)}<span><b>${each.text}.</b> <span class="quiet">${each.advice}</span></span>${SignOffButton(each)}
+      ${asking.value === each.id && html`<${SignOffQuestion} key="question" alarm=${each} />`}</div>`)}
     ${detail?.not_confirmed_home && html`<p class="refusal" key="home"><b>${detail.not_confirmed_home.detail}</b> ${detail.not_confirmed_home.advice}</p>`}
     ${loop.locked && html`<p class="refusal" key="lock">Locked by ${loop.locked.by} since ${when(loop.locked.since)}: ${loop.locked.reason}. Tests and decisions wait until it is unlocked.</p>`}
     <div class="loop" key="loop">

@@ -2,13 +2,13 @@
 /** All loops: PV between its limits, what is under test, what waits for a decision, what is abnormal. */
 import { computed, signal } from "../../vendor/signals-core.js";
 import { useEffect } from "../../vendor/hooks.js";
+import { worstOf } from "../alarms.js";
 import { ask } from "../api.js";
 import { html } from "../html.js";
 import { ago, duration, fixed, known, ms, pvDecimals, unit } from "../numbers.js";
 import { go, loopPath } from "../router.js";
 import { buses, isSilent, jobs, loops, loopsError, now_s, rowOf } from "../state.js";
 import { AlarmSymbol, DecisionSign, TestSign } from "../symbols.js";
-import { abnormalNow } from "../watching.js";
 import { modeWord, reasonWords, stageName } from "../words.js";
 import { Progress } from "./frame.js";
 
@@ -23,16 +23,11 @@ const sparks = signal(/** @type {Map<string, any>} */ (new Map()));
 const SPARK_S = 300;
 
 const jobByLoop = computed(() => new Map(jobs.value.filter((each) => !each.dry_run).map((each) => [each.loop, each])));
-const alarmByLoop = computed(() => {
-  const worst = new Map();
-  for (const each of abnormalNow.value) if (each.loop && !worst.has(each.loop)) worst.set(each.loop, each);
-  return worst;
-});
 
 /** @param {any} loop */
 const waits = (loop) => loop.last_job?.state === "proposed" && !jobByLoop.value.has(loop.tag);
 /** @param {any} loop */
-const needsLook = (loop) => jobByLoop.value.has(loop.tag) || waits(loop) || alarmByLoop.value.has(loop.tag);
+const needsLook = (loop) => jobByLoop.value.has(loop.tag) || waits(loop) || worstOf.value.has(loop.tag);
 
 const listed = computed(() => {
   const text = find.value.trim().toLowerCase();
@@ -98,7 +93,7 @@ function Sentence() {
     [all.length, all.length === 1 ? "loop" : "loops"],
     [jobByLoop.value.size, "under test"],
     [all.filter(waits).length, all.filter(waits).length === 1 ? "waits for a decision" : "wait for a decision"],
-    [alarmByLoop.value.size, "abnormal"],
+    [worstOf.value.size, "abnormal"],
   ].filter(([count], n) => n === 0 || count);
   return html`<span class="sentence">${parts.map(([count, words], n) => html`${n ? " · " : ""}<b>${count}</b> ${words}`)}</span>`;
 }
@@ -112,12 +107,12 @@ function Row({ loop }) {
   const mv = silent ? null : (row?.mv ?? null);
   const mode = silent ? null : (row?.mode ?? null);
   const decimals = pvDecimals(loop.pv_limits);
-  const alarm = alarmByLoop.value.get(loop.tag);
+  const alarm = worstOf.value.get(loop.tag);
   const job = jobByLoop.value.get(loop.tag);
   const outside = pv !== null && (pv < loop.pv_limits.low || pv > loop.pv_limits.high);
   return html`<tr class=${`row ${atRow.value === loop.tag ? "at" : ""}`} data-tag=${loop.tag} onClick=${(/** @type {MouseEvent} */ e) => { if (!(/** @type {Element} */ (e.target).closest("a"))) go(loopPath(loop.tag)); }}>
     <td class="sign">${alarm ? AlarmSymbol(alarm.level) : job ? TestSign() : waits(loop) ? DecisionSign() : null}</td>
-    <td class="name"><a class="tag" href=${loopPath(loop.tag)}>${loop.tag}</a><small>${alarm ? html`<b>${alarm.words}</b>` : loop.description}</small></td>
+    <td class="name"><a class="tag" href=${loopPath(loop.tag)}>${loop.tag}</a><small>${alarm ? html`<b>${alarm.text}</b>` : loop.description}</small></td>
     <td class="num"><span class=${`pvnum ${outside ? "outside" : ""}`}>${fixed(pv, decimals)}</span></td>
     <td class="unit">${unit(loop.pv_unit)}</td>
     <td class="c-limits">${PvBar(loop, pv, sp)}</td>

@@ -1,0 +1,52 @@
+// @ts-check
+/** Signing an alarm off: a person answers for it, under a name. */
+import { signal } from "../../vendor/signals-core.js";
+import { useEffect, useRef, useState } from "../../vendor/hooks.js";
+import { command } from "../api.js";
+import { html } from "../html.js";
+import { isSilent, may, sign, signature } from "../state.js";
+
+/** Id of the alarm whose question is open: one at a time. */
+export const asking = signal("");
+
+/** @param {import("../alarms.js").Alarm} alarm @returns what opens the question; null where the key or the alarm does not permit it. */
+export function SignOffButton(alarm) {
+  if (!alarm.to_sign || !may.operate.value || asking.value === alarm.id) return null;
+  return html`<button key="sign" class="signoff" disabled=${isSilent.value} aria-label=${`Sign off: ${alarm.subject}, ${alarm.text}`} onClick=${() => (asking.value = alarm.id)}>Sign off…</button>`;
+}
+
+/** @param {{alarm: import("../alarms.js").Alarm}} props */
+export function SignOffQuestion({ alarm }) {
+  const field = useRef(/** @type {HTMLInputElement | null} */ (null));
+  const [sending, setSending] = useState(false);
+  const [problem, setProblem] = useState("");
+  useEffect(() => {
+    field.current?.focus();
+    return () => {
+      if (asking.peek() === alarm.id) asking.value = "";
+    };
+  }, []);
+  const close = () => (asking.value = "");
+  const dead = sending || isSilent.value || !signature.value.trim();
+  const send = async () => {
+    if (dead) return;
+    setSending(true);
+    setProblem("");
+    try {
+      await command(`/alarms/${encodeURIComponent(alarm.id)}/sign-off`, { by: signature.value.trim() });
+      close(); // the stream takes it off the list
+    } catch (error) {
+      setProblem(/** @type {Error} */ (error).message);
+    }
+    setSending(false);
+  };
+  const keys = (/** @type {KeyboardEvent} */ e) => {
+    if (e.key === "Enter") void send();
+    if (e.key === "Escape") close();
+  };
+  return html`<div class="signoff" role="group" aria-label=${`Sign off: ${alarm.subject}, ${alarm.text}`}>
+    <span class="say">I have looked at <b>${alarm.subject}</b> and answer for it.</span>
+    <label key="by">Signed <input ref=${field} type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${keys} /></label>
+    <button key="cancel" onClick=${close}>Cancel</button><button key="go" class="main" disabled=${dead} onClick=${send}>Sign off</button>
+    ${problem && html`<p key="problem" class="refusal" role="alert">${problem}</p>`}</div>`;
+}
