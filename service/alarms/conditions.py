@@ -26,6 +26,11 @@ from loopwright.tuning.reasons import ADVICE, Reason
 _NEVER_HEARD_OF_T95 = 0.2
 """A loop that can be tuned is sampled at least fifty times a period: three samples take less than this part of T95."""
 _NO_ANSWER = (JobState.FAILED, JobState.INTERRUPTED)
+_BUS_ADVICE = (
+    "Check the interface and the cable. The bus is opened again every 2 s; controllers whose tests ran on it bring "
+    "their loops home by themselves."
+)
+_EAR_ADVICE = "It is started again by itself. Tests go on; what the loops do is not seen until then."
 _SEE_THE_JOB = "See the job."
 _UNTIL_SIGNED = "It stays until somebody signs it off."
 
@@ -155,12 +160,12 @@ def _buses(known: Facts) -> Iterator[Condition]:
     for bus in known.buses:
         if bus.why is None:
             continue
+        text, advice = f"Bus {bus.url} is down: {bus.why}", _BUS_ADVICE
+        if bus.why.startswith("the listening process"):
+            text, advice = f"Bus {bus.url} is not heard: {bus.why}", _EAR_ADVICE
         yield Condition(
-            alarm_id(AlarmKind.BUS_DOWN, known.host, bus.url), AlarmKind.BUS_DOWN, bus.url,
-            f"Bus {bus.url} is down: {bus.why}",
-            "Check the interface and the cable. The bus is opened again every 2 s; controllers whose tests ran on it "
-            "bring their loops home by themselves.",
-            known.host, loops=_tags(loop.config for loop in known.loops if loop.config.bus == bus.url),
+            alarm_id(AlarmKind.BUS_DOWN, known.host, bus.url), AlarmKind.BUS_DOWN, bus.url, text, advice, known.host,
+            loops=_tags(loop.config for loop in known.loops if loop.config.bus == bus.url),
         )  # fmt: skip
 
 
@@ -217,7 +222,7 @@ def _no_data(host: str, loop: LoopFacts, up_s: float) -> Iterator[Condition]:
     advice = "Check power and cable of controller and plant I/O, and that both nodes are operational."
     if heard is None:
         patience_s = max(3.0, _NEVER_HEARD_OF_T95 * config.t95_s)
-        text = "No data: no sample has come since the bus is heard"
+        text = "No data since the bus is heard"
         yield _condition(AlarmKind.NO_DATA, host, config, text, advice, since_s=up_s, from_s=up_s, on_s=patience_s)
     elif heard.silent:
         from_s = max(heard.at_s, up_s)

@@ -102,7 +102,7 @@ class Listening:
         self._to_read: Collection[str] = ()
         self._over = threading.Event()
         self._reader = threading.Thread(target=self._read_loops, name="listening: readings", daemon=True)
-        self._started = False
+        self._started = self._begun = False
 
     def start(self) -> None:
         """Starts to listen, in the background."""
@@ -117,8 +117,8 @@ class Listening:
 
     @property
     def begun(self) -> bool:
-        """Returns whether any bus is listened to by now."""
-        return self._started
+        """Returns whether the process that listens has reported by now: before that no bus is known to be heard."""
+        return self._begun
 
     def close(self) -> None:
         self._over.set()
@@ -221,6 +221,7 @@ class Listening:
         for url, frames in report.frames.items():
             FRAMES_HEARD.labels(url).inc(frames)
             LISTENING_UP.labels(url).set(0 if url in report.down else 1)
+        self._begun = True
         self._to_read = report.to_read
         self._writer.put(
             HistoryBlock(block.tag, block.after_s, block.first_s, block.last_s, block.count, block.data)

@@ -18,7 +18,7 @@ from loopwright.tuning.reasons import Reason
 
 NOT_RESTORED = "not_restored"
 """The kind of the alarm that a loop is not confirmed to be as before a test."""
-NOT_RESTORED_TEXT = "It was not confirmed after the test that the loop is as before it"
+NOT_RESTORED_TEXT = "Not confirmed that the loop is as before the test"
 
 
 class SignedOffAlready(Exception):

@@ -80,7 +80,7 @@ def test_a_loop_that_was_not_confirmed_to_be_as_before_is_an_alarm_at_once_and_u
     known = facts(unconfirmed=(unconfirmed(),), tests=(job(JobState.FAILED, Reason.RESTORE_UNCONFIRMED),))
     ((alarm,), (later,)) = steps(known, 0.0, 1e6)
     assert (alarm.level, alarm.kind, alarm.subject, alarm.loops) == (1, AlarmKind.NOT_RESTORED, "A", ["A"])
-    assert alarm.text == "It was not confirmed after the test that the loop is as before it"
+    assert alarm.text == "Not confirmed that the loop is as before the test"
     assert "Look at the controller now" in alarm.advice and "until somebody signs it off" in alarm.advice
     assert (alarm.since, alarm.host, alarm.job, alarm.to_sign) == (AT, "gw-2", "/jobs/4f0c2a9be113", True)
     assert later == alarm, "it is the only alarm of that test"
@@ -108,6 +108,12 @@ def test_a_bus_that_is_down_is_one_alarm_which_names_its_loops() -> None:
     assert (alarm.level, alarm.kind, alarm.subject, alarm.loop) == (2, AlarmKind.BUS_DOWN, BUS, None)
     assert alarm.text == f"Bus {BUS} is down: no such interface" and alarm.loops == ["A", "B"]
     assert (alarm.since, alarm.to_sign) == (AT, False)
+
+
+def test_a_bus_that_only_the_listening_process_has_lost_says_so() -> None:
+    known = facts(buses=(BusFacts(BUS, "the listening process has died", T0),))
+    (found,) = conditions(known)
+    assert found.text == f"Bus {BUS} is not heard: the listening process has died" and "Tests go on" in found.advice
 
 
 def test_a_node_that_is_lost_is_one_alarm_which_names_its_loops() -> None:
@@ -153,7 +159,7 @@ def test_a_loop_without_data_counts_from_its_last_sample() -> None:
 def test_a_loop_of_which_no_sample_ever_came(t95_s: float, after_s: float) -> None:
     known = facts(LoopFacts(config(t95_s=t95_s)), buses=(BusFacts(BUS, None, T0),))
     none, (alarm,) = steps(known, after_s - 0.1, after_s)
-    assert not none and alarm.text == "No data: no sample has come since the bus is heard"
+    assert not none and alarm.text == "No data since the bus is heard"
 
 
 @pytest.mark.parametrize(

@@ -53,12 +53,13 @@ class OpenEar(Listening):
     def __init__(self, service: Service) -> None:
         super().__init__(service.jobs.directory.loops, service.store, on=False)
         self.off = {}
+        self.reported = True
         self.why: str | None = None
         self.hear()
 
     @property
     def begun(self) -> bool:
-        return True
+        return self.reported
 
     def hear(self, **changes: Any) -> None:
         usual = Heard(T0, False, 50.0, 40.0, 50.0, 2, False, False)
@@ -149,6 +150,13 @@ def test_a_bus_that_is_back_gives_its_loops_time(watched: Watched) -> None:
     watched.ear.why = None
     watched.ear.hear(silent=True)
     assert watched.after(1.0) == [] and watched.after(3.0) == [(2, "No data")]
+
+
+def test_before_the_listening_process_has_reported_nothing_is_known(watched: Watched) -> None:
+    watched.ear.heard, watched.ear.reported = {}, False
+    assert watched.after(0.0) == watched.after(60.0) == []
+    watched.ear.reported = True
+    assert watched.after(1.0) == watched.after(2.9) == [] and len(watched.after(0.2)) == 2
 
 
 def test_what_is_not_listened_to_is_no_alarm(service: Service) -> None:
@@ -397,7 +405,7 @@ def test_on_the_command_line(service: Service, client: TestClient, monkeypatch: 
     left(service)
     alarm = the_alarm(client)
     shown = said()
-    assert alarm["id"] in shown and TAG in shown and "not confirmed" in " ".join(shown.split())
+    assert alarm["id"] in shown and TAG in shown and "Not confirmed" in " ".join(shown.split())
     assert f'"id": "{alarm["id"]}"' in said("--json")
     assert said("--sign-off", alarm["id"], "--by", "A. Lind").startswith(f"{TAG}: signed off by A. Lind at ")
     assert said() == "Nothing is abnormal.\n"

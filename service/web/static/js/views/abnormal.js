@@ -31,12 +31,12 @@ export function AbnormalView() {
   }, []);
   if (!all) return html`<p class="calm" role="status">Asking what is abnormal…</p>`;
   if (!all.length) return html`<p class="calm" role="status">Nothing is abnormal.</p>`;
-  return html`<div><div class="pagehead" key="head"><h1>Abnormal</h1></div><div class="table alarms" key="table"><table><thead><tr><th>Level</th><th>Of</th><th>What</th><th>Since</th><th class="c-description">Description</th><th class="c-area">Area</th><th><span class="hidden-words">Sign off</span></th></tr></thead>
+  return html`<div><div class="pagehead" key="head"><h1>Abnormal</h1></div><div class="table alarms" key="table"><table><thead><tr><th>Level</th><th>Where</th><th>What</th><th>Since</th><th class="c-description">Description</th><th class="c-area">Area</th><th><span class="hidden-words">Sign off</span></th></tr></thead>
     <tbody>${all.flatMap((each) => {
       const loop = each.loop ? loops.value?.get(each.loop) : null;
       const old = isSilent.value && each.id !== "silent";
       const row = html`<tr key=${each.id} class=${old ? "old" : ""}><td>${AlarmSymbol(each.level)}</td><td>${Subject(each)}</td>
-        <td class="what"><b>${each.text}</b>${each.job && html`<a key="job" href=${jobPath(each.job)}>the test</a>`}<small key="advice">${each.advice}</small></td>
+        <td class="what"><b>${each.text}</b> ${each.job && html`<a key="job" href=${jobPath(each.job)}>the test</a>`}<small key="advice">${each.advice}</small></td>
         <td class="since" title=${when(each.since)}>${old ? when(each.since) : duration(Math.max(0, now_s.value - Date.parse(each.since) / 1000))}</td>
         <td class="c-description">${loop?.description}</td><td class="c-area">${loop?.area}</td><td class="do">${SignOffButton(each)}</td></tr>`;
       return asking.value === each.id ? [row, html`<tr key=${`sign ${each.id}`} class="question"><td colspan="7"><${SignOffQuestion} alarm=${each} /></td></tr>`] : [row];
