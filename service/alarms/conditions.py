@@ -68,7 +68,7 @@ class LoopFacts:
 
 
 @dataclass(frozen=True)
-class Facts:
+class AlarmFacts:
     """What is known at one moment.
 
     host: the name of this gateway.
@@ -110,7 +110,7 @@ class Condition:
     on_s: float | None = None
 
 
-def conditions(known: Facts) -> list[Condition]:
+def conditions(known: AlarmFacts) -> list[Condition]:
     """Returns everything that is abnormal at the moment of which this is known, each once."""
     found = [*_tests(known), *_buses(known), *_nodes(known)]
     explained = {tag for each in found if each.loop is None for tag in each.loops}
@@ -120,13 +120,13 @@ def conditions(known: Facts) -> list[Condition]:
     return [each for each in found if each.id not in known.signed]
 
 
-def to_be_asked(known: Facts) -> set[str]:
+def to_be_asked(known: AlarmFacts) -> set[str]:
     """Returns the ids of the alarms of which it matters here whether they were signed off."""
     ended = {alarm_id(AlarmKind.NOT_RESTORED, test.id) for test in known.tests if test.state in _NO_ANSWER}
     return ended | {each.id for each in conditions(known) if RULES[each.kind].to_sign}
 
 
-def _tests(known: Facts) -> Iterator[Condition]:
+def _tests(known: AlarmFacts) -> Iterator[Condition]:
     """What remains of tests that have ended."""
     unconfirmed = {job.id for job in known.unconfirmed}
     for job in known.unconfirmed:
@@ -156,7 +156,7 @@ def _tests(known: Facts) -> Iterator[Condition]:
         )  # fmt: skip
 
 
-def _buses(known: Facts) -> Iterator[Condition]:
+def _buses(known: AlarmFacts) -> Iterator[Condition]:
     for bus in known.buses:
         if bus.why is None:
             continue
@@ -169,7 +169,7 @@ def _buses(known: Facts) -> Iterator[Condition]:
         )  # fmt: skip
 
 
-def _nodes(known: Facts) -> Iterator[Condition]:
+def _nodes(known: AlarmFacts) -> Iterator[Condition]:
     up_s = {bus.url: bus.up_s for bus in known.buses if bus.why is None}
     for (url, node), heard in sorted(known.nodes.items()):
         loops = _tags(

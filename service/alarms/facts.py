@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from loopwright.service.alarms.conditions import BusFacts, Facts, LoopFacts, to_be_asked
+from loopwright.service.alarms.conditions import AlarmFacts, BusFacts, LoopFacts, to_be_asked
 from loopwright.service.jobs.journal import temporary
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.listening import Listening
@@ -44,14 +44,14 @@ class FactSource:
         self._signed: frozenset[str] = frozenset()
         self._up_s: dict[str, float] = {}
 
-    def gather(self, now_s: float) -> Facts:
+    def gather(self, now_s: float) -> AlarmFacts:
         """Returns what is known. now_s: the present time, wall time, s."""
         store = self._jobs.store
         try:
             self._stored = _asked(store, self._stored)
         except SQLAlchemyError as error:
             _report(error)
-        known = Facts(
+        known = AlarmFacts(
             host=store.host,
             buses=self._buses(now_s),
             loops=self._loops(),

@@ -11,7 +11,7 @@ import pytest
 
 from loopwright.protocol.profile import NmtState
 from loopwright.service.alarms.alarm import RULES, Alarm, AlarmKind
-from loopwright.service.alarms.conditions import BusFacts, Facts, LoopFacts, conditions, to_be_asked
+from loopwright.service.alarms.conditions import AlarmFacts, BusFacts, LoopFacts, conditions, to_be_asked
 from loopwright.service.alarms.delays import Delays
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.job_states import JobState
@@ -42,21 +42,21 @@ def heard(at_s: float = T0, **changes: object) -> Heard:
     return replace(Heard(at_s, False, 50.0, 40.0, 50.0, 2, False, False), **changes)
 
 
-def facts(*loops: LoopFacts, **changes: object) -> Facts:
-    return replace(Facts("local", (BusFacts(BUS, None, T0 - 100.0),), loops), **changes)
+def facts(*loops: LoopFacts, **changes: object) -> AlarmFacts:
+    return replace(AlarmFacts("local", (BusFacts(BUS, None, T0 - 100.0),), loops), **changes)
 
 
 def job(state: JobState, reason: Reason | None = None, id_: str = "4f0c2a9be113", loop: str = "A") -> JobInBrief:
     return JobInBrief(id_, loop, "local", state, False, "A. Lind", "relay", 3.0, False, reason, AT)
 
 
-def steps(known: Facts, *ages_s: float, delays: Delays | None = None) -> list[Sequence[Alarm]]:
+def steps(known: AlarmFacts, *ages_s: float, delays: Delays | None = None) -> list[Sequence[Alarm]]:
     """The alarms at these times after T0, of something that stays as it is."""
     delays = delays or Delays()
     return [delays.step(conditions(known), T0 + age_s) for age_s in ages_s]
 
 
-def kinds(known: Facts) -> list[AlarmKind]:
+def kinds(known: AlarmFacts) -> list[AlarmKind]:
     return [each.kind for each in conditions(known)]
 
 
