@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.service.alarms.conditions import AlarmFacts, BusFacts, LoopFacts, to_be_asked
+from loopwright.service.job_states import ACTIVE
 from loopwright.service.jobs.journal import temporary
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.listening import Listening
@@ -28,8 +29,7 @@ log = logging.getLogger(__name__)
 class _Stored:
     """What the database has said. audited: number of the latest entry of the audit log, which every decision writes."""
 
-    busy: Mapping[str, str] = field(default_factory=dict)
-    tests: Sequence[JobInBrief] = ()
+    tests: Mapping[str, JobInBrief] = field(default_factory=dict)
     unconfirmed: Sequence[UnconfirmedJob] = ()
     accepted: Mapping[str, Acceptance] = field(default_factory=dict)
     audited: int | None = None
@@ -56,7 +56,7 @@ class FactSource:
             buses=self._buses(now_s),
             loops=self._loops(),
             nodes=dict(self._listening.nodes),
-            tests=self._stored.tests,
+            tests=list(self._stored.tests.values()),
             unconfirmed=self._stored.unconfirmed,
         )
         candidates = to_be_asked(known)
@@ -89,7 +89,7 @@ class FactSource:
                 config=config,
                 heard=heard.get(tag),
                 held=held.get(tag, (None, None))[1],
-                job=held[tag][0] if tag in held else stored.busy.get(tag),
+                job=held[tag][0] if tag in held else _active(stored.tests.get(tag)),
                 gains=self._listening.gains_read(tag),
                 accepted=stored.accepted.get(tag),
             )
@@ -106,13 +106,17 @@ class FactSource:
         return found
 
 
+def _active(latest: JobInBrief | None) -> str | None:
+    """Returns the id of the job that has the loop, of its latest one: no other is made while one has it."""
+    return latest.id if latest is not None and latest.state in ACTIVE else None
+
+
 def _asked(store: Store, before: _Stored) -> _Stored:
     """Asks the database. Raises SQLAlchemyError."""
     with store.reading() as session:
         audited = audit.latest(session)
     return _Stored(
-        busy=store.busy(),
-        tests=list(latest_tests(store).values()),
+        tests=latest_tests(store),
         unconfirmed=alarms.unconfirmed(store),
         accepted=before.accepted if audited == before.audited else acceptances(store),
         audited=audited,

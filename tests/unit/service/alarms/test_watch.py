@@ -172,7 +172,7 @@ def test_a_trial_of_a_job_of_ours_is_none_and_one_of_others_is(watched: Watched)
     watched.ear.hear(on_trial=True, session=True)
     assert watched.after(0.0) == watched.after(6.0) == []
     service.tune.hold.set()
-    service.wait(job.id)
+    until(lambda: not service.jobs.under_test())
     assert watched.after(1.0) == watched.after(4.9) == []
     assert watched.after(0.1) == [(2, "Gains are on trial that no job here has begun")]
 
