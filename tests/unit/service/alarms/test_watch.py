@@ -167,7 +167,7 @@ def test_what_is_not_listened_to_is_no_alarm(service: Service) -> None:
 def test_a_trial_of_a_job_of_ours_is_none_and_one_of_others_is(watched: Watched) -> None:
     service = watched.service
     service.tune.hold.clear()
-    job = service.jobs.start(TAG, FastRetune())
+    service.jobs.start(TAG, FastRetune())
     assert service.tune.inside.wait(60)
     watched.ear.hear(on_trial=True, session=True)
     assert watched.after(0.0) == watched.after(6.0) == []
