@@ -87,7 +87,7 @@ class Alarm(BaseModel):
     signed_off: SignOff | None = Field(description="Who has signed it off, and when; null: nobody has")
 
 
-class Alarms(BaseModel):
+class AlarmList(BaseModel):
     """Everything that is abnormal, the worst first."""
 
     alarms: list[Alarm]

@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Body, FastAPI, Path, Request
 from fastapi.responses import JSONResponse
 
-from loopwright.service.alarms.alarm import Alarm, Alarms
+from loopwright.service.alarms.alarm import Alarm, AlarmList
 from loopwright.service.alarms.watch import FRESH_S, AlarmWatch, NoSuchAlarm
 from loopwright.service.api import problems
 from loopwright.service.api.bodies import JsonRoute
@@ -21,8 +21,8 @@ def install(app: FastAPI, watch: AlarmWatch) -> None:
     router = APIRouter(tags=["alarms"], route_class=JsonRoute)
 
     @router.get("/alarms", summary="What is abnormal now, the worst first")
-    def alarms() -> Alarms:
-        return Alarms(alarms=list(watch.look(FRESH_S)))
+    def alarms() -> AlarmList:
+        return AlarmList(alarms=list(watch.look(FRESH_S)))
 
     @router.get(
         "/alarms/{alarm_id}", summary="An alarm, also one that was signed off", responses=problems.responses(404)

@@ -26,7 +26,7 @@ def alarms(
     as_json: AsJson = False,
 ) -> None:
     """Show what is abnormal, the worst first, or sign an alarm off."""
-    from loopwright.service.alarms.alarm import Alarm, Alarms
+    from loopwright.service.alarms.alarm import Alarm, AlarmList
 
     client = Client(url)
     if sign_off is not None:
@@ -42,7 +42,7 @@ def alarms(
     if as_json:
         print_json(answer)
         return
-    found = Alarms.model_validate(answer).alarms
+    found = AlarmList.model_validate(answer).alarms
     if not found:
         print("Nothing is abnormal.")
         return

@@ -15,7 +15,7 @@ from importlib.metadata import version
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from loopwright.service.alarms.alarm import Alarms
+from loopwright.service.alarms.alarm import AlarmList
 from loopwright.service.alarms.watch import LOOK_S as ALARM_LOOK_S
 from loopwright.service.alarms.watch import AlarmWatch
 from loopwright.service.jobs.journal import temporary
@@ -203,7 +203,7 @@ class Live:
 
     def _show_alarms(self) -> None:
         if self._alarms.latest is not None:
-            self._show("alarms", event("alarms", Alarms(alarms=list(self._alarms.latest))))
+            self._show("alarms", event("alarms", AlarmList(alarms=list(self._alarms.latest))))
 
     def _show_rows(self) -> None:
         self._show_alarms()
