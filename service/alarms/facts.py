@@ -47,9 +47,11 @@ class FactSource:
     def gather(self, now_s: float) -> AlarmFacts:
         """Returns what is known. now_s: the present time, wall time, s."""
         store = self._jobs.store
+        away = False
         try:
             self._stored = _asked(store, self._stored)
         except SQLAlchemyError as error:
+            away = True
             _report(error)
         known = AlarmFacts(
             host=store.host,
@@ -62,10 +64,11 @@ class FactSource:
         candidates = to_be_asked(known)
         if not candidates:
             return known
-        try:
-            self._signed = alarms.signed_off(store, candidates)
-        except SQLAlchemyError as error:
-            _report(error)
+        if not away:  # else one more question would wait as long as the first one
+            try:
+                self._signed = alarms.signed_off(store, candidates)
+            except SQLAlchemyError as error:
+                _report(error)
         return replace(known, signed=self._signed)
 
     def _buses(self, now_s: float) -> list[BusFacts]:
