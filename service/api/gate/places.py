@@ -28,6 +28,7 @@ class RequestKind(StrEnum):
     DECISION = "acceptances and rollbacks"
     COMMAND = "commands"
     READ = "reads of the database"
+    FIGURES = "records, designs and reports of jobs"
     BUS = "reads of the bus"
     COMPUTATION = "computations"
     STREAM = "event streams"
@@ -41,6 +42,7 @@ _LAST_WORDS = {
     "abort": RequestKind.ABORT, "dismiss": RequestKind.ABORT,
     "accept": RequestKind.DECISION, "rollback": RequestKind.DECISION,
 }  # fmt: skip
+_OF_FIGURES = ("record", "designs", "report")
 _WATCHED = ("/readyz", "/metrics")
 
 
@@ -73,6 +75,8 @@ def kind_of(method: str, path: str) -> RequestKind | None:
         return RequestKind.WATCH
     if last == "events" or path == "/live":
         return RequestKind.STREAM
+    if last in _OF_FIGURES and path.startswith("/jobs/"):
+        return RequestKind.FIGURES
     return RequestKind.BUS if path.startswith("/loops/") and path.count("/") == 2 else RequestKind.READ
 
 
@@ -95,12 +99,14 @@ class Room:
 
 def rooms(limits: RequestLimits) -> dict[RequestKind, Room]:
     """The places and turns of each kind. Turns are few: threads that read the database contend for the interpreter
-    lock with the threads of the loops and with the event loop. Threads that wait for a bus hardly need the lock."""
+    lock with the threads of the loops and with the event loop. Threads that wait for a bus hardly need the lock, and who
+    waits for the figures of a job that has just ended takes no thread, and holds nobody up who reads something else."""
     return {
         RequestKind.ABORT: Room(64, 4),
         RequestKind.DECISION: Room(32, 8),
         RequestKind.COMMAND: Room(32, 2),
         RequestKind.READ: Room(limits.at_once, 2),
+        RequestKind.FIGURES: Room(64, 32),
         RequestKind.BUS: Room(32, 4),
         RequestKind.COMPUTATION: Room(limits.computations_at_once, limits.computations_at_once),
         RequestKind.STREAM: Room(limits.streams_at_once, 2),

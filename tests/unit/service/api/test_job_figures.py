@@ -41,6 +41,7 @@ from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.api.test_api import assert_problem, finished, start
 from tests.unit.service.fakes import Service, ThreadEngine
+from tests.unit.service.processes import until
 
 LOOP = "TIC-1"
 K, T, L = 2.0, 6.0, 1.5
@@ -194,6 +195,26 @@ def test_the_end_of_the_job_computes_them_once_for_all_who_ask(tmp_path: Path) -
     # another process of the service finds them in the store
     later = Counting()
     assert KeptFigures(here.store, later).kept(job) is not None and later.count == 0
+    here.figures.close()
+    here.jobs.stop()
+    here.store.close()
+
+
+def test_who_waits_for_them_reads_other_things_meanwhile(tmp_path: Path) -> None:
+    """As a page does, which asks for all three at a job's end, and for other things beside."""
+    here = Here(tmp_path)
+    here.pool.hold.clear()
+    job = here.finished()
+    shared = Mock(wraps=here.figures.asked)
+    here.figures.asked = shared
+    with here.client() as client, ThreadPoolExecutor(3) as askers:
+        asked = [askers.submit(client.get, f"/jobs/{job}/{what}") for what in ("record", "designs", "report")]
+        until(lambda: shared.called)
+        for path in ("/jobs", "/loops", f"/jobs/{job}", "/session"):
+            assert client.get(path).status_code == 200
+        assert not any(each.done() for each in asked)
+        here.pool.hold.set()
+        assert [each.result().status_code for each in asked] == 3 * [200]
     here.figures.close()
     here.jobs.stop()
     here.store.close()
