@@ -99,8 +99,8 @@ class Room:
 
 def rooms(limits: RequestLimits) -> dict[RequestKind, Room]:
     """The places and turns of each kind. Turns are few: threads that read the database contend for the interpreter
-    lock with the threads of the loops and with the event loop. Threads that wait for a bus hardly need the lock, and who
-    waits for the figures of a job that has just ended takes no thread, and holds nobody up who reads something else."""
+    lock with the threads of the loops and with the event loop. Threads that wait for a bus hardly need the lock. Who
+    waits for the figures of a job that has just ended takes no thread, and must not keep others from reading."""
     return {
         RequestKind.ABORT: Room(64, 4),
         RequestKind.DECISION: Room(32, 8),
