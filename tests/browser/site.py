@@ -47,6 +47,17 @@ class Site(Plantsite):
         more = tuple(dict(each) for each in more_loops)
         super().__init__(stack, folder, CASE, bus, more, served_with=(*port, *served_with), changes=LOOP)
 
+    def ask(self, path: str) -> Any:
+        """An answer of the API."""
+        answer = self.http.get(path)
+        assert answer.status_code == 200, answer.text
+        return answer.json()
+
+    def latest(self) -> dict[str, Any]:
+        """The latest job."""
+        job: dict[str, Any] = self.ask("/jobs?limit=1")[0]
+        return job
+
 
 def _free_port() -> int:
     with socket.create_server(("127.0.0.1", 0)) as found:
