@@ -70,9 +70,14 @@ function pause(seconds, stop) {
  * @param {string} path @param {AbortSignal} [stop] @returns {Promise<any>}
  */
 export async function ask(path, stop) {
+  return (await asked(path, stop)).found;
+}
+
+/** @param {string} path @param {AbortSignal} [stop] @returns {Promise<{found: any, headers: Headers}>} */
+async function asked(path, stop) {
   for (let tries = 1; ; tries++) {
     try {
-      return (await request("GET", path, undefined, stop)).found;
+      return await request("GET", path, undefined, stop);
     } catch (error) {
       if (!(error instanceof Problem) || error.retryAfter_s === null || tries >= 6) throw error;
       await pause(Math.min(error.retryAfter_s, 10), stop);
@@ -80,15 +85,15 @@ export async function ask(path, stop) {
   }
 }
 
-/** Asks for a list with all its pages. @param {string} path @param {AbortSignal} [stop] @returns {Promise<any[]>} */
-export async function askAll(path, stop) {
+/** Asks for a list with all its pages. @param {string} path @returns {Promise<any[]>} */
+export async function askAll(path) {
   /** @type {any[]} */
   const all = [];
   /** @type {string | null} */
   let next = path;
   while (next) {
     /** @type {{found: any, headers: Headers}} */
-    const { found, headers } = await request("GET", next, undefined, stop);
+    const { found, headers } = await asked(next);
     all.push(...found);
     next = /<([^>]+)>;\s*rel="next"/.exec(headers.get("Link") ?? "")?.[1] ?? null;
   }
@@ -97,7 +102,7 @@ export async function askAll(path, stop) {
 
 /** A page of a list, and the path of the next one. @param {string} path @param {AbortSignal} [stop] */
 export async function askPage(path, stop) {
-  const { found, headers } = await request("GET", path, undefined, stop);
+  const { found, headers } = await asked(path, stop);
   return { entries: found, next: /<([^>]+)>;\s*rel="next"/.exec(headers.get("Link") ?? "")?.[1] ?? null };
 }
 
