@@ -7,19 +7,28 @@ import { duration, entered, fixed, known, ms, pvDecimals, significant, unit, wit
 import { jobPath } from "../router.js";
 import { isSilent, rowOf, sign, signature } from "../state.js";
 
+/** Obstacles that a test looks at again for itself before it gives up: it may be started. */
+const PASSING = ["not_at_rest"];
+/** What the preview says is of a moment: it is asked for again, sooner where something stands in the way. */
+const [SOON_MS, LATER_MS] = [5000, 30_000];
+
 /** @param {{loop: any, onClose: (() => void) | null, onStarted: (job: any) => void}} props */
 export function RetuneForm({ loop, onClose, onStarted }) {
   const [wish, setWish] = useState(/** @type {Record<string, any>} */ ({ method: "fast", ms: 1.6 }));
   const [more, setMore] = useState(false);
   const [methods, setMethods] = useState(/** @type {any[]} */ ([]));
   const [preview, setPreview] = useState(/** @type {any} */ (null));
-  const [problem, setProblem] = useState(/** @type {any} */ (null));
+  const [unclear, setUnclear] = useState(/** @type {any} */ (null));
+  const [refused, setRefused] = useState(/** @type {any} */ (null));
   const [sending, setSending] = useState(false);
   const first = useRef(/** @type {HTMLElement | null} */ (null));
   const row = rowOf(loop.tag).value;
   const { body, bad } = bodyOf(wish);
   const asked = JSON.stringify(body);
   const situation = `${row?.mode} ${row?.not_heard ? "silent" : ""} ${loop.locked?.since ?? ""}`;
+
+  const inTheWay = !!unclear || !!preview?.obstacles.length;
+  const problem = refused ?? unclear;
 
   useEffect(() => {
     first.current?.focus({ preventScroll: true });
@@ -35,19 +44,25 @@ export function RetuneForm({ loop, onClose, onStarted }) {
   useEffect(() => {
     if (bad) return;
     const stop = new AbortController();
-    const timer = setTimeout(async () => {
+    const look = async () => {
       try {
         setPreview(await askWith(`/loops/${encodeURIComponent(loop.tag)}/retune/preview`, JSON.parse(asked), stop.signal));
-        setProblem(null);
+        setUnclear(null);
       } catch (error) {
-        if (!stop.signal.aborted) setProblem(error);
+        if (!stop.signal.aborted) setUnclear(error);
       }
-    }, 200);
+    };
+    const timer = setTimeout(look, 200);
+    const again = setInterval(() => {
+      if (!document.hidden && !isSilent.peek()) void look();
+    }, inTheWay ? SOON_MS : LATER_MS);
     return () => {
       clearTimeout(timer);
+      clearInterval(again);
       stop.abort();
     };
-  }, [asked, bad, situation]);
+  }, [asked, bad, situation, inTheWay]);
+  useEffect(() => setRefused(null), [asked]);
 
   const set = (/** @type {string} */ name) => (/** @type {any} */ event) => {
     const { type, checked, value } = event.target;
@@ -55,16 +70,16 @@ export function RetuneForm({ loop, onClose, onStarted }) {
   };
   const start = async () => {
     setSending(true);
-    setProblem(null);
+    setRefused(null);
     try {
       onStarted(await command(`/loops/${encodeURIComponent(loop.tag)}/retune`, { ...body, requested_by: signature.value.trim() }));
     } catch (error) {
-      setProblem(error);
+      setRefused(error);
       setSending(false);
     }
   };
   const designed = wish.method === "fast" || wish.method === "setpoint";
-  const obstacle = preview?.obstacles[0];
+  const obstacle = preview?.obstacles.find((/** @type {any} */ each) => !PASSING.includes(each.reason));
   const unsigned = !signature.value.trim();
   const why = isSilent.value ? "The service is silent." : bad ? bad : obstacle ? "" : unsigned ? "Who signs?" : "";
   const u = unit(loop.pv_unit);
