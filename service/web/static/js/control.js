@@ -9,9 +9,20 @@
  * @typedef {{Kp: number, Ti: number, Td?: number, Tf?: number, b?: number, c?: number}} Gains
  */
 
-/** The model of a job, of either procedure; null: there is none. @param {any} found @returns {Model | null} */
-export function modelOf(found) {
+/**
+ * The model of a job, of either procedure; null: there is none.
+ * @param {any} found
+ * @param {number} delay_s which the sampled loop has beside the model, s
+ * @returns {Model | null}
+ */
+export function modelOf(found, delay_s = 0) {
   if (!found) return null;
+  const model = continuous(found);
+  return { ...model, dead_time_s: model.dead_time_s + delay_s };
+}
+
+/** @param {any} found @returns {Model} */
+function continuous(found) {
   if (found.num) return { num: found.num, den: found.den, dead_time_s: found.dead_time_s };
   const { K, T_s, L_s, zeta } = found;
   if (typeof zeta === "number") return { num: [K], den: [T_s * T_s, 2 * zeta * T_s, 1], dead_time_s: L_s };
