@@ -15,7 +15,9 @@ const GAP = 16;
 
 /** @param {{loop: any, detail: any, job: any, latest: boolean, quiet: boolean, onChanged: (job: any) => void}} props */
 export function Choice({ loop, detail, job, latest, quiet, onChanged }) {
-  const model = useMemo(() => modelOf(job.model) ?? (job.rehearsed_on ? modelOf({ ...job.rehearsed_on }) : null), [job.id]);
+  // The gains of these methods are designed for the sampled loop, which is half a sample later than the model.
+  const sampling_s = job.method === "fast" || job.method === "setpoint" ? (job.sample_time_s ?? 0) / 2 : 0;
+  const model = useMemo(() => modelOf(job.model, sampling_s) ?? (job.rehearsed_on ? modelOf({ ...job.rehearsed_on }) : null), [job.id]);
   const designed = (job.method === "fast" || job.method === "setpoint") && !job.dry_run && !!model;
   const tested = job.chosen.Ms ?? job.predicted?.Ms ?? Number(job.request.ms ?? 1.6);
   const [ms, setMs] = useState(/** @type {number} */ (tested));
@@ -57,7 +59,7 @@ export function Choice({ loop, detail, job, latest, quiet, onChanged }) {
         ${Curve(width, points, ms, tested, job.comparison?.before.Ms ?? null, model && job.old_gains && stableBefore ? step(model, job.old_gains, { load: 1 }, horizon_s, 300).IAE : null)}
         <input type="range" min=${designs[0].ms} max=${designs[designs.length - 1].ms} step="0.01" value=${ms} disabled=${designs.length < 2} aria-label="Ms" aria-valuetext=${`Ms ${msText(ms)}${atTested ? ", as tested" : ""}`}
           onInput=${(/** @type {any} */ e) => { const value = Number(e.target.value); setMs(Math.abs(value - tested) < 0.015 ? tested : value); }}
-          onDblClick=${() => setMs(tested)} onKeyDown=${(/** @type {any} */ e) => slide(e, ms, tested, designs, setMs)} />
+          onDblClick=${() => setMs(tested)} onKeyDown=${(/** @type {any} */ e) => slide(e, tested, designs, setMs)} />
         <div class="ends"><span>${msText(designs[0].ms)} robust</span>${asked && html`<span class="quiet">asking for the designs…</span>`}<span>fast ${msText(designs[designs.length - 1].ms)}</span></div></div>`}
       ${after && html`<div class="small-plots" key="plots">
         <figure><figcaption><b>Set-point step</b> PV, ${unit(loop.pv_unit)}</figcaption>${StepPlot(small, stableBefore ? before?.setpoint : null, after.setpoint, size, "Set-point step before and after")}</figure>
@@ -69,8 +71,8 @@ export function Choice({ loop, detail, job, latest, quiet, onChanged }) {
   </div>`;
 }
 
-/** @param {any} e @param {number} ms @param {number} tested @param {any[]} designs @param {(ms: number) => void} setMs */
-function slide(e, ms, tested, designs, setMs) {
+/** @param {any} e @param {number} tested @param {any[]} designs @param {any} setMs */
+function slide(e, tested, designs, setMs) {
   const move = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[/** @type {string} */ (e.key)];
   if (e.key === "Escape") {
     e.preventDefault();
@@ -78,9 +80,10 @@ function slide(e, ms, tested, designs, setMs) {
   } else if (move) {
     e.preventDefault();
     const by = e.shiftKey ? 0.05 : 0.01;
-    let to = Math.round((ms + move * by) * 100) / 100;
-    if (Math.abs(to - tested) < 0.005) to = tested;
-    setMs(Math.min(designs[designs.length - 1].ms, Math.max(designs[0].ms, to)));
+    setMs((/** @type {number} */ ms) => { // a key that repeats comes more often than the page is drawn
+      const to = Math.round((ms + move * by) * 100) / 100;
+      return Math.abs(to - tested) < 0.005 ? tested : Math.min(designs[designs.length - 1].ms, Math.max(designs[0].ms, to));
+    });
   }
 }
 
@@ -125,21 +128,20 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
   const [problem, setProblem] = useState(/** @type {any} */ (null));
   const [sending, setSending] = useState(false);
   const field = useRef(/** @type {HTMLInputElement | null} */ (null));
-  const opener = useRef(/** @type {Element | null} */ (null));
+  const group = useRef(/** @type {HTMLElement | null} */ (null));
+  const asked = useRef("");
   useEffect(() => {
     if (asking) field.current?.focus();
+    else if (asked.current) /** @type {HTMLElement | null} */ (group.current?.querySelector(`[data-opens="${asked.current}"]`))?.focus();
+    asked.current = asking;
     const escape = (/** @type {KeyboardEvent} */ e) => {
       if (e.key === "Escape") close();
     };
     if (asking) addEventListener("keydown", escape);
     return () => removeEventListener("keydown", escape);
   }, [asking]);
-  const close = () => {
-    setAsking("");
-    /** @type {HTMLElement | null} */ (opener.current)?.focus?.();
-  };
+  const close = () => setAsking("");
   const open = (/** @type {string} */ what) => {
-    opener.current = document.activeElement;
     setProblem(null);
     setAsking(what);
   };
@@ -168,8 +170,8 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
   const gains = asking === "rollback" ? job.old_gains : job.new_gains;
   const written = gains && `Kp ${significant(gains.Kp)} %/${unit(loop.pv_unit)}, Ti ${significant(gains.Ti)} s${gains.Td ? `, Td ${significant(gains.Td)} s` : ""}`;
   const where = `${loop.tag}, node ${loop.controller_node.toString(16)}h channel ${loop.channel}`;
-  const Signed = (/** @type {string} */ action, /** @type {() => void} */ go) => html`<label key="by">Signed <input ref=${field} type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && signature.value.trim() && !dead) go(); }} /></label>
-    <button key="cancel" onClick=${close}>Cancel</button><button key="go" class="main" disabled=${dead || !signature.value.trim()} onClick=${go}>${action}</button>`;
+  const Signed = (/** @type {string} */ action, /** @type {() => void} */ go) => html`<span class="ask" key="ask"><label key="by">Signed <input ref=${field} type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && signature.value.trim() && !dead) go(); }} /></label>
+    <button key="cancel" onClick=${close}>Cancel</button><button key="go" class="main" disabled=${dead || !signature.value.trim()} onClick=${go}>${action}</button></span>`;
   let inside = null;
   if (loop.locked) inside = html`<span class="say">Locked by ${loop.locked.by}: no decision until it is unlocked.</span>`;
   else if (job.dry_run) inside = html`<span class="say">A rehearsal: nothing was moved, and there is nothing to accept.</span>`;
@@ -178,12 +180,12 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
   else if (asking === "keep") inside = html`<span class="say">Keep the old gains; the proposal is declined.</span>${Signed("Keep the old gains", () => send(() => command(`${job.url}/rollback`, by())))}`;
   else if (asking === "rollback") inside = html`<span class="say">Write the old gains, <b>${written}</b>, back into ${where}.</span>${Signed(`Roll ${loop.tag} back`, () => send(() => command(`${job.url}/rollback`, by())))}`;
   else if (asking === "try") inside = html`<span class="say">A trial listens, steps the set-point by <b>${withUnit(fixed(loop.sp_deviation, pvDecimals(loop.pv_limits)), loop.pv_unit)}</b> under the gains for Ms ${msText(ms)}, and ends as a proposal. No relay.</span>${Signed(`Try Ms ${msText(ms)} on ${loop.tag}`, tryIt)}`;
-  else if (!atTested) inside = html`<span class="say">These gains have not been on the loop.</span><button key="back" onClick=${back}>Back to Ms ${msText(tested)}</button><button key="try" class="main" disabled=${dead} onClick=${() => open("try")}>Try Ms ${msText(ms)} on ${loop.tag}…</button>`;
-  else if (job.state === "proposed" && latest) inside = html`<span class="say">The loop runs on its old gains until you accept.</span><button key="keep" disabled=${dead} onClick=${() => open("keep")}>Keep the old gains…</button><button key="accept" class="main" disabled=${dead} onClick=${() => open("accept")}>Accept the new gains…</button>`;
-  else if (job.state === "accepted" && latest) inside = html`<span class="say">Accepted by <b>${job.decided?.by ?? "–"}</b>${detail?.live ? html`; in effect now: Kp ${significant(detail.live.gains.Kp)}, Ti ${significant(detail.live.gains.Ti)} s` : ""}.</span><button key="rollback" disabled=${dead} onClick=${() => open("rollback")}>Roll back to the old gains…</button>`;
+  else if (!atTested) inside = html`<span class="say">These gains have not been on the loop.</span><button key="back" onClick=${back}>Back to Ms ${msText(tested)}</button><button key="try" class="main" disabled=${dead} data-opens="try" onClick=${() => open("try")}>Try Ms ${msText(ms)} on ${loop.tag}…</button>`;
+  else if (job.state === "proposed" && latest) inside = html`<span class="say">The loop runs on its old gains until you accept.</span><button key="keep" disabled=${dead} data-opens="keep" onClick=${() => open("keep")}>Keep the old gains…</button><button key="accept" class="main" disabled=${dead} data-opens="accept" onClick=${() => open("accept")}>Accept the new gains…</button>`;
+  else if (job.state === "accepted" && latest) inside = html`<span class="say">Accepted by <b>${job.decided?.by ?? "–"}</b>${detail?.live ? html`; in effect now: Kp ${significant(detail.live.gains.Kp)}, Ti ${significant(detail.live.gains.Ti)} s` : ""}.</span><button key="rollback" disabled=${dead} data-opens="rollback" onClick=${() => open("rollback")}>Roll back to the old gains…</button>`;
   else if (job.state === "rolled_back") inside = html`<span class="say">The loop runs on its old gains${job.decided ? `; decided by ${job.decided.by}` : ""}.</span>`;
   else if (job.state === "proposed") inside = html`<span class="say">Not decided; a later test came.</span>`;
   else if (job.state === "accepted") inside = html`<span class="say">Accepted by <b>${job.decided?.by ?? "–"}</b>; a later test came.</span>`;
   if (!inside && !problem) return null;
-  return html`<div class="decide" role="group" aria-label="Decision">${inside}${problem && html`<p class="refusal" role="alert" key="problem">${problem.message} <span class="advice">${problem.advice ?? ""}</span></p>`}</div>`;
+  return html`<div class="decide" ref=${group} role="group" aria-label="Decision">${inside}${problem && html`<p class="refusal" role="alert" key="problem">${problem.message} <span class="advice">${problem.advice ?? ""}</span></p>`}</div>`;
 }

@@ -27,7 +27,7 @@ export function LoopView({ tag }) {
   const loop = loops.value?.get(tag);
   const [detail, setDetail] = useState(/** @type {any} */ (null));
   const [tests, setTests] = useState(/** @type {any[]} */ ([]));
-  const [result, setResult] = useState(/** @type {any} */ (null));
+  const [result, setResult] = useState(/** @type {any} */ (undefined)); // null: there is none; undefined: not known yet
   const [running, setRunning] = useState(/** @type {any} */ (null));
   const [open, setOpen] = useState(/** @type {boolean | null} */ (null));
   const job = jobs.value.find((each) => each.loop === tag && !each.dry_run) ?? null;
@@ -51,7 +51,7 @@ export function LoopView({ tag }) {
       setTests(entries);
       const latest = entries.find((/** @type {any} */ each) => !each.dry_run && !["queued", "running"].includes(each.state));
       setResult(latest ? await ask(latest.url, stop.signal) : null);
-    }, () => {});
+    }).catch(() => {});
     const timer = setInterval(() => {
       if (!document.hidden && !isSilent.peek()) void read();
     }, REREAD_MS);
@@ -79,13 +79,13 @@ export function LoopView({ tag }) {
       if (["queued", "running"].includes(found.state)) setRunning(found);
     }, () => {});
   };
-  const formOpen = !job && (open ?? (!result && may.operate.value));
+  const formOpen = !job && (open ?? (result === null && may.operate.value));
   const mine = (abnormalNow.value ?? []).filter((each) => each.loops.includes(tag));
   const height = TREND_PX;
   return html`<div>
     <div class="looptitle" key="title"><h1 class="tag">${tag}</h1><span class="what">${loop.description}</span>
       <span class="where">${[loop.area, loop.bus, `node ${loop.controller_node.toString(16)}h`, `channel ${loop.channel}`, loop.host === "local" ? null : `by way of ${loop.host}`].filter(Boolean).join(" · ")}</span>
-      ${!job && !formOpen && may.operate.value && html`<button key="retune" onClick=${() => setOpen(true)}>Retune…</button>`}
+      ${!job && !formOpen && may.operate.value && html`<button key="retune" id="retune" onClick=${() => setOpen(true)}>Retune…</button>`}
       ${!may.operate.value && html`<span key="may" class="quiet">Your key may read. To retune it needs the scope operate.</span>`}
     </div>
     ${mine.map((each) => html`<div class="abnormal" key=${each.id}>${AlarmSymbol(each.level)}<span><b>${each.text}.</b> <span class="quiet">${each.advice}</span></span>${SignOffButton(each)}
@@ -96,12 +96,17 @@ export function LoopView({ tag }) {
       <aside key="aside"><${Face} key="face" loop=${loop} />${Settings(loop, detail)}<${Known} key="known" loop=${loop} detail=${detail} />${Tests(tests)}</aside>
       <div key="right">
         <${Trend} key="trend" loop=${loop} job=${job} height=${height} onJob=${onJob} />
-        ${formOpen && html`<${RetuneForm} key="form" loop=${loop} onClose=${result ? () => setOpen(false) : null} onStarted=${() => setOpen(false)} />`}
+        ${formOpen && html`<${RetuneForm} key="form" loop=${loop} onClose=${result ? () => { setOpen(false); focusOpener(); } : null} onStarted=${() => setOpen(false)} />`}
         ${job && html`<${UnderTest} key="test" loop=${loop} live=${job} job=${running?.id === job.id ? running : null} />`}
         ${!job && result && html`<${Result} key=${`result ${result.id}`} loop=${loop} detail=${detail} job=${result} quiet=${formOpen} onChanged=${setResult} />`}
       </div>
     </div>
   </div>`;
+}
+
+/** The focus goes back to what opened the form, once it is drawn again. */
+function focusOpener() {
+  requestAnimationFrame(() => requestAnimationFrame(() => document.getElementById("retune")?.focus()));
 }
 
 /** @param {any} loop @param {any} detail */
