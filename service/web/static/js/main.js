@@ -8,7 +8,7 @@ import { forbidden, signedOut } from "./api.js";
 import { html } from "./html.js";
 import { beginPalette } from "./palette.js";
 import { beginRouting, go, path } from "./router.js";
-import { jobs, refreshLoops, refreshSession } from "./state.js";
+import { jobs, may, refreshLoops, refreshSession } from "./state.js";
 import { stream } from "./stream.js";
 import { AbnormalView } from "./views/abnormal.js";
 import { Banner, Bar, Dock, dockLoop } from "./views/frame.js";
@@ -46,7 +46,7 @@ addEventListener("keydown", (event) => {
   if ((event.ctrlKey || event.metaKey) && event.key === ".") {
     const running = jobs.value.filter((each) => !each.dry_run);
     const job = running.find((each) => each.loop === dockLoop.value) ?? (running.length === 1 ? running[0] : null);
-    if (job) {
+    if (job && may.operate.value) {
       event.preventDefault();
       void abortJob(job);
     }

@@ -179,11 +179,16 @@ export function mark(u, ctx, at, name, row = 0) {
   ctx.stroke();
   ctx.setLineDash([]);
   if (!name) return;
-  ctx.fillStyle = colour("ink-2");
   ctx.font = `${11 * ratio}px Inter, system-ui, sans-serif`;
   ctx.textAlign = "left";
   ctx.textBaseline = "top";
-  ctx.fillText(name, x + 5 * ratio, u.bbox.top + (4 + 14 * row) * ratio);
+  const [left, top] = [x + 2 * ratio, u.bbox.top + (2 + 16 * row) * ratio];
+  ctx.fillStyle = colour("well");
+  ctx.globalAlpha = 0.85; // a curve behind it stays to be seen, and the name can be read
+  ctx.fillRect(left, top, ctx.measureText(name).width + 6 * ratio, 15 * ratio);
+  ctx.globalAlpha = 1;
+  ctx.fillStyle = colour("ink-2");
+  ctx.fillText(name, left + 3 * ratio, top + 2 * ratio);
 }
 
 /** Hatched ground, beyond a limit. @param {any} u @param {CanvasRenderingContext2D} ctx @param {number} from @param {number} to */

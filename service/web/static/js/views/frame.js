@@ -75,7 +75,7 @@ export function Dock() {
   const own = all.find((each) => each.loop === dockLoop.value);
   const shown = own ? [own] : all.slice(0, MOST);
   const more = all.length - shown.length;
-  return html`<section class=${`dock ${shown.length > 1 ? "many" : ""}`} aria-label="Under test">
+  return html`<section class=${`dock ${shown.length > 1 ? "many" : ""}`} aria-label="Tests under way">
     ${shown.map((job) => html`<${Cell} key=${job.id} job=${job} />`)}
     ${more > 0 && html`<a key="more" href="/ui/">${more} more under test</a>`}
   </section>`;
@@ -86,7 +86,7 @@ function Cell({ job }) {
   const stopping = job.stopping || aborting.value.has(job.id);
   const error = abortError.value.get(job.id);
   const left = isSilent.value ? "" : stopping ? "" : job.remaining_plant_time_s === null ? "" : `${duration(job.remaining_plant_time_s)} left`;
-  const stage = stopping ? "stopping, the loop is being restored" : job.state === "queued" ? "waits for its turn" : stageName(job.stage);
+  const stage = stopping ? "stopping, the loop is being restored" : job.state === "queued" ? "waits for its turn" : stageName(job.stage) || "begins";
   return html`<div class="cell">
     <a class="tag" href=${loopPath(job.loop)}>${job.loop}</a>
     <span class="stage" aria-live="polite">${stage}</span>

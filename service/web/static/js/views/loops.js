@@ -128,7 +128,7 @@ function Row({ loop }) {
 /** @param {any} loop @param {any} job */
 function Tuning(loop, job) {
   if (job) {
-    return html`<span class="tuning"><b>${job.stopping ? "stopping" : job.state === "queued" ? "waits for its turn" : stageName(job.stage)}</b>${Progress(job.progress, job.stopping)}
+    return html`<span class="tuning"><b>${job.stopping ? "stopping" : job.state === "queued" ? "waits for its turn" : stageName(job.stage) || "begins"}</b>${Progress(job.progress, job.stopping)}
       <span>${isSilent.value || job.remaining_plant_time_s === null ? "" : duration(job.remaining_plant_time_s)}</span></span>`;
   }
   const last = loop.last_job;
