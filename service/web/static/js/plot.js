@@ -50,6 +50,22 @@ export function yRange(columns, least) {
  */
 
 /**
+ * Where no line is drawn, in pixels: between the numbers beside one that is none. The plot itself knows null alone, which
+ * a typed array cannot hold, and would draw a line across.
+ * @param {any} u @param {ArrayLike<number>} at @param {ArrayLike<number>} values @param {number} first @param {number} last
+ */
+function gapsOf(u, at, values, first, last) {
+  const found = [];
+  for (let n = first; n <= last; n++) {
+    if (!Number.isNaN(values[n])) continue;
+    const from = Math.max(first, n - 1);
+    while (n < last && Number.isNaN(values[n + 1])) n++;
+    found.push([at[from], at[Math.min(last, n + 1)]].map((each) => Math.round(u.valToPos(each, "x", true))));
+  }
+  return found;
+}
+
+/**
  * Makes a plot. Words are drawn in `draw`: `drawClear` comes before the grid.
  * @param {HTMLElement} where @param {Wish} wish
  */
@@ -103,6 +119,7 @@ export function makePlot(where, wish) {
           dash: line.dash,
           points: { show: false },
           spanGaps: false,
+          gaps: (/** @type {any} */ u, /** @type {number} */ of, /** @type {number} */ first, /** @type {number} */ last) => gapsOf(u, u.data[0], u.data[of], first, last),
           paths: line.stepped ? uPlot.paths.stepped?.({ align: 1 }) : undefined,
         })),
       ],

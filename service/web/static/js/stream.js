@@ -28,6 +28,8 @@ class Stream {
     this.hidden = undefined;
     this.given_up = false;
     this.jobs_seen = "";
+    /** Counts how often the stream was opened. */
+    this.opened = 0;
   }
 
   begin() {
@@ -56,6 +58,7 @@ class Stream {
     clearTimeout(this.retry);
     this.source?.close();
     const query = this.tag ? `?loops=${encodeURIComponent(this.tag)}&back_s=${this.back_s}` : "";
+    this.opened++;
     const source = new EventSource(`/live${query}`);
     this.source = source;
     /** @param {string} name @param {(found: any) => void} take */

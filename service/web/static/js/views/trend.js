@@ -14,7 +14,7 @@ import { stageName } from "../words.js";
 
 const WINDOWS = /** @type {const} */ ([["30 s", 30], ["2 min", 120], ["10 min", 600], ["30 min", 1800]]);
 const LONGEST_S = 1800;
-/** Between what the service keeps and the first live sample: longer is a gap. */
+/** Between what the service keeps and the first live sample, and over a break of the stream: longer is a gap. */
 const GAP_S = 3;
 /** Not more than ten drawings a second: a process is not smoother at sixty. */
 const DRAW_MS = 100;
@@ -155,7 +155,10 @@ export function Trend({ loop, job, height, onJob }) {
           join(false);
           return;
         }
-        if (found.past && found.at_s.length && found.at_s[0] > it.ring.last) it.ring.gap();
+        // After a break of the stream, which may be one of the service: what was not heard is not drawn.
+        const late_s = found.at_s.length ? found.at_s[0] - it.ring.last : 0;
+        if (found.past ? late_s > 0 : it.opened !== stream.opened && late_s > GAP_S) it.ring.gap();
+        it.opened = stream.opened;
         it.ring.take(found);
         it.dirty = true;
       },
