@@ -20,7 +20,7 @@ import { UnderTest } from "./undertest.js";
 
 const REREAD_MS = 60_000;
 /** Chosen once: a test with its stages is seen whole, and a trend that was made anew would be empty for a while. */
-const TREND_PX = Math.max(240, Math.min(400, innerHeight - 560));
+const TREND_PX = Math.max(240, Math.min(400, innerHeight - 620));
 
 /** @param {{tag: string}} props */
 export function LoopView({ tag }) {
