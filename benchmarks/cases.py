@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from benchmarks.disturbances import Disturbance
@@ -20,6 +21,7 @@ class Case:
     samples: in Pu.  known: T95 as it is said over 3 Pu.  adapted: so many times the amplitude is where MV ends, and the
     procedure finds the amplitude itself.  limits: of MV, amplitudes.  Mt, noise_gain: bounds on them, this in Ku.
     tail: Pu at the end of the record that are lost; what is left is judged anew, as for another Ms.
+    directions: to which sides the set-point goes.  sp_rate: of the set-point, permitted steps in Pu.
     """
 
     name: str
@@ -36,6 +38,8 @@ class Case:
     Mt: float | None = None
     noise_gain: float | None = None
     tail: float = 0.0
+    directions: str = "both"
+    sp_rate: float = math.inf
 
     def spec(self, plant: Plant) -> DesignSpec:
         bound = None if self.noise_gain is None else self.noise_gain * plant.Ku

@@ -40,7 +40,7 @@ from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.execution.runner import run
 from loopwright.tuning.experiments.preflight import PREFLIGHT, SETTLE
-from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.experiments.primitives import Directions, Facts
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.setpoint_procedure import setpoint
 from loopwright.tuning.models import sign
@@ -62,6 +62,20 @@ CASES = {
         Case("PID 1 %", 0.01, derivative=True, limits=math.inf),
     )
 }
+FURTHER = {
+    case.name: case
+    for case in (
+        Case("PI 1 %, up", 0.01, limits=math.inf, directions="up"),
+        Case("PI 1 %, down", 0.01, limits=math.inf, directions="down"),
+        Case("PI 2 % + load, up", 0.02, ONE, limits=math.inf, directions="up"),
+        Case("PI 1 %, a step in 0.25 Pu", 0.01, limits=math.inf, sp_rate=4.0),
+        Case("PI 1 %, a step in 1 Pu", 0.01, limits=math.inf, sp_rate=1.0),
+        Case("PI 1 %, a step in 2 Pu", 0.01, limits=math.inf, sp_rate=0.5),
+        Case("PI 1 %, a step in 4 Pu", 0.01, limits=math.inf, sp_rate=0.25),
+        Case("PI 1 %, up, a step in 1 Pu", 0.01, limits=math.inf, directions="up", sp_rate=1.0),
+    )
+}
+"""Loops that may be moved to one side only, or no faster than at a rate: asked for by name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +85,14 @@ class Pulsed(Ran):
     present: the kind of the present gains.
     pv: the largest |PV| before the trial, in permitted steps; at_limit, at_limit_trial: how long MV was at its limit,
     before and in the trial, Pu.
+    beyond: the largest PV to the side that is not permitted, in permitted steps; None where both are.
     """
 
     present: str = ""
     pv: float = 0.0
     at_limit: float = 0.0
     at_limit_trial: float = 0.0
+    beyond: float | None = None
 
 
 class PulsedLoop(RehearsedLoop):
@@ -116,7 +132,10 @@ def measure(plant: Plant, present: str, case: Case, seed: int) -> Pulsed:
     reverse = sign(model) > 0.0
     settings = Settings(mv_low=-limit, mv_high=limit, pv_low=-1e9, pv_high=1e9, reverse=reverse)
     channel = Channel(plant.Ts, settings, Parameters(gains.Kp, gains.Ti), 0.0, int(Mode.AUTOMATIC), 0.0)
-    facts = Facts(plant.Ts, case.known * T95_PERIODS * plant.Pu, -limit, limit, STEP, gains, reverse)
+    facts = Facts(
+        plant.Ts, case.known * T95_PERIODS * plant.Pu, -limit, limit, STEP, gains, reverse,
+        directions=Directions(case.directions), sp_rate_max_per_s=case.sp_rate * STEP / plant.Pu,
+    )  # fmt: skip
     loop, spec = PulsedLoop(disturbed, channel, plant.Ts), case.spec(plant)
     options = DesignOptions(spec.Ms, spec.derivative, spec.Mt, spec.noise_gain, propose_anyway=True)
     begun = time.process_time()
@@ -130,6 +149,7 @@ def measure(plant: Plant, present: str, case: Case, seed: int) -> Pulsed:
         pv=max((abs(each.pv) for each in before), default=0.0) / STEP,
         at_limit=sum(abs(each.mv) >= 0.9999 * limit for each in before) / plant.samples,
         at_limit_trial=sum(abs(each.mv) >= 0.9999 * limit for each in trial) / plant.samples,
+        beyond=max(-facts.side * each.pv for each in [*before, *trial]) / STEP if facts.one_sided and before else None,
     )  # fmt: skip
     if result.value is None:
         assert isinstance(result.ended, Ended)
@@ -141,7 +161,7 @@ def measure(plant: Plant, present: str, case: Case, seed: int) -> Pulsed:
 
 def _measured(given: tuple[Plant, str, str, int]) -> Pulsed:
     plant, present, case, seed = given
-    return measure(plant, present, CASES[case], seed)
+    return measure(plant, present, (CASES | FURTHER)[case], seed)
 
 
 HEAD = (
@@ -176,7 +196,7 @@ def spread(values: Sequence[float], digits: int, at: Sequence[int] = (50, 90, 99
 
 def table(runs: Sequence[Pulsed]) -> Iterator[str]:
     yield HEAD
-    for name in CASES:
+    for name in CASES | FURTHER:
         of_case = [each for each in runs if each.case == name]
         for present in PRESENT:
             if mine := [each for each in of_case if each.present == present]:
@@ -228,11 +248,15 @@ def runs(given: argparse.Namespace) -> Iterator[Pulsed]:
 def main(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     """parser, given: of `benchmarks.tuning`."""
     given.cases = given.cases or ";".join(CASES)
-    check_names(parser, "case", given.cases.split(";"), CASES)
+    check_names(parser, "case", given.cases.split(";"), CASES | FURTHER)
     found = saved(given.of) if given.of else list(runs(given))
     if not found:
         parser.exit(2, f"{parser.prog}: no run: {given.of or 'no plants or no seeds'}\n")
     print(*table(found), sep="\n")
+    for name in FURTHER:
+        if beyond := [each.beyond for each in found if each.case == name and each.beyond is not None]:
+            spread_of = spread(beyond, 2, (50, 90), largest=True)
+            print(f"\n{name}: PV beyond its rest, permitted steps: p50 / p90 / max {spread_of}.")
     seconds = [each.seconds for each in found]
     print(
         f"\n{len(found)} runs, {np.median(seconds):.2f} s of processor each (median), {np.mean(seconds):.2f} s (mean), "

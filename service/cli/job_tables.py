@@ -186,6 +186,8 @@ def loop_report(loop: LoopDetail) -> None:
         ("SP", figure(live, "sp"), unit),
         ("SP from", ", ".join(filter(None, (loop.setpoint_from, loop.outer_loop))), ""),
         ("fast moves it by", ", ".join(loop.test.excitations), ""),
+        ("SP moves in a test", loop.test.directions, ""),
+        ("SP rate in a test", cell(loop.test.sp_rate_max_per_s), f"{unit}/s"),
         ("PV", figure(live, "pv"), unit),
         ("MV", figure(live, "mv"), "%"),
         ("mode", figure(live, "mode"), ""),

@@ -245,6 +245,10 @@ def retune(
     sp_deviation: Annotated[float | None, typer.Option(help="Permitted set-point step, PV units.")] = None,
     mv_low: Annotated[float | None, typer.Option(help="Lowest MV during the test, percent.")] = None,
     mv_high: Annotated[float | None, typer.Option(help="Highest MV during the test, percent.")] = None,
+    directions: Annotated[str | None, typer.Option(help="To where the set-point is moved: both, up or down.")] = None,
+    sp_rate_max: Annotated[
+        float | None, typer.Option("--sp-rate-max-per-s", help="Largest rate of the set-point, PV units per s.")
+    ] = None,
     method: Annotated[str | None, typer.Option(help="fast, setpoint, five-stage or a rule; default: fast.")] = None,
     ms: Annotated[float | None, typer.Option(help="Ms that is designed for: 1.2 robust .. 1.6 .. 2.0 fast.")] = None,
     derivative: Annotated[
@@ -276,7 +280,7 @@ def retune(
     client = Client(url)
     options: dict[str, object] = {
         "sp_deviation": sp_deviation, "mv_low": mv_low, "mv_high": mv_high, "dry_run": dry_run or None,
-        "method": method, "ms": ms, "derivative": derivative or None, "amplitude_pct": amplitude,
+        "directions": directions, "sp_rate_max_per_s": sp_rate_max, "method": method, "ms": ms, "derivative": derivative or None, "amplitude_pct": amplitude,
         "excitations": excitations.split(",") if excitations else None,
         "careful": careful or None, "verify": None if verify else False, "propose_anyway": propose_anyway or None,
         "pattern": loop if many else None,

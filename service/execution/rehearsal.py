@@ -36,6 +36,7 @@ from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Restored
 from loopwright.service.results import FastResult, FiveStageResult, UltimateView, empty_result
 from loopwright.tuning.analysis.margins import ultimate_point
+from loopwright.tuning.experiments.primitives import Directions
 from loopwright.tuning.fast.design_trial import trial
 from loopwright.tuning.fast.excitation_choice import chosen_stages, fast_by
 from loopwright.tuning.fast.options import DesignOptions
@@ -175,6 +176,10 @@ class PlantFile(BaseModel):
     seed: int = Field(1, ge=0)
     mv_limits: tuple[Value, Value] = (-0.5, 0.5)
     mv_step_max: Annotated[Value, Field(gt=0)] | None = Field(None, description="largest jump of MV in the test")
+    directions: Directions = Field(Directions.BOTH, description="to which sides of its rest the set-point is moved")
+    sp_rate_max_per_s: Annotated[Value, Field(gt=0)] | None = Field(
+        None, description="largest rate of the set-point in the test, PV units per s"
+    )
     sp_deviation: Annotated[Value, Field(gt=0)] | None = None
     gains: PresentGains | None = Field(None, description="present gains of the loop")
     reverse_acting: bool | None = Field(None, description="the controller's action; left out: right for the plant")
@@ -357,7 +362,12 @@ def _loop(file: PlantFile) -> tuple[RehearsedLoop, Facts]:
     settings = Settings(mv_low=low, mv_high=high, safe_output=0.0, pv_low=-span, pv_high=span, reverse=reverse)
     present = Gains(**gains.model_dump())
     channel = Channel(ts, settings, _parameters(present), 0.0, int(Mode.AUTOMATIC), 0.0)
-    facts = Facts(ts, t95, low, high, step, present, reverse, mv_step_max=file.mv_step_max or math.inf)
+    facts = Facts(
+        ts, t95, low, high, step, present, reverse,
+        mv_step_max=file.mv_step_max or math.inf,
+        directions=file.directions,
+        sp_rate_max_per_s=file.sp_rate_max_per_s or math.inf,
+    )  # fmt: skip
     return RehearsedLoop(plant, channel, ts), facts
 
 

@@ -18,6 +18,7 @@ from loopwright.service.inputs.plausible import Positive, Size, Time, Value, che
 
 Node = Annotated[int, Field(ge=1, le=127)]
 ExcitationName = Literal["observe", "setpoint", "relay"]
+DirectionName = Literal["both", "up", "down"]
 Tag = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 
 _BUS_KINDS = ("socketcan", "socketcand", "virtual", "pcan", "kvaser", "ixxat", "vector", "slcan", "gs_usb")
@@ -54,6 +55,9 @@ class PermittedTest(BaseModel):
     order, each where those before it tell too little.
     mv_step_max: the largest jump of MV from one sample to the next, percent, of a test by any method; None: what
     mv_limits permit.
+    directions: to which sides of its rest a test by any method moves the set-point. A relay moves PV to both.
+    sp_rate_max_per_s: the largest rate of the set-point, PV units per s of plant time, of a test by any method; None:
+    the set-point is stepped.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -71,6 +75,17 @@ class PermittedTest(BaseModel):
         "null: only the MV limits bound it",
         examples=[10.0],
     )
+    directions: DirectionName = Field(
+        default="both",
+        description="To which sides of its rest a test moves the set-point; up and down exclude the relay",
+        examples=["up"],
+    )
+    sp_rate_max_per_s: Positive | None = Field(
+        default=None,
+        description="The largest rate at which a test moves the set-point, PV units per s of plant time; null: it is "
+        "stepped",
+        examples=[0.02],
+    )
 
     @field_validator("excitations")
     @classmethod
@@ -78,6 +93,15 @@ class PermittedTest(BaseModel):
         if len(set(value)) < len(value):
             raise ValueError(f"{', '.join(value)}: each excitation is named once")
         return value
+
+    @model_validator(mode="after")
+    def _to_one_side(self) -> Self:
+        if self.directions != "both" and "relay" in self.excitations:
+            raise ValueError(
+                f"directions {self.directions} exclude the relay, which moves PV to both sides: name excitations "
+                "without it, such as [setpoint]"
+            )
+        return self
 
 
 class LoopConfig(BaseModel):

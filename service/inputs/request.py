@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Literal, Self
 
@@ -18,7 +19,7 @@ from pydantic import (
 )
 
 from loopwright.service.errors import RemoteSetpoint
-from loopwright.service.inputs.config import ExcitationName, LoopConfig, PermittedTest
+from loopwright.service.inputs.config import DirectionName, ExcitationName, LoopConfig, PermittedTest
 from loopwright.service.inputs.model_json import ModelForm
 from loopwright.service.inputs.plausible import (
     Finite,
@@ -34,11 +35,14 @@ from loopwright.service.inputs.plausible import (
     check_step,
 )
 from loopwright.service.inputs.validation import branch, branch_of
+from loopwright.tuning.experiments.primitives import Directions
+from loopwright.tuning.experiments.step_limits import not_kept
+from loopwright.tuning.fast.design_trial import trial_stages
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.procedure import FAST, FastOptions
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.fast.setpoint_procedure import SETPOINT
-from loopwright.tuning.five_stage.procedure import PROCEDURE, Options, rule_of
+from loopwright.tuning.five_stage.procedure import PROCEDURE, Options, rule_of, stages_of
 from loopwright.tuning.models import FOPDT, SOPDT
 from loopwright.tuning.reasons import Refused
 from loopwright.tuning.rules.registry import METHODS
@@ -92,6 +96,17 @@ class Bounds(BaseModel):
         description="Budget of plant time, s; by default 100 times the loop's T95 for fast and setpoint, 500 times for "
         "five-stage",
         examples=[3600.0],
+    )
+    directions: DirectionName | None = Field(
+        default=None,
+        description="To which sides of its rest the set-point is moved, within those of loops.yaml; up and down leave "
+        "the relay out",
+        examples=["up"],
+    )
+    sp_rate_max_per_s: Positive | None = Field(
+        default=None,
+        description="Largest rate of the set-point, PV units per s of plant time; at most the loop's own",
+        examples=[0.02],
     )
 
 
@@ -516,10 +531,21 @@ def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[s
 
 def _narrow_test(loop: LoopConfig, request: RetuneRequest) -> tuple[PermittedTest, list[str]]:
     """What the test may do by the request, and the errors in that."""
+    test, problems = _narrow_moves(loop, request)
     if not isinstance(request, FastRetune) or request.start == "design":
-        return loop.test, []
+        return test, problems + _not_kept(test, request)
     permitted = loop.test.excitations
     asked = permitted if request.excitations is None else request.excitations
+    if test.directions != "both" and "relay" in permitted:  # left out where it is not asked for
+        words = f"directions {test.directions}: a relay moves PV to both sides of its rest"
+        if request.excitations is not None and "relay" in request.excitations:
+            problems.append(f"{words}; ask for excitations without it, or leave directions out")
+        elif permitted == ("relay",):
+            problems.append(f"{words}, and loops.yaml permits no other excitation (test: excitations)")
+        else:
+            asked = tuple(each for each in asked if each != "relay")
+    if problems:
+        return loop.test, problems
     more = [each for each in asked if each not in permitted]
     if more:
         words = f"loops.yaml permits {', '.join(permitted)} (test: excitations)"
@@ -530,7 +556,33 @@ def _narrow_test(loop: LoopConfig, request: RetuneRequest) -> tuple[PermittedTes
     if asked == ("observe",) and not request.verify:
         words = "gains from operation are proposed only after the step under them"
         return loop.test, [f"verify: false, with observe as the only excitation: {words}; leave verify out"]
-    return loop.test.model_copy(update={"excitations": asked}), []
+    return test.model_copy(update={"excitations": asked}), []
+
+
+def _narrow_moves(loop: LoopConfig, request: RetuneRequest) -> tuple[PermittedTest, list[str]]:
+    """To where and how fast the test may move the set-point by the request, and the errors in that."""
+    test, unit, problems = loop.test, loop.pv_unit, []
+    directions = request.directions or test.directions
+    if test.directions not in ("both", directions):
+        problems.append(
+            f"directions {directions} is asked for, loops.yaml permits {test.directions} (test: directions)"
+        )
+    rate, permitted = request.sp_rate_max_per_s, test.sp_rate_max_per_s
+    if rate is not None and permitted is not None and rate > permitted:
+        problems.append(f"sp_rate_max_per_s {rate:g} is more than the configured {permitted:g} {unit}/s")
+    return test.model_copy(update={"directions": directions, "sp_rate_max_per_s": rate or permitted}), problems
+
+
+def _not_kept(test: PermittedTest, request: RetuneRequest) -> list[str]:
+    """What a retune by steps of the set-point cannot keep, in sentences; empty for one by pulses."""
+    if isinstance(request, SetpointRetune):
+        return []
+    if isinstance(request, FastRetune):
+        stages, mirrored = trial_stages(request.verify), True
+    else:
+        stages = stages_of(request.start, request.options.baseline, request.verify)
+        mirrored = False
+    return not_kept(Directions(test.directions), test.sp_rate_max_per_s or math.inf, stages, mirrored)
 
 
 def _given_dead_time_s(request: RetuneRequest) -> float:

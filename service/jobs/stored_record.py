@@ -17,6 +17,9 @@ from loopwright.tuning.plan import Mode
 
 MIN_TURNS = 2
 """Smallest number of turns of the set-point for a fit."""
+MAX_RAMP_GAP = 12
+"""Number of samples between two moves of the set-point in one direction, from which on they are no ramp: a simulated
+plant at full speed takes the commands of ten samples at once."""
 Columns = Mapping[str, Sequence[Any] | Reals]
 """Columns by their names in GET /jobs/{id}/samples."""
 
@@ -66,9 +69,16 @@ class StoredRecord:
             excited=self.excited,
             turns=len(self.switches),
             period=oscillation_period(self.switches) if relay else first_period(u[excited], y[excited], self.Ts),
-            steps=tuple(int(i) for i in self.excited + np.flatnonzero(np.diff(self.sp[self.excited - 1 :]))),
+            steps=tuple(int(i) for i in self.excited + moves_of(self.sp[self.excited - 1 :]) - 1),
             excitation=self.excitation,
+            one_sided=not relay and self._to_one_side,
         )
+
+    @property
+    def _to_one_side(self) -> bool:
+        """Whether the pulses went to one side of where the set-point was at rest only."""
+        away = self.sp[self.listened : self.excited] - self.sp[0]
+        return bool(np.all(away >= 0.0) or np.all(away <= 0.0))
 
     @property
     def _rises_with_setpoint(self) -> bool:
@@ -141,6 +151,15 @@ def record_columns(blocks: Iterable[Block]) -> Columns:
     return {"stage": stages} | {column: np.concatenate(found) for column, found in numbers.items()}
 
 
+def moves_of(sp: Reals) -> NDArray[np.int64]:
+    """Returns the samples at which the set-point begins to move, each ramp once."""
+    change = np.diff(sp)
+    moved = np.flatnonzero(change)
+    apart, way = np.diff(moved, prepend=-MAX_RAMP_GAP), np.sign(change[moved])
+    first: NDArray[np.int64] = moved[(apart >= MAX_RAMP_GAP) | (np.diff(way, prepend=0.0) != 0.0)]
+    return first + 1
+
+
 Parts = tuple[int, int, tuple[int, ...]]
 """The number of samples at rest, that up to the end of the excitation, and the samples of its turns."""
 
@@ -150,7 +169,7 @@ def _of_relay(mv: Reals, mode: Reals, sp: Reals, stage: NDArray[np.str_]) -> Par
     after = np.flatnonzero(mode[begun:] != Mode.EXPERIMENT)
     excited = begun + int(after[0]) if len(after) else len(mode)
     # the relay may follow pulses of the set-point, which belong to the same record
-    pulses = 1 + np.flatnonzero(np.diff(sp[:begun]))
+    pulses = moves_of(sp[:begun])
     listened = int(pulses[0]) if np.any(stage[:begun] == "pulses") and len(pulses) else begun
     # the relay begins high
     high = np.append(True, mv[begun:excited] > np.mean(mv[: max(listened, 1)]))
@@ -158,7 +177,7 @@ def _of_relay(mv: Reals, mode: Reals, sp: Reals, stage: NDArray[np.str_]) -> Par
 
 
 def _of_pulses(sp: Reals, stage: NDArray[np.str_]) -> Parts:
-    moved = 1 + np.flatnonzero(np.diff(sp))
+    moved = moves_of(sp)
     verified = [int(i) for i in moved if stage[i] == "verify"]
     excited = verified[0] if verified else len(sp)
     return int(moved[0]), excited, tuple(int(i) for i in moved[1:] if i < excited)

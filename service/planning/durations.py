@@ -19,16 +19,25 @@ from loopwright.tuning.fast.setpoint_procedure import MAX_T95
 PU_OF_T95 = (0.07, 0.95)
 """Ultimate period as a fraction of T95: the range of eight in ten of 116 self-regulating plants."""
 
+MOVES, MOVES_OF_STEP = 5.0, 2.0
+"""Way of the set-point in permitted steps, at most: pulses up, down and up again; the step, and home at the end."""
+
 Span = tuple[float, float]
 
 
 def durations(
-    request: RetuneRequest, stages: Sequence[str], t95_s: float, sample_time_s: float | None, pu_s: float | None
+    request: RetuneRequest,
+    stages: Sequence[str],
+    t95_s: float,
+    sample_time_s: float | None,
+    pu_s: float | None,
+    ramp_s: float = 0.0,
 ) -> dict[str, Span]:
     """Returns the shortest and the longest time expected of each stage, s.
 
     stages: the stages that the retune may have.
     pu_s: the ultimate period, s; None where no model is known.
+    ramp_s: the time that the set-point takes for the permitted step, s.
     """
     designed_only = isinstance(request, FastRetune) and request.start == "design"
     whole_record = not designed_only and not isinstance(request, FiveStages)
@@ -43,10 +52,14 @@ def durations(
     if whole_record:
         # where operation has shown the plant only the trial moves the loop, else the trial is left out
         may_be_known = "trial" in stages
-        pulses = (0.0 if may_be_known else 1.5 * low, max(MAX_PERIODS_OF_PULSES * high, MAX_T95 * t95_s))
+        pulses = (
+            0.0 if may_be_known else 1.5 * low,
+            max(MAX_PERIODS_OF_PULSES * high, MAX_T95 * t95_s) + MOVES * ramp_s,
+        )
         # the relay follows pulses only where they tell too little
         relay = (0.0 if may_be_known or "pulses" in stages else 1.8 * low, MAX_PERIODS * high)
-        steps = (VERIFICATION_PERIODS * low, (1.0 + STEP_BACK_FRACTION) * VERIFICATION_PERIODS * high)
+        longest = (1.0 + STEP_BACK_FRACTION) * VERIFICATION_PERIODS * high + MOVES_OF_STEP * ramp_s
+        steps = (VERIFICATION_PERIODS * low, longest)
         verify = (0.0 if may_be_known else steps[0], steps[1])
         known = {"preflight": listening, "trial": steps, "pulses": pulses, "relay": relay, "verify": verify}
         return {stage: known.get(stage, nothing) for stage in stages}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from pydantic import BaseModel, Field
 
 from loopwright.service.inputs.config import LoopConfig
@@ -98,12 +100,14 @@ def _moved(config: LoopConfig, state: LoopState, known: KnowledgeView | None) ->
     amplitude = FIRST_AMPLITUDE * max_amplitude(state.mv, low, high, jump)
     if not room > 0.0 or not amplitude > 0.0:  # MV may be no number
         return None
-    kick = new.b * new.Kp
+    one_sided, kick = config.test.directions != "both", new.b * new.Kp
     step = min(config.sp_deviation, KICK_OF_ROOM * room / kick) if kick > 0.0 else config.sp_deviation
     return Moved(
         gains=state.gains,
         new=new,
-        pulse=pulse_size(config.sp_deviation, room, state.gains),
+        pulse=pulse_size(config.sp_deviation, room, state.gains, one_sided),
+        one_sided=one_sided,
+        sp_rate_max_per_s=config.test.sp_rate_max_per_s or math.inf,
         step=step,
         high=amplitude,
         low=BIAS * amplitude,

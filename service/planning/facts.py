@@ -6,7 +6,7 @@ import math
 
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.loop_state import LoopState
-from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.experiments.primitives import Directions, Facts
 from loopwright.tuning.fast.procedure import FAST
 from loopwright.tuning.fast.setpoint_procedure import SETPOINT
 
@@ -32,6 +32,8 @@ def facts_of(config: LoopConfig, state: LoopState) -> Facts:
         mv_step_max=config.test.mv_step_max or math.inf,
         pv_low=config.pv_limits.low,
         pv_high=config.pv_limits.high,
+        directions=Directions(config.test.directions),
+        sp_rate_max_per_s=config.test.sp_rate_max_per_s or math.inf,
     )
 
 

@@ -81,7 +81,7 @@ def rehearsal_spec(
             spec["sample_time_s"] = state.sample_time_s
     middle = 0.5 * (low + high)
     spec["mv_limits"] = [low - middle, high - middle]
-    spec["mv_step_max"] = config.test.mv_step_max
+    spec |= config.test.model_dump(include={"mv_step_max", "directions", "sp_rate_max_per_s"})
 
     last = ground.last_model
     source, job, ended_at = PlantSource.GIVEN, None, None

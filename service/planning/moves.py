@@ -79,14 +79,16 @@ def broken_limits(config: LoopConfig, request: RetuneRequest, sp: float) -> list
     share = 1.0
     if isinstance(request, FiveStages) and "zn_pi" in stages:
         share += request.overshoot_window_pct[0] / 100.0
-    if any(stage in stages for stage in (*_STEPPING, "pulses")) and sp + share * step > high + hair:
+    up, down = (config.test.directions in ("both", way) for way in ("up", "down"))
+    stepping = any(stage in stages for stage in (*_STEPPING, "pulses"))
+    if up and stepping and sp + share * step > high + hair:
         overshoot = f" and an overshoot of {100 * (share - 1):g} % is looked for," if share > 1 else ","
         broken.append(
             f"the set-point is stepped from {sp:.6g} by up to {step:g} {unit} (sp_deviation),{overshoot} which takes "
             f"PV to {sp + share * step:.6g}, above the PV limit {high:g}: {_remedy((high - sp) / share, unit)}"
         )
     adapted = isinstance(request, FastRetune) and request.amplitude_pct is None
-    if "pulses" in stages and sp - step < low - hair:
+    if down and ("pulses" in stages or (stepping and not up)) and sp - step < low - hair:
         broken.append(
             f"the set-point is moved from {sp:.6g} down by up to {step:g} {unit} (sp_deviation), which takes PV to "
             f"{sp - step:.6g}, below the PV limit {low:g}: {_remedy(sp - low, unit)}"
@@ -178,7 +180,7 @@ def _fast(stage: str, config: LoopConfig, request: FastRetune, before: Before) -
     if stage != "relay":
         what = (
             f"The set-point is stepped up by up to {step:g} {unit} under the new gains, on trial; it is stepped back "
-            "where the record is not conclusive."
+            f"where the record is not conclusive.{_ramp(config, step)}"
         )
         return Moves(stage, what, up, up, step, pv=_UNDER_NEW_GAINS * step)
     size, mean = "The size stays", 0.5 * (1.0 + BIAS)
@@ -197,35 +199,67 @@ def _fast(stage: str, config: LoopConfig, request: FastRetune, before: Before) -
 
 def _setpoint(stage: str, config: LoopConfig, before: Before) -> Moves:
     step, unit, room, gains = config.sp_deviation, config.pv_unit, _room(config, before.mv), before.gains
+    one_sided, way = config.test.directions != "both", config.test.directions
     if gains is not None and gains.Kp * gains.b > 0.0:
-        step = pulse_size(step, room, gains)
+        step = pulse_size(step, room, gains, one_sided)
     if stage == "pulses":
+        pulses = f"{way}, back and {way} again" if one_sided else "up, down and up again"
         what = (
-            f"The set-point moves up, down and up again by up to {step:.4g} {unit} under the present gains; the loop "
-            "stays in automatic."
+            f"The set-point moves {pulses} by up to {step:.4g} {unit} under the present gains; the loop stays in "
+            f"automatic.{_ramp(config, step)}"
         )
-        return Moves(stage, what, room, room, step, step, _UNDER_PRESENT_GAINS * step)
+        if one_sided:
+            what += " A gain that differs above and below where it begins is not seen."
+        return Moves(stage, what, room, room, *_sides(config, step, step), _UNDER_PRESENT_GAINS * step)
+    again = "once more, by half as much"
     what = (
         f"The set-point goes back by {step:.4g} {unit} to where it was, under the new gains, on trial; it is stepped "
-        "once more, by half as much, where the record is not conclusive."
+        f"{again}, where the record is not conclusive.{_ramp(config, step)}"
     )
-    return Moves(stage, what, room, room, step, pv=_UNDER_NEW_GAINS * step)
+    return Moves(stage, what, room, room, *_sides(config, step, 0.0), pv=_UNDER_NEW_GAINS * step)
 
 
 def _known_trial(config: LoopConfig, before: Before) -> Moves:
     kick, step = KICK_OF_ROOM * _room(config, before.mv), config.sp_deviation
     what = (
-        f"Only where operation has shown the plant well enough: the set-point is stepped up by up to {step:g} "
-        f"{config.pv_unit} under the gains that follow from it, on trial, and home where the record is not conclusive. "
-        "A plant that is another one by now shows in it; the present gains then take over again."
+        f"Only where operation has shown the plant well enough: the set-point is stepped {_first(config)} by up to "
+        f"{step:g} {config.pv_unit} under the gains that follow from it, on trial, and home where the record is not "
+        f"conclusive. A plant that is another one by now shows in it; the present gains then take over again."
+        f"{_ramp(config, step)}"
     )
-    return Moves("trial", what, kick, kick, step, pv=FARTHEST * step)
+    return Moves("trial", what, kick, kick, *_sides(config, step, 0.0), pv=FARTHEST * step)
 
 
 def _trial(stage: str, config: LoopConfig, before: Before) -> Moves:
     kick, step = KICK_OF_ROOM * _room(config, before.mv), config.sp_deviation
-    what = f"The set-point is stepped up by up to {step:g} {config.pv_unit} under the new gains, on trial, and back."
-    return Moves(stage, what, kick, kick, step, pv=_UNDER_NEW_GAINS * step)
+    what = (
+        f"The set-point is stepped {_first(config)} by up to {step:g} {config.pv_unit} under the new gains, on trial, "
+        "and back."
+    )
+    return Moves(stage, what, kick, kick, *_sides(config, step, 0.0), pv=_UNDER_NEW_GAINS * step)
+
+
+def _first(config: LoopConfig) -> str:
+    """Returns the side to which the set-point is moved first."""
+    return "down" if config.test.directions == "down" else "up"
+
+
+def _sides(config: LoopConfig, first: float, second: float) -> tuple[float, float]:
+    """Returns the largest moves of the set-point up and down.
+
+    first, second: its moves to the side to which it goes first, and to the other one where that is permitted.
+    """
+    if config.test.directions == "both":
+        return first, second
+    return (first, 0.0) if config.test.directions == "up" else (0.0, first)
+
+
+def _ramp(config: LoopConfig, step: float) -> str:
+    """Returns the sentence on the time that moves of the set-point take; empty where they are steps."""
+    rate = config.test.sp_rate_max_per_s
+    if rate is None:
+        return ""
+    return f" It is moved at {rate:g} {config.pv_unit}/s at most: {step / rate:.3g} s for {step:.4g} {config.pv_unit}."
 
 
 def _five_stage(stage: str, config: LoopConfig, request: FiveStages, before: Before) -> Moves:

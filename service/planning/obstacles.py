@@ -8,11 +8,21 @@ from enum import StrEnum
 
 from loopwright.service.errors import RemoteSetpoint
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.inputs.request import FastRetune, RetuneRequest, check_setpoint_source, narrow
+from loopwright.service.inputs.request import (
+    FastRetune,
+    RetuneRequest,
+    SetpointRetune,
+    check_setpoint_source,
+    excitations,
+    narrow,
+)
 from loopwright.service.loop_state import OPERATIONAL, LoopState
 from loopwright.service.planning.facts import facts_of
 from loopwright.service.planning.moves import broken_limits, stages_asked
 from loopwright.tuning.experiments.preflight import MAX_ATTEMPTS, MAX_AWAY, MAX_NOISE, MIN_ROOM
+from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.experiments.ramp import check_ramp
+from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.fast.relay_test import BIAS, max_amplitude
 from loopwright.tuning.models import sign
 from loopwright.tuning.plan import Mode
@@ -87,6 +97,18 @@ def obstacles(config: LoopConfig, request: RetuneRequest, now: Now) -> list[Obst
     return found
 
 
+def _ramp_obstacles(config: LoopConfig, request: RetuneRequest, facts: Facts) -> list[Obstacle]:
+    """Returns the obstacle where ramps of the set-point are too slow for pulses, and nothing may follow them."""
+    pulses = isinstance(request, SetpointRetune) or excitations(config, request) == (Excitation.SETPOINT,)
+    if not pulses:
+        return []
+    try:
+        check_ramp(facts, config.noise_std_hint or 0.0)
+    except Refused as refused:
+        return [Obstacle(refused.reason, refused.detail)]
+    return []
+
+
 def _state_obstacles(config: LoopConfig, request: RetuneRequest, state: LoopState) -> list[Obstacle]:
     """Returns the obstacles in the state of the loop. config: the configuration with the limits of the job."""
     found: list[Obstacle] = []
@@ -106,7 +128,7 @@ def _state_obstacles(config: LoopConfig, request: RetuneRequest, state: LoopStat
     if not math.isfinite(state.pv) or not math.isfinite(state.mv):
         return [*found, Obstacle(Reason.BAD_SAMPLE, f"PV is {state.pv}, MV is {state.mv}")]
     mv = _mv_obstacles(config, request, state.mv, facts.mv_low, facts.mv_high)
-    return found + mv + _pv_obstacles(config, request, state)
+    return found + mv + _pv_obstacles(config, request, state) + _ramp_obstacles(config, request, facts)
 
 
 def _mv_obstacles(config: LoopConfig, request: RetuneRequest, mv: float, low: float, high: float) -> list[Obstacle]:

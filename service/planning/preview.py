@@ -158,7 +158,9 @@ def preview(
     Ku, Pu_s = _entered(request)
     pu_s = Pu_s or (last.Pu_s if last else None)
     sample_time_s = state.sample_time_s if state else None
-    times = durations(request, stages_asked(narrowed, request), config.t95_s, sample_time_s, pu_s)
+    rate = narrowed.test.sp_rate_max_per_s
+    ramp_s = narrowed.sp_deviation / rate if rate else 0.0
+    times = durations(request, stages_asked(narrowed, request), config.t95_s, sample_time_s, pu_s, ramp_s)
     mv, sp = (_finite(state.mv), _finite(state.sp)) if state else (None, None)
     before = Before(state.gains if state else None, mv, Ku or (last.Ku if last else None))
     moved = [] if request.dry_run else moves(limited, request, before)
@@ -184,7 +186,7 @@ def preview(
         duration_basis=_basis(request, config, last),
         watched=WatchedLimits(pv=narrowed.pv_limits, mv=permitted, max_time_s=_budget_s(request, limited, state)),
         at_the_end=_at_the_end(request),
-        on_abort=_on_abort(request, state, config.pv_unit),
+        on_abort=_on_abort(request, state, config.pv_unit, ramped=rate is not None),
         known=_known(config, last),
         excitations=excitation_previews(limited, request, state, knowledge),
     )
@@ -201,7 +203,7 @@ def _permitted(config: LoopConfig, state: LoopState | None) -> Limits:
 
 
 def _stage(each: Moves, time: Span, mv_limits: Limits, mv: float | None, sp: float | None) -> StagePreview:
-    moves_mv, moves_sp = max(each.mv_down, each.mv_up) > 0.0, each.sp_up > 0.0
+    moves_mv, moves_sp = max(each.mv_down, each.mv_up) > 0.0, max(each.sp_up, each.sp_down) > 0.0
     low, high = time
     return StagePreview(
         stage=each.stage,
@@ -211,7 +213,7 @@ def _stage(each: Moves, time: Span, mv_limits: Limits, mv: float | None, sp: flo
         mv_move_pct=_rounded(max(each.mv_down, each.mv_up)),
         sp_low=_rounded(sp - each.sp_down) if sp is not None and moves_sp else None,
         sp_high=_rounded(sp + each.sp_up) if sp is not None and moves_sp else None,
-        sp_move=_rounded(each.sp_up),
+        sp_move=_rounded(max(each.sp_up, each.sp_down)),
         pv_move=None if each.pv is None else _rounded(each.pv),
         duration_low_s=_rounded(low),
         duration_high_s=_rounded(high),
@@ -255,14 +257,15 @@ def _at_the_end(request: RetuneRequest) -> str:
     return "The loop is as after an abort; the new gains are a proposal, which takes effect when a person accepts it."
 
 
-def _on_abort(request: RetuneRequest, state: LoopState | None, unit: str) -> str:
+def _on_abort(request: RetuneRequest, state: LoopState | None, unit: str, ramped: bool) -> str:
     if request.dry_run:
         return "Nothing on the loop has changed."
     silent = ""
     if state is not None and state.when_silent:
         silent = f" If the controller itself falls silent, the plant's I/O {state.when_silent}."
     by_itself = "The controller does that by itself also when the service or the bus fails."
-    return f"{_home(state, unit)} {by_itself}{silent}"
+    at_once = " Where a test is cut short the set-point goes home at once, not by a ramp." if ramped else ""
+    return f"{_home(state, unit)} {by_itself}{at_once}{silent}"
 
 
 def _home(state: LoopState | None, unit: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,14 @@ from loopwright.tuning.plan import Command, Event, Mode, Plan, Sample, SetMode, 
 from loopwright.tuning.reasons import Reason, Refused
 
 Array = NDArray[np.float64]
+
+
+class Directions(StrEnum):
+    """To which sides of its rest a test may move the set-point."""
+
+    BOTH = "both"
+    UP = "up"
+    DOWN = "down"
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +37,8 @@ class Facts:
     reverse: True when MV must fall as PV rises (positive plant gain).
     pv_low, pv_high: the limits within which PV must stay, absolute, PV units.
     mv_step_max: the largest jump of MV that the test may make from one sample to the next, MV units.
+    directions: to which sides of its rest the test may move the set-point.
+    sp_rate_max_per_s: the largest rate at which the test may move the set-point, PV units per s.
     Raises Refused: BAD_INPUT, BAD_LIMITS, SAMPLING_TOO_SLOW.
     """
 
@@ -41,18 +52,37 @@ class Facts:
     pv_low: float = -math.inf
     pv_high: float = math.inf
     mv_step_max: float = math.inf
+    directions: Directions = Directions.BOTH
+    sp_rate_max_per_s: float = math.inf
 
     def __post_init__(self) -> None:
         for name in ("sample_time_s", "T95_s", "sp_deviation"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise Refused(Reason.BAD_INPUT, f"{name} must be a positive number, not {value!r}")
+        if not self.sp_rate_max_per_s > 0:
+            text = f"sp_rate_max_per_s must be a positive number, not {self.sp_rate_max_per_s!r}"
+            raise Refused(Reason.BAD_INPUT, text)
         if not self.mv_low < self.mv_high:
             raise Refused(Reason.BAD_LIMITS, f"mv_low {self.mv_low:g} must be below mv_high {self.mv_high:g}")
         if self.T95_s < 5 * self.sample_time_s:
             raise Refused(
                 Reason.SAMPLING_TOO_SLOW, f"T95 {self.T95_s:g} s is under five sample times of {self.sample_time_s:g} s"
             )
+
+    @property
+    def one_sided(self) -> bool:
+        """Whether the set-point may go to one side of its rest only."""
+        return self.directions is not Directions.BOTH
+
+    @property
+    def side(self) -> float:
+        """The side to which the set-point goes first: +1 up, -1 down."""
+        return -1.0 if self.directions is Directions.DOWN else 1.0
+
+    def ramp_s(self, move: float) -> float:
+        """The time that a move of the set-point takes at the permitted rate, s. move: PV units."""
+        return abs(move) / self.sp_rate_max_per_s
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,8 @@ def verification(
     )
     commands = (SetGains(gains), SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp))
     yield from settle(point.sp, 0.02 * step, facts.T95_s / 5, 3 * facts.T95_s, point.noise, commands)
-    result = yield from step_test(facts, point, step, band=0.05, max_s=5 * facts.T95_s, smooth_s=dead_time_s / 2)
+    to = facts.side * step
+    result = yield from step_test(facts, point, to, band=0.05, max_s=5 * facts.T95_s, smooth_s=dead_time_s / 2)
     unlimited(facts, result, gains)
     maximum = max(40.0, predicted.overshoot_pct + 25.0)
     if not result.settled or result.overshoot_pct > maximum:

@@ -8,6 +8,7 @@ from functools import partial
 from loopwright.tuning.analysis.comparison import Comparison, predicted
 from loopwright.tuning.experiments.preflight import preflight
 from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.experiments.step_limits import not_kept
 from loopwright.tuning.experiments.step_test import StepResult
 from loopwright.tuning.experiments.verification import verification
 from loopwright.tuning.fast.design import GainDesign, OptimalGains
@@ -52,6 +53,8 @@ def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal
     """
     expected = {"preflight": facts.T95_s / 2, "design": 0.0, "verify": 6 * facts.T95_s}
     todo = trial_stages(options.verify)
+    if broken := not_kept(facts.directions, facts.sp_rate_max_per_s, todo, mirrored=True):
+        raise Refused(Reason.BAD_LIMITS, "; ".join(broken))
 
     def started(stage: str) -> tuple[StageStarted]:
         after = todo[todo.index(stage) + 1 :]

@@ -147,6 +147,8 @@ def _nonlinearity(fit: Fit[ExperimentRecord], found: Fitted) -> tuple[Reason, st
     test = LinearityTest(fit, found)
     if (shown := test.nonlinearity()) is not None:
         return Reason.UNEXPLAINED, f"{shown.what}, +-{2.0 * shown.deviation:.2g}"
+    if fit.record.one_sided:  # such a record cannot tell how far the sides differ, and its proposal says so
+        return None
     if (unknown := test.unknown_difference()) > MAX_DIFFERENCE:
         by = f"{100.0 * unknown:.0f} %" if unknown < 1.0 else "any factor"
         what = f"the gain above and below the operating point may differ by {by}"

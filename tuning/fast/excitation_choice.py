@@ -13,15 +13,16 @@ record.
 from __future__ import annotations
 
 from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.experiments.ramp import ramped
 from loopwright.tuning.experiments.settle import after_settling
 from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
 from loopwright.tuning.fast.known_procedure import KNOWN_STAGES, TRIAL, ObservedPlantFails, by_known_plant
-from loopwright.tuning.fast.procedure import FAST, FastOptions, by_relay, fast
+from loopwright.tuning.fast.procedure import FAST, FastOptions, by_relay, fast_by_relay
 from loopwright.tuning.fast.proposal import FastProposal
 from loopwright.tuning.fast.pulse_test import PulseTest
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.fast.relay_test import BIAS, RelayTest
-from loopwright.tuning.fast.setpoint_procedure import SETPOINT_STAGES, TooLittleExcited, setpoint
+from loopwright.tuning.fast.setpoint_procedure import SETPOINT_STAGES, TooLittleExcited, by_pulses
 from loopwright.tuning.plan import Note, Plan
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -57,6 +58,12 @@ def fast_by(
     known: what normal operation has shown of the plant.
     Raises Refused. The plan restores nothing: the runner restores the loop.
     """
+    return (yield from ramped(facts, _chosen(excitations, facts, options, known)))
+
+
+def _chosen(
+    excitations: tuple[Excitation, ...], facts: Facts, options: FastOptions, known: ObservedPlant | NothingKnown
+) -> Plan[FastProposal]:
     if Excitation.OBSERVE not in excitations:
         return (yield from _moved_by(excitations, facts, options))
     try:
@@ -76,10 +83,10 @@ def fast_by(
 
 def _moved_by(excitations: tuple[Excitation, ...], facts: Facts, options: FastOptions) -> Plan[FastProposal]:
     if Excitation.SETPOINT not in excitations:
-        return (yield from fast(facts, options))
+        return (yield from fast_by_relay(facts, options))
     relay_follows = Excitation.RELAY in excitations
     try:
-        return (yield from setpoint(facts, options, FAST, relay_follows))
+        return (yield from by_pulses(facts, options, FAST, relay_follows))
     except TooLittleExcited as found:
         test, refused = found.test, found
     yield from test.report(Note(f"the relay follows, because the pulses tell too little: {refused.detail}"))
@@ -109,7 +116,8 @@ def _near_rest(test: PulseTest, facts: Facts) -> Plan[bool]:
         Note(f"MV is {away():.4g} from rest: the set-point goes home first, so that the relay does not jump too far")
     )
     yield from test.turn(0.0)
-    longest = test.elapsed + MAX_NEAR_T95 * facts.T95_s / facts.sample_time_s
+    home_s = facts.ramp_s(test.trace.sp[-1] - test.point.sp)
+    longest = test.elapsed + (MAX_NEAR_T95 * facts.T95_s + home_s) / facts.sample_time_s
     while away() > maximum and test.elapsed < longest:
         yield from test.sample()
     return away() <= maximum

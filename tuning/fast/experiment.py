@@ -86,9 +86,10 @@ class Experiment:
         Raises Refused, DIVERGES.
         """
         self._steps.append(len(self.trace))
+        moves = [each.value - self.trace.sp[-1] for each in commands if isinstance(each, SetSetpoint)]
         sample = yield commands
         self._add(sample)
-        end = sample.t + self._follow_s
+        end = sample.t + self._follow_s + self.facts.ramp_s(moves[-1] if moves else 0.0)
         while sample.t < end:
             sample = yield ()
             self._add(sample)

@@ -31,6 +31,7 @@ class Past:
     low, high: the limits of MV, as deviations from rest, MV units.
     action: +1 for a controller whose MV falls as PV rises, else -1.
     gains: the gains in effect.
+    sp_step_max: the largest move of the set-point within one sample, PV units.
     """
 
     Ts: float
@@ -41,6 +42,7 @@ class Past:
     high: float
     action: float
     gains: Gains
+    sp_step_max: float = math.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,7 +137,8 @@ def forecast(
 
     model: the process model, without the delay of the sampling.
     gains: the gains from the next sample on; other gains than those in effect take over without a bump.
-    setpoints: the set-point from the next sample on, as a deviation from rest, PV units, shape (moves,).
+    setpoints: the set-point from the next sample on, or where its ramp ends, as a deviation from rest, PV units, shape
+    (moves,).
     samples: the number of samples to simulate.
     """
     plant, law, moves = _Plant(model, past.Ts), _Law(gains, past, len(setpoints)), len(setpoints)
@@ -146,10 +149,12 @@ def forecast(
     waiting = np.concatenate((np.zeros(plant.delay + 2), past.mv))[-plant.delay - 2 :]
     u = np.concatenate((np.repeat(waiting[:, None], moves, axis=1), np.zeros((samples, moves))))
     pv, mv = np.empty((samples, moves)), np.empty((samples, moves))
+    sp = np.full(moves, past.sp[-1])
     for k in range(samples):
         x = plant.A @ x + plant.now[:, None] * u[k + 1] + plant.before[:, None] * u[k]
         pv[k] = plant.C @ x + plant.D * u[k + 1] + offset
-        mv[k], u[k + plant.delay + 2] = law.step(setpoints, pv[k])
+        sp = sp + np.clip(setpoints - sp, -past.sp_step_max, past.sp_step_max)
+        mv[k], u[k + plant.delay + 2] = law.step(sp, pv[k])
         if turn is not None:
             passed = pv[k] >= turn.at if turn.up else pv[k] <= turn.at
             setpoints = np.where(passed, turn.setpoints, setpoints)

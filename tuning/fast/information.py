@@ -8,16 +8,17 @@ is the reciprocal of the variance (R. A. Fisher, Phil. Trans. R. Soc. A 222, 192
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.fast.design import frequencies
 from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY
 from loopwright.tuning.fast.experiment import VERIFICATION_PERIODS
 from loopwright.tuning.fast.forecast import Past, forecast, oscillation, pv_of
-from loopwright.tuning.fast.pulse_levels import MIN_FOLLOWED
+from loopwright.tuning.fast.pulse_levels import CAME_BACK, FOLLOWED_TO_ONE_SIDE, MIN_FOLLOWED
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.fast.uncertainty import STANDARD_DEVIATIONS, peak
 from loopwright.tuning.gains import Gains
@@ -41,6 +42,7 @@ class Moved:
     high, low: the amplitudes of the relay's sides, MV units.
     noise: the standard deviation of PV at each sample of the controller, PV units.
     sample_time_s: the sample time of the controller, s.
+    one_sided: whether the pulses go to one side of rest only. sp_rate_max_per_s: the largest rate of the set-point.
     """
 
     gains: Gains
@@ -51,6 +53,8 @@ class Moved:
     low: float
     noise: float
     sample_time_s: float
+    one_sided: bool = False
+    sp_rate_max_per_s: float = math.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,29 +105,35 @@ def _mv(model: Model, moved: Moved, excitation: Excitation, Ts: float, samples: 
     """MV under an excitation, as a deviation from rest."""
     if excitation is Excitation.RELAY:
         return oscillation(model, Ts, moved.high, moved.low, samples)
-    past = Past(Ts, np.zeros(3), np.zeros(3), np.zeros(3), -math.inf, math.inf, sign(model), moved.gains)
+    sp_step = moved.sp_rate_max_per_s * Ts
+    past = Past(Ts, np.zeros(3), np.zeros(3), np.zeros(3), -math.inf, math.inf, sign(model), moved.gains, sp_step)
     if excitation is Excitation.OBSERVE:
         return forecast(model, past, moved.new, np.array([moved.step]), samples).mv[:, 0]
-    level = before = 0.0
-    for turned in (moved.pulse, -moved.pulse, moved.pulse):
+    level, turns = 0.0, (moved.pulse, 0.0 if moved.one_sided else -moved.pulse, moved.pulse)
+    for number, turned in enumerate(turns):
         before, level = level, turned
         course = forecast(model, past, moved.gains, np.array([level]), samples)
-        pv, mv, move = course.pv[:, 0], course.mv[:, 0], level - before
-        followed = (pv - past.pv[-1]) * math.copysign(1.0, move) >= MIN_FOLLOWED * abs(move)
-        until = int(np.argmax(followed)) + 1 if followed.any() else samples
-        if turned > 0.0 and before < 0.0:
-            until = samples
-        past = Past(
-            Ts,
-            np.append(past.sp, np.full(until, level)),
-            np.append(past.pv, pv[:until]),
-            np.append(past.mv, mv[:until]),
-            past.low,
-            past.high,
-            past.action,
-            past.gains,
+        pv, mv = course.pv[:, 0], course.mv[:, 0]
+        followed = _followed(pv, past.pv[-1], level - before, moved.one_sided)
+        until = int(np.argmax(followed)) + 1 if followed.any() and number < 2 else samples
+        farthest = sp_step * np.arange(1, until + 1)
+        past = replace(
+            past,
+            sp=np.append(past.sp, past.sp[-1] + np.clip(level - past.sp[-1], -farthest, farthest)),
+            pv=np.append(past.pv, pv[:until]),
+            mv=np.append(past.mv, mv[:until]),
         )
     return past.mv[3 : 3 + samples]
+
+
+def _followed(pv: Reals, begun: float, move: float, one_sided: bool) -> NDArray[np.bool_]:
+    """At which samples after a move of the set-point PV has followed far enough for the next one, see `pulse_test`."""
+    if not one_sided:
+        return np.asarray((pv - begun) * math.copysign(1.0, move) >= MIN_FOLLOWED * abs(move))
+    if move > 0.0:
+        return np.asarray(pv - begun >= FOLLOWED_TO_ONE_SIDE * move)
+    farthest = np.maximum.accumulate(pv)
+    return np.asarray(farthest - pv >= CAME_BACK * farthest)
 
 
 def _sensitivities(

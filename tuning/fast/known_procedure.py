@@ -15,6 +15,7 @@ from functools import partial
 from loopwright.tuning.analysis.comparison import Comparison
 from loopwright.tuning.experiments.preflight import PREFLIGHT, at_rest
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace
+from loopwright.tuning.experiments.ramp import MIN_NOISES_OF_TRIAL, too_slow
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.agreement import Agreement, agreement
 from loopwright.tuning.fast.evaluation import NEGLIGIBLE_RESIDUAL, Evaluation, evaluate
@@ -102,18 +103,19 @@ class KnownTrial(Experiment):
         model_period: the ultimate period of the model, s.
         """
         kick, permitted = gains.b * gains.Kp, self.facts.sp_deviation
-        self._step = min(permitted, KICK_OF_ROOM * self.point.room / kick) if kick > 0.0 else permitted
+        size = min(permitted, KICK_OF_ROOM * self.point.room / kick) if kick > 0.0 else permitted
+        self._step = self.facts.side * size
         self._period = model_period
         self._follow_s = VERIFICATION_PERIODS * model_period
         self.excited = len(self.trace)
         commands = (*self._commands, SetGains(gains), SetSetpoint(self.point.sp + self._step))
         self._commands = ()
-        yield from self._follow(commands, self._step, FARTHEST)
+        yield from self._follow(commands, size, FARTHEST)
 
     def step_home(self) -> Plan[None]:
         """Steps the set-point home under the same gains and follows PV for half as long as after the first step."""
         self._follow_s *= STEP_BACK_FRACTION
-        yield from self._follow((SetSetpoint(self.point.sp),), self._step, FARTHEST)
+        yield from self._follow((SetSetpoint(self.point.sp),), abs(self._step), FARTHEST)
 
     def experiment_record(self) -> ExperimentRecord:
         """The record of operation with the step as its last piece."""
@@ -156,6 +158,8 @@ def by_known_plant(facts: Facts, options: DesignOptions, known: ObservedPlant, m
     shown: VerifiedStep | None = None
     evaluation = first
     if outcome.gain or options.propose_anyway:
+        if (why := too_slow(facts, test.noise, first.period, MIN_NOISES_OF_TRIAL)) is not None:
+            raise ObservedPlantFails(Reason.UNCERTAIN, why)
         yield from test.report(*started(TRIAL))
         evaluation, shown = yield from _tried(facts, options, known, test, first)
         yield from test.report(*started("redesign"), StageDone("redesign", evaluation_summary(evaluation)))

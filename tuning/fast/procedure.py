@@ -16,6 +16,7 @@ from functools import partial
 from loopwright.tuning.analysis.comparison import Comparison
 from loopwright.tuning.experiments.preflight import at_rest
 from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.experiments.ramp import ramped
 from loopwright.tuning.fast.evaluation import Evaluation
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.outcome import OPEN_REASONS, evaluated
@@ -74,6 +75,17 @@ def fast(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
 
     Raises Refused. The plan restores nothing: the runner restores the loop.
     """
+    return (yield from ramped(facts, fast_by_relay(facts, options)))
+
+
+def fast_by_relay(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
+    """The plan of the whole procedure without the limit of the set-point's rate, see `ramped`.
+
+    Raises Refused, BAD_LIMITS where the loop may be moved to one side only: a relay moves PV to both.
+    """
+    if facts.one_sided:
+        text = f"the loop may be moved {facts.directions} only, and a relay moves PV to both sides of its rest"
+        raise Refused(Reason.BAD_LIMITS, text)
     expected = _expected_s(facts)
     after_s = sum(expected[stage] for stage in fast_stages(options.verify)[1:])
     point, listened = yield from at_rest(facts, after_s, MIN_SAMPLES)

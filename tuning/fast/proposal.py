@@ -337,6 +337,11 @@ def proposed(
             f"Such a load disturbance is larger than what the {moved_by} moved MV by ({input_range:.3g}): a change of "
             "the plant would look the same. Look at the record before accepting."
         )
+    if facts.one_sided and evaluation.fit.record.one_sided:
+        notes.append(
+            f"The set-point was moved {facts.directions} only. A gain of the plant that differs above and below where "
+            f"the test began cannot be seen in such a record: the gains hold for the side that was tested."
+        )
     if found.drift:
         notes.append("PV drifted at a steady rate during the test; this was allowed for.")
     return FastProposal(

@@ -23,6 +23,9 @@ from loopwright.tuning.reasons import Refused
 
 MIN_FOLLOWED = 0.2
 """A pulse turns when PV has followed this fraction of the set-point's move."""
+FOLLOWED_TO_ONE_SIDE, CAME_BACK = 0.4, 0.5
+"""Where the set-point may go to one side of its rest only: the fraction of the first move that PV follows before the
+set-point goes back, and the fraction of the way back that PV has come before the last pulse."""
 STRUCTURES = (FIRST, SECOND, INTEGRATOR, LAGGED_INTEGRATOR)
 CLOSE_BIC = 10.0
 """Difference of BIC within which a model is asked besides the best one."""
@@ -88,14 +91,42 @@ def second_level(past: Past, begun: int, size: float, bounds: PulseBounds) -> fl
     return -_largest(second, past, begun, HORIZON_OF_SECOND, excess)
 
 
+def back_level(past: Past, begun: int, size: float, bounds: PulseBounds) -> float:
+    """The level after the first pulse where the set-point may go to one side of its rest only, in sizes of the first
+    pulse: as near to rest as every candidate model permits. The arguments are those of `second_level`; the size is
+    negative where the set-point goes down."""
+    swings = LEVELS[LEVELS >= MIN_LEVEL - 1e-9]
+    last = LEVELS[LEVELS >= MIN_LEVEL - 1e-9][::4]
+    back, again = (each.ravel() for each in np.meshgrid(1.0 - swings, last, indexing="ij"))
+    now = float(np.mean(past.pv[-3:]))
+    at = now - CAME_BACK * (now - back * size)
+
+    def excess(model: Model, samples: int) -> Reals:
+        turn = SetpointTurn(at, size < 0.0, size * again)
+        course = forecast(model, past, past.gains, size * back, samples, turn)
+        found = _excess(course, past, bounds, SECOND_MAY_USE).reshape(len(swings), len(last))
+        return np.asarray(found.min(axis=1))
+
+    return 1.0 - _largest(swings, past, begun, HORIZON_OF_SECOND, excess)
+
+
+def last_level_of_one_side(past: Past, begun: int, size: float, bounds: PulseBounds) -> float:
+    """The level of the last pulse where the set-point may go to one side of its rest only, see `last_level`. It is
+    never at rest: the step home begins there."""
+    return _last_level(LEVELS[LEVELS >= MIN_LEVEL - 1e-9], past, begun, size, bounds)
+
+
 def last_level(past: Past, begun: int, size: float, bounds: PulseBounds) -> float:
     """The level of the last pulse, in sizes of the first: the largest at which every candidate model keeps PV and MV
     within bounds, or the one that leaves them least. The arguments are those of `second_level`."""
+    return _last_level(LEVELS, past, begun, size, bounds)
 
+
+def _last_level(levels: Reals, past: Past, begun: int, size: float, bounds: PulseBounds) -> float:
     def excess(model: Model, samples: int) -> Reals:
-        return _excess(forecast(model, past, past.gains, size * LEVELS, samples), past, bounds, LAST_MAY_USE)
+        return _excess(forecast(model, past, past.gains, size * levels, samples), past, bounds, LAST_MAY_USE)
 
-    return _largest(LEVELS, past, begun, HORIZON_OF_LAST, excess)
+    return _largest(levels, past, begun, HORIZON_OF_LAST, excess)
 
 
 def step_fits(past: Past, models: Sequence[Model], gains: Gains, home: float, noise: float, samples: int) -> bool:

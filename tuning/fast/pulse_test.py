@@ -13,29 +13,40 @@ from functools import partial
 
 import numpy as np
 
-from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace
+from loopwright.tuning.experiments.primitives import Directions, Facts, OperatingPoint, Trace
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.experiment import STEP_BACK_FRACTION, VERIFICATION_PERIODS, Experiment
 from loopwright.tuning.fast.forecast import Past
 from loopwright.tuning.fast.proposal import PulseFigures
-from loopwright.tuning.fast.pulse_levels import MIN_FOLLOWED, PulseBounds, step_fits
+from loopwright.tuning.fast.pulse_levels import (
+    CAME_BACK,
+    FOLLOWED_TO_ONE_SIDE,
+    MIN_FOLLOWED,
+    PulseBounds,
+    step_fits,
+)
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Model, Reals
 from loopwright.tuning.plan import Command, Note, Plan, Sample, SetGains, SetSetpoint
 from loopwright.tuning.reasons import Reason, Refused
 
-UP, DOWN = 1.0, -1.0
+UP, DOWN, BACK = 1.0, -1.0, 0.0
 """The levels of the set-point, in sizes of a pulse: up, down as far as `pulse_levels` permits, and up again as far as
-it permits; the last level is held until the step home."""
+it permits; the last level is held until the step home. Where the set-point may go to one side only, it goes back to
+where it was in place of down."""
 MAX_PV_DEVIATION = 1.5
 """Largest deviation of PV from rest during the pulses, in permitted steps of the set-point."""
 MIN_FOLLOWED_NOISES = 5.0
 """A pulse turns when PV has followed the fraction MIN_FOLLOWED of the set-point's move, and this many standard
 deviations of the noise."""
+NOISES_TO_ONE_SIDE = 10.0
+"""The same for the first pulse where the set-point may go to one side only: half of it is left for the way back."""
+MAX_BEYOND = 0.5
+"""How far PV may go beyond its rest to the side that is not permitted, in permitted steps: it overshoots on its way
+back."""
 SAMPLES_AVERAGED = 3
-LEVELS_APART = UP - DOWN
-"""The swing of the set-point from one level to the other, in sizes of a pulse."""
+AVERAGE = np.full(SAMPLES_AVERAGED, 1.0 / SAMPLES_AVERAGED)
 MAX_T95 = 10.0
 """Longest time for PV to follow a pulse, in T95."""
 APPROACH_CHECKED, MAX_APPROACH = 0.25, 8.0
@@ -57,7 +68,7 @@ class PulseTest(Experiment):
 
     def __init__(self, facts: Facts, point: OperatingPoint, listened: Trace) -> None:
         super().__init__(facts, point, listened)
-        self.size = pulse_size(facts.sp_deviation, point.room, facts.old_gains)
+        self.size = pulse_size(facts.sp_deviation, point.room, facts.old_gains, facts.one_sided)
         self.turns: list[int] = []  # samples at which the set-point moved; the first one is the start
         self.levels: list[float] = []  # of the set-point, in sizes of a pulse
         self._gains = facts.old_gains
@@ -74,16 +85,22 @@ class PulseTest(Experiment):
         """Moves the set-point to a level, in sizes of a pulse."""
         self.turns.append(len(self.trace))
         self.levels.append(level)
-        self._commands = (SetSetpoint(self.point.sp + level * self.size),)
+        self._commands = (SetSetpoint(self.point.sp + level * self._signed_size),)
         yield from self.sample()
 
-    def turn_within_bounds(self, level_of: Callable[[Past, int, float, PulseBounds], float]) -> Plan[None]:
-        """Turns the set-point to the level that this function finds, see `pulse_levels`."""
-        level = yield from self.computed(partial(level_of, self._past(), self.listened, self.size, self._bounds()))
-        if abs(level) < UP:
-            wanted, size = self.size, abs(level) * self.size
+    def turn_within_bounds(
+        self, level_of: Callable[[Past, int, float, PulseBounds], float], wanted: float
+    ) -> Plan[None]:
+        """Turns the set-point to the level that this function finds, see `pulse_levels`.
+
+        wanted: the level where nothing bounds it.
+        """
+        work = partial(level_of, self._past(), self.listened, self._signed_size, self._bounds())
+        level = yield from self.computed(work)
+        if level != wanted:
+            size = self._signed_size
             yield from self.report(
-                Note(f"a pulse of {size:.3g} in place of {wanted:.3g} keeps PV and MV within bounds")
+                Note(f"a pulse to {level * size:+.3g} in place of {wanted * size:+.3g} keeps PV and MV within bounds")
             )
         yield from self.turn(level)
 
@@ -101,7 +118,7 @@ class PulseTest(Experiment):
         while not self._followed():
             yield from self.sample()
             passed = (len(self.trace) - self.turns[-1]) * Ts
-            if passed > max(max_T95 * self.facts.T95_s, 40 * Ts):
+            if passed > max(max_T95 * self.facts.T95_s, 40 * Ts) + self.facts.ramp_s(self._move):
                 raise self._not_followed(passed)
 
     def lasting(self, samples: float) -> Plan[None]:
@@ -125,8 +142,8 @@ class PulseTest(Experiment):
         samples = int(VERIFICATION_PERIODS * period)
 
         def fits() -> Plan[bool]:
-            kick = gains.b * gains.Kp * abs(self.trace.sp[-1] - point.sp)
-            if kick > facts.mv_step_max:
+            at_once = min(abs(self.trace.sp[-1] - point.sp), facts.sp_rate_max_per_s * facts.sample_time_s)
+            if gains.b * gains.Kp * at_once > facts.mv_step_max:
                 return False
             past = self._past()
             home = float(past.sp[-1]) + point.sp - self.trace.sp[-1]
@@ -144,7 +161,8 @@ class PulseTest(Experiment):
         )
         self._commands = (SetSetpoint(point.sp + near),)
         begun = self.elapsed
-        while self.elapsed < begun + MAX_APPROACH * period:
+        longest = MAX_APPROACH * period + facts.ramp_s(away - near) / facts.sample_time_s
+        while self.elapsed < begun + longest:
             yield from self.lasting(self.elapsed + max(1.0, APPROACH_CHECKED * period))
             if (yield from fits()):
                 return
@@ -167,7 +185,8 @@ class PulseTest(Experiment):
         """Steps the set-point by half a pulse under the new gains and follows PV for half as long as after the first
         step."""
         self._follow_s *= STEP_BACK_FRACTION
-        target = self.point.sp + min(STEP_BACK_FRACTION * self.size, self._fitting(self._gains))
+        step = min(STEP_BACK_FRACTION * self.size, self._fitting(self._gains))
+        target = self.point.sp + self.facts.side * step
         yield from self._follow((SetSetpoint(target),), self.experiment_record().output_range)
 
     def experiment_record(self) -> ExperimentRecord:
@@ -184,6 +203,7 @@ class PulseTest(Experiment):
             period=self.period,
             steps=tuple(self._steps),
             excitation=Excitation.SETPOINT,
+            one_sided=self.facts.one_sided,
         )
 
     def figures(self) -> PulseFigures:
@@ -216,13 +236,28 @@ class PulseTest(Experiment):
             high=facts.mv_high - mv,
             action=self._direction,
             gains=facts.old_gains,
+            sp_step_max=facts.sp_rate_max_per_s * facts.sample_time_s,
         )
 
     def _bounds(self) -> PulseBounds:
         """How far PV may move."""
         facts, rest = self.facts, self.point.pv
-        maximum = MAX_PV_DEVIATION * facts.sp_deviation
-        return PulseBounds(max(-maximum, facts.pv_low - rest), min(maximum, facts.pv_high - rest), self.noise)
+        low = high = MAX_PV_DEVIATION * facts.sp_deviation
+        if facts.directions is Directions.UP:
+            low = MAX_BEYOND * facts.sp_deviation
+        elif facts.directions is Directions.DOWN:
+            high = MAX_BEYOND * facts.sp_deviation
+        return PulseBounds(max(-low, facts.pv_low - rest), min(high, facts.pv_high - rest), self.noise)
+
+    @property
+    def _signed_size(self) -> float:
+        """The size of a pulse, PV units, negative where the first one goes down."""
+        return self.facts.side * self.size
+
+    @property
+    def _move(self) -> float:
+        """The last move of the set-point, PV units."""
+        return self._signed_size * (self.levels[-1] - (self.levels[-2] if len(self.levels) > 1 else 0.0))
 
     def _on_sample(self, sample: Sample) -> tuple[Command, ...]:
         self._add(sample)
@@ -259,10 +294,20 @@ class PulseTest(Experiment):
         since = self.turns[-1]
         if len(self.trace) < since + SAMPLES_AVERAGED:
             return False
-        move = self.size * (self.levels[-1] - (self.levels[-2] if len(self.levels) > 1 else 0.0))
+        move = self._move
         begun = float(np.mean(self.trace.pv[max(since - SAMPLES_AVERAGED, 0) : since]))
-        followed = math.copysign(1.0, move) * (float(np.mean(self.trace.pv[-SAMPLES_AVERAGED:])) - begun)
-        return followed >= max(MIN_FOLLOWED * abs(move), MIN_FOLLOWED_NOISES * self.noise)
+        now = float(np.mean(self.trace.pv[-SAMPLES_AVERAGED:]))
+        if not self.facts.one_sided:
+            followed = math.copysign(1.0, move) * (now - begun)
+            return followed >= max(MIN_FOLLOWED * abs(move), MIN_FOLLOWED_NOISES * self.noise)
+        if len(self.levels) == 1:
+            followed = self.facts.side * (now - begun)
+            return followed >= max(FOLLOWED_TO_ONE_SIDE * abs(move), NOISES_TO_ONE_SIDE * self.noise)
+        # PV goes on for a dead time after the turn, and comes back to where it was at best
+        means = self.facts.side * np.convolve(self.trace.pv[since - SAMPLES_AVERAGED :], AVERAGE, mode="valid")
+        farthest = float(means.max())
+        ends = self.facts.side * (self.point.pv + self.levels[-1] * self._signed_size)
+        return farthest - self.facts.side * now >= max(CAME_BACK * (farthest - ends), MIN_FOLLOWED_NOISES * self.noise)
 
     def _not_followed(self, passed: float) -> Refused:
         moved = float(np.mean(self.trace.pv[-SAMPLES_AVERAGED:])) - self.point.pv
@@ -272,11 +317,12 @@ class PulseTest(Experiment):
         return Refused(Reason.STALLED, text)
 
 
-def pulse_size(sp_deviation: float, room: float, gains: Gains) -> float:
+def pulse_size(sp_deviation: float, room: float, gains: Gains, one_sided: bool = False) -> float:
     """The size of the pulses, PV units. Under the proportional action of the present gains, a swing from one level to
     the other takes a part of MV's room, and leaves the rest to what PV and the integral add.
 
     sp_deviation: the largest permitted set-point step, PV units. room: the largest permitted move of MV, MV units.
+    one_sided: whether the set-point goes to one side of its rest only.
     """
-    kick = LEVELS_APART * gains.b * gains.Kp
+    kick = (UP - (BACK if one_sided else DOWN)) * gains.b * gains.Kp
     return min(sp_deviation, KICK_OF_ROOM * room / kick) if kick > 0.0 else sp_deviation

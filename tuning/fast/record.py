@@ -51,6 +51,7 @@ class ExperimentRecord:
     excitation: what moved the loop.
     lengths: the number of samples of each piece of the record, where there are several: the time at rest, then each
     set-point change of normal operation. MV and PV are deviations from the rest before each change.
+    one_sided: whether the set-point went to one side of its rest only.
     held_s: the time for which the controller holds MV, s; None where it is the sample time.
     Raises Refused: BAD_INPUT, NO_RESPONSE.
     """
@@ -67,6 +68,7 @@ class ExperimentRecord:
     excitation: Excitation = Excitation.RELAY
     lengths: tuple[int, ...] = ()
     held_s: float | None = None
+    one_sided: bool = False
 
     @property
     def sampling_delay_s(self) -> float:

@@ -7,12 +7,14 @@ The pulses end when the gains that would be proposed are certain enough: see `_s
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 
 from loopwright.tuning.analysis.comparison import Comparison
 from loopwright.tuning.experiments.preflight import at_rest
 from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.experiments.ramp import check_ramp, ramped, slow_words
 from loopwright.tuning.fast.design import frequencies
 from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY, Evaluation
 from loopwright.tuning.fast.options import DesignOptions
@@ -24,16 +26,16 @@ from loopwright.tuning.fast.proposal import (
     proposed,
     verified_step,
 )
-from loopwright.tuning.fast.pulse_levels import last_level, second_level
+from loopwright.tuning.fast.pulse_levels import back_level, last_level, last_level_of_one_side, second_level
+from loopwright.tuning.fast.pulse_test import BACK, DOWN, UP, PulseTest
 from loopwright.tuning.fast.pulse_test import MAX_T95 as MAX_T95_TO_FOLLOW
-from loopwright.tuning.fast.pulse_test import PulseTest
 from loopwright.tuning.fast.record import MIN_LISTENED, Excitation, ExperimentRecord
 from loopwright.tuning.fast.record_evaluation import first_period
 from loopwright.tuning.fast.uncertainty import peak
 from loopwright.tuning.plan import Note, Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
 
-__all__ = ["SETPOINT", "SETPOINT_STAGES", "TooLittleExcited", "setpoint"]
+__all__ = ["SETPOINT", "SETPOINT_STAGES", "TooLittleExcited", "by_pulses", "setpoint"]
 
 SETPOINT = "setpoint"
 SETPOINT_STAGES = ("preflight", "pulses", "design", "verify", "redesign")
@@ -91,10 +93,18 @@ def setpoint_stages(verify: bool) -> tuple[str, ...]:
     return SETPOINT_STAGES if verify else SETPOINT_STAGES[:3]
 
 
-def setpoint(
+def setpoint(facts: Facts, options: DesignOptions) -> Plan[FastProposal]:
+    """The plan of the whole procedure, for a loop in automatic and at rest.
+
+    Raises Refused. The plan restores nothing: the runner restores the loop.
+    """
+    return (yield from ramped(facts, by_pulses(facts, options)))
+
+
+def by_pulses(
     facts: Facts, options: DesignOptions, method: str = SETPOINT, relay_follows: bool = False
 ) -> Plan[FastProposal]:
-    """The plan of the whole procedure, for a loop in automatic and at rest.
+    """The plan of the whole procedure without the limit of the set-point's rate, see `ramped`.
 
     method: the name of the procedure in the proposal.
     relay_follows: TooLittleExcited is raised as soon as a relay would take less time than the pulses still need.
@@ -110,18 +120,21 @@ def setpoint(
 
     point, listened = yield from at_rest(facts, sum(expected[stage] for stage in todo[1:]), MIN_SAMPLES)
     test = PulseTest(facts, point, listened)
-    yield from test.report(StageDone("preflight", point), *started("pulses"))
+    yield from test.report(StageDone("preflight", point))
+    check_ramp(facts, test.noise)
+    yield from test.report(*started("pulses"))
     yield from test.start()
     longest_T95 = MAX_T95_BEFORE_RELAY if relay_follows else MAX_T95_TO_FOLLOW
     try:
         yield from test.until_followed(longest_T95)
-        yield from test.turn_within_bounds(second_level)
+        second, wanted = (back_level, BACK) if facts.one_sided else (second_level, DOWN)
+        yield from test.turn_within_bounds(second, wanted)
         yield from test.until_followed(longest_T95)
     except Refused as refused:
         if relay_follows and refused.reason in NOT_FOLLOWED:
             raise TooLittleExcited(refused, test) from None
         raise
-    yield from test.turn_within_bounds(last_level)
+    yield from test.turn_within_bounds(last_level_of_one_side if facts.one_sided else last_level, UP)
     test.period = yield from test.computed(partial(first_period, *test.columns(), facts.sample_time_s))
     look = Look(test.period, None, Refused(Reason.STALLED, "the pulses came to nothing"))
     turned_at, looks = test.elapsed, 0
@@ -143,6 +156,9 @@ def setpoint(
         if looked_at >= longest:
             if not isinstance(look.outcome, Refused):
                 text = f"after {looked_at} samples two successive evaluations still disagree on the gains"
+                look = Look(look.period, look.evaluation, Refused(Reason.UNCERTAIN, text))
+            elif math.isfinite(facts.sp_rate_max_per_s) and look.outcome.reason is Reason.UNCERTAIN:
+                text = f"{look.outcome.detail}; {slow_words(facts)}, which excites little"
                 look = Look(look.period, look.evaluation, Refused(Reason.UNCERTAIN, text))
             break
         if isinstance(look.outcome, Refused):

@@ -20,6 +20,7 @@ from loopwright.tuning.analysis.comparison import Comparison, Predicted
 from loopwright.tuning.analysis.margins import Ultimate
 from loopwright.tuning.experiments.preflight import preflight
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, to_rest
+from loopwright.tuning.experiments.step_limits import not_kept
 from loopwright.tuning.experiments.step_test import StepResult, allowed_step, step_test
 from loopwright.tuning.experiments.verification import verification
 from loopwright.tuning.five_stage.relay import RelayResult, relay_test
@@ -212,6 +213,8 @@ def five_stage(facts: Facts, options: Options, finished: Finished = Finished()) 
         "verify": 6 * T95,
     }
     todo = stages_of(options.start, options.baseline, options.verify)
+    if broken := not_kept(facts.directions, facts.sp_rate_max_per_s, todo):
+        raise Refused(Reason.BAD_LIMITS, "; ".join(broken))
 
     def started(stage: str) -> tuple[StageStarted]:
         after = todo[todo.index(stage) + 1 :]
