@@ -280,7 +280,8 @@ def retune(
     client = Client(url)
     options: dict[str, object] = {
         "sp_deviation": sp_deviation, "mv_low": mv_low, "mv_high": mv_high, "dry_run": dry_run or None,
-        "directions": directions, "sp_rate_max_per_s": sp_rate_max, "method": method, "ms": ms, "derivative": derivative or None, "amplitude_pct": amplitude,
+        "directions": directions, "sp_rate_max_per_s": sp_rate_max,
+        "method": method, "ms": ms, "derivative": derivative or None, "amplitude_pct": amplitude,
         "excitations": excitations.split(",") if excitations else None,
         "careful": careful or None, "verify": None if verify else False, "propose_anyway": propose_anyway or None,
         "pattern": loop if many else None,

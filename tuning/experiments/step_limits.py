@@ -24,17 +24,17 @@ def not_kept(
     found = []
     if both and directions is not Directions.BOTH:
         found.append(
-            f"directions {directions}: the stages {' and '.join(both)} move PV to both sides of its rest; use method "
+            f"directions {directions}: PV is moved to both sides of its rest by {' and '.join(both)}; use method "
             "setpoint, or fast with pulses"
         )
     elif stepped and not mirrored and directions is Directions.DOWN:
         found.append(
-            f"directions down: the stages {', '.join(stepped)} step the set-point up; use method setpoint, or fast "
-            "with pulses"
+            f"directions down: the set-point is stepped up by {', '.join(stepped)}; use method setpoint, or fast with "
+            "pulses"
         )
     if (stepped or "ultimate" in both) and math.isfinite(sp_rate_max_per_s):
         found.append(
-            f"sp_rate_max_per_s {sp_rate_max_per_s:g}: the stages {', '.join((*both[1:], *stepped))} measure the "
-            "overshoot and the settling of a step, which a ramp does not show; use method setpoint, or fast"
+            f"sp_rate_max_per_s {sp_rate_max_per_s:g}: the overshoot and the settling of a step, which a ramp does not "
+            f"show, are measured by {', '.join((*both[1:], *stepped))}; use method setpoint, or fast with start=relay"
         )
     return found

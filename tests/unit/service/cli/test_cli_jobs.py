@@ -96,6 +96,15 @@ def test_the_options_of_fast_are_asked_for(service: Service, through: Through) -
     assert job["method"] == "fast" and job["request"]["ms"] == 1.4
 
 
+def test_to_where_and_how_fast_the_set_point_may_move_is_asked_for(service: Service, through: Through) -> None:
+    result = run("retune", TAG, "--method", "setpoint", "--directions", "down", "--sp-rate-max-per-s", "0.5",
+                 "--no-wait", "--json", "--yes")  # fmt: skip
+    assert result.exit_code == 0, result.output
+    (body,) = through.posted
+    assert body == {"method": "setpoint", "directions": "down", "sp_rate_max_per_s": 0.5, "requested_by": "cli"}
+    service.wait(json.loads(result.stdout)["id"])
+
+
 def test_a_proposal_all_the_same_is_asked_for(service: Service, through: Through) -> None:
     result = run("retune", TAG, "--propose-anyway", "--no-wait", "--json", "--yes")
     assert through.posted == [{"propose_anyway": True, "requested_by": "cli"}]

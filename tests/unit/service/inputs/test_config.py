@@ -36,6 +36,7 @@ def test_every_error_is_listed_at_once() -> None:
         loop_entry(tag="J", channel=9, test={"excitations": []}),
         loop_entry(tag="K", channel=10, test={"excitations": ["relays"]}),
         "nonsense",
+        loop_entry(tag="L", channel=11, test={"directions": "up"}),
     ]
     with pytest.raises(ConfigError) as caught:
         parse_site({"loops": entries, "extra": 1}, "loops.yaml")
@@ -47,6 +48,7 @@ def test_every_error_is_listed_at_once() -> None:
         "loops[7].pv_unit (H): Field required",
         "loops[8].test.excitations (I): relay, relay: each excitation is named once",
         "loops[9].test.excitations (J)", "loops[10].test.excitations.0 (K)", "loops[11]", "extra: unknown key",
+        "loops[12].test (L): directions up exclude the relay",
     ):  # fmt: skip
         assert words in text
 

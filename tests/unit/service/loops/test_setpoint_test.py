@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import pairwise
+from typing import Any, ClassVar
 from unittest.mock import patch
 
 import pytest
@@ -13,7 +15,7 @@ from loopwright.protocol.profile import COMMAND_FRAME, channel_ids
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.runner import RunResult, run
 from loopwright.tuning.analysis.margins import margins
-from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.experiments.primitives import Directions, Facts
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.proposal import FastProposal
 from loopwright.tuning.fast.setpoint_procedure import setpoint
@@ -33,13 +35,16 @@ Strike = Callable[[str, int], None]
 
 
 def of_a_test(
-    site: Site, strike: Strike = lambda stage, samples: None, mv: tuple[float, float] = (0.0, 100.0)
+    site: Site,
+    strike: Strike = lambda stage, samples: None,
+    mv: tuple[float, float] = (0.0, 100.0),
+    **more: Any,
 ) -> tuple[RunResult[FastProposal], list[Sample]]:
-    """A whole test with these MV limits of the job, percent, and its samples."""
+    """A whole test with these MV limits of the job, percent, and further facts of the loop, and its samples."""
     if site.plant.pace:
         site.let_run()
     state = site.loop.read()
-    facts = Facts(site.plant.sample_time_s, T95_S, *mv, STEP, state.gains)
+    facts = Facts(site.plant.sample_time_s, T95_S, *mv, STEP, state.gains, **more)
     taken: list[Sample] = []
     stage, since = "", 0
 
@@ -162,3 +167,49 @@ class TestMvAtItsLimit:
         found, _ = of_a_test(site, load, (self.LOW, self.HIGH))
         assert found.ended is not None and found.ended.reason is Reason.MV_LIMIT
         assert site.is_home()
+
+
+class TestDownByRamps:
+    """A loop whose set-point may only go down, by a permitted step in 4 s: half an ultimate period."""
+
+    RATE = STEP / 4.0
+    LIMITS: ClassVar[dict[str, Any]] = {"directions": Directions.DOWN, "sp_rate_max_per_s": RATE}
+
+    def test_the_controller_never_gets_another_set_point(self) -> None:
+        site = Site()
+        held: list[float] = []
+        found, taken = of_a_test(site, lambda stage, samples: held.append(site.channel.setpoint), **self.LIMITS)
+        assert found.value is not None, found.ended
+        assert margins(PLANT, found.value.gains).Ms == pytest.approx(1.6, abs=0.05)
+        assert max(held) == 50.0 > min(held) >= 50.0 - STEP - 1e-5
+        allowed = self.RATE * site.plant.sample_time_s + 1e-5  # REAL32
+        assert max(abs(after - before) for before, after in pairwise(held)) <= allowed
+        assert {sample.mode for sample in taken} == {2} and site.is_home()
+
+    @pytest.mark.parametrize(("stage", "samples"), [("pulses", 15), ("verify", 10)])
+    def test_a_kill_on_a_ramp_leaves_the_loop_at_home(self, stage: str, samples: int) -> None:
+        site = Site()
+        at = 50.0
+
+        def kill(now: str, passed: int) -> None:
+            nonlocal at
+            if (now, passed) == (stage, samples):
+                at = site.channel.setpoint
+                site.gateway.dead = True
+
+        with pytest.raises(Killed):
+            of_a_test(site, kill, **self.LIMITS)
+        assert 50.0 - STEP < at < 50.0, "on its way"
+        site.pass_time(OVER_S)
+        assert site.is_home()
+
+    def test_an_operator_who_moves_the_set_point_on_a_ramp_has_the_last_word(self) -> None:
+        site = Site()
+
+        def outer(stage: str, samples: int) -> None:
+            if stage == "pulses" and samples == 15:
+                site.hand("controller_setpoint", 50.03)
+
+        found, _ = of_a_test(site, outer, **self.LIMITS)
+        assert found.ended is not None and found.ended.reason is Reason.SETPOINT_CHANGED
+        assert site.is_home(setpoint=pytest.approx(50.03))
