@@ -3,6 +3,7 @@ is another one by now."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -15,8 +16,8 @@ from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.execution.runner import RunResult, run
 from loopwright.service.observing.packed_plant import pack, unpack
-from loopwright.tuning.analysis.margins import margins
-from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.analysis.margins import margins, ultimate_point
+from loopwright.tuning.experiments.primitives import Directions, Facts
 from loopwright.tuning.fast.excitation_choice import fast_by
 from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
 from loopwright.tuning.fast.known_procedure import TrialFigures
@@ -59,6 +60,8 @@ class Retuned:
         gains: Gains,
         known: ObservedPlant | NothingKnown,
         excitations: tuple[Excitation, ...] = BOTH,
+        directions: Directions = Directions.BOTH,
+        sp_rate_max_per_s: float = math.inf,
         **options: bool,
     ) -> None:
         self.stages: list[str] = []
@@ -70,7 +73,9 @@ class Retuned:
         process = LinearPlant(plant.num, plant.den, plant.L, TS, noise_std=NOISE, seed=11)
         settings = Settings(mv_low=-50.0, mv_high=50.0, pv_low=-1e9, pv_high=1e9, reverse=reverse)
         channel = Channel(TS, settings, Parameters(gains.Kp, gains.Ti), 0.0, int(Mode.AUTOMATIC), 0.0)
-        facts = Facts(TS, T95_S, -50.0, 50.0, 1.0, gains, reverse)
+        facts = Facts(
+            TS, T95_S, -50.0, 50.0, 1.0, gains, reverse, directions=directions, sp_rate_max_per_s=sp_rate_max_per_s
+        )
         asked = FastOptions(propose_anyway=True, **options)
         self.ended: RunResult[FastProposal] = run(
             fast_by(excitations, facts, asked, known),
@@ -204,3 +209,41 @@ def test_what_was_known_is_the_same_after_it_was_stored() -> None:
     assert one.gains == other.gains and one.model_from == other.model_from
     assert unpack(pack(NothingKnown("why"))) == NothingKnown("why")
     assert isinstance(unpack(b"damaged"), NothingKnown)
+
+
+class TestDownByRamps:
+    """The set-point goes down by a permitted step in one ultimate period of the plant as it was observed."""
+
+    def rehearsed(self, plant: Plant, part: float = 1.0) -> Retuned:
+        """part: of that rate."""
+        known = heard_of(LAG, PI)
+        period = ultimate_point(LAG)[1]
+        self.rate = part / period
+        return Retuned(plant, PI, known, directions=Directions.DOWN, sp_rate_max_per_s=self.rate)
+
+    def check_moves(self, found: Retuned) -> None:
+        sp = np.array([sample.sp for sample in found.taken])
+        assert sp.max() == 0.0 and -1.0 - 1e-9 <= sp.min() < 0.0 and sp[-1] == 0.0
+        assert np.abs(np.diff(sp)).max() <= self.rate * TS * (1.0 + 1e-6)
+
+    def test_only_the_new_gains_are_tried(self) -> None:
+        found = self.rehearsed(LAG)
+        assert found.stages == ["preflight", "design", "trial", "redesign"]
+        assert found.true_Ms == pytest.approx(1.6, abs=0.05)
+        assert found.trials[0].step == -1.0 and found.trials[0].outdated is None
+        self.check_moves(found)
+
+    def test_a_plant_that_has_changed_shows_and_pulses_follow_down(self) -> None:
+        changed = FOPDT(1.5 * LAG.K, LAG.T, LAG.L)
+        found = self.rehearsed(changed)
+        assert found.trials[0].outdated is not None and "pulses" in found.stages
+        assert found.true_Ms == pytest.approx(1.6, abs=0.05)
+        self.check_moves(found)
+
+    def test_a_ramp_that_would_show_no_change_is_no_trial(self) -> None:
+        found = self.rehearsed(LAG, 0.2)
+        assert "trial" not in found.stages and "pulses" in found.stages
+        assert any("a rate of" in note and "at least is needed" in note for note in found.notes)
+        if found.ended.value is not None:
+            assert found.true_Ms == pytest.approx(1.6, abs=0.1)
+        self.check_moves(found)
