@@ -67,6 +67,13 @@ PAGE = (
         "4b8a8191e425658e3ea8c8c1314b0fc679c861ee3a1af2b20c7b16ba50b5133d",
         {"uPlot.js": "dist/uPlot.esm.js", "uPlot.min.css": "dist/uPlot.min.css"},
     ),
+    Package(
+        "@fontsource-variable/inter",
+        "5.3.0",
+        "OFL-1.1",
+        "d26710dd38e7217484a1d47ee76c024977ec550548876f26d06ed1844af09a14",
+        {"inter.woff2": "files/inter-latin-wght-normal.woff2"},
+    ),
 )  # fmt: skip
 TESTS = (
     Package(
@@ -93,11 +100,13 @@ def main() -> None:
             for package in packages:
                 archive = _packed(package, Path(folder))
                 for name, path in package.files.items():
-                    text = _read(archive, path)
-                    (vendor / name).write_text(text if packages is TESTS else _without_bare_imports(text))
-                    digest = hashlib.sha256((vendor / name).read_bytes()).hexdigest()
+                    content = _read(archive, path)
+                    if packages is PAGE and not name.endswith(".woff2"):
+                        content = _without_bare_imports(content.decode()).encode()
+                    (vendor / name).write_bytes(content)
+                    digest = hashlib.sha256(content).hexdigest()
                     versions.append(f"{name} {package.name} {package.version} {package.licence} {digest}")
-                licences.append(f"{package.name} {package.version}\n\n{_read(archive, 'LICENSE').strip()}\n")
+                licences.append(f"{package.name} {package.version}\n\n{_read(archive, 'LICENSE').decode().strip()}\n")
         (vendor / "VERSIONS").write_text("\n".join(versions) + "\n")
         (vendor / "LICENSES").write_text(f"\n{'-' * 72}\n\n".join(licences))
 
@@ -112,12 +121,12 @@ def _packed(package: Package, folder: Path) -> Path:
     return archive
 
 
-def _read(archive: Path, path: str) -> str:
+def _read(archive: Path, path: str) -> bytes:
     with tarfile.open(archive) as files:
         found = files.extractfile(f"package/{path}")
         if found is None:
             raise SystemExit(f"{archive.name} has no file {path}")
-        return found.read().decode()
+        return found.read()
 
 
 def _without_bare_imports(text: str) -> str:
