@@ -50,12 +50,13 @@ export function Choice({ loop, detail, job, latest, quiet, onChanged }) {
   const before = useMemo(() => (model && job.old_gains ? pictures(model, job.old_gains, size, horizon_s) : null), [job.id]);
   const after = useMemo(() => (model ? pictures(model, gains, size, horizon_s) : null), [job.id, gains.Kp, gains.Ti, gains.Td]);
   const points = useMemo(() => (model ? designs.map((each) => ({ ms: each.ms, IAE: step(model, each.gains, { load: 1 }, horizon_s, 300).IAE })) : []), [job.id, grid.length]);
+  const found = nameOf(job);
   const narrow = matchMedia("(max-width: 720px)").matches;
   const small = narrow ? width : (width - 2 * GAP) / 2.8;
   const stableBefore = job.comparison?.before.stable ?? true;
 
   return html`<div class="card choice"><div class="body"><div ref=${curve}>
-      ${designed && html`<div class="curve" key="curve"><div class="split"><span class="title">Faster or more robust</span><span>Ms <b>${msText(ms)}</b> <span class="quiet">${atTested ? "as asked and tested" : "not tested"}</span></span></div>
+      ${designed && html`<div class="curve" key="curve"><div class="split"><span class="title">Faster or more robust</span><span>Ms <b>${msText(ms)}</b> <span class="quiet">${!atTested ? "not tested" : job.verification || job.after ? "as asked and tested" : "as asked"}</span></span></div>
         ${Curve(width, points, ms, tested, job.comparison?.before.Ms ?? null, model && job.old_gains && stableBefore ? step(model, job.old_gains, { load: 1 }, horizon_s, 300).IAE : null)}
         <input type="range" min=${designs[0].ms} max=${designs[designs.length - 1].ms} step="0.01" value=${ms} disabled=${designs.length < 2} aria-label="Ms" aria-valuetext=${`Ms ${msText(ms)}${atTested ? ", as tested" : ""}`}
           onInput=${(/** @type {any} */ e) => { const value = Number(e.target.value); setMs(Math.abs(value - tested) < 0.015 ? tested : value); }}
@@ -65,11 +66,14 @@ export function Choice({ loop, detail, job, latest, quiet, onChanged }) {
         <figure><figcaption><b>Set-point step</b> PV, ${unit(loop.pv_unit)}</figcaption>${StepPlot(small, stableBefore ? before?.setpoint : null, after.setpoint, size, "Set-point step before and after")}</figure>
         <figure><figcaption><b>Load step of ${LOAD_PCT} %</b> PV, ${unit(loop.pv_unit)}</figcaption>${StepPlot(small, stableBefore ? before?.load : null, after.load, 0, "Load step before and after")}</figure>
         <figure><figcaption><b>Distance from −1</b> Nyquist</figcaption>${NyquistPlot(narrow ? small : 0.8 * small, before?.freq ?? null, after.freq, atTested ? (job.comparison?.after.Ms ?? after.freq.Ms) : after.freq.Ms)}</figure></div>
-        <div class="legend" key="legend" style=${{ marginTop: "8px" }}><span class="old">before</span><span class="new">${atTested ? "proposed" : "chosen"}</span></div>`}
-    </div><div>${Table(loop, job, gains, before, after, atTested, size)}<p class="note" key="verdict">${job.comparison?.verdict}</p></div></div>
+        <div class="legend" key="legend" style=${{ marginTop: "8px" }}><span class="old">before</span><span class="new">${atTested ? found : "chosen"}</span></div>`}
+    </div><div>${Table(loop, job, gains, before, after, atTested, size)}${!job.reason && html`<p class="note" key="verdict">${job.comparison?.verdict}</p>`}</div></div>
     ${!quiet && html`<${Decide} key="decide" loop=${loop} detail=${detail} job=${job} latest=${latest} ms=${ms} tested=${tested} atTested=${atTested} back=${() => setMs(tested)} onChanged=${onChanged} />`}
   </div>`;
 }
+
+/** What the gains are that were found. @param {any} job */
+const nameOf = (job) => (["proposed", "accepted", "rolled_back"].includes(job.state) ? "proposed" : "found");
 
 /** @param {any} e @param {number} tested @param {any[]} designs @param {any} setMs */
 function slide(e, tested, designs, setMs) {
@@ -117,7 +121,7 @@ function Table(loop, job, gains, before, after, atTested, size) {
     [html`Phase margin <small>°</small>`, "pm", stable ? a.PM_deg : null, b.PM_deg, (v) => fixed(v, 0)],
   ];
   return html`<table class="figures" key="table"><caption class="hidden-words">Before and after, for a set-point step of ${size} ${u}</caption>
-    <thead><tr><th></th><th class="num">before</th><th class="num">${atTested ? "proposed" : "chosen"}</th><th></th></tr></thead>
+    <thead><tr><th><span class="hidden-words">Figure</span></th><th class="num">before</th><th class="num">${atTested ? nameOf(job) : "chosen"}</th><th><span class="hidden-words">Change</span></th></tr></thead>
     <tbody>${rows.map(([name, key, x, y, text]) => html`<tr key=${key}><td>${name}</td><td class="num">${key === "ti" && x === 0 ? "off" : text(x)}</td><td class="num after">${text(y)}</td><td class="num quiet">${key === "os" ? "" : change(x, y)}</td></tr>`)}</tbody></table>
     ${!stable && html`<p class="note" key="unstable">With the gains before, the loop is not stable on this model.</p>`}`;
 }

@@ -27,10 +27,10 @@ export function Bar() {
       ${may.admin.value && html`<a key="log" href="/ui/log" aria-current=${inside("/ui/log") ? "page" : undefined}>Log</a>`}
     </nav>
     <div class="right">
-      <a href="/ui/alarms" aria-label=${!all ? "What is abnormal" : some.length ? `${all.length} abnormal` : "Nothing abnormal"}>
-        ${some.length ? some.map(([level, count]) => html`<span key=${level} class="count">${AlarmSymbol(/** @type {1|2|3} */ (level))} ${count}</span>`) : html`<span class="calmness">${all ? "Nothing abnormal" : "…"}</span>`}
+      <a href="/ui/alarms"><span class="hidden-words">${!all ? "What is abnormal" : some.length ? `${all.length} abnormal: ` : ""}</span>
+        ${some.length ? some.map(([level, count]) => html`<span key=${level} class="count">${AlarmSymbol(/** @type {1|2|3} */ (level))} ${count}</span>`) : html`<svg class="calm-sign" viewBox="0 0 20 20" aria-hidden="true"><path d="M10 2.5 18 17H2Z" class="s-line" /></svg><span class="calmness">${all ? "Nothing abnormal" : "…"}</span>`}
       </a>
-      <span class="who">${service.value?.host} ${session.value && html`<b>${session.value.name}</b> ${session.value.scope}`}</span>
+      <span class="who">${session.value && html`${service.value && service.value.host !== session.value.name ? `${service.value.host} · ` : ""}<b>${session.value.name}</b> · ${session.value.scope}`}</span>
       <button class="plain" onClick=${cyclePalette} aria-label=${`Colours: ${palette.value}`}>◑ <span class="who">${palette.value}</span></button>
       ${signOutError.value && html`<span key="error" role="alert">${signOutError.value}</span>`}
       ${session.value?.keys && html`<button key="out" class="plain" onClick=${signOut} aria-label=${`Sign out ${session.value.name}`}>Sign out</button>`}

@@ -116,13 +116,13 @@ function Settings(loop, detail) {
   const decimals = Math.min(3, pvDecimals(loop.pv_limits));
   const u = unit(loop.pv_unit);
   return html`<section class="card" key="settings" aria-label="Gains and limits">
-    <h3 class="title" key="t1">Gains in effect</h3>
+    <h2 class="title" key="t1">Gains in effect</h2>
     ${gains ? html`<dl class="pairs" key="gains"><dt>Kp</dt><dd>${significant(gains.Kp)} <span class="quiet">%/${u}</span></dd><dt>Ti</dt><dd>${gains.Ti ? significant(gains.Ti) : "off"} <span class="quiet">s</span></dd>
       ${gains.Td > 0 && html`<dt key="td">Td</dt><dd key="tdv">${significant(gains.Td)} <span class="quiet">s</span></dd>`}
       <dt>action</dt><dd>${live.reverse_acting ? "reverse" : "direct"}</dd><dt>sampled</dt><dd>every ${period(live.sample_time_s)}</dd></dl>`
     : html`<p key="none" class="quiet">${detail?.live_error ? `${detail.live_error.detail}. ${detail.live_error.advice}` : detail ? "not known here" : "reading…"}</p>`}
     ${loop.gains_differ && loop.accepted && html`<p class="note" key="differ">Accepted last: Kp ${significant(loop.accepted.gains.Kp)}, Ti ${significant(loop.accepted.gains.Ti)} s, by ${loop.accepted.by}, ${when(loop.accepted.at)}.</p>`}
-    <h3 class="title" key="t2">Permitted</h3>
+    <h2 class="title" key="t2">Permitted</h2>
     <dl class="pairs" key="limits"><dt>PV</dt><dd>${fixed(loop.pv_limits.low, decimals)} … ${fixed(loop.pv_limits.high, decimals)} <span class="quiet">${u}</span></dd>
       <dt>MV</dt><dd>${significant(loop.mv_limits.low, 3)} … ${significant(loop.mv_limits.high, 3)} <span class="quiet">%</span></dd>
       <dt>SP step</dt><dd>${{ both: "±", up: "+", down: "−" }[/** @type {"both" | "up" | "down"} */ (loop.test.directions)]} ${fixed(loop.sp_deviation, decimals)} <span class="quiet">${u}</span></dd><dt>test by</dt><dd>${loop.test.excitations.map((/** @type {string} */ each) => (each === "setpoint" ? "set-point" : each)).join(", ")}</dd></dl>
@@ -132,7 +132,7 @@ function Settings(loop, detail) {
 
 /** @param {any[]} tests */
 function Tests(tests) {
-  return html`<section class="card tests" key="tests"><h3 class="title">Earlier tests</h3>
+  return html`<section class="card tests" key="tests"><h2 class="title">Earlier tests</h2>
     ${tests.length ? html`<ul class="tests">${tests.slice(0, 6).map((each) => html`<li key=${each.id}><a href=${jobPath(each.url)}>${when(each.ended_at ?? each.created_at)}</a>
       <small>${each.dry_run ? "rehearsal · " : ""}${stateWords(each)}${known(each.request.ms) ? ` · Ms ${ms(each.request.ms)}` : ""}</small></li>`)}</ul>` : html`<p class="quiet">none yet</p>`}</section>`;
 }

@@ -78,7 +78,7 @@ export function LoopsView() {
       <${Sentence} />
     </div>
     ${shown.length ? html`<div class="table loops" key="table"><table>
-      <thead><tr><th class="sign"><span class="hidden-words">State</span></th><th>Loop</th><th class="num">PV</th><th></th><th class="c-limits">between its limits</th><th class="num c-sp">SP</th><th class="c-spark">last 5 min</th><th class="num c-mv">MV</th><th class="c-mv"></th><th class="c-mode">Mode</th><th>Tuning</th></tr></thead>
+      <thead><tr><th class="sign"><span class="hidden-words">State</span></th><th>Loop</th><th class="num">PV</th><th class="unit"><span class="hidden-words">Unit of PV</span></th><th class="c-limits">between its limits</th><th class="num c-sp">SP</th><th class="c-spark">last 5 min</th><th class="num c-mv">MV</th><th class="c-mv"><span class="hidden-words">MV between its limits</span></th><th class="c-mode">Mode</th><th>Tuning</th></tr></thead>
       ${[...groups].map(([name, members]) => html`<tbody key=${name}>
         ${groups.size > 1 || name ? html`<tr class="area" key="area"><th colspan="11" scope="rowgroup">${name || "No area"}</th></tr>` : null}
         ${members.map((loop) => html`<${Row} key=${loop.tag} loop=${loop} />`)}</tbody>`)}
@@ -113,7 +113,7 @@ function Row({ loop }) {
   return html`<tr class=${`row ${atRow.value === loop.tag ? "at" : ""}`} data-tag=${loop.tag} onClick=${(/** @type {MouseEvent} */ e) => { if (!(/** @type {Element} */ (e.target).closest("a"))) go(loopPath(loop.tag)); }}>
     <td class="sign">${alarm ? AlarmSymbol(alarm.level) : job ? TestSign() : waits(loop) ? DecisionSign() : null}</td>
     <td class="name"><a class="tag" href=${loopPath(loop.tag)}>${loop.tag}</a><small>${alarm ? html`<b>${alarm.text}</b>` : loop.description}</small></td>
-    <td class="num"><span class=${`pvnum ${outside ? "outside" : ""}`}>${fixed(pv, decimals)}</span></td>
+    <td class="num"><span class=${`pvnum ${outside ? "outside" : ""}`}>${fixed(pv, decimals)}</span><span class="name-below">${unit(loop.pv_unit)}</span></td>
     <td class="unit">${unit(loop.pv_unit)}</td>
     <td class="c-limits">${PvBar(loop, pv, sp)}</td>
     <td class="num c-sp">${fixed(sp, decimals)}</td>

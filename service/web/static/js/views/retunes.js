@@ -76,12 +76,12 @@ function Form() {
   const on = (/** @type {(v: string) => void} */ set) => (/** @type {any} */ e) => set(e.target.value);
   return html`<section class="card" aria-label="Retune many loops"><h2 class="title" key="t">Retune many</h2>
     <div class="options" key="fields" style=${{ borderTop: 0, marginTop: 0 }}>
-      <label class="field"><span>Loops, as TIC-*</span><input type="text" class="wide" value=${pattern} onInput=${on(setPattern)} /></label>
-      <label class="field"><span>Ms asked for: <b>${ms(Number(asked))}</b></span><input type="range" min="1.2" max="2" step="0.05" value=${asked} onInput=${on(setAsked)} /></label>
-      <label class="field"><span>at once per bus</span><input type="text" inputmode="numeric" value=${perBus} onInput=${on(setPerBus)} /></label>
-      <label class="field"><span>at once per area</span><input type="text" inputmode="numeric" value=${perArea} onInput=${on(setPerArea)} /></label>
-      <label class="field"><span>stop after failures</span><input type="text" inputmode="numeric" value=${failures} onInput=${on(setFailures)} /></label></div>
-    ${preview?.summary.map((/** @type {string} */ line) => html`<p key=${line}>${line}</p>`)}
+      <label class="field"><span>Loops</span><input type="text" class="wide" placeholder="TIC-* or *" value=${pattern} onInput=${on(setPattern)} /></label>
+      <label class="field"><span>Robustness asked for <b>Ms ${ms(Number(asked))}</b></span><input type="range" min="1.2" max="2" step="0.05" value=${asked} onInput=${on(setAsked)} /></label>
+      <label class="field"><span>At once per bus</span><input type="text" inputmode="numeric" value=${perBus} onInput=${on(setPerBus)} /></label>
+      <label class="field"><span>At once per area</span><input type="text" inputmode="numeric" value=${perArea} onInput=${on(setPerArea)} /></label>
+      <label class="field"><span>Stop after failures</span><input type="text" inputmode="numeric" value=${failures} onInput=${on(setFailures)} /></label></div>
+    ${preview && html`<div key="what" class="explain">${preview.summary.map((/** @type {string} */ line) => html`<p key=${line}>${line}</p>`)}</div>`}
     ${preview?.loops.filter((/** @type {any} */ each) => !each.would_start).map((/** @type {any} */ each) => html`<p class="note" key=${each.loop}><b>${each.loop}</b> ${each.obstacles[0]?.detail}. ${each.obstacles[0]?.advice}</p>`)}
     ${problem && html`<p class="refusal" role="alert" key="problem">${problem.message} <span class="advice">${problem.advice}</span></p>`}
     <div class="foot" key="foot"><label class="left">Signed <input type="text" maxlength="100" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} /></label>
@@ -118,9 +118,9 @@ function One({ id }) {
   return html`<div><div class="pagehead" key="head"><h1>Retune of ${found.loops.length} loops</h1><span class="quiet">${when(found.created_at)} · ${found.requested_by} · ${found.state}</span><span class="sentence">${countWords(found.counts)}</span></div>
     ${found.detail && html`<p class="refusal" key="detail">${found.detail}</p>`}${problem && html`<p class="refusal" role="alert" key="problem">${problem}</p>`}
     ${going && may.operate.value && html`<p class="foot" key="abort">${asking ? html`<span key="q">This ends the retune of all ${found.loops.length} loops.</span><button key="no" onClick=${() => setAsking(false)}>Go on</button><button key="yes" class="abort" onClick=${abort}>Abort all ${found.loops.length}</button>` : html`<button key="ask" class="abort" onClick=${() => setAsking(true)}>Abort all ${found.loops.length}…</button>`}</p>`}
-    <div class="table" key="table"><table><thead><tr><th>Loop</th><th>State</th><th>Result</th><th></th></tr></thead><tbody>
+    <div class="table" key="table"><table><thead><tr><th>Loop</th><th>State</th><th>Result</th><th>Job</th></tr></thead><tbody>
       ${found.loops.map((/** @type {any} */ each) => {
         const live = jobs.value.find((job) => job.url === each.job);
-        return html`<tr key=${each.loop}><td><a class="tag" href=${loopPath(each.loop)}>${each.loop}</a></td><td>${each.state.replaceAll("_", " ")}${live ? `, ${stageName(live.stage)}` : ""}</td><td>${reasonWords(each.reason)} <span class="quiet">${each.detail}</span></td><td>${each.job && html`<a href=${jobPath(each.job)}>job</a>`}</td></tr>`;
+        return html`<tr key=${each.loop}><td><a class="tag" href=${loopPath(each.loop)}>${each.loop}</a></td><td>${each.state.replaceAll("_", " ")}${live ? `, ${stageName(live.stage)}` : ""}</td><td>${reasonWords(each.reason)} <span class="quiet">${each.detail}</span></td><td>${each.job && html`<a href=${jobPath(each.job)}>${each.job.split("/").at(-1)}</a>`}</td></tr>`;
       })}</tbody></table></div></div>`;
 }
