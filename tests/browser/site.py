@@ -39,13 +39,14 @@ class Site(Plantsite):
         folder: Path,
         more_loops: tuple[Mapping[str, Any], ...] = (ABSENT,),
         served_with: Sequence[str] = (),
+        changes: Mapping[str, Any] = LOOP,
     ) -> None:
         self.hub = ChildProcess("hub", ("loopwright.protocol.hub", "--port", "0"), folder / "hub.log")
         stack.callback(self.hub.stop)
         bus = self.hub.wait_ready().split()[1]
-        port = ("--port", str(_free_port()))
+        port = ("--port", str(free_port()))
         more = tuple(dict(each) for each in more_loops)
-        super().__init__(stack, folder, CASE, bus, more, served_with=(*port, *served_with), changes=LOOP)
+        super().__init__(stack, folder, CASE, bus, more, served_with=(*port, *served_with), changes=changes)
 
     def ask(self, path: str) -> Any:
         """An answer of the API."""
@@ -59,6 +60,7 @@ class Site(Plantsite):
         return job
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A port of this machine at which nobody listens."""
     with socket.create_server(("127.0.0.1", 0)) as found:
         return int(found.getsockname()[1])
