@@ -19,7 +19,7 @@ from loopwright.tuning.models import Model, Reals, time_constants
 from loopwright.tuning.reasons import Ended
 
 WIDTH = 690.0
-_SMALL = (225.0, 190.0)
+_SMALL = (225.0, 160.0)
 _POINTS = 450
 _SHOWN_SETTLINGS = 1.6
 _LABEL_APART = 120.0
@@ -54,7 +54,7 @@ def record_pictures(record: JobRecord, pv_step: float) -> list[Picture]:
     rows = _rows(record, x)
     low, high = around([pv, sp], 0.5 * pv_step, 0.06)
     high += (high - low) * 0.07 * (1 + max(rows, default=0))  # room for the names of the stages
-    top = Picture("pv", "PV measured, set-point and model", x, (low, high), WIDTH, 190.0, named_x=False)
+    top = Picture("pv", "PV measured, set-point and model", x, (low, high), WIDTH, 160.0, named_x=False)
     top.curve(at, sp, "sp", stepped=True)
     top.curve(t, pv, "measured" if explained is not None else "pv")
     if explained is not None:
@@ -70,7 +70,7 @@ def record_pictures(record: JobRecord, pv_step: float) -> list[Picture]:
             rest.band(-2.0 * noise, 2.0 * noise)
         rest.curve(t, left, "rest")
         pictures.append(rest)
-    bottom = Picture("mv", "MV", x, around([mv], 5.0), WIDTH, 110.0)
+    bottom = Picture("mv", "MV", x, around([mv], 5.0), WIDTH, 92.0)
     bottom.curve(t, mv, "mv", stepped=True)
     pictures.append(bottom)
     for mark, row in zip(record.facts.marks, rows, strict=True):
