@@ -16,6 +16,8 @@ const WINDOWS = /** @type {const} */ ([["30 s", 30], ["2 min", 120], ["10 min", 
 const LONGEST_S = 1800;
 /** Between what the service keeps and the first live sample, and over a break of the stream: longer is a gap. */
 const GAP_S = 3;
+/** A sample that is older is not shown as the present. */
+const LATE_S = 3;
 /** Not more than ten drawings a second: a process is not smoother at sixty. */
 const DRAW_MS = 100;
 
@@ -107,7 +109,8 @@ export function Trend({ loop, job, height, onJob }) {
     }
     const draw = () => {
       it.dirty = false;
-      const end = Number.isNaN(it.ring.last) ? now_s.peek() : it.ring.last;
+      const now = now_s.peek();
+      const end = now - it.ring.last < LATE_S ? it.ring.last : now; // what is late is a gap at the right edge
       it.present_s = end;
       /** @type {[number, number]} */
       let x = [end - it.window_s, end];
@@ -124,7 +127,8 @@ export function Trend({ loop, job, height, onJob }) {
       plots[1]?.show([data.at, data.mv], x, yRange([data.mv], 10));
     };
     const timer = setInterval(() => {
-      if (it.dirty && !document.hidden) requestAnimationFrame(draw);
+      const late = now_s.peek() - it.ring.last >= LATE_S;
+      if ((it.dirty || late) && !document.hidden) requestAnimationFrame(draw);
     }, DRAW_MS);
     const unsubscribe = shown.subscribe(() => { it.dirty = true; });
 
