@@ -199,10 +199,12 @@ export function mark(u, ctx, at, name, row = 0) {
   ctx.font = `${11 * ratio}px Inter, system-ui, sans-serif`;
   ctx.textAlign = "left";
   ctx.textBaseline = "top";
-  const [left, top] = [x + 2 * ratio, u.bbox.top + (2 + 16 * row) * ratio];
+  const width = ctx.measureText(name).width + 6 * ratio;
+  const fits = x + 2 * ratio + width <= u.bbox.left + u.bbox.width;
+  const [left, top] = [fits ? x + 2 * ratio : x - 2 * ratio - width, u.bbox.top + (2 + 16 * row) * ratio];
   ctx.fillStyle = colour("well");
   ctx.globalAlpha = 0.85; // a curve behind it stays to be seen, and the name can be read
-  ctx.fillRect(left, top, ctx.measureText(name).width + 6 * ratio, 15 * ratio);
+  ctx.fillRect(left, top, width, 15 * ratio);
   ctx.globalAlpha = 1;
   ctx.fillStyle = colour("ink-2");
   ctx.fillText(name, left + 3 * ratio, top + 2 * ratio);

@@ -110,5 +110,8 @@ const MODES = { automatic: "AUTO", manual: "MAN", off: "OFF", experiment: "TEST"
 /** @param {string | null | undefined} mode */
 export const modeWord = (mode) => (mode ? (MODES[mode] ?? mode.toUpperCase()) : "–");
 
+/** What the service says, as a sentence. @param {string | null | undefined} text */
+export const sentence = (text) => (text ? text[0].toUpperCase() + text.slice(1) + (/[.!?]$/.test(text) ? "" : ".") : "");
+
 /** @param {string} method */
 export const methodName = (method) => method.replaceAll("-", " ");

@@ -99,5 +99,5 @@ export function NyquistPlot(width, before, after, Ms) {
     <path d=${`M0 ${y(0)}H${W}M${x(0)} 0V${H}`} class="s-grid" />
     ${before && html`<path key="before" d=${path(before)} class="s-old" />`}<path key="after" d=${path(after)} class="s-new" />
     <circle cx=${x(-1)} cy=${y(0)} r="2.5" class="f-ink" /><text x=${x(-1) - 5} y=${y(0) - 5} text-anchor="end">−1</text>
-    <text x=${x(-1)} y=${Math.min(H - 4, y(0) + scale / Ms + 13)} text-anchor="middle">1/Ms = ${fixed(1 / Ms, 2)}</text></svg>`;
+    <text x=${x(-1)} y=${Math.max(11, y(0) - scale / Ms - 5)} text-anchor="middle">1/Ms = ${fixed(1 / Ms, 2)}</text></svg>`;
 }

@@ -3,7 +3,7 @@
 import { html } from "../html.js";
 import { duration, fixed, known, ms, msError, significant, unit, when, withError, withUnit } from "../numbers.js";
 import { jobPath } from "../router.js";
-import { headline, methodName } from "../words.js";
+import { headline, methodName, sentence } from "../words.js";
 import { Choice } from "./choice.js";
 import { Record } from "./record.js";
 import { Stages } from "./undertest.js";
@@ -29,9 +29,6 @@ export function Result({ loop, detail, job, quiet = false, own = false, onChange
     ${job.notes.length > 0 && html`<div class="card" key="notes"><h2 class="title">Notes</h2>${job.notes.map((/** @type {string} */ each) => html`<p key=${each}>${sentence(each)}</p>`)}</div>`}
   </section>`;
 }
-
-/** @param {string | null} text */
-const sentence = (text) => (text ? text[0].toUpperCase() + text.slice(1) + (/[.!?]$/.test(text) ? "" : ".") : "");
 
 /** How far to trust it. @param {any} job */
 function trustWords(job) {

@@ -6,6 +6,7 @@ import { html } from "../html.js";
 import { duration, entered, fixed, known, ms, pvDecimals, significant, unit, withUnit } from "../numbers.js";
 import { jobPath } from "../router.js";
 import { isSilent, rowOf, sign, signature } from "../state.js";
+import { sentence } from "../words.js";
 
 /** Obstacles that a test looks at again for itself before it gives up: it may be started. */
 const PASSING = ["not_at_rest"];
@@ -109,9 +110,6 @@ export function RetuneForm({ loop, onClose, onStarted }) {
       <button class="main" disabled=${sending || !!why || !!obstacle} onClick=${start}>${wish.dry_run ? "Rehearse" : "Retune"} ${loop.tag}</button></div>
   </section>`;
 }
-
-/** @param {string} text */
-const sentence = (text) => (text ? text[0].toUpperCase() + text.slice(1) + (/[.!?]$/.test(text) ? "" : ".") : "");
 
 /** @param {string} name @param {string} label @param {string} u @param {number | null | undefined} usual @param {any} wish @param {any} set @param {any} problem */
 function Field(name, label, u, usual, wish, set, problem) {

@@ -85,7 +85,7 @@ function Form() {
     ${preview?.loops.filter((/** @type {any} */ each) => !each.would_start).map((/** @type {any} */ each) => html`<p class="note" key=${each.loop}><b>${each.loop}</b> ${each.obstacles[0]?.detail}. ${each.obstacles[0]?.advice}</p>`)}
     ${problem && html`<p class="refusal" role="alert" key="problem">${problem.message} <span class="advice">${problem.advice}</span></p>`}
     <div class="foot" key="foot"><label class="left">Signed <input type="text" maxlength="100" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} /></label>
-      <button class="main" disabled=${sending || isSilent.value || !preview?.would_start || !signature.value.trim()} onClick=${start}>${preview ? `Retune ${preview.would_start} loops` : "Retune"}</button></div></section>`;
+      <button class="main" disabled=${sending || isSilent.value || !preview?.would_start || !signature.value.trim()} onClick=${start}>${preview ? `Retune ${preview.would_start} ${preview.would_start === 1 ? "loop" : "loops"}` : "Retune"}</button></div></section>`;
 }
 
 /** @param {{id: string}} props */
@@ -115,7 +115,7 @@ function One({ id }) {
       setProblem(/** @type {Error} */ (error).message);
     }
   };
-  return html`<div><div class="pagehead" key="head"><h1>Retune of ${found.loops.length} loops</h1><span class="quiet">${when(found.created_at)} · ${found.requested_by} · ${found.state}</span><span class="sentence">${countWords(found.counts)}</span></div>
+  return html`<div><div class="pagehead" key="head"><h1>Retune of ${found.loops.length} ${found.loops.length === 1 ? "loop" : "loops"}</h1><span class="quiet">${when(found.created_at)} · ${found.requested_by} · ${found.state}</span><span class="sentence">${countWords(found.counts)}</span></div>
     ${found.detail && html`<p class="refusal" key="detail">${found.detail}</p>`}${problem && html`<p class="refusal" role="alert" key="problem">${problem}</p>`}
     ${going && may.operate.value && html`<p class="foot" key="abort">${asking ? html`<span key="q">This ends the retune of all ${found.loops.length} loops.</span><button key="no" onClick=${() => setAsking(false)}>Go on</button><button key="yes" class="abort" onClick=${abort}>Abort all ${found.loops.length}</button>` : html`<button key="ask" class="abort" onClick=${() => setAsking(true)}>Abort all ${found.loops.length}…</button>`}</p>`}
     <div class="table" key="table"><table><thead><tr><th>Loop</th><th>State</th><th>Result</th><th>Job</th></tr></thead><tbody>

@@ -3,7 +3,7 @@
 import { html } from "../html.js";
 import { duration } from "../numbers.js";
 import { isSilent } from "../state.js";
-import { stageFound, stageName, stagesOf, stageWhat } from "../words.js";
+import { sentence, stageFound, stageName, stagesOf, stageWhat } from "../words.js";
 import { aborting } from "../aborting.js";
 import { Progress } from "./frame.js";
 
@@ -18,8 +18,8 @@ export function UnderTest({ loop, live, job }) {
     ${Progress(live.progress, stopping)}
     ${job ? Stages(job, loop.pv_unit, live.stage ?? "") : html`<p class="quiet" key="asking">Asking for the stages…</p>`}
     ${job?.attempts > 1 && html`<p class="note" key="resumed">Resumed after a restart of the service: the stages begin anew.</p>`}
-    ${job?.notes.map((/** @type {string} */ note) => html`<p class="note" key=${note}>${note}</p>`)}
-    <p class="quiet" key="who">Asked for by ${live.requested_by}.</p>
+    ${job?.notes.map((/** @type {string} */ note) => html`<p class="note" key=${note}>${sentence(note)}</p>`)}
+    <p class="quiet who-asked" key="who">Asked for by ${live.requested_by}.</p>
   </section>`;
 }
 
