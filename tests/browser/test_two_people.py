@@ -1,0 +1,95 @@
+"""Two people at one loop, each in a browser of their own."""
+
+from __future__ import annotations
+
+import pytest
+from playwright.sync_api import Page, Route, expect
+
+from loopwright.protocol.profile import ParameterCommand
+from tests.browser import person
+from tests.browser.pages import Pages
+from tests.browser.site import TAG, Site
+
+LOOP = f"/ui/loops/{TAG}"
+OTHER = "B. Roth"
+
+
+def proposed(site: Site) -> None:
+    assert site.finished(site.retune(requested_by=person.NAME))["state"] == "proposed"
+
+
+def test_the_test_of_one_is_seen_by_the_other(site: Site, pages: Pages, page: Page) -> None:
+    other = pages.open(LOOP)
+    person.form(other)
+    site.write("plant_pace", 1.0)
+    person.open_loop(page)
+    person.retune(page)
+    expect(person.under_test(other)).to_contain_text(f"Asked for by {person.NAME}")
+    expect(other.get_by_role("region", name="Retune")).to_have_count(0)
+    person.abort_button(other).click()
+    for each in (page, other):
+        expect(person.headline(each)).to_contain_text("Stopped: by an operator")
+    assert site.is_home()
+
+
+def test_who_asks_too_late_is_shown_the_test_of_the_other(site: Site, pages: Pages) -> None:
+    page = pages.open(LOOP)
+    person.form(page)
+    person.sign(page, OTHER)
+    started = []
+
+    def overtaken(route: Route) -> None:
+        """The other one's request arrives first."""
+        site.write("plant_pace", 1.0)
+        started.append(site.retune(requested_by=person.NAME))
+        route.continue_()
+
+    page.route("**/retune", overtaken)
+    with pages.expecting("status of 409"):
+        page.get_by_role("button", name=f"Retune {TAG}").click()
+        expect(person.under_test(page)).to_contain_text(f"Asked for by {person.NAME}")
+    expect(page.get_by_role("region", name="Retune")).to_have_count(0)
+    [url] = started
+    site.http.post(f"{url}/abort")
+    site.finished(url)
+
+
+def test_what_one_accepts_the_other_sees(site: Site, pages: Pages, page: Page) -> None:
+    other = pages.open(LOOP)
+    proposed(site)
+    person.open_loop(page)
+    for each in (page, other):
+        expect(person.headline(each)).to_have_text("New gains are proposed")
+    page.get_by_role("button", name="Accept the new gains…").click()
+    person.sign(page)
+    page.get_by_role("button", name=f"Write to {TAG}").click()
+    expect(person.headline(other)).to_have_text("Accepted")
+    expect(person.decision(other)).to_contain_text(f"Accepted by {person.NAME}")
+    other.get_by_role("button", name="Roll back to the old gains…").click()
+    person.sign(other, OTHER)
+    other.get_by_role("button", name=f"Roll {TAG} back").click()
+    expect(person.headline(page)).to_have_text("The old gains are in effect")
+    assert site.is_home()
+
+
+def test_gains_that_somebody_else_has_changed_are_not_overwritten(site: Site, pages: Pages, page: Page) -> None:
+    proposed(site)
+    person.open_loop(page)
+    page.get_by_role("button", name="Accept the new gains…").click()
+    person.sign(page)
+    try:
+        change_gain(site, 75.0)
+        with pages.expecting("status of 409"):
+            page.get_by_role("button", name=f"Write to {TAG}").click()
+            expect(person.decision(page).get_by_role("alert")).to_contain_text("75")
+        assert site.state().gains.Kp == pytest.approx(75.0)
+    finally:
+        change_gain(site, site.case.kp)
+
+
+def change_gain(site: Site, kp: float) -> None:
+    """By hand, at the controller."""
+    site.write("controller_staged_kp", kp)
+    site.write("controller_staged_ti", site.case.ti)
+    site.write("controller_parameter_command", ParameterCommand.TRY)
+    site.write("controller_parameter_command", ParameterCommand.ACCEPT)
