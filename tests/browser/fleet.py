@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -12,9 +14,6 @@ from typing import Any
 import yaml
 
 from loopwright.service.cli.child_process import ChildProcess
-from loopwright.service.security.keys import Scope
-from loopwright.service.store.database import open_database
-from loopwright.service.store.keyring import Keyring
 from tests.browser.site import Site, free_port
 
 
@@ -99,9 +98,8 @@ def locked_service(stack: ExitStack, folder: Path) -> str:
     loops = folder / "locked.yaml"
     loops.write_text(yaml.safe_dump({"loops": [loop | {"pv_limits": {"low": 0, "high": 100}, "sp_deviation": 1.0}]}))
     data = folder / "locked"
-    engine = open_database(data, None, "test")
-    Keyring(engine).create("nobody", Scope.READ)  # without a key no service would ask for one
-    engine.dispose()
+    create = ("key", "create", "operator", "--scope", "operate", "--data", str(data))
+    subprocess.run([sys.executable, "-m", "loopwright.service", *create], check=True, capture_output=True)
     serve = ("serve", "--loops", str(loops), "--data", str(data), "--port", "0", "--auth")
     service = ChildProcess("service", ("loopwright.service", *serve), folder / "locked.log")
     stack.callback(service.stop)
