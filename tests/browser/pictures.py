@@ -14,7 +14,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect, sync_playwright
@@ -79,7 +79,8 @@ class Photographer:
     def _keep(self, name: str, picture: bytes) -> None:
         file = self._folder / f"{name}.png"
         whole = Image.open(io.BytesIO(picture)).convert("RGB")
-        found = sorted(whole.getcolors(whole.width * whole.height) or [], reverse=True)[:COLOURS]
+        counted = cast(list[tuple[int, tuple[int, ...]]], whole.getcolors(whole.width * whole.height))
+        found = sorted(counted, reverse=True)[:COLOURS]
         palette = Image.new("P", (1, 1))
         palette.putpalette([part for _, colour in found for part in colour])
         whole.quantize(palette=palette, dither=Image.Dither.NONE).save(file, optimize=True)
@@ -124,9 +125,9 @@ def photograph(fleet: Fleet, camera: Photographer, jobs: dict[str, str], locked:
         expect(page.get_by_label("API key")).to_be_focused()
 
     for name, size, palette in (
-        ("result", TALL, "light"),
-        ("result-dark", TALL, "dark"),
-        ("result-phone", PHONE, "light"),
+        ("loop", TALL, "light"),
+        ("loop-dark", TALL, "dark"),
+        ("loop-phone", PHONE, "light"),
     ):
         camera.take(name, f"/ui/loops/{RESULT}", result, size, palette)
     camera.take("refused", f"/ui{jobs[REFUSED]}", refused)

@@ -40,6 +40,7 @@ def test_a_retune_is_started_and_aborted(site: Site, page: Page) -> None:
     tab_to(page, start)
     page.keyboard.press("Enter")
     expect(person.under_test(page)).to_contain_text(f"Asked for by {person.NAME}")
+    person.in_stage(page, "Relay")
     page.keyboard.press("Control+.")
     expect(person.headline(page)).to_contain_text("Stopped: by an operator")
     assert site.is_home()

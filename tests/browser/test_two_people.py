@@ -26,6 +26,7 @@ def test_the_test_of_one_is_seen_by_the_other(site: Site, pages: Pages, page: Pa
     person.retune(page)
     expect(person.under_test(other)).to_contain_text(f"Asked for by {person.NAME}")
     expect(other.get_by_role("region", name="Retune")).to_have_count(0)
+    person.in_stage(other, "Relay")
     person.abort_button(other).click()
     for each in (page, other):
         expect(person.headline(each)).to_contain_text("Stopped: by an operator")
@@ -50,6 +51,7 @@ def test_who_asks_too_late_is_shown_the_test_of_the_other(site: Site, pages: Pag
         expect(person.under_test(page)).to_contain_text(f"Asked for by {person.NAME}")
     expect(page.get_by_role("region", name="Retune")).to_have_count(0)
     [url] = started
+    person.in_stage(page, "Relay")
     site.http.post(f"{url}/abort")
     site.finished(url)
 
