@@ -87,10 +87,10 @@ def test_another_Ms_is_tried_on_the_loop_before_it_can_be_accepted(site: Site, p
     expect(person.under_test(page)).to_be_visible()
     expect(person.under_test(page).get_by_role("listitem")).not_to_contain_text(["Relay"])
     expect(person.headline(page)).to_have_text("New gains are proposed")
-    expect(page.get_by_role("region", name="Result")).to_contain_text("of the measured step. Ms 1.40")
+    expect(page.get_by_role("region", name="Result")).to_contain_text("Ms 1.40 on the model")
     second = site.latest()
     assert second["url"] != first["url"] and (second["state"], second["requested_by"]) == ("proposed", NAME)
-    assert second["predicted"]["Ms"] == pytest.approx(1.4, abs=0.01) and second["verification"]["fit_pct"] > 95
+    assert second["predicted"]["Ms"] == pytest.approx(1.4, abs=0.01) and second["after"]["settled"]
     assert second["new_gains"]["Kp"] < first["new_gains"]["Kp"] and site.is_home()
     expect(page.get_by_role("button", name="Accept the new gains")).to_be_enabled()
     # the first proposal is no longer to be decided

@@ -83,7 +83,7 @@ def test_a_key_that_may_read_has_no_button_that_changes_something(
     for name in ("Retune", "Accept", "Abort", "Keep the old", "Roll back"):
         expect(page.get_by_role("button", name=name)).not_to_be_attached()
     expect(page.get_by_role("link", name="Log")).not_to_be_attached()
-    expect(page.get_by_role("banner")).to_contain_text("wall screen read")
+    expect(page.get_by_role("banner")).to_contain_text("wall screen · read")
 
     # a test that somebody else has begun is seen, and cannot be ended by this key
     _, operate = keyring.create("console", Scope.OPERATE)

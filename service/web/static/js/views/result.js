@@ -24,7 +24,7 @@ export function Result({ loop, detail, job, quiet = false, own = false, onChange
     ${job.superseded_by && html`<p class="refusal" key="later">A later test came: <a href=${jobPath(job.superseded_by)}>its result</a>.</p>`}
     ${job.new_gains && html`<${Choice} key="choice" loop=${loop} detail=${detail} job=${job} latest=${latest} quiet=${quiet} onChanged=${onChanged} />`}
     ${!["fast", "setpoint"].includes(job.method) || own ? html`<div class="card" key="stages" style=${{ marginTop: "16px" }}><h2 class="title">Stages</h2>${Stages(job, loop.pv_unit)}</div>` : null}
-    ${!job.dry_run && html`<${Record} key="record" loop=${loop} job=${job} />`}
+    ${!job.dry_run && job.plant_time_s > 0 && html`<${Record} key="record" loop=${loop} job=${job} />`}
     ${Numbers(loop, job)}
     ${job.notes.length > 0 && html`<div class="card" key="notes"><h2 class="title">Notes</h2>${job.notes.map((/** @type {string} */ each) => html`<p key=${each}>${sentence(each)}</p>`)}</div>`}
   </section>`;
@@ -38,6 +38,7 @@ function trustWords(job) {
   if (job.evidence) parts.push(html`Ms <b>${ms(job.predicted?.Ms ?? job.evidence.Ms)}</b>${known(job.evidence.uncertainty) ? html`, known to within ${msError(job.evidence.uncertainty)}` : ""}. `);
   if (job.rehearsed_on) parts.push(html`Computed on ${job.rehearsed_on.plant_text}; the loop was not moved. `);
   if (job.after && !job.verification) parts.push(html`Measured with the new gains: overshoot <b>${fixed(job.after.overshoot_pct, 0)} %</b>, ${job.after.settled ? `settled in ${duration(job.after.settling_s)}` : "not settled"}. `);
+  if (!job.evidence && known(job.predicted?.Ms)) parts.push(html`Ms <b>${ms(job.predicted.Ms)}</b> on the model. `);
   return parts.length ? parts : null;
 }
 
@@ -55,7 +56,7 @@ function Numbers(loop, job) {
   const rows = [];
   const m = job.model;
   const list = (/** @type {number[]} */ values, /** @type {number[] | null} */ errors) => values.map((value, n) => withError(value, errors?.[n])).join(", ");
-  if (m?.num) rows.push(["model", m.structure], ["numerator", list(m.num, m.num_errors)], ["denominator", list(m.den, m.den_errors)], ["dead time", withUnit(withError(m.dead_time_s, m.dead_time_error_s), "s")]);
+  if (m?.num) rows.push(["model", m.structure === "typed in" ? "given with the request" : m.structure], ["numerator", list(m.num, m.num_errors)], ["denominator", list(m.den, m.den_errors)], ["dead time", withUnit(withError(m.dead_time_s, m.dead_time_error_s), "s")]);
   else if (m) rows.push(["model", `K ${significant(m.K)} ${u}/%, T ${significant(m.T_s)} s, dead time ${significant(m.L_s)} s${known(m.zeta) ? `, damping ${significant(m.zeta)}` : ""}`]);
   if (known(m?.fit_pct)) rows.push(["fit", `${fixed(m.fit_pct, 1)} %`]);
   if (job.ultimate) rows.push(["ultimate point", `Ku ${significant(job.ultimate.Ku)} %/${u}, Pu ${significant(job.ultimate.Pu_s)} s`]);
