@@ -48,7 +48,7 @@ from loopwright.service.api.job_views import (
     loop_view,
 )
 from loopwright.service.api.paging import LARGEST
-from loopwright.service.api.samples import Reading, csv_text, json_text, parts, takes_gzip
+from loopwright.service.api.samples import Reading, csv_text, json_text, parts
 from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.inputs.request import FastRetune, RetuneRequest
 from loopwright.service.job_states import ACTIVE
@@ -63,6 +63,7 @@ from loopwright.service.store.idempotency import IdempotencyKeys
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.live_jobs import acceptances, latest_jobs
 from loopwright.service.telemetry.lateness import watched_event_loop
+from loopwright.service.web.compressed import takes_gzip
 from loopwright.service.web.pages import Pages
 from loopwright.tuning.reasons import Ended
 

@@ -7,7 +7,6 @@ column, so the blocks are read once for each column.
 from __future__ import annotations
 
 import json
-import re
 import zlib
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
@@ -100,12 +99,3 @@ def _gathered(text: Iterator[str]) -> Iterator[str]:
             waiting, length = [], 0
     if waiting:
         yield "".join(waiting)
-
-
-def takes_gzip(accept_encoding: str) -> bool:
-    """Whether the header Accept-Encoding names gzip, and not with q=0."""
-    for each in accept_encoding.lower().split(","):
-        name, _, weight = each.partition(";")
-        if name.strip() == "gzip":
-            return re.fullmatch(r"\s*q\s*=\s*0(\.0*)?\s*", weight) is None
-    return False

@@ -5,10 +5,14 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import anyio.to_thread
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
-from starlette.responses import Response
+from starlette.responses import FileResponse, Response
 from starlette.staticfiles import StaticFiles
 from starlette.types import Scope
+
+from loopwright.service.web.compressed import TEXTS, compressed, takes_gzip
 
 FILES = Path(__file__).parent / "static"
 POLICY = "; ".join(
@@ -47,10 +51,24 @@ class Pages(StaticFiles):
 
     async def get_response(self, path: str, scope: Scope) -> Response:
         try:
-            answer = await super().get_response("index.html" if path == "." else path, scope)
+            answer = await self._file("index.html" if path == "." else path, scope)
         except HTTPException as refused:
             if refused.status_code != 404 or os.path.splitext(path)[1]:
                 raise
-            answer = await super().get_response("index.html", scope)
+            answer = await self._file("index.html", scope)
         answer.headers.update(HEADERS)
         return answer
+
+    async def _file(self, path: str, scope: Scope) -> Response:
+        """A file, text compressed where the browser takes that. Its ETag is a weak one, for it stands for the same text
+        either way."""
+        answer = await super().get_response(path, scope)
+        if os.path.splitext(path)[1] not in TEXTS:
+            return answer
+        answer.headers["Vary"] = "Accept-Encoding"
+        answer.headers["ETag"] = f"W/{answer.headers['ETag']}"
+        if not isinstance(answer, FileResponse) or not takes_gzip(Headers(scope=scope).get("accept-encoding", "")):
+            return answer
+        body = await anyio.to_thread.run_sync(compressed, Path(answer.path))
+        kept = {name: answer.headers[name] for name in ("content-type", "last-modified", "etag", "vary")}
+        return Response(body, headers=kept | {"Content-Encoding": "gzip"})

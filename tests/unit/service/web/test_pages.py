@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import gzip
 import hashlib
+import os
 import re
 from collections.abc import Iterator
+from pathlib import Path
 
+import httpx
 import pytest
 from fastapi.testclient import TestClient
 
@@ -13,6 +17,7 @@ from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.keyring import Keyring
+from loopwright.service.web.compressed import TEXTS, compressed
 from loopwright.service.web.pages import FILES
 from tests.unit.service.fakes import TAG, Service
 
@@ -49,6 +54,60 @@ def test_a_file_that_did_not_change_is_not_sent_again(client: TestClient) -> Non
     again = client.get("/ui/js/main.js", headers={"If-None-Match": first.headers["etag"]})
     assert again.status_code == 304 and not again.content
     assert again.headers["content-security-policy"] == first.headers["content-security-policy"]
+
+
+def sent(client: TestClient, path: str, accepted: str, **headers: str) -> tuple[bytes, httpx.Headers, int]:
+    """The bytes of an answer as they come over the wire, its headers, its status."""
+    with client.stream("GET", path, headers={"Accept-Encoding": accepted, **headers}) as answer:
+        return b"".join(answer.iter_raw()), answer.headers, answer.status_code
+
+
+@pytest.mark.parametrize("path", ["/ui/", "/ui/js/main.js", "/ui/app.css", "/ui/icon.svg", "/ui/vendor/uPlot.js"])
+def test_text_is_sent_compressed_to_who_takes_it(client: TestClient, path: str) -> None:
+    file = FILES / (path.removeprefix("/ui/") or "index.html")
+    packed, headers, _ = sent(client, path, "gzip, deflate, br")
+    assert headers["content-encoding"] == "gzip" and int(headers["content-length"]) == len(packed)
+    assert gzip.decompress(packed) == file.read_bytes()
+    plain, plainly, _ = sent(client, path, "gzip;q=0, identity")
+    assert "content-encoding" not in plainly and plain == file.read_bytes()
+    assert headers["vary"] == plainly["vary"] == "Accept-Encoding"
+    for name in ("content-type", "content-security-policy", "etag"):
+        assert headers[name] == plainly[name]
+
+
+def test_a_browser_that_has_a_text_is_not_sent_it_again_in_either_form(client: TestClient) -> None:
+    for had in ("gzip", "identity"):
+        _, headers, _ = sent(client, "/ui/js/main.js", had)
+        assert headers["etag"].startswith('W/"')  # one for both forms, which differ in their bytes
+        for asked in ("gzip", "identity"):
+            body, again, status = sent(client, "/ui/js/main.js", asked, **{"If-None-Match": headers["etag"]})
+            assert status == 304 and not body and again["etag"] == headers["etag"]
+            assert again["vary"] == "Accept-Encoding"
+
+
+def test_other_files_are_sent_as_they_are(client: TestClient) -> None:
+    others = [path for path in FILES.rglob("*") if path.is_file() and path.suffix not in TEXTS]
+    assert others
+    for file in others:
+        body, headers, _ = sent(client, f"/ui/{file.relative_to(FILES)}", "gzip")
+        assert "content-encoding" not in headers and body == file.read_bytes()
+
+
+def test_a_text_is_compressed_once_and_anew_when_it_has_changed(tmp_path: Path) -> None:
+    file = tmp_path / "text.js"
+    file.write_text("const first = 1;")
+    os.utime(file, ns=(1, 1))
+    once = compressed(file)
+    assert compressed(file) is once and gzip.decompress(once) == b"const first = 1;"
+    file.write_text("const other = 2;")
+    os.utime(file, ns=(2, 2))
+    assert gzip.decompress(compressed(file)) == b"const other = 2;"
+
+
+def test_the_page_is_small_enough_for_a_slow_line() -> None:
+    """All that a first visit brings, compressed: well under 300 kB, which `make bench` measures in the browser."""
+    files = [path for path in FILES.rglob("*.*") if path.name not in ("VERSIONS", "LICENSES")]
+    assert sum(len(compressed(path)) if path.suffix in TEXTS else path.stat().st_size for path in files) < 300_000
 
 
 @pytest.mark.parametrize(
