@@ -51,7 +51,7 @@ check: setup
 
 # Without them the others are measured, and the table says what was not.
 bench: setup
-	@sh tools/system-packages $(UML) postgresql
+	@sh tools/system-packages $(UML) postgresql chromium
 	$(BIN)/python -m benchmarks
 
 # Writes docs/validation.md and its plots; fails when a number of a paper leaves its tolerance.

@@ -45,6 +45,10 @@ BENCHMARKS = {name: Benchmark((sys.executable, "-m", f"benchmarks.{name}")) for 
         (sys.executable, "-m", "benchmarks.gateways"),
         "no PostgreSQL server is to be had: sudo apt-get install postgresql",
     ),
+    "page": Benchmark(
+        (sys.executable, "-m", "benchmarks.page"),
+        "no browser is to be had: sudo apt-get install chromium",
+    ),
 }
 
 

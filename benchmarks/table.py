@@ -259,6 +259,86 @@ def of_listening(listening: Figures) -> list[str]:
     ]
 
 
+def of_page(page: Figures) -> list[str]:
+    visits, frames, updates, hour = page["visits"], page["frames"], page["updates"], page["hour"]
+    viewers = page["viewers"]
+    beats = viewers["heartbeat"]
+
+    def counted(name: str) -> str:
+        of = frames[name]
+        return (
+            f"{of['late']} of {of['frames']:,}, worst {of['worst_ms']:.0f} ms; an empty page in turn with it "
+            f"{of['empty_late']} of {of['empty_frames']:,}, {of['empty_worst_ms']:.0f} ms; "
+            f"{100 * of['share_of_a_core']:.1f} % of a core"
+        )
+
+    def grown(name: str) -> str:
+        of = hour[name]
+        heap = "/".join(f"{each / 1e6:.2f}" for each in of["heap_bytes"])
+        return (
+            f"{heap} MB, nodes {'/'.join(map(str, of['nodes']))}, listeners {'/'.join(map(str, of['listeners']))}, "
+            f"in {of['took_s']:.0f} s"
+        )
+
+    def flat(name: str) -> bool:
+        of = hour[name]
+        same = all(of[each][0] >= of[each][-1] for each in ("nodes", "listeners"))
+        return same and of["heap_bytes"][-1] - of["heap_bytes"][0] < 1e6
+
+    return [
+        row(
+            f"first visit of the page, {visits['loops']} loops, all that is sent",
+            f"{visits['bytes'] / 1e3:.0f} kB, {visits['requests']} requests",
+            "300 kB",
+            visits["bytes"] < 300_000,
+        ),
+        row(
+            "the same, from the navigation to the rows on the screen; the second visit",
+            f"{visits['rows_ms'] / 1e3:.2f} s (median), {visits['rows_worst_ms'] / 1e3:.2f} s (worst); "
+            f"{visits['rows_again_ms'] / 1e3:.2f} s",
+            "1 s",
+            visits["rows_ms"] < 1000.0,
+        ),
+        *(
+            row(
+                f"{what}, {frames['loops']} loops at 10 Hz: frames over 50 ms",
+                counted(name),
+                "none more than on the empty page",
+                frames[name]["late"] <= frames[name]["empty_late"],
+            )
+            for name, what in (("overview", "overview"), ("loop", "a loop's page with its trend"))
+        ),
+        row(
+            f"overview with {updates['loops']} loops, one update a second: script of a second",
+            f"{updates['script_ms']:.0f} ms (median), {updates['script_worst_ms']:.0f} ms (worst, with sparklines); "
+            f"layout and styles {updates['layout_ms']:.0f} and {updates['layout_worst_ms']:.0f} ms",
+            "100 ms",
+            updates["script_worst_ms"] < 100.0,
+        ),
+        *(
+            row(
+                f"{what}: heap after collection at the beginning, in the middle and at the end of an hour",
+                grown(name),
+                "under 1 MB more",
+                flat(name),
+            )
+            for name, what in (("overview", "overview"), ("loop", "a loop's page with its trend"))
+        ),
+        row(
+            f"GET /jobs/ID, 100/s, with {viewers['viewers']} viewers of the overview, p95 of {viewers['rounds']} rounds",
+            f"{viewers['viewed_p95_ms']:.1f} ms, without them {viewers['alone_p95_ms']:.1f} ms: "
+            f"{viewers['ratio']:.1f} times ({viewers['ratio_range'][0]:.1f} to {viewers['ratio_range'][1]:.1f})",
+            "2 times",
+            viewers["ratio"] <= 2.0,
+        ),
+        row(
+            "the same: the heartbeat of the test that runs comes late by, with and without them",
+            f"{beats['viewed']['p95_ms']:.1f} and {beats['alone']['p95_ms']:.1f} ms (p95), "
+            f"{beats['viewed']['worst_ms']:.0f} and {beats['alone']['worst_ms']:.0f} ms (worst)",
+        ),
+    ]
+
+
 ROWS: dict[str, Callable[[Figures], list[str]]] = {
     "bus": of_bus,
     "load": of_load,
@@ -272,4 +352,5 @@ ROWS: dict[str, Callable[[Figures], list[str]]] = {
     "answers": of_answers,
     "listening": of_listening,
     "fast": of_fast,
+    "page": of_page,
 }
