@@ -53,16 +53,17 @@ def processor_s(pid: int) -> float:
     return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
 
-def answered_ms(url: str, paths: list[str]) -> list[float]:
+def answered_ms(url: str, paths: list[str], rate_per_s: float = RATE_PER_S) -> list[float]:
     """Waiting times for GETs sent by the clock, ms, sorted: from when each was due, so that a slow answer is not
     excused by the requests it kept from being sent."""
     place = urlsplit(url)
+    number = round(ASK_S * rate_per_s)
     began, found = time.perf_counter() + 0.2, list[float]()
 
     def ask(first: int) -> None:
         connection = http.client.HTTPConnection(str(place.hostname), place.port, timeout=30)
-        for n in range(first, int(ASK_S * RATE_PER_S), CONNECTIONS):
-            due = began + n / RATE_PER_S
+        for n in range(first, number, CONNECTIONS):
+            due = began + n / rate_per_s
             time.sleep(max(0.0, due - time.perf_counter()))
             connection.request("GET", paths[n % len(paths)])
             answer = connection.getresponse()
@@ -77,7 +78,7 @@ def answered_ms(url: str, paths: list[str]) -> list[float]:
         thread.start()
     for thread in threads:
         thread.join()
-    if len(found) != ASK_S * RATE_PER_S:
+    if len(found) != number:
         raise RuntimeError("not every request was answered")
     return sorted(found)
 

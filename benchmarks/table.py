@@ -325,7 +325,8 @@ def of_page(page: Figures) -> list[str]:
             for name, what in (("overview", "overview"), ("loop", "a loop's page with its trend"))
         ),
         row(
-            f"GET /jobs/ID, 100/s, {viewers['viewers']} viewers of the overview, p95 of {viewers['rounds']} rounds",
+            f"GET /jobs/ID, {viewers['rate_per_s']:g}/s, beside {viewers['viewers']} viewers of the overview, "
+            f"p95 of {viewers['rounds']} rounds",
             f"{viewers['viewed_p95_ms']:.1f} ms, without them {viewers['alone_p95_ms']:.1f} ms: "
             f"{viewers['ratio']:.1f} times ({viewers['ratio_range'][0]:.1f} to {viewers['ratio_range'][1]:.1f})",
             "2 times",

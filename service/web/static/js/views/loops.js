@@ -42,13 +42,17 @@ export function LoopsView() {
   useEffect(() => {
     document.title = "Loops · Loopwright";
     let stopped = false;
+    let asking = false; // of many loops the answer may take longer than the interval
     const look = async () => {
-      if (document.hidden || isSilent.peek()) return;
+      if (document.hidden || isSilent.peek() || asking) return;
+      asking = true;
       try {
         const found = await ask(`/history?seconds=${SPARK_S}&points=75`);
         if (!stopped) sparks.value = new Map(found.loops.map((/** @type {any} */ each) => [each.tag, { ...each, from_s: found.from_s, to_s: found.to_s }]));
       } catch {
         // The next look says more.
+      } finally {
+        asking = false;
       }
     };
     void look();
