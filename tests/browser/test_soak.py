@@ -1,5 +1,4 @@
-"""What a page keeps while the stream goes on, as on a wall of screens for weeks. `make bench` measures an hour; a page
-that kept each of its pictures, as htm and Preact do by themselves, shows here: that is 9 MB a minute."""
+"""What a page keeps while the stream goes on, as on a wall of screens for weeks. `make bench` measures an hour."""
 
 from __future__ import annotations
 
