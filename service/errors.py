@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.reasons import Failed, Reason, Refused
 
 
 class UnknownLoop(Exception):
@@ -21,6 +21,17 @@ class Stopping(Exception):
 
 class Conflict(Exception):
     """The job or its loop is not as the wish supposes."""
+
+
+class GatewayLost(Failed):
+    """The gateway of the loop does not answer: nothing was written, and nothing will be."""
+
+    def __init__(self, detail: str) -> None:
+        super().__init__(Reason.GATEWAY_LOST, detail)
+
+
+class NotKnown(Exception):
+    """Whether a decision was carried out is not known; the text says how it becomes known."""
 
 
 class _OfOneReason(Refused):

@@ -55,6 +55,7 @@ class Reason(StrEnum):
     PV_FROZEN = "pv_frozen"
     NODE_LOST = "node_lost"
     BUS_LOST = "bus_lost"
+    GATEWAY_LOST = "gateway_lost"
     NODE_NOT_OPERATIONAL = "node_not_operational"
     DEVICE_WENT_BACK = "device_went_back"
     RESTORE_UNCONFIRMED = "restore_unconfirmed"
@@ -122,6 +123,8 @@ ADVICE: dict[Reason, str] = {
     Reason.GAINS_CHANGED: "Somebody else tried other gains during the test; agree on the time and repeat.",
     Reason.NODE_LOST: "The device fell silent: check power and cable; it goes home by itself.",
     Reason.BUS_LOST: "The CAN bus is gone: check the interface; the device goes home by itself.",
+    Reason.GATEWAY_LOST: "The gateway of the loop alone reaches it: see that its service runs and reaches the "
+    "database. What is under test there goes on, or ends safely by itself.",
     Reason.NODE_NOT_OPERATIONAL: "The node does not control: start it (NMT) and look at the loop; Loopwright looks at "
     "it again by itself, and sends no NMT command.",
     Reason.DEVICE_WENT_BACK: "The controller ended the test by itself (lease, heartbeat): check this machine's load.",

@@ -15,6 +15,7 @@ from loopwright.service.api import alarms as alarms_api
 from loopwright.service.api import (
     decisions,
     fleet,
+    gateways,
     history,
     job_figures,
     locks,
@@ -40,6 +41,7 @@ from loopwright.service.api.job_views import (
     DismissedView,
     JobView,
     LiveErrorView,
+    LiveView,
     LoopDetail,
     NotHomeView,
     SamplesView,
@@ -50,15 +52,19 @@ from loopwright.service.api.job_views import (
 from loopwright.service.api.paging import LARGEST
 from loopwright.service.api.samples import Reading, csv_text, json_text, parts
 from loopwright.service.execution.computing.pool import Pool
+from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import FastRetune, RetuneRequest
-from loopwright.service.job_states import ACTIVE
+from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.fleet import Fleet
 from loopwright.service.jobs.kept_figures import KeptFigures
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.listening import Listening
 from loopwright.service.live.live import Live
+from loopwright.service.live.other_gateways import OtherGateways
+from loopwright.service.live.own_gateway import OwnGateway
 from loopwright.service.loops.shared_reading import SharedReading
 from loopwright.service.security.principal import current
+from loopwright.service.store import decision_requests
 from loopwright.service.store.idempotency import IdempotencyKeys
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.live_jobs import acceptances, latest_jobs
@@ -83,6 +89,8 @@ def create_app(
     live: Live | None = None,
     figures: KeptFigures | None = None,
     alarms: AlarmWatch | None = None,
+    own: OwnGateway | None = None,
+    others: OtherGateways | None = None,
 ) -> FastAPI:
     """The application for these jobs, which it stops when the server shuts down.
 
@@ -90,6 +98,7 @@ def create_app(
     new pool.  sdo_retries: SDO retries by bus, as counted in this process.  listening: None for one that knows only
     what is stored.  live: None for a stream of its own.  figures: None for those that this pool computes when asked.
     alarms: None for one that looks only when it is asked.
+    own, others: this gateway, and those that share its database; None for one without a URL.
     """
 
     policy = policy or Policy()
@@ -120,7 +129,8 @@ def create_app(
     app.router.route_class = JsonRoute
     app.add_middleware(Idempotent, keys=IdempotencyKeys(jobs.store))
     key_checks = None if keyring is None else KeyChecks(keyring, policy.limits)
-    app.add_middleware(Gate, policy=policy, checks=key_checks)
+    gateway = jobs.store.host if jobs.store.shared else None
+    app.add_middleware(Gate, policy=policy, checks=key_checks, gateway=gateway)
     app.add_middleware(Access)
     problems.install(app)
     openapi.install(app)
@@ -134,12 +144,28 @@ def create_app(
         events = jobs.store.events_by_job([row.id for row in rows], limit=MAX_EVENTS)
         loops = {row.loop for row in rows}
         latest = latest_jobs(jobs.store, loops.pop() if len(loops) == 1 else None)
-        return [job_view(row, events[row.id], jobs.running(row.id), latest.get(row.loop)) for row in rows]
+        asked = decision_requests.latest(jobs.store, [row.id for row in rows])
+        return [
+            job_view(row, events[row.id], jobs.running(row.id), latest.get(row.loop), asked.get(row.id)) for row in rows
+        ]
 
     def view(row: Job) -> JobView:
         return views([row])[0]
 
-    fleet.install(app, jobs, many, views, listening)
+    others = others or OtherGateways(jobs.store)
+    own = own or OwnGateway(jobs, listening)
+    fleet.install(app, jobs, many, views, listening, others)
+
+    def here(tag: str) -> tuple[LiveView | None, LiveErrorView | None]:
+        try:
+            state = readings.of(tag)
+        except Ended as ended:
+            return None, LiveErrorView.of(ended)
+        return (live_view(state) if state else None), None
+
+    def there(config: LoopConfig, host: str) -> tuple[LiveView | None, LiveErrorView | None]:
+        others.look()
+        return gateways.live_there(config, host, others)
 
     @app.get(
         "/loops/{tag}", tags=["loops"], summary="A loop and its present state", responses=problems.responses(404, 503)
@@ -147,26 +173,24 @@ def create_app(
     def loop(tag: Tag) -> LoopDetail:
         config, host = jobs.directory.owner(tag)
         not_home = next(iter(jobs.aftercare.not_home(tag)), None)
-        try:
-            state, away = readings.of(tag), None
-        except Ended as ended:
-            state, away = None, LiveErrorView.of(ended)
+        present, away = there(config, host) if host != jobs.store.host else here(tag)
+        gains = None if present is None else present.gains.gains()
         shown = loop_view(
             config,
             host,
             jobs.store.busy().get(tag),
             latest_jobs(jobs.store, tag).get(tag),
             acceptances(jobs.store, tag).get(tag),
-            None if state is None or state.on_trial else state.gains,
+            None if present is None or present.on_trial else gains,
             jobs.locking.locks().get(tag),
         )
         return LoopDetail(
             **dict(shown),
-            live=live_view(state) if state else None,
+            live=present,
             live_error=away,
             not_confirmed_home=NotHomeView.of(not_home) if not_home else None,
             disturbed_by=jobs.directory.disturbed_by(tag),
-            knowledge=jobs.knowledge.of(tag, state.gains if state else None),
+            knowledge=jobs.knowledge.of(tag, gains),
         )
 
     @app.post(
@@ -268,23 +292,40 @@ def create_app(
     def abort(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
         return view(jobs.abort(job_id, (decision or Decision()).by))
 
+    not_yet: problems.Responses = {
+        202: {
+            "model": JobView,
+            "description": "The gateway that has the loop has not answered yet; `decision_request` of the job says "
+            "what becomes of it",
+        }
+    }
+
+    def decided(row: Job, wanted: JobState, response: Response) -> JobView:
+        """The view of a job after a decision, which another gateway may not have carried out yet."""
+        if row.state is not wanted:
+            response.status_code = 202
+            response.headers["Location"] = f"/jobs/{row.id}"
+        return view(row)
+
     @app.post(
         "/jobs/{job_id}/accept",
         tags=["jobs"],
         summary="Write the proposed gains to the controller permanently",
-        responses=problems.responses(404, 409, 422, 503),
+        responses={**not_yet, **problems.responses(404, 409, 422, 503)},
     )
-    def accept(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
-        return view(jobs.decisions.accept(job_id, (decision or Decision()).by))
+    def accept(job_id: JobId, response: Response, decision: Annotated[Decision | None, Body()] = None) -> JobView:
+        row = jobs.decisions.accept(job_id, (decision or Decision()).by)
+        return decided(row, JobState.ACCEPTED, response)
 
     @app.post(
         "/jobs/{job_id}/rollback",
         tags=["jobs"],
         summary="Decline the proposal, or write the old gains back after it was accepted",
-        responses=problems.responses(404, 409, 422, 503),
+        responses={**not_yet, **problems.responses(404, 409, 422, 503)},
     )
-    def rollback(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
-        return view(jobs.decisions.rollback(job_id, (decision or Decision()).by))
+    def rollback(job_id: JobId, response: Response, decision: Annotated[Decision | None, Body()] = None) -> JobView:
+        row = jobs.decisions.rollback(job_id, (decision or Decision()).by)
+        return decided(row, JobState.ROLLED_BACK, response)
 
     app.mount("/ui", Pages(), name="page")
     app.add_route("/", lambda _: RedirectResponse("/ui/"), include_in_schema=False)
@@ -295,7 +336,8 @@ def create_app(
     app.include_router(history.router(jobs.directory, listening))
     app.include_router(sparklines.router(jobs.directory, listening))
     app.include_router(observation.router(jobs, readings, listening, pool))
-    live = live or Live(jobs, listening, alarms)
+    live = live or Live(jobs, listening, alarms, others)
+    app.include_router(gateways.router(jobs.directory, own, others))
     app.include_router(live_api.router(live, jobs.directory, keyring, policy.sessions))
     app.include_router(previews.router(jobs, many))
     app.include_router(tunings.router(jobs, pool))

@@ -37,6 +37,11 @@ class DecisionView(BaseModel):
         "command on this machine; `service`: the service itself",
         examples=["control room"],
     )
+    gateway: str | None = Field(
+        description="Name of the gateway at which it was asked; null: no other shares the database, or the service "
+        "itself did it",
+        examples=["gw-1"],
+    )
     gains_before: GainsView | None = Field(description="Gains in effect before an acceptance or a rollback")
     gains_after: GainsView | None = Field(description="Gains in effect after an acceptance or a rollback")
     error: str | None = Field(description="Why the decision failed; null: it did not")
@@ -93,6 +98,7 @@ def _view(row: AuditRow) -> DecisionView:
         job=f"/jobs/{row.subject}",
         by=row.said_by,
         key=row.who,
+        gateway=row.gateway,
         gains_before=_gains(row.before) if decided else None,
         gains_after=_gains(row.after) if decided else None,
         error=str(after["error"]) if "error" in after else None,

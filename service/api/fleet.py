@@ -18,10 +18,12 @@ from loopwright.service.job_states import JobState
 from loopwright.service.jobs.fleet import BadFleet, Fleet, FleetRequest
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.listening import Listening
+from loopwright.service.live.other_gateways import OtherGateways
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.live_jobs import acceptances, latest_jobs
 from loopwright.service.store.retunes import NoSuchRetune, Part, RetuneOver, RetuneState, StopReason
 from loopwright.service.store.tables import RetuneRow
+from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Reason
 
 RetuneId = Annotated[str, Path(description="Id of the retune", examples=["9d1b7c02aa45"])]
@@ -71,9 +73,24 @@ class RetuneView(RetuneSummary):
 
 
 def install(
-    app: FastAPI, jobs: Jobs, fleet: Fleet, views: Callable[[Sequence[Job]], list[JobView]], listening: Listening
+    app: FastAPI,
+    jobs: Jobs,
+    fleet: Fleet,
+    views: Callable[[Sequence[Job]], list[JobView]],
+    listening: Listening,
+    others: OtherGateways,
 ) -> None:
-    """Adds the routes. views: makes the API's view of each job.  listening: knows the gains that were read last."""
+    """Adds the routes.
+
+    views: makes the API's view of each job.  listening, others: know the gains that were read last.
+    """
+
+    def gains_of(tag: str, host: str) -> Gains | None:
+        if host == jobs.store.host:
+            return listening.gains_of(tag)
+        settings = None if others.values(tag, host).on_trial else others.settings(tag, host)
+        return None if settings is None else settings.gains.gains()
+
     router = APIRouter(route_class=JsonRoute)
 
     @router.get(
@@ -95,6 +112,7 @@ def install(
     ) -> list[LoopView]:
         busy, last, locks = jobs.store.busy(), latest_jobs(jobs.store), jobs.locking.locks()
         accepted = acceptances(jobs.store)
+        others.look()
         found: list[LoopView] = []
         for config, host in sorted(jobs.directory.everywhere(), key=lambda one: one[0].tag):
             if cursor is not None and config.tag <= cursor:
@@ -105,7 +123,7 @@ def install(
             if len(found) == limit:
                 more(response, "/loops", found[-1].tag, state=state, limit=limit)
                 break
-            of_it = busy.get(config.tag), job, accepted.get(config.tag), listening.gains_of(config.tag)
+            of_it = busy.get(config.tag), job, accepted.get(config.tag), gains_of(config.tag, host)
             found.append(loop_view(config, host, *of_it, locks.get(config.tag)))
         return found
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, Field
@@ -28,12 +29,14 @@ from loopwright.service.results import (
     VerificationView,
     empty_result,
 )
+from loopwright.service.store.clock import stamp
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import ADVICE, Ended, Reason
 
 if TYPE_CHECKING:  # the command line reads views, and has no store
     from loopwright.service.jobs.active_job import Running
     from loopwright.service.jobs.aftercare import NotHome
+    from loopwright.service.store.decision_requests import DecisionRequest
     from loopwright.service.store.jobs import Job, JobEvent
     from loopwright.service.store.live_jobs import Acceptance, JobInBrief
     from loopwright.service.store.tables import LoopLockRow
@@ -172,7 +175,9 @@ class NotHomeView(BaseModel):
 
 class LoopDetail(LoopView):
     live: LiveView | None = Field(
-        description="The present state; null: the loop belongs to another host, or it is not reached (`live_error`)"
+        description="The present state; null: the loop, or the gateway that has it, is not reached (`live_error`). Of "
+        "a loop of another gateway it is what that one wrote into the database last, a second ago; gains and limits "
+        "were read within the last minute"
     )
     live_error: LiveErrorView | None = Field(description="Why the present state cannot be read; null: it is not so")
     not_confirmed_home: NotHomeView | None = Field(description="The unconfirmed restoration; null: there is none")
@@ -208,6 +213,41 @@ class DecidedView(BaseModel):
     what: Literal["accept", "rollback"]
     by: str = Field(description="Who decided, as given in the request", examples=["operator A"])
     at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
+
+
+class DecisionRequestView(BaseModel):
+    """A decision that was asked at another gateway than the one that has the loop, and has not been carried out."""
+
+    what: Literal["accept", "rollback"]
+    by: str = Field(description="Who has asked, as given in the request", examples=["operator A"])
+    at: str = Field(
+        description="UTC, ISO 8601, wall time by the clock of the database", examples=["2026-01-31T12:00:00.000Z"]
+    )
+    gateway: str = Field(description="Name of the gateway at which it was asked", examples=["gw-1"])
+    state: Literal["waiting", "under_way", "refused", "expired", "withdrawn", "cut_off"] = Field(
+        description="waiting: its gateway has not begun it; under_way; refused: it ended with an error; expired, "
+        "withdrawn: it was not begun, and will not be; cut_off: its gateway ended in the middle, and whether the gains "
+        "were written is not known"
+    )
+    detail: str | None = Field(description="Why it was refused")
+
+    @classmethod
+    def of(cls, found: DecisionRequest | None, state: JobState) -> DecisionRequestView | None:
+        """state: of the job. Returns None for a request that was carried out, or whose aim was reached otherwise."""
+        if found is None or found.what == "writes_over" or found.state == "done":
+            return None
+        if state is JobState.ROLLED_BACK or (state is JobState.ACCEPTED and found.what == "accept"):
+            return None
+        return cls.model_validate(
+            {
+                "what": found.what.value,
+                "by": found.by,
+                "at": stamp(datetime.fromtimestamp(found.asked_s, UTC)),
+                "gateway": found.asked_at,
+                "state": found.state.value,
+                "detail": (found.answer.detail or None) if found.answer else None,
+            }
+        )
 
 
 class StoppingView(BaseModel):
@@ -282,6 +322,10 @@ class JobView(BaseModel):
     advice: str | None = Field(description="What the operator should do about the reason")
     restored: Mapping[str, object] | None = Field(description="State of the loop as read back at the end")
     decided: DecidedView | None = Field(description="The latest decision; null: nothing was decided")
+    decision_request: DecisionRequestView | None = Field(
+        description="The latest decision about the job that was asked at another gateway and was not carried out; "
+        "null: there is none"
+    )
     superseded_by: str | None = Field(
         description="URL of the loop's latest job, where it came after this proposal and nothing was decided; null: "
         "this is no such proposal",
@@ -353,11 +397,15 @@ def live_view(state: LoopState) -> LiveView:
 
 
 def job_view(
-    row: Job, events: Sequence[JobEvent], running: Running | None, latest: JobInBrief | None = None
+    row: Job,
+    events: Sequence[JobEvent],
+    running: Running | None,
+    latest: JobInBrief | None = None,
+    request: DecisionRequest | None = None,
 ) -> JobView:
     """The view of a job from its row and events, and from the live progress while it runs.
 
-    latest: the latest job of the loop, without dry runs.
+    latest: the latest job of the loop, without dry runs.  request: the latest decision asked at another gateway.
     """
     state = shown(row.state, row.dry_run)
     later = latest is not None and latest.id != row.id and state is JobState.PROPOSED
@@ -403,6 +451,7 @@ def job_view(
         advice=ADVICE[row.reason] if row.reason else None,
         restored=row.restored,
         decided=_decided(events),
+        decision_request=DecisionRequestView.of(request, row.state),
         superseded_by=f"/jobs/{latest.id}" if later and latest is not None else None,
         stopping=next((_stopping(event) for event in reversed(events) if event.kind == "abort_requested"), None),
         sample_time_s=None if row.found is None else number(row.found["sample_time_s"]),

@@ -70,6 +70,11 @@ class AuditView(BaseModel):
     )
     key_id: str | None = Field(description="Id of the key", examples=["0f3ac2d9be11"])
     address: str | None = Field(description="Network address of the caller", examples=["10.0.0.7"])
+    gateway: str | None = Field(
+        description="Name of the gateway at which it was asked; null: no other shares the database, or the service "
+        "itself did it",
+        examples=["gw-1"],
+    )
     said_by: str | None = Field(description="Name of the person, as given in the request", examples=["night shift"])
     what: str = Field(
         description="retune, abort, accept, rollback, accept_failed, rollback_failed, retune_many, retune_many_abort, "

@@ -15,7 +15,7 @@ from starlette.exceptions import HTTPException
 
 from loopwright.service.api.bodies import BadBody
 from loopwright.service.api.openapi_document import DocumentedResponse, MediaType
-from loopwright.service.errors import Conflict, Locked, RemoteSetpoint, Stopping, UnknownLoop
+from loopwright.service.errors import Conflict, Locked, NotKnown, RemoteSetpoint, Stopping, UnknownLoop
 from loopwright.service.execution.computing.pool import NotWanted
 from loopwright.service.inputs.model_json import BadModel
 from loopwright.service.inputs.request import BadLimits
@@ -159,6 +159,10 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(FolderInUse)
     async def _stopping(_request: Request, error: Exception) -> JSONResponse:
         return problem(503, str(error), reason=Reason.SERVICE_STOPPED)
+
+    @app.exception_handler(NotKnown)
+    async def _not_known(_request: Request, error: NotKnown) -> JSONResponse:
+        return problem(503, str(error), headers={"Retry-After": "5"})
 
     @app.exception_handler(DataError)
     async def _unkeepable(_request: Request, error: DataError) -> JSONResponse:

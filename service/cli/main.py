@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import re
 import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -71,6 +72,15 @@ def serve(
     ] = None,
     host: Annotated[
         str | None, typer.Option(envvar="LOOPWRIGHT_HOST", help="Name of this host among those of a shared database.")
+    ] = None,
+    own_url: Annotated[
+        str | None,
+        typer.Option(
+            "--own-url",
+            metavar="URL",
+            envvar="LOOPWRIGHT_OWN_URL",
+            help="Where browsers reach this service; shown on the pages of the other gateways.",
+        ),
     ] = None,
     node: Annotated[
         str,
@@ -191,6 +201,8 @@ def serve(
         proxies = tuple(ip_network(each) for each in trusted_proxy or ())
     except ValueError as error:
         die(f"--trusted-proxy takes an address or a network, as 10.0.0.7 or 10.0.0.0/24: {error}", 2)
+    if own_url is not None and not re.fullmatch(r"https?://[^\s/?#\"'<>]+/?", own_url):
+        die(f"--own-url takes https://HOST or https://HOST:PORT, or http, not {own_url!r}", 2)
     try:
         own_node = node_id(node)
     except (ValueError, ArgumentTypeError):
@@ -199,6 +211,7 @@ def serve(
         loops, data, bind, port, database, host, resume,
         node=own_node, auth=auth, limits=limits, log_format="json" if log_format == "json" else "text",
         keep=RetentionPolicy(keep_jobs, keep_days, keep_history_days), trusted_proxies=proxies, listen=listen,
+        url=None if own_url is None else own_url.rstrip("/"),
         computing=ComputingLimits(live_cpu_s, tuning_cpu_s, dry_run_cpu_s, computation_memory_mb),
     )  # fmt: skip
     try:

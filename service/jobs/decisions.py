@@ -8,10 +8,12 @@ from loopwright.service.errors import Conflict, Locked
 from loopwright.service.job_states import IllegalMove, JobState, shown
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.machine import Machine
+from loopwright.service.jobs.passing_on import PassingOn
 from loopwright.service.loop_state import gains_of, state_json
 from loopwright.service.loops.gain_change import ForeignGains, replace_accepted
 from loopwright.service.observing.kept_knowledge import KeptKnowledge
 from loopwright.service.store import loop_locks
+from loopwright.service.store.decision_requests import What
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Busy, Store
 from loopwright.tuning.gains import Gains
@@ -20,14 +22,23 @@ from loopwright.tuning.reasons import Ended, Reason
 WRITES_S = 10.0
 """Wall time for which a lock waits for a decision that writes to the loop, s: each of its few answers comes within a
 second or two."""
+_WHAT = {JobState.ACCEPTED: What.ACCEPT, JobState.ROLLED_BACK: What.ROLLBACK}
 
 
 class Decisions:
-    """Decides the jobs of the loops of this host."""
+    """Decides the jobs of the loops of this host, and passes on the decisions about those of other hosts."""
 
-    def __init__(self, store: Store, directory: LoopDirectory, machine: Machine, knowledge: KeptKnowledge) -> None:
+    def __init__(
+        self,
+        store: Store,
+        directory: LoopDirectory,
+        machine: Machine,
+        knowledge: KeptKnowledge,
+        passing_on: PassingOn,
+    ) -> None:
         self.store = store
         self._knowledge = knowledge
+        self._passing_on = passing_on
         self._directory = directory
         self._machine = machine
         # By loop: an event that is set when a decision that writes to its controller has ended.
@@ -36,8 +47,9 @@ class Decisions:
     def accept(self, job_id: str, by: str) -> Job:
         """Makes the proposed gains the accepted ones of the controller, and reads them back. Returns the job.
 
-        After an error the decision can be repeated, which completes it, or be rolled back.
-        Raises Conflict, and Failed or Refused as the loop does.
+        After an error the decision can be repeated, which completes it, or be rolled back. A job of another host whose
+        gateway has not answered yet is returned as it is, not accepted.
+        Raises Conflict, and Failed or Refused as the loop does; of another host's also GatewayLost, NotKnown.
         """
         return self._decide(job_id, JobState.ACCEPTED, by)
 
@@ -62,8 +74,9 @@ class Decisions:
             with self.store.reading() as session:
                 loop_locks.check(session, row.loop)
             config, host = self._directory.owner(row.loop)
-            if host != self.store.host:
-                raise Conflict(f"loop {row.loop} is on the bus of host {host}: only the service there can write to it")
+            if host != self.store.host:  # only the service there can write to it
+                self._passing_on.ask(host, _WHAT[wanted], row.loop, job_id, by)
+                return self.store.get(job_id)
             old, new = gains_of(row.old_gains), new_gains(row)
             before, after = (old, new) if wanted is JobState.ACCEPTED else (new, old)
             begun = self.store.decision_begun(job_id)

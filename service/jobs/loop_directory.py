@@ -46,6 +46,8 @@ class LoopDirectory:
         self._registry = registry
         self._buses = buses or {}
         self._machine = machine
+        self.last_read: dict[str, LoopState] = {}
+        """The loops of this host as they were read from the bus last, by tag."""
         # By loop: held while a job on it is started or decided, or while it is restored.
         self._loop_locks: dict[str, AbstractContextManager[object]] = {}
 
@@ -111,7 +113,8 @@ class LoopDirectory:
         """Reads a loop of this host from the bus. Raises Ended."""
         loop = self.open_loop(self.loops[tag])
         try:
-            return loop.read()
+            state = self.last_read[tag] = loop.read()
+            return state
         finally:
             loop.close()
 

@@ -18,6 +18,7 @@ from loopwright.service.inputs.request import RetuneRequest, check_setpoint_sour
 from loopwright.service.job_states import ACTIVE, IllegalMove, JobState
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.aftercare import Aftercare
+from loopwright.service.jobs.carrying_out import CarryingOut
 from loopwright.service.jobs.decisions import Decisions
 from loopwright.service.jobs.engine import WORKFLOW_VERSION, Engine
 from loopwright.service.jobs.journal import Journal
@@ -66,6 +67,7 @@ class Jobs:
         worker: Worker,
         decisions: Decisions,
         locking: Locking,
+        carrying_out: CarryingOut,
         aftercare: Aftercare,
         recovery: Recovery,
         machine: Machine,
@@ -80,6 +82,7 @@ class Jobs:
         self.worker = worker
         self.decisions = decisions
         self.locking = locking
+        self.carrying_out = carrying_out
         self.aftercare = aftercare
         self.knowledge = knowledge
         self.operation = operation
@@ -123,6 +126,7 @@ class Jobs:
             self._watcher.start()
             if self.store.shared:
                 self._name_holder.start()
+                self.carrying_out.start()
             self.aftercare.start()
 
     def reconcile(self, at_once: bool = False) -> None:
@@ -275,6 +279,7 @@ class Jobs:
                     running.job_id, running.tag, ENDS_S,
                 )  # fmt: skip
         self.aftercare.close()
+        self.carrying_out.close()
         self.stop_watching()
         if self._watcher.ident is not None:  # a service that never started leaves the jobs as they are
             try:

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from loopwright.service.job_states import ACTIVE
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.live.messages import JobHappening, LiveJob, LiveJobs, event
+from loopwright.service.live.other_gateways import OtherGateways
+from loopwright.service.live.snapshot import JobProgress, progress_of
 from loopwright.service.live.viewer import Viewer
 from loopwright.service.store.jobs import JobEvent
 from loopwright.service.store.live_jobs import JobInBrief, latest_jobs, live_jobs, new_events
@@ -26,8 +28,8 @@ class _Followed:
 class LookedUpJobs:
     """What the database said last. `look` is called in a thread, the rest reads what it has put there as a whole."""
 
-    def __init__(self, jobs: Jobs) -> None:
-        self._jobs = jobs
+    def __init__(self, jobs: Jobs, others: OtherGateways) -> None:
+        self._jobs, self._others = jobs, others
         self.live: list[JobInBrief] = []
         self.latest: dict[str, JobInBrief] = {}
         self.loops: list[tuple[str, str]] = [(tag, jobs.store.host) for tag in jobs.directory.loops]
@@ -41,6 +43,8 @@ class LookedUpJobs:
         thoroughly: whether the latest jobs and the loops of other hosts are asked for too.
         """
         store = self._jobs.store
+        if thoroughly:
+            self._others.look()
         live = live_jobs(store)
         if thoroughly or {job.id for job in live} != {job.id for job in self.live}:
             self.latest = latest_jobs(store)
@@ -69,13 +73,11 @@ class LookedUpJobs:
             yield from (text for seq, text in job.events if seq > after)
 
     def message(self) -> LiveJobs:
-        """Returns the live jobs, with the progress of those of this service."""
+        """Returns the live jobs, with their progress as far as it is known."""
         return LiveJobs(jobs=[self._live_job(job) for job in self.live])
 
     def _live_job(self, job: JobInBrief) -> LiveJob:
-        running = self._jobs.running(job.id)
-        progress = None if running is None else running.progress_now()
-        remaining_s = None if progress is None else progress.remaining_s
+        now = self._progress(job)
         return LiveJob(
             id=job.id,
             url=f"/jobs/{job.id}",
@@ -84,12 +86,16 @@ class LookedUpJobs:
             state=job.state,
             dry_run=job.dry_run,
             requested_by=job.requested_by,
-            stage=job.stage if progress is None or progress.stage is None else progress.stage,
-            progress=None if progress is None else round(progress.fraction, 4),
-            remaining_plant_time_s=None if remaining_s is None else round(remaining_s, 1),
-            plant_time_s=round(job.plant_time_s if progress is None else progress.plant_time_s, 1),
-            stopping=job.stopping or (running is not None and running.stop_reason is not None),
+            stage=job.stage if now is None or now.stage is None else now.stage,
+            progress=None if now is None else now.progress,
+            remaining_plant_time_s=None if now is None else now.remaining_plant_time_s,
+            plant_time_s=round(job.plant_time_s, 1) if now is None else now.plant_time_s,
+            stopping=job.stopping or (now is not None and now.stopping),
         )
+
+    def _progress(self, job: JobInBrief) -> JobProgress | None:
+        running = self._jobs.running(job.id)
+        return self._others.progress(job.id, job.host) if running is None else progress_of(running)
 
 
 def _happening(loop: str, found: JobEvent) -> str:

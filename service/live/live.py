@@ -24,8 +24,10 @@ from loopwright.service.listening.bins import of_samples
 from loopwright.service.listening.listening import Listening
 from loopwright.service.listening.messages import NewSamples
 from loopwright.service.live.jobs import LookedUpJobs
-from loopwright.service.live.messages import Buses, BusView, Hello, Loops, event
-from loopwright.service.live.rows import LiveFacts, loop_row, samples_message
+from loopwright.service.live.messages import Buses, Hello, Loops, event
+from loopwright.service.live.other_gateways import OtherGateways
+from loopwright.service.live.own_gateway import OwnGateway
+from loopwright.service.live.rows import LiveFacts, loop_row, samples_message, with_jobs
 from loopwright.service.live.viewer import Viewer
 from loopwright.service.store.keyring import REVOKED_WITHIN_S
 
@@ -48,12 +50,19 @@ _FIRST_LOOK_S = 1.0
 
 class Live:
     """The methods belong to one event loop, that of the server. listening: calls back in threads of its own.
-    alarms: so does it; None for one that looks only when it is asked."""
+    alarms: so does it; None for one that looks only when it is asked.  others: None for what the database says."""
 
-    def __init__(self, jobs: Jobs, listening: Listening, alarms: AlarmWatch | None = None) -> None:
+    def __init__(
+        self,
+        jobs: Jobs,
+        listening: Listening,
+        alarms: AlarmWatch | None = None,
+        others: OtherGateways | None = None,
+    ) -> None:
         self._jobs, self._listening = jobs, listening
         self._alarms = alarms or AlarmWatch(jobs, listening)
-        self._looked_up = LookedUpJobs(jobs)
+        self._own, self._others = OwnGateway(jobs, listening), others or OtherGateways(jobs.store)
+        self._looked_up = LookedUpJobs(jobs, self._others)
         self._viewers: set[Viewer] = set()
         self._working: tuple[asyncio.Task[None], ...] = ()
         self._reported = asyncio.Event()
@@ -213,17 +222,15 @@ class Live:
         rows = []
         for tag, host in found.loops:
             job = job_of.get(tag)
+            if host != self._jobs.store.host:
+                rows.append(with_jobs(self._others.values(tag, host), host, job, found.latest.get(tag)))
+                continue
             running = None if job is None else self._jobs.running(job.id)
             held = running.loop.latest if running is not None and running.loop is not None else None
             deaf = self._listening.why_not_heard(tag)
             rows.append(loop_row(tag, host, LiveFacts(heard.get(tag), deaf, held, job, found.latest.get(tag)), now_s))
         self._show("loops", event("loops", Loops(now_s=round(now_s, 3), loops=rows)))
-        off = self._listening.off
-        buses = [
-            BusView(bus=url, up=None if url in off else why is None, why=why)
-            for url, why in self._listening.buses().items()
-        ]
-        self._show("buses", event("buses", Buses(buses=buses)))
+        self._show("buses", event("buses", Buses(buses=[*self._own.buses(), *self._others.buses()])))
 
     def _show(self, name: str, text: str) -> None:
         """Shows a message to all viewers, unless it is as before."""

@@ -26,11 +26,10 @@ class LastJob(BaseModel):
     state: JobState
 
 
-class LiveLoopRow(BaseModel):
-    """The present state of a loop."""
+class LoopValues(BaseModel):
+    """What was heard of a loop last."""
 
     tag: str
-    host: str
     pv: float | None = Field(description="PV units; null, as set-point, MV and mode, where the last sample is old")
     sp: float | None = Field(description="PV units")
     mv: float | None = Field(description="Percent")
@@ -39,6 +38,12 @@ class LiveLoopRow(BaseModel):
     under_test: bool | None = Field(description="Whether a tuner, this service or another, has a session open")
     on_trial: bool | None = Field(description="Whether gains are on trial")
     not_heard: str | None = Field(description="Why there are no values; null: there are")
+
+
+class LiveLoopRow(LoopValues):
+    """The present state of a loop."""
+
+    host: str = Field(description="The gateway that has the loop")
     job: str | None = Field(description="URL of the job that has the loop")
     last_job: LastJob | None
 
@@ -51,8 +56,9 @@ class Loops(BaseModel):
 
 
 class BusView(BaseModel):
-    """A bus of this service. up: null where the bus is not listened to."""
+    """A bus of a gateway. up: null where the bus is not listened to, or is of a gateway that does not answer."""
 
+    host: str
     bus: str
     up: bool | None
     why: str | None = Field(description="Why the bus is not heard; null: it is")
@@ -83,7 +89,7 @@ class Samples(BaseModel):
 
 
 class LiveJob(BaseModel):
-    """A job that is queued or running. Of a job of another host the progress is not known."""
+    """A job that is queued or running. The progress of another host's is a second old."""
 
     id: str
     url: str

@@ -10,7 +10,7 @@ import numpy as np
 from loopwright.protocol.profile import Mode
 from loopwright.service.listening.bins import Bins, decimals
 from loopwright.service.listening.heard_loop import Heard
-from loopwright.service.live.messages import LastJob, LiveLoopRow, Samples
+from loopwright.service.live.messages import LastJob, LiveLoopRow, LoopValues, Samples
 from loopwright.service.loop_state import LoopState
 from loopwright.service.store.live_jobs import JobInBrief
 
@@ -35,18 +35,25 @@ class LiveFacts:
 
 
 def loop_row(tag: str, host: str, known: LiveFacts, now_s: float) -> LiveLoopRow:
-    """Returns the row of a loop. Old values are left out; where a bus is not heard, those of the running job count."""
+    """Returns the row of a loop of this host."""
+    return with_jobs(loop_values(tag, known, now_s), host, known.job, known.last_job)
+
+
+def with_jobs(values: LoopValues, host: str, job: JobInBrief | None, last_job: JobInBrief | None) -> LiveLoopRow:
+    """Returns the row of a loop with these values."""
+    return LiveLoopRow(
+        **dict(values),
+        host=host,
+        job=None if job is None else f"/jobs/{job.id}",
+        last_job=None if last_job is None else LastJob(url=f"/jobs/{last_job.id}", state=last_job.state),
+    )
+
+
+def loop_values(tag: str, known: LiveFacts, now_s: float) -> LoopValues:
+    """Returns the values of a loop. Old ones are left out; where a bus is not heard, those of the running job count."""
     heard, held = known.heard, known.held
     age_s = None if heard is None else max(0.0, now_s - heard.at_s)
-    row = LiveLoopRow(
-        tag=tag, host=host, pv=None, sp=None, mv=None, mode=None,
-        age_s=None if age_s is None else round(age_s, 3),
-        under_test=None, on_trial=None, not_heard=None,
-        job=None if known.job is None else f"/jobs/{known.job.id}",
-        last_job=None if known.last_job is None else LastJob(
-            url=f"/jobs/{known.last_job.id}", state=known.last_job.state
-        ),
-    )  # fmt: skip
+    row = no_values(tag, None, age_s)
     if heard is not None and not heard.silent:
         row.pv, row.sp, row.mv = (_finite(value) for value in (heard.pv, heard.sp, heard.mv))
         row.mode = _MODES.get(heard.mode)
@@ -59,6 +66,14 @@ def loop_row(tag: str, host: str, known: LiveFacts, now_s: float) -> LiveLoopRow
     if row.under_test is None and held is not None:
         row.under_test = True
     return row
+
+
+def no_values(tag: str, not_heard: str | None, age_s: float | None) -> LoopValues:
+    """Returns the values of a loop of which nothing is known. age_s: of its last sample, s."""
+    return LoopValues(
+        tag=tag, pv=None, sp=None, mv=None, mode=None, age_s=None if age_s is None else round(age_s, 3),
+        under_test=None, on_trial=None, not_heard=not_heard,
+    )  # fmt: skip
 
 
 def samples_message(tag: str, bins: Bins, past: bool) -> Samples:

@@ -15,6 +15,7 @@ class Principal:
     name: the name of the key, or a general name for callers without one.
     address: the network address, where there is one.
     session: id of the browser's session, where the caller has signed in.
+    gateway: name of the gateway at which it asks, where several share a database.
     """
 
     name: str
@@ -22,6 +23,7 @@ class Principal:
     key_id: str | None = None
     address: str | None = None
     session: str | None = None
+    gateway: str | None = None
 
 
 SERVICE = Principal("service", Scope.ADMIN)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from loopwright.service.execution.procedures import Rehearse, Tune
 from loopwright.service.inputs.config import BusConfig, LoopConfig
 from loopwright.service.jobs.aftercare import Aftercare
+from loopwright.service.jobs.carrying_out import CarryingOut
 from loopwright.service.jobs.decisions import Decisions
 from loopwright.service.jobs.engine import Engine
 from loopwright.service.jobs.journal import Journal
@@ -15,10 +16,12 @@ from loopwright.service.jobs.loop_directory import LoopDirectory, LoopFactory
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.operation import OperationHeard
+from loopwright.service.jobs.passing_on import PassingOn
 from loopwright.service.jobs.recovery import Recovery
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.worker import Worker
 from loopwright.service.observing.kept_knowledge import KeptKnowledge
+from loopwright.service.store.decision_requests import What
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
 
@@ -49,7 +52,19 @@ def make_jobs(
     directory = LoopDirectory(loops, store, open_loop, registry, machine, buses)
     knowledge = KeptKnowledge(store, machine.lock())
     operation = OperationHeard(store, directory, knowledge)
-    decisions = Decisions(store, directory, machine, knowledge)
+    passing_on = PassingOn(store, machine)
+    decisions = Decisions(store, directory, machine, knowledge, passing_on)
+    locking = Locking(store, directory, decisions, passing_on)
+    carrying_out = CarryingOut(
+        store,
+        machine,
+        registry,
+        {
+            What.ACCEPT: lambda asked: decisions.accept(asked.job_id or "", asked.by),
+            What.ROLLBACK: lambda asked: decisions.rollback(asked.job_id or "", asked.by),
+            What.WRITES_OVER: lambda asked: locking.wait_for_writes(asked.loop),
+        },
+    )
     return Jobs(
         store=store,
         engine=engine,
@@ -58,7 +73,8 @@ def make_jobs(
         directory=directory,
         worker=Worker(store, journal, directory, registry, tune, rehearse, machine, knowledge, operation, ended),
         decisions=decisions,
-        locking=Locking(store, directory, decisions),
+        locking=locking,
+        carrying_out=carrying_out,
         aftercare=Aftercare(store, directory, machine),
         recovery=Recovery(loops, store, open_loop, resume, lambda: registry.stopping),
         machine=machine,

@@ -47,6 +47,8 @@ from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.retention import Retention, RetentionPolicy
 from loopwright.service.listening.listening import Listening
 from loopwright.service.live.live import Live
+from loopwright.service.live.other_gateways import OtherGateways
+from loopwright.service.live.own_gateway import Announcing, OwnGateway
 from loopwright.service.loops.loop import Loop
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.server.signals import Signals
@@ -163,6 +165,7 @@ class Setup:
     computing: the limits of one computation.
     trusted_proxies: addresses and networks whose X-Forwarded-For and -Proto headers are trusted.
     listen: whether the process data of the loops are heard and kept as history.
+    url: where browsers reach this service, for the pages of the gateways that share its database.
     """
 
     loops_file: Path
@@ -181,6 +184,7 @@ class Setup:
     computing: ComputingLimits = field(default_factory=ComputingLimits)
     trusted_proxies: tuple[IPv4Network | IPv6Network, ...] = ()
     listen: bool = True
+    url: str | None = None
 
 
 def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None = None) -> None:
@@ -243,8 +247,12 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
             closing(Looking(jobs.directory, jobs.registry, store, listening, jobs.knowledge, pool))
         )
         alarms = stack.enter_context(closing(AlarmWatch(jobs, listening)))
-        live_stream = Live(jobs, listening, alarms)
-        app = create_app(jobs, policy, checks, pool, station.sdo_retries, listening, live_stream, figures, alarms)
+        own, others = OwnGateway(jobs, listening, setup.url), OtherGateways(store)
+        announcing = stack.enter_context(closing(Announcing(jobs, own)))
+        live_stream = Live(jobs, listening, alarms, others)
+        app = create_app(
+            jobs, policy, checks, pool, station.sdo_retries, listening, live_stream, figures, alarms, own, others
+        )
         server = _Server(server_config(app, setup, listener, descriptors), jobs, listening, live_stream, alarms)
 
         def end() -> None:
@@ -258,6 +266,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         jobs.boot()
         if not jobs.stopping:
             retention.start()
+            announcing.start()
             if setup.listen:
                 looking.start()
             server.run(sockets=[listener])

@@ -27,8 +27,8 @@ def record(
     who = current.get()
     session.add(
         AuditRow(
-            at=now(), who=who.name, key_id=who.key_id, address=who.address, said_by=said_by, what=what,
-            subject=subject, loop=loop, before=before, after=after,
+            at=now(), who=who.name, key_id=who.key_id, address=who.address, gateway=who.gateway, said_by=said_by,
+            what=what, subject=subject, loop=loop, before=before, after=after,
         )
     )  # fmt: skip
 

@@ -4,7 +4,19 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from sqlalchemy import JSON, BigInteger, Dialect, Double, ForeignKey, Index, LargeBinary, String, TypeDecorator, text
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    Dialect,
+    Double,
+    ForeignKey,
+    Index,
+    LargeBinary,
+    String,
+    Text,
+    TypeDecorator,
+    text,
+)
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 from loopwright.service.job_states import JobState
@@ -146,6 +158,55 @@ class HostRow(Base):
     ages_from: Mapped[str | None]
     # When somebody last asked whether the database takes anything.
     written_at: Mapped[str | None]
+
+
+class GatewayRow(Base):
+    """What a gateway says of itself to those that share its database, once a second: see service.live.snapshot.
+
+    at_s: when, seconds since 1970 UTC by the clock of the database.
+    present: what `GET /live` shows of its loops, buses and jobs, as JSON.
+    settings: what its controllers were read as, as JSON; written when it has changed.
+    """
+
+    __tablename__ = "gateways"
+
+    name: Mapped[str] = mapped_column(primary_key=True)
+    at_s: Mapped[float] = mapped_column(Double)
+    url: Mapped[str | None]
+    version: Mapped[str]
+    present: Mapped[str] = mapped_column(Text)
+    settings: Mapped[str] = mapped_column(Text)
+
+
+class DecisionRequestRow(Base):
+    """What was asked at one gateway and another one has to carry out: see service.store.decision_requests.
+
+    host: the gateway that carries it out.  asked_at: the gateway at which it was asked.
+    asked_s, expires_s: seconds since 1970 UTC by the clock of the database; it is not begun after the second.
+    who: the caller.  claim_...: the Idempotency-Key that the caller gave.
+    """
+
+    __tablename__ = "decision_requests"
+    __table_args__ = (
+        Index("decision_requests_by_host", "host", "state"),
+        Index("decision_requests_by_job", "job_id", "number"),
+    )
+
+    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    host: Mapped[str]
+    asked_at: Mapped[str]
+    asked_s: Mapped[float] = mapped_column(Double)
+    expires_s: Mapped[float] = mapped_column(Double)
+    what: Mapped[str]
+    loop: Mapped[str]
+    job_id: Mapped[str | None] = mapped_column(ForeignKey("jobs.id"))
+    by: Mapped[str]
+    who: Mapped[JsonObject]
+    claim_principal: Mapped[str | None]
+    claim_key: Mapped[str | None]
+    claim_token: Mapped[str | None]
+    state: Mapped[str]
+    answer: Mapped[JsonObject | None]
 
 
 class EventRow(Base):
@@ -319,7 +380,8 @@ class KeyRow(Base):
 
 
 class AuditRow(Base):
-    """One change. who: the key's name, `local` or `cli:USER`; said_by: what the request itself claimed."""
+    """One change. who: the key's name, `local` or `cli:USER`; said_by: what the request itself claimed.  gateway: at
+    which gateway it was asked, where several share the database."""
 
     __tablename__ = "audit"
     __table_args__ = (Index("audit_by_loop", "loop", "number"),)
@@ -329,6 +391,7 @@ class AuditRow(Base):
     who: Mapped[str]
     key_id: Mapped[str | None]
     address: Mapped[str | None]
+    gateway: Mapped[str | None]
     said_by: Mapped[str | None]
     what: Mapped[str]
     subject: Mapped[str]

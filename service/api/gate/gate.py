@@ -79,10 +79,13 @@ class Gate:
 
     The gate checks the key, then the rate of its holder, then receives the body, then takes a place among the requests
     of the same kind. A body that does not arrive therefore takes nobody's place.
+
+    gateway: name of this gateway, where several share a database.
     """
 
-    def __init__(self, app: ASGIApp, policy: Policy, checks: KeyChecks | None) -> None:
+    def __init__(self, app: ASGIApp, policy: Policy, checks: KeyChecks | None, gateway: str | None = None) -> None:
         self._app = app
+        self._gateway = gateway
         self._policy = policy
         limits = policy.limits
         # Decisions have buckets of their own: a client that reads too much may still stop a test.
@@ -99,6 +102,7 @@ class Gate:
         if isinstance(found, Response):
             await found(scope, receive, send)
             return
+        found = replace(found, gateway=self._gateway)
         token, arrived = current.set(found), asked_at.set(time.monotonic())
         try:
             await self._let_in(scope, receive, send, found)

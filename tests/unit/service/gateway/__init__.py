@@ -34,6 +34,7 @@ from loopwright.service.loop_state import LoopState, differences, loop_state, st
 from loopwright.service.loops.loop import Loop, Restored
 from loopwright.service.server.serving import Setup, open_bus_loop, serve
 from loopwright.service.store import store
+from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Mode, Sample, SetGains, SetSetpoint, StageDone, StageStarted
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
 from tests.unit.service.fakes import NEW, OLD, RESULT, Found, loop_entry
@@ -101,8 +102,12 @@ class FileLoop:
             return Restored(self.read(), "the session was closed")
         return Restored(state, "the controller knows nothing of the session", differences(state, home))
 
-    def accept(self, gains: object, instead_of: object) -> LoopState:
-        raise NotImplementedError
+    def accept(self, gains: Gains, instead_of: Gains) -> LoopState:
+        """FOLDER/TAG.accepted has a line for each time."""
+        with (self._folder / f"{self._tag}.accepted").open("a") as accepted:
+            accepted.write(f"{gains.Kp}\n")
+        write_loop(self._folder, self._tag, replace(self.read(), gains=gains))
+        return self.read()
 
     def close(self) -> None:
         """Nothing is open."""

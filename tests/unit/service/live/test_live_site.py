@@ -42,7 +42,7 @@ def test_samples_come_once_and_what_stops_is_no_longer_shown(site: Site) -> None
         assert (row["mode"], row["sp"], row["not_heard"], row["on_trial"]) == ("automatic", 50.0, None, False)
         assert row["age_s"] < 3.0 and row["pv"] is not None and row["mv"] is not None
         buses = [message for name, message in viewer.messages if name == "buses"]
-        assert buses[-1] == {"buses": [{"bus": site.bus, "up": True, "why": None}]}
+        assert buses[-1] == {"buses": [{"host": "local", "bus": site.bus, "up": True, "why": None}]}
 
         tuner = Tuner(site.bus, CONTROLLER_NODE, PLANT_NODE)
         tuner.write("controller_setpoint", 50.5)

@@ -81,7 +81,9 @@ def test_what_comes_first(screens: Screens) -> None:
         viewer.becomes("jobs", lambda message: message.get("jobs") == [])
         viewer.becomes("buses", bool)
         found = dict(viewer.messages)
-        assert found["buses"]["buses"] == [{"bus": "virtual:test", "up": None, "why": "listening is turned off"}]
+        assert found["buses"]["buses"] == [
+            {"host": "local", "bus": "virtual:test", "up": None, "why": "listening is turned off"}
+        ]
 
 
 def test_every_viewer_sees_a_test_from_its_first_event_to_its_decision(screens: Screens) -> None:

@@ -338,7 +338,64 @@ def test_two_gateways_on_one_database(stack: ExitStack, tmp_path: Path, postgres
     a.go()
     assert b.over(on_a)["state"] == "proposed"
     assert read_loop(tmp_path / "a", "A-1") == read_loop(tmp_path / "a", "A-2") == HOME
-    assert b.http.post(f"{on_a}/accept").status_code == 409
+    # Decided at the other one, written at home.
+    assert b.http.post(f"{on_a}/accept").json()["state"] == "accepted"
+    assert read_loop(tmp_path / "a", "A-1").gains == NEW
+    assert b.http.post(f"{on_a}/rollback").json()["state"] == "rolled_back"
+    assert read_loop(tmp_path / "a", "A-1") == HOME
+
+
+def test_killed_as_it_carries_out_a_decision_of_another_gateway(
+    stack: ExitStack, tmp_path: Path, postgres: Server
+) -> None:
+    """It has noted that it is about to write, and is gone: it does not write when it is back, until somebody asks."""
+    database = postgres.database()
+    dies = "--sigkill=after loopwright.service.store.store:Store.begin_decision"
+    a = Gateway(stack, tmp_path / "a", database, "gw-a", ["A-1"], first=[dies])
+    b = Gateway(stack, tmp_path / "b", database, "gw-b", ["B-1"])
+    a.go()
+    job = b.retune("A-1")
+    assert b.over(job)["state"] == "proposed"
+    answer = b.http.post(f"{job}/accept", json={"by": "at b"})
+    assert answer.status_code == 202 and answer.json()["decision_request"]["state"] == "under_way", answer.text
+    until(lambda: a.process.poll() is not None)
+    a.serve()
+    asked = b.until(job, lambda job: job["decision_request"]["state"] != "under_way")
+    assert (asked["state"], asked["decision_request"]["state"]) == ("proposed", "cut_off")
+    assert read_loop(tmp_path / "a", "A-1") == HOME and not (tmp_path / "a" / "A-1.accepted").exists()
+    assert b.http.post(f"{job}/accept", json={"by": "at b"}).json()["state"] == "accepted"
+    assert read_loop(tmp_path / "a", "A-1").gains == NEW
+    assert len((tmp_path / "a" / "A-1.accepted").read_text().split()) == 1
+
+
+def test_a_database_that_is_restarted_before_a_decision_is_carried_out(
+    stack: ExitStack, tmp_path: Path, postgres: Server
+) -> None:
+    """The gateway that was asked, the one that has the loop and their rows go on by themselves."""
+    database = postgres.database()
+    a = Gateway(stack, tmp_path / "a", database, "gw-a", ["A-1"])
+    b = Gateway(stack, tmp_path / "b", database, "gw-b", ["B-1"])
+    a.go()
+    job = b.retune("A-1")
+    assert b.over(job)["state"] == "proposed"
+
+    def seen() -> str:
+        return str(next(each["last_seen"] for each in b.http.get("/gateways").json() if each["name"] == "gw-a"))
+
+    before = seen()
+    postgres.stop()
+    try:
+        answer = b.http.post(f"{job}/accept", json={"by": "at b"})
+        assert answer.status_code == 503 and answer.headers["retry-after"], answer.text
+    finally:
+        postgres.start()
+    b.until(job, lambda job: job["state"] == "proposed")
+    until(lambda: seen() > before)
+    assert read_loop(tmp_path / "a", "A-1") == HOME
+    answer = b.http.post(f"{job}/accept", json={"by": "at b"})
+    assert answer.status_code == 200, answer.text
+    assert read_loop(tmp_path / "a", "A-1").gains == NEW
+    assert len((tmp_path / "a" / "A-1.accepted").read_text().split()) == 1
 
 
 @pytest.mark.parametrize(("path", "body"), [(f"/loops/{TAG}/retune", {"ms": 1.4}), ("/retunes", {"pattern": "*"})])

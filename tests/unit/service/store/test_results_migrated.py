@@ -46,6 +46,7 @@ def with_later_fields(golden: dict[str, Any]) -> dict[str, Any]:
     sample_time_s = None if golden["dry_run"] else 0.1
     return golden | {
         "decided": None,
+        "decision_request": None,
         "superseded_by": None,
         "stopping": None,
         "model_from": None,

@@ -1,0 +1,115 @@
+"""The gateways that share a database, and what this one shows of the loops of the others."""
+
+from __future__ import annotations
+
+from collections import Counter
+from datetime import UTC, datetime
+
+from fastapi import APIRouter
+from pydantic import BaseModel, Field
+
+from loopwright.service.api import problems
+from loopwright.service.api.bodies import JsonRoute
+from loopwright.service.api.job_views import LiveErrorView, LiveView
+from loopwright.service.errors import GatewayLost
+from loopwright.service.inputs.config import LoopConfig
+from loopwright.service.jobs.loop_directory import LoopDirectory
+from loopwright.service.live.messages import BusView
+from loopwright.service.live.other_gateways import OtherGateways
+from loopwright.service.live.own_gateway import OwnGateway
+from loopwright.service.store.clock import now, stamp
+from loopwright.tuning.reasons import Failed, Reason
+
+
+class GatewayBusView(BaseModel):
+    """A bus of a gateway."""
+
+    bus: str = Field(description="Address of the CAN bus", examples=["socketcan:can0"])
+    up: bool | None = Field(description="Whether it is heard; null: it is not listened to, or not known")
+    why: str | None = Field(description="Why it is not heard; null: it is")
+
+    @classmethod
+    def of(cls, bus: BusView) -> GatewayBusView:
+        return cls(bus=bus.bus, up=bus.up, why=bus.why)
+
+
+class GatewayView(BaseModel):
+    """A gateway: a service with loops of its own."""
+
+    name: str = Field(examples=["gw-1"])
+    here: bool = Field(description="Whether it is the one that answers this request")
+    url: str | None = Field(
+        description="Where browsers reach it (`loopwright serve --own-url`); null: it has not said so",
+        examples=["https://gw-1.example"],
+    )
+    version: str | None = Field(description="null: it has not run since the database was brought to this version")
+    last_seen: str | None = Field(
+        description="When it was last there: UTC, ISO 8601, by the clock of the database",
+        examples=["2026-01-31T12:00:00.000Z"],
+    )
+    answers: bool = Field(description="Whether it was there within the last 10 s")
+    buses: list[GatewayBusView]
+    loops: int = Field(description="Number of its loops", examples=[12])
+
+
+def router(directory: LoopDirectory, own: OwnGateway, others: OtherGateways) -> APIRouter:
+    """A router with GET /gateways."""
+    routes = APIRouter(tags=["operations"], route_class=JsonRoute)
+
+    @routes.get(
+        "/gateways",
+        summary="The gateways that share the database, sorted by name",
+        responses=problems.responses(503),
+    )
+    def gateways() -> list[GatewayView]:
+        others.look()
+        loops = Counter(host for _, host in directory.everywhere())
+        found = [_here(own, loops[own.name])]
+        found += [_other(name, loops[name], others) for name in {*loops, *others.every()} - {own.name}]
+        return sorted(found, key=lambda each: each.name)
+
+    return routes
+
+
+def live_there(config: LoopConfig, host: str, others: OtherGateways) -> tuple[LiveView | None, LiveErrorView | None]:
+    """Returns the present state of a loop of another gateway, or why it is not known."""
+    tag, why = config.tag, others.why_no_data(host)
+    values, settings = others.values(tag, host), others.settings(tag, host)
+    if why is None and settings is not None and values.sp is not None and values.mode is not None:
+        return LiveView(
+            sp=values.sp,
+            pv=values.pv,
+            mv=values.mv,
+            mode=values.mode,
+            on_trial=bool(values.on_trial),
+            **dict(settings),
+        ), None
+    if why is not None:
+        return None, LiveErrorView.of(GatewayLost(why))
+    down = any((bus.host, bus.bus, bus.up) == (host, config.bus, False) for bus in others.buses())
+    reason = Reason.BUS_LOST if down else Reason.NODE_LOST
+    detail = values.not_heard or "the controller has not been read yet"
+    return None, LiveErrorView.of(Failed(reason, f"gateway {host}: {detail}"))
+
+
+def _here(own: OwnGateway, loops: int) -> GatewayView:
+    buses = [GatewayBusView.of(bus) for bus in own.buses()]
+    return GatewayView(
+        name=own.name, here=True, url=own.url, version=own.version, last_seen=now(), answers=True, buses=buses,
+        loops=loops,
+    )  # fmt: skip
+
+
+def _other(name: str, loops: int, others: OtherGateways) -> GatewayView:
+    found = others.every().get(name)
+    said = None if found is None else found.said
+    return GatewayView(
+        name=name,
+        here=False,
+        url=None if said is None else said.url,
+        version=None if said is None else said.version,
+        last_seen=None if said is None else stamp(datetime.fromtimestamp(said.at_s, UTC)),
+        answers=others.answers(name),
+        buses=[GatewayBusView.of(bus) for bus in others.buses() if bus.host == name],
+        loops=loops,
+    )
