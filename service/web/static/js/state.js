@@ -29,7 +29,7 @@ export function takeRows(found) {
   });
 }
 
-export const buses = signal(/** @type {{bus: string, up: boolean | null, why: string | null}[]} */ ([]));
+export const buses = signal(/** @type {{host: string, bus: string, up: boolean | null, why: string | null}[]} */ ([]));
 /** Live jobs. */
 export const jobs = signal(/** @type {any[]} */ ([]));
 /** What is abnormal, as the service says, the worst first; null: it has not said yet. */

@@ -66,10 +66,23 @@ const REASONS = {
   mv_limit: "MV at its limit",
   node_lost: "node lost",
   bus_lost: "bus lost",
+  gateway_lost: "gateway does not answer",
   internal: "an error inside the service",
 };
 /** @param {string | null | undefined} reason */
 export const reasonWords = (reason) => (reason ? (REASONS[reason] ?? reason.replaceAll("_", " ")) : "");
+
+/** What became of a decision that was asked at another gateway than the loop's. @param {any} request @param {string} host the loop's gateway */
+export function decisionRequestWords(request, host) {
+  const what = `${request.what === "accept" ? "Accepting" : "Rolling back"}, asked by ${request.by} at gateway ${request.gateway}`;
+  switch (request.state) {
+    case "waiting": return `${what}: gateway ${host} has not begun it yet.`;
+    case "under_way": return `${what}: gateway ${host} is at it.`;
+    case "refused": return `${what}, was not done: ${request.detail ?? "an error there"}.`;
+    case "cut_off": return `${what}, was cut off: whether the gains were written is not known. Look at the gains in effect, then decide again.`;
+    default: return `${what}, was not done: gateway ${host} did not answer in time, and will not do it any more.`;
+  }
+}
 
 /** The headline of a job. @param {any} job */
 export function headline(job) {

@@ -7,6 +7,7 @@ import { designsOf, fillDesigns } from "../designs.js";
 import { html } from "../html.js";
 import { change, fixed, known, ms as msText, msError, pvDecimals, significant, unit, withUnit } from "../numbers.js";
 import { isSilent, may, refreshLoops, sign, signature } from "../state.js";
+import { decisionRequestWords } from "../words.js";
 import { Curve, NyquistPlot, StepPlot } from "./figures.js";
 
 const LOAD_PCT = 10;
@@ -163,6 +164,17 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
     setSending(false);
   };
   const by = () => ({ by: signature.value.trim() });
+  const request = job.decision_request;
+  const pending = request && ["waiting", "under_way"].includes(request.state);
+  useEffect(() => {
+    if (!pending) return;
+    const stop = new AbortController();
+    const timer = setInterval(() => void ask(job.url, stop.signal).then(onChanged, () => {}), 1000);
+    return () => {
+      clearInterval(timer);
+      stop.abort();
+    };
+  }, [pending, job.url]);
   const tryIt = () =>
     send(async () => {
       const answer = await ask(`${job.url}/alternatives?ms=${ms.toFixed(2)}`);
@@ -180,6 +192,7 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
   if (loop.locked) inside = html`<span class="say">Locked by ${loop.locked.by}: no decision until it is unlocked.</span>`;
   else if (job.dry_run) inside = html`<span class="say">A rehearsal: nothing was moved, and there is nothing to accept.</span>`;
   else if (!may.operate.value) inside = html`<span class="say">${job.state === "proposed" ? "The loop runs on its old gains. To accept the new ones needs the scope operate." : ""}</span>`;
+  else if (pending) inside = html`<span class="say" role="status">${decisionRequestWords(request, loop.host)}</span>`;
   else if (asking === "accept") inside = html`<span class="say">Write <b>${written}</b> into ${where}, for good.</span>${Signed(`Write to ${loop.tag}`, () => send(() => command(`${job.url}/accept`, by())))}`;
   else if (asking === "keep") inside = html`<span class="say">Keep the old gains; the proposal is declined.</span>${Signed("Keep the old gains", () => send(() => command(`${job.url}/rollback`, by())))}`;
   else if (asking === "rollback") inside = html`<span class="say">Write the old gains, <b>${written}</b>, back into ${where}.</span>${Signed(`Roll ${loop.tag} back`, () => send(() => command(`${job.url}/rollback`, by())))}`;
@@ -191,5 +204,5 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
   else if (job.state === "proposed") inside = html`<span class="say">Not decided; a later test came.</span>`;
   else if (job.state === "accepted") inside = html`<span class="say">Accepted by <b>${job.decided?.by ?? "–"}</b>; a later test came.</span>`;
   if (!inside && !problem) return null;
-  return html`<div class="decide" ref=${group} role="group" aria-label="Decision">${inside}${problem && html`<p class="refusal" role="alert" key="problem">${problem.message} <span class="advice">${problem.advice ?? ""}</span></p>`}</div>`;
+  return html`<div class="decide" ref=${group} role="group" aria-label="Decision">${inside}${request && !pending && !asking && html`<p class="quiet" key="request">${decisionRequestWords(request, loop.host)}</p>`}${problem && html`<p class="refusal" role="alert" key="problem">${problem.message} <span class="advice">${problem.advice ?? ""}</span></p>`}</div>`;
 }

@@ -3,6 +3,7 @@
 import { useEffect, useState } from "../../vendor/hooks.js";
 import { abnormalNow } from "../alarms.js";
 import { ask, askPage } from "../api.js";
+import { GatewayName, isElsewhere, refreshGateways } from "../gateways.js";
 import { html } from "../html.js";
 import { known, ms, period, pvDecimals, fixed, significant, unit, when } from "../numbers.js";
 import { jobPath } from "../router.js";
@@ -32,7 +33,7 @@ export function LoopView({ tag }) {
   const [open, setOpen] = useState(/** @type {boolean | null} */ (null));
   const job = jobs.value.find((each) => each.loop === tag && !each.dry_run) ?? null;
   const row = rowOf(tag).value;
-  const mark = `${row?.job ?? ""} ${row?.last_job?.url ?? ""} ${row?.last_job?.state ?? ""} ${loop?.locked?.since ?? ""}`;
+  const mark = `${row?.job ?? ""} ${row?.last_job?.url ?? ""} ${row?.last_job?.state ?? ""} ${loop?.locked?.since ?? ""} ${row?.not_heard ? "not heard" : ""}`;
 
   useEffect(() => {
     document.title = `${tag} · Loopwright`;
@@ -61,6 +62,11 @@ export function LoopView({ tag }) {
     };
   }, [tag, mark]);
 
+  const elsewhere = loop ? isElsewhere(loop) : false;
+  useEffect(() => {
+    if (elsewhere) void refreshGateways();
+  }, [elsewhere, tag]);
+
   useEffect(() => {
     if (!job) {
       setRunning(null);
@@ -84,12 +90,13 @@ export function LoopView({ tag }) {
   const height = TREND_PX;
   return html`<div>
     <div class="looptitle" key="title"><h1 class="tag">${tag}</h1><span class="what">${loop.description}</span>
-      <span class="where">${[loop.area, loop.bus, `node ${loop.controller_node.toString(16)}h`, `channel ${loop.channel}`, loop.host === "local" ? null : `by way of ${loop.host}`].filter(Boolean).join(" · ")}</span>
+      <span class="where">${[loop.area, loop.bus, `node ${loop.controller_node.toString(16)}h`, `channel ${loop.channel}`].filter(Boolean).join(" · ")}${elsewhere && html` · by way of ${GatewayName(loop)}`}</span>
       ${!job && !formOpen && may.operate.value && html`<button key="retune" id="retune" onClick=${() => setOpen(true)}>Retune…</button>`}
       ${!may.operate.value && html`<span key="may" class="quiet">Your key may read. To retune it needs the scope operate.</span>`}
     </div>
     ${mine.map((each) => html`<div class="abnormal" key=${each.id}>${AlarmSymbol(each.level)}<span><b>${each.text}.</b> <span class="quiet">${each.advice}</span></span>${SignOffButton(each)}
       ${asking.value === each.id && html`<${SignOffQuestion} key="question" alarm=${each} />`}</div>`)}
+    ${elsewhere && row?.not_heard && !isSilent.value && html`<p class="refusal" key="gateway" role="status"><b>${row.not_heard}.</b></p>`}
     ${detail?.not_confirmed_home && html`<p class="refusal" key="home"><b>${detail.not_confirmed_home.detail}</b> ${detail.not_confirmed_home.advice}</p>`}
     ${loop.locked && html`<p class="refusal" key="lock">Locked by ${loop.locked.by} since ${when(loop.locked.since)}: ${loop.locked.reason}. Tests and decisions wait until it is unlocked.</p>`}
     <div class="loop" key="loop">

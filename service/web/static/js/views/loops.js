@@ -4,6 +4,7 @@ import { computed, signal } from "../../vendor/signals-core.js";
 import { useEffect } from "../../vendor/hooks.js";
 import { worstOf } from "../alarms.js";
 import { ask } from "../api.js";
+import { isElsewhere } from "../gateways.js";
 import { html } from "../html.js";
 import { ago, duration, fixed, known, ms, pvDecimals, unit } from "../numbers.js";
 import { go, loopPath } from "../router.js";
@@ -87,7 +88,7 @@ export function LoopsView() {
         ${groups.size > 1 || name ? html`<tr class="area" key="area"><th colspan="11" scope="rowgroup">${name || "No area"}</th></tr>` : null}
         ${members.map((loop) => html`<${Row} key=${loop.tag} loop=${loop} />`)}</tbody>`)}
     </table></div>` : html`<p class="calm" key="none">${onlyLook.value && !find.value ? "Nothing needs a look." : "No loop is found by this."}</p>`}
-    ${buses.value.filter((each) => each.up === false).map((each) => html`<p class="busline" key=${each.bus}>${AlarmSymbol(2)}<span>Bus <b>${each.bus}</b> is down, opening it again every 2 s. <span class="quiet">${each.why}</span></span></p>`)}
+    ${buses.value.filter((each) => each.up === false).map((each) => html`<p class="busline" key=${`${each.host} ${each.bus}`}>${AlarmSymbol(2)}<span>Bus <b>${each.bus}</b>${isElsewhere(each) ? ` of gateway ${each.host}` : ""} is down, opening it again every 2 s. <span class="quiet">${each.why}</span></span></p>`)}
   </div>`;
 }
 

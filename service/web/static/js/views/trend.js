@@ -3,6 +3,7 @@
 import { signal } from "../../vendor/signals-core.js";
 import { useEffect, useRef } from "../../vendor/hooks.js";
 import { ask } from "../api.js";
+import { GatewayName, isElsewhere } from "../gateways.js";
 import { html } from "../html.js";
 import { fixed, pvDecimals, timeOfDay, unit } from "../numbers.js";
 import { colour, shown } from "../palette.js";
@@ -218,6 +219,7 @@ export function Trend({ loop, job, height, onJob }) {
         ${it.job && html`<button key="test" aria-pressed=${String(it.chosen.value === "test" && !it.zoomed.value)} onClick=${() => chooseTest(it)}>test</button>`}
         ${WINDOWS.map(([name, seconds]) => html`<button key=${name} aria-pressed=${String(it.chosen.value === name && !it.zoomed.value)} onClick=${() => choose(it, name, seconds)}>${name}</button>`)}
       </span></div>
+    ${isElsewhere(loop) && html`<p class="note" key="elsewhere">Samples as they come are at ${GatewayName(loop)}; here is what it has stored, a minute late.</p>`}
     <span class="axis-name" key="n1">PV, ${unit(loop.pv_unit)}</span>
     <div class="plot" key="p1" ref=${upper} role="img" aria-label=${`PV and set-point of ${loop.tag}`}></div>
     <span class="axis-name" key="n2">MV, %</span>
