@@ -21,6 +21,7 @@ from loopwright.service.results import FastResult, FiveStageResult
 from loopwright.service.store import retunes
 from loopwright.service.store.database import FILE
 from loopwright.service.store.store import Store
+from loopwright.tuning.reasons import ADVICE, Reason
 from tests.unit.service.postgres import Server
 from tests.unit.service.store.test_store import migrate
 
@@ -42,9 +43,12 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
 
 
 def with_later_fields(golden: dict[str, Any]) -> dict[str, Any]:
-    """The golden job with what is shown of it since: nobody has decided, and a live test knows how fast it sampled."""
+    """The golden job with what is shown of it since: nobody has decided, and a live test knows how fast it sampled. Its
+    advice is not stored, but today's for its reason."""
+    advice = None if golden["reason"] is None else ADVICE[Reason(golden["reason"])]
     sample_time_s = None if golden["dry_run"] else 0.1
     return golden | {
+        "advice": advice,
         "decided": None,
         "decision_request": None,
         "superseded_by": None,
