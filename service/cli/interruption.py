@@ -53,14 +53,17 @@ class Interruption:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Delays the exception to the end of the context: a process that is started is noted before it is raised."""
+        """Delays the exception to the end of the context: a process that is started is noted before it is raised.
+
+        It takes the place of an error of the context: a closed terminal ends the processes that are waited for as well.
+        """
         self._held = True
         try:
             yield
         finally:
             self._held = False
-        if self._pending is not None and not self._ignored:
-            raise Interrupted(self._pending)
+            if self._pending is not None and not self._ignored:
+                raise Interrupted(self._pending)
 
     def _hear(self, number: int, _frame: FrameType | None) -> None:
         self._heard = True

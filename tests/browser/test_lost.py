@@ -94,7 +94,8 @@ def test_a_service_that_is_killed_in_mid_test_and_comes_back(site: Site, page: P
     expect(person.headline(page)).to_have_text("New gains are proposed")
     ended = site.job(job)
     assert (ended["state"], ended["attempts"]) == ("proposed", 2) and site.is_home()
-    page.get_by_role("button", name="2 min").click()
-    expect(page.get_by_role("button", name="2 min")).to_have_attribute("aria-pressed", "true")
-    until(lambda: len(trend.gaps(page)) == 1, "one gap in the trend")
-    assert trend.gaps(page)[0].seconds > 2.0
+    # two minutes of the plant pass in less than one, and what follows the gap may take longer on a busy machine
+    page.get_by_role("button", name="10 min").click()
+    expect(page.get_by_role("button", name="10 min")).to_have_attribute("aria-pressed", "true")
+    until(lambda: len(trend.gaps(page, 600.0)) == 1, "one gap in the trend")
+    assert trend.gaps(page, 600.0)[0].seconds > 2.0

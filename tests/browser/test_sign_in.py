@@ -128,6 +128,7 @@ def test_a_key_that_may_operate_and_the_way_out(pages: Pages, page: Page, keyrin
 
 def test_a_key_that_is_revoked_meanwhile(pages: Pages, page: Page, keyring: Keyring) -> None:
     row, key = keyring.create("contractor", Scope.OPERATE)
+    pages.expected.append(r"status of 409 .*/record")  # of the test that was aborted above
     sign_in(page, key)
     expect(person.face(page).locator(".big")).to_have_text("50.000")
     with pages.expecting(REFUSED):

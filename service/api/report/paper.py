@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 _HERE = Path(__file__).parent
 STYLE = (_HERE / "report.css").read_text(encoding="utf-8")
 _STYLE_HASH = base64.b64encode(hashlib.sha256(STYLE.encode()).digest()).decode()
-_IN_FILE = f"default-src 'none'; style-src 'sha256-{_STYLE_HASH}'; base-uri 'none'; form-action 'none'"
+_IN_FILE = f"default-src 'none'; style-src 'sha256-{_STYLE_HASH}'; img-src data:; base-uri 'none'; form-action 'none'"
 POLICY = f"{_IN_FILE}; frame-ancestors 'none'; sandbox"
 """Content-Security-Policy of a report: its own style sheet, and nothing else. The file itself holds what a file can."""
 FORM = "u = Kp (b SP − PV + 1/Ti ∫(SP − PV) dt + Td d/dt(c SP − PV) / (1 + Tf s)); Ti 0 is no integral action."

@@ -43,6 +43,12 @@ def test_one_that_comes_while_a_process_is_started_waits_until_it_is_noted() -> 
     assert noted == ["started"]
 
 
+def test_it_takes_the_place_of_an_error_that_it_has_caused() -> None:
+    with pytest.raises(Interrupted), Interruption() as interruption, interruption.held():
+        send(signal.SIGHUP)
+        raise OSError("the process that is waited for has ended by the same signal")
+
+
 def test_nothing_interrupts_the_end_nor_what_follows_it() -> None:
     with Interruption() as interruption:
         interruption.ignore()
