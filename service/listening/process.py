@@ -159,8 +159,13 @@ class ListeningProcess:
         command = [sys.executable, "-m", "loopwright.service.listening.child", str(theirs.fileno())]
         with ours:
             with theirs:
+                # A group of its own: Ctrl-C in a terminal is for the service, and would meet the child as it imports.
                 process = subprocess.Popen(
-                    command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, pass_fds=[theirs.fileno()]
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    pass_fds=[theirs.fileno()],
+                    process_group=0,
                 )
             self.pid = process.pid
             with suppress(ProcessLookupError):
