@@ -44,6 +44,15 @@ def _job(job_id: str) -> None:
             raise _Left from error
 
 
+def without_traceback(record: logging.LogRecord) -> bool:
+    """Keeps the words and the error of a message that has a traceback in its text: a database may be away."""
+    said, found, rest = record.getMessage().partition("Traceback (most recent call last):")
+    if found:
+        error = next((line for line in reversed(rest.splitlines()) if line[:1].isalpha()), "")
+        record.msg, record.args = said + error, None
+    return True
+
+
 class DurableEngine:
     """The engine on DBOS.
 
@@ -83,6 +92,7 @@ class DurableEngine:
         }
         DBOS(config=config)
         logging.getLogger("dbos").setLevel(logging.WARNING)
+        logging.getLogger("dbos").addFilter(without_traceback)
         DBOS.listen_queues(list(queues))
         DBOS.launch()
         for name, at_once in queues.items():
