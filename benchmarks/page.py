@@ -64,7 +64,7 @@ FRAMES = """(ms) => new Promise((done) => {
 })"""
 
 
-def told(what: str) -> None:
+def show_progress(what: str) -> None:
     print(f"  {what}", file=sys.stderr, flush=True)
 
 
@@ -117,7 +117,7 @@ def frames(browser: Browser, site: Heard) -> dict[str, Any]:
             "empty_frames": len(nothing), "empty_late": _late(nothing), "empty_worst_ms": max(nothing),
             "share_of_a_core": script_s / (TURNS * FRAMES_S),
         }  # fmt: skip
-        told(f"{name}: {found[name]}")
+        show_progress(f"{name}: {found[name]}")
     return found
 
 
@@ -163,7 +163,7 @@ def hour(browser: Browser, site: Heard) -> dict[str, Any]:
             for _ in range(2):
                 pass_seconds(page, HALF_HOUR_S, heard)
                 state.append(kept(session))
-                told(f"{name}: {state[-1]}")
+                show_progress(f"{name}: {state[-1]}")
         found[name] = {
             "heap_bytes": [each.heap for each in state], "nodes": [each.nodes for each in state],
             "listeners": [each.listeners for each in state], "took_s": time.monotonic() - began,
@@ -225,7 +225,7 @@ def viewed(stack: ExitStack, folder: Path) -> dict[str, Any]:
             late["viewed"].append(beats.taken())
         finally:
             viewers.stop()
-        told(f"p95 {p95(alone[-1]):.1f} ms, with viewers {p95(beside[-1]):.1f} ms")
+        show_progress(f"p95 {p95(alone[-1]):.1f} ms, with viewers {p95(beside[-1]):.1f} ms")
     state = site.http.get(job).json()["state"]
     site.http.post(f"{job}/abort", json={})
     if state != "running":
@@ -252,14 +252,14 @@ def measure() -> dict[str, Any]:
             site = Heard(few, _made(folder / "few"), FEW, RATE_PER_S)
             site.until_heard()
             found["visits"] = visits(browser, site)
-            told(f"visits: {found['visits']}")
+            show_progress(f"visits: {found['visits']}")
             found["frames"] = frames(browser, site)
             found["hour"] = hour(browser, site)
         with ExitStack() as many:
             site = Heard(many, _made(folder / "many"), MANY, 1.0)
             site.until_heard()
             found["updates"] = updates(browser, site)
-            told(f"updates: {found['updates']}")
+            show_progress(f"updates: {found['updates']}")
         with ExitStack() as alone:
             found["viewers"] = viewed(alone, _made(folder / "viewed"))
         return found
