@@ -18,6 +18,9 @@ from loopwright.protocol.fair_lock import FairLock
 from loopwright.protocol.profile import HEARTBEAT_FRAME, TUNER_NODE, NmtState, heartbeat_id
 
 HEARTBEAT_S = 0.1
+"""Longest wall time between two heartbeats of this process, s."""
+WAIT_S = 0.05
+"""Longest single wait of a loop on the bus, s. A heartbeat that becomes due within the next wait is sent before it."""
 LISTEN_S = 2.0
 """Wall time for which a node listens for another one with its node-ID before its first heartbeat, s."""
 _LISTEN_STEP_S = 0.05
@@ -66,10 +69,10 @@ class Station:
     # -- heartbeat
 
     def beat_if_due(self, url: str, bus: Bus) -> float:
-        """Sends the heartbeat unless another loop of this process has just done so. Returns the time on the clock,
-        whose reading is a system call in some virtual machines."""
+        """Sends the heartbeat if it would be late after the next wait, unless another loop of this process has just
+        sent it. Returns the time on the clock, whose reading is a system call in some virtual machines."""
         now = self.monotonic()
-        if now - self._beats.get(url, -math.inf) >= HEARTBEAT_S:
+        if now - self._beats.get(url, -math.inf) >= HEARTBEAT_S - WAIT_S:
             self.beat(url, bus, now)
         return now
 

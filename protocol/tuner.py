@@ -28,9 +28,8 @@ from loopwright.protocol.profile import (
     sdo_response_id,
 )
 from loopwright.protocol.real32 import shortest
-from loopwright.protocol.station import Station
+from loopwright.protocol.station import WAIT_S, Station
 
-_WAIT_S = 0.05  # one wait on the bus: short enough for the heartbeat, and always the same, which is cheap in RawBus
 _TAKE_IN_S = 0.1
 _ABORT = 0x80
 _URGENT = ("controller_session_renewal", "controller_order_close")
@@ -162,7 +161,7 @@ class Tuner(ProcessData):
         now = self.heartbeat()  # also while samples are queued: a tuner that catches up is alive
         give_up = now + timeout_s
         while not self._samples:
-            wait = _WAIT_S if now < give_up else 0.0  # then only what is here already
+            wait = WAIT_S if now < give_up else 0.0  # then only what is here already
             if not self._receive(wait) and not wait:
                 return None
             now = self.heartbeat()
@@ -327,7 +326,7 @@ class Tuner(ProcessData):
                 can_id, data = self._answers.popleft()
                 if can_id == wanted and len(data) == 8:
                     return data
-            wait = _WAIT_S if self.heartbeat() < give_up else 0.0  # then only what is here already
+            wait = WAIT_S if self.heartbeat() < give_up else 0.0  # then only what is here already
             if not self._receive(wait) and not wait:
                 return None
 

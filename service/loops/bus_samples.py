@@ -13,6 +13,7 @@ from contextlib import suppress
 
 from loopwright.protocol.process_data import BusSample
 from loopwright.protocol.profile import FOREVER, samples_between
+from loopwright.protocol.station import WAIT_S
 from loopwright.protocol.tuner import Tuner
 from loopwright.service.loops.bus_connection import BusConnection
 from loopwright.service.loops.bus_session import BusSession
@@ -29,7 +30,6 @@ MAX_GAP = 5
 """Largest number of samples in a row that may be missing."""
 BLOCK = 10
 """Samples per block of a plant at pace 0."""
-_SLICE_S = 0.05  # longest single wait; lease and stop requests are checked after each
 _HALTED_S = 0.03  # time without a sample after which the plant has halted
 
 
@@ -151,7 +151,7 @@ class BusSamples:
     def _wait_for_next(self, tuner: Tuner) -> BusSample:
         give_up: float | None = None
         while True:
-            sample = tuner.sample(_SLICE_S)
+            sample = tuner.sample(WAIT_S)  # lease and stop requests are checked after each
             self._session.check_status(tuner)
             if sample is not None and (self._first_n is None or sample.n != self._last_n):  # a frame may come twice
                 return sample

@@ -18,7 +18,7 @@ from statistics import median
 from tests.hostile.measuring import EXPECTED_ENDS, Found, Measuring
 from tests.hostile.site import Site
 
-ABORT_P99_S, LATE_S = 0.5, 0.05
+ABORT_P99_S, EFFECT_S, LATE_S = 0.5, 1.0, 0.05
 GROWTH = 1.3
 """Memory at the end, of what it was when everything had begun."""
 MAX_MB = 600.0
@@ -53,6 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             attack.stop()
         measuring.end_tests()
         rows = judged(measuring.found, site.unsafe())
+        rows.append(("event loop held up by at most", f"{1e3 * site.event_loop_late_s():.0f} ms", "", True))
         for log in sorted(folder.glob("attackers-*.log")):
             print(f"answered: {log.read_text().splitlines()[-1]}")
     print("\n| what | found | permitted | |\n| --- | --- | --- | --- |")
@@ -69,7 +70,14 @@ def judged(found: Found, unsafe: dict[str, str]) -> list[tuple[str, str, str, bo
     return [
         (f"{len(found.abort_s)} aborts answered, p99", f"{abort:.3f} s", f"{ABORT_P99_S} s", abort < ABORT_P99_S),
         ("the same, median", f"{median(found.abort_s or [float('inf')]):.3f} s", "", True),
-        ("aborts, until the loop was read back as home, p99", f"{p99(found.effect_s):.3f} s", "", True),
+        (
+            "aborts, until the controller had ended the test, p99",
+            f"{p99(found.effect_s):.3f} s",
+            f"{EFFECT_S} s",
+            p99(found.effect_s) < EFFECT_S,
+        ),
+        ("the same, at most", f"{max(found.effect_s, default=float('inf')):.3f} s", "", True),
+        ("aborts, until the loop was read back as home, p99", f"{p99(found.home_s):.3f} s", "", True),
         ("/healthz, p99", f"{p99(found.healthz_s):.3f} s", f"{ABORT_P99_S} s", p99(found.healthz_s) < ABORT_P99_S),
         ("supervision late by at most", f"{1e3 * late:.0f} ms", f"{1e3 * LATE_S:.0f} ms", late <= LATE_S),
         ("the same, p99", f"{1e3 * p99(found.late_s):.0f} ms", "", True),

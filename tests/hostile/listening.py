@@ -1,9 +1,11 @@
-"""Listens to the service's heartbeat, and beside it to the machine: how late a process is that only sleeps.
+"""Listens to the service's heartbeat and to the session of one loop, and beside them to the machine: how late a process
+is that only sleeps.
 
-    python -m tests.hostile.listening BUS
+    python -m tests.hostile.listening BUS CHANNEL
 
 A process of its own, so that what the rest of the measuring does is not counted as the service's. On SIGTERM it prints
-what was late, when (in monotonic time, which all processes of a machine share) and by how much, and ends.
+what was late, when (in monotonic time, which all processes of a machine share) and by how much, and when a session of
+the channel was opened or over, and ends.
 What the machine does to a process that wants nothing but 10 ms of sleep it does to the service, too.
 """
 
@@ -17,7 +19,7 @@ import threading
 import time
 
 from loopwright.protocol.bus import open_bus
-from loopwright.protocol.profile import TUNER_NODE, heartbeat_id
+from loopwright.protocol.profile import STATUS_FRAME, TUNER_NODE, channel_ids, heartbeat_id
 from loopwright.protocol.station import HEARTBEAT_S
 
 NAP_S = 0.01
@@ -29,7 +31,9 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: over.set())
     heartbeat: list[tuple[float, float]] = []
     machine: list[tuple[float, float]] = []
-    listener = threading.Thread(target=listen, args=(sys.argv[1], heartbeat, over))
+    sessions: list[tuple[float, int]] = []
+    arguments = (sys.argv[1], channel_ids(int(sys.argv[2])).status, heartbeat, sessions, over)
+    listener = threading.Thread(target=listen, args=arguments)
     listener.start()
     print("ready", flush=True)
     while not over.is_set():
@@ -38,23 +42,33 @@ def main() -> None:
         now = time.monotonic()
         machine.append((now, now - due))
     listener.join()
-    print(json.dumps({"heartbeat": heartbeat, "machine": machine}), flush=True)
+    print(json.dumps({"heartbeat": heartbeat, "machine": machine, "sessions": sessions}), flush=True)
 
 
-def listen(url: str, found: list[tuple[float, float]], over: threading.Event) -> None:
-    """Notes by how much each heartbeat came later than it is due."""
+def listen(
+    url: str,
+    status_id: int,
+    heartbeat: list[tuple[float, float]],
+    sessions: list[tuple[float, int]],
+    over: threading.Event,
+) -> None:
+    """Notes by how much each heartbeat came later than it is due, and when a session began or ended."""
     bus = open_bus(url)
-    wanted = heartbeat_id(TUNER_NODE)
-    bus.set_filters({wanted})
+    heartbeats_id = heartbeat_id(TUNER_NODE)
+    bus.set_filters({heartbeats_id, status_id})
     last: float | None = None
     while not over.is_set():
         frame = bus.recv(0.05)
-        if frame is None or frame[0] != wanted:
-            continue
         now = time.monotonic()
-        if last is not None:
-            found.append((now, max(0.0, now - last - HEARTBEAT_S)))
-        last = now
+        match frame:
+            case (can_id, _) if can_id == heartbeats_id:
+                if last is not None:
+                    heartbeat.append((now, max(0.0, now - last - HEARTBEAT_S)))
+                last = now
+            case (can_id, data) if can_id == status_id:
+                session = STATUS_FRAME.unpack(data)[3]
+                if not sessions or sessions[-1][1] != session:
+                    sessions.append((now, session))
     bus.close()
 
 

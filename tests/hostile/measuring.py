@@ -22,13 +22,15 @@ EXPECTED_ENDS = ("proposed", "refused")
 
 @dataclass
 class Found:
-    """abort_s: until it was answered.  effect_s: until the job was over, its loop read back as home.
+    """abort_s: until it was answered.  effect_s: until the loop's status on the bus said that its session is over.
+    home_s: until the job was over, its loop read back as home.
     late_s: by which the service's heartbeat came later than it is due.  machine_late_s: by which a process that only
     sleeps was woken later than it had asked.  late_alone_s: late_s while that one was not late.
     ends: of the tests, by state and reason."""
 
     abort_s: list[float] = field(default_factory=list)
     effect_s: list[float] = field(default_factory=list)
+    home_s: list[float] = field(default_factory=list)
     healthz_s: list[float] = field(default_factory=list)
     late_s: list[float] = field(default_factory=list)
     late_alone_s: list[float] = field(default_factory=list)
@@ -37,6 +39,13 @@ class Found:
     ends: dict[str, int] = field(default_factory=dict)
     refused: int = 0
     """Requests of the operator that were told to come again."""
+
+
+def session_over(sessions: list[tuple[float, float]], at: float) -> float:
+    """Seconds from a time until no session was open on the loop; 0 where none was open then."""
+    after = [when for when, open_ in sessions if when >= at and not open_]
+    open_then = next((open_ for when, open_ in reversed(sessions) if when < at), 0.0)
+    return (after[0] if after else float("inf")) - at if open_then else 0.0
 
 
 def late_alone(heartbeat: list[tuple[float, float]], machine: list[tuple[float, float]]) -> list[float]:
@@ -64,7 +73,8 @@ class Measuring:
         self._counting = threading.Event()
         self._threads = [threading.Thread(target=run) for run in (self._keep_testing, self._abort)]
         self._jobs: dict[str, str] = {}
-        self._listener = site.listener()
+        self._listener = site.listener(self._victim)
+        self._aborted_at: list[float] = []
         self._counts_from = float("inf")
 
     def __enter__(self) -> Measuring:
@@ -77,10 +87,11 @@ class Measuring:
         for thread in self._threads:
             thread.join()
         self._listener.stop()
-        late = self._site.late()
+        heard = self._site.heard()
         heartbeat, machine = (
-            [(at, late_s) for at, late_s in late[of] if at >= self._counts_from] for of in ("heartbeat", "machine")
+            [(at, late_s) for at, late_s in heard[of] if at >= self._counts_from] for of in ("heartbeat", "machine")
         )
+        self.found.effect_s = [session_over(heard["sessions"], at) for at in self._aborted_at]
         self.found.late_s, self.found.machine_late_s = ([late_s for _, late_s in of] for of in (heartbeat, machine))
         self.found.late_alone_s = late_alone(heartbeat, machine)
 
@@ -163,7 +174,8 @@ class Measuring:
                 time.sleep(0.02)
             if self._counting.is_set() and answer is not None and answer.status_code == 202:
                 self.found.abort_s.append(answered)
-                self.found.effect_s.append(time.monotonic() - began)
+                self.found.home_s.append(time.monotonic() - began)
+                self._aborted_at.append(began)
             began = time.monotonic()
             if self._asked("GET", "/healthz") is not None and self._counting.is_set():
                 self.found.healthz_s.append(time.monotonic() - began)

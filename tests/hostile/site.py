@@ -85,15 +85,17 @@ class Site:
         process.wait_ready(START_S)
         return process
 
-    def listener(self) -> ChildProcess:
-        """A process that listens to the heartbeat; `late` has what it found, once it was stopped."""
-        process = ChildProcess("listener", ("tests.hostile.listening", self.bus), self._folder / "listener.log")
+    def listener(self, tag: str) -> ChildProcess:
+        """A process that listens to the heartbeat and the sessions of a loop; `heard` has what it found, once it was
+        stopped."""
+        command = ("tests.hostile.listening", self.bus, str(self.tags.index(tag) + 1))
+        process = ChildProcess("listener", command, self._folder / "listener.log")
         self._stack.callback(process.stop)
         process.wait_ready(START_S)
         return process
 
-    def late(self) -> dict[str, list[tuple[float, float]]]:
-        """Of the heartbeat and of the machine: when, and by how many seconds."""
+    def heard(self) -> dict[str, list[tuple[float, float]]]:
+        """When, and by how many seconds, heartbeat and machine were late; when sessions were opened (1) or over (0)."""
         found: dict[str, list[tuple[float, float]]] = json.loads(
             (self._folder / "listener.log").read_text().splitlines()[-1]
         )
@@ -105,6 +107,12 @@ class Site:
         headers = {"Authorization": f"Bearer {self.operator}"}
         with httpx.Client(base_url=self.url, timeout=60.0, trust_env=False, verify=False, headers=headers) as client:
             return client.request(method, path, **more)
+
+    def event_loop_late_s(self) -> float:
+        """The longest time for which the service's event loop was held up."""
+        name = "loopwright_event_loop_late_worst_seconds "
+        lines = self.ask("GET", "/metrics").text.splitlines()
+        return next(float(line.removeprefix(name)) for line in lines if line.startswith(name))
 
     def read(self, tag: str) -> LoopState:
         """By another way than the service's."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from loopwright.protocol.bus import Frame
 from loopwright.protocol.profile import HEARTBEAT_FRAME, TUNER_NODE, NmtState, heartbeat_id
-from loopwright.protocol.station import HEARTBEAT_S, LISTEN_S, NodeTaken, Station
+from loopwright.protocol.station import HEARTBEAT_S, LISTEN_S, WAIT_S, NodeTaken, Station
 from tests.unit.protocol.memory_bus import MemoryBus, Wire
 
 BEAT = HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL)
@@ -139,6 +141,24 @@ def test_each_bus_has_its_own_beat() -> None:
     wire.clock.now += 1.1 * HEARTBEAT_S
     station.beat_if_due("one", bus)
     assert len(wire.sent(heartbeat_id(TUNER_NODE))) == 3
+
+
+@pytest.mark.parametrize("every_s", [0.02, 0.033, WAIT_S, 0.06, 0.099, 0.1, 0.5])
+def test_no_heartbeat_waits_for_the_next_sample(every_s: float) -> None:
+    """A loop looks at its clock when a sample has come, or after the longest wait on the bus."""
+    wire = Wire()
+    station, bus = station_on(wire), wire.open()
+    beaten_at = []
+    sample_at = wire.clock.now + every_s
+    for _ in range(200):
+        station.beat_if_due("wire", bus)
+        if len(wire.frames) > len(beaten_at):
+            beaten_at.append(wire.clock.now)
+        wire.clock.now = min(sample_at, wire.clock.now + WAIT_S)
+        if wire.clock.now == sample_at:
+            sample_at += every_s
+    gaps = [later - earlier for earlier, later in pairwise(beaten_at)]
+    assert HEARTBEAT_S - WAIT_S <= min(gaps) + 1e-9 and max(gaps) <= HEARTBEAT_S + 1e-9
 
 
 def test_a_station_beats_with_its_own_node_id() -> None:
