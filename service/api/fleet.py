@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field
 from loopwright.service.api import problems
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.job_views import Decision, JobView, LoopView, loop_view
-from loopwright.service.api.paging import LINK, Cursor, Limit, more
+from loopwright.service.api.paging import LINK, Cursor, Limit, listed, more
 from loopwright.service.job_states import JobState
 from loopwright.service.jobs.fleet import BadFleet, Fleet, FleetRequest
 from loopwright.service.jobs.manager import Jobs
@@ -95,6 +95,7 @@ def install(
 
     @router.get(
         "/loops",
+        response_model=list[LoopView],
         tags=["loops"],
         summary="The configured loops of every host, sorted by tag",
         responses={**LINK, **problems.responses(422)},
@@ -109,7 +110,7 @@ def install(
         cursor: Annotated[
             str | None, Query(max_length=64, description="Cursor from the URL of the next page, unchanged")
         ] = None,
-    ) -> list[LoopView]:
+    ) -> Response:
         busy, last, locks = jobs.store.busy(), latest_jobs(jobs.store), jobs.locking.locks()
         accepted = acceptances(jobs.store)
         others.look()
@@ -125,23 +126,25 @@ def install(
                 break
             of_it = busy.get(config.tag), job, accepted.get(config.tag), gains_of(config.tag, host)
             found.append(loop_view(config, host, *of_it, locks.get(config.tag)))
-        return found
+        return listed(response, found)
 
     @router.get(
         "/loops/{tag}/jobs",
+        response_model=list[JobView],
         tags=["loops"],
         summary="The jobs of a loop, latest first",
         responses={**LINK, **problems.responses(404, 422)},
     )
-    def history(tag: Tag, response: Response, limit: Limit = 50, cursor: Cursor = None) -> list[JobView]:
+    def history(tag: Tag, response: Response, limit: Limit = 50, cursor: Cursor = None) -> Response:
         jobs.directory.owner(tag)
         rows = jobs.store.recent(tag, None, limit + 1, cursor)
         if len(rows) > limit:
             more(response, f"/loops/{tag}/jobs", rows[limit - 1].number, limit=limit)
-        return views(rows[:limit])
+        return listed(response, views(rows[:limit]))
 
     @router.get(
         "/jobs",
+        response_model=list[JobView],
         tags=["jobs"],
         summary="The jobs of every loop, latest first",
         responses={**LINK, **problems.responses(422)},
@@ -152,11 +155,11 @@ def install(
         state: Annotated[JobState | None, Query(description="Only jobs in this state")] = None,
         limit: Limit = 50,
         cursor: Cursor = None,
-    ) -> list[JobView]:
+    ) -> Response:
         rows = jobs.store.recent(loop, state, limit + 1, cursor)
         if len(rows) > limit:
             more(response, "/jobs", rows[limit - 1].number, loop=loop, state=state, limit=limit)
-        return views(rows[:limit])
+        return listed(response, views(rows[:limit]))
 
     @router.post(
         "/retunes",
