@@ -203,6 +203,24 @@ class TestDownByRamps:
         site.pass_time(OVER_S)
         assert site.is_home()
 
+    @pytest.mark.parametrize(("stage", "samples"), [("pulses", 15), ("verify", 10)])
+    def test_a_bus_that_is_lost_on_a_ramp_leaves_the_loop_at_home(self, stage: str, samples: int) -> None:
+        """The service can do nothing; the controller misses its heartbeat."""
+        site = Site()
+        at = 50.0
+
+        def cut(now: str, passed: int) -> None:
+            nonlocal at
+            if (now, passed) == (stage, samples):
+                at = site.channel.setpoint
+                site.lost = OSError(100, "Network is down")
+
+        found, _ = of_a_test(site, cut, **self.LIMITS)
+        assert found.ended is not None and found.ended.reason is Reason.BUS_LOST
+        assert 50.0 - STEP < at < 50.0, "on its way"
+        site.pass_time(OVER_S)
+        assert site.is_home()
+
     def test_an_operator_who_moves_the_set_point_on_a_ramp_has_the_last_word(self) -> None:
         site = Site()
 
