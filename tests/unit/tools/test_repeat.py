@@ -11,7 +11,7 @@ import pytest
 
 from tests import repeat
 from tests.conftest import starts_processes
-from tests.repeat import once
+from tests.repeat import Round, once
 from tests.unit.containers import test_bus, test_data_volume
 from tests.unit.protocol import test_hub
 from tests.unit.service.execution import test_computing
@@ -19,10 +19,16 @@ from tests.unit.service.server import test_serving, test_start, test_stop, test_
 from tests.unit.tuning.analysis import test_margins
 
 TESTS = """
+import subprocess
+
 def test_is_good():
     pass
 
+def test_starts_a_service():
+    subprocess.run(["true", "serve"])
+
 def test_is_not():
+    subprocess.run(["true"])
     print("what it said")
     assert not "this time"
 """
@@ -32,20 +38,21 @@ def test_what_failed_is_known_by_name_with_its_output(tmp_path: Path, monkeypatc
     monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")  # loading them takes longer than all else here
     file = tmp_path / "test_of_the_test.py"
     file.write_text(TESTS)
-    last, failed = once(["-c", "/dev/null", str(file)], tmp_path)
-    assert "1 failed, 1 passed" in last
-    assert list(failed) == ["test_of_the_test::test_is_not"]
-    assert all(words in failed["test_of_the_test::test_is_not"] for words in ("this time", "what it said"))
-    _, failed = once(["-c", "/dev/null", str(tmp_path / "nowhere.py")], tmp_path)
-    assert "it ended with status 4" in failed["pytest itself"]
+    found = once(["-c", "/dev/null", str(file)], tmp_path)
+    assert "1 failed, 2 passed" in found.last
+    assert list(found.failed) == ["test_of_the_test::test_is_not"]
+    assert all(words in found.failed["test_of_the_test::test_is_not"] for words in ("this time", "what it said"))
+    assert found.services == ["test_of_the_test.py::test_starts_a_service"]
+    found = once(["-c", "/dev/null", str(tmp_path / "nowhere.py")], tmp_path)
+    assert "it ended with status 4" in found.failed["pytest itself"]
 
 
 def test_every_failure_is_told_and_counted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    good: tuple[str, dict[str, str]] = ("2 passed", {})
-    ends = iter([good, ("1 failed", {"a::b": "its words"}), good, ("1 failed", {"a::b": "more"})])
+    good = Round("2 passed", {}, ["c::starts"])
+    ends = iter([good, Round("1 failed", {"a::b": "its words"}, []), good, Round("1 failed", {"a::b": "more"}, [])])
     asked: list[Sequence[str]] = []
 
-    def once(arguments: Sequence[str], folder: Path) -> tuple[str, dict[str, str]]:
+    def once(arguments: Sequence[str], folder: Path) -> Round:
         asked.append(arguments)
         return next(ends)
 
@@ -55,9 +62,9 @@ def test_every_failure_is_told_and_counted(monkeypatch: pytest.MonkeyPatch, caps
     assert "1 of 4, 0 s: 2 passed\n2 of 4, 0 s: 1 failed\nFAILED a::b\nits words\n" in told
     assert told.endswith("a::b failed 2 of 4 times\n")
     assert asked == [["-k", "this"]] * 4
-    ends = iter([good])
-    assert repeat.main(["--times", "1", "--busy", "0"]) == 0
-    assert asked[-1] == repeat.ALL
+    ends = iter([good, good])
+    assert repeat.main(["--times", "2", "--busy", "0"]) == 0
+    assert asked[-2:] == [repeat.ALL, ["c::starts"]]
 
 
 def test_the_load_is_there_meanwhile_and_no_longer() -> None:
