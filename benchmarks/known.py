@@ -11,20 +11,19 @@ asked for; a result is wrong where Ms on the true plant is off by more than 0.1.
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import product
-from multiprocessing import Pool
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.cases import ASKED, PI
 from benchmarks.command import check_names, parser_of
+from benchmarks.drawn_runs import Draw, run_all
 from benchmarks.operation import KINDS, LOOKS, PRESENT, SAMPLES, SPACING, WRONG, chosen, operation, present_gains
 from benchmarks.plants import Plant
 from benchmarks.tuning import T95_PERIODS, spread
@@ -170,7 +169,7 @@ def measured(plant: Plant, present: str, change: str, seed: int) -> KnownRun:
     )  # fmt: skip
 
 
-def _measured(given: tuple[Plant, str, str, int]) -> KnownRun:
+def _measured(given: Draw) -> KnownRun:
     return measured(*given)
 
 
@@ -204,7 +203,7 @@ def main() -> None:
     parser.add_argument("--changes", default=";".join(CHANGES))
     parser.add_argument("--present", default=";".join(PRESENT))
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--save", type=Path)
+    parser.add_argument("--save", type=Path, help="a line of JSON for every run; what it holds is not run again")
     given = parser.parse_args()
     check_names(parser, "change", given.changes.split(";"), CHANGES)
     check_names(parser, "present", given.present.split(";"), PRESENT)
@@ -213,13 +212,7 @@ def main() -> None:
         for change in given.changes.split(";") for present in given.present.split(";")
         for plant in chosen(given.plants, given.every) for seed in range(1, given.seeds + 1)
     ]  # fmt: skip
-    with Pool(given.processes) as pool:
-        ran = []
-        for each in pool.imap_unordered(_measured, todo):
-            ran.append(each)
-            if given.save:
-                with given.save.open("a") as file:
-                    print(json.dumps(asdict(each)), file=file)
+    ran = list(run_all(KnownRun, _measured, todo, given.save, given.processes))
     print(*table(ran), sep="\n")
 
 

@@ -12,20 +12,19 @@ asked for.
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import product
-from multiprocessing import Pool
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.cases import ASKED, PI
 from benchmarks.command import check_names, parser_of
+from benchmarks.drawn_runs import Draw, run_all
 from benchmarks.plants import Plant, plants
 from benchmarks.tuning import cost_over_best, optimum, spread
 from loopwright.controller.channel import Channel, Settings
@@ -181,7 +180,7 @@ def operated(plant: Plant, present: str, kind: str, seed: int) -> Operated:
     return Operated(plant.name, present, kind, seed, None, reason.value if reason else None, detail, None, None, spent)
 
 
-def _operated(given: tuple[Plant, str, str, int]) -> Operated:
+def _operated(given: Draw) -> Operated:
     return operated(*given)
 
 
@@ -220,7 +219,7 @@ def main() -> None:
     parser.add_argument("--kinds", default=";".join(KINDS))
     parser.add_argument("--present", default=";".join(PRESENT))
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--save", type=Path)
+    parser.add_argument("--save", type=Path, help="a line of JSON for every run; what it holds is not run again")
     given = parser.parse_args()
     check_names(parser, "kind", given.kinds.split(";"), KINDS)
     check_names(parser, "present", given.present.split(";"), PRESENT)
@@ -229,13 +228,7 @@ def main() -> None:
         for kind in given.kinds.split(";") for present in given.present.split(";")
         for plant in chosen(given.plants, given.every) for seed in range(1, given.seeds + 1)
     ]  # fmt: skip
-    with Pool(given.processes) as pool:
-        ran = []
-        for each in pool.imap_unordered(_operated, todo):
-            ran.append(each)
-            if given.save:
-                with given.save.open("a") as file:
-                    print(json.dumps(asdict(each)), file=file)
+    ran = list(run_all(Operated, _operated, todo, given.save, given.processes))
     print(*table(ran), sep="\n")
     spent = [each.seconds for each in ran]
     print(f"\none look, processor time: {np.median(spent):.2f} s at the median, {max(spent):.2f} s at most")
