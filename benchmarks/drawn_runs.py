@@ -6,9 +6,10 @@ A run is of a plant, its present gains, a kind of case and a seed. The file has 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
-from multiprocessing import Pool
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, TypeVar
 
@@ -48,7 +49,8 @@ def run_all(
             todo.append(draw)
         else:
             yield ran
-    with Pool(processes) as pool:
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is imported, as in the service's own processes
+    with get_context("spawn").Pool(processes) as pool:
         for ran in pool.imap_unordered(measure, todo):
             if file:
                 with file.open("a") as out:
