@@ -83,14 +83,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--times", type=int, default=50, metavar="N", help="default: %(default)s")
     parser.add_argument("--busy", type=int, default=4, metavar="K", help="busy processes beside; default: %(default)s")
+    parser.add_argument("--at-once", type=int, default=1, metavar="N", help="tests at a time; default: %(default)s")
     parser.add_argument("pytest", nargs="*", metavar="ARGUMENT", help=f"of pytest; default: {' '.join(ALL)}")
     asked = parser.parse_args(argv)
     arguments: Sequence[str] = asked.pytest or ALL
+    beside = () if asked.at_once == 1 else (f"--numprocesses={asked.at_once}", "--dist=loadfile")
     count: Counter[str] = Counter()
     with busy(asked.busy), tempfile.TemporaryDirectory() as folder:
         for number in range(1, asked.times + 1):
             began = time.monotonic()
-            found = once(arguments, Path(folder))
+            found = once((*beside, *arguments), Path(folder))
             print(f"{number} of {asked.times}, {time.monotonic() - began:.0f} s: {found.last}", flush=True)
             for name, said in found.failed.items():
                 print(f"FAILED {name}\n{said}\n", flush=True)

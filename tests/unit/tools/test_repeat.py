@@ -61,10 +61,11 @@ def test_every_failure_is_told_and_counted(monkeypatch: pytest.MonkeyPatch, caps
     told = capsys.readouterr().out
     assert "1 of 4, 0 s: 2 passed\n2 of 4, 0 s: 1 failed\nFAILED a::b\nits words\n" in told
     assert told.endswith("a::b failed 2 of 4 times\n")
-    assert asked == [["-k", "this"]] * 4
+    assert asked == [("-k", "this")] * 4
     ends = iter([good, good])
-    assert repeat.main(["--times", "2", "--busy", "0"]) == 0
-    assert asked[-2:] == [repeat.ALL, ["c::starts"]]
+    assert repeat.main(["--times", "2", "--busy", "0", "--at-once", "3"]) == 0
+    beside = ("--numprocesses=3", "--dist=loadfile")
+    assert asked[-2:] == [(*beside, *repeat.ALL), (*beside, "c::starts")]
 
 
 def test_the_load_is_there_meanwhile_and_no_longer() -> None:
