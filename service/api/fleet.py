@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field
 from loopwright.service.api import problems
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.job_views import Decision, JobView, LoopView, loop_view
-from loopwright.service.api.paging import LINK, Cursor, Limit, listed, more
+from loopwright.service.api.paging import LINK, Cursor, JobLimit, Limit, listed, more
 from loopwright.service.job_states import JobState
 from loopwright.service.jobs.fleet import BadFleet, Fleet, FleetRequest
 from loopwright.service.jobs.manager import Jobs
@@ -135,7 +135,7 @@ def install(
         summary="The jobs of a loop, latest first",
         responses={**LINK, **problems.responses(404, 422)},
     )
-    def history(tag: Tag, response: Response, limit: Limit = 50, cursor: Cursor = None) -> Response:
+    def history(tag: Tag, response: Response, limit: JobLimit = 50, cursor: Cursor = None) -> Response:
         jobs.directory.owner(tag)
         rows = jobs.store.recent(tag, None, limit + 1, cursor)
         if len(rows) > limit:
@@ -153,7 +153,7 @@ def install(
         response: Response,
         loop: Annotated[str | None, Query(description="Only jobs of this loop", examples=["TIC-101"])] = None,
         state: Annotated[JobState | None, Query(description="Only jobs in this state")] = None,
-        limit: Limit = 50,
+        limit: JobLimit = 50,
         cursor: Cursor = None,
     ) -> Response:
         rows = jobs.store.recent(loop, state, limit + 1, cursor)

@@ -15,6 +15,7 @@ from loopwright.service.api.problems import Responses
 LARGEST = 2**53
 """Maximum of an integer in a query or a header: JSON numbers are exact up to it, and every database can store it."""
 Limit = Annotated[int, Query(ge=1, le=1000, description="Maximum number of entries")]
+JobLimit = Annotated[int, Query(ge=1, le=200, description="Maximum number of jobs, each with its stages and result")]
 Cursor = Annotated[
     int | None, Query(ge=1, le=LARGEST, description="Cursor from the URL of the next page, unchanged", examples=[17])
 ]

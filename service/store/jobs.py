@@ -13,7 +13,7 @@ from loopwright.service.results import FastResult, FiveStageResult
 from loopwright.tuning.reasons import Reason
 
 if TYPE_CHECKING:  # computations and commands know jobs, and have no store
-    from loopwright.service.store.tables import EventRow, JobRow
+    from loopwright.service.store.tables import JobRow
 
 Word = TypeVar("Word", bound=StrEnum)
 
@@ -111,10 +111,6 @@ class JobEvent:
     plant_time_s: float
     kind: str
     data: JsonObject
-
-    @classmethod
-    def from_row(cls, row: EventRow) -> JobEvent:
-        return cls(**{field.name: getattr(row, field.name) for field in fields(cls)})
 
     def stage_begun(self) -> StageBegun | None:
         """Returns what the event says of a stage that has begun; None for an event of another kind."""

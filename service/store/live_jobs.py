@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from sqlalchemy import and_, func, or_, select
 
 from loopwright.service.job_states import ACTIVE, JobState
+from loopwright.service.store.events import events
 from loopwright.service.store.jobs import JobEvent
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import EventRow, JobRow, LoopRow
@@ -114,6 +115,5 @@ def new_events(store: Store, after: Mapping[str, int]) -> Sequence[JobEvent]:
     if not after:
         return []
     of_each = (and_(EventRow.job_id == job_id, EventRow.seq > seq) for job_id, seq in after.items())
-    wanted = select(EventRow).where(or_(*of_each)).order_by(EventRow.job_id, EventRow.seq).limit(_EVENTS_AT_ONCE)
     with store.reading() as session:
-        return [JobEvent.from_row(event) for event in session.scalars(wanted)]
+        return events(session, or_(*of_each), limit=_EVENTS_AT_ONCE)

@@ -31,6 +31,7 @@ from loopwright.service.store.database import (
     postgresql,
     sessions,
 )
+from loopwright.service.store.events import events
 from loopwright.service.store.jobs import Job, JobColumns, JobEvent
 from loopwright.service.store.lock import FolderInUse, FolderLock, HostLock, ourselves
 from loopwright.service.store.tables import ChunkRow, EventRow, HostRow, JobRow, LoopRow, RetuneRow
@@ -403,11 +404,8 @@ class Store:
 
     def events(self, job_id: str, after: int = 0, limit: int | None = None) -> Sequence[JobEvent]:
         """In order; after: only those with a larger number."""
-        wanted = select(EventRow).where(EventRow.job_id == job_id, EventRow.seq > after).order_by(EventRow.seq)
-        if limit is not None:
-            wanted = wanted.limit(limit)
         with self._session() as session:
-            return [JobEvent.from_row(row) for row in session.scalars(wanted)]
+            return events(session, EventRow.job_id == job_id, EventRow.seq > after, limit=limit)
 
     def events_by_job(self, job_ids: Sequence[str], limit: int) -> dict[str, list[JobEvent]]:
         """The first events of each of these jobs, in order: a query for a hundred jobs, not for each."""
@@ -415,9 +413,8 @@ class Store:
         with self._session() as session:
             for begin in range(0, len(job_ids), _JOBS_AT_ONCE):
                 some = job_ids[begin : begin + _JOBS_AT_ONCE]
-                theirs = select(EventRow).where(EventRow.job_id.in_(some), EventRow.seq <= limit)
-                for event in session.scalars(theirs.order_by(EventRow.job_id, EventRow.seq)):
-                    found[event.job_id].append(JobEvent.from_row(event))
+                for event in events(session, EventRow.job_id.in_(some), EventRow.seq <= limit):
+                    found[event.job_id].append(event)
         return found
 
     def restored(self, source: str) -> int:

@@ -117,7 +117,7 @@ async def reads_of_the_database(target: Target) -> None:
     """Asks for lists as fast as they come."""
     reader, writer = await target.open()
     while True:
-        writer.write(target.head("GET", "/jobs?limit=1000"))
+        writer.write(target.head("GET", "/jobs?limit=200"))
         if await target.answered("reads", reader) in ("429", "closed"):
             await asyncio.sleep(PAUSE_S)
 
