@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Body, FastAPI, Path, Request
+from fastapi import Body, FastAPI, Path, Request
 from fastapi.responses import JSONResponse
 
 from loopwright.service.alarms.alarm import Alarm, AlarmList
 from loopwright.service.alarms.watch import FRESH_S, AlarmWatch, NoSuchAlarm
 from loopwright.service.api import problems
-from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.job_views import Decision
+from loopwright.service.api.routes import add, new_router
 
 AlarmId = Annotated[str, Path(description="Id of the alarm", examples=["0f3ac2d9be11"])]
 
 
 def install(app: FastAPI, watch: AlarmWatch) -> None:
     """Adds GET /alarms, GET /alarms/{id} and POST /alarms/{id}/sign-off."""
-    router = APIRouter(tags=["alarms"], route_class=JsonRoute)
+    router = new_router("alarms")
 
     @router.get("/alarms", summary="What is abnormal now, the worst first")
     def alarms() -> AlarmList:
@@ -38,7 +38,7 @@ def install(app: FastAPI, watch: AlarmWatch) -> None:
     def sign_off(alarm_id: AlarmId, decision: Annotated[Decision | None, Body()] = None) -> Alarm:
         return watch.sign_off(alarm_id, (decision or Decision()).by)
 
-    app.include_router(router)
+    add(app, router)
 
     @app.exception_handler(NoSuchAlarm)
     async def _unknown(_request: Request, error: NoSuchAlarm) -> JSONResponse:

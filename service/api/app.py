@@ -50,6 +50,7 @@ from loopwright.service.api.job_views import (
     loop_view,
 )
 from loopwright.service.api.paging import LARGEST
+from loopwright.service.api.routes import add, name_of
 from loopwright.service.api.samples import Reading, csv_text, json_text, parts
 from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.inputs.config import LoopConfig
@@ -124,7 +125,7 @@ def create_app(
         openapi_url=None,  # FastAPI would encode the document for each request; operations.py does it once
         docs_url=None,  # the page would load scripts from a CDN
         redoc_url=None,
-        generate_unique_id_function=lambda route: route.name,  # generated clients name their functions by it
+        generate_unique_id_function=name_of,
     )
     app.router.route_class = JsonRoute
     app.add_middleware(Idempotent, keys=IdempotencyKeys(jobs.store))
@@ -329,19 +330,19 @@ def create_app(
 
     app.mount("/ui", Pages(), name="page")
     app.add_route("/", lambda _: RedirectResponse("/ui/"), include_in_schema=False)
-    app.include_router(sessions.router(jobs.store, key_checks, policy.sessions))
-    app.include_router(decisions.router(jobs))
-    app.include_router(locks.router(jobs.locking))
+    add(app, sessions.router(jobs.store, key_checks, policy.sessions))
+    add(app, decisions.router(jobs))
+    add(app, locks.router(jobs.locking))
     pool = pool or Pool()
-    app.include_router(history.router(jobs.directory, listening))
-    app.include_router(sparklines.router(jobs.directory, listening))
-    app.include_router(observation.router(jobs, readings, listening, pool))
+    add(app, history.router(jobs.directory, listening))
+    add(app, sparklines.router(jobs.directory, listening))
+    add(app, observation.router(jobs, readings, listening, pool))
     live = live or Live(jobs, listening, alarms, others)
-    app.include_router(gateways.router(jobs.directory, own, others))
-    app.include_router(live_api.router(live, jobs.directory, keyring, policy.sessions))
-    app.include_router(previews.router(jobs, many))
-    app.include_router(tunings.router(jobs, pool))
+    add(app, gateways.router(jobs.directory, own, others))
+    add(app, live_api.router(live, jobs.directory, keyring, policy.sessions))
+    add(app, previews.router(jobs, many))
+    add(app, tunings.router(jobs, pool))
     figures = figures or KeptFigures(jobs.store, pool)
-    app.include_router(job_figures.router(jobs, figures))
-    app.include_router(reports.router(jobs, figures, pool, view))
+    add(app, job_figures.router(jobs, figures))
+    add(app, reports.router(jobs, figures, pool, view))
     return app

@@ -10,8 +10,8 @@ from fastapi import APIRouter, Query, Response
 from pydantic import AwareDatetime, BaseModel, Field
 
 from loopwright.service.api import problems
-from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.paging import LINK, Cursor, Limit, more
+from loopwright.service.api.routes import new_router
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.loop_state import gains_of
 from loopwright.service.results import GainsView
@@ -49,7 +49,7 @@ class DecisionView(BaseModel):
 
 def router(jobs: Jobs) -> APIRouter:
     """A router with GET /decisions."""
-    routes = APIRouter(tags=["jobs"], route_class=JsonRoute)
+    routes = new_router("jobs")
 
     @routes.get(
         "/decisions",

@@ -6,14 +6,14 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Body, FastAPI, Path, Query, Request, Response
+from fastapi import Body, FastAPI, Path, Query, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 
 from loopwright.service.api import problems
-from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.job_views import Decision, JobView, LoopView, loop_view
 from loopwright.service.api.paging import LINK, Cursor, JobLimit, Limit, listed, more
+from loopwright.service.api.routes import add, new_router
 from loopwright.service.job_states import JobState
 from loopwright.service.jobs.fleet import BadFleet, Fleet, FleetRequest
 from loopwright.service.jobs.manager import Jobs
@@ -91,7 +91,7 @@ def install(
         settings = None if others.values(tag, host).on_trial else others.settings(tag, host)
         return None if settings is None else settings.gains.gains()
 
-    router = APIRouter(route_class=JsonRoute)
+    router = new_router()
 
     @router.get(
         "/loops",
@@ -205,7 +205,7 @@ def install(
         fleet.abort(retune_id, (decision or Decision()).by)
         return _view(*fleet.get(retune_id))
 
-    app.include_router(router)
+    add(app, router)
 
     @app.exception_handler(BadFleet)
     async def _bad(_request: Request, error: BadFleet) -> JSONResponse:

@@ -9,8 +9,8 @@ from fastapi import APIRouter
 from pydantic import BaseModel, Field
 
 from loopwright.service.api import problems
-from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.job_views import LiveErrorView, LiveView
+from loopwright.service.api.routes import new_router
 from loopwright.service.errors import GatewayLost
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.jobs.loop_directory import LoopDirectory
@@ -54,7 +54,7 @@ class GatewayView(BaseModel):
 
 def router(directory: LoopDirectory, own: OwnGateway, others: OtherGateways) -> APIRouter:
     """A router with GET /gateways."""
-    routes = APIRouter(tags=["operations"], route_class=JsonRoute)
+    routes = new_router("operations")
 
     @routes.get(
         "/gateways",

@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field
 
 from loopwright.protocol.profile import Mode
 from loopwright.service.api import problems
-from loopwright.service.api.bodies import JsonRoute
+from loopwright.service.api.routes import new_router
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.listening.bins import Bins, decimals
@@ -86,7 +86,7 @@ class HistoryView(BaseModel):
 
 def router(directory: LoopDirectory, listening: Listening) -> APIRouter:
     """A router with GET /loops/{tag}/history."""
-    routes = APIRouter(tags=["loops"], route_class=JsonRoute)
+    routes = new_router("loops")
 
     @routes.get(
         "/loops/{tag}/history",

@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field
 
 from loopwright.protocol.profile import Mode
 from loopwright.service.api import problems
-from loopwright.service.api.bodies import JsonRoute
+from loopwright.service.api.routes import new_router
 from loopwright.service.errors import Conflict, Stopping
 from loopwright.service.execution.computing.pool import NotWanted
 from loopwright.service.jobs.alternatives import designable
@@ -86,7 +86,7 @@ async def figures_of(jobs: Jobs, figures: KeptFigures, job_id: str) -> tuple[Job
 
 def router(jobs: Jobs, figures: KeptFigures) -> APIRouter:
     """A router with GET /jobs/{job_id}/record and GET /jobs/{job_id}/designs."""
-    routes = APIRouter(tags=["jobs"], route_class=JsonRoute)
+    routes = new_router("jobs")
 
     @routes.get(
         "/jobs/{job_id}/record",

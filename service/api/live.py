@@ -10,8 +10,8 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import StreamingResponse
 
 from loopwright.service.api import problems
-from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.events import still_permitted
+from loopwright.service.api.routes import new_router
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.live.live import MOST_BACK_S, Live
 from loopwright.service.security.principal import current
@@ -24,7 +24,7 @@ _EVENT_ID = re.compile(r"([0-9a-f]{1,32})\.([0-9]{1,9})")
 
 def router(live: Live, directory: LoopDirectory, keyring: Keyring | None, sessions: BrowserSessions) -> APIRouter:
     """A router with GET /live. keyring: None where no keys are asked for."""
-    routes = APIRouter(tags=["live"], route_class=JsonRoute)
+    routes = new_router("live")
 
     @routes.get(
         "/live",

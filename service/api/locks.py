@@ -8,8 +8,8 @@ from fastapi import APIRouter, Body, Path
 from pydantic import BaseModel, ConfigDict, Field
 
 from loopwright.service.api import problems
-from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.job_views import Decision, LockView
+from loopwright.service.api.routes import new_router
 from loopwright.service.jobs.locking import Locking
 
 _ONE_LINE = r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$"
@@ -53,7 +53,7 @@ class UnlockedView(BaseModel):
 
 def router(locking: Locking) -> APIRouter:
     """A router with POST /loops/{tag}/lock and POST /loops/{tag}/unlock."""
-    routes = APIRouter(tags=["loops"], route_class=JsonRoute)
+    routes = new_router("loops")
 
     @routes.post(
         "/loops/{tag}/lock",

@@ -10,8 +10,8 @@ from fastapi import APIRouter, Path, Query, Request
 from fastapi.concurrency import run_in_threadpool
 
 from loopwright.service.api import problems
-from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.computed import computed
+from loopwright.service.api.routes import new_router
 from loopwright.service.errors import Conflict
 from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.jobs.manager import Jobs
@@ -25,7 +25,7 @@ from loopwright.tuning.fast.design import DesignSpec
 
 def router(jobs: Jobs, readings: SharedReading[LoopState | None], listening: Listening, pool: Pool) -> APIRouter:
     """A router with GET /loops/{tag}/observation. readings: the present states of loops.  pool: computes the answer."""
-    routes = APIRouter(tags=["loops"], route_class=JsonRoute)
+    routes = new_router("loops")
 
     @routes.get(
         "/loops/{tag}/observation",

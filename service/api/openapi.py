@@ -50,6 +50,7 @@ def _complete(document: Document) -> None:
             "machine needs no key, unless it was started with --auth.",
         }
     }
+    schemas["schemas"] = problems.schemas() | schemas["schemas"]
     for never_answered in ("HTTPValidationError", "ValidationError"):
         schemas["schemas"].pop(never_answered, None)
     for path, item in document["paths"].items():

@@ -11,7 +11,7 @@ from functools import cache
 from typing import Annotated
 from urllib.parse import urlencode
 
-from fastapi import APIRouter, FastAPI, Query, Response
+from fastapi import FastAPI, Query, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import BaseModel, Field
 
@@ -20,6 +20,7 @@ from loopwright.service.api import metrics, problems
 from loopwright.service.api.docs_page import POLICY, page
 from loopwright.service.api.openapi_document import as_document
 from loopwright.service.api.paging import LARGEST
+from loopwright.service.api.routes import add, new_router
 from loopwright.service.jobs.aftercare import NotHome
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.loops.bus_watch import BusWatch
@@ -165,7 +166,7 @@ def install(
     app: FastAPI, jobs: Jobs, parts: Mapping[str, Check], sdo_retries: Mapping[str, int], alarms: AlarmWatch
 ) -> None:
     """Adds the routes. parts: the checks of /readyz.  sdo_retries: SDO retries by bus."""
-    router = APIRouter(tags=["operations"])
+    router = new_router("operations")
     readiness = Readiness(parts, lambda: loops_looked_after(jobs))
     counted = metrics.registry(jobs.directory.loops, jobs.store, sdo_retries, alarms.counts)
 
@@ -209,7 +210,7 @@ def install(
             more = f"/audit?{urlencode({k: v for k, v in query.items() if v is not None})}"
         return AuditPage(entries=[_view(row) for row in page_of], next=more)
 
-    app.include_router(router)
+    add(app, router)
 
     # Encoded once: clients need no key for them, and each encoding holds the interpreter lock for milliseconds.
     made_once = cache(lambda: (json.dumps(app.openapi()).encode(), page(as_document(app.openapi())).encode()))

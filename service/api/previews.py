@@ -8,6 +8,7 @@ from typing import Annotated
 from fastapi import APIRouter, Body, Path
 
 from loopwright.service.api import problems
+from loopwright.service.api.routes import new_router
 from loopwright.service.inputs.request import FastRetune, RetuneRequest
 from loopwright.service.jobs.fleet import Fleet, FleetRequest
 from loopwright.service.jobs.manager import Jobs
@@ -23,7 +24,7 @@ Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 
 def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
     """A router with POST /loops/{tag}/retune/preview and POST /retunes/preview."""
-    routes = APIRouter()
+    routes = new_router()
 
     @routes.post(
         "/loops/{tag}/retune/preview",

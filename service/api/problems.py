@@ -7,14 +7,16 @@ from http import HTTPStatus
 from typing import Any
 
 from fastapi import FastAPI, Request, Response
+from fastapi.encoders import jsonable_encoder
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
+from pydantic.json_schema import models_json_schema
 from sqlalchemy.exc import DataError, SQLAlchemyError
 from starlette.exceptions import HTTPException
 
 from loopwright.service.api.bodies import BadBody
-from loopwright.service.api.openapi_document import DocumentedResponse, MediaType
+from loopwright.service.api.openapi_document import DocumentedResponse, MediaType, Schema
 from loopwright.service.errors import Conflict, Locked, NotKnown, RemoteSetpoint, Stopping, UnknownLoop
 from loopwright.service.execution.computing.pool import NotWanted
 from loopwright.service.inputs.model_json import BadModel
@@ -183,15 +185,26 @@ def install(app: FastAPI) -> None:
         return problem(500, f"{type(error).__name__}: {error}", reason=Reason.INTERNAL)
 
 
+_REFERENCE: MediaType = {"schema": {"$ref": "#/components/schemas/Problem"}}
+
+
 def responses(*statuses: int) -> Responses:
-    """The documented error responses of a route with these statuses."""
-    content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
-    return {
-        status: {"model": Problem, "content": content, "description": HTTPStatus(status).phrase} for status in statuses
-    }
+    """The documented error responses of a route with these statuses.
+
+    They refer to the schema that `schemas` adds: with a model, FastAPI would make a field for each of them, one by one.
+    """
+    content = {MEDIA_TYPE: _REFERENCE, "application/json": _REFERENCE}
+    return {status: {"content": content, "description": HTTPStatus(status).phrase} for status in statuses}
+
+
+def schemas() -> dict[str, Schema]:
+    """The schemas of a problem by name, for the components of an OpenAPI document."""
+    _, found = models_json_schema([(Problem, "serialization")], ref_template="#/components/schemas/{model}")
+    made: dict[str, Schema] = jsonable_encoder(found["$defs"], exclude_none=True)  # as FastAPI encodes the document
+    return made
 
 
 def documented(*statuses: int) -> dict[int, DocumentedResponse]:
     """The same responses for an OpenAPI document that FastAPI has already generated."""
-    content: dict[str, MediaType] = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    content = {MEDIA_TYPE: _REFERENCE}
     return {status: {"content": content, "description": HTTPStatus(status).phrase} for status in statuses}

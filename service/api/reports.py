@@ -11,11 +11,11 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import HTMLResponse
 
 from loopwright.service.api import problems
-from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.computed import computed
 from loopwright.service.api.job_figures import JobId, figures_of
 from loopwright.service.api.job_views import JobView
 from loopwright.service.api.report.paper import POLICY, ReportSource, paper
+from loopwright.service.api.routes import new_router
 from loopwright.service.errors import UnknownLoop
 from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.inputs.config import LoopConfig
@@ -40,7 +40,7 @@ def router(jobs: Jobs, figures: KeptFigures, pool: Pool, view: Callable[[Job], J
     pool: writes the reports.
     view: the view of a job, as GET /jobs/{job_id} has it.
     """
-    routes = APIRouter(tags=["jobs"], route_class=JsonRoute)
+    routes = new_router("jobs")
 
     @routes.get(
         "/jobs/{job_id}/report",

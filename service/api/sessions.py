@@ -12,10 +12,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.service.api import problems
-from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.gate.cookies import cookie_name, from_elsewhere
 from loopwright.service.api.gate.key_checks import KeyChecks, TooOften
 from loopwright.service.api.gate.limits import Buckets, retry_after
+from loopwright.service.api.routes import new_router
 from loopwright.service.security.keys import Scope, key_id_of
 from loopwright.service.security.principal import Principal, current
 from loopwright.service.security.sessions import LASTS_S, BrowserSessions
@@ -78,7 +78,7 @@ class _Refusals:
 
 def router(store: Store, checks: KeyChecks | None, open_sessions: BrowserSessions) -> APIRouter:
     """A router with GET, POST and DELETE /session. checks: None where no keys are asked for."""
-    routes = APIRouter(tags=["operations"], route_class=JsonRoute)
+    routes = new_router("operations")
     refusals = _Refusals(store)
 
     def view(who: Principal, csrf: str | None) -> SessionView:

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Query
 from pydantic import BaseModel, Field
 
 from loopwright.service.api import problems
-from loopwright.service.api.bodies import JsonRoute
+from loopwright.service.api.routes import new_router
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.listening.bins import Bins, decimals
 from loopwright.service.listening.listening import Listening
@@ -39,7 +39,7 @@ class SparklinesView(BaseModel):
 
 def router(directory: LoopDirectory, listening: Listening) -> APIRouter:
     """A router with GET /history."""
-    routes = APIRouter(tags=["loops"], route_class=JsonRoute)
+    routes = new_router("loops")
 
     @routes.get(
         "/history", summary="PV and set-point of all loops in the last minutes", responses=problems.responses(422)

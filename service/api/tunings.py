@@ -10,8 +10,8 @@ from fastapi import APIRouter, Path, Query, Request
 from fastapi.concurrency import run_in_threadpool
 
 from loopwright.service.api import problems
-from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.computed import computed
+from loopwright.service.api.routes import new_router
 from loopwright.service.api.tuning_views import AlternativesView, MethodView, TuningRequest, TuningsView
 from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.jobs.alternatives import alternatives, redesigned
@@ -24,7 +24,7 @@ from loopwright.tuning.fast.procedure import FAST
 
 def router(jobs: Jobs, pool: Pool) -> APIRouter:
     """A router with GET /methods, POST /tunings and GET /jobs/{job_id}/alternatives. pool: computes the tunings."""
-    routes = APIRouter(route_class=JsonRoute)
+    routes = new_router()
 
     @routes.get("/methods", tags=["tunings"], summary="The tuning methods")
     def methods() -> list[MethodView]:

@@ -21,7 +21,10 @@ from tests.unit.service.fakes import TAG, FakeController, FakeLoop, FakeTune, Se
 from tests.unit.service.postgres import Server
 
 JSON = {"Content-Type": "application/json"}
-POSTS = [f"/loops/{TAG}/retune", "/retunes", "/tunings", "/jobs/none/abort", f"/loops/{TAG}/dismiss"]
+POSTS = [
+    f"/loops/{TAG}/retune", f"/loops/{TAG}/retune/preview", "/retunes", "/tunings", "/jobs/none/abort",
+    f"/loops/{TAG}/dismiss",
+]  # fmt: skip
 
 
 def refused(client: TestClient, url: str, body: str | bytes, **headers: str) -> Any:
@@ -31,8 +34,16 @@ def refused(client: TestClient, url: str, body: str | bytes, **headers: str) -> 
 
 
 def test_every_route_with_a_body_reads_it_strictly(service: Service) -> None:
-    found = [route for route in create_app(service.jobs).routes if isinstance(route, APIRoute) and route.body_field]
-    assert found and all(isinstance(route, JsonRoute) for route in found)
+    app = create_app(service.jobs)
+    found = [route for route in app.routes if isinstance(route, APIRoute) and route.body_field]
+    assert all(isinstance(route, JsonRoute) for route in found)
+    documented = {
+        (method.upper(), path)
+        for path, operations in app.openapi()["paths"].items()
+        for method, operation in operations.items()
+        if "requestBody" in operation
+    }
+    assert {(method, route.path) for route in found for method in route.methods} == documented != set()
 
 
 def test_a_key_given_twice_starts_nothing(client: TestClient, service: Service) -> None:
@@ -64,9 +75,9 @@ def test_a_key_given_twice_starts_nothing(client: TestClient, service: Service) 
     ],
     ids=lambda body: repr(body[:20]),
 )
-def test_what_is_no_body_is_422_everywhere(client: TestClient, url: str, body: bytes) -> None:
+def test_what_is_no_body_is_422_everywhere(shared_client: TestClient, url: str, body: bytes) -> None:
     too_long = kind_of("POST", url) in DECIDES and len(body) > SMALL
-    assert refused(client, url, body).status_code == (413 if too_long else 422)
+    assert refused(shared_client, url, body).status_code == (413 if too_long else 422)
 
 
 def test_a_body_with_a_byte_order_mark_is_read(client: TestClient) -> None:
@@ -75,21 +86,27 @@ def test_a_body_with_a_byte_order_mark_is_read(client: TestClient) -> None:
 
 
 @pytest.mark.parametrize("kind", ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data", ""])
-def test_a_body_that_is_not_said_to_be_json(client: TestClient, kind: str) -> None:
-    answer = refused(client, POSTS[0], b"{}", **{"Content-Type": kind})
+def test_a_body_that_is_not_said_to_be_json(shared_client: TestClient, kind: str) -> None:
+    answer = refused(shared_client, POSTS[0], b"{}", **{"Content-Type": kind})
     assert answer.status_code == 415 and "Content-Type: application/json" in answer.json()["detail"]
+
+
+@pytest.fixture(scope="module")
+def ended(shared_service: Service) -> str:
+    """A job that is over."""
+    job = shared_service.jobs.start(TAG, FastRetune()).id
+    shared_service.wait(job)
+    return job
 
 
 @pytest.mark.parametrize("number", ["9" * 400, str(2**63), str(2**63 - 1), "-1", "abc", "1.5", "1e3", "٣", ""])
 @pytest.mark.parametrize("what", ["event", "/jobs?limit=", "/jobs?cursor=", "/retunes?cursor=", "/audit?before="])
-def test_whole_numbers_out_of_all_bounds(client: TestClient, service: Service, number: str, what: str) -> None:
+def test_whole_numbers_out_of_all_bounds(shared_client: TestClient, ended: str, number: str, what: str) -> None:
     if what == "event":
-        job = service.jobs.start(TAG, FastRetune()).id
-        service.wait(job)
         headers = {"Last-Event-ID": number.encode()}
-        answer = client.get(f"/jobs/{job}/events", headers=headers)
+        answer = shared_client.get(f"/jobs/{ended}/events", headers=headers)
     else:
-        answer = client.get(what + number)
+        answer = shared_client.get(what + number)
     assert answer.status_code == 422, answer.text
 
 
