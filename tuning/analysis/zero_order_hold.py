@@ -42,17 +42,19 @@ class Pulses:
 
     def drive(self, u: Reals, count: int | None = None) -> Reals:
         """The first `count` states under u, 0 before the first sample, shape (plants, len(u), states)."""
-        forward = self.forward[:, :, :count]
-        plants, taps = forward.shape[:2]
+        forward = np.swapaxes(self.forward[:, :, :count], 1, 2)
+        plants, _, taps = forward.shape
         # one recursion for all states of a plant; what tells them apart is a short sum over its last values
-        common = np.zeros((plants, len(u) + taps - 2))
-        for row, recursion, delay in zip(common, self.recursion, self.delay, strict=True):
-            if (length := len(u) - 1 - int(delay)) > 0:
+        common = np.zeros((plants, 1, len(u) + taps - 2))
+        for row, recursion, delay in zip(common[:, 0], self.recursion, self.delay.tolist(), strict=True):
+            if (length := len(u) - 1 - delay) > 0:
                 row[len(row) - length :] = recursive(recursion, u[:length])
-        out = common[:, : len(u), None] * forward[:, None, -1]
+        # time runs along the last axis until all is summed: numpy is slow along an axis of two or three states
+        driven = common[:, :, : len(u)] * forward[:, :, -1:]
+        tap = np.empty_like(driven)
         for k in range(1, taps - 1):
-            out += common[:, k : k + len(u), None] * forward[:, None, -1 - k]
-        return np.asarray(out)
+            driven += np.multiply(common[:, :, k : k + len(u)], forward[:, :, -1 - k, None], out=tap)
+        return np.ascontiguousarray(np.swapaxes(driven, 1, 2))
 
 
 def states(monic: Reals, L: float, u: Reals, count: int) -> Reals:
@@ -102,6 +104,6 @@ def _characteristic(phi: Reals) -> Reals:
     carried = np.broadcast_to(one, phi.shape)
     for k in range(1, order + 1):
         product = phi @ carried
-        found[:, k] = -np.trace(product, axis1=1, axis2=2) / k
+        found[:, k] = -product.trace(axis1=1, axis2=2) / k
         carried = product + found[:, k, None, None] * one
     return found
