@@ -53,6 +53,21 @@ def client(service: Service) -> Iterator[TestClient]:
         yield client
 
 
+@pytest.fixture(scope="module")
+def shared_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """A service for the tests of a module that change nothing of it."""
+    service = Service(tmp_path_factory.mktemp("shared"))
+    yield service
+    service.close()
+
+
+@pytest.fixture(scope="module")
+def shared_client(shared_service: Service) -> Iterator[TestClient]:
+    """Its client, for requests that are refused or read only: to make an application takes 0.1 s of processor time."""
+    with TestClient(create_app(shared_service.jobs), raise_server_exceptions=False) as client:
+        yield client
+
+
 @pytest.fixture(scope="session")
 def postgres() -> Iterator[Server]:
     """A private server. Skipped where there is none to start, but not where the tests must be complete."""

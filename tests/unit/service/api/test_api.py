@@ -172,10 +172,10 @@ def test_absent_node(service: Service, client: TestClient) -> None:
         ({"plant": {"num": [1], "den": [1, 1]}}, "bad_input", "dry run"),
     ],
 )
-def test_bad_requests(client: TestClient, body: dict[str, Any], reason: str, words: str) -> None:
-    problem = assert_problem(client.post(f"/loops/{TAG}/retune", json=body), 422)
+def test_bad_requests(shared_client: TestClient, body: dict[str, Any], reason: str, words: str) -> None:
+    problem = assert_problem(shared_client.post(f"/loops/{TAG}/retune", json=body), 422)
     assert problem["reason"] == reason and words in problem["detail"]
-    assert client.get("/jobs").json() == []
+    assert shared_client.get("/jobs").json() == []
 
 
 def test_the_request_kept_has_the_options_of_its_method_alone(service: Service, client: TestClient) -> None:
@@ -186,20 +186,20 @@ def test_the_request_kept_has_the_options_of_its_method_alone(service: Service, 
 
 
 @pytest.mark.parametrize("body", ['{"sp_deviation": NaN}', '{"mv_low": Infinity}', "{", "[]"])
-def test_nan_and_nonsense_are_problems(client: TestClient, body: str) -> None:
-    answer = client.post(f"/loops/{TAG}/retune", content=body, headers={"content-type": "application/json"})
+def test_nan_and_nonsense_are_problems(shared_client: TestClient, body: str) -> None:
+    answer = shared_client.post(f"/loops/{TAG}/retune", content=body, headers={"content-type": "application/json"})
     assert_problem(answer, 422)
 
 
 @pytest.mark.parametrize("path", ["/loops/NONE", "/jobs/none", "/jobs/none/events", "/jobs/none/samples", "/nowhere"])
-def test_not_found(client: TestClient, path: str) -> None:
-    assert_problem(client.get(path), 404)
+def test_not_found(shared_client: TestClient, path: str) -> None:
+    assert_problem(shared_client.get(path), 404)
 
 
-def test_other_http_errors_are_problems(client: TestClient) -> None:
-    assert_problem(client.delete("/loops"), 405)
-    assert_problem(client.get("/jobs?limit=0"), 422)
-    assert_problem(client.post("/loops/NONE/retune", json={}), 404)
+def test_other_http_errors_are_problems(shared_client: TestClient) -> None:
+    assert_problem(shared_client.delete("/loops"), 405)
+    assert_problem(shared_client.get("/jobs?limit=0"), 422)
+    assert_problem(shared_client.post("/loops/NONE/retune", json={}), 404)
 
 
 def test_samples_as_columns_and_as_csv(service: Service, client: TestClient) -> None:

@@ -77,14 +77,14 @@ def test_a_refusal_is_an_answer(client: TestClient) -> None:
         ({"model": {"K": 2, "T_s": 1, "L_s": 1}, "surplus": 1}, "surplus"),
     ],
 )
-def test_bad_requests(client: TestClient, body: dict[str, Any], words: str) -> None:
-    problem = assert_problem(client.post("/tunings", json=body), 422)
+def test_bad_requests(shared_client: TestClient, body: dict[str, Any], words: str) -> None:
+    problem = assert_problem(shared_client.post("/tunings", json=body), 422)
     assert problem["reason"] == "bad_input" and words in problem["detail"]
 
 
-def test_nan_is_a_problem(client: TestClient) -> None:
+def test_nan_is_a_problem(shared_client: TestClient) -> None:
     text = '{"model": {"K": NaN, "T_s": 1, "L_s": 1}}'
-    answer = client.post("/tunings", content=text, headers={"content-type": "application/json"})
+    answer = shared_client.post("/tunings", content=text, headers={"content-type": "application/json"})
     assert "body.model.K: NaN" in assert_problem(answer, 422)["detail"]
 
 
