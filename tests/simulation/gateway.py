@@ -240,16 +240,28 @@ class SimStore(Store):
         super().__init__(folder)
         self.on_statement: Callable[[str], None] | None = None
         self.on_move: Callable[[Job, JobState], None] | None = None
+        self._seen: list[Job] | None = None
         event.listen(self.engine, "before_cursor_execute", self._before_statement)
         event.listen(self.engine, "commit", self._before_commit)
+        event.listen(self._reserve, "commit", self._forget)
 
     def _before_statement(self, *_: object) -> None:
         if self.on_statement is not None:
             self.on_statement("database")
 
-    def _before_commit(self, _: object) -> None:
+    def _forget(self, _: object) -> None:
+        self._seen = None
+
+    def _before_commit(self, connection: object) -> None:
+        self._forget(connection)
         if self.on_statement is not None:
             self.on_statement("commit")
+
+    def seen(self) -> list[Job]:
+        """The latest jobs as an observer sees them, the latest last; read again only after something was written."""
+        if self._seen is None:
+            self._seen = list(reversed(self.recent()))
+        return self._seen
 
     def empty(self) -> None:
         self.on_statement = self.on_move = None
@@ -404,7 +416,10 @@ class Gateway:
         return True
 
     def rows(self) -> list[Job]:
-        return list(reversed(self.store.recent()))
+        return self.store.seen()
+
+    def state_of(self, job_id: str) -> str:
+        return next(row.state for row in self.rows() if row.id == job_id)
 
     def busy(self) -> bool:
         return any(row.state in ACTIVE for row in self.rows())

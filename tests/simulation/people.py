@@ -87,13 +87,12 @@ class Person:
             self._wait(self._abort_s)
             if self.gateway.is_up:
                 self._ask("abort", lambda jobs: jobs.abort(job_id, "person"))
-        store = self.gateway.store
-        while store.get(job_id).state in ACTIVE:
+        while self.gateway.state_of(job_id) in ACTIVE:
             if not self.gateway.wait_until_up():
                 return
             self._wait(_LOOK_S)
         for decision in self._decisions:
-            if store.get(job_id).state not in ("proposed", "accepted") or not self._decide(job_id, decision):
+            if self.gateway.state_of(job_id) not in ("proposed", "accepted") or not self._decide(job_id, decision):
                 return
 
     def _start(self) -> str | None:
