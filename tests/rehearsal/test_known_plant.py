@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -39,6 +40,7 @@ T95_S = 40.0
 FROM_OPERATION = [0.8, -0.3, 0.6, 0.0]
 
 
+@cache
 def heard_of(plant: Plant, gains: Gains, together: int = 1) -> ObservedPlant:
     """What operation shows of a plant. together: the number of samples of which the history has means."""
     stretch = operated(plant, gains, changes(FROM_OPERATION, 200.0))
