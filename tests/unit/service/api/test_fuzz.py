@@ -12,11 +12,13 @@ import os
 import warnings
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import ExitStack
 from datetime import timedelta
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
+from anyio.from_thread import start_blocking_portal
 from fastapi.testclient import TestClient
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -95,6 +97,9 @@ class Site:
         live.close()  # its streams, which would never end, end after their first messages
         app = create_app(self.service.jobs, policy, listening=listening, live=live)
         self.client = TestClient(app, raise_server_exceptions=False)
+        self._open = ExitStack()
+        # One event loop for all cases: the client would make one, in a thread of its own, for each.
+        self.client.portal = self._open.enter_context(start_blocking_portal())
         self.keys = {scope.value: keyring.create(scope, scope)[1] for scope in Scope}
         self.keys["expired"] = keyring.create("old", Scope.ADMIN, timedelta(days=-1))[1]
         revoked, self.keys["revoked"] = keyring.create("revoked", Scope.ADMIN)
@@ -148,6 +153,7 @@ class Site:
 
     def close(self) -> None:
         self.client.close()
+        self._open.close()
         self.service.close()
 
 
