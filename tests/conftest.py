@@ -15,6 +15,7 @@ import pytest
 
 from loopwright.service.cli.demo import vcan_usable
 
+gc.disable()  # until all tests are collected: next to nothing becomes garbage, and each collection goes through all
 _STARTERS = {
     "subprocess",
     "multiprocessing",
@@ -50,6 +51,7 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000, 20, 50)
+    gc.enable()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
