@@ -27,18 +27,20 @@ class ChildProcess:
         self._log = log
         self._ready = threading.Event()
         self.ready = ""
-        command = [sys.executable, "-u", "-m", *arguments]
         self._errors = log.open("ab")
-        self._process = subprocess.Popen(
-            command,
+        self._process = self._start(arguments, own_group)
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _start(self, arguments: Sequence[str], own_group: bool) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [sys.executable, "-u", "-m", *arguments],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=self._errors,
             text=True,
             process_group=0 if own_group else None,
         )
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
 
     def _read(self) -> None:
         assert self._process.stdout is not None

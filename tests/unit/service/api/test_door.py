@@ -17,6 +17,7 @@ from loopwright.service.security.keys import Scope
 from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Store
 from tests.unit.service.fakes import TAG
+from tests.unit.service.forked import ForkedGateway
 from tests.unit.service.gateway import HOME, read_loop
 
 pytestmark = pytest.mark.timeout(300)  # processes that start slowly on a busy machine
@@ -43,7 +44,7 @@ class Door:
                     )
                 )  # fmt: skip
         arguments = [str(folder), f"--tag={TAG}", f"--on-bus={SILENT}", f"--limits={json.dumps(limits)}"]
-        self.process = ChildProcess(
+        self.process = ForkedGateway(
             "gateway", ("tests.unit.service.gateway", *arguments, *(["--auth"] if auth else [])), folder / "gateway.log"
         )
         stack.callback(self.process.stop)

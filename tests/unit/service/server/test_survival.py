@@ -20,6 +20,7 @@ from loopwright.service.cli.child_process import ChildProcess, NotReady
 from loopwright.service.store.database import WAIT_S
 from loopwright.service.store.tables import EventRow
 from tests.unit.service.fakes import NEW, OLD, TAG
+from tests.unit.service.forked import ForkedGateway
 from tests.unit.service.gateway import HOME, STAGES, read_loop
 from tests.unit.service.postgres import Server
 from tests.unit.service.processes import until
@@ -53,7 +54,7 @@ class Gateway:
 
     def launch(self, *more: str) -> ChildProcess:
         arguments = ("tests.unit.service.gateway", str(self.folder), *self._arguments, *more)
-        process = ChildProcess("gateway", arguments, self.folder / "gateway.log")
+        process = ForkedGateway("gateway", arguments, self.folder / "gateway.log")
         self._stack.callback(process.stop)
         return process
 
@@ -78,7 +79,7 @@ class Gateway:
             if answer.status_code == 200 and wanted(answer.json()):
                 return dict(answer.json())
             assert time.monotonic() < deadline, answer.text
-            time.sleep(0.02)
+            time.sleep(0.05)  # each look takes the service some ms of processor time
 
     def in_stage(self, url: str, stage: str) -> dict[str, Any]:
         """Runs the job up to the middle of a stage: the loop is on trial, and the API says which stage it is."""
@@ -157,7 +158,7 @@ def test_a_second_service_on_the_same_data_is_told_who_has_it(
         other = tmp_path / "other"
         other.mkdir()
         arguments = ("tests.unit.service.gateway", str(other), f"--tag={TAG}", f"--database={database}")
-        second = ChildProcess("second", arguments, tmp_path / "second.log")
+        second = ForkedGateway("second", arguments, tmp_path / "second.log")
         stack.callback(second.stop)
     with pytest.raises(NotReady) as refused:
         second.wait_ready(180)
@@ -284,7 +285,7 @@ def another(stack: ExitStack, folder: Path, database: str) -> ChildProcess:
     """A gateway of the same name with a data folder of its own."""
     (folder / "other").mkdir()
     arguments = ("tests.unit.service.gateway", str(folder / "other"), f"--tag={TAG}", f"--database={database}")
-    process = ChildProcess("another", arguments, folder / "another.log")
+    process = ForkedGateway("another", arguments, folder / "another.log")
     stack.callback(process.stop)
     return process
 

@@ -1,0 +1,151 @@
+"""Gateways forked from one process that has everything loaded: a start costs a tenth of the processor time.
+
+    python -m tests.unit.service.forked FD
+
+Each is a process of its own with its own log, and is killed like any other. What a start of the service itself does
+until it is ready is the subject of test_start.py and test_stop.py, which start it anew.
+"""
+
+from __future__ import annotations
+
+import atexit
+import gc
+import json
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from functools import cache
+
+from loopwright.service.cli.child_process import ChildProcess
+
+MODULE = "tests.unit.service.gateway"
+_MESSAGE = 65_536
+_KILLED = -signal.SIGKILL
+
+
+class _Forked:
+    """What `ChildProcess` needs of a subprocess.Popen. told: where the parent writes its pid, then its exit status."""
+
+    def __init__(self, told: socket.socket, output: int) -> None:
+        self._told = told
+        self.stdout = os.fdopen(output, encoding="utf-8")
+        self.returncode: int | None = None
+        self.pid = int(told.recv(_MESSAGE))
+
+    def poll(self) -> int | None:
+        try:
+            return self.wait(0.0)
+        except subprocess.TimeoutExpired:
+            return None
+
+    def wait(self, timeout: float | None = None) -> int:
+        if self.returncode is None:
+            self._told.settimeout(timeout)
+            try:
+                self.returncode = int(self._told.recv(_MESSAGE) or _KILLED)
+            except (BlockingIOError, TimeoutError):
+                raise subprocess.TimeoutExpired(MODULE, timeout or 0.0) from None
+            self._told.close()
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def terminate(self) -> None:
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+
+class ForkedGateway(ChildProcess):
+    """tests.unit.service.gateway with these arguments."""
+
+    def _start(self, arguments: Sequence[str], own_group: bool) -> subprocess.Popen[str]:
+        assert arguments[0] == MODULE and not own_group
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        read, write = os.pipe()
+        with theirs:
+            socket.send_fds(
+                _parent(), [json.dumps(arguments[1:]).encode()], [write, self._errors.fileno(), theirs.fileno()]
+            )
+        os.close(write)
+        return _Forked(ours, read)  # type: ignore[return-value]
+
+
+@cache
+def _parent() -> socket.socket:
+    """The connection to the process that forks, which ends with this one."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with theirs:
+        command = [sys.executable, "-u", "-m", __name__, str(theirs.fileno())]
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()])
+
+    def end() -> None:
+        ours.close()
+        process.wait()
+
+    atexit.register(end)
+    return ours
+
+
+def arguments_of_a_fork(asked: socket.socket) -> list[str]:
+    """Forks as often as it is asked to, and returns in each child. In the parent it ends with the connection."""
+    woken, wakes = socket.socketpair()
+    for each in (woken, wakes):
+        each.setblocking(False)
+    signal.signal(signal.SIGCHLD, lambda *_: None)
+    signal.set_wakeup_fd(wakes.fileno())
+    told: dict[int, socket.socket] = {}
+    while True:
+        ready, _, _ = select.select([asked, woken], [], [])
+        if woken in ready:
+            woken.recv(_MESSAGE)
+            while told and (ended := os.waitpid(-1, os.WNOHANG))[0]:
+                with told.pop(ended[0]) as end:
+                    end.send(str(os.waitstatus_to_exitcode(ended[1])).encode())
+        if asked not in ready:
+            continue
+        message, fds, _, _ = socket.recv_fds(asked, _MESSAGE, 3)
+        if not message:
+            sys.exit()
+        output, errors, end_fd = fds
+        end = socket.socket(fileno=end_fd)
+        assert threading.active_count() == 1
+        if (pid := os.fork()) == 0:
+            signal.set_wakeup_fd(-1)
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            os.dup2(output, 1)
+            os.dup2(errors, 2)
+            for opened in (asked, woken, wakes, end, *told.values()):
+                opened.close()
+            for fd in (output, errors):
+                os.close(fd)
+            return [str(each) for each in json.loads(message)]
+        for fd in (output, errors):
+            os.close(fd)
+        told[pid] = end
+        end.send(str(pid).encode())
+
+
+def main() -> None:
+    from loopwright.service.server.loading import loading
+
+    with loading():
+        from loopwright.service.server import serving
+        from tests.unit.service import gateway
+
+        serving.load()
+    gc.collect()
+    sys.argv[1:] = arguments_of_a_fork(socket.socket(fileno=int(sys.argv[1])))
+    gateway.main()
+
+
+if __name__ == "__main__":
+    main()
