@@ -4,6 +4,7 @@ more."""
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ PLANT = FOPDT(2.0, 6.0, 1.5)
 LOOPS = parse_site({"loops": [entry(TAG) | {"test": {"excitations": ["observe", "setpoint"]}}]}, "test").loops
 
 
+@cache
 def shown(plant: FOPDT) -> ObservedPlant:
     """What operation has shown of a plant, around MV 50."""
     sp = np.repeat([0.0, 1.6, -0.6, 1.2, 0.0], round(120.0 / TS))
