@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from importlib.metadata import version
@@ -63,6 +64,7 @@ from loopwright.service.listening.listening import Listening
 from loopwright.service.live.live import Live
 from loopwright.service.live.other_gateways import OtherGateways
 from loopwright.service.live.own_gateway import OwnGateway
+from loopwright.service.live.snapshot import JobProgress
 from loopwright.service.loops.shared_reading import SharedReading
 from loopwright.service.security.principal import current
 from loopwright.service.store import decision_requests
@@ -137,6 +139,8 @@ def create_app(
     openapi.install(app)
     checks = operations.checks(jobs) if checks is None else checks
     listening = listening or Listening(jobs.directory.loops, jobs.store, on=False)
+    others = others or OtherGateways(jobs.store)
+    own = own or OwnGateway(jobs, listening)
     alarms = alarms or AlarmWatch(jobs, listening)
     operations.install(app, jobs, checks, {} if sdo_retries is None else sdo_retries, alarms)
     alarms_api.install(app, alarms)
@@ -146,15 +150,22 @@ def create_app(
         loops = {row.loop for row in rows}
         latest = latest_jobs(jobs.store, loops.pop() if len(loops) == 1 else None)
         asked = decision_requests.latest(jobs.store, [row.id for row in rows])
-        return [
-            job_view(row, events[row.id], jobs.running(row.id), latest.get(row.loop), asked.get(row.id)) for row in rows
-        ]
+        found = []
+        for row in rows:
+            of_it = jobs.running(row.id), latest.get(row.loop), asked.get(row.id), elsewhere(row)
+            found.append(job_view(row, events[row.id], *of_it))
+        return found
+
+    def elsewhere(row: Job) -> JobProgress | None:
+        """How far a job of another gateway has come; None where it has not said so."""
+        if row.host == jobs.store.host or row.state not in ACTIVE:
+            return None
+        others.look()
+        return others.progress(row.id, row.host)
 
     def view(row: Job) -> JobView:
         return views([row])[0]
 
-    others = others or OtherGateways(jobs.store)
-    own = own or OwnGateway(jobs, listening)
     fleet.install(app, jobs, many, views, listening, others)
 
     def here(tag: str) -> tuple[LiveView | None, LiveErrorView | None]:
@@ -174,7 +185,9 @@ def create_app(
     def loop(tag: Tag) -> LoopDetail:
         config, host = jobs.directory.owner(tag)
         not_home = next(iter(jobs.aftercare.not_home(tag)), None)
-        present, away = there(config, host) if host != jobs.store.host else here(tag)
+        elsewhere = host != jobs.store.host
+        present, away = there(config, host) if elsewhere else here(tag)
+        last = others.values(tag, host) if elsewhere else own.values(tag, time.time())
         gains = None if present is None else present.gains.gains()
         shown = loop_view(
             config,
@@ -189,6 +202,7 @@ def create_app(
             **dict(shown),
             live=present,
             live_error=away,
+            last_heard=None if present is not None else gateways.last_heard(last),
             not_confirmed_home=NotHomeView.of(not_home) if not_home else None,
             disturbed_by=jobs.directory.disturbed_by(tag),
             knowledge=jobs.knowledge.of(tag, gains),
@@ -252,7 +266,8 @@ def create_app(
         over = row.state not in ACTIVE
         if over and last_event_id and not jobs.store.events(job_id, last_event_id, limit=1):
             return Response(status_code=204)
-        stream = event_stream(jobs, job_id, last_event_id, still_permitted(keyring, policy.sessions, current.get()))
+        permitted = still_permitted(keyring, policy.sessions, current.get())
+        stream = event_stream(jobs, job_id, last_event_id, permitted, elsewhere)
         return StreamingResponse(stream, media_type="text/event-stream", headers={"Cache-Control": "no-store"})
 
     @app.get(

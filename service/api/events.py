@@ -17,8 +17,10 @@ from sqlalchemy.exc import SQLAlchemyError
 from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.journal import temporary
 from loopwright.service.jobs.manager import Jobs
+from loopwright.service.live.snapshot import JobProgress
 from loopwright.service.security.principal import Principal
 from loopwright.service.security.sessions import BrowserSessions
+from loopwright.service.store.jobs import Job
 from loopwright.service.store.keyring import REVOKED_WITHIN_S, Keyring
 
 _POLL_S = 0.2
@@ -39,9 +41,16 @@ def still_permitted(keyring: Keyring | None, sessions: BrowserSessions, who: Pri
 
 
 async def event_stream(
-    jobs: Jobs, job_id: str, after: int, permitted: Callable[[], bool] = lambda: True
+    jobs: Jobs,
+    job_id: str,
+    after: int,
+    permitted: Callable[[], bool] = lambda: True,
+    elsewhere: Callable[[Job], JobProgress | None] = lambda row: None,
 ) -> AsyncIterator[str]:
-    """The events after number `after` as text/event-stream, until the job ends or `permitted` returns false."""
+    """The events after number `after` as text/event-stream, until the job ends or `permitted` returns false.
+
+    elsewhere: how far a job of another gateway has come; None where it has not said so.
+    """
     sent = ""
     silent = 0
     asked = time.monotonic()
@@ -71,7 +80,7 @@ async def event_stream(
             return
         if more:
             continue
-        progress = _progress(jobs, job_id)
+        progress = _progress(jobs, job_id) or await _progress_elsewhere(row, elsewhere)
         if progress and progress != sent:
             sent, silent = progress, 0
             yield f"event: progress\ndata: {progress}\n\n"
@@ -86,12 +95,25 @@ def _progress(jobs: Jobs, job_id: str) -> str:
     if running is None:
         return ""
     live = running.progress_now()
-    remaining = live.remaining_s
+    return _said(live.stage, live.fraction, live.remaining_s, live.plant_time_s)
+
+
+async def _progress_elsewhere(row: Job, elsewhere: Callable[[Job], JobProgress | None]) -> str:
+    try:
+        found = await asyncio.to_thread(elsewhere, row)
+    except SQLAlchemyError:  # the next look says that the database does not answer
+        return ""
+    if found is None:
+        return ""
+    return _said(found.stage, found.progress, found.remaining_plant_time_s, found.plant_time_s)
+
+
+def _said(stage: str | None, progress: float, remaining_s: float | None, plant_time_s: float) -> str:
     return json.dumps(
         {
-            "stage": live.stage,
-            "progress": round(live.fraction, 4),
-            "remaining_plant_time_s": None if remaining is None else round(remaining, 3),
-            "plant_time_s": round(live.plant_time_s, 3),
+            "stage": stage,
+            "progress": round(progress, 4),
+            "remaining_plant_time_s": None if remaining_s is None else round(remaining_s, 3),
+            "plant_time_s": round(plant_time_s, 3),
         }
     )

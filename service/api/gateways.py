@@ -9,14 +9,15 @@ from fastapi import APIRouter
 from pydantic import BaseModel, Field
 
 from loopwright.service.api import problems
-from loopwright.service.api.job_views import LiveErrorView, LiveView
+from loopwright.service.api.job_views import LastHeardView, LiveErrorView, LiveView
 from loopwright.service.api.routes import new_router
 from loopwright.service.errors import GatewayLost
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.jobs.loop_directory import LoopDirectory
-from loopwright.service.live.messages import BusView
+from loopwright.service.live.messages import BusView, LoopValues
 from loopwright.service.live.other_gateways import OtherGateways
 from loopwright.service.live.own_gateway import OwnGateway
+from loopwright.service.live.rows import old
 from loopwright.service.store.clock import now, stamp
 from loopwright.tuning.reasons import Failed, Reason
 
@@ -90,6 +91,12 @@ def live_there(config: LoopConfig, host: str, others: OtherGateways) -> tuple[Li
     reason = Reason.BUS_LOST if down else Reason.NODE_LOST
     detail = values.not_heard or "the controller has not been read yet"
     return None, LiveErrorView.of(Failed(reason, f"gateway {host}: {detail}"))
+
+
+def last_heard(values: LoopValues) -> LastHeardView | None:
+    """Returns the values that were heard last; None: nothing was heard."""
+    last = old(values)
+    return None if last is None else LastHeardView(**dict(last), age_s=values.age_s)
 
 
 def _here(own: OwnGateway, loops: int) -> GatewayView:

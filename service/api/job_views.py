@@ -36,6 +36,7 @@ from loopwright.tuning.reasons import ADVICE, Ended, Reason
 if TYPE_CHECKING:  # the command line reads views, and has no store
     from loopwright.service.jobs.active_job import Running
     from loopwright.service.jobs.aftercare import NotHome
+    from loopwright.service.live.snapshot import JobProgress
     from loopwright.service.store.decision_requests import DecisionRequest
     from loopwright.service.store.jobs import Job, JobEvent
     from loopwright.service.store.live_jobs import Acceptance, JobInBrief
@@ -173,6 +174,16 @@ class NotHomeView(BaseModel):
         return cls(job=f"/jobs/{found.job_id}", reason=found.reason, detail=found.detail, advice=found.words)
 
 
+class LastHeardView(BaseModel):
+    """The values of a loop that were heard last."""
+
+    pv: float | None = Field(description="Process value, PV units", examples=[49.8])
+    sp: float | None = Field(description="Set-point, PV units", examples=[50.0])
+    mv: float | None = Field(description="Controller output, percent", examples=[41.2])
+    mode: str | None = Field(description="off, manual, automatic or experiment", examples=["automatic"])
+    age_s: float | None = Field(description="How long ago, wall time, s", examples=[12.5])
+
+
 class LoopDetail(LoopView):
     live: LiveView | None = Field(
         description="The present state; null: the loop, or the gateway that has it, is not reached (`live_error`). Of "
@@ -180,6 +191,10 @@ class LoopDetail(LoopView):
         "were read within the last minute"
     )
     live_error: LiveErrorView | None = Field(description="Why the present state cannot be read; null: it is not so")
+    last_heard: LastHeardView | None = Field(
+        description="What was heard last of a loop whose present state is not known (`live` is null); of a loop of "
+        "another gateway, what that one has said last. null: the present state is known, or nothing was heard"
+    )
     not_confirmed_home: NotHomeView | None = Field(description="The unconfirmed restoration; null: there is none")
     disturbed_by: str | None = Field(
         description="Which neighbours are under test and may disturb the loop: loops of the same area, and those whose "
@@ -279,7 +294,13 @@ class JobView(BaseModel):
     started_at: str | None = Field(description="UTC, ISO 8601, wall time")
     ended_at: str | None = Field(description="UTC, ISO 8601, wall time")
     stage: str | None = Field(description="The present or last stage", examples=["ultimate"])
-    progress: float = Field(ge=0, le=1, description="Fraction of the expected plant time, 0 to 1", examples=[0.42])
+    progress: float = Field(
+        ge=0,
+        le=1,
+        description="Fraction of the expected plant time, 0 to 1. Of a job of another gateway it is up to 2 s old, as "
+        "are the times below; while that gateway says nothing, they are those at the start of its present stage",
+        examples=[0.42],
+    )
     remaining_plant_time_s: float | None = Field(description="Expected plant time to the end, s", examples=[310.0])
     plant_time_s: float = Field(description="Plant time so far, s", examples=[224.0])
     stages: list[StageView]
@@ -402,16 +423,18 @@ def job_view(
     running: Running | None,
     latest: JobInBrief | None = None,
     request: DecisionRequest | None = None,
+    elsewhere: JobProgress | None = None,
 ) -> JobView:
     """The view of a job from its row and events, and from the live progress while it runs.
 
     latest: the latest job of the loop, without dry runs.  request: the latest decision asked at another gateway.
+    elsewhere: how far the job has come on the gateway that runs it, where that is another one and has said so.
     """
     state = shown(row.state, row.dry_run)
     later = latest is not None and latest.id != row.id and state is JobState.PROPOSED
     method = str(row.request.get("method", FIVE_STAGE))
     result = row.result or empty_result(method)
-    progress, remaining, plant_time = _progress(state, row, events, running)
+    progress, remaining, plant_time = _progress(state, row, events, running, elsewhere)
     return JobView(
         id=row.id,
         url=f"/jobs/{row.id}",
@@ -425,7 +448,7 @@ def job_view(
         created_at=row.created_at,
         started_at=row.started_at,
         ended_at=row.ended_at,
-        stage=row.stage,
+        stage=elsewhere.stage if elsewhere is not None and elsewhere.stage is not None else row.stage,
         progress=progress,
         remaining_plant_time_s=remaining,
         plant_time_s=plant_time,
@@ -459,14 +482,17 @@ def job_view(
 
 
 def _progress(
-    state: JobState, row: Job, events: Sequence[JobEvent], running: Running | None
+    state: JobState, row: Job, events: Sequence[JobEvent], running: Running | None, elsewhere: JobProgress | None
 ) -> tuple[float, float | None, float]:
-    """Fraction, remaining and present plant time. For a job on another host they are those at its last stage start."""
+    """Fraction, remaining and present plant time. For a job of a gateway that says nothing they are those at its last
+    stage start."""
     if running is not None:
         live = running.progress_now()
         return live.fraction, live.remaining_s, live.plant_time_s
     if state not in ACTIVE:
         return 1.0, 0.0, row.plant_time_s
+    if elsewhere is not None:
+        return elsewhere.progress, elsewhere.remaining_plant_time_s, elsewhere.plant_time_s
     begun = next((begun for event in reversed(events) if (begun := event.stage_begun())), None)
     if begun is None:
         return 0.0, None, row.plant_time_s

@@ -26,11 +26,22 @@ class LastJob(BaseModel):
     state: JobState
 
 
+class OldValues(BaseModel):
+    """Values of a loop that are not present ones."""
+
+    pv: float | None = Field(description="PV units")
+    sp: float | None = Field(description="PV units")
+    mv: float | None = Field(description="Percent")
+    mode: str | None = Field(description="off, manual, automatic or experiment")
+
+
 class LoopValues(BaseModel):
     """What was heard of a loop last."""
 
     tag: str
-    pv: float | None = Field(description="PV units; null, as set-point, MV and mode, where the last sample is old")
+    pv: float | None = Field(
+        description="PV units; null, as set-point, MV and mode, where the last sample is old: then `last` has it"
+    )
     sp: float | None = Field(description="PV units")
     mv: float | None = Field(description="Percent")
     mode: str | None = Field(description="off, manual, automatic or experiment")
@@ -38,6 +49,10 @@ class LoopValues(BaseModel):
     under_test: bool | None = Field(description="Whether a tuner, this service or another, has a session open")
     on_trial: bool | None = Field(description="Whether gains are on trial")
     not_heard: str | None = Field(description="Why there are no values; null: there are")
+    last: OldValues | None = Field(
+        default=None,
+        description="What was heard last, `age_s` ago, where no values are present; null: they are, or none came",
+    )
 
 
 class LiveLoopRow(LoopValues):

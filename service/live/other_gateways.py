@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.service.live.messages import BusView, LoopValues
-from loopwright.service.live.rows import no_values
+from loopwright.service.live.rows import no_values, old
 from loopwright.service.live.snapshot import SETTINGS, JobProgress, LoopSettings, Present
 from loopwright.service.store import gateways
 from loopwright.service.store.gateways import LOST_S, NO_DATA_S, GatewaySaid, silent
@@ -102,16 +102,20 @@ class OtherGateways:
         return f"no data from gateway {name} for {age_s:.0f} s"
 
     def values(self, tag: str, name: str) -> LoopValues:
-        """Returns what was heard last of a loop of another gateway."""
+        """Returns what was heard last of a loop of another gateway; of a gateway that has fallen silent, what it
+        has said last, as old values."""
         found = self._found.get(name)
         values = None if found is None else found.values.get(tag)
         age_s = self.age_s(name)
-        sample_s = None if values is None or values.age_s is None or age_s is None else values.age_s + age_s
+        last = None if values is None else old(values)
+        sample_s = None
+        if values is not None and age_s is not None and (values.age_s is not None or last is not None):
+            sample_s = age_s + (values.age_s or 0.0)  # what a job has read has no age of its own
         why = self.why_no_data(name)
         if why is None and values is None:
             why = f"gateway {name} does not have the loop"
         if why is not None or values is None:
-            return no_values(tag, why, sample_s)
+            return no_values(tag, why, sample_s, last)
         return values.model_copy(update={"age_s": None if sample_s is None else round(sample_s, 3)})
 
     def settings(self, tag: str, name: str) -> LoopSettings | None:

@@ -5,14 +5,16 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Iterable
 from importlib.metadata import version
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.journal import temporary
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.listening import Listening
-from loopwright.service.live.messages import BusView
+from loopwright.service.live.messages import BusView, LoopValues
 from loopwright.service.live.rows import LiveFacts, loop_values
 from loopwright.service.live.snapshot import SETTINGS, LoopSettings, Present, progress_of
 from loopwright.service.store import gateways
@@ -40,13 +42,17 @@ class OwnGateway:
     def present(self, now_s: float) -> Present:
         """Returns the present state of its loops, buses and jobs. now_s: s since 1970 UTC."""
         running = list(self._jobs.registry.running.copy().values())
-        held = {each.tag: each.loop.latest for each in running if each.loop is not None}
-        heard, why_not = self._listening.heard, self._listening.why_not_heard
-        loops = [
-            loop_values(tag, LiveFacts(heard.get(tag), why_not(tag), held.get(tag)), now_s)
-            for tag in self._jobs.directory.loops
-        ]
+        loops = [self._values(tag, running, now_s) for tag in self._jobs.directory.loops]
         return Present(loops=loops, buses=self.buses(), jobs=[progress_of(each) for each in running])
+
+    def values(self, tag: str, now_s: float) -> LoopValues:
+        """Returns what was heard last of one of its loops. now_s: s since 1970 UTC."""
+        return self._values(tag, self._jobs.registry.running.copy().values(), now_s)
+
+    def _values(self, tag: str, running: Iterable[Running], now_s: float) -> LoopValues:
+        held = next((each.loop.latest for each in running if each.tag == tag and each.loop is not None), None)
+        known = LiveFacts(self._listening.heard.get(tag), self._listening.why_not_heard(tag), held)
+        return loop_values(tag, known, now_s)
 
     def buses(self) -> list[BusView]:
         """Returns its buses as they are."""

@@ -10,7 +10,7 @@ import numpy as np
 from loopwright.protocol.profile import Mode
 from loopwright.service.listening.bins import Bins, decimals
 from loopwright.service.listening.heard_loop import Heard
-from loopwright.service.live.messages import LastJob, LiveLoopRow, LoopValues, Samples
+from loopwright.service.live.messages import LastJob, LiveLoopRow, LoopValues, OldValues, Samples
 from loopwright.service.loop_state import LoopState
 from loopwright.service.store.live_jobs import JobInBrief
 
@@ -50,30 +50,39 @@ def with_jobs(values: LoopValues, host: str, job: JobInBrief | None, last_job: J
 
 
 def loop_values(tag: str, known: LiveFacts, now_s: float) -> LoopValues:
-    """Returns the values of a loop. Old ones are left out; where a bus is not heard, those of the running job count."""
+    """Returns the values of a loop. Old ones are set apart; where a bus is not heard, the running job's count."""
     heard, held = known.heard, known.held
     age_s = None if heard is None else max(0.0, now_s - heard.at_s)
     row = no_values(tag, None, age_s)
     if heard is not None and not heard.silent:
-        row.pv, row.sp, row.mv = (_finite(value) for value in (heard.pv, heard.sp, heard.mv))
-        row.mode = _MODES.get(heard.mode)
+        row.pv, row.sp, row.mv, row.mode = _values(heard)
         row.under_test, row.on_trial = heard.session, heard.on_trial
     elif held is not None and known.deaf is not None:
         row.pv, row.sp, row.mv = (_finite(value) for value in (held.pv, held.sp, held.mv))
         row.mode, row.on_trial = held.mode.name.lower(), held.on_trial
     else:
         row.not_heard = known.deaf or ("no sample has come yet" if age_s is None else f"no data for {age_s:.0f} s")
+        if heard is not None:
+            pv, sp, mv, mode = _values(heard)
+            row.last = OldValues(pv=pv, sp=sp, mv=mv, mode=mode)
     if row.under_test is None and held is not None:
         row.under_test = True
     return row
 
 
-def no_values(tag: str, not_heard: str | None, age_s: float | None) -> LoopValues:
-    """Returns the values of a loop of which nothing is known. age_s: of its last sample, s."""
+def no_values(tag: str, not_heard: str | None, age_s: float | None, last: OldValues | None = None) -> LoopValues:
+    """Returns the values of a loop whose present ones are not known. age_s, last: of its last sample."""
     return LoopValues(
         tag=tag, pv=None, sp=None, mv=None, mode=None, age_s=None if age_s is None else round(age_s, 3),
-        under_test=None, on_trial=None, not_heard=not_heard,
+        under_test=None, on_trial=None, not_heard=not_heard, last=last,
     )  # fmt: skip
+
+
+def old(values: LoopValues) -> OldValues | None:
+    """Returns the values that are still known when these are no longer present ones; None: there are none."""
+    if values.not_heard is not None:
+        return values.last
+    return OldValues(pv=values.pv, sp=values.sp, mv=values.mv, mode=values.mode)
 
 
 def samples_message(tag: str, bins: Bins, past: bool) -> Samples:
@@ -91,6 +100,11 @@ def samples_message(tag: str, bins: Bins, past: bool) -> Samples:
         mode=[mode if mode in _MODES else None for mode in bins["mode"].tolist()],
         gap_before=np.flatnonzero(bins["gap"]).tolist(),
     )
+
+
+def _values(heard: Heard) -> tuple[float | None, float | None, float | None, str | None]:
+    """Returns PV, set-point, MV and mode."""
+    return _finite(heard.pv), _finite(heard.sp), _finite(heard.mv), _MODES.get(heard.mode)
 
 
 def _finite(value: float) -> float | None:

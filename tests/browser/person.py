@@ -17,11 +17,16 @@ def open_loop(page: Page, tag: str = TAG) -> None:
     """Opens a loop from the overview, and waits for its live values."""
     page.get_by_role("main").get_by_role("link", name=tag).click()
     expect(page.get_by_role("heading", name=tag)).to_be_visible()
-    expect(face(page).locator(".big")).not_to_have_text(DASH)
+    expect(present(page, tag).locator(".big")).not_to_have_text(DASH)
 
 
 def face(page: Page, tag: str = TAG) -> Locator:
     return page.get_by_role("region", name=f"Present values of {tag}")
+
+
+def present(page: Page, tag: str = TAG) -> Locator:
+    """The face of a loop while its values are present ones, not old."""
+    return face(page, tag).and_(page.locator(":not(.old)"))
 
 
 def sign(page: Page, name: str = NAME) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import ExitStack
 
@@ -42,4 +43,6 @@ def test_a_loop_of_another_gateway(site: GatewaySite, pages: Pages) -> None:
     assert site.kp() == pytest.approx(CASE.kp)
     site.other.kill()
     expect(page.locator(".refusal")).to_contain_text(f"gateway {OTHER} does not answer")
-    expect(page.locator(".face .big")).to_have_text("–")
+    old = page.locator(".face.old")
+    expect(old.locator(".age")).to_have_text(re.compile(r"^\d.* old$"))
+    expect(old.locator(".big")).to_have_text("50.000")

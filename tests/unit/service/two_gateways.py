@@ -66,8 +66,8 @@ class OneGateway:
         self.announcing = Announcing(self.jobs, self.own)
         self._later_s = 0.0
         self.others = OtherGateways(self.store, lambda: time.monotonic() + self._later_s)
-        app = create_app(self.jobs, checks={}, listening=self.listening, own=self.own, others=self.others)
-        self.http = TestClient(app, raise_server_exceptions=False)
+        self.app = create_app(self.jobs, checks={}, listening=self.listening, own=self.own, others=self.others)
+        self.http = TestClient(self.app, raise_server_exceptions=False)
         # FastAPI builds its routes with the first requests, and silences warnings of the whole process meanwhile: two
         # gateways that do so at once, which one service never does, would not silence all of them.
         assert self.http.get("/nowhere").status_code == 404

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Iterator
@@ -9,22 +10,26 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
+from fastapi.testclient import TestClient
 from sqlalchemy import event
 from sqlalchemy.exc import OperationalError
 
+from loopwright.service.inputs.request import FastRetune
 from loopwright.service.listening.heard_loop import Heard
 from loopwright.service.live import other_gateways, own_gateway
 from loopwright.service.live.live import Live
 from loopwright.service.live.other_gateways import OtherGateways
 from loopwright.service.live.own_gateway import Announcing, OwnGateway
 from loopwright.service.store import gateways
+from loopwright.tuning.reasons import Reason
 from tests.unit.service.fakes import NEW, OLD, Service
 from tests.unit.service.live_viewer import viewing
 from tests.unit.service.postgres import Server
 from tests.unit.service.processes import until
 from tests.unit.service.served import served
-from tests.unit.service.two_gateways import HERE, TAG_HERE, TAG_THERE, THERE, TwoGateways, two_gateways
+from tests.unit.service.two_gateways import HERE, TAG_HERE, TAG_THERE, THERE, OneGateway, TwoGateways, two_gateways
 
 
 @pytest.fixture
@@ -51,6 +56,10 @@ def detail(fleet: TwoGateways) -> Any:
     answer = fleet.here.http.get(f"/loops/{TAG_THERE}")
     assert answer.status_code == 200, answer.text
     return answer.json()
+
+
+def detail_here(fleet: TwoGateways) -> Any:
+    return fleet.here.http.get(f"/loops/{TAG_HERE}").json()
 
 
 def test_a_loop_of_another_gateway_is_shown_as_it_is_there(fleet: TwoGateways) -> None:
@@ -102,6 +111,12 @@ def test_old_rows_are_not_shown_as_new(fleet: TwoGateways, age_s: float, words: 
     row = fleet.here.others.values(TAG_THERE, THERE)
     assert (row.pv is None) == (words is not None)
     assert (row.not_heard is None) == (words is None)
+    last = found["last_heard"]
+    if words is None:
+        assert last is None and row.last is None
+    else:
+        assert [last[name] for name in ("pv", "sp", "mv", "mode")] == [49.5, 50.0, 41.0, "automatic"]
+        assert row.age_s is not None and age_s < last["age_s"] <= row.age_s
     listed = {each["name"]: each for each in fleet.here.http.get("/gateways").json()}
     assert (listed[HERE]["answers"], listed[THERE]["answers"]) == (True, age_s <= 10.0)
 
@@ -126,6 +141,74 @@ def test_the_ages_at_which_it_changes(
     assert others.why_no_data(THERE) == words and others.answers(THERE) == (age_s <= 10.0)
     found = others.values(TAG_THERE, THERE)
     assert (found.pv is None) == (words is not None) and found.age_s is not None and found.age_s >= age_s
+
+
+def test_a_loop_that_is_silent_there_has_the_age_of_its_last_sample(fleet: TwoGateways) -> None:
+    fleet.there.listening.hears(Heard(time.time() - 60.0, True, 49.5, 41.0, 50.0, 2, False, False))
+    fleet.write()
+    fleet.age(5.0)
+    found = detail(fleet)
+    assert found["live"] is None and found["last_heard"]["pv"] == 49.5 and found["last_heard"]["age_s"] > 65.0
+
+
+def test_what_a_job_has_read_is_as_old_as_what_its_gateway_has_said(fleet: TwoGateways) -> None:
+    """A bus that is not listened to: the job that runs on the loop knows it, and its reading has no age of its own."""
+    fleet.there.tune.hold.clear()
+    fleet.there.jobs.start(TAG_THERE, FastRetune())
+    assert fleet.there.tune.inside.wait(60)
+    fleet.there.listening.hears(None, down="this bus cannot be opened by a second process")
+    fleet.write()
+    fleet.age(5.0)
+    row = fleet.here.others.values(TAG_THERE, THERE)
+    assert row.last is None, "not looked at yet"
+    fleet.here.look_again()
+    fleet.here.others.look()
+    row = fleet.here.others.values(TAG_THERE, THERE)
+    assert row.pv is None and row.last is not None and row.last.sp == 50.0
+    assert row.age_s is not None and 5.0 < row.age_s < 60.0
+
+
+def test_a_loop_that_was_never_heard_has_no_old_values(fleet: TwoGateways) -> None:
+    fleet.age(5.0)
+    assert detail(fleet)["last_heard"] is None
+    assert detail_here(fleet)["last_heard"] is None
+
+
+def test_a_loop_of_this_gateway_that_has_fallen_silent(fleet: TwoGateways) -> None:
+    fleet.here.listening.hears(Heard(time.time() - 60.0, True, 49.5, 41.0, 50.0, 2, False, False))
+    fleet.here.controller.absent = Reason.NODE_LOST
+    found = detail_here(fleet)
+    assert found["live"] is None and found["live_error"]["reason"] == "node_lost"
+    assert found["last_heard"]["pv"] == 49.5 and found["last_heard"]["age_s"] > 59.0
+
+
+def test_how_far_a_job_of_the_other_gateway_has_come(fleet: TwoGateways) -> None:
+    """Of a gateway that says nothing it is what its job has stored: nothing before its first stage."""
+    fleet.there.tune.hold.clear()
+    job = fleet.there.http.post(f"/loops/{TAG_THERE}/retune", json={}).json()["url"]
+    assert fleet.there.tune.inside.wait(60)
+    fleet.write()
+
+    def figures(gateway: OneGateway) -> list[object]:
+        gateway.look_again()
+        found = gateway.http.get(job).json()
+        return [found[name] for name in ("stage", "progress", "remaining_plant_time_s", "plant_time_s")]
+
+    present = json.loads(gateways.every(fleet.here.store)[THERE].present)
+    (said,) = present["jobs"]
+    assert figures(fleet.here) == [said[name] for name in _FIGURES]
+    said |= {"stage": "verify", "progress": 0.75, "remaining_plant_time_s": 12.5, "plant_time_s": 30.5}
+    fleet.here.sql("UPDATE gateways SET present = :text", text=json.dumps(present))
+    assert figures(fleet.here) == ["verify", 0.75, 12.5, 30.5]
+    with served(fleet.here.app) as door, httpx.stream("GET", f"http://127.0.0.1:{door.port}{job}/events") as stream:
+        line = next(line for line in stream.iter_lines() if line.startswith('data: {"stage": "verify"'))
+        fleet.age(12.0)
+        until(lambda: figures(fleet.here)[:2] == ["preflight", 0.0])
+        fleet.there.tune.hold.set()
+    assert json.loads(line[6:]) == dict(zip(_FIGURES, ["verify", 0.75, 12.5, 30.5], strict=True))
+
+
+_FIGURES = ("stage", "progress", "remaining_plant_time_s", "plant_time_s")
 
 
 def test_a_bus_that_is_down_there(fleet: TwoGateways) -> None:
@@ -259,8 +342,6 @@ def test_a_name_that_another_service_has_taken_is_not_written_to(fleet: TwoGatew
 
 
 def test_a_file_is_not_written_to_once_a_second_and_there_is_one_gateway(service: Service) -> None:
-    from fastapi.testclient import TestClient
-
     from loopwright.service.api.app import create_app
     from loopwright.service.listening.listening import Listening
 

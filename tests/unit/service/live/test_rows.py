@@ -10,6 +10,7 @@ import numpy as np
 from loopwright.service.job_states import JobState
 from loopwright.service.listening.bins import GAP_BEFORE, SAMPLE, UNKNOWN_MODE, of_samples
 from loopwright.service.listening.heard_loop import Heard
+from loopwright.service.live.messages import OldValues
 from loopwright.service.live.rows import LiveFacts, loop_row, samples_message
 from loopwright.service.loop_state import LoopState
 from loopwright.service.store.live_jobs import JobInBrief
@@ -50,10 +51,12 @@ def test_what_is_not_known_is_null() -> None:
     assert row.pv is row.age_s is None and row.not_heard == "no sample has come yet"
 
 
-def test_what_is_old_is_left_out_with_its_age() -> None:
+def test_what_is_old_is_set_apart_with_its_age() -> None:
     row = loop_row("A", "local", LiveFacts(replace(HEARD, silent=True), held=HELD), T0 + 12.4)
     assert row.pv is row.sp is row.mv is row.mode is row.on_trial is None
     assert (row.age_s, row.not_heard) == (12.4, "no data for 12 s")
+    assert row.last == OldValues(pv=49.9, sp=50.0, mv=41.2, mode="automatic")
+    assert loop_row("A", "local", LiveFacts(HEARD), T0).last is None
 
 
 def test_where_a_bus_is_not_heard_the_running_job_knows_the_loop() -> None:

@@ -3,22 +3,25 @@
 import { html } from "../html.js";
 import { fixed, pvDecimals, tick, unit } from "../numbers.js";
 import { isSilent, rowOf } from "../state.js";
+import { ageWords, valuesOf } from "../values.js";
 import { modeWord } from "../words.js";
 import { Hatch } from "./loops.js";
 
 /** @param {{loop: any}} props */
 export function Face({ loop }) {
-  const row = isSilent.value ? null : rowOf(loop.tag).value;
-  const { pv = null, sp = null, mv = null, mode = null } = row ?? {};
+  const row = rowOf(loop.tag).value;
+  const values = valuesOf(row, isSilent.value);
+  const { pv, sp, mv, mode, old } = values;
   const decimals = pvDecimals(loop.pv_limits);
-  const outside = pv !== null && (pv < loop.pv_limits.low || pv > loop.pv_limits.high);
-  return html`<section class="card face" aria-label=${`Present values of ${loop.tag}`}>
+  const outside = pv !== null && !old && (pv < loop.pv_limits.low || pv > loop.pv_limits.high);
+  return html`<section class=${`card face ${old ? "old" : ""}`} aria-label=${`Present values of ${loop.tag}`}>
     <div key="mode"><span class=${`mode ${mode === "experiment" ? "test" : mode === "automatic" ? "auto" : "boxed"}`}>${modeWord(mode)}</span>
-      ${row?.on_trial && html` <span class="mode test">gains on trial</span>`}</div>
+      ${row?.on_trial && !isSilent.value && html` <span class="mode test">gains on trial</span>`}
+      ${old && html` <span key="age" class="age">${ageWords(values)}</span>`}</div>
     <div key="pv"><span class="label">PV</span><span class=${`big pvnum ${outside ? "outside" : ""}`}>${fixed(pv, decimals)}</span> <span class="u">${unit(loop.pv_unit)}</span></div>
     <div class="pair" key="pair"><div><span class="label">SP</span><span class="mid">${fixed(sp, decimals)} <span class="u">${unit(loop.pv_unit)}</span></span></div>
       <div><span class="label">MV</span><span class="mid">${fixed(mv, 1)} <span class="u">%</span></span></div></div>
-    ${Scales(loop, pv, sp, mv)}
+    ${old ? Scales(loop, null, null, null) : Scales(loop, pv, sp, mv)}
   </section>`;
 }
 

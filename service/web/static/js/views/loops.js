@@ -10,6 +10,7 @@ import { ago, duration, fixed, known, ms, pvDecimals, unit } from "../numbers.js
 import { go, loopPath } from "../router.js";
 import { buses, isSilent, jobs, loops, loopsError, now_s, rowOf } from "../state.js";
 import { AlarmSymbol, DecisionSign, TestSign } from "../symbols.js";
+import { ageWords, valuesOf } from "../values.js";
 import { modeWord, reasonWords, stageName } from "../words.js";
 import { Progress } from "./frame.js";
 
@@ -105,26 +106,22 @@ function Sentence() {
 
 /** @param {{loop: any}} props */
 function Row({ loop }) {
-  const silent = isSilent.value;
-  const row = rowOf(loop.tag).value;
-  const pv = silent ? null : (row?.pv ?? null);
-  const sp = silent ? null : (row?.sp ?? null);
-  const mv = silent ? null : (row?.mv ?? null);
-  const mode = silent ? null : (row?.mode ?? null);
+  const values = valuesOf(rowOf(loop.tag).value, isSilent.value);
+  const { pv, sp, mv, mode, old } = values;
   const decimals = pvDecimals(loop.pv_limits);
   const alarm = worstOf.value.get(loop.tag);
   const job = jobByLoop.value.get(loop.tag);
-  const outside = pv !== null && (pv < loop.pv_limits.low || pv > loop.pv_limits.high);
-  return html`<tr class=${`row ${atRow.value === loop.tag ? "at" : ""}`} data-tag=${loop.tag} onClick=${(/** @type {MouseEvent} */ e) => { if (!(/** @type {Element} */ (e.target).closest("a"))) go(loopPath(loop.tag)); }}>
+  const outside = pv !== null && !old && (pv < loop.pv_limits.low || pv > loop.pv_limits.high);
+  return html`<tr class=${`row ${atRow.value === loop.tag ? "at" : ""} ${old ? "old" : ""}`} data-tag=${loop.tag} onClick=${(/** @type {MouseEvent} */ e) => { if (!(/** @type {Element} */ (e.target).closest("a"))) go(loopPath(loop.tag)); }}>
     <td class="sign">${alarm ? AlarmSymbol(alarm.level) : job ? TestSign() : waits(loop) ? DecisionSign() : null}</td>
     <td class="name"><a class="tag" href=${loopPath(loop.tag)}>${loop.tag}</a><small>${alarm ? html`<b>${alarm.text}</b>` : loop.description}</small></td>
-    <td class="num"><span class=${`pvnum ${outside ? "outside" : ""}`}>${fixed(pv, decimals)}</span><span class="name-below">${unit(loop.pv_unit)}</span></td>
+    <td class="num"><span class=${`pvnum ${outside ? "outside" : ""}`}>${fixed(pv, decimals)}</span><span class="name-below">${unit(loop.pv_unit)}</span>${old && html`<small key="age" class="age">${ageWords(values)}</small>`}</td>
     <td class="unit">${unit(loop.pv_unit)}</td>
-    <td class="c-limits">${PvBar(loop, pv, sp)}</td>
+    <td class="c-limits">${PvBar(loop, old ? null : pv, sp)}</td>
     <td class="num c-sp">${fixed(sp, decimals)}</td>
-    <td class="c-spark"><${Spark} loop=${loop} dead=${pv === null} /></td>
+    <td class="c-spark"><${Spark} loop=${loop} dead=${pv === null || old} /></td>
     <td class="num c-mv">${fixed(mv, 1)} <span class="quiet">%</span></td>
-    <td class="c-mv">${MvBar(loop, mv)}</td>
+    <td class="c-mv">${MvBar(loop, old ? null : mv)}</td>
     <td class="c-mode"><span class=${`mode ${mode === "experiment" ? "boxed test" : mode === "manual" || mode === "off" ? "boxed" : ""}`}>${modeWord(mode)}</span></td>
     <td>${Tuning(loop, job)}</td>
   </tr>`;

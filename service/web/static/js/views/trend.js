@@ -9,7 +9,7 @@ import { fixed, pvDecimals, timeOfDay, unit } from "../numbers.js";
 import { colour, shown } from "../palette.js";
 import { hatched, makePlot, mark, yRange } from "../plot.js";
 import { Ring } from "../ring.js";
-import { isSilent, now_s } from "../state.js";
+import { isSilent, now_s, rowOf } from "../state.js";
 import { stream } from "../stream.js";
 import { stageName } from "../words.js";
 
@@ -17,6 +17,8 @@ const WINDOWS = /** @type {const} */ ([["30 s", 30], ["2 min", 120], ["10 min", 
 const LONGEST_S = 1800;
 /** Between what the service keeps and the first live sample, and over a break of the stream: longer is a gap. */
 const GAP_S = 3;
+/** Of a loop of another gateway a value comes once a second; what comes sooner is the same one again. */
+const SAME_S = 0.3;
 /** A sample that is older is not shown as the present. */
 const LATE_S = 3;
 /** Not more than ten drawings a second: a process is not smoother at sixty. */
@@ -180,6 +182,14 @@ export function Trend({ loop, job, height, onJob }) {
         onJob(event);
       },
     };
+    // The samples of another gateway do not come here: its values do, once a second.
+    const leaveRow = rowOf(loop.tag).subscribe((row) => {
+      if (!row || row.not_heard !== null || row.age_s === null || !isElsewhere(loop)) return;
+      const at_s = now_s.peek() - row.age_s;
+      const since_s = at_s - it.ring.last;
+      if (since_s < SAME_S) return;
+      listener.samples({ tag: loop.tag, past: false, at_s: [at_s], pv: [row.pv], sp: [row.sp], mv: [row.mv], gap_before: since_s > GAP_S ? [0] : [] });
+    });
     const leave = stream.watch(loop.tag, 130, listener);
     const late = setTimeout(() => join(true), 3000);
     void ask(`/loops/${encodeURIComponent(loop.tag)}/history?from=${now_s.peek() - LONGEST_S}&points=1500`, stop.signal).then(
@@ -200,6 +210,7 @@ export function Trend({ loop, job, height, onJob }) {
     return () => {
       stop.abort();
       clearTimeout(late);
+      leaveRow();
       leave();
       clearInterval(timer);
       unsubscribe();
@@ -219,7 +230,7 @@ export function Trend({ loop, job, height, onJob }) {
         ${it.job && html`<button key="test" aria-pressed=${String(it.chosen.value === "test" && !it.zoomed.value)} onClick=${() => chooseTest(it)}>test</button>`}
         ${WINDOWS.map(([name, seconds]) => html`<button key=${name} aria-pressed=${String(it.chosen.value === name && !it.zoomed.value)} onClick=${() => choose(it, name, seconds)}>${name}</button>`)}
       </span></div>
-    ${isElsewhere(loop) && html`<p class="note" key="elsewhere">Samples as they come are at ${GatewayName(loop)}; here is what it has stored, a minute late.</p>`}
+    ${isElsewhere(loop) && html`<p class="note" key="elsewhere">Samples as they come are at ${GatewayName(loop)}; here is a value a second, and of the past what it has stored.</p>`}
     <span class="axis-name" key="n1">PV, ${unit(loop.pv_unit)}</span>
     <div class="plot" key="p1" ref=${upper} role="img" aria-label=${`PV and set-point of ${loop.tag}`}></div>
     <span class="axis-name" key="n2">MV, %</span>
