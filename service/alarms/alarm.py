@@ -22,6 +22,7 @@ class AlarmKind(StrEnum):
     NO_DATA = "no_data"
     PV_OUTSIDE_LIMITS = "pv_outside_limits"
     FOREIGN_TEST = "foreign_test"
+    GATEWAY_SILENT = "gateway_silent"
     TEST_FAILED = "test_failed"
     GAINS_DIFFER = "gains_differ"
 
@@ -49,6 +50,7 @@ RULES: dict[AlarmKind, KindRule] = {
     AlarmKind.NO_DATA: KindRule(2, 3.0, 3.0, False),
     AlarmKind.PV_OUTSIDE_LIMITS: KindRule(2, 3.0, 3.0, False),
     AlarmKind.FOREIGN_TEST: KindRule(2, 5.0, 3.0, False),
+    AlarmKind.GATEWAY_SILENT: KindRule(2, 10.0, 3.0, False),
     AlarmKind.TEST_FAILED: KindRule(3, 0.0, 0.0, True),
     AlarmKind.GAINS_DIFFER: KindRule(3, 0.0, 0.0, True),
 }
@@ -72,13 +74,15 @@ class Alarm(BaseModel):
     level: Level = Field(description="1: look now, and sign off; 2: soon; 3: when there is time")
     kind: AlarmKind
     subject: str = Field(
-        description="The loop, the bus or the node", examples=["TIC-101", "node 20h on socketcan:can0"]
+        description="The loop, the bus, the node or the gateway", examples=["TIC-101", "node 20h on socketcan:can0"]
     )
     text: str = Field(description="What is abnormal", examples=["PV is above its limit of 51 degC"])
     advice: str = Field(description="What the operator should do")
     since: str = Field(description="When it began: UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
     host: str = Field(description="Name of the gateway that has the loop or the bus", examples=["local"])
-    loop: str | None = Field(description="Tag of the loop; null: it is about a bus or a node", examples=["TIC-101"])
+    loop: str | None = Field(
+        description="Tag of the loop; null: it is about a bus, a node or a gateway", examples=["TIC-101"]
+    )
     loops: list[str] = Field(description="Tags of all loops that it concerns", examples=[["TIC-101"]])
     job: str | None = Field(description="URL of the test that it is about", examples=["/jobs/4f0c2a9be113"])
     to_sign: bool = Field(

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 
 from loopwright.protocol.profile import Mode, NmtState
-from loopwright.service.alarms.alarm import RULES, AlarmKind
+from loopwright.service.alarms.alarm import RULES, Alarm, AlarmKind
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.job_states import JobState
 from loopwright.service.listening.heard_loop import Heard
@@ -31,6 +31,7 @@ _BUS_ADVICE = (
     "their loops home by themselves."
 )
 _EAR_ADVICE = "It is started again by itself. Tests go on; what the loops do is not seen until then."
+_GATEWAY_ADVICE = f"{ADVICE[Reason.GATEWAY_LOST]} What is abnormal there is not known here meanwhile."
 _SEE_THE_JOB = "See the job."
 _UNTIL_SIGNED = "It stays until somebody signs it off."
 
@@ -68,11 +69,30 @@ class LoopFacts:
 
 
 @dataclass(frozen=True)
+class GatewayFacts:
+    """Another gateway of the database, with at least one loop.
+
+    last_s: when it was last there, wall time, s; None: never.
+    silent: whether it should have been there again since.
+    waited_from_s: since when the database, by which it is seen, has answered without a break, wall time, s.
+    alarms: what it has said last of what only it can know.
+    """
+
+    name: str
+    last_s: float | None
+    silent: bool
+    waited_from_s: float
+    loops: tuple[str, ...]
+    alarms: Sequence[Alarm] = ()
+
+
+@dataclass(frozen=True)
 class AlarmFacts:
     """What is known at one moment.
 
     host: the name of this gateway.
     nodes: the heartbeats heard last, by bus and node.
+    gateways: the other gateways of the database.
     tests: the latest job of each loop of every gateway.
     unconfirmed: tests of every gateway after which the loop was not confirmed to be as before.
     signed: ids of alarms that were signed off, of those in `to_be_asked`.
@@ -82,6 +102,7 @@ class AlarmFacts:
     buses: Sequence[BusFacts] = ()
     loops: Sequence[LoopFacts] = ()
     nodes: Mapping[tuple[str, int], HeardHeartbeat] = field(default_factory=dict)
+    gateways: Sequence[GatewayFacts] = ()
     tests: Sequence[JobInBrief] = ()
     unconfirmed: Sequence[UnconfirmedJob] = ()
     signed: frozenset[str] = frozenset()
@@ -112,7 +133,7 @@ class Condition:
 
 def conditions(known: AlarmFacts) -> list[Condition]:
     """Returns everything that is abnormal at the moment of which this is known, each once."""
-    found = [*_tests(known), *_buses(known), *_nodes(known)]
+    found = [*_tests(known), *_gateways(known), *_buses(known), *_nodes(known)]
     explained = {tag for each in found if each.loop is None for tag in each.loops}
     up_s = {bus.url: bus.up_s for bus in known.buses if bus.why is None}
     for loop in known.loops:
@@ -123,7 +144,8 @@ def conditions(known: AlarmFacts) -> list[Condition]:
 def to_be_asked(known: AlarmFacts) -> set[str]:
     """Returns the ids of the alarms of which it matters here whether they were signed off."""
     ended = {alarm_id(AlarmKind.NOT_RESTORED, test.id) for test in known.tests if test.state in _NO_ANSWER}
-    return ended | {each.id for each in conditions(known) if RULES[each.kind].to_sign}
+    theirs = {alarm.id for gateway in known.gateways for alarm in gateway.alarms if alarm.to_sign}
+    return ended | theirs | {each.id for each in conditions(known) if RULES[each.kind].to_sign}
 
 
 def _tests(known: AlarmFacts) -> Iterator[Condition]:
@@ -154,6 +176,17 @@ def _tests(known: AlarmFacts) -> Iterator[Condition]:
             alarm_id(AlarmKind.TEST_FAILED, test.id), AlarmKind.TEST_FAILED, test.loop, f"The last test {how}{why}",
             advice, test.host, test.loop, (test.loop,), f"/jobs/{test.id}", _seconds(test.at),
         )  # fmt: skip
+
+
+def _gateways(known: AlarmFacts) -> Iterator[Condition]:
+    for gateway in known.gateways:
+        if gateway.silent:
+            waited_from_s = max(gateway.waited_from_s, gateway.last_s or 0.0)
+            yield Condition(
+                alarm_id(AlarmKind.GATEWAY_SILENT, gateway.name), AlarmKind.GATEWAY_SILENT, f"gateway {gateway.name}",
+                f"Gateway {gateway.name} does not answer", _GATEWAY_ADVICE, gateway.name, loops=gateway.loops,
+                since_s=gateway.last_s, from_s=waited_from_s,
+            )  # fmt: skip
 
 
 def _buses(known: AlarmFacts) -> Iterator[Condition]:

@@ -1,4 +1,4 @@
-"""Gathers what is known at one moment, from the listening, the running jobs and the database.
+"""Gathers what is known at one moment, from the listening, the running jobs, the database and the other gateways.
 
 While the database does not answer, what it has said last stays: buses and loops are looked at all the same.
 """
@@ -8,16 +8,18 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from loopwright.service.alarms.conditions import AlarmFacts, BusFacts, LoopFacts, to_be_asked
+from loopwright.service.alarms.alarm import Alarm
+from loopwright.service.alarms.conditions import AlarmFacts, BusFacts, GatewayFacts, LoopFacts, to_be_asked
 from loopwright.service.job_states import ACTIVE
 from loopwright.service.jobs.journal import temporary
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.listening import Listening
 from loopwright.service.loop_state import LoopState
-from loopwright.service.store import alarms, audit
+from loopwright.service.store import alarms, audit, gateways
 from loopwright.service.store.alarms import UnconfirmedJob
 from loopwright.service.store.live_jobs import Acceptance, JobInBrief, acceptances, latest_tests
 from loopwright.service.store.store import Store
@@ -35,12 +37,27 @@ class _Stored:
     audited: int | None = None
 
 
-class FactSource:
-    """One thread at a time may gather."""
+class OtherGateways(Protocol):
+    """What is known of the other gateways of the database."""
 
-    def __init__(self, jobs: Jobs, listening: Listening) -> None:
-        self._jobs, self._listening = jobs, listening
+    def look(self) -> None:
+        """Asks the database, unless it was asked just now. Raises SQLAlchemyError."""
+
+    def age_s(self, name: str) -> float | None:
+        """Returns how long ago a gateway was there, s; None: it never was."""
+
+    def alarms(self, name: str) -> Sequence[Alarm]:
+        """Returns what a gateway has said last of what only it can know."""
+
+
+class FactSource:
+    """One thread at a time may gather. others: None where no other gateway is looked at."""
+
+    def __init__(self, jobs: Jobs, listening: Listening, others: OtherGateways | None) -> None:
+        self._jobs, self._listening, self._others = jobs, listening, others
         self._stored = _Stored()
+        self._gateways: Sequence[GatewayFacts] = ()
+        self._asked_from_s: float | None = None
         self._signed: frozenset[str] = frozenset()
         self._up_s: dict[str, float] = {}
 
@@ -50,14 +67,16 @@ class FactSource:
         away = False
         try:
             self._stored = _asked(store, self._stored)
+            self._gateways = self._asked_gateways(now_s)
         except SQLAlchemyError as error:
-            away = True
+            away, self._asked_from_s = True, None
             _report(error)
         known = AlarmFacts(
             host=store.host,
             buses=self._buses(now_s),
             loops=self._loops(),
             nodes=dict(self._listening.nodes),
+            gateways=self._gateways,
             tests=list(self._stored.tests.values()),
             unconfirmed=self._stored.unconfirmed,
         )
@@ -70,6 +89,20 @@ class FactSource:
             except SQLAlchemyError as error:
                 _report(error)
         return replace(known, signed=self._signed)
+
+    def _asked_gateways(self, now_s: float) -> list[GatewayFacts]:
+        """Asks for the other gateways. Raises SQLAlchemyError."""
+        if self._others is None or not self._jobs.store.shared:
+            return []
+        self._others.look()
+        asked_from_s = self._asked_from_s = now_s if self._asked_from_s is None else min(now_s, self._asked_from_s)
+        found = []
+        for name, tags in gateways.loops_elsewhere(self._jobs.store).items():
+            age_s = self._others.age_s(name)
+            last_s = None if age_s is None else now_s - age_s
+            silent = age_s is None or age_s > gateways.NO_DATA_S
+            found.append(GatewayFacts(name, last_s, silent, asked_from_s, tags, self._others.alarms(name)))
+        return found
 
     def _buses(self, now_s: float) -> list[BusFacts]:
         if not self._listening.begun:

@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterable, Sequence
 from loopwright.service.alarms.alarm import LEVELS, RULES, Alarm, AlarmKind, Level, SignOff
 from loopwright.service.alarms.conditions import conditions
 from loopwright.service.alarms.delays import Delays
-from loopwright.service.alarms.facts import FactSource
+from loopwright.service.alarms.facts import FactSource, OtherGateways
+from loopwright.service.alarms.merging import merged, only_known_here
 from loopwright.service.errors import Conflict
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.listening import Listening
@@ -39,14 +40,21 @@ class NoSuchAlarm(Exception):
 
 
 class AlarmWatch:
-    """The alarms of this gateway, and those of tests of every gateway of the database.
+    """The alarms of this gateway, and those of the others of the database.
 
+    others: what is known of these; None: their tests alone are.
     clock: the wall time, s.
     """
 
-    def __init__(self, jobs: Jobs, listening: Listening, clock: Callable[[], float] = time.time) -> None:
+    def __init__(
+        self,
+        jobs: Jobs,
+        listening: Listening,
+        others: OtherGateways | None = None,
+        clock: Callable[[], float] = time.time,
+    ) -> None:
         self._store = jobs.store
-        self._source = FactSource(jobs, listening)
+        self._source = FactSource(jobs, listening, others)
         self._clock = clock
         self._delays = Delays()
         self._looking = threading.Lock()
@@ -74,7 +82,8 @@ class AlarmWatch:
             if before is not None and time.monotonic() - self._looked < fresh_s:
                 return before
             now_s = self._clock()
-            found = tuple(self._delays.step(conditions(self._source.gather(now_s)), now_s))
+            known = self._source.gather(now_s)
+            found = tuple(merged(self._delays.step(conditions(known), now_s), known))
             self.latest, self._looked = found, time.monotonic()
         if found != before:
             self.on_change()
@@ -85,6 +94,10 @@ class AlarmWatch:
         so that the sum over all gateways has each once."""
         found = Counter(alarm.level for alarm in self.latest or () if alarm.host == self._store.host)
         return {level: found[level] for level in LEVELS}
+
+    def only_known_here(self) -> list[Alarm]:
+        """Returns the alarms, as they were seen last, of which the other gateways know only what this one says."""
+        return only_known_here(self.latest or (), self._store.host)
 
     def find(self, alarm_id: str) -> Alarm:
         """Returns an alarm, also one that was signed off. Raises NoSuchAlarm, SQLAlchemyError."""

@@ -141,7 +141,7 @@ def create_app(
     listening = listening or Listening(jobs.directory.loops, jobs.store, on=False)
     others = others or OtherGateways(jobs.store)
     own = own or OwnGateway(jobs, listening)
-    alarms = alarms or AlarmWatch(jobs, listening)
+    alarms = alarms or AlarmWatch(jobs, listening, others)
     operations.install(app, jobs, checks, {} if sdo_retries is None else sdo_retries, alarms)
     alarms_api.install(app, alarms)
 

@@ -60,8 +60,8 @@ class Live:
         others: OtherGateways | None = None,
     ) -> None:
         self._jobs, self._listening = jobs, listening
-        self._alarms = alarms or AlarmWatch(jobs, listening)
         self._own, self._others = OwnGateway(jobs, listening), others or OtherGateways(jobs.store)
+        self._alarms = alarms or AlarmWatch(jobs, listening, self._others)
         self._looked_up = LookedUpJobs(jobs, self._others)
         self._viewers: set[Viewer] = set()
         self._working: tuple[asyncio.Task[None], ...] = ()

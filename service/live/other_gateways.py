@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pydantic import ValidationError
 from sqlalchemy.exc import SQLAlchemyError
 
+from loopwright.service.alarms.alarm import Alarm
 from loopwright.service.live.messages import BusView, LoopValues
 from loopwright.service.live.rows import no_values, old
 from loopwright.service.live.snapshot import SETTINGS, JobProgress, LoopSettings, Present
@@ -27,6 +28,7 @@ class OtherGateway:
     """A gateway as it was read last.
 
     said: its row.  values, settings: of its loops, by tag.  jobs: those that run there, by id.
+    alarms: what only it can know of what is abnormal.
     not_readable: why its values are not known although it was there; None: they are.
     """
 
@@ -35,6 +37,7 @@ class OtherGateway:
     settings: Mapping[str, LoopSettings]
     jobs: Mapping[str, JobProgress]
     buses: Sequence[BusView]
+    alarms: Sequence[Alarm]
     not_readable: str | None
 
 
@@ -130,6 +133,11 @@ class OtherGateways:
             return None
         return found.jobs.get(job_id)
 
+    def alarms(self, name: str) -> Sequence[Alarm]:
+        """Returns what a gateway has said last of what only it can know of what is abnormal."""
+        found = self._found.get(name)
+        return () if found is None else found.alarms
+
     def buses(self) -> list[BusView]:
         """Returns the buses of the other gateways."""
         found = []
@@ -150,6 +158,6 @@ def _read(said: GatewaySaid, before: OtherGateway | None) -> OtherGateway:
     except ValidationError as error:
         fields = ", ".join(sorted({str(each["loc"][0]) for each in error.errors() if each["loc"]}))
         why = f"what gateway {said.name} of version {said.version} says cannot be read here ({fields})"
-        return OtherGateway(said, {}, {}, {}, [], why)
+        return OtherGateway(said, {}, {}, {}, [], [], why)
     values = {each.tag: each for each in now.loops}
-    return OtherGateway(said, values, settings, {each.id: each for each in now.jobs}, now.buses, None)
+    return OtherGateway(said, values, settings, {each.id: each for each in now.jobs}, now.buses, now.alarms, None)

@@ -10,6 +10,7 @@ from importlib.metadata import version
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from loopwright.service.alarms.watch import AlarmWatch
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.journal import temporary
 from loopwright.service.jobs.manager import Jobs
@@ -31,19 +32,26 @@ _STOP_S = 2.0
 
 
 class OwnGateway:
-    """What this gateway says of itself. url: where browsers reach it, as configured."""
+    """What this gateway says of itself.
 
-    def __init__(self, jobs: Jobs, listening: Listening, url: str | None = None) -> None:
-        self._jobs, self._listening = jobs, listening
+    url: where browsers reach it, as configured.  alarms: what is abnormal; None: nothing is said of that.
+    """
+
+    def __init__(
+        self, jobs: Jobs, listening: Listening, url: str | None = None, alarms: AlarmWatch | None = None
+    ) -> None:
+        self._jobs, self._listening, self._alarms = jobs, listening, alarms
         self.url = url
         self.name = jobs.store.host
         self.version = version("loopwright")
 
     def present(self, now_s: float) -> Present:
-        """Returns the present state of its loops, buses and jobs. now_s: s since 1970 UTC."""
+        """Returns the present state of its loops, buses, jobs and alarms. now_s: s since 1970 UTC."""
         running = list(self._jobs.registry.running.copy().values())
         loops = [self._values(tag, running, now_s) for tag in self._jobs.directory.loops]
-        return Present(loops=loops, buses=self.buses(), jobs=[progress_of(each) for each in running])
+        alarms = [] if self._alarms is None else self._alarms.only_known_here()
+        progress = [progress_of(each) for each in running]
+        return Present(loops=loops, buses=self.buses(), jobs=progress, alarms=alarms)
 
     def values(self, tag: str, now_s: float) -> LoopValues:
         """Returns what was heard last of one of its loops. now_s: s since 1970 UTC."""

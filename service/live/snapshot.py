@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from pydantic import BaseModel, TypeAdapter
 
+from loopwright.service.alarms.alarm import Alarm
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.live.messages import BusView, LoopValues
 from loopwright.service.loop_state import LoopState
@@ -37,11 +38,13 @@ def progress_of(running: Running) -> JobProgress:
 
 
 class Present(BaseModel):
-    """What changes all the time. Ages of samples are those at the time of writing."""
+    """What changes all the time. Ages of samples are those at the time of writing. alarms: those that the others
+    cannot find in the database by themselves."""
 
     loops: list[LoopValues]
     buses: list[BusView]
     jobs: list[JobProgress]
+    alarms: list[Alarm] = []
 
 
 class LoopSettings(BaseModel):

@@ -246,8 +246,9 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         looking = stack.enter_context(
             closing(Looking(jobs.directory, jobs.registry, store, listening, jobs.knowledge, pool))
         )
-        alarms = stack.enter_context(closing(AlarmWatch(jobs, listening)))
-        own, others = OwnGateway(jobs, listening, setup.url), OtherGateways(store)
+        others = OtherGateways(store)
+        alarms = stack.enter_context(closing(AlarmWatch(jobs, listening, others)))
+        own = OwnGateway(jobs, listening, setup.url, alarms)
         announcing = stack.enter_context(closing(Announcing(jobs, own)))
         live_stream = Live(jobs, listening, alarms, others)
         app = create_app(

@@ -52,6 +52,15 @@ def every(store: Store) -> dict[str, GatewaySaid]:
         return {row.name: GatewaySaid(*row) for row in session.execute(_EVERY)}
 
 
+def loops_elsewhere(store: Store) -> dict[str, tuple[str, ...]]:
+    """Returns the tags of the loops of each other gateway, sorted. Raises SQLAlchemyError."""
+    found: dict[str, list[str]] = {}
+    with store.reading() as session:
+        for tag, host in session.execute(_LOOPS_ELSEWHERE, {"name": store.host}):
+            found.setdefault(host, []).append(tag)
+    return {host: tuple(tags) for host, tags in found.items()}
+
+
 def age_s(store: Store, host: str) -> float | None:
     """Returns how old the row of a gateway is, s; None: it has none. Raises SQLAlchemyError."""
     with store.reading() as session:
@@ -89,5 +98,6 @@ _WRITE = text(
     " present = excluded.present, settings = coalesce(:settings, gateways.settings)"
 )
 _EVERY = text(f"SELECT name, at_s, {NOW_S} - at_s AS age_s, url, version, present, settings FROM gateways")
+_LOOPS_ELSEWHERE = text("SELECT tag, host FROM loops WHERE host <> :name ORDER BY host, tag")
 _AGE = text(f"SELECT {NOW_S} - at_s FROM gateways WHERE name = :name")
 _FORGET = text(f"DELETE FROM gateways WHERE {NOW_S} - at_s > :age_s AND name NOT IN (SELECT host FROM loops)")

@@ -13,6 +13,8 @@ import httpx
 from fastapi.testclient import TestClient
 from sqlalchemy import text
 
+from loopwright.service.alarms.alarm import Alarm
+from loopwright.service.alarms.watch import AlarmWatch
 from loopwright.service.api.app import create_app
 from loopwright.service.inputs.config import parse_site
 from loopwright.service.inputs.request import FastRetune
@@ -38,7 +40,7 @@ class Hearing(Listening):
 
     def hears(self, heard: Heard | None, down: str | None = None) -> None:
         """down: why no bus is heard."""
-        self.off, self._started = {}, True
+        self.off, self._started, self._begun = {}, True, True
         self._down = dict.fromkeys(self.buses(), down) if down else {}
         self.heard = dict.fromkeys(self._loops, heard) if heard else {}
 
@@ -62,11 +64,14 @@ class OneGateway:
         self.jobs = self.make_jobs()
         self.jobs.boot()
         self.listening = Hearing(self.jobs.directory.loops, self.store, on=False)
-        self.own = OwnGateway(self.jobs, self.listening, f"https://{name}.example")
-        self.announcing = Announcing(self.jobs, self.own)
-        self._later_s = 0.0
+        self._later_s = self.alarms_later_s = 0.0
         self.others = OtherGateways(self.store, lambda: time.monotonic() + self._later_s)
-        self.app = create_app(self.jobs, checks={}, listening=self.listening, own=self.own, others=self.others)
+        self.watch = AlarmWatch(self.jobs, self.listening, self.others, lambda: time.time() + self.alarms_later_s)
+        self.own = OwnGateway(self.jobs, self.listening, f"https://{name}.example", self.watch)
+        self.announcing = Announcing(self.jobs, self.own)
+        self.app = create_app(
+            self.jobs, checks={}, listening=self.listening, alarms=self.watch, own=self.own, others=self.others
+        )
         self.http = TestClient(self.app, raise_server_exceptions=False)
         # FastAPI builds its routes with the first requests, and silences warnings of the whole process meanwhile: two
         # gateways that do so at once, which one service never does, would not silence all of them.
@@ -95,6 +100,12 @@ class OneGateway:
     def look_again(self) -> None:
         """The next who asks for the other gateways has the database asked."""
         self._later_s += LOOK_S
+
+    def alarms_after(self, seconds: float) -> list[Alarm]:
+        """What is abnormal here when so much time has passed, with what the others have said by then."""
+        self.alarms_later_s += seconds
+        self.look_again()
+        return list(self.watch.look())
 
     def requests(self) -> list[tuple[str, str]]:
         """What is asked and the state of every request, as the database has them."""

@@ -5,7 +5,7 @@ import { alarms, isSilent, now_s, silent_s } from "./state.js";
 
 /**
  * As GET /alarms has them.
- * @typedef {{id: string, level: 1 | 2 | 3, subject: string, text: string, advice: string, since: string, loop: string | null,
+ * @typedef {{id: string, level: 1 | 2 | 3, kind?: string, host?: string, subject: string, text: string, advice: string, since: string, loop: string | null,
  *   loops: string[], job: string | null, to_sign: boolean}} Alarm
  */
 

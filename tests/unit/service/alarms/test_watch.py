@@ -81,7 +81,7 @@ class Watched:
     def __init__(self, service: Service) -> None:
         self.service, self.clock = service, Clock()
         self.ear = OpenEar(service)
-        self.watch = AlarmWatch(service.jobs, self.ear, self.clock)
+        self.watch = AlarmWatch(service.jobs, self.ear, clock=self.clock)
 
     def after(self, seconds: float) -> list[tuple[int, str]]:
         self.clock.now_s += seconds

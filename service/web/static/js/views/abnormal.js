@@ -2,6 +2,7 @@
 /** What is abnormal, and nothing else. Meant to stay open. */
 import { useEffect } from "../../vendor/hooks.js";
 import { abnormalNow } from "../alarms.js";
+import { isElsewhere } from "../gateways.js";
 import { html } from "../html.js";
 import { duration, when } from "../numbers.js";
 import { jobPath, loopPath } from "../router.js";
@@ -43,12 +44,13 @@ export function AbnormalView() {
     })}</tbody></table></div></div>`;
 }
 
-/** A loop; or a bus or a node, with the loops that it concerns. @param {import("../alarms.js").Alarm} alarm */
+/** A loop; or a bus, a node or a gateway, with the loops that it concerns. @param {import("../alarms.js").Alarm} alarm */
 function Subject(alarm) {
   if (alarm.loop) return html`<a class="tag" href=${loopPath(alarm.loop)}>${alarm.loop}</a>`;
   const shown = alarm.loops.slice(0, MOST);
   const more = alarm.loops.length - shown.length;
-  return html`<span key="of">${alarm.subject}</span>${shown.length > 0 && html`<small key="loops">${shown.map((tag, n) => html`${n ? ", " : ""}<a class="tag" href=${loopPath(tag)}>${tag}</a>`)}${more > 0 ? ` and ${more} more` : ""}</small>`}`;
+  const at = alarm.host && alarm.kind !== "gateway_silent" && isElsewhere({ host: alarm.host }) ? ` of gateway ${alarm.host}` : "";
+  return html`<span key="of">${alarm.subject}${at}</span>${shown.length > 0 && html`<small key="loops">${shown.map((tag, n) => html`${n ? ", " : ""}<a class="tag" href=${loopPath(tag)}>${tag}</a>`)}${more > 0 ? ` and ${more} more` : ""}</small>`}`;
 }
 
 const MOST = 6;

@@ -96,7 +96,7 @@ export function LoopView({ tag }) {
     </div>
     ${mine.map((each) => html`<div class="abnormal" key=${each.id}>${AlarmSymbol(each.level)}<span><b>${each.text}.</b> <span class="quiet">${each.advice}</span></span>${SignOffButton(each)}
       ${asking.value === each.id && html`<${SignOffQuestion} key="question" alarm=${each} />`}</div>`)}
-    ${elsewhere && row?.not_heard && !isSilent.value && html`<p class="refusal" key="gateway" role="status"><b>${row.not_heard}.</b></p>`}
+    ${elsewhere && row?.not_heard && !isSilent.value && !mine.some((each) => each.kind === "gateway_silent") && html`<p class="refusal" key="gateway" role="status"><b>${row.not_heard}.</b></p>`}
     ${detail?.not_confirmed_home && html`<p class="refusal" key="home"><b>${detail.not_confirmed_home.detail}</b> ${detail.not_confirmed_home.advice}</p>`}
     ${loop.locked && html`<p class="refusal" key="lock">Locked by ${loop.locked.by} since ${when(loop.locked.since)}: ${loop.locked.reason}. Tests and decisions wait until it is unlocked.</p>`}
     <div class="loop" key="loop">
