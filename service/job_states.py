@@ -46,18 +46,12 @@ GOOD = frozenset({_S.PROPOSED, _S.NO_GAIN, _S.REHEARSED})
 
 
 class IllegalMove(Exception):
-    """A move that the table does not have."""
+    """A move that the table does not have. detail: what is there instead, and what to do next."""
 
-    def __init__(self, now: JobState, wanted: JobState) -> None:
-        super().__init__(f"a job that is {now.value} cannot become {wanted.value}")
+    def __init__(self, now: JobState, wanted: JobState, detail: str = "") -> None:
+        super().__init__(detail or f"a job that is {now.value} cannot become {wanted.value}: look at the job again")
         self.now = now
         self.wanted = wanted
-
-
-def check(now: JobState, wanted: JobState) -> None:
-    """Raises IllegalMove unless the table has it."""
-    if wanted not in MOVES[now]:
-        raise IllegalMove(now, wanted)
 
 
 def state_after(ended: Ended) -> JobState:

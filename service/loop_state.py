@@ -63,7 +63,7 @@ _LOOP_STATE = TypeAdapter(LoopState)
 def gains_of(data: JsonValue) -> Gains:
     """Returns the gains in the JSON of a job. Raises Conflict where there are none."""
     if not data or not isinstance(data, dict):
-        raise Conflict("the job has no gains to put")
+        raise Conflict("the job has kept no old gains, so that none can be written or taken back; retune the loop")
     return Gains(**{name: number(data[name]) for name in Gains.__dataclass_fields__ if data.get(name) is not None})
 
 

@@ -51,7 +51,8 @@ class Problem(BaseModel):
     title: str = Field(description="Title of the HTTP status", examples=["Conflict"])
     status: int = Field(description="HTTP status", examples=[409])
     detail: str = Field(
-        description="Explanation of this occurrence", examples=["loop TIC-101 is busy with job 4f0c2a9be113"]
+        description="Explanation of this occurrence",
+        examples=["loop TIC-101 is locked by night shift since 2026-01-31T12:00:00.000Z: valve"],
     )
     reason: Reason | None = Field(default=None, description="Reason code from the closed list", examples=["node_lost"])
     advice: str | None = Field(default=None, description="What the client or the operator should do")

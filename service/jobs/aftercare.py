@@ -17,7 +17,7 @@ from loopwright.service.loop_state import state_json
 from loopwright.service.loops.restoration import Restoration, restore_loop_of
 from loopwright.service.store import looked_after
 from loopwright.service.store.jobs import Job
-from loopwright.service.store.store import Busy, Store
+from loopwright.service.store.store import Store
 from loopwright.service.telemetry.logs import about
 from loopwright.tuning.reasons import ADVICE, Reason
 
@@ -121,9 +121,8 @@ class Aftercare:
         if not looked_after.rows(self._store, tag):
             self._directory.owner(tag)
             return []
-        active = self._store.active(tag)
-        if active is not None:
-            raise Busy(tag, active.id)
+        if (busy := self._store.why_busy(tag)) is not None:
+            raise busy
         return looked_after.dismissed(self._store, tag, by)
 
     def check_due_loops(self) -> None:

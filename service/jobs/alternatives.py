@@ -105,11 +105,11 @@ def _tuned(gains: Gains, ms: float, assessed: Assessment) -> MethodResult:
 def job_model(row: Job, events: Sequence[JobEvent]) -> FoundModel:
     """Returns the model of the job's result, else the last one of a stage, else the one entered. Raises Conflict."""
     if row.state in ACTIVE:
-        raise Conflict(f"job {row.id} is not over: it has no model to compare methods on yet")
+        raise Conflict(f"job {row.id} is not over: it has no model to compare methods on yet; ask again when it is")
     model = found_model(row, events) or _typed_in(row)
     if model is not None:
         return model
-    raise Conflict(f"job {row.id} ended as {row.state} before it had a model")
+    raise Conflict(f"job {row.id} ended as {row.state} before it had a model to compare methods on; the job says why")
 
 
 def designable(row: Job, events: Sequence[JobEvent], has_record: bool) -> FoundModel:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 
 from loopwright.service.errors import Conflict, Locked
-from loopwright.service.job_states import IllegalMove, JobState, shown
+from loopwright.service.job_states import JobState, shown
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.passing_on import PassingOn
@@ -15,7 +15,7 @@ from loopwright.service.observing.kept_knowledge import KeptKnowledge
 from loopwright.service.store import loop_locks
 from loopwright.service.store.decision_requests import What
 from loopwright.service.store.jobs import Job
-from loopwright.service.store.store import Busy, Store
+from loopwright.service.store.store import Store
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Ended, Reason
 
@@ -49,7 +49,8 @@ class Decisions:
 
         After an error the decision can be repeated, which completes it, or be rolled back. A job of another host whose
         gateway has not answered yet is returned as it is, not accepted.
-        Raises Conflict, and Failed or Refused as the loop does; of another host's also GatewayLost, NotKnown.
+        Raises IllegalMove, Busy, Conflict, and Failed or Refused as the loop does; of another host's also GatewayLost,
+        NotKnown.
         """
         return self._decide(job_id, JobState.ACCEPTED, by)
 
@@ -64,11 +65,9 @@ class Decisions:
         with self._directory.alone_with(row.loop):
             row = self.store.get(job_id)
             now = shown(row.state, row.dry_run)
-            if now not in (JobState.PROPOSED, JobState.ACCEPTED) or now is wanted:
-                raise IllegalMove(now, wanted)
-            active = self.store.active(row.loop)
-            if active is not None:
-                raise Busy(row.loop, active.id)
+            self.store.check_move(job_id, wanted)
+            if (busy := self.store.why_busy(row.loop)) is not None:
+                raise busy
             if wanted is JobState.ROLLED_BACK and (declined := self.store.decline(job_id, by)) is not None:
                 return declined
             with self.store.reading() as session:
@@ -122,5 +121,5 @@ class Decisions:
 def new_gains(row: Job) -> Gains:
     """Raises Conflict for a job without new gains."""
     if row.result is None or row.result.new_gains is None:
-        raise Conflict("the job has no gains to put")
+        raise Conflict(f"job {row.id} has no new gains, so that none can be written; retune the loop")
     return row.result.new_gains.gains()

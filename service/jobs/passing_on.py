@@ -119,9 +119,9 @@ def raise_of(answer: RequestAnswer, loop: str, host: str) -> None:
         case AnswerKind.DONE:
             return
         case AnswerKind.ILLEGAL_MOVE:
-            raise IllegalMove(JobState(answer.now or ""), JobState(answer.wanted or ""))
+            raise IllegalMove(JobState(answer.now or ""), JobState(answer.wanted or ""), answer.detail)
         case AnswerKind.BUSY:
-            raise Busy(loop, answer.job or "")
+            raise Busy(loop, answer.job or "", answer.detail)
         case AnswerKind.LOCKED:
             raise Locked(answer.detail)
         case AnswerKind.CONFLICT:

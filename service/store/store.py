@@ -14,10 +14,10 @@ from sqlalchemy import ColumnElement, delete, func, select, update
 from sqlalchemy.exc import IntegrityError, SQLAlchemyError, TimeoutError
 from sqlalchemy.orm import Session
 
-from loopwright.service.job_states import ACTIVE, IllegalMove, JobState, check
+from loopwright.service.job_states import ACTIVE, MOVES, JobState, shown
 from loopwright.service.jsonable import JsonObject, json_object, to_jsonable
 from loopwright.service.loop_state import gains_of, same_gains
-from loopwright.service.store import audit, claims, loop_locks, retunes, sample_blocks
+from loopwright.service.store import audit, claims, late, loop_locks, retunes, sample_blocks
 from loopwright.service.store.clock import now
 from loopwright.service.store.damage import Damage
 from loopwright.service.store.database import (
@@ -56,10 +56,10 @@ _ACTIVE = [state.value for state in ACTIVE]
 
 
 class Busy(Exception):
-    """The loop already has an active job."""
+    """The loop already has an active job. detail: whose, since when, and what to do next."""
 
-    def __init__(self, loop: str, job_id: str) -> None:
-        super().__init__(f"loop {loop} is busy with job {job_id}")
+    def __init__(self, loop: str, job_id: str, detail: str = "") -> None:
+        super().__init__(detail or f"loop {loop} is busy with job {job_id}: wait for its end, or abort it")
         self.loop = loop
         self.job_id = job_id
 
@@ -251,10 +251,10 @@ class Store:
                     also(session, row)
                 return Job.from_row(row)
         except IntegrityError as error:
-            active = self.active(loop)
-            if active is None:
+            busy = self.why_busy(loop)
+            if busy is None:
                 raise
-            raise Busy(loop, active.id) from error
+            raise busy from error
 
     def move(self, job_id: str, wanted: JobState, by: str = "service", **columns: Unpack[JobColumns]) -> Job:
         """Moves the job as the table allows and sets the columns, in one transaction with its event. Raises
@@ -279,7 +279,7 @@ class Store:
         """Notes that the controller is about to be written to. Raises IllegalMove when another was faster, Locked."""
         with self.writing() as session:
             row = _find(session, job_id, lock=True)
-            check(row.state, wanted)
+            _check(session, row, wanted)
             loop_locks.check(session, row.loop)
             append(session, job_id, _BEGUN, {"decision": DECISIONS[wanted], "by": by}, row.plant_time_s)
 
@@ -288,7 +288,7 @@ class Store:
         with self.writing() as session:
             row = _find(session, job_id, lock=True)
             if row.state not in ACTIVE:
-                raise IllegalMove(row.state, JobState.RUNNING)
+                raise late.too_late(row, row.state, JobState.RUNNING, _decided(session, row))
             _may_begin(session, row)
             set_columns(row, columns)
             append(session, job_id, "resumed", details, row.plant_time_s)
@@ -312,6 +312,18 @@ class Store:
         with self._session() as session:
             row = session.scalars(wanted).one_or_none()
         return None if row is None else Job.from_row(row)
+
+    def why_busy(self, loop: str) -> Busy | None:
+        """The error for who asks for the loop; None: no job has it."""
+        wanted = select(JobRow).where(JobRow.loop == loop, JobRow.state.in_(_ACTIVE), JobRow.dry_run.is_(False))
+        with self._session() as session:
+            row = session.scalars(wanted).one_or_none()
+            return None if row is None else Busy(loop, row.id, late.busy(row))
+
+    def check_move(self, job_id: str, wanted: JobState) -> None:
+        """Raises IllegalMove, with words for who asks for it, unless the job may become so."""
+        with self._session() as session:
+            _check(session, _find(session, job_id), wanted)
 
     def busy(self) -> dict[str, str]:
         """The active job by loop, of every host."""
@@ -346,7 +358,7 @@ class Store:
             row = _find(session, job_id, lock=True)
             ended_for_it = heard and (row.state, row.reason, row.stop_reason) == (JobState.ABORTED, reason, None)
             if not ended_for_it:
-                check(row.state, JobState.ABORTED)
+                _check(session, row, JobState.ABORTED)
             claims.changed(session, f"/jobs/{job_id}")
             if row.stop_reason is None:
                 row.stop_reason = reason
@@ -539,7 +551,7 @@ def _may_begin(session: Session, row: JobRow) -> None:
 
 def _move(session: Session, row: JobRow, wanted: JobState, by: str, columns: JobColumns) -> JobRow:
     previous = row.state
-    check(previous, wanted)
+    _check(session, row, wanted)
     if wanted is JobState.RUNNING:
         _may_begin(session, row)
     row.state = wanted
@@ -556,6 +568,22 @@ def _move(session: Session, row: JobRow, wanted: JobState, by: str, columns: Job
         held = (row.restored or {}).get("gains") if "restored" in columns else None
         _audit_decision(session, row, previous, wanted, by, held if isinstance(held, dict) else None)
     return row
+
+
+def _check(session: Session, row: JobRow, wanted: JobState) -> None:
+    """Raises IllegalMove, with words for who asks for it, unless the job may become so."""
+    present = shown(row.state, row.dry_run)
+    if wanted not in MOVES[present]:
+        raise late.too_late(row, present, wanted, _decided(session, row))
+
+
+def _decided(session: Session, row: JobRow) -> late.Decided | None:
+    """Who has decided the job last; None: nobody has."""
+    if row.state not in DECISIONS:
+        return None
+    mine = (EventRow.job_id == row.id, EventRow.kind == "state")
+    event = session.scalars(select(EventRow).where(*mine).order_by(EventRow.seq.desc()).limit(1)).one_or_none()
+    return None if event is None else late.Decided(str(event.data.get("by", "")), event.at)
 
 
 def _last_begun(session: Session, job_id: str) -> str | None:
