@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections import Counter
@@ -15,19 +14,17 @@ from loopwright.service.alarms.facts import FactSource, OtherGateways
 from loopwright.service.alarms.merging import merged, only_known_here
 from loopwright.service.errors import Conflict
 from loopwright.service.jobs.manager import Jobs
+from loopwright.service.jobs.repeated import Repeated
 from loopwright.service.listening.listening import Listening
 from loopwright.service.store import alarms as stored
 from loopwright.service.store.alarms import NOT_RESTORED, SignedOffAlready
 from loopwright.service.store.clock import now
 from loopwright.service.store.tables import AlarmSignOffRow
 
-log = logging.getLogger(__name__)
-
 LOOK_S = 1.0
 """Wall time between two looks, s."""
 FRESH_S = 0.25
 """Age up to which a look is used again, s, so that frequent questions cost no more."""
-_STOP_S = 5.0
 
 
 class NoSuchAlarm(Exception):
@@ -63,17 +60,15 @@ class AlarmWatch:
         """The alarms as they were seen last, the worst first, replaced as a whole; None before the first look."""
         self.on_change: Callable[[], None] = lambda: None
         """Called in another thread when `latest` is another list than before."""
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="alarms", daemon=True)
+        failed = "what is abnormal could not be looked for"
+        self._looks = Repeated(lambda: self.look(0.5 * LOOK_S), LOOK_S, "alarms", failed)
 
     def start(self) -> None:
         """Looks from now on by itself, in the background."""
-        self._thread.start()
+        self._looks.start()
 
     def close(self) -> None:
-        self._over.set()
-        if self._thread.is_alive():
-            self._thread.join(_STOP_S)
+        self._looks.close()
 
     def look(self, fresh_s: float = 0.0) -> Sequence[Alarm]:
         """Looks now, unless the last look is no older than this, s. Returns the alarms, the worst first."""
@@ -134,14 +129,6 @@ class AlarmWatch:
             raise Conflict(str(error)) from error
         self.look()
         return _signed(row)
-
-    def _run(self) -> None:
-        while not self._over.is_set():
-            try:
-                self.look(0.5 * LOOK_S)
-            except Exception:  # the next look may see more
-                log.exception("defect while looking for what is abnormal")
-            self._over.wait(LOOK_S)
 
 
 def _of(alarms: Iterable[Alarm], alarm_id: str) -> Alarm | None:

@@ -68,10 +68,14 @@ class KeptFigures:
             return
         future.add_done_callback(partial(_tell, job.id))
 
+    def request_stop(self) -> None:
+        """Ends the computations, so that nobody waits for them; returns at once."""
+        self._closed = True
+
     def close(self) -> None:
         """Ends the computations; what they have not stored is computed when somebody asks."""
+        self.request_stop()
         with self._lock:
-            self._closed = True
             threads = list(self._threads.values())
         for thread in threads:
             thread.join(_CLOSE_S)

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.protocol.profile import Mode
 from loopwright.service.execution.computing.limits import ComputationKind
@@ -23,6 +21,7 @@ from loopwright.service.execution.computing.pool import NotWanted, Pool
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.registry import Registry
+from loopwright.service.jobs.repeated import Repeated
 from loopwright.service.listening.bins import Bins
 from loopwright.service.listening.listening import Listening
 from loopwright.service.listening.rings import SAMPLES
@@ -30,7 +29,7 @@ from loopwright.service.observing.hearing import question
 from loopwright.service.observing.kept_knowledge import KeptKnowledge
 from loopwright.service.observing.observed import observed
 from loopwright.service.observing.resolution import FIRST_S, wall_period_s
-from loopwright.service.store.store import FolderInUse, Store
+from loopwright.service.store.store import Store
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.models import Reals
 from loopwright.tuning.reasons import Ended
@@ -47,7 +46,6 @@ FOLLOWED_T95 = 6.5
 POINTS = 2000
 """Bins in which set-point changes are looked for: shorter than the time between two changes of an operator."""
 _ROUND_S = 5.0
-_STOP_S = 5.0
 
 
 @dataclass
@@ -86,27 +84,14 @@ class Looking:
         self._every_s, self._wall = every_s, wall
         self._spec = DesignSpec()
         self._loops = {tag: _Loop() for tag in directory.loops}
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="looks at histories", daemon=True)
+        failed = "the histories of the loops could not be looked at"
+        self._looks = Repeated(self.look_at_due_loops, _ROUND_S, "looks at histories", failed, at_once=False)
 
     def start(self) -> None:
-        self._thread.start()
+        self._looks.start()
 
     def close(self) -> None:
-        self._over.set()
-        if self._thread.is_alive():
-            self._thread.join(_STOP_S)
-
-    def _run(self) -> None:
-        while not self._over.wait(_ROUND_S):
-            try:
-                self.look_at_due_loops()
-            except FolderInUse:  # another service has this host's name, and looks instead
-                return
-            except SQLAlchemyError as error:
-                log.warning("the histories of the loops could not be looked at, this is tried again: %s", error)
-            except Exception:  # after any error, the other loops must still be looked at
-                log.exception("defect while looking at the histories of the loops")
+        self._looks.close()
 
     def look_at_due_loops(self) -> list[str]:
         """Looks at every loop whose time has come and whose set-point was changed. Returns their tags. Raises
@@ -175,7 +160,7 @@ class Looking:
         return tag in self._registry.under_test().values()
 
     def _stopping(self) -> bool:
-        return self._over.is_set() or self._registry.stopping
+        return self._looks.closed or self._registry.stopping
 
 
 def moves(bins: Bins) -> Reals:

@@ -7,20 +7,19 @@ After a jump of the clock nothing is deleted for its age: service/store/clock_wa
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 from sqlalchemy import ColumnElement, delete, func, select, update
-from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.engine import Engine
+from loopwright.service.jobs.repeated import Repeated
 from loopwright.service.store import audit, history, hosts, knowledge
 from loopwright.service.store.clock import stamp
 from loopwright.service.store.clock_watch import ClockWatch, longest_stop
-from loopwright.service.store.store import FolderInUse, Store, append
+from loopwright.service.store.store import Store, append
 from loopwright.service.store.tables import ChunkRow, JobFiguresRow, JobKnowledgeRow, JobRow
 from loopwright.service.telemetry.metrics import CLOCK_JUMPS
 
@@ -31,7 +30,6 @@ CLOCK_CHECK_S = 60.0
 """Wall time between two checks of the clock, s."""
 _AT_ONCE = 50
 _FORGOTTEN_AT_ONCE = 500
-_STOP_S = 5.0
 _KEPT = [state.value for state in (*ACTIVE, JobState.PROPOSED)]
 
 
@@ -154,18 +152,16 @@ class Retention:
         watch: ClockWatch | None = None,
     ) -> None:
         self._store, self._engine, self._policy = store, engine, policy
-        self._every_s, self._clock_check_s = every_s, clock_check_s
+        self._every_s = every_s
         self._watch = watch or ClockWatch()
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="retention", daemon=True)
+        self._tidied_s: float | None = None
+        self._turns = Repeated(self._turn, clock_check_s, "retention", "old samples could not be deleted")
 
     def start(self) -> None:
-        self._thread.start()
+        self._turns.start()
 
     def close(self) -> None:
-        self._over.set()
-        if self._thread.is_alive():
-            self._thread.join(_STOP_S)  # the engine may be waiting for an unreachable database
+        self._turns.close()
 
     def note(self) -> str | None:
         """Returns why no samples are deleted for their age at present; None where they are."""
@@ -190,21 +186,11 @@ class Retention:
         if self._watch.seen is not None:
             hosts.keep_seen(self._store, self._watch.seen, jump)
 
-    def _run(self) -> None:
-        tidied: float | None = None
-        while not self._over.is_set():
-            try:
-                self.check_clock()
-                if tidied is None or time.monotonic() - tidied >= self._every_s:
-                    self.tidy()
-                    tidied = time.monotonic()
-            except FolderInUse:  # another service has this host's name, and deletes instead
-                return
-            except SQLAlchemyError as error:
-                log.warning("old samples could not be deleted, this is tried again later: %s", error)
-            except Exception:  # after any error, it must be tried again
-                log.exception("old samples could not be deleted")
-            self._over.wait(self._clock_check_s)
+    def _turn(self) -> None:
+        self.check_clock()
+        if self._tidied_s is None or time.monotonic() - self._tidied_s >= self._every_s:
+            self.tidy()
+            self._tidied_s = time.monotonic()
 
     def tidy(self) -> None:
         """One turn of the thread, without a look at the clock."""

@@ -260,6 +260,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
             """Ends jobs and server: the server waits for its connections, and event streams end with their jobs."""
             tell_systemd("STOPPING=1")
             jobs.request_stop()
+            figures.request_stop()  # else the server would cancel requests that wait for them, and log each as an error
             server.should_exit = True
 
         signals.tell(end, partial(_awaited, jobs))

@@ -30,7 +30,8 @@ logging.getLogger("can").setLevel(logging.ERROR)
 class Site(Plantsite):
     """A hub of its own, and a service that comes back at the same port, as one does whose page is open.
 
-    The plant runs as fast as it can until somebody calls at_rest(pace).
+    The plant runs as fast as it can until somebody calls at_rest(pace).  bus: of a hub that the test runs itself; None:
+    a process of its own, `hub`.
     """
 
     def __init__(
@@ -40,13 +41,28 @@ class Site(Plantsite):
         more_loops: tuple[Mapping[str, Any], ...] = (ABSENT,),
         served_with: Sequence[str] = (),
         changes: Mapping[str, Any] = LOOP,
+        bus: str | None = None,
     ) -> None:
-        self.hub = ChildProcess("hub", ("loopwright.protocol.hub", "--port", "0"), folder / "hub.log")
-        stack.callback(self.hub.stop)
-        bus = self.hub.wait_ready().split()[1]
+        if bus is None:
+            hub_port = free_port()
+            self._hub_options = ("loopwright.protocol.hub", "--port", str(hub_port))
+            self.hub = ChildProcess("hub", self._hub_options, folder / "hub.log")
+            stack.callback(self.hub.stop)
+            bus = self.hub.wait_ready().split()[1]
         port = ("--port", str(free_port()))
         more = tuple(dict(each) for each in more_loops)
         super().__init__(stack, folder, CASE, bus, more, served_with=(*port, *served_with), changes=changes)
+
+    def start_hub(self) -> None:
+        """The hub anew, at the address that it had, and the devices, which end with their bus."""
+        self.hub = self.launch("hub", *self._hub_options)
+        self.hub.wait_ready()
+        for old in (self.controller, self.plant):
+            old.kill()
+        self.start_controller()
+        self.controller.wait_ready()
+        self.start_plant()
+        self.plant.wait_ready()
 
     def ask(self, path: str) -> Any:
         """An answer of the API."""

@@ -1,8 +1,13 @@
-"""A plant that stops and begins anew: the trend ends, and no line is drawn across what is missing."""
+"""Data that are missing: a plant that stops, a bus that goes and comes back, frames that are lost.
+
+What is old is grey and has its age, words say what is wrong, and the trend has a gap: no line is drawn across what is
+missing, while it comes and when it is looked at later.
+"""
 
 from __future__ import annotations
 
 import re
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -10,16 +15,30 @@ from contextlib import ExitStack
 import pytest
 from playwright.sync_api import Page, expect
 
+from loopwright.protocol.profile import channel_ids
 from tests.browser import person, trend
 from tests.browser.site import TAG, Site
+from tests.faults.faulty_hub import FaultyHub, well
+from tests.unit.service import processes
 
 PATIENCE_S = 60.0
+WINDOW_S = 30.0
+AGE = re.compile(r"^\d.* old$")
+SHORT_S = 1.5
+"""Shorter than the silence after which values count as old."""
 
 
 @pytest.fixture
-def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+def bus() -> str | None:
+    """Of a hub that the test runs itself; None: the hub is a process of its own."""
+    return None
+
+
+@pytest.fixture
+def site(bus: str | None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    """Processes of the test's own, which it ends, and a loop at rest."""
     with ExitStack() as stack:
-        site = Site(stack, tmp_path_factory.mktemp("site"), more_loops=())
+        site = Site(stack, tmp_path_factory.mktemp("site"), more_loops=(), bus=bus)
         site.at_rest(1.0)
         yield site
 
@@ -37,21 +56,105 @@ def empty_at_the_right(page: Page) -> float:
     return (width - found[-1]) / width if found else 1.0
 
 
-def test_the_plant_is_started_anew(site: Site, page: Page) -> None:
+def watched(page: Page) -> None:
+    """The loop's page with its trend, up to the present."""
     person.open_loop(page)
-    page.keyboard.press("1")
+    page.get_by_role("button", name="30 s").click()
     until(page, lambda: len(trend.columns(page)[0]) > 0 and empty_at_the_right(page) < 0.02)
+
+
+def one_gap(page: Page) -> float:
+    """The width of the only gap, s, once the trend goes on behind it."""
+    until(page, lambda: empty_at_the_right(page) < 0.02 and len(trend.gaps(page, WINDOW_S)) == 1)
+    [gap] = trend.gaps(page, WINDOW_S)
+    return gap.seconds
+
+
+def seen_later(page: Page) -> None:
+    """The history has the gap, too."""
+    page.reload()
+    page.get_by_role("button", name="30 s").click()
+    until(page, lambda: len(trend.gaps(page, WINDOW_S)) == 1)
+    assert TAG in page.title()
+
+
+def is_old(page: Page) -> None:
+    """The values of the loop's page are those of before."""
+    face = person.face(page)
+    expect(face.locator(".age")).to_have_text(AGE)
+    expect(face).to_have_class(re.compile(r"\bold\b"))
+    expect(face.locator(".big")).to_have_text("50.000")
+
+
+def test_the_plant_is_started_anew(site: Site, page: Page) -> None:
+    watched(page)
     site.plant.kill()
     until(page, lambda: empty_at_the_right(page) > 0.12)  # time goes on, and the trend with it
-    expect(person.face(page).locator(".age")).to_have_text(re.compile(r"^\d.* old$"))
-    assert trend.gaps(page, 30.0) == []
+    is_old(page)
+    assert trend.gaps(page, WINDOW_S) == []
     site.start_plant()
     site.plant.wait_ready()
     expect(person.present(page).locator(".big")).not_to_have_text(person.DASH)
-    until(page, lambda: empty_at_the_right(page) < 0.02)
-    [gap] = trend.gaps(page, 30.0)
+    assert one_gap(page) > 3.0
+    seen_later(page)
+
+
+def test_the_plant_stops_and_then_the_bus_goes_and_comes_back(site: Site, page: Page) -> None:
+    row = page.get_by_role("row", name=TAG)
+    expect(row.locator(".pvnum")).to_have_text("50.000")
+    expect(page.get_by_text("Nothing abnormal")).to_be_visible()
+    site.plant.kill()
+    expect(row.locator(".age")).to_have_text(AGE)
+    expect(row.locator(".pvnum")).to_have_text("50.000")
+    expect(row).to_contain_text("Node 10h is lost")
+    expect(page.get_by_role("link", name="1 abnormal")).to_be_visible()
+    site.hub.kill()
+    expect(row).to_contain_text(f"Bus {site.bus} is down")
+    expect(page.get_by_text(f"Bus {site.bus} is down, opening it again every 2 s.")).to_be_visible()
+    page.get_by_role("main").get_by_role("link", name=TAG).click()
+    is_old(page)
+    expect(page.get_by_role("main")).to_contain_text(f"Bus {site.bus} is down")
+    expect(page.get_by_role("region", name="Gains and limits")).not_to_contain_text("80.00")
+    start = page.get_by_role("button", name=f"Retune {TAG}")
+    person.sign(page)
+    expect(start).to_be_disabled()
+    site.start_hub()
+    site.at_rest(1.0)
+    expect(person.present(page).locator(".big")).to_have_text("50.000")
+    expect(page.get_by_role("main")).not_to_contain_text("is down")
+    page.keyboard.press("Escape")
+    page.get_by_role("button", name="2 min").click()
+    until(page, lambda: len(trend.gaps(page, 120.0)) == 1)
+    [gap] = trend.gaps(page, 120.0)
     assert gap.seconds > 3.0
-    page.reload()  # the history has the gap, too
-    page.keyboard.press("1")
-    until(page, lambda: len(trend.gaps(page, 30.0)) == 1)
-    assert TAG in page.title()
+    expect(start).to_be_enabled()
+
+
+class TestFramesLost:
+    @pytest.fixture
+    def hub(self) -> Iterator[FaultyHub]:
+        hub = FaultyHub()
+        serving = threading.Thread(target=hub.serve, daemon=True)
+        serving.start()
+        yield hub
+        hub.stop()
+        serving.join()
+
+    @pytest.fixture
+    def bus(self, hub: FaultyHub) -> str | None:
+        return hub.url
+
+    def test_samples_that_are_lost_are_a_gap_and_nothing_is_abnormal(
+        self, hub: FaultyHub, site: Site, page: Page
+    ) -> None:
+        watched(page)
+        pv, mv = channel_ids(1)[:2]
+        hub.fault = lambda can_id: () if can_id in (pv, mv) else (0.0,)
+        began_s, first = time.monotonic(), hub.sample_number
+        processes.until(lambda: hub.sample_number - first > SHORT_S / site.case.ts)
+        lost_s = time.monotonic() - began_s  # a busy machine brings samples late, and several at once
+        hub.fault = well
+        assert lost_s - 0.3 < one_gap(page) < lost_s + 1.0
+        expect(page.get_by_text("Nothing abnormal")).to_be_visible()
+        expect(person.present(page).locator(".big")).to_have_text("50.000")
+        seen_later(page)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -276,6 +277,37 @@ def test_what_cannot_be_computed_or_stored_is_said_and_tried_again(
     monkeypatch.setattr(here.pool, "run", Mock(side_effect=NotWanted()))
     with here.client() as client:
         assert assert_problem(client.get(f"/jobs/{job}/record"), 503)["reason"] == "service_stopped"
+
+
+class Endless(Counting):
+    """A pool whose computations last until nobody wants them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.begun = threading.Event()
+
+    def run(self, kind: ComputationKind, work: Any, *, unwanted: Callable[[], bool] = lambda: False, **_: Any) -> Any:
+        self.begun.set()
+        until(unwanted)
+        raise NotWanted
+
+
+def test_who_waits_as_the_service_is_to_end_gets_an_answer(
+    here: Here, job: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The server would cancel the request after its grace, and log that as an error of the application."""
+    monkeypatch.setattr("loopwright.service.jobs.kept_figures.VERSION", job_figures.VERSION + 4)
+    pool = Endless()
+    figures = KeptFigures(here.store, pool)
+    app = create_app(here.jobs, pool=pool, figures=figures)
+    with TestClient(app) as client, ThreadPoolExecutor(2) as askers:
+        asked = [askers.submit(client.get, f"/jobs/{job}/{what}") for what in ("record", "designs")]
+        assert pool.begun.wait(60.0)
+        figures.request_stop()
+        for each in asked:
+            assert assert_problem(each.result(60.0), 503)["reason"] == "service_stopped"
+    figures.close()
+    assert [record for record in caplog.records if record.levelno >= logging.ERROR] == []
 
 
 def test_a_defect_in_a_fit_takes_neither_the_record_nor_the_job(

@@ -1,0 +1,62 @@
+"""What is done again and again beside everything else, in a thread of its own, until it is closed."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from loopwright.service.store.lock import FolderInUse
+
+log = logging.getLogger(__name__)
+
+_STOP_S = 5.0
+"""Wall time for which the end of a turn is waited for, s: it may be waiting for a database that is not reached."""
+
+
+class Repeated:
+    """Calls `turn` until it is closed. Where another service has taken the name of this host, that one does it instead.
+
+    every_s: wall time from the end of one turn to the next, s.
+    name: of the thread.
+    failed: says in the log what could not be done; the next turn tries it again.
+    at_once: whether the first turn is not waited for.
+    """
+
+    def __init__(
+        self, turn: Callable[[], object], every_s: float, name: str, failed: str, at_once: bool = True
+    ) -> None:
+        self._turn, self._every_s, self._failed = turn, every_s, failed
+        self._at_once = at_once
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    @property
+    def closed(self) -> bool:
+        """Whether the present turn is the last one."""
+        return self._over.is_set()
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def close(self) -> None:
+        """Begins no other turn, and waits for the present one."""
+        self._over.set()
+        if self._thread.is_alive():
+            self._thread.join(_STOP_S)
+
+    def _run(self) -> None:
+        if not self._at_once:
+            self._over.wait(self._every_s)
+        while not self._over.is_set():
+            try:
+                self._turn()
+            except FolderInUse:
+                return
+            except SQLAlchemyError as error:
+                log.warning("%s, this is tried again: %s", self._failed, error)
+            except Exception:  # whatever it was, the next turn may succeed
+                log.exception("%s, by a defect; this is tried again", self._failed)
+            self._over.wait(self._every_s)
