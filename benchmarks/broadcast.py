@@ -1,6 +1,6 @@
 """Loops as a bus carries them, for those that listen only: PV, MV and status of so many, so often a second.
 
-    python -m benchmarks.broadcast BUS LOOPS RATE_PER_S
+python -m benchmarks.broadcast BUS LOOPS RATE_PER_S
 """
 
 from __future__ import annotations

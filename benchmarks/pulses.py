@@ -1,14 +1,15 @@
-"""How well pulses of the set-point tune: `python -m benchmarks.tuning --method setpoint`, judged on the true plant.
+"""How well pulses tune, of the set-point or (in manual) of the manual output, judged on the true plant.
 
-    python -m benchmarks.tuning --method setpoint [--plants N] [--part I/N] [--seeds N] [--cases "PI 1 %;..."]
-                                                  [--of-batch | --kept-apart] [--save FILE] [--of FILE]
+    python -m benchmarks.tuning --method setpoint|manual [--plants N] [--part I/N] [--seeds N] [--cases "PI 1 %;..."]
+                                                         [--of-batch | --kept-apart] [--save FILE] [--of FILE]
 
 Each plant has three kinds of present gains: sluggish (Ms 1.1 to 1.2), typical (1.3 to 2) and nearly unstable (2.8 to
 3.2), with Ti of half to 2.5 times that of the best PI. Noise is white, its standard deviation a part of the permitted
 step of the set-point; a load step is 10 to 50 % of the MV that moves PV by that step (an integrating plant: of 0.3 Ku),
 of random sign and time within 3.5 Pu after the first pulse; a drift is in permitted steps per Pu. MV ends at three
 times what the permitted step needs, at rest or by the proportional action of the present gains, where "little MV" is
-said. Ms 1.6 is asked for. Plant time counts from the first pulse, the trial included.
+said. Ms 1.6 is asked for. Plant time counts from the first pulse, the trial included, which pulses of the manual output
+have not. A plant with a fault of the valve, or whose gain differs above and below rest, is judged where it is steepest.
 The plants of the batch are those on which rules are set (--of-batch); the others are kept apart from that.
 """
 
@@ -21,13 +22,14 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import product
 from multiprocessing import Pool
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.cases import ASKED, ONE, Case
+from benchmarks.cases import ASKED, ONE, TWO, Case
 from benchmarks.command import check_names
 from benchmarks.disturbances import Disturbance, Disturbed
 from benchmarks.operation import PRESENT, chosen, present_gains
@@ -41,10 +43,11 @@ from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.execution.runner import run
 from loopwright.tuning.experiments.preflight import PREFLIGHT, SETTLE
 from loopwright.tuning.experiments.primitives import Directions, Facts
+from loopwright.tuning.fast.manual_procedure import MANUAL, by_manual
 from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.setpoint_procedure import setpoint
+from loopwright.tuning.fast.setpoint_procedure import SETPOINT, setpoint
 from loopwright.tuning.models import sign
-from loopwright.tuning.plan import Command, Event, Mode, Sample, SetGains, SetSetpoint, StageStarted
+from loopwright.tuning.plan import Command, Event, Mode, Sample, SetGains, SetOutput, SetSetpoint, StageStarted
 from loopwright.tuning.reasons import Ended
 
 STEP = 1.0
@@ -76,6 +79,23 @@ FURTHER = {
     )
 }
 """Loops that may be moved to one side only, or no faster than at a rate: asked for by name."""
+IN_MANUAL = {
+    case.name: case
+    for case in (
+        *(Case(f"gain below {below:g} of that above", 0.01, Disturbance(below=below), limits=math.inf)
+          for below in (0.5, 0.7, 0.85, 1.2, 1.5, 2.0)),
+        Case("valve sticks by 0.1", 0.01, Disturbance(stiction=0.1), limits=math.inf),
+        Case("valve sticks by 0.3", 0.01, Disturbance(stiction=0.3), limits=math.inf),
+        Case("dead band 0.05", 0.01, Disturbance(dead_band=0.05), limits=math.inf),
+        Case("dead band 0.2", 0.01, Disturbance(dead_band=0.2), limits=math.inf),
+        Case("two loads", 0.01, TWO, limits=math.inf),
+        Case("noise of pole 0.8", 0.01, Disturbance(pole=0.8), limits=math.inf),
+        Case("T95 a fifth", 0.01, known=0.2, limits=math.inf),
+        Case("T95 five times", 0.01, known=5.0, limits=math.inf),
+    )
+}  # fmt: skip
+"""What pulses of the manual output cannot have tried by a step under the new gains: asked for by name."""
+EVERY = CASES | FURTHER | IN_MANUAL
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +125,7 @@ class PulsedLoop(RehearsedLoop):
         self.taken: dict[str, list[Sample]] = {}
 
     def step(self, commands: Sequence[Command]) -> Sample:
-        if any(isinstance(each, SetSetpoint) for each in commands):
+        if any(isinstance(each, SetSetpoint | SetOutput) for each in commands):
             self._process.relay()
         if any(isinstance(each, SetGains) for each in commands):
             self._process.change()
@@ -118,7 +138,7 @@ class PulsedLoop(RehearsedLoop):
             self._stage = event.stage
 
 
-def measure(plant: Plant, present: str, case: Case, seed: int) -> Pulsed:
+def measure(plant: Plant, present: str, case: Case, seed: int, method: str = SETPOINT) -> Pulsed:
     plant = replace(plant, samples=case.samples)
     random = np.random.default_rng([seed, len(plant.name), int(1e6 * plant.Pu), list(PRESENT).index(present)])
     gains = present_gains(plant, present, random)
@@ -131,7 +151,8 @@ def measure(plant: Plant, present: str, case: Case, seed: int) -> Pulsed:
     )
     reverse = sign(model) > 0.0
     settings = Settings(mv_low=-limit, mv_high=limit, pv_low=-1e9, pv_high=1e9, reverse=reverse)
-    channel = Channel(plant.Ts, settings, Parameters(gains.Kp, gains.Ti), 0.0, int(Mode.AUTOMATIC), 0.0)
+    mode = Mode.MANUAL if method == MANUAL else Mode.AUTOMATIC
+    channel = Channel(plant.Ts, settings, Parameters(gains.Kp, gains.Ti), 0.0, int(mode), 0.0)
     facts = Facts(
         plant.Ts, case.known * T95_PERIODS * plant.Pu, -limit, limit, STEP, gains, reverse,
         directions=Directions(case.directions), sp_rate_max_per_s=case.sp_rate * STEP / plant.Pu,
@@ -139,10 +160,11 @@ def measure(plant: Plant, present: str, case: Case, seed: int) -> Pulsed:
     loop, spec = PulsedLoop(disturbed, channel, plant.Ts), case.spec(plant)
     options = DesignOptions(spec.Ms, spec.derivative, spec.Mt, spec.noise_gain, propose_anyway=True)
     begun = time.process_time()
-    result = run(setpoint(facts, options), loop, limits=RunLimits(max_time_s=100.0 * plant.Pu), on_event=loop.hear)
+    plan = by_manual(facts, options, MANUAL) if method == MANUAL else setpoint(facts, options)
+    result = run(plan, loop, limits=RunLimits(max_time_s=100.0 * plant.Pu), on_event=loop.hear)
     seconds = time.process_time() - begun
     passed = sum(value for stage, value in result.plant_time_s.items() if stage not in (PREFLIGHT, SETTLE)) / plant.Pu
-    before = [each for stage in ("pulses", "design") for each in loop.taken.get(stage, [])]
+    before = [each for stage in ("pulses", "manual", "design") for each in loop.taken.get(stage, [])]
     trial = loop.taken.get("verify", [])
     ran = Pulsed(
         case.name, plant.name, seed, passed, seconds, present=present,
@@ -154,14 +176,17 @@ def measure(plant: Plant, present: str, case: Case, seed: int) -> Pulsed:
     if result.value is None:
         assert isinstance(result.ended, Ended)
         return replace(ran, reason=result.ended.reason.value, detail=result.ended.detail)
-    found = evaluated(ran, plant, result.value.gains, spec)
+    moved = [each.mv for each in before]
+    steepest = case.how.steepest(min(moved), max(moved))
+    judged = replace(plant, num=tuple(steepest * each for each in plant.num))
+    found = evaluated(ran, judged, result.value.gains, spec)
     assert isinstance(found, Pulsed)
     return found
 
 
-def _measured(given: tuple[Plant, str, str, int]) -> Pulsed:
+def _measured(given: tuple[Plant, str, str, int], method: str) -> Pulsed:
     plant, present, case, seed = given
-    return measure(plant, present, (CASES | FURTHER)[case], seed)
+    return measure(plant, present, EVERY[case], seed, method)
 
 
 HEAD = (
@@ -196,7 +221,7 @@ def spread(values: Sequence[float], digits: int, at: Sequence[int] = (50, 90, 99
 
 def table(runs: Sequence[Pulsed]) -> Iterator[str]:
     yield HEAD
-    for name in CASES | FURTHER:
+    for name in EVERY:
         of_case = [each for each in runs if each.case == name]
         for present in PRESENT:
             if mine := [each for each in of_case if each.present == present]:
@@ -238,7 +263,7 @@ def runs(given: argparse.Namespace) -> Iterator[Pulsed]:
                 else:
                     todo.append((which[i], present, case, seed))
     with Pool(given.processes) as pool:
-        for ran in pool.imap_unordered(_measured, todo):
+        for ran in pool.imap_unordered(partial(_measured, method=given.method), todo):
             if given.save:
                 with given.save.open("a") as file:
                     file.write(f"{json.dumps(asdict(ran))}\n")
@@ -248,7 +273,7 @@ def runs(given: argparse.Namespace) -> Iterator[Pulsed]:
 def main(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     """parser, given: of `benchmarks.tuning`."""
     given.cases = given.cases or ";".join(CASES)
-    check_names(parser, "case", given.cases.split(";"), CASES | FURTHER)
+    check_names(parser, "case", given.cases.split(";"), EVERY)
     found = saved(given.of) if given.of else list(runs(given))
     if not found:
         parser.exit(2, f"{parser.prog}: no run: {given.of or 'no plants or no seeds'}\n")

@@ -306,14 +306,14 @@ def runs_of(parser: argparse.ArgumentParser, given: argparse.Namespace, runs: It
 
 def main() -> None:
     parser = runs_parser(__doc__)
-    parser.add_argument("--method", choices=("fast", "setpoint"), default="fast")
+    parser.add_argument("--method", choices=("fast", "setpoint", "manual"), default="fast")
     parser.add_argument("--cases", help="names, separated by ';', or 'further' (fast)")
     apart = parser.add_mutually_exclusive_group()
-    apart.add_argument("--of-batch", action="store_true", help="setpoint: the plants of the batch alone")
-    apart.add_argument("--kept-apart", action="store_true", help="setpoint: the other plants alone")
-    parser.add_argument("--processes", type=int, default=2, help="setpoint: at the same time (default: %(default)s)")
+    apart.add_argument("--of-batch", action="store_true", help="pulses: the plants of the batch alone")
+    apart.add_argument("--kept-apart", action="store_true", help="pulses: the other plants alone")
+    parser.add_argument("--processes", type=int, default=2, help="of pulses, at the same time (default: %(default)s)")
     given = parser.parse_args()
-    if given.method == "setpoint":
+    if given.method != "fast":
         from benchmarks import pulses  # it needs this module
 
         pulses.main(parser, given)

@@ -1,6 +1,6 @@
 """Viewers of the overview, as connections that take the live stream and throw it away.
 
-    python -m benchmarks.viewers URL NUMBER
+python -m benchmarks.viewers URL NUMBER
 """
 
 from __future__ import annotations

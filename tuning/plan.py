@@ -99,6 +99,15 @@ class SetRelay:
 
 
 @dataclass(frozen=True, slots=True)
+class SetPvLimits:
+    """Sets the limits at which the controller by itself ends the test and restores the loop, PV units; in force until
+    the test ends."""
+
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
 class StageStarted:
     """A stage has started.
 
@@ -169,7 +178,7 @@ class Work(Generic[T]):
         return cast(T, self._value)
 
 
-Command = SetMode | SetGains | SetSetpoint | SetOutput | SetRelay
+Command = SetMode | SetGains | SetSetpoint | SetOutput | SetRelay | SetPvLimits
 Event = StageStarted | StageDone | Note
 Plan = Generator[Sequence[Command | Event | Work[Any]], Sample, T]
 

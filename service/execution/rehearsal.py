@@ -56,6 +56,7 @@ from loopwright.tuning.plan import (
     SetGains,
     SetMode,
     SetOutput,
+    SetPvLimits,
     SetRelay,
     SetSetpoint,
     StageDone,
@@ -127,6 +128,8 @@ class RehearsedLoop:
                 channel.start_relay(
                     RelaySettings(amplitude, hysteresis, working, 10**9, low, high, amplitude_low or 0.0, average)
                 )
+            case SetPvLimits():
+                pass  # the runner alone watches PV in memory
 
     def restore(self, home: LoopState, session: int | None = None) -> Restored:
         self._channel.go_home(self._home)
@@ -297,7 +300,7 @@ def rehearse(
     model: the model to design for; fast then needs no relay.
     options: those of `tuning.fast.procedure.FastOptions`, or of `tuning.five_stage.procedure.Options`.
     asked: the options as one of these two; in place of the options by name.
-    excitations: what fast may move the loop by.
+    excitations: what fast may move the loop by; manual alone: the loop is in manual.
     """
     results: dict[str, object] = {}
 
@@ -309,7 +312,7 @@ def rehearse(
 
     try:
         file = _complete(PlantFile.model_validate(spec))
-        loop, facts = _loop(file)
+        loop, facts = _loop(file, Mode.MANUAL if excitations == (Excitation.MANUAL,) else Mode.AUTOMATIC)
         outcome: RunResult[Proposal] | RunResult[FastProposal]
         limits = _limits(facts, _reach(file))
         hear = on_samples or (lambda samples: None)
@@ -349,7 +352,7 @@ def _entered(model: Model | None) -> FOPDT | SOPDT | None:
     return model
 
 
-def _loop(file: PlantFile) -> tuple[RehearsedLoop, Facts]:
+def _loop(file: PlantFile, mode: Mode) -> tuple[RehearsedLoop, Facts]:
     ts, t95, step, gains = file.sample_time_s, file.t95_s, file.sp_deviation, file.gains
     assert ts and t95 and step and gains
     low, high = file.mv_limits
@@ -361,7 +364,7 @@ def _loop(file: PlantFile) -> tuple[RehearsedLoop, Facts]:
     span = 1e9
     settings = Settings(mv_low=low, mv_high=high, safe_output=0.0, pv_low=-span, pv_high=span, reverse=reverse)
     present = Gains(**gains.model_dump())
-    channel = Channel(ts, settings, _parameters(present), 0.0, int(Mode.AUTOMATIC), 0.0)
+    channel = Channel(ts, settings, _parameters(present), 0.0, int(mode), 0.0)
     facts = Facts(
         ts, t95, low, high, step, present, reverse,
         mv_step_max=file.mv_step_max or math.inf,

@@ -22,6 +22,7 @@ from loopwright.tuning.plan import (
     SetGains,
     SetMode,
     SetOutput,
+    SetPvLimits,
     SetRelay,
     SetSetpoint,
     StageDone,
@@ -160,7 +161,7 @@ class _Run(Generic[T]):
         step."""
         commands: list[Command] = []
         for item in answer:
-            if isinstance(item, SetMode | SetGains | SetSetpoint | SetOutput | SetRelay):
+            if isinstance(item, SetMode | SetGains | SetSetpoint | SetOutput | SetRelay | SetPvLimits):
                 commands.append(item)
             elif isinstance(item, Work):
                 self._start_work(item)

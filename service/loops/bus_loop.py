@@ -22,7 +22,17 @@ from loopwright.service.loops.bus_samples import BLOCK, MAX_GAP, BusSamples
 from loopwright.service.loops.bus_session import BusSession
 from loopwright.service.loops.loop import Restored
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.plan import Command, Mode, Sample, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
+from loopwright.tuning.plan import (
+    Command,
+    Mode,
+    Sample,
+    SetGains,
+    SetMode,
+    SetOutput,
+    SetPvLimits,
+    SetRelay,
+    SetSetpoint,
+)
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason, Refused
 
 BEGIN_PATIENCE_S = 2.0
@@ -166,6 +176,8 @@ class BusLoop:
                 tuner.on_trial = True
             case SetOutput(value):
                 order(tuner, Order.OUTPUT, value)
+            case SetPvLimits(low, high):
+                order(tuner, Order.WATCH, low, high)
             case SetRelay():
                 low, high = self._pv_limits or tuple(tuner.number(f"controller_pv_{end}") for end in ("low", "high"))
                 order(

@@ -35,7 +35,7 @@ def preflight(facts: Facts, after_s: float) -> Plan[OperatingPoint]:
 
 
 def at_rest(
-    facts: Facts, after_s: float, min_samples: int = MIN_LISTENED_SAMPLES
+    facts: Facts, after_s: float, min_samples: int = MIN_LISTENED_SAMPLES, mode: Mode = Mode.AUTOMATIC
 ) -> Plan[tuple[OperatingPoint, Trace]]:
     """Checks the loop until it is at rest, at most MAX_ATTEMPTS times.
 
@@ -44,6 +44,8 @@ def at_rest(
 
     after_s: the expected plant time of the stages that follow, s.
     min_samples: the smallest number of samples of a check.
+    mode: the mode that the test needs, automatic or manual. In manual the set-point drives nothing: it may be
+    anywhere, and may move.
     Raises Refused: WRONG_MODE, SETPOINT_IS_DRIVEN, NOT_AT_REST, NOISE_TOO_HIGH, SATURATED.
     """
     once_s = facts.T95_s / 2
@@ -51,27 +53,31 @@ def at_rest(
     for _ in range(MAX_ATTEMPTS - 1):
         yield begin
         try:
-            return (yield from check_at_rest(facts, min_samples))
+            return (yield from check_at_rest(facts, min_samples, mode))
         except Refused as refused:
             if refused.reason is not Reason.NOT_AT_REST:
                 raise
             yield from record(once_s, (Note(refused.detail), StageStarted(SETTLE, once_s, once_s + after_s)))
     yield begin
-    return (yield from check_at_rest(facts, min_samples))
+    return (yield from check_at_rest(facts, min_samples, mode))
 
 
-def check_at_rest(facts: Facts, min_samples: int = MIN_LISTENED_SAMPLES) -> Plan[tuple[OperatingPoint, Trace]]:
-    """Checks the loop once, in automatic, for half of T95 and at least `min_samples`. Raises Refused as `at_rest`."""
+def check_at_rest(
+    facts: Facts, min_samples: int = MIN_LISTENED_SAMPLES, mode: Mode = Mode.AUTOMATIC
+) -> Plan[tuple[OperatingPoint, Trace]]:
+    """Checks the loop once, for half of T95 and at least `min_samples`. Raises Refused as `at_rest`."""
     trace = yield from record(max(facts.T95_s / 2, min_samples * facts.sample_time_s))
     sample = yield ()
     trace.add(sample)
-    if sample.mode != Mode.AUTOMATIC:
-        raise Refused(Reason.WRONG_MODE, f"the controller is in mode {Mode(sample.mode).name.lower()}, not automatic")
+    if sample.mode != mode:
+        found = Mode(sample.mode).name.lower()
+        raise Refused(Reason.WRONG_MODE, f"the controller is in mode {found}, not {mode.name.lower()}")
     pv, mv = np.asarray(trace.pv), np.asarray(trace.mv)
     step = facts.sp_deviation
+    by_setpoint = mode is Mode.AUTOMATIC
     moved = np.diff(trace.sp) != 0.0
     parts = sum(bool(part.any()) for part in np.array_split(moved, LISTENED_PARTS))
-    if parts:
+    if parts and by_setpoint:
         text = (
             f"the set-point moved at {np.count_nonzero(moved)} of {len(pv)} samples while listening, in {parts} of "
             f"{LISTENED_PARTS} parts of the time, by {np.ptp(trace.sp):.4g}"
@@ -81,7 +87,7 @@ def check_at_rest(facts: Facts, min_samples: int = MIN_LISTENED_SAMPLES) -> Plan
     drift = float(np.polyfit(x, pv, 1)[0])
     noise = float(np.std(np.diff(pv))) / math.sqrt(2)
     spread = float(np.std(pv - drift * x))
-    away = float(pv.mean()) - sample.sp
+    away = float(pv.mean()) - sample.sp if by_setpoint else 0.0
     near = facts.mv_high - facts.mv_low
     room = min(facts.mv_high - float(mv.mean()), float(mv.mean()) - facts.mv_low)
     if room < MIN_ROOM * near:
@@ -95,10 +101,11 @@ def check_at_rest(facts: Facts, min_samples: int = MIN_LISTENED_SAMPLES) -> Plan
         raise Refused(Reason.NOISE_TOO_HIGH, f"noise {noise:.3g} is above {MAX_NOISE:.0%} of the step {step:.3g}")
     near_rest = MAX_AWAY * step
     if abs(drift) > near_rest + 4 * slack or abs(away) > near_rest + slack or spread > 0.03 * step + 2 * noise:
+        off = f"is {away:+.3g} off the set-point and " if by_setpoint else "and "
         raise Refused(
             Reason.NOT_AT_REST,
-            f"within {trace.t[-1] - trace.t[0]:.3g} s PV drifted by {drift:+.3g}, is {away:+.3g} off the set-point and "
-            f"varies by {spread:.3g} (noise {noise:.3g}); the step would be {step:.3g}",
+            f"within {trace.t[-1] - trace.t[0]:.3g} s PV drifted by {drift:+.3g}, {off}varies by {spread:.3g} "
+            f"(noise {noise:.3g}); the step would be {step:.3g}",
         )
     room = min(room, 0.5 * facts.mv_step_max)
     return OperatingPoint(sample.sp, float(pv.mean()), float(mv.mean()), noise, room), trace

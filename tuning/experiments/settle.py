@@ -7,7 +7,7 @@ from typing import TypeVar
 
 from loopwright.tuning.experiments.preflight import SETTLE, check_at_rest
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.plan import Plan, StageDone, StageStarted
+from loopwright.tuning.plan import Mode, Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Refused
 
 T = TypeVar("T")
@@ -17,10 +17,12 @@ MAX_ATTEMPTS = 20
 the plant alone."""
 
 
-def after_settling(facts: Facts, plan: Plan[T]) -> Plan[T]:
+def after_settling(facts: Facts, plan: Plan[T], mode: Mode = Mode.AUTOMATIC) -> Plan[T]:
     """Waits until the loop is at rest, then carries out the plan: the transient of the test that was cut off dies away.
 
     A loop that is not at rest after MAX_ATTEMPTS checks is left to the preflight of the plan, which refuses it.
+
+    mode: the mode of the loop, automatic or manual.
     """
     with closing(plan):
         items = next(plan)
@@ -28,7 +30,7 @@ def after_settling(facts: Facts, plan: Plan[T]) -> Plan[T]:
         yield (StageStarted(SETTLE, facts.T95_s, ahead),)
         for _ in range(MAX_ATTEMPTS):
             with suppress(Refused):
-                yield from check_at_rest(facts)
+                yield from check_at_rest(facts, mode=mode)
                 break
         items = (StageDone(SETTLE, None), *items)
         while True:

@@ -22,10 +22,11 @@ the range of PV below which a residual is accepted in any case."""
 MAX_DURBIN_WATSON_RATIO = 1.35
 MAX_ROUNDED = 1.25
 """Residual, in average rounding errors, below which slow variations are accepted: rounding errors are not white."""
-MAX_UNCERTAINTY = {Excitation.RELAY: 0.10, Excitation.SETPOINT: 0.06, Excitation.OBSERVE: 0.06}
+MAX_UNCERTAINTY = {Excitation.RELAY: 0.10, Excitation.SETPOINT: 0.06, Excitation.OBSERVE: 0.06, Excitation.MANUAL: 0.05}
 """Largest accepted uncertainty of Ms, by the delta method and among rival models."""
-MAX_DIFFERENCE = 0.25
-"""Largest difference of the gain above and below rest that a record may leave open, a fraction of the gain."""
+MAX_DIFFERENCE, MAX_DIFFERENCE_UNTRIED = 0.25, 0.15
+"""Largest difference of the gain above and below rest that a record may leave open, a fraction of the gain; the second
+value holds in manual, where no step under the new gains follows."""
 MAX_MODEL_MISMATCH, MAX_MODEL_MISMATCH_OF_TWO_LOADS = 0.5, 0.2
 """Largest accepted difference of Ms from the Ms asked for, of the tested gains on the new model and of the new gains on
 the earlier model; the second value holds where the model has two load disturbances."""
@@ -87,7 +88,7 @@ def evaluate(
     fit = Fit(record)
     chosen = choose_structure(fit, earlier.chosen.fits if earlier else ())
     found = chosen.best
-    by_relay = record.excitation is Excitation.RELAY
+    by_relay, manual = (record.excitation is each for each in (Excitation.RELAY, Excitation.MANUAL))
     max_uncertainty = MAX_UNCERTAINTY[record.excitation]
     model = fit.model(found)
     delay = record.sampling_delay_s
@@ -115,6 +116,8 @@ def evaluate(
     elif rivals > max_uncertainty:
         reason = Reason.AMBIGUOUS
         detail = f"another model that explains the record as well gives an Ms off by {rivals:.2g}"
+    elif manual and (fault := find_valve_fault(fit, found)) is not None:
+        reason, detail = Reason.UNEXPLAINED, f"{fault.fault} explains the record better, or the plant is not linear"
     elif (not by_relay or (earlier is None and not test_follows)) and (shown := _nonlinearity(fit, found)) is not None:
         reason, detail = shown
     elif earlier is not None:
@@ -149,7 +152,8 @@ def _nonlinearity(fit: Fit[ExperimentRecord], found: Fitted) -> tuple[Reason, st
         return Reason.UNEXPLAINED, f"{shown.what}, +-{2.0 * shown.deviation:.2g}"
     if fit.record.one_sided:  # such a record cannot tell how far the sides differ, and its proposal says so
         return None
-    if (unknown := test.unknown_difference()) > MAX_DIFFERENCE:
+    untried = fit.record.excitation is Excitation.MANUAL
+    if (unknown := test.unknown_difference()) > (MAX_DIFFERENCE_UNTRIED if untried else MAX_DIFFERENCE):
         by = f"{100.0 * unknown:.0f} %" if unknown < 1.0 else "any factor"
         what = f"the gain above and below the operating point may differ by {by}"
         return Reason.UNCERTAIN, f"{what}, the record does not tell"

@@ -17,6 +17,7 @@ from loopwright.tuning.experiments.ramp import ramped
 from loopwright.tuning.experiments.settle import after_settling
 from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
 from loopwright.tuning.fast.known_procedure import KNOWN_STAGES, TRIAL, ObservedPlantFails, by_known_plant
+from loopwright.tuning.fast.manual_procedure import MANUAL, MANUAL_STAGES, by_manual
 from loopwright.tuning.fast.procedure import FAST, FastOptions, by_relay, fast_by_relay
 from loopwright.tuning.fast.proposal import FastProposal
 from loopwright.tuning.fast.pulse_test import PulseTest
@@ -38,13 +39,16 @@ MAX_NEAR_T95 = 10.0
 def chosen_stages(excitations: tuple[Excitation, ...], verify: bool) -> tuple[str, ...]:
     """The stages that a run with these excitations may have, in their order; the relay's is left out where the pulses
     tell enough."""
+    if excitations == (Excitation.MANUAL,):
+        return MANUAL_STAGES
+    manual = (MANUAL,) if Excitation.MANUAL in excitations else ()
     trial = (TRIAL,) if Excitation.OBSERVE in excitations and verify else ()
     if excitations == (Excitation.OBSERVE,):
         return KNOWN_STAGES
     relay = ("relay",) if Excitation.RELAY in excitations else ()
     pulses = ("pulses",) if Excitation.SETPOINT in excitations else ()
     first, _, design, *last = SETPOINT_STAGES
-    return (first, *trial, *pulses, *relay, design, *(last if verify else ()))
+    return (first, *trial, *pulses, *relay, *manual, design, *(last if verify else ()))
 
 
 def fast_by(
@@ -56,8 +60,11 @@ def fast_by(
     """The plan of the fast procedure with the excitations that the loop permits, for a loop in automatic and at rest.
 
     known: what normal operation has shown of the plant.
+    With MANUAL alone the loop is in manual and stays there.
     Raises Refused. The plan restores nothing: the runner restores the loop.
     """
+    if excitations == (Excitation.MANUAL,):
+        return (yield from by_manual(facts, options, FAST))
     return (yield from ramped(facts, _chosen(excitations, facts, options, known)))
 
 

@@ -83,7 +83,10 @@ class LinearityTest:
         """
         fit, found = self._fit, self._found
         structure, inputs = found.structure, found.structure.inputs
-        further = Fit(replace(fit.record, u=fit.record.input_range * changed(fit.record.u / fit.record.input_range)))
+        moved = fit.record.input_range * changed(fit.record.u / fit.record.input_range)
+        if not np.any(moved):  # MV was never above rest
+            return 0.0, math.inf
+        further = Fit(replace(fit.record, u=moved))
         # a record's input range is its own: the scale of MV must stay that of the fit
         scale = further.record.input_range / fit.record.input_range
         columns = further.regressors(structure, UNDISTURBED, found.theta[None, : structure.searched])[0]

@@ -367,7 +367,10 @@ def _model_from(record: ExperimentRecord, known_from: str | None) -> str:
     """Where the model of a record comes from, in words."""
     if known_from is not None:
         return f"{known_from}{', and the step under the new gains' if record.steps else ''}"
-    moved = "a relay" if record.excitation is Excitation.RELAY else "pulses of the set-point"
+    moved = {
+        Excitation.RELAY: "a relay",
+        Excitation.MANUAL: "pulses of the manual output",
+    }.get(record.excitation, "pulses of the set-point")
     return f"{moved}{', and the set-point step under the new gains' if record.steps else ''}"
 
 

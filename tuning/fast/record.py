@@ -20,11 +20,17 @@ class Excitation(StrEnum):
     RELAY = "relay"
     SETPOINT = "setpoint"
     OBSERVE = "observe"
+    MANUAL = "manual"
 
     @property
     def in_words(self) -> str:
         """The excitation in the words of a sentence."""
-        return {"relay": "relay", "setpoint": "pulses", "observe": "step under the new gains"}[self]
+        return {
+            "relay": "relay",
+            "setpoint": "pulses",
+            "observe": "step under the new gains",
+            "manual": "pulses of the manual output",
+        }[self]
 
 
 MIN_LISTENED = 60
@@ -37,7 +43,7 @@ MIN_SWITCHES = 4
 @dataclass(frozen=True, slots=True, eq=False)
 class ExperimentRecord:
     """The record of a fast experiment so far: time at rest, then the excitation (the relay, or pulses of the
-    set-point), then possibly set-point steps under new gains.
+    set-point or of the manual output), then possibly set-point steps under new gains.
 
     Ts: the sample time, s.
     u: MV as a deviation from rest, held from each sample to the next, MV units, shape (N,).
@@ -45,7 +51,7 @@ class ExperimentRecord:
     direction: +1 if PV finally rises with MV, else -1; the action of the controller tells which.
     listened: the number of samples at rest.
     excited: the number of samples up to the end of the excitation.
-    turns: the number of switches of the relay, or of turns of the set-point.
+    turns: the number of switches of the relay, or of turns of the set-point or the manual output.
     period: the time scale, in samples: the period of the relay oscillation, or the ultimate period of a first model.
     steps: the samples at which the set-point stepped under the new gains.
     excitation: what moved the loop.

@@ -2,21 +2,19 @@
 
     listen - pulses of the set-point under the present gains - fit and design - set-point step home under the new gains
 
-The pulses end when the gains that would be proposed are certain enough: see `_settled`.
+The pulses end when the gains that would be proposed are certain enough: see `look.settled`.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import partial
 
-from loopwright.tuning.analysis.comparison import Comparison
 from loopwright.tuning.experiments.preflight import at_rest
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.ramp import check_ramp, ramped, slow_words
-from loopwright.tuning.fast.design import frequencies
-from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY, Evaluation
+from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY
+from loopwright.tuning.fast.look import Look, look_at, settled
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.outcome import OPEN_REASONS, evaluated
 from loopwright.tuning.fast.proposal import (
@@ -29,9 +27,8 @@ from loopwright.tuning.fast.proposal import (
 from loopwright.tuning.fast.pulse_levels import back_level, last_level, last_level_of_one_side, second_level
 from loopwright.tuning.fast.pulse_test import BACK, DOWN, UP, PulseTest
 from loopwright.tuning.fast.pulse_test import MAX_T95 as MAX_T95_TO_FOLLOW
-from loopwright.tuning.fast.record import MIN_LISTENED, Excitation, ExperimentRecord
+from loopwright.tuning.fast.record import MIN_LISTENED, Excitation
 from loopwright.tuning.fast.record_evaluation import first_period
-from loopwright.tuning.fast.uncertainty import peak
 from loopwright.tuning.plan import Note, Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -48,10 +45,6 @@ LOOKS_OFTEN, LATER_LOOK = 5, 1.6
 """After so many looks the record has to grow by this factor from one to the next: each costs more than the last."""
 MAX_MODELS = 4
 """Number of models that are asked whether the step home fits into MV's limits."""
-MIN_OWN_PERIODS = 2.0
-"""Smallest length of the record, in ultimate periods of its own model."""
-MAX_DISAGREEMENT = 0.08
-"""Largest difference of Ms from the Ms asked for, of the gains of two successive looks on each other's model."""
 MAX_PERIODS, MAX_T95, MAX_TURNS = 12.0, 1.5, 2.5
 """Longest record: the longest of these numbers of ultimate periods, of T95, and of the time of the first two turns."""
 MAX_PERIODS_IN_ALL, MAX_TURNS_IN_ALL = 30.0, 12.0
@@ -72,20 +65,6 @@ class TooLittleExcited(Refused):
     def __init__(self, refused: Refused, test: PulseTest) -> None:
         super().__init__(refused.reason, refused.detail)
         self.test = test
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Look:
-    """One look at the record.
-
-    period: the time scale of the fit, in samples.
-    evaluation: the evaluation, None where the record could not be evaluated.
-    outcome: the refusal that follows from the look, or the comparison of old and new gains.
-    """
-
-    period: float
-    evaluation: Evaluation | None
-    outcome: Refused | Comparison
 
 
 def setpoint_stages(verify: bool) -> tuple[str, ...]:
@@ -143,9 +122,9 @@ def by_pulses(
         yield from test.lasting(at)
         looked_at = test.elapsed
         record = test.experiment_record()
-        last, look = look, (yield from test.computed(partial(_look, facts, options, record)))
+        last, look = look, (yield from test.computed(partial(look_at, facts, options, record)))
         test.period = look.period
-        if _settled(look, last, looked_at, options.Ms):
+        if settled(look, last, looked_at, options.Ms):
             break
         own = look.period
         longest = min(
@@ -202,22 +181,6 @@ def by_pulses(
     return (yield from test.computed(partial(proposed, method, facts, spec, evaluation, outcome, shown, begun_at_s)))
 
 
-def _settled(look: Look, last: Look, samples: int, asked: float) -> bool:
-    """Whether the pulses may end: the look has no objection, the record is long enough for its own model, and this
-    look and the one before agree on each other's gains."""
-    now, before = look.evaluation, last.evaluation
-    if now is None or before is None or isinstance(look.outcome, Refused):
-        return False
-    if samples < MIN_OWN_PERIODS * now.period / now.fit.record.Ts:
-        return False
-    w = frequencies(now.period)
-    delay = now.design_delay
-    return all(
-        abs(peak(model.model, gains.best.gains, w, delay) - asked) <= MAX_DISAGREEMENT
-        for model, gains in ((now, before), (before, now))
-    )
-
-
 def _relay_is_shorter(look: Look, samples: int) -> bool:
     """Whether a relay would take less time than the pulses still need.
 
@@ -229,12 +192,3 @@ def _relay_is_shorter(look: Look, samples: int) -> bool:
         return samples > RELAY_PERIODS * look.period
     open_by = max(look.evaluation.uncertainty, look.evaluation.ambiguity)
     return samples * (open_by / MAX_UNCERTAINTY[Excitation.SETPOINT]) ** 2 > by_relay
-
-
-def _look(facts: Facts, options: DesignOptions, record: ExperimentRecord) -> Look:
-    """One look at the record so far."""
-    try:
-        evaluation, outcome = evaluated(facts, options, record)
-    except Refused as refused:
-        return Look(record.period, None, refused)
-    return Look(evaluation.fit.period, evaluation, outcome)

@@ -1,0 +1,59 @@
+"""One look at the growing record of pulses, and whether two looks in a row agree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from loopwright.tuning.analysis.comparison import Comparison
+from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.fast.design import frequencies
+from loopwright.tuning.fast.evaluation import Evaluation
+from loopwright.tuning.fast.options import DesignOptions
+from loopwright.tuning.fast.outcome import evaluated
+from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.uncertainty import peak
+from loopwright.tuning.reasons import Refused
+
+MIN_OWN_PERIODS = 2.0
+"""Smallest length of the record, in ultimate periods of its own model."""
+MAX_DISAGREEMENT = 0.08
+"""Largest difference of Ms from the Ms asked for, of the gains of two successive looks on each other's model."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """One look at the record.
+
+    period: the time scale of the fit, in samples.
+    evaluation: the evaluation, None where the record could not be evaluated.
+    outcome: the refusal that follows from the look, or the comparison of old and new gains.
+    """
+
+    period: float
+    evaluation: Evaluation | None
+    outcome: Refused | Comparison
+
+
+def look_at(facts: Facts, options: DesignOptions, record: ExperimentRecord) -> Look:
+    """One look at the record so far."""
+    try:
+        evaluation, outcome = evaluated(facts, options, record)
+    except Refused as refused:
+        return Look(record.period, None, refused)
+    return Look(evaluation.fit.period, evaluation, outcome)
+
+
+def settled(look: Look, last: Look, samples: int, asked: float, max_disagreement: float = MAX_DISAGREEMENT) -> bool:
+    """Whether the pulses may end: the look has no objection, the record is long enough for its own model, and this
+    look and the one before agree on each other's gains."""
+    now, before = look.evaluation, last.evaluation
+    if now is None or before is None or isinstance(look.outcome, Refused):
+        return False
+    if samples < MIN_OWN_PERIODS * now.period / now.fit.record.Ts:
+        return False
+    w = frequencies(now.period)
+    delay = now.design_delay
+    return all(
+        abs(peak(model.model, gains.best.gains, w, delay) - asked) <= max_disagreement
+        for model, gains in ((now, before), (before, now))
+    )
