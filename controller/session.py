@@ -2,9 +2,9 @@
 
 A tuner opens a session with a number that the controller has given out, and commands by orders whose check covers that
 number and a running count (`protocol.session`). The session ends when the tuner closes it, when the lease or the
-tuner's heartbeat runs out, when PV is lost, when the node leaves operational, or when an operator or another master
-commands something; the controller itself then restores mode, set-point and gains. Time is an argument: seconds of the
-controller's clock.
+tuner's heartbeat runs out, when PV is lost or leaves the limits that the tuner has set, when the node leaves
+operational, or when an operator or another master commands something; the controller itself then restores mode,
+set-point, manual output and gains. Time is an argument: seconds of the controller's clock.
 """
 
 from __future__ import annotations
@@ -59,6 +59,8 @@ class Session:
         self.home = _NO_HOME
         self.home_gains = channel.accepted
         self.terms: Terms | None = None
+        self.pv_limits: tuple[float, float] | None = None
+        """The limits of PV at which the session ends, in every mode, PV units; None for none."""
         self._draw = draw
         self._pv_timeout_s = pv_timeout_s
         self._answered: tuple[Order, int] | None = None
@@ -137,6 +139,11 @@ class Session:
                 channel.command_mode(int(numbers[0]))
             case Order.OUTPUT:
                 channel.manual_output = numbers[0]
+            case Order.WATCH:
+                low, high = numbers
+                if not -math.inf < low < high < math.inf:
+                    raise ValueError("the PV limits must be finite, the low one below the high one")
+                self.pv_limits = low, high
             case Order.RELAY:
                 amplitude, hysteresis, working, samples, low, high, amplitude_low, average = numbers
                 channel.start_relay(
@@ -156,7 +163,7 @@ class Session:
         if self.channel.on_trial:  # an operator has gains on trial, which a session would end
             raise SdoAbort(Abort.DEVICE_STATE)
         self.number, self.terms, self.home = self.next, terms, self.channel.home
-        self.home_gains = self.channel.accepted
+        self.home_gains, self.pv_limits = self.channel.accepted, None
         self.next, self.count, self.outside_changes = self._draw(), 0, OutsideChange.NONE
         self._samples_left = terms.lease_samples
         self._lease_until, self._heard_at, self._valid_at = now + terms.lease_s, now, max(now, self._valid_at)
@@ -180,6 +187,8 @@ class Session:
         if self.is_open:
             if self.channel.relay is not None:
                 self._watch_relay(pv)
+            if self.pv_limits is not None and (pv < self.pv_limits[0] or pv > self.pv_limits[1]):
+                self.end(Cause.PV_LIMIT)
             if not self._samples_left:
                 self.end(Cause.LEASE)
             self._samples_left -= 1
@@ -249,6 +258,7 @@ class Session:
             state = RelayState.ENDED_BY_LIMIT if cause is Cause.PV_LIMIT else RelayState.DONE
             self.channel.go_home(self.home, state)
             self.last, self.number, self.terms, self.cause = self.number, 0, None, cause
+            self.pv_limits = None
             self._unsettled = True
 
     def settle(self, operational: bool = True) -> None:

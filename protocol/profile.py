@@ -93,6 +93,7 @@ class Order(IntEnum):
     RELAY = 5
     TRY = 6
     ACCEPT = 7
+    WATCH = 8
 
 
 class ParameterCommand(IntEnum):

@@ -7,12 +7,19 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.inputs.request import FastRetune, RetuneRequest, SetpointRetune, excitations
+from loopwright.service.inputs.request import (
+    FastRetune,
+    RetuneRequest,
+    SetpointRetune,
+    check_setpoint_source,
+    excitations,
+    wrong_mode,
+)
 from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.service.planning.facts import facts_of, time_budget_s
 from loopwright.service.planning.ground import Ground, rehearsal_spec
-from loopwright.service.planning.moves import broken_limits
+from loopwright.service.planning.moves import broken_from
 from loopwright.service.results import Result, empty_result
 from loopwright.service.store.jobs import JobEvent
 from loopwright.tuning.experiments.primitives import Facts
@@ -20,7 +27,7 @@ from loopwright.tuning.experiments.settle import after_settling
 from loopwright.tuning.fast.excitation_choice import NOT_ASKED
 from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
 from loopwright.tuning.models import Model
-from loopwright.tuning.plan import Event, Note, Plan, Sample
+from loopwright.tuning.plan import Event, Mode, Note, Plan, Sample
 from loopwright.tuning.reasons import Ended, NoGain, Reason, Refused
 
 if TYPE_CHECKING:
@@ -101,7 +108,11 @@ def tune(
     from loopwright.service.execution.runner import run
 
     facts = facts_of(config, state)
-    broken = broken_limits(config, request, state.sp)
+    check_setpoint_source(config, request, state.mode)
+    wrong = wrong_mode(config, request, state.mode)
+    if wrong is not None:
+        raise Refused(Reason.WRONG_MODE, wrong)
+    broken = broken_from(config, request, state)
     if broken:
         raise Refused(Reason.BAD_LIMITS, "; ".join(broken))
     limits = RunLimits(
@@ -114,7 +125,7 @@ def tune(
     )
     computing = ComputingLoop(loop, workers)
     ran = run(
-        plan(config, request, facts, hooks.earlier, hooks.plant),
+        plan(config, request, facts, hooks.earlier, hooks.plant, state.mode),
         computing,
         limits=limits,
         on_event=hooks.on_event,
@@ -136,6 +147,7 @@ def plan(
     facts: Facts,
     earlier: Sequence[JobEvent] = (),
     plant: ObservedPlant | NothingKnown = NOT_ASKED,
+    mode: Mode = Mode.AUTOMATIC,
 ) -> Plan[Any]:
     """Returns the plan of the requested procedure.
 
@@ -143,9 +155,10 @@ def plan(
     earlier: events of interrupted attempts, after which the loop gets time to come to rest. The record of an
     interrupted fast procedure is not continued: relay and set-point step are one record of an otherwise untouched loop.
     plant: what operation has shown of the plant.
+    mode: the mode of the loop.
     """
-    procedure = _procedure(config, request, facts, earlier, plant)
-    return after_settling(facts, procedure) if earlier else procedure
+    procedure = _procedure(config, request, facts, earlier, plant, mode)
+    return after_settling(facts, procedure, mode) if earlier else procedure
 
 
 def _procedure(
@@ -154,6 +167,7 @@ def _procedure(
     facts: Facts,
     earlier: Sequence[JobEvent],
     plant: ObservedPlant | NothingKnown,
+    mode: Mode,
 ) -> Plan[Any]:
     if isinstance(request, FastRetune):
         from loopwright.tuning.fast.design_trial import trial
@@ -162,7 +176,7 @@ def _procedure(
         known = _known_model(request)
         if known is not None:
             return trial(facts, request.options, known)
-        return fast_by(excitations(config, request), facts, request.options, plant)
+        return fast_by(excitations(config, request, mode), facts, request.options, plant)
     if isinstance(request, SetpointRetune):
         from loopwright.tuning.fast.setpoint_procedure import setpoint
 
@@ -185,7 +199,7 @@ def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcom
     # A model entered for a dry run is the plant itself; the procedure still starts where the request says.
     found = rehearse_spec(
         spec, request.method, hooks.on_event, hooks.on_samples, model=known, asked=request.options,
-        excitations=excitations(config, request),
+        excitations=excitations(config, request, hooks.ground.mode),
     )  # fmt: skip
     if found.ended is None or isinstance(found.ended, NoGain):
         return Outcome(found.result.model_copy(update={"rehearsed_on": on}), None, None, found.plant_time_s)

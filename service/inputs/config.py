@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from loopwright.service.inputs.plausible import Positive, Size, Time, Value, check_step
 
 Node = Annotated[int, Field(ge=1, le=127)]
-ExcitationName = Literal["observe", "setpoint", "relay"]
+ExcitationName = Literal["observe", "setpoint", "relay", "manual"]
 DirectionName = Literal["both", "up", "down"]
 Tag = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 
@@ -52,10 +52,12 @@ class PermittedTest(BaseModel):
 
     excitations: what method fast may learn the plant from: normal operation (observe), after which only the gains
     found are tried; pulses of the set-point under the present gains; the controller's relay. They are tried in this
-    order, each where those before it tell too little.
+    order, each where those before it tell too little. Of a loop in manual: pulses of its manual output (manual), and
+    nothing else.
     mv_step_max: the largest jump of MV from one sample to the next, percent, of a test by any method; None: what
     mv_limits permit.
-    directions: to which sides of its rest a test by any method moves the set-point. A relay moves PV to both.
+    directions: to which sides of its rest a test by any method moves the set-point, or PV by the manual output. A
+    relay moves PV to both.
     sp_rate_max_per_s: the largest rate of the set-point, PV units per s of plant time, of a test by any method; None:
     the set-point is stepped.
     """
@@ -66,8 +68,9 @@ class PermittedTest(BaseModel):
         default=("relay",),
         min_length=1,
         description="What method fast may learn the plant from: normal operation (observe), after which only the gains "
-        "found are tried, pulses of the set-point under the present gains, or the relay",
-        examples=[["setpoint", "relay"], ["observe", "setpoint", "relay"]],
+        "found are tried, pulses of the set-point under the present gains, or the relay; of a loop in manual pulses of "
+        "its manual output (manual), after which the gains are not tried",
+        examples=[["setpoint", "relay"], ["observe", "setpoint", "relay", "manual"]],
     )
     mv_step_max: Positive | None = Field(
         default=None,

@@ -44,6 +44,7 @@ from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.fast.setpoint_procedure import SETPOINT
 from loopwright.tuning.five_stage.procedure import PROCEDURE, Options, rule_of, stages_of
 from loopwright.tuning.models import FOPDT, SOPDT
+from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Refused
 from loopwright.tuning.rules.registry import METHODS
 
@@ -229,7 +230,8 @@ class FastRetune(DesignRetune):
         description="What moves the loop, among what loops.yaml permits (test: excitations); the default is all of "
         "that. observe: where normal operation has shown the plant well enough, only the new gains are tried; "
         "setpoint: pulses under the present gains, in automatic; relay: the controller's relay. Each follows only "
-        "where those before it tell too little",
+        "where those before it tell too little. manual: of a loop in manual, pulses of its manual output and nothing "
+        "else; in automatic it is left out",
         examples=[["setpoint"], ["observe", "setpoint"]],
     )
     careful: bool = Field(default=False, description="Use at least six switches of the relay, not four")
@@ -453,16 +455,20 @@ def within(loop: LoopConfig, request: RetuneRequest) -> LoopConfig:
     return narrowed
 
 
-def excitations(loop: LoopConfig, request: RetuneRequest) -> tuple[Excitation, ...]:
+def excitations(loop: LoopConfig, request: RetuneRequest, mode: Mode = Mode.AUTOMATIC) -> tuple[Excitation, ...]:
     """What may move the loop during a retune by fast, in the order in which it is tried; empty where there is no such
-    choice. A set-point that another controller moves is left alone where the relay is permitted. A dry run has no
-    history of operation: `observe` is left out where something else is permitted.
+    choice. A loop in manual is moved by pulses of its manual output alone, where they are permitted. A set-point that
+    another controller moves is left alone where the relay is permitted. A dry run has no history of operation:
+    `observe` is left out where something else is permitted.
 
     loop: the loop with the limits of the request.
+    mode: the mode of the loop.
     """
     if not isinstance(request, FastRetune) or request.start == "design":
         return ()
     permitted = loop.test.excitations
+    if "manual" in permitted and (mode is Mode.MANUAL or permitted == ("manual",)):
+        return (Excitation.MANUAL,)
     remote = loop.setpoint_from == "remote" and "relay" in permitted and not request.dry_run
     if remote:
         return (Excitation.RELAY,)
@@ -471,13 +477,35 @@ def excitations(loop: LoopConfig, request: RetuneRequest) -> tuple[Excitation, .
     return found[1:] if request.dry_run and len(found) > 1 and found[0] is Excitation.OBSERVE else found
 
 
-def check_setpoint_source(loop: LoopConfig, request: RetuneRequest) -> None:
-    """Raises RemoteSetpoint where the request would pulse a set-point that another controller moves.
+def wrong_mode(loop: LoopConfig, request: RetuneRequest, mode: Mode) -> str | None:
+    """Why the retune cannot be made in this mode, with what to do; None where it can.
 
     loop: the loop with the limits of the request.
     """
-    tried = excitations(loop, request)
-    pulses = isinstance(request, SetpointRetune) or (tried and Excitation.RELAY not in tried)
+    needed = Mode.MANUAL if Excitation.MANUAL in excitations(loop, request, mode) else Mode.AUTOMATIC
+    if mode is needed:
+        return None
+    text = f"the controller is in mode {mode.name.lower()}, not {needed.name.lower()}"
+    if needed is Mode.MANUAL:
+        return f"{text}, and excitations permit nothing but pulses of the manual output"
+    if mode is not Mode.MANUAL:
+        return text
+    if isinstance(request, FastRetune) and request.start == "relay":
+        asked = "" if request.excitations is None else ", and name manual among the excitations asked for"
+        return f"{text}; to tune it in manual, permit manual in loops.yaml (test: excitations){asked}"
+    return (
+        f"{text}; in manual a loop is tuned by method fast alone, where loops.yaml permits manual (test: excitations)"
+    )
+
+
+def check_setpoint_source(loop: LoopConfig, request: RetuneRequest, mode: Mode | None = None) -> None:
+    """Raises RemoteSetpoint where the request would move a set-point that another controller moves.
+
+    loop: the loop with the limits of the request.
+    mode: the mode of the loop; None where it is not known yet: a loop that may be in manual is then left for later.
+    """
+    tried = excitations(loop, request, Mode.MANUAL if mode is None else mode)
+    pulses = isinstance(request, SetpointRetune) or (tried and not {Excitation.RELAY, Excitation.MANUAL} & {*tried})
     if loop.setpoint_from == "operator" or not pulses or request.dry_run:
         return
     tag, outer = loop.tag, loop.outer_loop or "another controller"

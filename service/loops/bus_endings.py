@@ -50,7 +50,7 @@ def why_over(reading: BusReading, number: int, pv_silence_s: float) -> Ended:
             reason = moved[0][0] if moved else Reason.MODE_CHANGED
             return Aborted(reason, f"an operator or another master changed: {', '.join(name for _, name, _ in moved)}")
         case Cause.PV_LIMIT:
-            return Failed(Reason.PV_LIMIT, "PV left its limits during the relay; the controller ended the test")
+            return Failed(Reason.PV_LIMIT, "PV left its limits; the controller ended the test")
         case Cause.NO_PV:
             reading.check_plant_operational()
             text = f"the controller has had no valid PV for {pv_silence_s:g} s"

@@ -11,6 +11,11 @@ from collections.abc import Sequence
 from loopwright.service.inputs.request import FastRetune, FiveStages, RetuneRequest
 from loopwright.tuning.experiments.preflight import MAX_ATTEMPTS, MIN_LISTENED_SAMPLES
 from loopwright.tuning.fast.experiment import STEP_BACK_FRACTION, VERIFICATION_PERIODS
+from loopwright.tuning.fast.look import MIN_OWN_PERIODS
+from loopwright.tuning.fast.manual_procedure import MANUAL
+from loopwright.tuning.fast.manual_procedure import MAX_PERIODS as MAX_PERIODS_IN_MANUAL
+from loopwright.tuning.fast.manual_procedure import MAX_T95 as MAX_T95_IN_MANUAL
+from loopwright.tuning.fast.manual_test import ANSWER_T95, BACK_PULSES, BACK_T95, LONGEST_PULSE_T95, MAX_RAISES
 from loopwright.tuning.fast.procedure import MIN_SAMPLES
 from loopwright.tuning.fast.relay_test import MAX_PERIODS
 from loopwright.tuning.fast.setpoint_procedure import MAX_PERIODS as MAX_PERIODS_OF_PULSES
@@ -61,7 +66,17 @@ def durations(
         longest = (1.0 + STEP_BACK_FRACTION) * VERIFICATION_PERIODS * high + MOVES_OF_STEP * ramp_s
         steps = (VERIFICATION_PERIODS * low, longest)
         verify = (0.0 if may_be_known else steps[0], steps[1])
-        known = {"preflight": listening, "trial": steps, "pulses": pulses, "relay": relay, "verify": verify}
+        # the first pulse is raised where PV hardly answers, and PV is waited for until it comes back
+        first = (1 + MAX_RAISES) * (LONGEST_PULSE_T95 + ANSWER_T95) + max(BACK_T95, BACK_PULSES * LONGEST_PULSE_T95)
+        manual = (MIN_OWN_PERIODS * low, first * t95_s + max(MAX_PERIODS_IN_MANUAL * high, MAX_T95_IN_MANUAL * t95_s))
+        known = {
+            "preflight": listening,
+            MANUAL: manual,
+            "trial": steps,
+            "pulses": pulses,
+            "relay": relay,
+            "verify": verify,
+        }
         return {stage: known.get(stage, nothing) for stage in stages}
     return {
         "preflight": listening,

@@ -16,6 +16,7 @@ from loopwright.tuning.fast.information import Expected, Moved, expected
 from loopwright.tuning.fast.pulse_test import pulse_size
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.fast.relay_test import BIAS, FIRST_AMPLITUDE, max_amplitude
+from loopwright.tuning.plan import Mode
 
 _WHEN = {
     Excitation.SETPOINT: "pulses of the set-point under the present gains",
@@ -52,9 +53,9 @@ def excitation_previews(
     """
     found: list[ExcitationPreview] = []
     moved = None if state is None else _moved(config, state, known)
-    for each in excitations(config, request):
+    for each in excitations(config, request, Mode.AUTOMATIC if state is None else state.mode):
         told: Expected | None = None
-        if moved is not None and known is not None:
+        if each is not Excitation.MANUAL and moved is not None and known is not None:
             told = expected(known.model.process_model(), moved, each)
         found.append(
             ExcitationPreview(
@@ -71,6 +72,8 @@ def excitation_previews(
 def _when(each: Excitation, follows: bool, known: KnowledgeView | None) -> str:
     if each is Excitation.OBSERVE:
         return f"{_of_operation(known)} The history of the loop is looked at again as the job begins."
+    if each is Excitation.MANUAL:
+        return "Of a loop in manual, and nothing else: pulses of its manual output. The new gains are not tried."
     what = _WHEN[each]
     if not follows:
         return f"First: {what}."

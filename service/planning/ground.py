@@ -14,6 +14,7 @@ from loopwright.service.results import GainsSource, PlantSource, RehearsedOnView
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, Model
+from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Ended
 
 MAX_GUESS_Ms = 2.5
@@ -50,6 +51,11 @@ class Ground:
     state: LoopState | None = None
     state_job: str | None = None
     silence: str = "the controller was not asked"
+
+    @property
+    def mode(self) -> Mode:
+        """Returns the mode of the loop; automatic where it is not known."""
+        return Mode.AUTOMATIC if self.state is None else self.state.mode
 
     @property
     def gains_source(self) -> GainsSource:

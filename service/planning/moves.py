@@ -12,10 +12,14 @@ from dataclasses import dataclass, replace
 from loopwright.protocol.real32 import TOLERANCE
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import FastRetune, FiveStages, RetuneRequest, SetpointRetune, excitations
+from loopwright.service.loop_state import LoopState
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.design_trial import trial_stages
 from loopwright.tuning.fast.excitation_choice import chosen_stages
 from loopwright.tuning.fast.known_procedure import FARTHEST
+from loopwright.tuning.fast.manual_procedure import MANUAL
+from loopwright.tuning.fast.manual_sizes import first_pulse, largest_pulse
+from loopwright.tuning.fast.manual_test import LONGEST_PULSE_T95
 from loopwright.tuning.fast.pulse_test import pulse_size
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.fast.relay_test import BIAS, FIRST_AMPLITUDE, MAX_OUTPUT_RANGE, MAX_RAISE, max_amplitude
@@ -23,6 +27,7 @@ from loopwright.tuning.fast.setpoint_procedure import setpoint_stages
 from loopwright.tuning.five_stage.procedure import stages_of
 from loopwright.tuning.five_stage.ultimate_gain import RUN_MV_LIMIT
 from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Mode
 
 _COMPUTING = ("design", "redesign", "estimate", "optimise")
 _STEPPING = ("baseline", "ultimate", "zn_pi", "verify", "trial")
@@ -37,7 +42,7 @@ class Moves:
     mv_down, mv_up: largest moves of MV from its present value, percent, both positive.
     sp_up, sp_down: largest moves of the set-point from its present value, PV units, both positive.
     pv: expected excursion of PV from the present set-point, PV units; None where it is not known.
-    first_mv: initial amplitude of the relay, percent; None without a relay.
+    first_mv: initial amplitude of the relay, or size of the first pulse of the manual output, percent; None without.
     """
 
     stage: str
@@ -50,18 +55,32 @@ class Moves:
     first_mv: float | None = None
 
 
-def stages_asked(config: LoopConfig, request: RetuneRequest) -> tuple[str, ...]:
+def stages_asked(config: LoopConfig, request: RetuneRequest, mode: Mode = Mode.AUTOMATIC) -> tuple[str, ...]:
     """Returns the stages that the retune may have, in their order.
 
     config: the configuration with the limits of the job.
+    mode: the mode of the loop.
     """
     if isinstance(request, FastRetune):
         if request.start == "design":
             return trial_stages(request.verify)
-        return chosen_stages(excitations(config, request), request.verify)
+        return chosen_stages(excitations(config, request, mode), request.verify)
     if isinstance(request, SetpointRetune):
         return setpoint_stages(request.verify)
     return stages_of(request.start, request.options.baseline, request.verify)
+
+
+def broken_from(config: LoopConfig, request: RetuneRequest, state: LoopState) -> list[str]:
+    """Returns a sentence with the numbers for each PV limit that the test itself would break from this state.
+
+    Pulses of the manual output are sized to keep the PV limits, so that PV has to be within them, and no more.
+    """
+    low, high = config.pv_limits.low, config.pv_limits.high
+    if MANUAL not in stages_asked(config, request, state.mode):
+        return broken_limits(config, request, state.sp)
+    if low < state.pv < high or not math.isfinite(state.pv):
+        return []
+    return [f"PV {state.pv:.6g} {config.pv_unit} is not within the PV limits {low:g} .. {high:g}"]
 
 
 def broken_limits(config: LoopConfig, request: RetuneRequest, sp: float) -> list[str]:
@@ -114,11 +133,15 @@ class Before:
     gains: the gains in effect.
     mv: the present MV, percent.
     Ku: the ultimate gain of the last model, percent per PV unit.
+    mode: the mode; automatic where it is not known.
+    reverse: whether MV has to fall as PV rises.
     """
 
     gains: Gains | None = None
     mv: float | None = None
     Ku: float | None = None
+    mode: Mode = Mode.AUTOMATIC
+    reverse: bool = True
 
 
 def moves(config: LoopConfig, request: RetuneRequest, before: Before) -> list[Moves]:
@@ -129,9 +152,13 @@ def moves(config: LoopConfig, request: RetuneRequest, before: Before) -> list[Mo
     config: the configuration with the limits of the job, and the MV limits in effect.
     """
     found = []
-    for stage in stages_asked(config, request):
+    stages = stages_asked(config, request, before.mode)
+    mode = "manual" if MANUAL in stages else "automatic"
+    for stage in stages:
         if stage == "preflight":
-            found.append(Moves(stage, "Nothing is moved: the loop is observed in automatic until it is at rest."))
+            found.append(Moves(stage, f"Nothing is moved: the loop is observed in {mode} until it is at rest."))
+        elif stage == MANUAL:
+            found.append(_manual(config, before))
         elif stage in _COMPUTING:
             found.append(Moves(stage, "Nothing is moved by the test: the gains are computed from the record."))
         else:
@@ -217,6 +244,24 @@ def _setpoint(stage: str, config: LoopConfig, before: Before) -> Moves:
         f"{again}, where the record is not conclusive.{_ramp(config, step)}"
     )
     return Moves(stage, what, room, room, *_sides(config, step, 0.0), pv=_UNDER_NEW_GAINS * step)
+
+
+def _manual(config: LoopConfig, before: Before) -> Moves:
+    low, high, step, way = config.mv_limits.low, config.mv_limits.high, config.sp_deviation, config.test.directions
+    side = None if way == "both" else 1.0 if (way == "up") is before.reverse else -1.0
+    mv = 0.5 * (low + high) if before.mv is None else before.mv
+    most = largest_pulse(mv, low, high, config.test.mv_step_max or math.inf, side)
+    first = first_pulse(before.gains.Kp * step if before.gains else math.inf, most)
+    sides = "to both sides in turn" if side is None else f"{'up' if side > 0.0 else 'down'} only"
+    what = (
+        f"The manual output moves by {first:.4g} % at first and by up to {most:.4g} %, {sides}, and back to where it "
+        f"is: pulses of {LONGEST_PULSE_T95 * config.t95_s:.3g} s at most, sized so that PV moves by up to {step:g} "
+        f"{config.pv_unit}. The loop stays in manual; the new gains are not tried."
+    )
+    if side is not None:
+        what += " A gain that differs above and below where MV is is not seen."
+    up, down = (0.0 if side is not None and side * sign < 0.0 else most for sign in (1.0, -1.0))
+    return Moves(MANUAL, what, down, up, pv=step, first_mv=first)
 
 
 def _known_trial(config: LoopConfig, before: Before) -> Moves:

@@ -15,10 +15,11 @@ from loopwright.service.inputs.request import (
     check_setpoint_source,
     excitations,
     narrow,
+    wrong_mode,
 )
 from loopwright.service.loop_state import OPERATIONAL, LoopState
 from loopwright.service.planning.facts import facts_of
-from loopwright.service.planning.moves import broken_limits, stages_asked
+from loopwright.service.planning.moves import broken_from, stages_asked
 from loopwright.tuning.experiments.preflight import MAX_ATTEMPTS, MAX_AWAY, MAX_NOISE, MIN_ROOM
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.ramp import check_ramp
@@ -83,7 +84,7 @@ def obstacles(config: LoopConfig, request: RetuneRequest, now: Now) -> list[Obst
     if now.locked is not None:
         found.append(Obstacle(Reason.LOCKED, now.locked))
     try:
-        check_setpoint_source(narrowed, request)
+        check_setpoint_source(narrowed, request, None if now.state is None else now.state.mode)
     except RemoteSetpoint as remote:
         found.append(Obstacle(remote.reason, remote.detail))
     if now.silent is not None:
@@ -117,10 +118,9 @@ def _state_obstacles(config: LoopConfig, request: RetuneRequest, state: LoopStat
     if state.on_trial or state.mode is Mode.EXPERIMENT:
         text = "gains are on trial, or a relay is running, that no job of this service has started"
         found.append(Obstacle(Reason.LOOP_IN_USE, text))
-    elif state.mode is not Mode.AUTOMATIC:
-        text = f"the controller is in mode {state.mode.name.lower()}, not automatic"
-        found.append(Obstacle(Reason.WRONG_MODE, text))
-    found += [Obstacle(Reason.BAD_LIMITS, text) for text in broken_limits(config, request, state.sp)]
+    elif (wrong := wrong_mode(config, request, state.mode)) is not None:
+        found.append(Obstacle(Reason.WRONG_MODE, wrong))
+    found += [Obstacle(Reason.BAD_LIMITS, text) for text in broken_from(config, request, state)]
     try:
         facts = facts_of(config, state)
     except Refused as refused:
@@ -153,7 +153,8 @@ def _pv_obstacles(config: LoopConfig, request: RetuneRequest, state: LoopState) 
     step, noise = config.sp_deviation, config.noise_std_hint
     # one reading is not a mean: a noise that the configuration does not state may be as large as is permitted
     maximum = MAX_AWAY * step + 4.0 * (MAX_NOISE * step if noise is None else noise)
-    away = state.pv - state.sp
+    in_manual = Excitation.MANUAL in excitations(config, request, state.mode)
+    away = 0.0 if in_manual else state.pv - state.sp
     limits, unit = config.pv_limits, config.pv_unit
     if not limits.low <= state.pv <= limits.high:
         text = f"PV {state.pv:.5g} {unit} is outside {limits.low:g} .. {limits.high:g}"

@@ -17,7 +17,9 @@ from loopwright.service.planning.facts import time_budget_s
 from loopwright.service.planning.moves import Before, Moves, moves, stages_asked
 from loopwright.service.planning.obstacles import Now, Obstacle, Occupied, obstacles
 from loopwright.service.results import KnowledgeView, Result, TransferModelView
+from loopwright.tuning.fast.manual_procedure import MANUAL
 from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Mode
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +74,8 @@ class StagePreview(BaseModel):
     sp_high: float | None = Field(description="Set-point at most, PV units", examples=[52.0])
     sp_move: float = Field(description="The largest step of the set-point, PV units", examples=[2.0])
     pv_move: float | None = Field(
-        description="How far PV is expected to go from the present set-point, PV units; null: not known before",
+        description="How far PV is expected to go from the present set-point, in manual from its present value, PV "
+        "units; null: not known before",
         examples=[2.8],
     )
     duration_low_s: float = Field(description="Expected at least, plant time, s", examples=[7.0])
@@ -116,7 +119,9 @@ class Preview(BaseModel):
     pv: float | None = Field(description="Process value now, PV units; null: not known", examples=[49.9])
     mv: float | None = Field(description="Controller output now, percent; null: not known", examples=[50.0])
     first_mv_move_pct: float | None = Field(
-        description="Initial amplitude of the relay, percent of MV; null: there is no relay", examples=[12.5]
+        description="Initial amplitude of the relay, or size of the first pulse of the manual output, percent of MV; "
+        "null: there is neither",
+        examples=[12.5],
     )
     largest_mv_move_pct: float = Field(description="The largest move of MV in any stage, percent", examples=[50.0])
     largest_sp_move: float = Field(
@@ -160,9 +165,13 @@ def preview(
     sample_time_s = state.sample_time_s if state else None
     rate = narrowed.test.sp_rate_max_per_s
     ramp_s = narrowed.sp_deviation / rate if rate else 0.0
-    times = durations(request, stages_asked(narrowed, request), config.t95_s, sample_time_s, pu_s, ramp_s)
+    mode = state.mode if state else Mode.AUTOMATIC
+    times = durations(request, stages_asked(narrowed, request, mode), config.t95_s, sample_time_s, pu_s, ramp_s)
     mv, sp = (_finite(state.mv), _finite(state.sp)) if state else (None, None)
-    before = Before(state.gains if state else None, mv, Ku or (last.Ku if last else None))
+    before = Before(
+        state.gains if state else None, mv, Ku or (last.Ku if last else None), mode,
+        state.reverse_acting if state else True,
+    )  # fmt: skip
     moved = [] if request.dry_run else moves(limited, request, before)
     stages = [_stage(each, times[each.stage], permitted, mv, sp) for each in moved]
     in_the_way = obstacles(config, request, now)
@@ -272,6 +281,8 @@ def _home(state: LoopState | None, unit: str) -> str:
     if state is None:
         return "The controller has its mode, set-point and gains as they were before."
     gains = _gains_text(state.gains)
+    if state.mode is Mode.MANUAL:
+        return f"The controller is in manual again, manual output {state.manual_output:.6g} %, with {gains}."
     return f"The controller is in {state.mode.name.lower()} again, set-point {state.sp:.6g} {unit}, with {gains}."
 
 
@@ -299,7 +310,10 @@ def _summary(found: Preview, unit: str) -> list[str]:
     limits = f"{found.watched.mv.low:g} .. {found.watched.mv.high:g} %"
     goes = "How far PV goes under the relay is not known beforehand."
     if found.largest_pv_move is not None:
-        goes = f"PV is expected to go up to {found.largest_pv_move:.3g} {unit} from the set-point as it is now."
+        where = (
+            "where it is now" if any(each.stage == MANUAL for each in found.stages) else "the set-point as it is now"
+        )
+        goes = f"PV is expected to go up to {found.largest_pv_move:.3g} {unit} from {where}."
     time, pv = duration_text(found.duration_low_s, found.duration_high_s), found.watched.pv
     lines = [
         f"A retune of {found.loop} by {found.method} moves MV {first}by at most {found.largest_mv_move_pct:.3g} %, "

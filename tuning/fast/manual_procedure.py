@@ -3,7 +3,8 @@
     listen - a first pulse - (pulse - rest - fit and design) until two evaluations agree
 
 MV goes away from the manual output found and comes back to it, pulse by pulse; the loop stays in manual. The gains are
-not tried, so that the record has to answer what a trial would: see `_limits`.
+not tried, so that the record has to answer what a trial would: the limits of the evaluation are narrower, a faulty valve
+is looked for, and two evaluations with a pulse between them have to agree.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.look import Look, look_at, settled
 from loopwright.tuning.fast.manual_test import ManualTest
 from loopwright.tuning.fast.options import DesignOptions
+from loopwright.tuning.fast.outcome import OPEN_REASONS
 from loopwright.tuning.fast.proposal import FastProposal, evaluation_summary, proposed
 from loopwright.tuning.fast.record import MIN_LISTENED
 from loopwright.tuning.fast.record_evaluation import first_period
@@ -37,6 +39,8 @@ MORE_REST = 0.5
 MAX_PERIODS, MAX_T95 = 12.0, 1.5
 """Longest record: the longer of these numbers of ultimate periods and of T95, from the end of the first pulse's
 response on."""
+MAX_OBJECTIONS = 3
+"""Number of looks in a row with an objection that a longer record will not remove, after which the pulses end."""
 MAX_DISAGREEMENT = 0.05
 """Largest difference of Ms from the Ms asked for, of the gains of two successive looks on each other's model."""
 
@@ -62,7 +66,7 @@ def by_manual(facts: Facts, options: DesignOptions, method: str) -> Plan[FastPro
     test.period = yield from test.computed(partial(first_period, *test.columns(), facts.sample_time_s))
     begun = test.elapsed
     look = Look(test.period, None, Refused(Reason.STALLED, "the pulses came to nothing"))
-    widths = cycle(WIDTHS)
+    widths, objections = cycle(WIDTHS), 0
     while True:
         if not (yield from test.pulse(max(1, round(next(widths) * test.period)))):
             yield from test.resting(MORE_REST * test.period)
@@ -76,6 +80,10 @@ def by_manual(facts: Facts, options: DesignOptions, method: str) -> Plan[FastPro
                 break
             if isinstance(look.outcome, Refused):
                 yield from test.report(Note(f"after {looked_at} samples: {look.outcome.detail}"))
+            lasting = isinstance(look.outcome, Refused) and look.outcome.reason not in OPEN_REASONS
+            objections = objections + 1 if lasting else 0
+            if objections == MAX_OBJECTIONS:
+                break
         if test.elapsed - begun >= max(MAX_PERIODS * test.period, MAX_T95 * T95 / facts.sample_time_s):
             if not isinstance(look.outcome, Refused):
                 text = f"after {test.elapsed} samples two successive evaluations still disagree on the gains"

@@ -48,21 +48,23 @@ class Past:
     action: float
 
 
-def largest_pulse(facts: Facts, home: float) -> float:
+def largest_pulse(home: float, mv_low: float, mv_high: float, mv_step_max: float, side: float | None) -> float:
     """The largest pulse that MV's limits and its largest jump permit, MV units; 0 where there is no room.
 
-    home: MV at rest, MV units.
+    home: MV at rest. mv_low, mv_high, mv_step_max: as in `Facts`. All in MV units.
+    side: +1 for pulses up, -1 for pulses down, None for both.
     """
-    up, down = facts.mv_high - home, home - facts.mv_low
-    first, second = (up, down) if facts.side * (1.0 if facts.reverse else -1.0) > 0.0 else (down, up)
-    room = first if facts.one_sided else min(first, second)
-    return max(0.0, min(OF_ROOM * room, facts.mv_step_max))
+    up, down = mv_high - home, home - mv_low
+    room = min(up, down) if side is None else up if side > 0.0 else down
+    return max(0.0, min(OF_ROOM * room, mv_step_max))
 
 
-def first_pulse(facts: Facts, largest: float) -> float:
+def first_pulse(kick: float, largest: float) -> float:
     """The size of the first pulse, MV units: what the proportional part of the present gains makes of the permitted
-    step of the set-point, which is known to move PV by about that where these gains are any good."""
-    kick = facts.old_gains.Kp * facts.sp_deviation
+    step of the set-point, which moves PV by about that where these gains are any good.
+
+    kick: Kp of the present gains times the permitted step. largest: the largest pulse that MV permits. In MV units.
+    """
     return min(kick, FIRST_OF_LARGEST * largest) if kick > 0.0 else WITHOUT_KP * largest
 
 

@@ -54,15 +54,16 @@ class ManualTest(Experiment):
     def __init__(self, facts: Facts, point: OperatingPoint, listened: Trace) -> None:
         super().__init__(facts, point, listened)
         self.home = listened.mv[-1]
-        self.largest = largest_pulse(facts, self.home)
+        self.side = facts.side * self._direction
+        """The side of the next pulse: +1 up, -1 down."""
+        only = self.side if facts.one_sided else None
+        self.largest = largest_pulse(self.home, facts.mv_low, facts.mv_high, facts.mv_step_max, only)
         if not self.largest > 0.0:
             raise Refused(Reason.SATURATED, f"MV {self.home:.4g} leaves no room for a pulse")
-        self.size = first_pulse(facts, self.largest)
+        self.size = first_pulse(facts.old_gains.Kp * facts.sp_deviation, self.largest)
         self.turns: list[int] = []  # samples at which MV left home, or came back
         self.period = 0.0
         """The time scale of the record, in samples; known after the first pulse."""
-        self.side = facts.side * self._direction
-        """The side of the next pulse: +1 up, -1 down."""
         self._ordered = self.home
         self._follows_at = 0
 

@@ -27,6 +27,7 @@ ORDERS: dict[Order, Sequence[float]] = {
     Order.RELAY: RELAY,
     Order.TRY: TRIED,
     Order.ACCEPT: TRIED,
+    Order.WATCH: (0.0, 100.0),
 }
 """Every order that a session takes but the last, with values that make a difference."""
 HOMES = pytest.mark.parametrize("mode", [Mode.OFF, Mode.MANUAL, Mode.AUTOMATIC], ids=lambda mode: mode.name.lower())
@@ -87,7 +88,7 @@ class Bench:
         c = self.channel
         return (
             c.mode, c.setpoint, c.manual_output, c.accepted, c.in_effect, c.on_trial, c.relay, self.session.number,
-            self.session.count, tuple(self.stored),
+            self.session.count, self.session.pv_limits, tuple(self.stored),
         )  # fmt: skip
 
     def is_home(self, home: Home) -> bool:

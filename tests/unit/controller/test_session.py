@@ -12,7 +12,20 @@ from loopwright.controller.channel import Home, Mode, Parameters, RelayState
 from loopwright.protocol.profile import Abort, Cause, Order, OutsideChange
 from loopwright.protocol.sdo import SdoAbort
 from loopwright.protocol.session import check_of
-from tests.unit.controller.sessions import NO_NUMBERS, ORDERS, OTHER, PI, RELAY, TERMS, TRIED, TUNER, Bench
+from tests.unit.controller.sessions import (
+    CAUSES,
+    HOMES,
+    NO_NUMBERS,
+    ORDERS,
+    OTHER,
+    PI,
+    RELAY,
+    TERMS,
+    TRIED,
+    TUNER,
+    WITHOUT_PV,
+    Bench,
+)
 
 EACH_ORDER = pytest.mark.parametrize("order", ORDERS, ids=lambda order: order.name.lower())
 
@@ -181,6 +194,8 @@ class TestOrders:
             (Order.TRY, (-1.0, *TRIED[1:])),
             (Order.ACCEPT, (math.nan, *TRIED[1:])),
             (Order.ACCEPT, (1.0, -1.0, *TRIED[2:])),
+            (Order.WATCH, (60.0, 40.0)),
+            (Order.WATCH, (math.nan, 60.0)),
         ],
     )
     def test_a_value_that_makes_no_sense_is_refused_and_the_count_stays(
@@ -384,3 +399,64 @@ class TestWatches:
         modes = [bench.samples(1) and bench.channel.mode for _ in range(6)]
         assert modes == [Mode.EXPERIMENT] * 5 + [Mode.AUTOMATIC]
         assert (bench.session.cause, bench.channel.relay_state) == (Cause.RELAY_SAMPLES, RelayState.DONE)
+
+    @HOMES
+    def test_a_test_ends_at_a_pv_limit_in_every_mode(self, mode: Mode) -> None:
+        bench = Bench(mode)
+        bench.samples(3)
+        bench.open()
+        home = bench.session.home
+        bench.order(Order.WATCH, 45.0, 55.0)
+        bench.order(Order.MODE, Mode.MANUAL)
+        bench.order(Order.OUTPUT, 70.0)
+        assert bench.samples(1, 55.0) == 70.0
+        assert bench.session.is_open
+        bench.samples(1, 55.1)
+        assert bench.session.cause is Cause.PV_LIMIT and bench.is_home(home)
+
+    def test_the_pv_limits_of_a_session_end_with_it(self, bench: Bench) -> None:
+        bench.open()
+        bench.order(Order.WATCH, 45.0, 55.0)
+        bench.order(Order.CLOSE)
+        bench.open()
+        bench.samples(3, 60.0)
+        assert bench.session.is_open
+
+    def test_a_pv_that_is_no_number_is_out_of_no_limits(self, bench: Bench) -> None:
+        bench.open()
+        bench.order(Order.WATCH, 45.0, 55.0)
+        bench.samples(1, math.nan)
+        assert bench.session.is_open
+
+
+class TestManualOutput:
+    """What becomes of the manual output of a loop in manual that a tuner moves."""
+
+    @pytest.mark.parametrize("cause", CAUSES, ids=lambda cause: cause.name.lower())
+    def test_every_end_restores_the_manual_output_found(self, cause: Cause) -> None:
+        """Also the end at a PV limit that the tuner has set, on the same sample."""
+        bench = Bench(Mode.MANUAL)
+        bench.samples(3)
+        bench.open()
+        bench.order(Order.WATCH, 45.0, 55.0)
+        bench.order(Order.OUTPUT, 70.0)
+        assert bench.samples(1) == 70.0
+        if cause is Cause.PV_LIMIT:
+            assert bench.samples(1, 55.1) == 45.0
+        else:
+            bench.end_by(cause)
+            if cause not in WITHOUT_PV:
+                bench.samples(1)
+        assert bench.session.cause is cause
+        assert (bench.channel.mode, bench.channel.manual_output, bench.channel.mv) == (Mode.MANUAL, 45.0, 45.0)
+
+    def test_gains_are_accepted_in_manual_without_moving_MV(self) -> None:
+        bench = Bench(Mode.MANUAL)
+        bench.samples(3)
+        bench.open()
+        assert bench.order(Order.ACCEPT, *TRIED) is None
+        seen = {bench.samples(1) for _ in range(3)}
+        bench.order(Order.CLOSE)
+        seen |= {bench.samples(1) for _ in range(3)}
+        assert seen == {45.0} and bench.channel.mode is Mode.MANUAL
+        assert bench.channel.accepted == Parameters(*TRIED)
