@@ -76,7 +76,8 @@ ADVICE: dict[Reason, str] = {
     Reason.NOT_AT_REST: "Wait until PV and MV are steady (or put the loop in manual and let it settle), then retune.",
     Reason.NOISE_TOO_HIGH: "Filter the measurement or permit a larger set-point deviation.",
     Reason.SATURATED: "MV is at a limit: move the operating point or widen the limits, then retune.",
-    Reason.WRONG_MODE: "Put the loop in automatic with working gains before retuning.",
+    Reason.WRONG_MODE: "Put the loop in automatic with working gains, or permit pulses of the manual output "
+    "(loops.yaml), then retune.",
     Reason.LOOP_IN_USE: "Another tuner holds a session on this loop: wait for its end, then retune.",
     Reason.SETPOINT_IS_DRIVEN: "Another controller or a ramp moves the set-point: put the loop to local set-point, or "
     "wait for the ramp's end, then retune.",
@@ -89,7 +90,8 @@ ADVICE: dict[Reason, str] = {
     "check for backlash, sticking or another loop acting on this one.",
     Reason.NO_OVERSHOOT: "The overshoot never came into the window: the plant is outside the class of this procedure; "
     "enter a model by hand or use another method.",
-    Reason.NOT_SELF_REGULATING: "The plant integrates: use a rule for integrating plants.",
+    Reason.NOT_SELF_REGULATING: "The plant integrates: use a rule for integrating plants; where the loop is in manual, "
+    "put it in automatic, then retune.",
     Reason.NOT_ROBUST: "The best PI would not be robust; keep the present gains, or enter a model by hand.",
     Reason.NOT_CONFIRMED: "The loop did not behave as its model predicts: keep the present gains, and repeat.",
     Reason.BAD_LIMITS: "Correct the limits: low < present value < high, and enough room for the test on both sides.",

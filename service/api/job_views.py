@@ -333,6 +333,11 @@ class JobView(BaseModel):
     )
     evidence: EvidenceView | None = Field(description="Evidence from the record of method fast, also for a refused job")
     verification: VerificationView | None = Field(description="Measured step that verifies the model of method fast")
+    tried: bool | None = Field(
+        description="Whether the new gains were tried on the loop by a set-point step; null: there are none, or of "
+        "a dry run",
+        examples=[True],
+    )
     before: StepView | None = Field(description="Measured set-point step with the old gains; only for five-stage")
     after: StepView | None = Field(description="Measured set-point step with the new gains, from rest")
     notes: list[str]
@@ -466,6 +471,7 @@ def job_view(
         model_from=result.model_from if isinstance(result, FastResult) else None,
         evidence=_evidence(result, events),
         verification=_verification(result, events),
+        tried=_tried(result, row),
         before=result.before if isinstance(result, FiveStageResult) else None,
         after=result.after,
         notes=[note for event in events if (note := event.note()) is not None] + result.notes,
@@ -531,6 +537,12 @@ def _verification(result: FastResult | FiveStageResult, events: Sequence[JobEven
         return result.verification
     found = _stage_result(events, ("verify",), "tested")
     return None if found is None else VerificationView.of_stage(found)
+
+
+def _tried(result: FastResult | FiveStageResult, row: Job) -> bool | None:
+    if result.new_gains is None or row.dry_run:
+        return None
+    return result.after is not None or (isinstance(result, FastResult) and result.verification is not None)
 
 
 def _stage_result(events: Sequence[JobEvent], stages: Sequence[str], field: str) -> JsonObject | None:

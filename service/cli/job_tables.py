@@ -167,6 +167,8 @@ def _certainty(job: JobView) -> Iterator[tuple[str, str, str]]:
     found, step = job.evidence, job.verification
     if job.model_from is not None:
         yield "model from", job.model_from, ""
+    if job.tried is False:
+        yield "tried on the loop", "never", ""
     if found is not None:
         yield "uncertainty of Ms", cell(found.uncertainty), "(2 std. dev.)"
         yield "Ms, other models", cell(found.ambiguity), "(max. diff.)"

@@ -269,7 +269,7 @@ def retune(
     ] = False,
     amplitude: Annotated[float | None, typer.Option(help="Relay amplitude for fast, percent of MV.")] = None,
     excitations: Annotated[
-        str | None, typer.Option(help="What fast moves the loop by, of what loops.yaml permits: setpoint,relay.")
+        str | None, typer.Option(help="What fast moves the loop by, of what loops.yaml permits: setpoint,relay,manual.")
     ] = None,
     careful: Annotated[
         bool, typer.Option("--careful", help="Let the relay of fast switch at least six times.")

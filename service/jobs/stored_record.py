@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.service.store.sample_blocks import COLUMNS, Block
+from loopwright.tuning.fast.manual_procedure import MANUAL
 from loopwright.tuning.fast.record import MIN_LISTENED, MIN_SWITCHES, Excitation, ExperimentRecord, oscillation_period
 from loopwright.tuning.fast.record_evaluation import first_period
 from loopwright.tuning.models import Reals
@@ -20,6 +21,8 @@ MIN_TURNS = 2
 MAX_RAMP_GAP = 12
 """Number of samples between two moves of the set-point in one direction, from which on they are no ramp: a simulated
 plant at full speed takes the commands of ten samples at once."""
+AWAY = 1e-3
+"""Distance from home at which MV is away in a pulse of the manual output, as a part of its range."""
 Columns = Mapping[str, Sequence[Any] | Reals]
 """Columns by their names in GET /jobs/{id}/samples."""
 
@@ -32,7 +35,7 @@ class StoredRecord:
     t: time since the relay or the pulses began, s.
     sp, pv, mv: as recorded, in PV and MV units.
     listened, excited: number of samples before the relay or the pulses, and up to their end.
-    switches: the samples at which the relay switched, or the set-point turned.
+    switches: the samples at which the relay switched, or the set-point or the manual output turned.
     excitation: what moved the loop.
     """
 
@@ -63,8 +66,8 @@ class StoredRecord:
             Ts=self.Ts,
             u=u,
             y=y,
-            # both begin high, and turn after PV has moved in the direction in which MV drives it
-            direction=1.0 if (y[self.switches[0]] > 0.0) == (relay or self._rises_with_setpoint) else -1.0,
+            # each begins with a move of MV, and turns after PV has moved in the direction in which MV drives it
+            direction=1.0 if (y[self.switches[0]] > 0.0) == (relay or self._rises_first) else -1.0,
             listened=self.listened,
             excited=self.excited,
             turns=len(self.switches),
@@ -76,13 +79,14 @@ class StoredRecord:
 
     @property
     def _to_one_side(self) -> bool:
-        """Whether the pulses went to one side of where the set-point was at rest only."""
-        away = self.sp[self.listened : self.excited] - self.sp[0]
+        """Whether the pulses went to one side of where they began only."""
+        moved = self.mv if self.excitation is Excitation.MANUAL else self.sp
+        away = moved[self.listened : self.excited] - moved[0]
         return bool(np.all(away >= 0.0) or np.all(away <= 0.0))
 
     @property
-    def _rises_with_setpoint(self) -> bool:
-        """Whether MV has risen with the first move of the set-point."""
+    def _rises_first(self) -> bool:
+        """Whether MV has risen first, with the set-point or with the manual output."""
         mv, _ = self.rest
         return bool(np.mean(self.mv[self.listened : self.switches[0]]) > mv)
 
@@ -123,19 +127,23 @@ def last_attempt(columns: Columns) -> Attempt | None:
 
 
 def stored_record(columns: Columns) -> StoredRecord | None:
-    """Returns the record of these columns; None where neither a relay nor pulses of the set-point were run."""
+    """Returns the record of these columns; None where neither a relay nor pulses were run."""
     attempt = last_attempt(columns)
     return None if attempt is None else record_of(attempt)
 
 
 def record_of(attempt: Attempt) -> StoredRecord | None:
-    """Returns the record of an attempt; None where neither a relay nor pulses of the set-point were run."""
+    """Returns the record of an attempt; None where neither a relay nor pulses were run."""
     sp, mv, mode, stage, Ts = attempt.sp, attempt.mv, attempt.mode, attempt.stage, attempt.Ts
-    relay = bool(np.any(mode == Mode.EXPERIMENT))
-    if not (relay or np.any(np.diff(sp[stage == "pulses"]))):
+    if np.any(mode == Mode.EXPERIMENT):
+        excitation, parts = Excitation.RELAY, _of_relay(mv, mode, sp, stage)
+    elif np.any(np.diff(sp[stage == "pulses"])):
+        excitation, parts = Excitation.SETPOINT, _of_pulses(sp, stage)
+    elif np.any(np.diff(mv[stage == MANUAL])):
+        excitation, parts = Excitation.MANUAL, _of_manual(mv)
+    else:
         return None
-    listened, excited, switches = _of_relay(mv, mode, sp, stage) if relay else _of_pulses(sp, stage)
-    excitation = Excitation.RELAY if relay else Excitation.SETPOINT
+    listened, excited, switches = parts
     t: Reals = (np.arange(len(sp), dtype=np.float64) - listened) * Ts
     return StoredRecord(Ts, t, sp, attempt.pv, mv, listened, excited, switches, excitation)
 
@@ -181,3 +189,9 @@ def _of_pulses(sp: Reals, stage: NDArray[np.str_]) -> Parts:
     verified = [int(i) for i in moved if stage[i] == "verify"]
     excited = verified[0] if verified else len(sp)
     return int(moved[0]), excited, tuple(int(i) for i in moved[1:] if i < excited)
+
+
+def _of_manual(mv: Reals) -> Parts:
+    away = np.abs(mv - mv[0]) > AWAY * float(np.ptp(mv))
+    turned = np.flatnonzero(away[1:] != away[:-1]) + 1
+    return int(turned[0]), len(mv), tuple(int(i) for i in turned[1:])

@@ -3,8 +3,8 @@
     listen - a first pulse - (pulse - rest - fit and design) until two evaluations agree
 
 MV goes away from the manual output found and comes back to it, pulse by pulse; the loop stays in manual. The gains are
-not tried, so that the record has to answer what a trial would: the limits of the evaluation are narrower, a faulty valve
-is looked for, and two evaluations with a pulse between them have to agree.
+not tried, so that the record has to answer what a trial would: the limits of the evaluation are narrower, a faulty
+valve is looked for, and two evaluations with a pulse between them have to agree.
 """
 
 from __future__ import annotations

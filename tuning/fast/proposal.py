@@ -33,6 +33,8 @@ from loopwright.tuning.reasons import Ended, Reason, Refused
 CRITERION = "half of the set-point's and half of the load's IAE, each over the least under the bounds asked for"
 """J in words, as the comparison of old and new gains shows it."""
 
+NEVER_TRIED = "These gains were never tried on this loop, which stayed in manual. Watch it as it goes to automatic."
+
 
 @dataclass(frozen=True, slots=True)
 class LoadDisturbance:
@@ -331,6 +333,8 @@ def proposed(
         for load in found.loads
         if not known_from or load.t_s >= 0.0
     ]
+    if evaluation.fit.record.excitation is Excitation.MANUAL:
+        notes.insert(0, NEVER_TRIED)
     input_range = evaluation.fit.record.input_range
     if any(abs(load.size) > input_range for load in found.loads):
         notes.append(
@@ -338,8 +342,9 @@ def proposed(
             "the plant would look the same. Look at the record before accepting."
         )
     if facts.one_sided and evaluation.fit.record.one_sided:
+        moved = "PV" if evaluation.fit.record.excitation is Excitation.MANUAL else "The set-point"
         notes.append(
-            f"The set-point was moved {facts.directions} only. A gain of the plant that differs above and below where "
+            f"{moved} was moved {facts.directions} only. A gain of the plant that differs above and below where "
             f"the test began cannot be seen in such a record: the gains hold for the side that was tested."
         )
     if found.drift:

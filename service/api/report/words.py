@@ -12,6 +12,7 @@ STAGES = {
     "preflight": "At rest?",
     "settle": "Settling",
     "pulses": "Set-point pulses",
+    "manual": "Manual-output pulses",
     "relay": "Relay",
     "design": "Model and gains",
     "verify": "Step, new gains",
@@ -87,6 +88,8 @@ def trust(job: JobView) -> list[str]:
         Ms = job.predicted.Ms if job.predicted else job.evidence.Ms
         within = job.evidence.uncertainty
         said.append(f"Ms is {fixed(Ms, 2)}" + (f", known to within {Ms_error(within)}." if within is not None else "."))
+    if job.tried is False:
+        said.append("The new gains were never tried on this loop.")
     if job.rehearsed_on is not None:
         said.append(f"Computed on {job.rehearsed_on.plant_text}; the loop was not moved.")
     if job.after is not None and job.verification is None:

@@ -7,6 +7,7 @@ const STAGES = {
   preflight: ["At rest?", "Is the loop at rest, and how large is the noise?"],
   settle: ["Settling", "The loop comes to rest first"],
   pulses: ["Pulses", "The set-point is pulsed under the present gains, until what would be proposed is certain"],
+  manual: ["Manual pulses", "The manual output is pulsed, until what would be proposed is certain"],
   relay: ["Relay", "MV is switched up and down until what would be proposed is certain"],
   design: ["Model and gains", "A model is fitted to the record, and gains are designed on it"],
   verify: ["Step", "The set-point steps under the new gains"],
@@ -30,6 +31,7 @@ export function stagesOf(job) {
   let expected;
   if (method === "fast" && request.start === "design") expected = ["preflight", "design", "verify"];
   else if (method === "setpoint") expected = ["preflight", "pulses", "design", "verify", "redesign"];
+  else if (done.includes("manual")) expected = ["preflight", "manual", "design"];
   else if (method === "fast") expected = ["preflight", done.includes("pulses") && !done.includes("relay") ? "pulses" : "relay", "design", "verify", "redesign"];
   else expected = ["preflight", ...(request.baseline === false ? [] : ["baseline"]), "relay", "ultimate", "zn_pi", "estimate", "optimise", "verify"];
   if (request.verify === false) expected = expected.filter((each) => each !== "verify" && each !== "redesign");

@@ -132,7 +132,7 @@ function Settings(loop, detail) {
     <h2 class="title" key="t2">Permitted</h2>
     <dl class="pairs" key="limits"><dt>PV</dt><dd>${fixed(loop.pv_limits.low, decimals)} … ${fixed(loop.pv_limits.high, decimals)} <span class="quiet">${u}</span></dd>
       <dt>MV</dt><dd>${significant(loop.mv_limits.low, 3)} … ${significant(loop.mv_limits.high, 3)} <span class="quiet">%</span></dd>
-      <dt>SP step</dt><dd>${{ both: "±", up: "+", down: "−" }[/** @type {"both" | "up" | "down"} */ (loop.test.directions)]} ${fixed(loop.sp_deviation, decimals)} <span class="quiet">${u}</span></dd><dt>test by</dt><dd>${loop.test.excitations.map((/** @type {string} */ each) => (each === "setpoint" ? "set-point" : each)).join(", ")}</dd></dl>
+      <dt>SP step</dt><dd>${{ both: "±", up: "+", down: "−" }[/** @type {"both" | "up" | "down"} */ (loop.test.directions)]} ${fixed(loop.sp_deviation, decimals)} <span class="quiet">${u}</span></dd><dt>test by</dt><dd>${loop.test.excitations.map((/** @type {string} */ each) => ({ setpoint: "set-point", manual: "manual output" }[each] ?? each)).join(", ")}</dd></dl>
     ${loop.notes && html`<p class="note" key="notes">${loop.notes}</p>`}
   </section>`;
 }
