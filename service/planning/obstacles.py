@@ -98,9 +98,9 @@ def obstacles(config: LoopConfig, request: RetuneRequest, now: Now) -> list[Obst
     return found
 
 
-def _ramp_obstacles(config: LoopConfig, request: RetuneRequest, facts: Facts) -> list[Obstacle]:
+def _ramp_obstacles(config: LoopConfig, request: RetuneRequest, facts: Facts, mode: Mode) -> list[Obstacle]:
     """Returns the obstacle where ramps of the set-point are too slow for pulses, and nothing may follow them."""
-    pulses = isinstance(request, SetpointRetune) or excitations(config, request) == (Excitation.SETPOINT,)
+    pulses = isinstance(request, SetpointRetune) or excitations(config, request, mode) == (Excitation.SETPOINT,)
     if not pulses:
         return []
     try:
@@ -128,7 +128,7 @@ def _state_obstacles(config: LoopConfig, request: RetuneRequest, state: LoopStat
     if not math.isfinite(state.pv) or not math.isfinite(state.mv):
         return [*found, Obstacle(Reason.BAD_SAMPLE, f"PV is {state.pv}, MV is {state.mv}")]
     mv = _mv_obstacles(config, request, state.mv, facts.mv_low, facts.mv_high)
-    return found + mv + _pv_obstacles(config, request, state) + _ramp_obstacles(config, request, facts)
+    return found + mv + _pv_obstacles(config, request, state) + _ramp_obstacles(config, request, facts, state.mode)
 
 
 def _mv_obstacles(config: LoopConfig, request: RetuneRequest, mv: float, low: float, high: float) -> list[Obstacle]:

@@ -26,13 +26,15 @@ from loopwright.tuning.reasons import Reason, Refused
 
 TURN_STEPS, TURN_NOISES = 0.2, 8.0
 """The first pulse ends when PV has moved by this part of the permitted step, and by so many standard deviations of the
-noise."""
+noise. Where MV permits no larger pulse, PV has to move by the latter alone."""
 LONGEST_PULSE_T95 = 0.5
 """The longest pulse, in T95."""
 ANSWER_T95 = 1.0
 """How long after the first pulse PV may take to answer at all, in T95."""
 CAME_BACK = 0.5
 """Part of the way that PV comes back by itself, before a plant counts as self-regulating."""
+MIN_BACK_NOISES = 4.0
+"""Smallest way back, in standard deviations of the noise."""
 BACK_T95, BACK_PULSES = 2.0, 6.0
 """The longest wait for that, the longer of so many T95 and so many times the first pulse."""
 RAISE, MAX_RAISES = 4.0, 3
@@ -91,9 +93,10 @@ class ManualTest(Experiment):
             answered = begun + width + self._samples(ANSWER_T95 * self.facts.T95_s)
             while len(self.trace) < answered and self._farthest(begun) < self._turns_at:
                 yield from self.sample()
-            if self._farthest(begun) >= self._turns_at:
+            is_largest = raised == MAX_RAISES or self.size >= self.largest
+            if self._farthest(begun) >= (TURN_NOISES * self.noise if is_largest else self._turns_at):
                 return (yield from self._until_back(begun, width))
-            if raised < MAX_RAISES and self.size < self.largest:
+            if not is_largest:
                 size = min(RAISE * self.size, self.largest)
                 yield from self.report(
                     Note(f"PV hardly answers a pulse of {self.size:.3g} of MV: the next one has {size:.3g}")
@@ -103,7 +106,7 @@ class ManualTest(Experiment):
             break
         text = (
             f"a pulse of {self.size:.4g} of MV, {width * self.facts.sample_time_s:.3g} s long, moved PV by "
-            f"{self._farthest(begun):.3g}, and {self._turns_at:.3g} are needed (noise {self.noise:.3g})"
+            f"{self._farthest(begun):.3g}, and {TURN_NOISES:g} times the noise of {self.noise:.3g} are needed"
         )
         raise Refused(Reason.NO_RESPONSE, text)
 
@@ -182,7 +185,7 @@ class ManualTest(Experiment):
         back = len(self.trace)
         while True:
             farthest, away = self._farthest(begun), abs(self._moved())
-            if farthest - away >= max(CAME_BACK * farthest, 0.5 * self._turns_at):
+            if farthest - away >= max(CAME_BACK * farthest, MIN_BACK_NOISES * self.noise):
                 return
             if len(self.trace) - back > longest:
                 if (yield from self.computed(partial(comes_to_rest, self._record(MIN_PERIOD)))):
