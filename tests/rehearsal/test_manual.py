@@ -128,6 +128,30 @@ def test_a_load_in_the_first_pulse_is_no_integrating_plant(monkeypatch: pytest.M
         assert abs(true_Ms(plant, answer["new_gains"]) - 1.6) < 0.1
 
 
+@pytest.mark.parametrize("at", [0.4, 0.9, 1.4])
+@pytest.mark.parametrize("size", [0.35, -0.35])
+def test_a_load_near_a_pulse_does_not_hide_in_the_model(
+    monkeypatch: pytest.MonkeyPatch, at: float, size: float
+) -> None:
+    """at: in ultimate periods after the first pulse. size: in MV that moves PV by the permitted step. A fit without the
+    load had Ms off by 0.13 here."""
+    plant = spec("three lags", num=[8.0, 13.0, 5.0], den=[9.0, 31.0, 34.0, 13.0, 1.0], dead_time_s=2.0, t95_s=28.0,
+                 sample_time_s=0.116, sp_deviation=1.0, noise_std=0.01, gains={"Kp": 0.25, "Ti": 9.0})  # fmt: skip
+    begun = 0
+
+    class Loaded(RehearsedLoop):
+        def step(self, commands: Any) -> Sample:
+            nonlocal begun
+            begun += bool(begun) or any(isinstance(each, SetOutput) for each in commands)
+            if begun == round(at * 9.27 / 0.116):
+                self._plant.disturbance = size / 5.0  # type: ignore[attr-defined]  # of a LinearPlant
+            return super().step(commands)
+
+    monkeypatch.setattr("loopwright.service.execution.rehearsal.RehearsedLoop", Loaded)
+    answer, _ = pulsed(plant, propose_anyway=True)
+    assert answer["outcome"] == "refused" or abs(true_Ms(plant, answer["new_gains"]) - 1.6) < 0.05, answer["notes"]
+
+
 def test_MV_that_does_not_follow_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """A limit of the controller that is not among those that were read."""
 

@@ -14,6 +14,7 @@ from loopwright.protocol.profile import (
     channel_ids,
     sdo_request_id,
 )
+from loopwright.service.inputs.config import PermittedTest
 from loopwright.service.inputs.model_json import FirstOrderModel
 from loopwright.service.inputs.request import RetuneRequest, retune_request
 from tests.simulation import plans
@@ -483,6 +484,11 @@ def real_fast(world: World) -> None:
 def real_setpoint(world: World) -> None:
     request = retune_request(method="setpoint", verify=world.random.random() < 0.7)
     _real(world, request, 400 * world.loop.wall_s, ("plc",))
+
+
+def real_manual(world: World) -> None:
+    world.permitted = PermittedTest(excitations=("relay", "manual"), mv_step_max=10.0)
+    _real(world, retune_request(method="fast"), 400 * world.loop.wall_s)
 
 
 def real_five_stage(world: World) -> None:

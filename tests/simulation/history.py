@@ -13,7 +13,7 @@ from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, Mode, NmtState
 from loopwright.service.execution.procedures import Tune
-from loopwright.service.inputs.config import Limits, LoopConfig
+from loopwright.service.inputs.config import Limits, LoopConfig, PermittedTest
 from loopwright.service.inputs.request import retune_request
 from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.loop_state import LoopState, state_json
@@ -113,6 +113,7 @@ class World:
         self.actions = plans.draw(self.random, loop.samples)
         self.tune: Tune = plans.tunes(self.actions)
         self.request = retune_request(method="fast")
+        self.permitted = PermittedTest()
         self.pv_limits = Limits(low=20.0, high=80.0) if self.random.random() < 0.2 else Limits(low=-50.0, high=150.0)
         self.listen_s = 2.0 if self.random.random() < 0.25 else 0.0
         tick_s = 0.02 if loop.wall_s < 0.05 else 0.04 if loop.wall_s <= 0.5 else 0.1
@@ -156,7 +157,7 @@ class World:
         return LoopConfig(
             tag=TAG, bus=URL, controller_node=CONTROLLER_NODE, plant_node=PLANT_NODE, pv_unit="%",
             pv_limits=self.pv_limits, t95_s=(3.0 * self.time_constant + self.dead_time) * Ts,
-            sp_deviation=2.0,
+            sp_deviation=2.0, test=self.permitted,
         )  # fmt: skip
 
     def gateway(self, node: int = 0x7D) -> Gateway:

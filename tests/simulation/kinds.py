@@ -40,6 +40,7 @@ KINDS: dict[str, Kind] = {
     "mixed": Kind("two to four of all that at once", 3, faults.everything),
     "fast": Kind("the real fast procedure, with one of all that", 1, faults.real_fast, real=True),
     "setpoint": Kind("real pulses of the set-point, with one of all that", 1, faults.real_setpoint, real=True),
+    "manual": Kind("real pulses of the manual output, with one of all that", 0, faults.real_manual, real=True),
     "five_stage": Kind("the real five-stage procedure, with one of all that", 0, faults.real_five_stage, real=True),
     "trial": Kind("a real set-point trial, with one of all that", 1, faults.real_trial, real=True),
 }
@@ -51,7 +52,8 @@ def world(kind: str, seed: int, keeps_log: bool = False) -> World:
     if KINDS[kind].real:
         random = Random(f"{kind} {seed} loop")
         Ts, pace = random.choice(((0.1, 10.0), (0.1, 0.0), (1.0, 100.0), (0.02, 1.0)))
-        loop = Loop(Ts, pace, Mode.AUTOMATIC, 50.0, 50.0, random.choice((0.0, 0.005, 0.02)), random.random() < 0.5, 100)
+        mode = Mode.MANUAL if kind == "manual" else Mode.AUTOMATIC
+        loop = Loop(Ts, pace, mode, 50.0, 50.0, random.choice((0.0, 0.005, 0.02)), random.random() < 0.5, 100)
     made = World(kind, seed, loop, keeps_log)
     KINDS[kind].draw(made)
     return made

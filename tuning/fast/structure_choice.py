@@ -11,7 +11,7 @@ from functools import partial, reduce
 
 import numpy as np
 
-from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.identification.disturbances import (
     by_bic,
     disturbance_candidates,
@@ -36,7 +36,8 @@ class StructureChoice:
     """The structure chosen, with its competitors.
 
     best: the fit that the design uses.
-    rivals: fits of other structures whose BIC is within RIVAL_BIC of the best.
+    rivals: fits of other structures, in manual also of one load disturbance more or less, whose BIC is within RIVAL_BIC
+    of the best.
     fits: all fits under the disturbance hypothesis of the best one.
     """
 
@@ -51,12 +52,17 @@ def choose_structure(fit: Fit[ExperimentRecord], known: Sequence[Fitted] = ()) -
     known: fits of an earlier part of the same record, which are further starts of the search.
     """
     undisturbed = fit_structures(fit, UNDISTURBED, known)
-    found = undisturbed
+    found, others = undisturbed, list[Fitted]()
     first = min(undisturbed, key=by_bic)
     if _unexplained(fit, first):
         found = preferred(
             found, reduce(preferred, disturbance_candidates(fit, undisturbed, partial(_unexplained, fit), known))
         )
+    elif fit.record.excitation is Excitation.MANUAL:
+        # Nothing brings PV back from a load disturbance in manual: one near a pulse hides in the model.
+        with_load = disturbance_candidates(fit, undisturbed, lambda fitted: False, known)[0]
+        found = preferred(undisturbed, with_load)
+        others = undisturbed if found is with_load else with_load
     elif _slow(fit, first):
         # The noise limits how well MV at rest is known; an error of MV at rest makes a slow plant drift.
         drift = DisturbanceHypothesis(drift=True)
@@ -65,7 +71,7 @@ def choose_structure(fit: Fit[ExperimentRecord], known: Sequence[Fitted] = ()) -
     ranked = sorted(found, key=by_bic)
     # The record hardly shows the static gain of a slow plant, so a wrong sign alone does not rule a model out.
     ranked = [each for each in ranked if _gain_has_the_right_sign(fit, each)] or ranked
-    rivals = tuple(each for each in ranked[1:] if each.bic < ranked[0].bic + RIVAL_BIC)
+    rivals = tuple(each for each in [*ranked[1:], *others] if each.bic < ranked[0].bic + RIVAL_BIC)
     same = tuple(each for each in ranked if each.hypothesis == ranked[0].hypothesis)
     return StructureChoice(ranked[0], rivals, same)
 

@@ -21,7 +21,7 @@ from loopwright.tuning.fast.proposal import FastProposal
 from loopwright.tuning.models import FOPDT
 from loopwright.tuning.plan import Command, Event, Sample, StageStarted
 from loopwright.tuning.reasons import Reason
-from tests.unit.service.bus_site import Killed, Site
+from tests.unit.service.bus_site import NEW, Killed, Site
 
 PLANT = FOPDT(K=0.01, T=10.0, L=2.0)
 """The plant of the site, in PV units per percent."""
@@ -78,20 +78,27 @@ def of_a_test(
 
 
 def is_home(site: Site) -> bool:
+    """Once the next sample has carried the manual output to the plant."""
+    site.pass_time(0.3)
     return site.is_home(mode=Mode.MANUAL) and (site.channel.manual_output, site.mv) == (HOME, HOME)
 
 
-def test_it_proposes_and_the_gains_take_effect_without_moving_MV() -> None:
+def test_it_gets_the_Ms_asked_and_ends_at_home() -> None:
     site = in_manual(pace=0.0)
     found, taken = of_a_test(site)
     assert found.value is not None, found.ended
     assert margins(PLANT, found.value.gains).Ms == pytest.approx(1.6, abs=0.05)
     assert {sample.mode for sample in taken} == {Mode.MANUAL}
+    assert taken[-1].mv == HOME and site.is_home(mode=Mode.MANUAL)
+
+
+def test_new_gains_take_effect_in_manual_without_moving_MV() -> None:
+    site = in_manual()
+    site.let_run()
+    before = site.loop.read().gains
+    site.loop.accept(NEW, before)
     assert is_home(site)
-    site.loop.accept(found.value.gains, found.value.old_gains)
-    site.pass_time(1.0)
-    assert is_home(site)
-    assert site.channel.accepted.kp == pytest.approx(found.value.gains.Kp)
+    assert (site.channel.accepted.Kp, site.channel.accepted.Ti) == (NEW.Kp, NEW.Ti)
 
 
 @pytest.mark.parametrize("pulse", [1, 2])
