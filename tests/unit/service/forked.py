@@ -29,13 +29,13 @@ _KILLED = -signal.SIGKILL
 
 
 class _Forked:
-    """What `ChildProcess` needs of a subprocess.Popen. told: where the parent writes its pid, then its exit status."""
+    """What `ChildProcess` needs of a Popen. status: where the parent writes its pid, then its exit status."""
 
-    def __init__(self, told: socket.socket, output: int) -> None:
-        self._told = told
+    def __init__(self, status: socket.socket, output: int) -> None:
+        self._status = status
         self.stdout = os.fdopen(output, encoding="utf-8")
         self.returncode: int | None = None
-        self.pid = int(told.recv(_MESSAGE))
+        self.pid = int(status.recv(_MESSAGE))
 
     def poll(self) -> int | None:
         try:
@@ -45,12 +45,12 @@ class _Forked:
 
     def wait(self, timeout: float | None = None) -> int:
         if self.returncode is None:
-            self._told.settimeout(timeout)
+            self._status.settimeout(timeout)
             try:
-                self.returncode = int(self._told.recv(_MESSAGE) or _KILLED)
+                self.returncode = int(self._status.recv(_MESSAGE) or _KILLED)
             except (BlockingIOError, TimeoutError):
                 raise subprocess.TimeoutExpired(MODULE, timeout or 0.0) from None
-            self._told.close()
+            self._status.close()
         return self.returncode
 
     def send_signal(self, number: int) -> None:
@@ -76,7 +76,7 @@ class ForkedGateway(ChildProcess):
                 _parent(), [json.dumps(arguments[1:]).encode()], [write, self._errors.fileno(), theirs.fileno()]
             )
         os.close(write)
-        return _Forked(ours, read)  # type: ignore[return-value]
+        return _Forked(ours, read)  # type: ignore[return-value]  # it has what ChildProcess uses
 
 
 @cache
@@ -102,13 +102,13 @@ def arguments_of_a_fork(asked: socket.socket) -> list[str]:
         each.setblocking(False)
     signal.signal(signal.SIGCHLD, lambda *_: None)
     signal.set_wakeup_fd(wakes.fileno())
-    told: dict[int, socket.socket] = {}
+    statuses: dict[int, socket.socket] = {}
     while True:
         ready, _, _ = select.select([asked, woken], [], [])
         if woken in ready:
             woken.recv(_MESSAGE)
-            while told and (ended := os.waitpid(-1, os.WNOHANG))[0]:
-                with told.pop(ended[0]) as end:
+            while statuses and (ended := os.waitpid(-1, os.WNOHANG))[0]:
+                with statuses.pop(ended[0]) as end:
                     end.send(str(os.waitstatus_to_exitcode(ended[1])).encode())
         if asked not in ready:
             continue
@@ -123,14 +123,14 @@ def arguments_of_a_fork(asked: socket.socket) -> list[str]:
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             os.dup2(output, 1)
             os.dup2(errors, 2)
-            for opened in (asked, woken, wakes, end, *told.values()):
+            for opened in (asked, woken, wakes, end, *statuses.values()):
                 opened.close()
             for fd in (output, errors):
                 os.close(fd)
             return [str(each) for each in json.loads(message)]
         for fd in (output, errors):
             os.close(fd)
-        told[pid] = end
+        statuses[pid] = end
         end.send(str(pid).encode())
 
 

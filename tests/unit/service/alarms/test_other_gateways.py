@@ -79,7 +79,7 @@ def alarm(id_: str, kind: AlarmKind = AlarmKind.PV_OUTSIDE_LIMITS, host: str = T
     return Alarm(**given | changes)
 
 
-def told(*theirs: Alarm, signed: Sequence[str] = ()) -> AlarmFacts:
+def facts_with(*theirs: Alarm, signed: Sequence[str] = ()) -> AlarmFacts:
     there = GatewayFacts(THERE, T0, False, LONG_AGO_S, (TAG_THERE,), theirs)
     return AlarmFacts(HERE, gateways=[there], signed=frozenset(signed))
 
@@ -87,20 +87,20 @@ def told(*theirs: Alarm, signed: Sequence[str] = ()) -> AlarmFacts:
 def test_each_alarm_is_once_and_the_worst_first() -> None:
     own, same = alarm("b", host=HERE), alarm("b", text="as the other says it")
     worst = alarm("a", level=1)
-    assert merged([own], told(same, worst)) == [worst, own]
+    assert merged([own], facts_with(same, worst)) == [worst, own]
 
 
 def test_what_a_silent_gateway_has_said_counts_until_that_is_an_alarm() -> None:
     silent = alarm("s", AlarmKind.GATEWAY_SILENT)
-    assert merged([], told(alarm("a"))) == [alarm("a")]
-    assert merged([silent], told(alarm("a"))) == [silent]
-    assert alarm("a") in merged([alarm("s", AlarmKind.GATEWAY_SILENT, host="gw-3")], told(alarm("a")))
+    assert merged([], facts_with(alarm("a"))) == [alarm("a")]
+    assert merged([silent], facts_with(alarm("a"))) == [silent]
+    assert alarm("a") in merged([alarm("s", AlarmKind.GATEWAY_SILENT, host="gw-3")], facts_with(alarm("a")))
 
 
 def test_what_was_signed_off_is_gone_wherever_it_comes_from() -> None:
     theirs = alarm("g", AlarmKind.GAINS_DIFFER, to_sign=True)
-    assert to_be_asked(told(theirs, alarm("a"))) == {"g"}
-    assert merged([alarm("g", host=HERE)], told(theirs, signed=["g"])) == []
+    assert to_be_asked(facts_with(theirs, alarm("a"))) == {"g"}
+    assert merged([alarm("g", host=HERE)], facts_with(theirs, signed=["g"])) == []
 
 
 def test_a_gateway_says_what_the_others_cannot_find_in_the_database() -> None:
