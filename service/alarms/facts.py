@@ -37,7 +37,7 @@ class _Stored:
     audited: int | None = None
 
 
-class OtherGateways(Protocol):
+class GatewaysSeen(Protocol):
     """What is known of the other gateways of the database."""
 
     def look(self) -> None:
@@ -53,7 +53,7 @@ class OtherGateways(Protocol):
 class FactSource:
     """One thread at a time may gather. others: None where no other gateway is looked at."""
 
-    def __init__(self, jobs: Jobs, listening: Listening, others: OtherGateways | None) -> None:
+    def __init__(self, jobs: Jobs, listening: Listening, others: GatewaysSeen | None) -> None:
         self._jobs, self._listening, self._others = jobs, listening, others
         self._stored = _Stored()
         self._gateways: Sequence[GatewayFacts] = ()

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from loopwright.service.alarms.alarm import LEVELS, RULES, Alarm, AlarmKind, Level, SignOff
 from loopwright.service.alarms.conditions import conditions
 from loopwright.service.alarms.delays import Delays
-from loopwright.service.alarms.facts import FactSource, OtherGateways
+from loopwright.service.alarms.facts import FactSource, GatewaysSeen
 from loopwright.service.alarms.merging import merged, only_known_here
 from loopwright.service.errors import Conflict
 from loopwright.service.jobs.manager import Jobs
@@ -47,7 +47,7 @@ class AlarmWatch:
         self,
         jobs: Jobs,
         listening: Listening,
-        others: OtherGateways | None = None,
+        others: GatewaysSeen | None = None,
         clock: Callable[[], float] = time.time,
     ) -> None:
         self._store = jobs.store

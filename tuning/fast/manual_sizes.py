@@ -32,7 +32,7 @@ HORIZON = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Past:
+class ManualRecord:
     """The record so far, as deviations from rest.
 
     Ts: the sample time, s.
@@ -68,7 +68,9 @@ def first_pulse(kick: float, largest: float) -> float:
     return min(kick, FIRST_OF_LARGEST * largest) if kick > 0.0 else WITHOUT_KP * largest
 
 
-def next_pulse(past: Past, side: float, width: int, bounds: PulseBounds, before: float, largest: float) -> float:
+def next_pulse(
+    past: ManualRecord, side: float, width: int, bounds: PulseBounds, before: float, largest: float
+) -> float:
     """The size of a pulse that begins now, MV units: as large as every model that explains the record permits; 0 where
     PV needs more rest first.
 
@@ -87,7 +89,7 @@ def next_pulse(past: Past, side: float, width: int, bounds: PulseBounds, before:
     return size if size >= MIN_PULSE * before else 0.0
 
 
-def _permitted(model: Model, past: Past, side: float, width: int, bounds: PulseBounds, samples: int) -> float:
+def _permitted(model: Model, past: ManualRecord, side: float, width: int, bounds: PulseBounds, samples: int) -> float:
     """The largest pulse that keeps PV within its bounds on this model, MV units; inf where the model does not move."""
     u = np.concatenate((past.u, np.zeros(samples)))
     pulse = np.zeros(samples)

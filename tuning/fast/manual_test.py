@@ -13,7 +13,7 @@ import numpy as np
 
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace
 from loopwright.tuning.fast.experiment import Experiment
-from loopwright.tuning.fast.manual_sizes import Past, first_pulse, largest_pulse, next_pulse, pv_bounds
+from loopwright.tuning.fast.manual_sizes import ManualRecord, first_pulse, largest_pulse, next_pulse, pv_bounds
 from loopwright.tuning.fast.proposal import PulseFigures
 from loopwright.tuning.fast.pulse_levels import PulseBounds
 from loopwright.tuning.fast.pulse_test import MAX_BEYOND, SAMPLES_AVERAGED
@@ -240,9 +240,9 @@ class ManualTest(Experiment):
     def _samples(self, seconds: float) -> int:
         return max(1, math.ceil(seconds / self.facts.sample_time_s))
 
-    def _past(self) -> Past:
+    def _past(self) -> ManualRecord:
         u, y = self._deviations()
-        return Past(self.facts.sample_time_s, u, y, self.listened, self._direction)
+        return ManualRecord(self.facts.sample_time_s, u, y, self.listened, self._direction)
 
     def _bounds(self) -> PulseBounds:
         return pv_bounds(self.facts, self.point, self.noise, MAX_BEYOND)

@@ -382,4 +382,4 @@ def test_a_job_without_them_says_why(service: Service, client: TestClient) -> No
     service.wait(running)
     assert client.get(f"/jobs/{running}/record").status_code == 200
     told = assert_problem(client.get(f"/jobs/{running}/designs"), 409)["detail"]
-    assert told == f"job {running} ended as aborted before it had a model"
+    assert told == f"job {running} ended as aborted before it had a model to compare methods on; the job says why"

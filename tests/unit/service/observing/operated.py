@@ -10,6 +10,7 @@ from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.listening.bins import GAP_BEFORE
+from loopwright.service.listening.heard_loop import Heard
 from loopwright.service.listening.listening import History
 from loopwright.service.listening.rings import Rings
 from loopwright.tuning.gains import Gains
@@ -66,10 +67,14 @@ class Operated:
 
 
 class HeardBefore:
-    """A listening that has heard this, and nothing of any other loop."""
+    """A listening that has heard this, and nothing of any other loop; of present values it has none."""
 
     def __init__(self, rings: Rings, not_heard: str | None = None) -> None:
         self._rings, self._not_heard = rings, not_heard
+        self.heard: dict[str, Heard] = {}
+
+    def why_not_heard(self, tag: str) -> str | None:
+        return self._not_heard
 
     def history(self, tag: str, from_s: float, to_s: float, points: int) -> History:
         return History(self._rings.rows(from_s, to_s, points), self._not_heard)

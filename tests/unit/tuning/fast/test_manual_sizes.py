@@ -13,7 +13,7 @@ from loopwright.tuning.fast.manual_sizes import (
     GROWTH,
     MAY_USE,
     OF_ROOM,
-    Past,
+    ManualRecord,
     first_pulse,
     largest_pulse,
     next_pulse,
@@ -67,7 +67,7 @@ def test_the_next_pulse_takes_PV_as_far_as_it_may_go(side: float) -> None:
     width = 35
     u, y = after_pulses(LAG, [(0, 40, 0.5)], 150)
     bounds = PulseBounds(-1.0, 1.0, NOISE)
-    size = next_pulse(Past(TS, u, y, RESTED, 1.0), side, width, bounds, 2.0, 100.0)
+    size = next_pulse(ManualRecord(TS, u, y, RESTED, 1.0), side, width, bounds, 2.0, 100.0)
     _, then = after_pulses(LAG, [(0, 40, 0.5), (150, width, side * size)], 400)
     assert np.max(side * then[RESTED + 150 :]) == pytest.approx(MAY_USE, abs=0.06)
 
@@ -75,7 +75,7 @@ def test_the_next_pulse_takes_PV_as_far_as_it_may_go(side: float) -> None:
 def test_the_next_pulse_grows_by_a_factor_at_most_and_waits_for_PV() -> None:
     u, y = after_pulses(LAG, [(0, 40, 0.5)], 150)
     wide, narrow = PulseBounds(-1e3, 1e3, NOISE), PulseBounds(-0.05, 0.05, NOISE)
-    past = Past(TS, u, y, RESTED, 1.0)
+    past = ManualRecord(TS, u, y, RESTED, 1.0)
     assert next_pulse(past, 1.0, 35, wide, 0.5, 100.0) == GROWTH * 0.5
     assert next_pulse(past, 1.0, 35, wide, 0.5, 0.8) == 0.8
     assert next_pulse(past, 1.0, 35, narrow, 0.5, 100.0) == 0.0
