@@ -45,7 +45,9 @@ def test_a_loop_in_manual_is_not_tested(site: Site, page: Page) -> None:
     form = person.form(page)
     person.sign(page)
     expect(person.face(page)).to_contain_text("MAN")
-    expect(form).to_contain_text("The controller is in mode manual, not automatic; to tune it in manual, permit manual in loops.yaml")
+    expect(form).to_contain_text(
+        "The controller is in mode manual, not automatic; to tune it in manual, permit manual in loops.yaml"
+    )
     expect(form.locator(".advice")).to_contain_text("automatic")
     start = page.get_by_role("button", name=f"Retune {TAG}")
     expect(start).to_be_disabled()
