@@ -20,7 +20,7 @@ class Stopping(Exception):
 
 
 class Conflict(Exception):
-    """The job or its loop is not as the wish supposes."""
+    """The job or its loop is not in the state that the request needs."""
 
 
 class GatewayLost(Failed):

@@ -1,4 +1,4 @@
-"""What is done again and again beside everything else, in a thread of its own, until it is closed."""
+"""A function that a thread of its own calls again and again, until it is closed."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _STOP_S = 5.0
 
 
 class Repeated:
-    """Calls `turn` until it is closed. Where another service has taken the name of this host, that one does it instead.
+    """Calls `turn` until it is closed, or until another service has taken the name of this host and does it instead.
 
     every_s: wall time from the end of one turn to the next, s.
-    name: of the thread.
-    failed: says in the log what could not be done; the next turn tries it again.
-    at_once: whether the first turn is not waited for.
+    name: the name of the thread.
+    failed: what could not be done, for the log; the next turn tries it again.
+    at_once: whether the first turn begins at once; else it begins after every_s.
     """
 
     def __init__(
