@@ -38,7 +38,8 @@ def too_late(job: JobRow, now: JobState, wanted: JobState, decided: Decided | No
     """
     by = "" if decided is None else f" by {decided.by} at {decided.at}"
     if now in ACTIVE:
-        text = f"{_who(job)} is {_how_far(job)}: there are no gains to decide about yet. Wait for its end, or abort it"
+        text = f"{_who(job)} has been {_how_far(job)}: there are no gains to decide about yet. "
+        text += "Wait for its end, or abort it"
     elif wanted is JobState.ABORTED:
         text = f"job {job.id} {_ended(job, now, by)}: nothing runs that could be stopped. {_instead_of_abort(now)}"
     elif now is JobState.ACCEPTED:
@@ -67,7 +68,7 @@ def _how_far(job: JobRow) -> str:
 def _ended(job: JobRow, now: JobState, by: str) -> str:
     if now in (JobState.ACCEPTED, JobState.ROLLED_BACK):
         return f"was {str(now).replace('_', ' ')}{by}"
-    ended = f"has ended at {job.ended_at} as {str(now).replace('_', ' ')}"
+    ended = f"ended at {job.ended_at} as {str(now).replace('_', ' ')}"
     return ended if job.reason is None else f"{ended} ({str(job.reason).replace('_', ' ')})"
 
 

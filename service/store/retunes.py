@@ -184,7 +184,7 @@ def stop(session: Session, retune_id: str, reason: StopReason, detail: str, by: 
     row = find(session, retune_id, lock=True)
     if row.state not in OPEN:
         raise RetuneOver(
-            f"retune {retune_id} has ended at {row.ended_at} as {row.state}: nothing of it is left to stop. "
+            f"retune {retune_id} ended at {row.ended_at} as {row.state}: nothing of it is left to stop. "
             f"GET /retunes/{retune_id} says what became of each loop"
         )
     claims.changed(session, f"/retunes/{retune_id}")

@@ -190,7 +190,7 @@ def test_abort_stops_what_runs_and_begins_nothing_more(plant: Plant) -> None:
     row, parts = plant.fleet.get(retune)
     assert (row.state, row.stop_reason) == ("aborted", "operator")
     assert [part.state(False) for part in parts] == ["aborted", "aborted", "skipped"]
-    with pytest.raises(RetuneOver, match=r"has ended at .* as aborted: nothing of it is left to stop"):
+    with pytest.raises(RetuneOver, match=r"ended at .* as aborted: nothing of it is left to stop"):
         plant.fleet.abort(retune, "me")
     what = [(row.what, row.said_by) for row in audit.trail(plant.store.engine, 10)]
     assert ("retune_many_abort", "me") in what and ("retune_many", "api") in what

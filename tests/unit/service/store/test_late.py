@@ -49,10 +49,10 @@ def test_a_loop_that_a_job_has(state: JobState, changes: dict[str, object], said
      "no more. For new ones, retune the loop"),
     (JobState.ACCEPTED, JobState.ABORTED, f"job 4f0c was accepted by B. Berg at {AT}: nothing runs that could be "
      "stopped. To go back to the old gains, roll it back"),
-    (JobState.PROPOSED, JobState.ABORTED, f"job 4f0c has ended at {ENDED} as proposed: nothing runs that could be "
+    (JobState.PROPOSED, JobState.ABORTED, f"job 4f0c ended at {ENDED} as proposed: nothing runs that could be "
      "stopped. Accept its proposal, or roll it back"),
-    (JobState.QUEUED, JobState.ACCEPTED, f"job 4f0c of A. Lind is waiting for its turn since {BEGUN}: there are no "
-     "gains to decide about yet. Wait for its end, or abort it"),
+    (JobState.QUEUED, JobState.ACCEPTED, f"job 4f0c of A. Lind has been waiting for its turn since {BEGUN}: there are "
+     "no gains to decide about yet. Wait for its end, or abort it"),
 ])  # fmt: skip
 def test_a_decision_that_comes_late(now: JobState, wanted: JobState, said: str) -> None:
     assert words(now, wanted) == said
@@ -60,7 +60,7 @@ def test_a_decision_that_comes_late(now: JobState, wanted: JobState, said: str) 
 
 def test_a_job_without_a_proposal() -> None:
     said = words(JobState.REFUSED, JobState.ACCEPTED, reason=Reason.NOT_AT_REST)
-    assert said.startswith(f"job 4f0c has ended at {ENDED} as refused (not at rest): it proposes no gains.")
+    assert said.startswith(f"job 4f0c ended at {ENDED} as refused (not at rest): it proposes no gains.")
     assert "retune the loop with propose_anyway" in words(JobState.NO_GAIN, JobState.ACCEPTED)
     assert "retune the loop without dry_run" in words(JobState.REHEARSED, JobState.ACCEPTED)
 
