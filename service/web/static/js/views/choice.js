@@ -59,7 +59,7 @@ export function Choice({ loop, detail, job, latest, quiet, onChanged }) {
   return html`<div class="card choice"><div class="body"><div ref=${curve}>
       ${designed && html`<div class="curve" key="curve"><div class="split"><span class="title">Faster or more robust</span><span>Ms <b>${msText(ms)}</b> <span class="quiet">${!atTested ? "not tested" : job.verification || job.after ? "as asked and tested" : "as asked"}</span></span></div>
         ${Curve(width, points, ms, tested, job.comparison?.before.Ms ?? null, model && job.old_gains && stableBefore ? step(model, job.old_gains, { load: 1 }, horizon_s, 300).IAE : null)}
-        <input type="range" min=${designs[0].ms} max=${designs[designs.length - 1].ms} step="0.01" value=${ms} disabled=${designs.length < 2} aria-label="Ms" aria-valuetext=${`Ms ${msText(ms)}${atTested ? ", as tested" : ""}`}
+        <input type="range" min=${designs[0].ms} max=${designs[designs.length - 1].ms} step="0.01" value=${ms} disabled=${designs.length < 2} aria-label="Ms" aria-valuetext=${`Ms ${msText(ms)}${!atTested ? "" : job.tried === false ? ", as asked" : ", as tested"}`}
           onInput=${(/** @type {any} */ e) => { const value = Number(e.target.value); setMs(Math.abs(value - tested) < 0.015 ? tested : value); }}
           onDblClick=${() => setMs(tested)} onKeyDown=${(/** @type {any} */ e) => slide(e, tested, designs, setMs)} />
         <div class="ends"><span>${msText(designs[0].ms)} robust</span>${asked && html`<span class="quiet">asking for the designs…</span>`}<span>fast ${msText(designs[designs.length - 1].ms)}</span></div></div>`}
