@@ -127,11 +127,14 @@ def _state_obstacles(config: LoopConfig, request: RetuneRequest, state: LoopStat
         return [*found, Obstacle(refused.reason, refused.detail)]
     if not math.isfinite(state.pv) or not math.isfinite(state.mv):
         return [*found, Obstacle(Reason.BAD_SAMPLE, f"PV is {state.pv}, MV is {state.mv}")]
-    mv = _mv_obstacles(config, request, state.mv, facts.mv_low, facts.mv_high)
+    mv = _mv_obstacles(config, request, state, facts.mv_low, facts.mv_high)
     return found + mv + _pv_obstacles(config, request, state) + _ramp_obstacles(config, request, facts, state.mode)
 
 
-def _mv_obstacles(config: LoopConfig, request: RetuneRequest, mv: float, low: float, high: float) -> list[Obstacle]:
+def _mv_obstacles(
+    config: LoopConfig, request: RetuneRequest, state: LoopState, low: float, high: float
+) -> list[Obstacle]:
+    mv = state.mv
     room, minimum = min(high - mv, mv - low), MIN_ROOM * (high - low)
     if room < minimum:
         text = f"MV {mv:.4g} leaves {room:.3g} of room within {low:.4g} .. {high:.4g}; at least {minimum:.3g} is needed"
@@ -139,7 +142,8 @@ def _mv_obstacles(config: LoopConfig, request: RetuneRequest, mv: float, low: fl
     maximum = max_amplitude(mv, low, high, config.test.mv_step_max or math.inf)
     asked = request.amplitude_pct if isinstance(request, FastRetune) else None
     fits_nowhere = asked is not None and (1.0 + BIAS) * asked > high - low  # `narrow` has reported this already
-    if asked is not None and asked > maximum and not fits_nowhere and "relay" in stages_asked(config, request):
+    by_relay = "relay" in stages_asked(config, request, state.mode)
+    if asked is not None and asked > maximum and not fits_nowhere and by_relay:
         text = (
             f"a relay of amplitude_pct {asked:g} moves MV from {mv:.4g} to {mv - BIAS * asked:.4g} and "
             f"{mv + asked:.4g} %, which is not within {low:.4g} .. {high:.4g}: at most {maximum:.4g} fits"

@@ -115,6 +115,12 @@ class TestPreview:
     def test_MV_at_its_limit(self) -> None:
         assert "saturated" in reasons(told(replace(IN_MANUAL, mv=99.9), BOTH))
 
+    def test_the_size_of_a_relay_that_is_not_run_is_no_obstacle(self) -> None:
+        """MV 80 leaves a relay 20 % at most; the relay is of the loop in automatic."""
+        config = {"test": {"excitations": ["relay", "manual"]}}
+        assert "bad_limits" in reasons(told(replace(STATE, mv=80.0), config, amplitude_pct=30.0))
+        assert told(replace(IN_MANUAL, mv=80.0), config, amplitude_pct=30.0).would_start
+
 
 def test_the_plan_of_a_loop_in_manual_listens_in_manual() -> None:
     config, request = loop(BOTH), retune_request()
