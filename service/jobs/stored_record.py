@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -66,8 +67,7 @@ class StoredRecord:
             Ts=self.Ts,
             u=u,
             y=y,
-            # each begins with a move of MV, and turns after PV has moved in the direction in which MV drives it
-            direction=1.0 if (y[self.switches[0]] > 0.0) == (relay or self._rises_first) else -1.0,
+            direction=self._direction,
             listened=self.listened,
             excited=self.excited,
             turns=len(self.switches),
@@ -85,8 +85,25 @@ class StoredRecord:
         return bool(np.all(away >= 0.0) or np.all(away <= 0.0))
 
     @property
-    def _rises_first(self) -> bool:
-        """Whether MV has risen first, with the set-point or with the manual output."""
+    def _direction(self) -> float:
+        """+1 where PV rises with MV, else -1."""
+        if self.excitation is Excitation.MANUAL:  # PV may answer its first pulses not at all, or after their ends
+            return self._correlated_direction
+        # each begins with a move of MV, and turns after PV has moved in the direction in which MV drives it
+        rises_first = self.excitation is Excitation.RELAY or self._rises_with_setpoint
+        return 1.0 if (self.pv[self.switches[0]] > self.rest[1]) == rises_first else -1.0
+
+    @property
+    def _correlated_direction(self) -> float:
+        """The sign of the largest cross-correlation of MV with a later PV during the excitation."""
+        excited, count = slice(self.listened, self.excited), 2 * (self.excited - self.listened)
+        u, y = (np.fft.rfft(each[excited] - np.mean(each[excited]), count) for each in (self.mv, self.pv))
+        later = np.fft.irfft(y * np.conj(u), count)[: count // 2]
+        return math.copysign(1.0, later[np.argmax(np.abs(later))])
+
+    @property
+    def _rises_with_setpoint(self) -> bool:
+        """Whether MV has risen with the first move of the set-point."""
         mv, _ = self.rest
         return bool(np.mean(self.mv[self.listened : self.switches[0]]) > mv)
 

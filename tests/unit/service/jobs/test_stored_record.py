@@ -99,3 +99,26 @@ def test_no_relay_no_record(job: tuple[dict[str, Any], dict[str, list[Any]]]) ->
     first = columns["mode"].index(Mode.EXPERIMENT)
     begun = stored_record({name: values[: first + 5] for name, values in columns.items()})
     assert begun is not None and begun.experiment_record() is None
+
+
+@pytest.mark.parametrize("gain", [1.5, -1.5])
+@pytest.mark.parametrize("down", [-1.0, 1.0], ids=["both sides", "one side"])
+def test_the_sign_of_the_gain_where_the_first_pulse_is_over_before_pv_answers(gain: float, down: float) -> None:
+    """Pulses of the manual output of 1 / (s + 1) with a dead time of 5 s, the first of which lasts 4 s."""
+    dead_time, decay = 50, float(np.exp(-0.1))
+    pulses = [(0.0, 100), (1.0, 40), (0.0, 110), (2.0 * down, 60), (0.0, 90), (2.0, 40), (0.0, 90)]
+    mv = np.concatenate([np.full(samples, level) for level, samples in pulses])
+    pv, answer = np.random.default_rng(4).normal(0.0, 0.01, len(mv)), 0.0
+    for i in range(dead_time, len(mv)):
+        pv[i] += answer
+        answer = decay * answer + (1.0 - decay) * gain * mv[i - dead_time]
+    record = stored_record(
+        {
+            "stage": ["preflight"] * 100 + ["manual"] * (len(mv) - 100), "t_s": 0.1 * np.arange(len(mv)),
+            "sp": np.zeros(len(mv)), "pv": 40.0 + pv, "mv": 50.0 + mv, "mode": [int(Mode.MANUAL)] * len(mv),
+        }
+    )  # fmt: skip
+    assert record is not None and record.switches[0] == 140
+    evidence = record.experiment_record()
+    assert evidence is not None and evidence.one_sided == (down > 0.0)
+    assert evidence.direction == np.sign(gain)
