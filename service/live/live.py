@@ -23,6 +23,7 @@ from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.bins import of_samples
 from loopwright.service.listening.listening import Listening
 from loopwright.service.listening.messages import NewSamples
+from loopwright.service.listening.process import ANSWER_S
 from loopwright.service.live.jobs import LookedUpJobs
 from loopwright.service.live.messages import Buses, Hello, Loops, event
 from loopwright.service.live.other_gateways import OtherGateways
@@ -134,7 +135,9 @@ class Live:
 
     async def _past(self, viewer: Viewer, tag: str, back_s: float) -> str:
         now_s = time.time()
-        rows = await asyncio.to_thread(self._listening.memory, tag, now_s - back_s, now_s, _PAST_POINTS)
+        # What is heard until the answer belongs to it: samples are sent as they come only from some moment after now.
+        until_s = now_s + ANSWER_S
+        rows = await asyncio.to_thread(self._listening.memory, tag, now_s - back_s, until_s, _PAST_POINTS)
         if len(rows.bins):
             viewer.has_until(tag, rows.bins["until_s"][-1].item())
         return event("samples", samples_message(tag, rows.bins, past=True))

@@ -17,8 +17,10 @@ from loopwright.service.alarms.watch import AlarmWatch
 from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.inputs.request import FastRetune
+from loopwright.service.listening.bins import Rows
 from loopwright.service.listening.heard_loop import Heard
 from loopwright.service.listening.listening import Listening
+from loopwright.service.listening.rings import Rings
 from loopwright.service.live import live as module
 from loopwright.service.live.jobs import LookedUpJobs
 from loopwright.service.live.live import Live
@@ -165,6 +167,19 @@ def test_a_loop_that_is_heard_again_and_unknown_numbers(screens: Screens) -> Non
         screens.listening.heard = {TAG: Heard(time.time(), False, 49.5, math.nan, 50.0, 2, None, None)}
         row = viewer.row(TAG, lambda row: row["pv"])
         assert (row["pv"], row["mv"], row["mode"]) == (49.5, None, "automatic")
+
+
+def test_what_is_heard_before_a_late_answer_is_in_the_past(screens: Screens, monkeypatch: pytest.MonkeyPatch) -> None:
+    def memory(tag: str, from_s: float, to_s: float, points: int) -> Rows:
+        rings = Rings()
+        asked_s = time.time()
+        for n in range(4):
+            rings.put(asked_s + 0.5 * (n - 1), n, 50.0, 40.0, 50.0, 0, 2, 0)  # two are heard before the answer is made
+        return rings.rows(from_s, to_s, points)
+
+    monkeypatch.setattr(screens.listening, "memory", memory)
+    with viewing(screens.base, f"/live?loops={TAG}&back_s=60") as viewer:
+        assert viewer.until("samples")["n"] == [0, 1, 2, 3]
 
 
 def test_while_the_database_is_away_the_loops_are_shown(screens: Screens, monkeypatch: pytest.MonkeyPatch) -> None:
