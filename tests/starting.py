@@ -12,6 +12,8 @@ STARTS_A_SERVICE = "starts_a_service"
 """The property of a test in the report; its value is pytest's name of the test."""
 _SERVING = frozenset({"serve", "demo"})
 """Commands of `loopwright` that run a service."""
+FORKED = "tests.unit.service.forked"
+"""The audit event of a service that is forked from a process which has everything loaded."""
 
 _started: list[Sequence[object]] = []
 
@@ -19,6 +21,8 @@ _started: list[Sequence[object]] = []
 def _hear(event: str, arguments: tuple[object, ...]) -> None:
     if event == "subprocess.Popen" and isinstance(arguments[1], list | tuple):
         _started.append(arguments[1])
+    elif event == FORKED:
+        _started.append(("serve",))
 
 
 sys.addaudithook(_hear)
