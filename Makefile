@@ -45,7 +45,7 @@ check: setup
 	$(BIN)/ruff check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/deno check --quiet service/web/static/js
+	$(BIN)/deno check --quiet service/api/web/static/js
 	$(BIN)/deno lint --quiet
 	$(BIN)/python tools/audit_dependencies.py
 

@@ -16,10 +16,10 @@ from loopwright.service.inputs.config import LoopConfig, parse_site
 from loopwright.service.inputs.request import FastRetune, RetuneRequest
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.dbos_engine import DurableEngine
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.service.results import empty_result
 from loopwright.service.server.assembly import make_jobs
+from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store.store import Store
 from loopwright.tuning.plan import StageDone, StageStarted
 

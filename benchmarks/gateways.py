@@ -23,7 +23,7 @@ from sqlalchemy import Engine, create_engine, text
 from benchmarks.answers import processor_s
 from benchmarks.command import Missing, command
 from loopwright.service.cli.child_process import ChildProcess
-from loopwright.service.job_states import ACTIVE
+from loopwright.service.states.job_state import ACTIVE
 from tests.unit.service.postgres import Server, binaries
 
 LOOPS = 1000

@@ -29,7 +29,7 @@ from loopwright.plantsim.catalogue import find
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE
 from loopwright.protocol.tuner import Tuner
 from loopwright.service.cli.child_process import ChildProcess
-from loopwright.service.job_states import ACTIVE
+from loopwright.service.states.job_state import ACTIVE
 
 TS = 0.1
 MANY, PACE = 50, 1.0

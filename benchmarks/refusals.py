@@ -16,15 +16,15 @@ from PIL import Image
 from benchmarks.command import check_names, parser_of
 from loopwright.controller.channel import Channel, Settings
 from loopwright.plantsim.plant import LinearPlant
+from loopwright.service.cli.plots.fast_job import fast_job
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.rehearsal import RehearsedLoop, _parameters
 from loopwright.service.execution.result import result_of
 from loopwright.service.execution.runner import run
-from loopwright.service.job_states import JobState
 from loopwright.service.jobs.stored_record import stored_record
 from loopwright.service.jsonable import to_jsonable
-from loopwright.service.plots.fast_job import fast_job
 from loopwright.service.results import EvidenceView, GainsView, ModelView, TransferModelView, VerificationView
+from loopwright.service.states.job_state import JobState
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.procedure import FastOptions, fast
 from loopwright.tuning.fast.proposal import EvaluationSummary

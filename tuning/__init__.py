@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from loopwright.tuning.analysis.margins import Margins, margins, ultimate_point
     from loopwright.tuning.analysis.step_figures import StepFigures
     from loopwright.tuning.analysis.step_response import Response, step_figures, step_response
-    from loopwright.tuning.gain_forms import Parallel, Series, of_parallel, of_series, to_parallel, to_series
-    from loopwright.tuning.gains import Gains
+    from loopwright.tuning.gains import Gains, Parallel, Series, of_parallel, of_series, to_parallel, to_series
     from loopwright.tuning.identification.identify import Identified, identify
     from loopwright.tuning.identification.overshoot import fopdt_from_overshoot
     from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction, as_model
@@ -44,8 +43,7 @@ _WHERE = {
     "analysis.margins": ("Margins", "margins", "ultimate_point"),
     "analysis.step_figures": ("StepFigures",),
     "analysis.step_response": ("Response", "step_figures", "step_response"),
-    "gain_forms": ("Parallel", "Series", "of_parallel", "of_series", "to_parallel", "to_series"),
-    "gains": ("Gains",),
+    "gains": ("Gains", "Parallel", "Series", "of_parallel", "of_series", "to_parallel", "to_series"),
     "identification.identify": ("Identified", "identify"),
     "identification.overshoot": ("fopdt_from_overshoot",),
     "models": ("FOPDT", "SOPDT", "Integrating", "Model", "TransferFunction", "as_model"),

@@ -1,6 +1,6 @@
 """`make validate`: recompute the papers, write docs/validation.md and its plots, fail if a number left its tolerance.
 
-    python -m validation
+python -m validation
 """
 
 from __future__ import annotations

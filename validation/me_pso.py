@@ -6,8 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from loopwright.tuning.gain_forms import to_reciprocal
-from loopwright.tuning.gains import Gains
+from loopwright.tuning.gains import Gains, to_reciprocal
 from loopwright.tuning.models import Model, TransferFunction
 from loopwright.tuning.reasons import Refused
 from loopwright.tuning.rules.complex_criterion import ComplexCriterion, Weighting

@@ -14,10 +14,10 @@ from datetime import datetime
 from loopwright.protocol.profile import Mode, NmtState
 from loopwright.service.alarms.alarm import RULES, Alarm, AlarmKind
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.job_states import JobState
 from loopwright.service.listening.heard_loop import Heard
 from loopwright.service.listening.heard_node import HeardHeartbeat
-from loopwright.service.loop_state import LoopState, same_gains
+from loopwright.service.states.job_state import JobState
+from loopwright.service.states.loop_state import LoopState, same_gains
 from loopwright.service.store.alarms import NOT_RESTORED_TEXT, UnconfirmedJob, alarm_id
 from loopwright.service.store.live_jobs import Acceptance, JobInBrief
 from loopwright.tuning.gains import Gains

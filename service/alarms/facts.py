@@ -14,11 +14,11 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.service.alarms.alarm import Alarm
 from loopwright.service.alarms.conditions import AlarmFacts, BusFacts, GatewayFacts, LoopFacts, to_be_asked
-from loopwright.service.job_states import ACTIVE
 from loopwright.service.jobs.journal import temporary
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.listening import Listening
-from loopwright.service.loop_state import LoopState
+from loopwright.service.states.job_state import ACTIVE
+from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store import alarms, audit, gateways
 from loopwright.service.store.alarms import UnconfirmedJob
 from loopwright.service.store.live_jobs import Acceptance, JobInBrief, acceptances, latest_tests

@@ -53,10 +53,11 @@ from loopwright.service.api.job_views import (
 from loopwright.service.api.paging import LARGEST
 from loopwright.service.api.routes import add, name_of
 from loopwright.service.api.samples import Reading, csv_text, json_text, parts
+from loopwright.service.api.web.compressed import takes_gzip
+from loopwright.service.api.web.pages import Pages
 from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import FastRetune, RetuneRequest
-from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.fleet import Fleet
 from loopwright.service.jobs.kept_figures import KeptFigures
 from loopwright.service.jobs.manager import Jobs
@@ -67,13 +68,12 @@ from loopwright.service.live.own_gateway import OwnGateway
 from loopwright.service.live.snapshot import JobProgress
 from loopwright.service.loops.shared_reading import SharedReading
 from loopwright.service.security.principal import current
+from loopwright.service.states.job_state import ACTIVE, JobState
 from loopwright.service.store import decision_requests
 from loopwright.service.store.idempotency import IdempotencyKeys
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.live_jobs import acceptances, latest_jobs
 from loopwright.service.telemetry.lateness import watched_event_loop
-from loopwright.service.web.compressed import takes_gzip
-from loopwright.service.web.pages import Pages
 from loopwright.tuning.reasons import Ended
 
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]

@@ -13,8 +13,8 @@ from loopwright.service.api import problems
 from loopwright.service.api.paging import LINK, Cursor, Limit, more
 from loopwright.service.api.routes import new_router
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.loop_state import gains_of
 from loopwright.service.results import GainsView
+from loopwright.service.states.loop_state import gains_of
 from loopwright.service.store import audit
 from loopwright.service.store.clock import stamp
 from loopwright.service.store.tables import AuditRow

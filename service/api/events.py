@@ -14,12 +14,12 @@ from collections.abc import AsyncIterator, Callable
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.journal import temporary
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.live.snapshot import JobProgress
 from loopwright.service.security.principal import Principal
 from loopwright.service.security.sessions import BrowserSessions
+from loopwright.service.states.job_state import ACTIVE, JobState
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.keyring import REVOKED_WITHIN_S, Keyring
 

@@ -14,11 +14,11 @@ from loopwright.service.api import problems
 from loopwright.service.api.job_views import Decision, JobView, LoopView, loop_view
 from loopwright.service.api.paging import LINK, Cursor, JobLimit, Limit, listed, more
 from loopwright.service.api.routes import add, new_router
-from loopwright.service.job_states import JobState
 from loopwright.service.jobs.fleet import BadFleet, Fleet, FleetRequest
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.listening import Listening
 from loopwright.service.live.other_gateways import OtherGateways
+from loopwright.service.states.job_state import JobState
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.live_jobs import acceptances, latest_jobs
 from loopwright.service.store.retunes import NoSuchRetune, Part, RetuneOver, RetuneState, StopReason

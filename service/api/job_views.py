@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import BaseModel, Field
 
 from loopwright.service.inputs.config import Limits, LoopConfig, PermittedTest
-from loopwright.service.job_states import ACTIVE, JobState, shown
 from loopwright.service.jsonable import JsonObject, number
-from loopwright.service.loop_state import LoopState, gains_of, same_gains
 from loopwright.service.results import (
     FIVE_STAGE,
     ComparisonView,
@@ -29,6 +27,8 @@ from loopwright.service.results import (
     VerificationView,
     empty_result,
 )
+from loopwright.service.states.job_state import ACTIVE, JobState, shown
+from loopwright.service.states.loop_state import LoopState, gains_of, same_gains
 from loopwright.service.store.clock import stamp
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import ADVICE, Ended, Reason

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from loopwright.service.alarms.alarm import Level
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.job_states import ACTIVE, JobState, shown
+from loopwright.service.states.job_state import ACTIVE, JobState, shown
 from loopwright.service.store import looked_after
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow

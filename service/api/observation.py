@@ -16,10 +16,10 @@ from loopwright.service.errors import Conflict
 from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.listening import Listening
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.shared_reading import SharedReading
 from loopwright.service.observing.hearing import question
 from loopwright.service.observing.observed import ObservationView, Question, observed
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.fast.design import DesignSpec
 
 

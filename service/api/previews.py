@@ -12,9 +12,9 @@ from loopwright.service.api.routes import new_router
 from loopwright.service.inputs.request import FastRetune, RetuneRequest
 from loopwright.service.jobs.fleet import Fleet, FleetRequest
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.loop_state import loop_state
 from loopwright.service.planning.obstacles import Now
 from loopwright.service.planning.preview import FleetPreview, LastProposal, Preview, fleet_preview, preview
+from loopwright.service.states.loop_state import loop_state
 from loopwright.service.store import loop_locks
 from loopwright.service.store.jobs import Job
 from loopwright.tuning.reasons import Ended

@@ -22,9 +22,9 @@ from loopwright.service.execution.computing.pool import NotWanted
 from loopwright.service.inputs.model_json import BadModel
 from loopwright.service.inputs.request import BadLimits
 from loopwright.service.inputs.validation import place, words
-from loopwright.service.job_states import IllegalMove
 from loopwright.service.jobs.journal import temporary
 from loopwright.service.offline.tunings import BadTuning
+from loopwright.service.states.job_state import IllegalMove
 from loopwright.service.store.claims import StillAnswering
 from loopwright.service.store.damage import is_damage
 from loopwright.service.store.store import Busy, FolderInUse, NoSuchJob

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import httpx
 
-    from loopwright.service.plots.shown import ShownSamples
+    from loopwright.service.cli.plots.shown import ShownSamples
 
 DEFAULT_URL = "http://127.0.0.1:8080"
 KEY_VARIABLE = "LOOPWRIGHT_KEY"
@@ -48,7 +48,7 @@ class Client:
 
     def samples_of(self, job_url: str) -> Callable[[str | None], ShownSamples]:
         """Returns a function that gets the samples of a job, those of one stage or (None) all."""
-        from loopwright.service.plots.shown import ShownSamples
+        from loopwright.service.cli.plots.shown import ShownSamples
 
         return lambda stage: ShownSamples.model_validate(self.get(f"{job_url}/samples", stage=stage))
 

@@ -20,7 +20,7 @@ from loopwright.service.cli.child_process import ChildProcess, NotReady
 from loopwright.service.cli.client import ApiError, Client
 from loopwright.service.cli.demo_report import METHODS, PLANT, PLANT_MODEL, Demonstration, demonstrate, report
 from loopwright.service.cli.interruption import Interrupted, Interruption
-from loopwright.service.plots.job import NoPicture, job_picture
+from loopwright.service.cli.plots.job import NoPicture, job_picture
 
 TAG = "TIC-101"
 PV_UNIT = "degC"

@@ -13,7 +13,7 @@ from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE
 from loopwright.protocol.tuner import Tuner
 from loopwright.service.api.job_views import JobView
 from loopwright.service.cli.client import DEFAULT_URL
-from loopwright.service.job_states import JobState
+from loopwright.service.states.job_state import JobState
 
 FULL_SPEED = 0.0
 REAL_TIME = 1.0

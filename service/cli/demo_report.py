@@ -14,7 +14,7 @@ from rich.table import Table
 from loopwright.service.api.job_views import JobView, LiveView, LoopDetail
 from loopwright.service.cli import job_tables
 from loopwright.service.cli.client import ApiError, Client
-from loopwright.service.job_states import JobState
+from loopwright.service.states.job_state import JobState
 from loopwright.tuning.analysis.comparison import LoopPerformance, loop_performance
 from loopwright.tuning.fast.proposal import delayed
 from loopwright.tuning.gains import Gains

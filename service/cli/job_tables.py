@@ -12,8 +12,8 @@ from rich.table import Table
 from loopwright.service.api.job_views import JobView, LockView, LoopDetail
 from loopwright.service.cli.answers import NoteEvent, ProgressEvent, StageDoneEvent, StateEvent, job_event
 from loopwright.service.cli.client import Client
-from loopwright.service.job_states import JobState
 from loopwright.service.results import ModelView, TransferModelView
+from loopwright.service.states.job_state import JobState
 
 console = Console()
 _MARGINS = (("GM", "GM", ""), ("PM", "PM_deg", "deg"), ("Ms", "Ms", ""))

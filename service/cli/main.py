@@ -339,7 +339,7 @@ def _one(client: Client, started: object, wait: bool, as_json: bool) -> int:
     """Follows the job that was started; returns the exit status."""
     from loopwright.service.api.job_views import JobView
     from loopwright.service.cli import job_tables
-    from loopwright.service.job_states import GOOD
+    from loopwright.service.states.job_state import GOOD
 
     job = JobView.model_validate(started)
     if wait and as_json:
@@ -359,7 +359,7 @@ def _many(client: Client, started: object, wait: bool, as_json: bool) -> int:
     """Follows the retune of many loops that was started; returns the exit status."""
     from loopwright.service.cli import fleet_tables
     from loopwright.service.cli.answers import FleetRetune
-    from loopwright.service.job_states import GOOD
+    from loopwright.service.states.job_state import GOOD
 
     url = FleetRetune.model_validate(started).url
     answer = fleet_tables.follow(client, url, quiet=as_json) if wait else started
@@ -439,7 +439,7 @@ def one_job(
     if follow:
         job = job_tables.follow(client, path)
     if plot is not None:
-        from loopwright.service.plots.job import NoPicture, job_picture
+        from loopwright.service.cli.plots.job import NoPicture, job_picture
 
         tuning.check_plot(plot)
         unit = LoopDetail.model_validate(client.get(f"/loops/{job.loop}")).pv_unit

@@ -59,7 +59,7 @@ def tune(
         die(str(error), 2)
     answer = tunings.answer(plant, found)
     if plot is not None:
-        from loopwright.service.plots.tunings import responses
+        from loopwright.service.cli.plots.tunings import responses
 
         _save(plot, responses, plant, found)
     if as_json:
@@ -134,7 +134,7 @@ def identify(
             tuning_tables.not_identified(refusal)
         raise typer.Exit(3) from None
     if plot is not None:
-        from loopwright.service.plots.tunings import record_and_model
+        from loopwright.service.cli.plots.tunings import record_and_model
 
         _save(plot, record_and_model, record, found)
     if as_json:

@@ -13,8 +13,8 @@ from typing import Protocol, TypeVar
 
 from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.computing.pool import NoProcess, NotWanted
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop, Restored
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Sample, Work
 from loopwright.tuning.reasons import Reason

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from loopwright.service.loop_state import LoopState
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.plan import Sample
 from loopwright.tuning.reasons import Failed, Reason
 

@@ -15,12 +15,12 @@ from loopwright.service.inputs.request import (
     excitations,
     wrong_mode,
 )
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.service.planning.facts import facts_of, time_budget_s
 from loopwright.service.planning.ground import Ground, rehearsal_spec
 from loopwright.service.planning.moves import broken_from
 from loopwright.service.results import Result, empty_result
+from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store.jobs import JobEvent
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.settle import after_settling

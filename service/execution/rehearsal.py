@@ -32,9 +32,9 @@ from loopwright.service.inputs.plausible import (
 )
 from loopwright.service.inputs.validation import lines
 from loopwright.service.jsonable import to_jsonable
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Restored
 from loopwright.service.results import FastResult, FiveStageResult, UltimateView, empty_result
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.experiments.primitives import Directions
 from loopwright.tuning.fast.design_trial import trial

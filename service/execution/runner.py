@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from loopwright.service.execution.guard import Guard, RunLimits
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.plan import (
     Command,
     Event,

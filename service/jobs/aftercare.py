@@ -13,8 +13,8 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.machine import Machine
-from loopwright.service.loop_state import state_json
 from loopwright.service.loops.restoration import Restoration, restore_loop_of
+from loopwright.service.states.loop_state import state_json
 from loopwright.service.store import looked_after
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store

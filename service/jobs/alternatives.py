@@ -7,13 +7,13 @@ from collections.abc import Sequence
 
 from loopwright.service.errors import Conflict
 from loopwright.service.inputs.model_json import dump_model, parse_model
-from loopwright.service.job_states import ACTIVE
 from loopwright.service.jobs.stored_record import StoredRecord
 from loopwright.service.jsonable import JsonObject, json_object
-from loopwright.service.loop_state import loop_state
 from loopwright.service.offline.tunings import MethodResult, answer, tune_each
 from loopwright.service.planning.found_model import DISPROVED, FoundModel, found_model
 from loopwright.service.results import DESIGNED
+from loopwright.service.states.job_state import ACTIVE
+from loopwright.service.states.loop_state import loop_state
 from loopwright.service.store.jobs import Job, JobEvent
 from loopwright.tuning.analysis.assessment import Assessment, assess
 from loopwright.tuning.fast.design import DesignSpec

@@ -5,13 +5,13 @@ from __future__ import annotations
 import threading
 
 from loopwright.service.errors import Conflict, Locked
-from loopwright.service.job_states import JobState, shown
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.passing_on import PassingOn
-from loopwright.service.loop_state import gains_of, state_json
 from loopwright.service.loops.gain_change import ForeignGains, replace_accepted
 from loopwright.service.observing.kept_knowledge import KeptKnowledge
+from loopwright.service.states.job_state import JobState, shown
+from loopwright.service.states.loop_state import gains_of, state_json
 from loopwright.service.store import loop_locks
 from loopwright.service.store.decision_requests import What
 from loopwright.service.store.jobs import Job

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from pydantic import Field
 
 from loopwright.service.jsonable import json_object
-from loopwright.service.loop_state import gains_of, loop_state
 from loopwright.service.results import Figures, GainsView, WorthView
+from loopwright.service.states.loop_state import gains_of, loop_state
 from loopwright.service.store.jobs import Job
 from loopwright.tuning.analysis.comparison import loop_performance
 from loopwright.tuning.fast.design import DesignSpec, GainDesign

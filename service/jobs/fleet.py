@@ -30,8 +30,8 @@ from loopwright.service.inputs.request import (
     within,
 )
 from loopwright.service.inputs.validation import branch
-from loopwright.service.job_states import IllegalMove
 from loopwright.service.jobs.manager import Jobs
+from loopwright.service.states.job_state import IllegalMove
 from loopwright.service.store import retunes
 from loopwright.service.store.retunes import Part, RetuneOver, StopReason
 from loopwright.service.store.store import Busy, FolderInUse

@@ -12,8 +12,8 @@ from sqlalchemy.exc import SQLAlchemyError
 from loopwright.service.errors import Conflict
 from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.computing.pool import NotWanted, Pool
-from loopwright.service.job_states import ACTIVE
 from loopwright.service.jobs.job_figures import VERSION, JobFigures, job_figures, unpacked
+from loopwright.service.states.job_state import ACTIVE
 from loopwright.service.store import job_figures as stored
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import FolderInUse, Store

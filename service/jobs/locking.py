@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from loopwright.service.errors import Conflict, GatewayLost, NotKnown
-from loopwright.service.job_states import JobState
 from loopwright.service.jobs.decisions import WRITES_S, Decisions
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.passing_on import PassingOn
+from loopwright.service.states.job_state import JobState
 from loopwright.service.store import gateways, loop_locks
 from loopwright.service.store.decision_requests import What
 from loopwright.service.store.jobs import Job

@@ -13,9 +13,9 @@ from loopwright.service.inputs.config import BusConfig, LoopConfig
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.listening.heard_loop import InEffect
-from loopwright.service.loop_state import LoopState, gains_of, loop_state
 from loopwright.service.loops.loop import Loop
 from loopwright.service.observing.neighbours import disturbers
+from loopwright.service.states.loop_state import LoopState, gains_of, loop_state
 from loopwright.service.store.store import Store
 from loopwright.service.store.under_test import times_under_test
 

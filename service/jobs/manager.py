@@ -15,7 +15,6 @@ from sqlalchemy.exc import SQLAlchemyError
 from loopwright.service.errors import Stopping
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import RetuneRequest, check_setpoint_source, within
-from loopwright.service.job_states import ACTIVE, IllegalMove, JobState
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.aftercare import Aftercare
 from loopwright.service.jobs.carrying_out import CarryingOut
@@ -31,6 +30,7 @@ from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.until_answered import STOP_PATIENCE_S, UntilAnswered
 from loopwright.service.jobs.worker import Worker
 from loopwright.service.observing.kept_knowledge import KeptKnowledge
+from loopwright.service.states.job_state import ACTIVE, IllegalMove, JobState
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.lock import CHECK_S
 from loopwright.service.store.store import FolderInUse, Store, WithJob

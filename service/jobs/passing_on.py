@@ -5,9 +5,9 @@ from __future__ import annotations
 from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.service.errors import Conflict, GatewayLost, Locked, NotKnown, Stopping
-from loopwright.service.job_states import IllegalMove, JobState
 from loopwright.service.jobs.journal import temporary
 from loopwright.service.jobs.machine import Machine
+from loopwright.service.states.job_state import IllegalMove, JobState
 from loopwright.service.store import decision_requests, gateways
 from loopwright.service.store.decision_requests import (
     OPEN,

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from loopwright.service.errors import Locked, RemoteSetpoint
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import check_setpoint_source, retune_request, within
-from loopwright.service.job_states import JobState
 from loopwright.service.jobs.engine import WORKFLOW_VERSION
-from loopwright.service.loop_state import state_json
 from loopwright.service.loops.loop import Loop
 from loopwright.service.loops.restoration import Restoration, restore_loop_of
+from loopwright.service.states.job_state import JobState
+from loopwright.service.states.loop_state import state_json
 from loopwright.service.store import loop_locks
 from loopwright.service.store.jobs import Job, JobColumns
 from loopwright.service.store.store import Store

@@ -13,9 +13,9 @@ from datetime import UTC, datetime, timedelta
 
 from sqlalchemy import ColumnElement, delete, func, select, update
 
-from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.engine import Engine
 from loopwright.service.jobs.repeated import Repeated
+from loopwright.service.states.job_state import ACTIVE, JobState
 from loopwright.service.store import audit, history, hosts, knowledge
 from loopwright.service.store.clock import stamp
 from loopwright.service.store.clock_watch import ClockWatch, longest_stop

@@ -22,7 +22,6 @@ from loopwright.service.inputs.request import (
     retune_request,
     within,
 )
-from loopwright.service.job_states import ACTIVE, GOOD, JobState, state_after
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.journal import Journal
 from loopwright.service.jobs.loop_directory import LoopDirectory
@@ -30,12 +29,13 @@ from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.operation import OperationHeard, outdated_by
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.until_answered import STOP_PATIENCE_S, UntilAnswered
-from loopwright.service.loop_state import LoopState, differences, loop_state, same_gains, state_json
 from loopwright.service.loops.loop import Loop
 from loopwright.service.loops.observed_loop import ObservedLoop
 from loopwright.service.loops.restoration import restore_abandoned
 from loopwright.service.observing.kept_knowledge import KeptKnowledge
 from loopwright.service.planning.known_loop import known
+from loopwright.service.states.job_state import ACTIVE, GOOD, JobState, state_after
+from loopwright.service.states.loop_state import LoopState, differences, loop_state, same_gains, state_json
 from loopwright.service.store import looked_after
 from loopwright.service.store.jobs import Job, JobColumns
 from loopwright.service.store.lock import FolderInUse

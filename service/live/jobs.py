@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 
-from loopwright.service.job_states import ACTIVE
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.live.messages import JobHappening, LiveJob, LiveJobs, event
 from loopwright.service.live.other_gateways import OtherGateways
 from loopwright.service.live.snapshot import JobProgress, progress_of
 from loopwright.service.live.viewer import Viewer
+from loopwright.service.states.job_state import ACTIVE
 from loopwright.service.store.jobs import JobEvent
 from loopwright.service.store.live_jobs import JobInBrief, latest_jobs, live_jobs, new_events
 

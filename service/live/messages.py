@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from pydantic import BaseModel, Field, JsonValue
 
-from loopwright.service.job_states import JobState
+from loopwright.service.states.job_state import JobState
 
 
 class Hello(BaseModel):

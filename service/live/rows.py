@@ -11,7 +11,7 @@ from loopwright.protocol.profile import Mode
 from loopwright.service.listening.bins import Bins, decimals
 from loopwright.service.listening.heard_loop import Heard
 from loopwright.service.live.messages import LastJob, LiveLoopRow, LoopValues, OldValues, Samples
-from loopwright.service.loop_state import LoopState
+from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store.live_jobs import JobInBrief
 
 _MODES = {mode.value: mode.name.lower() for mode in Mode}

@@ -9,8 +9,8 @@ from pydantic import BaseModel, TypeAdapter
 from loopwright.service.alarms.alarm import Alarm
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.live.messages import BusView, LoopValues
-from loopwright.service.loop_state import LoopState
 from loopwright.service.results import GainsView
+from loopwright.service.states.loop_state import LoopState
 
 
 class JobProgress(BaseModel):

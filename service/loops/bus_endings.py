@@ -5,9 +5,9 @@ from __future__ import annotations
 from loopwright.protocol.profile import Cause, OutsideChange
 from loopwright.protocol.real32 import same
 from loopwright.protocol.tuner import Tuner
-from loopwright.service.loop_state import LoopState, differences
 from loopwright.service.loops.bus_reading import BusReading
 from loopwright.service.loops.loop import Restored
+from loopwright.service.states.loop_state import LoopState, differences
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
 

@@ -14,13 +14,13 @@ from dataclasses import astuple
 from loopwright.protocol.profile import Order
 from loopwright.protocol.station import Station
 from loopwright.protocol.tuner import Tuner
-from loopwright.service.loop_state import LoopState, same_gains
 from loopwright.service.loops.bus_connection import BusConnection, Read
 from loopwright.service.loops.bus_reading import BusReading
 from loopwright.service.loops.bus_restore import LOSSY_BUS_S, close_session, end_acceptance, restore
 from loopwright.service.loops.bus_samples import BLOCK, MAX_GAP, BusSamples
 from loopwright.service.loops.bus_session import BusSession
 from loopwright.service.loops.loop import Restored
+from loopwright.service.states.loop_state import LoopState, same_gains
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import (
     Command,

@@ -8,7 +8,7 @@ from loopwright.protocol.objects import Device, default_of, lookup
 from loopwright.protocol.profile import REVISION, NmtState, OnMissingAnswer
 from loopwright.protocol.session import GAINS
 from loopwright.protocol.tuner import Tuner, TunerError
-from loopwright.service.loop_state import OPERATIONAL, LoopState
+from loopwright.service.states.loop_state import OPERATIONAL, LoopState
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Failed, Reason, Refused

@@ -6,10 +6,10 @@ from contextlib import suppress
 
 from loopwright.protocol.tuner import Tuner, TunerError
 from loopwright.protocol.tuner_session import TunerSession
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_connection import AGAIN_S, BusConnection
 from loopwright.service.loops.bus_endings import cause_of, read_back, words_of
 from loopwright.service.loops.loop import Restored
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.reasons import Ended, Failed, Reason
 
 RESTORE_PATIENCE_S = 4.0

@@ -12,9 +12,9 @@ from collections.abc import Callable
 from loopwright.protocol.profile import FOREVER, Abort, Order
 from loopwright.protocol.tuner import FailureKind, Tuner, TunerError
 from loopwright.protocol.tuner_session import Lease, TunerSession
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_connection import AGAIN_S, BusConnection
 from loopwright.service.loops.bus_endings import why_over
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.reasons import Ended, Reason, Refused
 
 WATCH_S = 1.5

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from loopwright.service.errors import Conflict
-from loopwright.service.loop_state import LoopState, same_gains
 from loopwright.service.loops.loop import Loop
+from loopwright.service.states.loop_state import LoopState, same_gains
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Failed, Reason
 

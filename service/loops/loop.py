@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from loopwright.service.loop_state import LoopState
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Sample
 from loopwright.tuning.reasons import Reason

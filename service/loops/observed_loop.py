@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop, Restored
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Mode, Sample, SetGains
 from loopwright.tuning.reasons import Reason

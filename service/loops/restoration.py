@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.loop_state import LoopState, loop_state
 from loopwright.service.loops.loop import Loop
+from loopwright.service.states.loop_state import LoopState, loop_state
 from loopwright.service.store.jobs import Job
 from loopwright.tuning.reasons import Ended, Reason
 

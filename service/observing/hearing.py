@@ -9,9 +9,9 @@ from datetime import UTC, datetime
 
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.listening.listening import History, Listening
-from loopwright.service.loop_state import LoopState
 from loopwright.service.observing.observed import Question
 from loopwright.service.observing.resolution import FIRST_S, resolution
+from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store.job_knowledge import outdated_until_s
 from loopwright.service.store.store import Store
 from loopwright.service.store.under_test import TimeUnderTest, times_under_test

@@ -10,10 +10,10 @@ from datetime import UTC, datetime
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from loopwright.service.loop_state import loop_state
 from loopwright.service.observing import knowledge
 from loopwright.service.observing.observed import ObservationView
 from loopwright.service.results import Finding, KnowledgeView
+from loopwright.service.states.loop_state import loop_state
 from loopwright.service.store import knowledge as stored
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import FolderInUse, Store

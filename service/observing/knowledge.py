@@ -14,7 +14,6 @@ from dataclasses import astuple
 from datetime import datetime
 from functools import lru_cache
 
-from loopwright.service.loop_state import same_gains
 from loopwright.service.observing.observed import ObservationState, ObservationView
 from loopwright.service.results import (
     FastResult,
@@ -27,6 +26,7 @@ from loopwright.service.results import (
     RangeView,
     TransferModelView,
 )
+from loopwright.service.states.loop_state import same_gains
 from loopwright.service.store.clock import stamp
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.knowledge import Known

@@ -13,7 +13,6 @@ from pydantic import Field
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.jsonable import json_object
 from loopwright.service.listening.bins import Rows
-from loopwright.service.loop_state import LoopState
 from loopwright.service.observing.resolution import wall_period_s
 from loopwright.service.observing.stretches import HeardStretch, heard_stretches
 from loopwright.service.planning.facts import facts_of
@@ -27,6 +26,7 @@ from loopwright.service.results import (
     TransferModelView,
     UltimateView,
 )
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.analysis.comparison import Comparison, predicted
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.evaluation import Evaluation

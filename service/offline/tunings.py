@@ -15,8 +15,7 @@ from loopwright.service.inputs.plausible import Implausible, check_option
 from loopwright.service.jsonable import JsonObject, json_object
 from loopwright.tuning.analysis.assessment import Assessment
 from loopwright.tuning.analysis.step_figures import StepFigures
-from loopwright.tuning.gain_forms import to_parallel
-from loopwright.tuning.gains import Gains
+from loopwright.tuning.gains import Gains, to_parallel
 from loopwright.tuning.models import Model
 from loopwright.tuning.reasons import Ended, Failed, Reason, Refused
 from loopwright.tuning.rules.registry import METHODS, Method, Option

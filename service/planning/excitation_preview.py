@@ -8,8 +8,8 @@ from pydantic import BaseModel, Field
 
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import RetuneRequest, excitations
-from loopwright.service.loop_state import LoopState
 from loopwright.service.results import KnowledgeView
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY
 from loopwright.tuning.fast.information import Expected, Moved, expected

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.loop_state import LoopState
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.experiments.primitives import Directions, Facts
 from loopwright.tuning.fast.procedure import FAST
 from loopwright.tuning.fast.setpoint_procedure import SETPOINT

@@ -8,9 +8,9 @@ from numpy.linalg import LinAlgError
 
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import PlantModel, RetuneRequest
-from loopwright.service.loop_state import LoopState
 from loopwright.service.planning.found_model import FoundModel
 from loopwright.service.results import GainsSource, PlantSource, RehearsedOnView
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, Model

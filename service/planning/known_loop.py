@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from loopwright.service.job_states import JobState
-from loopwright.service.loop_state import LoopState, gains_of, loop_state
 from loopwright.service.planning.found_model import DISPROVED, found_model
 from loopwright.service.planning.ground import Ground, LastModel
+from loopwright.service.states.job_state import JobState
+from loopwright.service.states.loop_state import LoopState, gains_of, loop_state
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
 from loopwright.tuning.reasons import Ended

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from loopwright.protocol.real32 import TOLERANCE
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import FastRetune, FiveStages, RetuneRequest, SetpointRetune, excitations
-from loopwright.service.loop_state import LoopState
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.design_trial import trial_stages
 from loopwright.tuning.fast.excitation_choice import chosen_stages

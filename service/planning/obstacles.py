@@ -17,9 +17,9 @@ from loopwright.service.inputs.request import (
     narrow,
     wrong_mode,
 )
-from loopwright.service.loop_state import OPERATIONAL, LoopState
 from loopwright.service.planning.facts import facts_of
 from loopwright.service.planning.moves import broken_from, stages_asked
+from loopwright.service.states.loop_state import OPERATIONAL, LoopState
 from loopwright.tuning.experiments.preflight import MAX_ATTEMPTS, MAX_AWAY, MAX_NOISE, MIN_ROOM
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.ramp import check_ramp

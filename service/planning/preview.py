@@ -10,13 +10,13 @@ from pydantic import BaseModel, Field
 
 from loopwright.service.inputs.config import Limits, LoopConfig
 from loopwright.service.inputs.request import FiveStages, RetuneRequest, narrow
-from loopwright.service.loop_state import LoopState
 from loopwright.service.planning.durations import Span, durations
 from loopwright.service.planning.excitation_preview import ExcitationPreview, excitation_previews
 from loopwright.service.planning.facts import time_budget_s
 from loopwright.service.planning.moves import Before, Moves, moves, stages_asked
 from loopwright.service.planning.obstacles import Now, Obstacle, Occupied, obstacles
 from loopwright.service.results import KnowledgeView, Result, TransferModelView
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.fast.manual_procedure import MANUAL
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode

@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import TYPE_CHECKING, NamedTuple, TypedDict, TypeVar
 
-from loopwright.service.job_states import JobState
 from loopwright.service.jsonable import JsonObject, number
 from loopwright.service.results import FastResult, FiveStageResult
+from loopwright.service.states.job_state import JobState
 from loopwright.tuning.reasons import Reason
 
 if TYPE_CHECKING:  # computations and commands know jobs, and have no store

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from loopwright.service.job_states import ACTIVE, IllegalMove, JobState
+from loopwright.service.states.job_state import ACTIVE, IllegalMove, JobState
 from loopwright.service.store.tables import JobRow
 
 _GO_BACK = "To go back to the old gains, roll it back"

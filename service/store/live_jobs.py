@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from sqlalchemy import and_, func, or_, select
 
-from loopwright.service.job_states import ACTIVE, JobState
+from loopwright.service.states.job_state import ACTIVE, JobState
 from loopwright.service.store.events import events
 from loopwright.service.store.jobs import JobEvent
 from loopwright.service.store.store import Store

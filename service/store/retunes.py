@@ -10,7 +10,7 @@ from enum import StrEnum
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
-from loopwright.service.job_states import ACTIVE, JobState, shown
+from loopwright.service.states.job_state import ACTIVE, JobState, shown
 from loopwright.service.store import audit, claims
 from loopwright.service.store.clock import now
 from loopwright.service.store.tables import JobRow, RetuneLoopRow, RetuneRow

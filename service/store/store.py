@@ -14,9 +14,9 @@ from sqlalchemy import ColumnElement, delete, func, select, update
 from sqlalchemy.exc import IntegrityError, SQLAlchemyError, TimeoutError
 from sqlalchemy.orm import Session
 
-from loopwright.service.job_states import ACTIVE, MOVES, JobState, shown
 from loopwright.service.jsonable import JsonObject, json_object, to_jsonable
-from loopwright.service.loop_state import gains_of, same_gains
+from loopwright.service.states.job_state import ACTIVE, MOVES, JobState, shown
+from loopwright.service.states.loop_state import gains_of, same_gains
 from loopwright.service.store import audit, claims, late, loop_locks, retunes, sample_blocks
 from loopwright.service.store.clock import now
 from loopwright.service.store.damage import Damage

@@ -19,9 +19,9 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-from loopwright.service.job_states import JobState
 from loopwright.service.jsonable import JsonObject
 from loopwright.service.results import RESULT, FastResult, Finding, FiveStageResult
+from loopwright.service.states.job_state import JobState
 from loopwright.tuning.reasons import Reason
 
 

@@ -8,7 +8,7 @@ from datetime import datetime
 
 from sqlalchemy import select
 
-from loopwright.service.job_states import ACTIVE
+from loopwright.service.states.job_state import ACTIVE
 from loopwright.service.store.clock import stamp
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow

@@ -17,8 +17,8 @@ import yaml
 from loopwright.protocol.profile import FOREVER
 from loopwright.protocol.tuner import Tuner
 from loopwright.service.cli.child_process import ChildProcess
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_loop import BusLoop
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.plan import Mode
 
 VCAN = "socketcan:vcan0"

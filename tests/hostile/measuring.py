@@ -11,7 +11,7 @@ from typing import Any
 import httpx
 
 from loopwright.protocol.station import HEARTBEAT_S
-from loopwright.service.job_states import ACTIVE
+from loopwright.service.states.job_state import ACTIVE
 from tests.hostile.site import Site
 
 MACHINE_LATE_S = 0.01

@@ -14,9 +14,9 @@ from loopwright.plantsim.catalogue import find
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE
 from loopwright.service.cli.child_process import ChildProcess
 from loopwright.service.cli.demo import vcan_usable
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.service.security.keys import Scope
+from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Store
 from loopwright.tuning.plan import Mode

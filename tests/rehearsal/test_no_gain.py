@@ -19,8 +19,8 @@ from loopwright.service.execution.procedures import tune
 from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.inputs.config import LoopConfig, parse_site
 from loopwright.service.inputs.request import retune_request
-from loopwright.service.job_states import JobState
 from loopwright.service.server.assembly import make_jobs
+from loopwright.service.states.job_state import JobState
 from loopwright.service.store.retunes import Part
 from loopwright.service.store.store import Store
 from loopwright.tuning.analysis.margins import ultimate_point

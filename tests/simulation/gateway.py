@@ -21,13 +21,13 @@ from loopwright.protocol.fair_lock import FairLock
 from loopwright.protocol.station import Station
 from loopwright.service.execution.procedures import Tune
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_reading import BusReading
 from loopwright.service.loops.loop import Loop
 from loopwright.service.server.assembly import make_jobs
+from loopwright.service.states.job_state import ACTIVE, JobState
+from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import Base

@@ -15,9 +15,9 @@ from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, Mode, NmtSt
 from loopwright.service.execution.procedures import Tune
 from loopwright.service.inputs.config import Limits, LoopConfig, PermittedTest
 from loopwright.service.inputs.request import retune_request
-from loopwright.service.job_states import ACTIVE, JobState
-from loopwright.service.loop_state import LoopState, state_json
 from loopwright.service.loops.bus_loop import BusLoop
+from loopwright.service.states.job_state import ACTIVE, JobState
+from loopwright.service.states.loop_state import LoopState, state_json
 from loopwright.service.store.jobs import Job
 from tests.simulation import plans
 from tests.simulation.devices import Controller, PlantNode

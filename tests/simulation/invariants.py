@@ -27,8 +27,8 @@ from loopwright.protocol.profile import (
     channel_ids,
 )
 from loopwright.protocol.real32 import same
-from loopwright.service.job_states import ACTIVE, JobState
-from loopwright.service.loop_state import LoopState
+from loopwright.service.states.job_state import ACTIVE, JobState
+from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store.jobs import Job
 from tests.simulation.devices import Controller, PlantNode
 from tests.simulation.disk import AGAIN_S, SOON_S

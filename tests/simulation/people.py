@@ -20,8 +20,8 @@ from loopwright.protocol.profile import (
 from loopwright.protocol.tuner import Tuner, TunerError
 from loopwright.service.errors import Conflict, Stopping
 from loopwright.service.inputs.request import BadLimits, RetuneRequest
-from loopwright.service.job_states import ACTIVE, IllegalMove, JobState
 from loopwright.service.jobs.manager import Jobs
+from loopwright.service.states.job_state import ACTIVE, IllegalMove, JobState
 from loopwright.service.store.store import Busy
 from loopwright.tuning.reasons import Ended, Reason
 from tests.simulation.gateway import Gateway, SimStation

@@ -14,9 +14,9 @@ from loopwright.service.execution.procedures import Hooks, Outcome, Tune, tune
 from loopwright.service.execution.runner import run
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import RetuneRequest
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.service.results import FiveStageResult, GainsView
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import (
     Mode,

@@ -14,8 +14,8 @@ from loopwright.protocol.bus import open_bus
 from loopwright.protocol.profile import COMMAND_FRAME, channel_ids
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.runner import run
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_loop import BusLoop
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode, Plan, Sample, SetGains, SetMode, SetOutput, SetRelay, SetSetpoint
 from loopwright.tuning.reasons import Ended, Failed, Reason, Refused

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 
-from loopwright.tuning.gain_forms import Series, of_series
+from loopwright.tuning.gains import Series, of_series
 from loopwright.tuning.models import FOPDT, Integrating, Model, TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.reduction.half_rule import exact, half_rule

@@ -23,10 +23,10 @@ from loopwright.service.api.report.words import (
     trust,
 )
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.job_states import JobState
 from loopwright.service.jobs.design_curve import DesignCurve
 from loopwright.service.jobs.job_record import FITTED, JobRecord
 from loopwright.service.results import GainsView, StepWorthView, TransferModelView, WorthView
+from loopwright.service.states.job_state import JobState
 from loopwright.service.store.jobs import JobEvent
 from loopwright.service.store.sample_blocks import Block
 from loopwright.tuning.fast.proposal import delayed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from loopwright.service.api.job_views import JobView, StageView
 from loopwright.service.api.report.numbers import Ms_error, duration, fixed, significant, with_unit
-from loopwright.service.job_states import JobState
+from loopwright.service.states.job_state import JobState
 from loopwright.service.store.jobs import JobEvent
 from loopwright.tuning.reasons import Reason
 

@@ -30,8 +30,8 @@ from loopwright.protocol.profile import (
     sdo_request_id,
 )
 from loopwright.protocol.station import Station
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_loop import BusLoop
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import SetRelay
 from tests.unit.protocol.memory_bus import MemoryBus, Wire

@@ -17,9 +17,7 @@ import pytest
 from loopwright.service.execution.procedures import Hooks, Outcome, Rehearse
 from loopwright.service.inputs.config import LoopConfig, parse_site
 from loopwright.service.inputs.request import RetuneRequest
-from loopwright.service.job_states import ACTIVE, JobState
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.loop_state import OPERATIONAL, LoopState, differences, same_gains
 from loopwright.service.loops.loop import Loop, Restored
 from loopwright.service.results import (
     FiveStageResult,
@@ -30,6 +28,8 @@ from loopwright.service.results import (
     UltimateView,
 )
 from loopwright.service.server.assembly import make_jobs
+from loopwright.service.states.job_state import ACTIVE, JobState
+from loopwright.service.states.loop_state import OPERATIONAL, LoopState, differences, same_gains
 from loopwright.service.store.database import FILE
 from loopwright.service.store.store import Store, block_of
 from loopwright.tuning.analysis.comparison import Predicted

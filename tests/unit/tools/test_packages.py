@@ -100,11 +100,11 @@ def test_it_works_in_an_empty_environment(built: Path, tmp_path: Path) -> None:
             "lint-imports",
             ("--no-cache",),
             {
-                "tuning/models.py": "import loopwright.service.job_states",
+                "tuning/models.py": "import loopwright.service.states.job_state",
                 "tuning/new.py": "import loopwright.protocol.bus",
             },
             (
-                "loopwright.tuning.models -> loopwright.service.job_states",
+                "loopwright.tuning.models -> loopwright.service.states.job_state",
                 "loopwright.tuning.new -> loopwright.protocol.bus",
             ),
         ),

@@ -22,10 +22,10 @@ from loopwright.service.cli import main as cli
 from loopwright.service.cli.client import Client
 from loopwright.service.errors import Conflict
 from loopwright.service.inputs.request import FastRetune
-from loopwright.service.job_states import JobState
 from loopwright.service.jobs.aftercare import Aftercare
 from loopwright.service.listening.heard_loop import Heard, InEffect
 from loopwright.service.listening.listening import Listening
+from loopwright.service.states.job_state import JobState
 from loopwright.service.store import audit, looked_after
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store

@@ -20,10 +20,10 @@ from loopwright.service.api.gate.connections import Connections, OnceAMinute, Wa
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.api.gate.limits import RequestLimits
 from loopwright.service.api.gate.places import Full, Places, RequestKind, Room, kind_of
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.service.security.keys import Scope, matches, new_key
 from loopwright.service.server.serving import listen
+from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store.keyring import Keyring
 from loopwright.service.telemetry.metrics import REQUESTS
 from loopwright.tuning.reasons import Failed, Reason

@@ -12,8 +12,8 @@ from fastapi.testclient import TestClient
 from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.inputs.request import FastRetune
-from loopwright.service.loop_state import LoopState
 from loopwright.service.security.keys import Scope
+from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store.keyring import Keyring
 from loopwright.tuning.gains import Gains
 from tests.unit.service.fakes import NEW, OLD, TAG, FakeLoop, Service

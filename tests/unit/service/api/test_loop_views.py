@@ -12,7 +12,7 @@ from fastapi.testclient import TestClient
 from loopwright.service.api.app import create_app
 from loopwright.service.inputs.request import FastRetune
 from loopwright.service.listening.listening import Listening
-from loopwright.service.loop_state import LoopState
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.gains import Gains
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
 from tests.unit.service.processes import until

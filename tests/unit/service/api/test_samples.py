@@ -23,11 +23,11 @@ from sqlalchemy.pool import QueuePool
 
 from loopwright.service.api.app import create_app
 from loopwright.service.api.samples import Gone, Reading, csv_text, json_text, parts
+from loopwright.service.api.web.compressed import takes_gzip
 from loopwright.service.jobs.stored_record import record_columns
 from loopwright.service.store import sample_blocks
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import ChunkRow
-from loopwright.service.web.compressed import takes_gzip
 from loopwright.tuning.plan import Sample
 from tests.unit.service.fakes import TAG, Service, add_samples
 

@@ -16,10 +16,10 @@ from loopwright.service.cli import job_tables
 from loopwright.service.execution.procedures import Hooks, rehearse
 from loopwright.service.inputs.model_json import TransferFunctionModel
 from loopwright.service.inputs.request import FastRetune, PlantModel, retune_request
-from loopwright.service.job_states import JobState
 from loopwright.service.planning.found_model import DISPROVED
 from loopwright.service.planning.ground import Ground, LastModel, rehearsal_spec
 from loopwright.service.results import FastResult, GainsSource, PlantSource, TransferModelView
+from loopwright.service.states.job_state import JobState
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT

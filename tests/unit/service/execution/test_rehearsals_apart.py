@@ -18,7 +18,7 @@ from loopwright.service.execution.rehearsals import rehearsed_in_pool
 from loopwright.service.execution.runner import run
 from loopwright.service.inputs.config import LoopConfig, parse_site
 from loopwright.service.inputs.request import RetuneRequest, retune_request
-from loopwright.service.job_states import JobState
+from loopwright.service.states.job_state import JobState
 from loopwright.tuning.plan import Event, Mode, Plan, Sample, StageStarted
 from loopwright.tuning.reasons import Aborted, Failed, Reason
 from tests.unit.service.fakes import TAG, FakeController, FakeLoop, Service, loop_entry

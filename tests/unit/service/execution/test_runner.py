@@ -16,8 +16,8 @@ from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.execution.runner import RunResult, run
-from loopwright.service.loop_state import LoopState, differences
 from loopwright.service.loops.loop import Restored
+from loopwright.service.states.loop_state import LoopState, differences
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import (
     Command,

@@ -30,9 +30,9 @@ from loopwright.service.api.gate.limits import RequestLimits
 from loopwright.service.execution.procedures import Hooks, Outcome
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import RetuneRequest
-from loopwright.service.loop_state import LoopState, differences, loop_state, state_json
 from loopwright.service.loops.loop import Loop, Restored
 from loopwright.service.server.serving import Setup, open_bus_loop, serve
+from loopwright.service.states.loop_state import LoopState, differences, loop_state, state_json
 from loopwright.service.store import store
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Mode, Sample, SetGains, SetSetpoint, StageDone, StageStarted

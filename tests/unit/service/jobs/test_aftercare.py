@@ -18,10 +18,10 @@ from loopwright.service.api.metrics import exposition, registry
 from loopwright.service.cli import main as cli
 from loopwright.service.cli.client import Client
 from loopwright.service.inputs.request import FastRetune
-from loopwright.service.job_states import JobState
 from loopwright.service.jobs import aftercare
 from loopwright.service.jobs.aftercare import EVERY_S, LONGEST_S, Aftercare
-from loopwright.service.loop_state import state_json
+from loopwright.service.states.job_state import JobState
+from loopwright.service.states.loop_state import state_json
 from loopwright.service.store import audit, looked_after
 from loopwright.service.store.jobs import Job, JobColumns
 from loopwright.service.store.store import Store

@@ -14,13 +14,13 @@ import pytest
 from sqlalchemy.exc import OperationalError
 
 from loopwright.service.errors import Conflict, GatewayLost, Locked, NotKnown, Stopping
-from loopwright.service.job_states import IllegalMove, JobState
 from loopwright.service.jobs.carrying_out import CarryingOut
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.passing_on import answer_to, raise_of
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.security.keys import Scope
 from loopwright.service.security.principal import Principal, current
+from loopwright.service.states.job_state import IllegalMove, JobState
 from loopwright.service.store import audit, claims, decision_requests
 from loopwright.service.store.decision_requests import AnswerKind, DecisionRequest, RequestAnswer, RequestState, What
 from loopwright.service.store.idempotency import IdempotencyKeys

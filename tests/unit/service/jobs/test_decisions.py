@@ -12,8 +12,8 @@ from sqlalchemy.exc import OperationalError
 
 from loopwright.service.errors import Conflict
 from loopwright.service.inputs.request import FastRetune
-from loopwright.service.job_states import IllegalMove, JobState
-from loopwright.service.loop_state import LoopState
+from loopwright.service.states.job_state import IllegalMove, JobState
+from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store import audit
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Failed, Reason

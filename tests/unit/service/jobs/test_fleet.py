@@ -15,10 +15,10 @@ from loopwright.service.api.app import create_app
 from loopwright.service.cli.client import Client
 from loopwright.service.inputs.config import BusConfig, parse_site
 from loopwright.service.inputs.request import FastRetune, retune_request
-from loopwright.service.job_states import JobState
 from loopwright.service.jobs.fleet import BadFleet, Fleet, FleetRequest, fleet_request
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.server.assembly import make_jobs
+from loopwright.service.states.job_state import JobState
 from loopwright.service.store import audit
 from loopwright.service.store.retunes import NoSuchRetune, Part, RetuneOver
 from loopwright.service.store.store import Store

@@ -11,14 +11,14 @@ from sqlalchemy.exc import OperationalError
 from loopwright.service.api.job_views import job_view
 from loopwright.service.execution.procedures import rehearse
 from loopwright.service.inputs.request import FastRetune, retune_request
-from loopwright.service.job_states import IllegalMove, JobState
 from loopwright.service.jobs import manager as jobs_module
 from loopwright.service.jobs.progress import Progress
 from loopwright.service.jobs.until_answered import STOP_PATIENCE_S
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_restore import RESTORE_PATIENCE_S
 from loopwright.service.loops.loop import Restored
 from loopwright.service.results import ModelView, TransferModelView
+from loopwright.service.states.job_state import IllegalMove, JobState
+from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store import audit
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store

@@ -24,11 +24,11 @@ from loopwright.service.errors import Conflict, Locked
 from loopwright.service.execution.procedures import Hooks, Outcome
 from loopwright.service.inputs.config import LoopConfig, parse_site
 from loopwright.service.inputs.request import RetuneRequest, retune_request
-from loopwright.service.job_states import IllegalMove
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.loop import Loop
 from loopwright.service.results import FiveStageResult, GainsView
 from loopwright.service.server.assembly import make_jobs
+from loopwright.service.states.job_state import IllegalMove
+from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store import database
 from loopwright.service.store.database import FILE
 from loopwright.service.store.store import Busy, Store

@@ -24,12 +24,12 @@ from loopwright.service.cli.client import Client
 from loopwright.service.errors import Locked, UnknownLoop
 from loopwright.service.inputs.config import parse_site
 from loopwright.service.inputs.request import FastRetune
-from loopwright.service.job_states import JobState
 from loopwright.service.jobs.fleet import Fleet, fleet_request
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.loop_state import LoopState, state_json
 from loopwright.service.security.keys import Scope
 from loopwright.service.server.assembly import make_jobs
+from loopwright.service.states.job_state import JobState
+from loopwright.service.states.loop_state import LoopState, state_json
 from loopwright.service.store import audit, loop_locks
 from loopwright.service.store.backup import back_up, restore
 from loopwright.service.store.keyring import Keyring

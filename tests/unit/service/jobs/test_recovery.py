@@ -14,12 +14,12 @@ from sqlalchemy.exc import OperationalError
 
 from loopwright.service.inputs.config import parse_site
 from loopwright.service.inputs.request import FastRetune
-from loopwright.service.job_states import IllegalMove, JobState
 from loopwright.service.jobs.engine import WORKFLOW_VERSION
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.recovery import MAX_ATTEMPTS
-from loopwright.service.loop_state import LoopState, state_json
 from loopwright.service.server.assembly import make_jobs
+from loopwright.service.states.job_state import IllegalMove, JobState
+from loopwright.service.states.loop_state import LoopState, state_json
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
 from loopwright.tuning.gains import Gains

@@ -16,10 +16,10 @@ from loopwright.service.cli import loops as cli
 from loopwright.service.errors import RemoteSetpoint
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import retune_request
-from loopwright.service.job_states import JobState
 from loopwright.service.jobs.fleet import Fleet, fleet_request
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.loop_state import state_json
+from loopwright.service.states.job_state import JobState
+from loopwright.service.states.loop_state import state_json
 from loopwright.tuning.reasons import Reason
 from tests.unit.service.fakes import TAG, Service, loop_entry
 from tests.unit.service.jobs.test_recovery import in_the_session, left

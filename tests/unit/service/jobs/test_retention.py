@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from sqlalchemy import MetaData, Table, func, inspect, select, update
 
-from loopwright.service.job_states import JobState
 from loopwright.service.jobs.dbos_engine import DurableEngine
 from loopwright.service.jobs.retention import Retention, RetentionPolicy, delete_old_samples, forget_finished
+from loopwright.service.states.job_state import JobState
 from loopwright.service.store import audit
 from loopwright.service.store.clock_watch import ClockWatch
 from loopwright.service.store.store import Store

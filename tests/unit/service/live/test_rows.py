@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from loopwright.service.job_states import JobState
 from loopwright.service.listening.bins import GAP_BEFORE, SAMPLE, UNKNOWN_MODE, of_samples
 from loopwright.service.listening.heard_loop import Heard
 from loopwright.service.live.messages import OldValues
 from loopwright.service.live.rows import LiveFacts, loop_row, samples_message
-from loopwright.service.loop_state import LoopState
+from loopwright.service.states.job_state import JobState
+from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store.live_jobs import JobInBrief
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode

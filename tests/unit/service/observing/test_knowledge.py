@@ -7,9 +7,9 @@ from datetime import UTC, datetime
 
 import pytest
 
-from loopwright.service.job_states import JobState
 from loopwright.service.observing.knowledge import Ms_of, adds_nothing, disagreeing, known, of_trial, replaced
 from loopwright.service.results import TYPED_IN, FastResult, Finding, FindingSource, GainsView
+from loopwright.service.states.job_state import JobState
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.knowledge import Known
 from loopwright.tuning.gains import Gains

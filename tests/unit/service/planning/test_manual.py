@@ -18,10 +18,10 @@ from loopwright.service.inputs.request import (
     within,
     wrong_mode,
 )
-from loopwright.service.loop_state import LoopState
 from loopwright.service.planning.facts import facts_of
 from loopwright.service.planning.ground import Ground
 from loopwright.service.planning.preview import Preview
+from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.plan import Mode, Sample
 from tests.unit.service.fakes import loop_entry

@@ -12,13 +12,13 @@ from loopwright.service.api.gate.gate import scope_for
 from loopwright.service.execution.procedures import Hooks, tune
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import FastRetune, retune_request, within
-from loopwright.service.loop_state import LoopState
 from loopwright.service.observing.knowledge import known
 from loopwright.service.planning.moves import broken_limits
 from loopwright.service.planning.obstacles import Now
 from loopwright.service.planning.preview import LastProposal, Preview, duration_text, preview
 from loopwright.service.results import Finding, FindingSource, KnowledgeView, UltimateView
 from loopwright.service.security.keys import Scope
+from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store.knowledge import Known
 from loopwright.service.store.store import Store
 from loopwright.tuning.gains import Gains

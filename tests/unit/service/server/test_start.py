@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 from sqlalchemy import create_engine, select
 
-from loopwright.service.job_states import JobState
 from loopwright.service.jobs.engine import WORKFLOW_VERSION
-from loopwright.service.loop_state import state_json
+from loopwright.service.states.job_state import JobState
+from loopwright.service.states.loop_state import state_json
 from loopwright.service.store.database import FILE
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow

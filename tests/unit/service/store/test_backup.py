@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 
 from loopwright.service.cli import main as cli
 from loopwright.service.inputs.request import FastRetune
-from loopwright.service.job_states import JobState
 from loopwright.service.security.keys import Scope
+from loopwright.service.states.job_state import JobState
 from loopwright.service.store.backup import BackupProblem, back_up, restore
 from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import FolderInUse, Store

@@ -21,8 +21,8 @@ from loopwright.service.api import operations
 from loopwright.service.api.app import create_app
 from loopwright.service.cli import main as cli
 from loopwright.service.inputs.request import FastRetune
-from loopwright.service.job_states import JobState
 from loopwright.service.jobs.dbos_engine import DurableEngine
+from loopwright.service.states.job_state import JobState
 from loopwright.service.store.damage import FileCheck, Log, read_log
 from loopwright.service.store.database import ENGINE_FILE, FILE, BadDatabase
 from loopwright.service.store.store import Store, event_of

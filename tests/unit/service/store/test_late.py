@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from loopwright.service.inputs.request import FastRetune
-from loopwright.service.job_states import MOVES, IllegalMove, JobState
+from loopwright.service.states.job_state import MOVES, IllegalMove, JobState
 from loopwright.service.store import late
 from loopwright.service.store.late import Decided
 from loopwright.service.store.tables import JobRow

@@ -15,8 +15,8 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, inspect, text
 from sqlalchemy.exc import IntegrityError, StatementError
 
-from loopwright.service.job_states import MOVES, IllegalMove, JobState
 from loopwright.service.results import FiveStageResult, GainsView
+from loopwright.service.states.job_state import MOVES, IllegalMove, JobState
 from loopwright.service.store import database as opening
 from loopwright.service.store import lock
 from loopwright.service.store.database import USUAL, BadDatabase, urgent

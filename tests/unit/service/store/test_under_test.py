@@ -4,7 +4,7 @@ from datetime import UTC, datetime, timedelta
 
 from sqlalchemy import update
 
-from loopwright.service.job_states import JobState
+from loopwright.service.states.job_state import JobState
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow
 from loopwright.service.store.under_test import times_under_test

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 
 from loopwright.tuning.analysis.margins import margins, ultimate_point
-from loopwright.tuning.gain_forms import to_reciprocal
-from loopwright.tuning.gains import Gains
+from loopwright.tuning.gains import Gains, to_reciprocal
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules import tyreus_luyben, ziegler_nichols

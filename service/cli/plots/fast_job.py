@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from loopwright.service.cli.plots.shown import Shown
 from loopwright.service.jobs.stored_record import StoredRecord
-from loopwright.service.plots.shown import Shown
 from loopwright.service.results import EvidenceView, GainsView
 from loopwright.tuning.analysis.assessment import assess
 from loopwright.tuning.analysis.step_response import step_response

@@ -7,7 +7,7 @@ import math
 import pytest
 from pydantic import ValidationError
 
-from loopwright.service.plots.shown import ShownSamples
+from loopwright.service.cli.plots.shown import ShownSamples
 
 COLUMNS = {"job": "x", "stage": ["relay"] * 2, "t_s": [0.0, 0.1], "sp": [50, 50], "mv": [40.0, 60.0], "mode": [3, 3]}
 

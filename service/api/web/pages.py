@@ -12,7 +12,7 @@ from starlette.responses import FileResponse, Response
 from starlette.staticfiles import StaticFiles
 from starlette.types import Scope
 
-from loopwright.service.web.compressed import TEXTS, compressed, takes_gzip
+from loopwright.service.api.web.compressed import TEXTS, compressed, takes_gzip
 
 FILES = Path(__file__).parent / "static"
 POLICY = "; ".join(

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from loopwright.tuning.gain_forms import (
+from loopwright.tuning.gains import (
+    Gains,
     Parallel,
     Series,
     of_parallel,
@@ -18,7 +19,6 @@ from loopwright.tuning.gain_forms import (
     to_reciprocal,
     to_series,
 )
-from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Reason, Refused
 from tests.unit.tuning.isa import response
 

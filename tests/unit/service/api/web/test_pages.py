@@ -15,10 +15,10 @@ from fastapi.testclient import TestClient
 
 from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
+from loopwright.service.api.web.compressed import TEXTS, compressed
+from loopwright.service.api.web.pages import FILES
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.keyring import Keyring
-from loopwright.service.web.compressed import TEXTS, compressed
-from loopwright.service.web.pages import FILES
 from tests.unit.service.fakes import TAG, Service
 
 VENDOR = FILES / "vendor"

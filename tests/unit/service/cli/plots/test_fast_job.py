@@ -8,9 +8,9 @@ from typing import Any, cast
 import pytest
 from matplotlib.figure import Figure
 
+from loopwright.service.cli.plots.fast_job import before_after
+from loopwright.service.cli.plots.shown import Shown
 from loopwright.service.inputs.model_json import parse_model
-from loopwright.service.plots.fast_job import before_after
-from loopwright.service.plots.shown import Shown
 
 
 @pytest.mark.parametrize("step", [0.1, -0.1, None])

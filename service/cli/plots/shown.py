@@ -7,8 +7,8 @@ from typing import Annotated, Protocol
 
 from pydantic import BaseModel, BeforeValidator
 
-from loopwright.service.job_states import JobState
 from loopwright.service.results import EvidenceView, GainsView, ModelView, TransferModelView, VerificationView
+from loopwright.service.states.job_state import JobState
 from loopwright.tuning.reasons import Reason
 
 

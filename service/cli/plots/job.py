@@ -8,8 +8,8 @@ from pathlib import Path
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from loopwright.service.cli.plots.shown import Shown, ShownSamples
 from loopwright.service.jobs.stored_record import stored_record
-from loopwright.service.plots.shown import Shown, ShownSamples
 from loopwright.service.results import DESIGNED
 
 LEAD_IN = 20
@@ -30,7 +30,7 @@ def job_picture(path: Path, samples: Samples, job: Shown, pv_unit: str) -> None:
     other job shows the set-point step before and after. Raises NoPicture.
     """
     if job.method in DESIGNED and (record := stored_record(samples(None).columns())) is not None:
-        from loopwright.service.plots.fast_job import fast_job
+        from loopwright.service.cli.plots.fast_job import fast_job
 
         fast_job(path, job, record, pv_unit)
         return
