@@ -71,6 +71,7 @@ from loopwright.service.security.principal import current
 from loopwright.service.states.job_state import ACTIVE, JobState
 from loopwright.service.store import decision_requests
 from loopwright.service.store.idempotency import IdempotencyKeys
+from loopwright.service.store.job_figures import with_record
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.live_jobs import acceptances, latest_jobs
 from loopwright.service.telemetry.lateness import watched_event_loop
@@ -150,9 +151,10 @@ def create_app(
         loops = {row.loop for row in rows}
         latest = latest_jobs(jobs.store, loops.pop() if len(loops) == 1 else None)
         asked = decision_requests.latest(jobs.store, [row.id for row in rows])
+        recorded = with_record(jobs.store, [row.id for row in rows])
         found = []
         for row in rows:
-            of_it = jobs.running(row.id), latest.get(row.loop), asked.get(row.id), elsewhere(row)
+            of_it = jobs.running(row.id), latest.get(row.loop), asked.get(row.id), elsewhere(row), row.id in recorded
             found.append(job_view(row, events[row.id], *of_it))
         return found
 

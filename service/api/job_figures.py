@@ -101,7 +101,7 @@ def router(jobs: Jobs, figures: KeptFigures) -> APIRouter:
         if found.record is None:
             events = await run_in_threadpool(jobs.store.events, job_id)
             deleted = any(event.kind == "samples_deleted" for event in events)
-            why = "its samples were deleted" if deleted else f"it ended as {row.state} before it had any samples"
+            why = "its samples were deleted" if deleted else f"it ended as {row.state} before its second sample"
             raise Conflict(f"job {job_id} has no record: {why}")
         return _record_view(row, found.record.thinned(points))
 

@@ -362,6 +362,10 @@ class JobView(BaseModel):
         description="Sampling period of the controller as the job found it, s; null: the job has not read the loop",
         examples=[0.1],
     )
+    record: Literal["kept", "deleted", "none"] = Field(
+        description="kept: `GET /jobs/ID/record` has the record of the job; deleted: its samples were deleted, the "
+        "result stays; none: the job is not over, or it ended before its second sample"
+    )
 
 
 class SamplesView(BaseModel):
@@ -429,11 +433,13 @@ def job_view(
     latest: JobInBrief | None = None,
     request: DecisionRequest | None = None,
     elsewhere: JobProgress | None = None,
+    has_record: bool = False,
 ) -> JobView:
     """The view of a job from its row and events, and from the live progress while it runs.
 
     latest: the latest job of the loop, without dry runs.  request: the latest decision asked at another gateway.
     elsewhere: how far the job has come on the gateway that runs it, where that is another one and has said so.
+    has_record: whether its samples are stored.
     """
     state = shown(row.state, row.dry_run)
     later = latest is not None and latest.id != row.id and state is JobState.PROPOSED
@@ -484,6 +490,7 @@ def job_view(
         superseded_by=f"/jobs/{latest.id}" if later and latest is not None else None,
         stopping=next((_stopping(event) for event in reversed(events) if event.kind == "abort_requested"), None),
         sample_time_s=None if row.found is None else number(row.found["sample_time_s"]),
+        record=_record(state, events, has_record),
     )
 
 
@@ -562,6 +569,12 @@ def _decided(events: Sequence[JobEvent]) -> DecidedView | None:
             what: Literal["accept", "rollback"] = "accept" if state == JobState.ACCEPTED else "rollback"
             return DecidedView(what=what, by=str(event.data.get("by", "")), at=event.at)
     return None
+
+
+def _record(state: JobState, events: Sequence[JobEvent], has_record: bool) -> Literal["kept", "deleted", "none"]:
+    if has_record and state not in ACTIVE:
+        return "kept"
+    return "deleted" if any(event.kind == "samples_deleted" for event in events) else "none"
 
 
 def _stopping(event: JobEvent) -> StoppingView:

@@ -223,7 +223,7 @@ class EventRow(Base):
 
 
 class ChunkRow(Base):
-    """A block of samples of one stage, see service.store.chunks for the layout of `data`."""
+    """A block of samples of one stage, see service.store.sample_blocks for the layout of `data`."""
 
     __tablename__ = "sample_chunks"
 

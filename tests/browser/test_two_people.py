@@ -7,6 +7,7 @@ from playwright.sync_api import Page, Route, expect
 
 from loopwright.protocol.profile import ParameterCommand
 from tests.browser import person
+from tests.browser.conftest import PACE
 from tests.browser.pages import Pages
 from tests.browser.site import TAG, Site
 
@@ -31,6 +32,38 @@ def test_the_test_of_one_is_seen_by_the_other(site: Site, pages: Pages, page: Pa
     for each in (page, other):
         expect(person.headline(each)).to_contain_text("Stopped: by an operator")
     assert site.is_home()
+
+
+def test_no_other_test_than_the_one_that_has_ended_is_shown(site: Site, pages: Pages, page: Page) -> None:
+    """Neither the result of the one before it, nor the record of one that ended before it had any."""
+    without_record(site)
+    person.open_loop(page)
+    expect(person.headline(page)).to_contain_text("Stopped: by an operator")
+    expect(page.get_by_role("region", name="Record")).to_have_count(0)
+    proposed(site)
+    expect(person.headline(page)).to_have_text("New gains are proposed")
+    site.write("plant_pace", 1.0)
+    url = site.retune()
+    person.in_stage(page, "Relay")
+    person.remember(page, "section[aria-label=Result] h2")
+    site.http.post(f"{url}/abort")
+    expect(person.headline(page)).to_contain_text("Stopped: by an operator")
+    assert len(person.remembered(page)) == 1
+
+
+def without_record(site: Site) -> None:
+    """A test of one sample: the abort comes while that is waited for."""
+    site.write("plant_pace", 0.05)
+    for _ in range(20):
+        url = site.retune()
+        site.until(url, lambda job: job["stage"] == "preflight")
+        site.http.post(f"{url}/abort")
+        job = site.finished(url)
+        if len(site.ask(f"{url}/samples")["t_s"]) == 1:
+            assert job["plant_time_s"] > 0.0 and job["record"] == "none"
+            site.write("plant_pace", PACE)
+            return
+    raise AssertionError("each of 20 tests had another sample before its end")
 
 
 def test_who_asks_too_late_is_shown_the_test_of_the_other(site: Site, pages: Pages) -> None:

@@ -308,7 +308,7 @@ def _no_record(source: ReportSource) -> str:
         return f"The record could not be evaluated: {source.not_computed}. GET /jobs/{source.job.id}/samples has it."
     if any(event.kind == "samples_deleted" for event in source.events):
         return "The samples of this job were deleted, as the service was told to."
-    return "There are no samples: the job ended before it had any."
+    return "There is no record: the job ended before its second sample."
 
 
 def _model_rows(source: ReportSource, pv_unit: str) -> list[Row]:

@@ -241,6 +241,7 @@ def test_the_record_goes_with_the_samples_and_the_designs_stay(tmp_path: Path) -
         assert delete_old_samples(here.store, RetentionPolicy(jobs=1)) == 1
         told = assert_problem(client.get(f"/jobs/{first}/record"), 409)["detail"]
         assert told == f"job {first} has no record: its samples were deleted"
+        assert client.get(f"/jobs/{first}").json()["record"] == "deleted"
         assert client.get(f"/jobs/{first}/designs").json() == designs
         assert client.get(f"/jobs/{second}/record").status_code == 200
         report = client.get(f"/jobs/{first}/report")
@@ -372,14 +373,18 @@ def test_a_job_without_them_says_why(service: Service, client: TestClient) -> No
     assert_problem(client.get("/jobs/none/designs"), 404)
     rehearsed = finished(service, client, dry_run=True)["id"]
     told = assert_problem(client.get(f"/jobs/{rehearsed}/record"), 409)["detail"]
-    assert told == f"job {rehearsed} has no record: it ended as rehearsed before it had any samples"
+    assert told == f"job {rehearsed} has no record: it ended as rehearsed before its second sample"
+    assert client.get(f"/jobs/{rehearsed}").json()["record"] == "none"
     service.tune.hold.clear()
     running = start(client)
     assert service.tune.inside.wait(20.0)
     for what in ("record", "designs", "report"):
         assert "is not over" in assert_problem(client.get(f"/jobs/{running}/{what}"), 409)["detail"]
+    assert client.get(f"/jobs/{running}").json()["record"] == "none"
     client.post(f"/jobs/{running}/abort")
     service.wait(running)
     assert client.get(f"/jobs/{running}/record").status_code == 200
+    listed = {each["id"]: each["record"] for each in client.get("/jobs").json()}
+    assert listed == {rehearsed: "none", running: "kept"}
     told = assert_problem(client.get(f"/jobs/{running}/designs"), 409)["detail"]
     assert told == f"job {running} ended as aborted before it had a model to compare methods on; the job says why"

@@ -181,7 +181,7 @@ def test_a_dry_run_and_a_job_that_never_began(service: Service, client: TestClie
     rehearsed = finished(service, client, dry_run=True)
     answer, document = report(client, rehearsed["id"])
     assert_self_contained(answer, document)
-    assert "Report of a dry run" in document.text and "There are no samples" in document.text
+    assert "Report of a dry run" in document.text and "There is no record" in document.text
     service.controller.absent = Reason.NODE_LOST
     lost = finished(service, client)
     answer, document = report(client, lost["id"])

@@ -83,10 +83,13 @@ export function LoopView({ tag }) {
   const onJob = (/** @type {any} */ event) => {
     if (["stage_started", "stage_done", "note", "resumed", "state"].includes(event.kind)) void ask(`/jobs/${event.job}`).then((found) => {
       if (["queued", "running"].includes(found.state)) setRunning(found);
+      else if (rowOf(tag).peek()?.last_job?.url === found.url) setResult(found);
     }, () => {});
   };
   const formOpen = !job && (open ?? (result === null && may.operate.value));
   const mine = (abnormalNow.value ?? []).filter((each) => each.loops.includes(tag));
+  // A test that has just ended is not shown with the result of the one before it.
+  const isLatest = !row?.last_job || row.last_job.url === result?.url;
   const height = TREND_PX;
   return html`<div>
     <div class="looptitle" key="title"><h1 class="tag">${tag}</h1><span class="what">${loop.description}</span>
@@ -105,7 +108,8 @@ export function LoopView({ tag }) {
         <${Trend} key="trend" loop=${loop} job=${job} height=${height} onJob=${onJob} />
         ${formOpen && html`<${RetuneForm} key="form" loop=${loop} onClose=${result ? () => { setOpen(false); focusOpener(); } : null} onStarted=${() => setOpen(false)} />`}
         ${job && html`<${UnderTest} key="test" loop=${loop} live=${job} job=${running?.id === job.id ? running : null} />`}
-        ${!job && result && html`<${Result} key=${`result ${result.id}`} loop=${loop} detail=${detail} job=${result} quiet=${formOpen} onChanged=${setResult} />`}
+        ${!job && result && !isLatest && html`<p key="asking" class="quiet" role="status">Asking for the result…</p>`}
+        ${!job && result && isLatest && html`<${Result} key=${`result ${result.id}`} loop=${loop} detail=${detail} job=${result} quiet=${formOpen} onChanged=${setResult} />`}
       </div>
     </div>
   </div>`;

@@ -24,7 +24,8 @@ export function Result({ loop, detail, job, quiet = false, own = false, onChange
     ${job.superseded_by && html`<p class="refusal" key="later">A later test came: <a href=${jobPath(job.superseded_by)}>its result</a>.</p>`}
     ${job.new_gains && html`<${Choice} key="choice" loop=${loop} detail=${detail} job=${job} latest=${latest} quiet=${quiet} onChanged=${onChanged} />`}
     ${!["fast", "setpoint"].includes(job.method) || own ? html`<div class="card" key="stages" style=${{ marginTop: "16px" }}><h2 class="title">Stages</h2>${Stages(job, loop.pv_unit)}</div>` : null}
-    ${!job.dry_run && job.plant_time_s > 0 && html`<${Record} key="record" loop=${loop} job=${job} />`}
+    ${job.record === "kept" && html`<${Record} key="record" loop=${loop} job=${job} />`}
+    ${job.record === "deleted" && html`<p key="deleted" class="quiet">The samples of this test were deleted as old ones are; its result stays.</p>`}
     ${Numbers(loop, job)}
     ${job.notes.length > 0 && html`<div class="card" key="notes"><h2 class="title">Notes</h2>${job.notes.map((/** @type {string} */ each) => html`<p key=${each}>${sentence(each)}</p>`)}</div>`}
   </section>`;
