@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 
 import pytest
@@ -18,6 +18,7 @@ from playwright.sync_api import Page, expect
 from loopwright.protocol.profile import channel_ids
 from tests.browser import person, trend
 from tests.browser.site import TAG, Site
+from tests.e2e.plantsite import STAGES
 from tests.faults.faulty_hub import FaultyHub, well
 from tests.unit.service import processes
 
@@ -26,6 +27,8 @@ WINDOW_S = 30.0
 AGE = re.compile(r"^\d.* old$")
 SHORT_S = 1.5
 """Shorter than the silence after which values count as old."""
+SLOW = 0.2
+"""The pace at which a single sample can be seen: four a second."""
 
 
 @pytest.fixture
@@ -63,27 +66,27 @@ def watched(page: Page) -> None:
     until(page, lambda: len(trend.columns(page)[0]) > 0 and empty_at_the_right(page) < 0.02)
 
 
-def one_gap(page: Page) -> float:
+def one_gap(page: Page, window_s: float = WINDOW_S) -> float:
     """The width of the only gap, s, once the trend goes on behind it."""
-    until(page, lambda: empty_at_the_right(page) < 0.02 and len(trend.gaps(page, WINDOW_S)) == 1)
-    [gap] = trend.gaps(page, WINDOW_S)
+    until(page, lambda: empty_at_the_right(page) < 0.02 and len(trend.gaps(page, window_s)) == 1)
+    [gap] = trend.gaps(page, window_s)
     return gap.seconds
 
 
-def seen_later(page: Page) -> None:
+def seen_later(page: Page, window: str = "30 s", window_s: float = WINDOW_S) -> None:
     """The history has the gap, too."""
     page.reload()
-    page.get_by_role("button", name="30 s").click()
-    until(page, lambda: len(trend.gaps(page, WINDOW_S)) == 1)
+    page.get_by_role("button", name=window).click()
+    until(page, lambda: len(trend.gaps(page, window_s)) == 1)
     assert TAG in page.title()
 
 
-def is_old(page: Page) -> None:
+def is_old(page: Page, pv: str | re.Pattern[str] = "50.000") -> None:
     """The values of the loop's page are those of before."""
     face = person.face(page)
     expect(face.locator(".age")).to_have_text(AGE)
     expect(face).to_have_class(re.compile(r"\bold\b"))
-    expect(face.locator(".big")).to_have_text("50.000")
+    expect(face.locator(".big")).to_have_text(pv)
 
 
 def test_the_plant_is_started_anew(site: Site, page: Page) -> None:
@@ -130,6 +133,41 @@ def test_the_plant_stops_and_then_the_bus_goes_and_comes_back(site: Site, page: 
     expect(start).to_be_enabled()
 
 
+def test_the_bus_goes_and_comes_back_while_its_trend_is_watched(site: Site, page: Page) -> None:
+    main, down = page.get_by_role("main"), f"Bus {site.bus} is down"
+    watched(page)
+    site.hub.kill()
+    expect(main).to_contain_text(down)
+    is_old(page)
+    until(page, lambda: empty_at_the_right(page) > 0.12)
+    assert trend.gaps(page, WINDOW_S) == []  # nor is anything drawn of the time since
+    age_s = person.number(person.face(page).locator(".age").text_content())
+    site.start_hub()
+    expect(person.present(page).locator(".big")).to_have_text("50.000")
+    expect(main).not_to_contain_text(down)
+    expect(page.get_by_text("Nothing abnormal")).to_be_visible()
+    page.get_by_role("button", name="2 min").click()
+    assert one_gap(page, 120.0) > max(3.0, age_s)
+    seen_later(page, "2 min", 120.0)
+
+
+def test_the_bus_goes_in_a_test_and_comes_back(site: Site, page: Page) -> None:
+    site.write("plant_pace", 2.0)
+    person.open_loop(page)
+    job = site.in_stage(STAGES["fast-relay"])
+    person.in_stage(page, "Relay")
+    site.hub.kill()
+    expect(page.get_by_role("main")).to_contain_text(f"Bus {site.bus} is down")
+    is_old(page, re.compile(r"\d"))
+    expect(person.headline(page)).to_contain_text("Failed:")
+    assert site.job(job)["state"] == "failed"
+    site.start_hub()
+    site.at_rest(1.0)
+    expect(person.present(page).locator(".big")).to_have_text("50.000")
+    page.get_by_role("button", name="2 min").click()
+    assert one_gap(page, 120.0) > 3.0
+
+
 class TestFramesLost:
     @pytest.fixture
     def hub(self) -> Iterator[FaultyHub]:
@@ -158,3 +196,29 @@ class TestFramesLost:
         expect(page.get_by_text("Nothing abnormal")).to_be_visible()
         expect(person.present(page).locator(".big")).to_have_text("50.000")
         seen_later(page)
+
+    def test_one_frame_that_is_lost_in_a_test_is_a_gap_and_the_test_goes_on(
+        self, hub: FaultyHub, site: Site, page: Page
+    ) -> None:
+        site.write("plant_pace", SLOW)
+        person.open_loop(page)
+        job = site.in_stage(STAGES["fast-relay"])
+        person.in_stage(page, "Relay")
+        page.get_by_role("button", name="30 s").click()
+        until(page, lambda: len(trend.columns(page)[0]) > 0 and empty_at_the_right(page) < 0.1)
+        assert trend.gaps(page, WINDOW_S) == []
+        pv, lost = channel_ids(1)[0], list[int]()
+
+        def once(can_id: int) -> Sequence[float]:
+            if can_id != pv or lost:
+                return (0.0,)
+            lost.append(can_id)
+            return ()
+
+        hub.fault = once
+        assert one_gap(page) > 1.2 * site.case.ts / SLOW  # from the sample before to the one behind: two sample times
+        expect(person.under_test(page)).to_be_visible()
+        expect(page.get_by_text("Nothing abnormal")).to_be_visible()
+        assert site.job(job)["state"] == "running"
+        site.http.post(f"{job}/abort")
+        site.finished(job)
