@@ -82,7 +82,7 @@ export function duration(seconds) {
 /** A sampling period: 50 ms, 0.25 s. @param {number | null | undefined} seconds */
 export function period(seconds) {
   if (!known(seconds)) return DASH;
-  return seconds < 0.2 ? `${significant(seconds * 1000, 3)}${NARROW}ms` : `${significant(seconds, 3)}${NARROW}s`;
+  return seconds < 0.2 ? `${Number((seconds * 1000).toPrecision(3))}${NARROW}ms` : `${Number(seconds.toPrecision(3))}${NARROW}s`;
 }
 
 /** @param {number} value */

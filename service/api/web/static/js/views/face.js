@@ -35,11 +35,11 @@ function Scales(loop, pv, sp, mv) {
   return html`<svg class="scales" key="scales" viewBox="0 0 250 200" aria-hidden="true">
     ${names.map((value) => html`<g key=${value}><text x="56" y=${y(value) + 4} text-anchor="end">${tick(value, distance / 10)}</text><path d=${`M60 ${y(value)}h6`} class="s-line" /></g>`)}
     <rect x="72" y="10" width="20" height="180" class="f-well s-line" />
-    ${pv === null ? Hatch(72, 100, 20, 20) : null}
+    ${pv === null ? Hatch(72, 10, 20, 180) : null}
     ${sp !== null && html`<g key="sp"><rect x="72.5" y=${y(sp + loop.sp_deviation)} width="19" height=${Math.max(0, y(sp - loop.sp_deviation) - y(sp + loop.sp_deviation))} class="f-good" /><path d=${`M94 ${y(sp)}l10 -5v10z`} class="s-ink" /></g>`}
     ${pv !== null && html`<g key="pv"><path d=${`M72 ${y(pv)}h20`} class="s-live" stroke-width="2" /><path d=${`M71 ${y(pv)}l-11 -6v12z`} class="f-live" /></g>`}
     <rect x="160" y="10" width="20" height="180" class="f-well s-line" />
-    ${mv === null ? Hatch(160, 100, 20, 20) : html`<rect x="160.5" y=${m(mv)} width="19" height=${190 - m(mv)} class="f-mv" />`}
+    ${mv === null ? Hatch(160, 10, 20, 180) : html`<rect x="160.5" y=${m(mv)} width="19" height=${190 - m(mv)} class="f-mv" />`}
     <path d=${`M156 ${m(loop.mv_limits.high)}h28M156 ${m(loop.mv_limits.low)}h28`} class="s-ink" />
     ${[100, 50, 0].map((value) => html`<g key=${value}><path d=${`M184 ${m(value)}h6`} class="s-line" /><text x="194" y=${m(value) + 4}>${value}</text></g>`)}
   </svg>`;

@@ -9,7 +9,7 @@ import { known, ms, period, pvDecimals, fixed, significant, unit, when } from ".
 import { jobPath } from "../router.js";
 import { isSilent, jobs, loops, loopsError, may, rowOf } from "../state.js";
 import { AlarmSymbol } from "../symbols.js";
-import { stateWords } from "../words.js";
+import { sentence, stateWords } from "../words.js";
 import { Face } from "./face.js";
 import { dockLoop } from "./frame.js";
 import { Known } from "./known.js";
@@ -100,7 +100,7 @@ export function LoopView({ tag }) {
     ${mine.map((each) => html`<div class="abnormal" key=${each.id}>${AlarmSymbol(each.level)}<span><b>${each.text}.</b> <span class="quiet">${each.advice}</span></span>${SignOffButton(each)}
       ${asking.value === each.id && html`<${SignOffQuestion} key="question" alarm=${each} />`}</div>`)}
     ${elsewhere && row?.not_heard && !isSilent.value && !mine.some((each) => each.kind === "gateway_silent") && html`<p class="refusal" key="gateway" role="status"><b>${row.not_heard}.</b></p>`}
-    ${detail?.not_confirmed_home && html`<p class="refusal" key="home"><b>${detail.not_confirmed_home.detail}</b> ${detail.not_confirmed_home.advice}</p>`}
+    ${detail?.not_confirmed_home && html`<p class="refusal" key="home">${sentence(detail.not_confirmed_home.advice)}</p>`}
     ${loop.locked && html`<p class="refusal" key="lock">Locked by ${loop.locked.by} since ${when(loop.locked.since)}: ${loop.locked.reason}. Tests and decisions wait until it is unlocked.</p>`}
     <div class="loop" key="loop">
       <aside key="aside"><${Face} key="face" loop=${loop} />${Settings(loop, detail)}<${Known} key="known" loop=${loop} detail=${detail} />${Tests(tests)}</aside>
@@ -131,7 +131,7 @@ function Settings(loop, detail) {
     ${gains ? html`<dl class="pairs" key="gains"><dt>Kp</dt><dd>${significant(gains.Kp)} <span class="quiet">%/${u}</span></dd><dt>Ti</dt><dd>${gains.Ti ? significant(gains.Ti) : "off"} <span class="quiet">s</span></dd>
       ${gains.Td > 0 && html`<dt key="td">Td</dt><dd key="tdv">${significant(gains.Td)} <span class="quiet">s</span></dd>`}
       <dt>action</dt><dd>${live.reverse_acting ? "reverse" : "direct"}</dd><dt>sampled</dt><dd>every ${period(live.sample_time_s)}</dd></dl>`
-    : html`<p key="none" class="quiet">${detail?.live_error ? `${detail.live_error.detail}. ${detail.live_error.advice}` : detail ? "not known here" : "reading…"}</p>`}
+    : html`<p key="none" class="quiet">${detail?.live_error ? `${sentence(detail.live_error.detail)} ${detail.live_error.advice}` : detail ? "not known here" : "reading…"}</p>`}
     ${loop.gains_differ && loop.accepted && html`<p class="note" key="differ">Accepted last: Kp ${significant(loop.accepted.gains.Kp)}, Ti ${significant(loop.accepted.gains.Ti)} s, by ${loop.accepted.by}, ${when(loop.accepted.at)}.</p>`}
     <h2 class="title" key="t2">Permitted</h2>
     <dl class="pairs" key="limits"><dt>PV</dt><dd>${fixed(loop.pv_limits.low, decimals)} … ${fixed(loop.pv_limits.high, decimals)} <span class="quiet">${u}</span></dd>

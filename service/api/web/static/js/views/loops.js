@@ -165,10 +165,13 @@ function MvBar(loop, mv) {
     <path d=${`M${1 + low * 0.56} 0v14M${1 + high * 0.56} 0v14`} class="s-ink" /></svg>`;
 }
 
-/** @param {number} x @param {number} y @param {number} w @param {number} h */
+/** Rising lines, 6 apart, over a rectangle. @param {number} x @param {number} y @param {number} w @param {number} h */
 export function Hatch(x, y, w, h) {
   let d = "";
-  for (let at = x; at < x + w; at += 6) d += `M${at} ${y + h}l${Math.min(h, x + w - at)} ${-h}`;
+  for (let at = 6 - h; at < w; at += 6) {
+    const [from, to] = [Math.max(0, at), Math.min(w, at + h)]; // of a line that leaves the foot at `at`
+    d += `M${x + from} ${y + h - (from - at)}l${to - from} ${from - to}`;
+  }
   return html`<path d=${d} class="s-line" />`;
 }
 

@@ -1,7 +1,7 @@
 // @ts-check
 /** The result of a job: headline, how far to trust it, before and after, what the loop is now, the record. */
 import { html } from "../html.js";
-import { duration, fixed, known, ms, msError, significant, unit, when, withError, withUnit } from "../numbers.js";
+import { duration, fixed, known, ms, msError, pvDecimals, significant, unit, when, withError, withUnit } from "../numbers.js";
 import { jobPath } from "../router.js";
 import { headline, methodName, sentence } from "../words.js";
 import { Choice } from "./choice.js";
@@ -20,7 +20,7 @@ export function Result({ loop, detail, job, quiet = false, own = false, onChange
       <p class="facts">${when(job.ended_at ?? job.created_at)} · ${job.requested_by} · ${methodName(job.method)} · ${duration(job.plant_time_s)} of plant time<br />
         ${job.decided && html`${job.decided.what === "accept" ? "accepted" : "old gains kept"} by ${job.decided.by}, ${when(job.decided.at)} · `}
         <a href=${`${job.url}/report`} target="_blank">Report</a><a href=${`${job.url}/samples?format=csv`} target="_blank">Samples</a>${!own && html`<a href=${jobPath(job.url)}>job ${job.id}</a>`}</p></div>
-    ${job.reason && html`<div class="card" key="why"><p>${sentence(job.detail)}</p><p class="advice">${job.advice}</p>${After(job)}</div>`}
+    ${job.reason && html`<div class="card" key="why"><p>${sentence(job.detail)}</p><p class="advice">${job.advice}</p>${After(loop, job)}</div>`}
     ${job.superseded_by && html`<p class="refusal" key="later">A later test came: <a href=${jobPath(job.superseded_by)}>its result</a>.</p>`}
     ${job.new_gains && html`<${Choice} key="choice" loop=${loop} detail=${detail} job=${job} latest=${latest} quiet=${quiet} onChanged=${onChanged} />`}
     ${!["fast", "setpoint"].includes(job.method) || own ? html`<div class="card" key="stages" style=${{ marginTop: "16px" }}><h2 class="title">Stages</h2>${Stages(job, loop.pv_unit)}</div>` : null}
@@ -44,11 +44,11 @@ function trustWords(job) {
   return parts.length ? parts : null;
 }
 
-/** What the loop is now. @param {any} job */
-function After(job) {
+/** What the loop is now. @param {any} loop @param {any} job */
+function After(loop, job) {
   const r = job.restored;
   if (!r) return html`<p><b>The loop could not be read back: look at the controller.</b></p>`;
-  return html`<p class="quiet">The loop is in ${r.mode}, set-point ${significant(r.sp, 6)}${r.gains ? `, Kp ${significant(r.gains.Kp)}, Ti ${significant(r.gains.Ti)} s` : ""}, read back.</p>`;
+  return html`<p class="quiet">The loop is in ${r.mode}, set-point ${withUnit(fixed(r.sp, pvDecimals(loop.pv_limits)), unit(loop.pv_unit))}${r.gains ? `, Kp ${significant(r.gains.Kp)}, Ti ${significant(r.gains.Ti)} s` : ""}, read back.</p>`;
 }
 
 /** @param {any} loop @param {any} job */
@@ -66,7 +66,7 @@ function Numbers(loop, job) {
   for (const [name, value] of Object.entries(job.chosen)) rows.push([name, significant(Number(value))]);
   if (job.before) rows.push(["step before", `overshoot ${fixed(job.before.overshoot_pct, 0)} %, ${job.before.settled ? `settled in ${duration(job.before.settling_s)}` : "not settled"}`]);
   if (job.after) rows.push(["step after", `overshoot ${fixed(job.after.overshoot_pct, 0)} %, ${job.after.settled ? `settled in ${duration(job.after.settling_s)}` : "not settled"}`]);
-  if (job.restored && !job.reason) rows.push(["loop afterwards", `${job.restored.mode}, SP ${significant(job.restored.sp, 6)}, read back`]);
+  if (job.restored && !job.reason) rows.push(["loop afterwards", `${job.restored.mode}, SP ${withUnit(fixed(job.restored.sp, pvDecimals(loop.pv_limits)), u)}, read back`]);
   rows.push(["gateway", job.host]);
   return html`<div class="card" key="numbers"><h2 class="title">Numbers</h2><dl class="numbers">${rows.map(([name, value]) => html`<div key=${name}><dt>${name}</dt><dd>${value}</dd></div>`)}</dl></div>`;
 }
