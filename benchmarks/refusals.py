@@ -125,7 +125,7 @@ def cases() -> dict[str, Case]:
 
 @dataclass
 class Pictured:
-    """A job as its picture needs it (`service.plots.shown`), with its samples as columns."""
+    """A job as its picture needs it (`service.cli.plots.shown`), with its samples as columns."""
 
     loop: str
     state: JobState

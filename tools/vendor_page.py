@@ -1,5 +1,5 @@
-"""Writes the libraries of the operators' page into service/web/static/vendor, and what the tests in a browser use into
-tests/browser/vendor: `python tools/vendor_page.py`.
+"""Writes the libraries of the operators' page into service/api/web/static/vendor, and what the tests in a browser use
+into tests/browser/vendor: `python tools/vendor_page.py`.
 
 Needs `npm pack`. The packages have to be the ones named here, byte by byte. The result is committed; tests compare the
 files with VERSIONS beside them.
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-OF_THE_PAGE = ROOT / "service/web/static/vendor"
+OF_THE_PAGE = ROOT / "service/api/web/static/vendor"
 OF_THE_TESTS = ROOT / "tests/browser/vendor"
 
 

@@ -483,7 +483,7 @@ def _block(row: ChunkRow) -> sample_blocks.Block:
 
 
 def is_shown_as(state: JobState) -> ColumnElement[bool]:
-    """As `service.job_states.shown` has it."""
+    """As `service.states.job_state.shown` has it."""
     stored = JobRow.state == state.value
     if state is JobState.PROPOSED:
         return stored & JobRow.dry_run.is_(False)
