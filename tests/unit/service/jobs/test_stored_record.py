@@ -114,7 +114,7 @@ def test_the_sign_of_the_gain_where_the_first_pulse_is_over_before_pv_answers(ga
         answer = decay * answer + (1.0 - decay) * gain * mv[i - dead_time]
     record = stored_record(
         {
-            "stage": ["preflight"] * 100 + ["manual"] * (len(mv) - 100), "t_s": 0.1 * np.arange(len(mv)),
+            "stage": ["preflight"] * 100 + ["manual"] * (len(mv) - 100), "t_s": np.arange(len(mv)) / 10.0,
             "sp": np.zeros(len(mv)), "pv": 40.0 + pv, "mv": 50.0 + mv, "mode": [int(Mode.MANUAL)] * len(mv),
         }
     )  # fmt: skip
