@@ -193,7 +193,8 @@ def _buses(known: AlarmFacts) -> Iterator[Condition]:
     for bus in known.buses:
         if bus.why is None:
             continue
-        text, advice = f"Bus {bus.url} is down: {bus.why}", _BUS_ADVICE
+        why = bus.why.replace(f"bus '{bus.url}' ", "it ", 1)
+        text, advice = f"Bus {bus.url} is down: {why}", _BUS_ADVICE
         if bus.why.startswith("the listening process"):
             text, advice = f"Bus {bus.url} is not heard: {bus.why}", _EAR_ADVICE
         yield Condition(

@@ -110,6 +110,12 @@ def test_a_bus_that_is_down_is_one_alarm_which_names_its_loops() -> None:
     assert (alarm.since, alarm.to_sign) == (AT, False)
 
 
+def test_an_error_that_names_the_bus_names_it_once() -> None:
+    known = facts(buses=(BusFacts(BUS, f"bus '{BUS}' cannot be opened: no such device", T0),))
+    _, (alarm,) = steps(known, 0.0, 3.0)
+    assert alarm.text == f"Bus {BUS} is down: it cannot be opened: no such device"
+
+
 def test_a_bus_that_only_the_listening_process_has_lost_says_so() -> None:
     known = facts(buses=(BusFacts(BUS, "the listening process has died", T0),))
     (found,) = conditions(known)
