@@ -76,13 +76,13 @@ export function Dock() {
   const shown = own ? [own] : all.slice(0, MOST);
   const more = all.length - shown.length;
   return html`<section class=${`dock ${shown.length > 1 ? "many" : ""}`} aria-label="Tests under way">
-    ${shown.map((job) => html`<${Cell} key=${job.id} job=${job} />`)}
-    ${more > 0 && html`<a key="more" href="/ui/">${more} more under test</a>`}
+    ${shown.map((job) => html`<${Cell} key=${job.id} job=${job} more=${own ? more : 0} />`)}
+    ${!own && more > 0 && html`<a key="more" href="/ui/">${more} more under test</a>`}
   </section>`;
 }
 
-/** @param {{job: any}} props */
-function Cell({ job }) {
+/** @param {{job: any, more: number}} props  more: tests that have no cell; nothing stands beside the button at the right. */
+function Cell({ job, more }) {
   const stopping = job.stopping || aborting.value.has(job.id);
   const error = abortError.value.get(job.id);
   const left = isSilent.value ? "" : stopping ? "" : job.remaining_plant_time_s === null ? "" : `${duration(job.remaining_plant_time_s)} left`;
@@ -92,6 +92,7 @@ function Cell({ job }) {
     <span class="stage" aria-live="polite">${stage}</span>
     ${Progress(job.progress, stopping)}
     <span>${left}</span>
+    ${more > 0 && html`<a key="more" href="/ui/">${more} more under test</a>`}
     ${error && html`<b role="alert">${error}</b>`}
     ${may.operate.value && html`<button class="abort" disabled=${stopping} onClick=${() => abortJob(job)}>${stopping ? "Aborting…" : html`Abort ${job.loop}`}</button>`}
   </div>`;

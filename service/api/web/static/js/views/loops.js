@@ -11,7 +11,7 @@ import { go, loopPath } from "../router.js";
 import { buses, isSilent, jobs, loops, loopsError, now_s, rowOf } from "../state.js";
 import { AlarmSymbol, DecisionSign, TestSign } from "../symbols.js";
 import { ageWords, valuesOf } from "../values.js";
-import { modeWord, reasonWords, stageName } from "../words.js";
+import { modeWord, reasonWords, stageName, sentence } from "../words.js";
 import { Progress } from "./frame.js";
 
 const find = signal("");
@@ -89,7 +89,7 @@ export function LoopsView() {
         ${groups.size > 1 || name ? html`<tr class="area" key="area"><th colspan="11" scope="rowgroup">${name || "No area"}</th></tr>` : null}
         ${members.map((loop) => html`<${Row} key=${loop.tag} loop=${loop} />`)}</tbody>`)}
     </table></div>` : html`<p class="calm" key="none">${onlyLook.value && !find.value ? "Nothing needs a look." : "No loop is found by this."}</p>`}
-    ${buses.value.filter((each) => each.up === false).map((each) => html`<p class="busline" key=${`${each.host} ${each.bus}`}>${AlarmSymbol(2)}<span>Bus <b>${each.bus}</b>${isElsewhere(each) ? ` of gateway ${each.host}` : ""} is down, opening it again every 2 s. <span class="quiet">${each.why}</span></span></p>`)}
+    ${buses.value.filter((each) => each.up === false).map((each) => html`<p class="busline" key=${`${each.host} ${each.bus}`}>${AlarmSymbol(2)}<span>Bus <b>${each.bus}</b>${isElsewhere(each) ? ` of gateway ${each.host}` : ""} is down, opening it again every 2 s. <span class="quiet">${sentence(each.why ?? "")}</span></span></p>`)}
   </div>`;
 }
 
@@ -114,7 +114,7 @@ function Row({ loop }) {
   const outside = pv !== null && !old && (pv < loop.pv_limits.low || pv > loop.pv_limits.high);
   return html`<tr class=${`row ${atRow.value === loop.tag ? "at" : ""} ${old ? "old" : ""}`} data-tag=${loop.tag} onClick=${(/** @type {MouseEvent} */ e) => { if (!(/** @type {Element} */ (e.target).closest("a"))) go(loopPath(loop.tag)); }}>
     <td class="sign">${alarm ? AlarmSymbol(alarm.level) : job ? TestSign() : waits(loop) ? DecisionSign() : null}</td>
-    <td class="name"><a class="tag" href=${loopPath(loop.tag)}>${loop.tag}</a><small>${alarm ? html`<b>${alarm.text}</b>` : loop.description}</small></td>
+    <td class="name"><a class="tag" href=${loopPath(loop.tag)}>${loop.tag}</a><small>${alarm ? html`<b>${alarm.text.split(": ")[0]}</b>` : loop.description}</small></td>
     <td class="num"><span class=${`pvnum ${outside ? "outside" : ""}`}>${fixed(pv, decimals)}</span><span class="name-below">${unit(loop.pv_unit)}</span>${old && html`<small key="age" class="age">${ageWords(values)}</small>`}</td>
     <td class="unit">${unit(loop.pv_unit)}</td>
     <td class="c-limits">${PvBar(loop, old ? null : pv, sp)}</td>
