@@ -13,6 +13,8 @@ from typing import Any
 
 import yaml
 
+from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, ParameterCommand
+from loopwright.protocol.tuner import Tuner
 from loopwright.service.cli.child_process import ChildProcess
 from tests.browser.site import Site, free_port
 
@@ -85,6 +87,17 @@ class Fleet(Site):
         file = self._folder / f"{name}.yaml"
         file.write_text(yaml.safe_dump(rows))
         return file
+
+    def change_gains(self, tag: str, kp: float, ti: float) -> None:
+        """By hand, at the controller."""
+        tuner = Tuner(self.bus, CONTROLLER_NODE, PLANT_NODE, self.channel(tag))
+        try:
+            tuner.write("controller_staged_kp", kp)
+            tuner.write("controller_staged_ti", ti)
+            tuner.write("controller_parameter_command", ParameterCommand.TRY)
+            tuner.write("controller_parameter_command", ParameterCommand.ACCEPT)
+        finally:
+            tuner.close()
 
     def pace(self, pace: float) -> None:
         """Of the plant of all loops, in plant time for real time."""

@@ -31,10 +31,14 @@ LOW = {"width": 1440, "height": 480}
 SMALL = {"width": 720, "height": 440}
 TALL = {"width": 1440, "height": 1500}
 PHONE = {"width": 390, "height": 844}
-COLOURS = 256
-"""Of a picture: the most frequent ones, which are those of the page."""
+PATIENCE_S = 600.0
+"""A busy machine computes slowly, and the plants do not wait for it."""
+COLOURS, VIVID = 256, 48
+"""Of a picture: the most frequent ones, which are those of the page, and of what is vivid, which is rare, as many."""
 OUTSIDE = MappingProxyType({"pv_limits": {"low": 50.2, "high": 52.0}})
 RESULT, WAITS, REFUSED, ACCEPTED = "TIC-101", "TIC-310", "FIC-220", ("PIC-110", "FIC-120")
+CHANGED = ACCEPTED[0]
+"""Its gains are changed by hand at the controller."""
 UNDER_TEST = "TIC-102", "TIC-201"
 FLEET = (
     Member(RESULT, "Distillation", "Reboiler outlet temperature", "degC"),
@@ -80,7 +84,9 @@ class Photographer:
         file = self._folder / f"{name}.png"
         whole = Image.open(io.BytesIO(picture)).convert("RGB")
         counted = cast(list[tuple[int, tuple[int, ...]]], whole.getcolors(whole.width * whole.height))
-        found = sorted(counted, reverse=True)[:COLOURS]
+        frequent = sorted(counted, reverse=True)
+        vivid = [each for each in frequent if max(each[1]) - min(each[1]) > 100][:VIVID]
+        found = vivid + [each for each in frequent if each not in vivid][: COLOURS - len(vivid)]
         palette = Image.new("P", (1, 1))
         palette.putpalette([part for _, colour in found for part in colour])
         whole.quantize(palette=palette, dither=Image.Dither.NONE).save(file, optimize=True)
@@ -92,15 +98,16 @@ def prepare(fleet: Fleet) -> dict[str, str]:
     fleet.pace(3.0)
     jobs = {tag: fleet.retune(tag, requested_by="M. Weber") for tag in (*ACCEPTED, "QIC-210", WAITS)}
     for tag in ACCEPTED:
-        assert fleet.finished(jobs[tag])["state"] == "proposed"
+        assert fleet.finished(jobs[tag], PATIENCE_S)["state"] == "proposed"
         assert fleet.http.post(f"{jobs[tag]}/accept", json={"by": "A. Lind"}).status_code == 200
     for tag in ("QIC-210", WAITS):
-        fleet.finished(jobs[tag])
+        fleet.finished(jobs[tag], PATIENCE_S)
     fleet.http.post(f"{jobs['QIC-210']}/rollback", json={"by": "A. Lind"})
+    fleet.change_gains(CHANGED, 55.0, 3.0)
     fleet.pace(1.0)
     jobs |= {tag: fleet.retune(tag, requested_by="M. Weber") for tag in (REFUSED, RESULT)}
     for tag in (REFUSED, RESULT):
-        fleet.finished(jobs[tag])
+        fleet.finished(jobs[tag], PATIENCE_S)
     for tag in jobs:
         fleet.http.get(f"{jobs[tag]}/designs", timeout=600.0)  # returns once the figures of the job are stored
     return jobs
