@@ -102,12 +102,15 @@ def of_test(
 
 def of_trial(job: Job, findings: Sequence[Known], at: datetime) -> Finding | None:
     """What an accepted trial of gains has shown, which were designed on the model of an earlier finding; None where no
-    finding that is in effect has the model."""
+    finding that is in effect has the model, or gives the gains the same Ms: a later look at the history may have taken
+    the place of the one whose model it was."""
     found = job.result
     if not isinstance(found, FastResult) or found.model is None or not found.model.typed_in or found.new_gains is None:
         return None
     model, gains = found.model, found.new_gains
-    base = next((each.finding for each in reversed(findings) if not each.older_plant and _same(each, model)), None)
+    in_effect = [each.finding for each in reversed(findings) if not each.older_plant]
+    base = next((each for each in in_effect if _same(each.model, model)), None)
+    base = base or next((each for each in in_effect if _same_Ms(each, model, gains.gains())), None)
     if base is None:
         return None
     known = Ms_of(base, gains.gains(), SAME_GAINS)
@@ -122,9 +125,14 @@ def of_trial(job: Job, findings: Sequence[Known], at: datetime) -> Finding | Non
     )
 
 
-def _same(known: Known, model: TransferModelView) -> bool:
-    other = known.finding.model
-    return (other.num, other.den, other.dead_time_s) == (model.num, model.den, model.dead_time_s)
+def _same(one: TransferModelView, other: TransferModelView) -> bool:
+    return (one.num, one.den, one.dead_time_s) == (other.num, other.den, other.dead_time_s)
+
+
+def _same_Ms(finding: Finding, model: TransferModelView, gains: Gains) -> bool:
+    """Whether a finding gives gains the Ms that they have on a model, within the uncertainty of the finding."""
+    Ms, on_model = (_Ms_on(_sampled(each, finding.sampling_delay_s), gains) for each in (finding.model, model))
+    return Ms is not None and on_model is not None and abs(Ms - on_model) <= _largest(finding)
 
 
 def _range(found: tuple[float, float] | None) -> RangeView | None:
@@ -176,10 +184,8 @@ def Ms_of(finding: Finding, gains: Gains, tolerance: float = 0.0) -> KnownMsView
     found = _found_with(finding, gains)
     if found is not None:
         return KnownMsView(Ms=found.Ms, uncertainty=found.uncertainty)
-    model = finding.model
-    plant = TransferFunction(tuple(model.num), tuple(model.den), model.dead_time_s + finding.sampling_delay_s)
     close = (each.uncertainty for each in _both(finding) if tolerance and _close(each.gains.gains(), gains, tolerance))
-    Ms = _Ms_on(plant, gains)
+    Ms = _Ms_on(_sampled(finding.model, finding.sampling_delay_s), gains)
     return KnownMsView(Ms=Ms, uncertainty=None if Ms is None else next(close, None))
 
 
@@ -190,6 +196,10 @@ def _both(finding: Finding) -> list[KnownGainsView]:
 def _found_with(finding: Finding, gains: Gains) -> KnownGainsView | None:
     """What a finding itself says of these gains; None for others than its own."""
     return next((each for each in _both(finding) if same_gains(each.gains.gains(), gains)), None)
+
+
+def _sampled(model: TransferModelView, sampling_delay_s: float) -> TransferFunction:
+    return TransferFunction(tuple(model.num), tuple(model.den), model.dead_time_s + sampling_delay_s)
 
 
 @lru_cache(256)

@@ -132,6 +132,9 @@ def test_an_accepted_trial_says_so_of_the_finding_whose_model_it_has() -> None:
     )
     assert nearly is not None and nearly.proposed is not None and nearly.proposed.uncertainty == 0.04
     assert nearly.proposed.Ms == pytest.approx(1.42, abs=0.03)
+    later = model(1.01)  # of a later look, which has taken the place of the one whose model was tried
+    replaced = of_trial(job(result), stored(finding(1.31, 0.03, model=later)), at)
+    assert replaced is not None and replaced.model == later and replaced.source is FindingSource.TRIAL
     other = result.model_copy(update={"model": model(2.0).model_copy(update={"structure": TYPED_IN})})
     assert of_trial(job(other), stored(finding()), at) is None
     assert of_trial(job(result), [Known(1, finding(), "older")], at) is None
