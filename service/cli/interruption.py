@@ -27,11 +27,13 @@ class Interruption:
 
     After `ignore` further signals change nothing: what is being ended is ended. They also change nothing after the
     context once a signal has come, so that a second one does not turn the end into an error.
+    A closed terminal makes errors before its SIGHUP is heard: output fails, and processes of the terminal end. Where
+    one comes by the end of the context, Interrupted takes the place of the error.
     SIGHUP stays ignored where this process was started to ignore it, as by nohup.
     """
 
     def __init__(self) -> None:
-        self._held = self._ignored = self._heard = False
+        self._held = self._ignored = self._heard = self._hung_up = False
         self._pending: int | None = None
         self._before: dict[int, Any] = {}
 
@@ -43,9 +45,11 @@ class Interruption:
                 signal.signal(each, self._hear)
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         for each, before in self._before.items():
             signal.signal(each, signal.SIG_IGN if self._heard else before)
+        if self._hung_up and isinstance(error, Exception):
+            raise Interrupted(signal.SIGHUP) from error
 
     def ignore(self) -> None:
         """Lets no signal interrupt what follows."""
@@ -68,6 +72,7 @@ class Interruption:
     def _hear(self, number: int, _frame: FrameType | None) -> None:
         self._heard = True
         if number == signal.SIGHUP:
+            self._hung_up = True
             _leave_terminal()
         if self._held:
             self._pending = number

@@ -49,6 +49,25 @@ def test_it_takes_the_place_of_an_error_that_it_has_caused() -> None:
         raise OSError("the process that is waited for has ended by the same signal")
 
 
+def test_an_error_of_a_closed_terminal_is_its_signal_although_that_comes_later() -> None:
+    with pytest.raises(Interrupted) as raised, Interruption() as interruption:
+        try:
+            raise OSError("the terminal does not take what is printed")
+        finally:
+            interruption.ignore()
+            send(signal.SIGHUP)
+    assert raised.value.number == signal.SIGHUP
+
+
+def test_an_error_before_ctrl_c_stays_the_error() -> None:
+    with pytest.raises(OSError, match="the port"), Interruption() as interruption:
+        try:
+            raise OSError("the port is taken")
+        finally:
+            interruption.ignore()
+            send(signal.SIGINT)
+
+
 def test_nothing_interrupts_the_end_nor_what_follows_it() -> None:
     with Interruption() as interruption:
         interruption.ignore()
