@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,11 @@ import pytest
 from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.jobs.stored_record import stored_record
 from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.experiment import Experiment
 from loopwright.tuning.fast.manual_test import CAME_BACK
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.fast.record_evaluation import evaluate_again
-from loopwright.tuning.plan import Command, Event, Mode, Sample, SetOutput, StageStarted
+from loopwright.tuning.plan import Command, Event, Mode, Plan, Sample, SetOutput, StageStarted
 from tests.rehearsal.test_fast import PLANTS, spec, true_Ms
 from tests.rehearsal.test_setpoint import under
 from tests.rehearsed import rehearse
@@ -150,6 +152,23 @@ def test_a_load_near_a_pulse_does_not_hide_in_the_model(
     monkeypatch.setattr("loopwright.service.execution.rehearsal.RehearsedLoop", Loaded)
     answer, _ = pulsed(plant, propose_anyway=True)
     assert answer["outcome"] == "refused" or abs(true_Ms(plant, answer["new_gains"]) - 1.6) < 0.05, answer["notes"]
+
+
+def test_slow_computations_do_not_end_the_pulses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each takes seven ultimate periods, on a busy machine."""
+    computed = Experiment.computed
+
+    def slowly(self: Experiment, compute: Callable[[], object]) -> Plan[object]:
+        found = yield from computed(self, compute)
+        for _ in range(600):
+            self._commands = self._on_sample((yield self._commands))
+        return found
+
+    monkeypatch.setattr(Experiment, "computed", slowly)
+    plant = under("three lags", 0.2)
+    answer, _ = pulsed(plant, propose_anyway=True)
+    assert answer["outcome"] == "proposed", answer["detail"]
+    assert abs(true_Ms(plant, answer["new_gains"]) - 1.6) < 0.05
 
 
 def test_MV_that_does_not_follow_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

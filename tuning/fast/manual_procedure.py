@@ -38,7 +38,7 @@ MORE_REST = 0.5
 """Time at home where PV is too far away for a pulse, in ultimate periods."""
 MAX_PERIODS, MAX_T95 = 12.0, 1.5
 """Longest record: the longer of these numbers of ultimate periods and of T95, from the end of the first pulse's
-response on."""
+response on, without what computations take."""
 MAX_OBJECTIONS = 3
 """Number of looks in a row with an objection that a longer record will not remove, after which the pulses end."""
 MAX_DISAGREEMENT = 0.05
@@ -64,7 +64,7 @@ def by_manual(facts: Facts, options: DesignOptions, method: str) -> Plan[FastPro
     yield from test.start()
     yield from test.first()
     test.period = yield from test.computed(partial(first_period, *test.columns(), facts.sample_time_s))
-    begun = test.elapsed
+    begun = test.spent
     look = Look(test.period, None, Refused(Reason.STALLED, "the pulses came to nothing"))
     widths, objections = cycle(WIDTHS), 0
     while True:
@@ -84,7 +84,7 @@ def by_manual(facts: Facts, options: DesignOptions, method: str) -> Plan[FastPro
             objections = objections + 1 if lasting else 0
             if objections == MAX_OBJECTIONS:
                 break
-        if test.elapsed - begun >= max(MAX_PERIODS * test.period, MAX_T95 * T95 / facts.sample_time_s):
+        if test.spent - begun >= max(MAX_PERIODS * test.period, MAX_T95 * T95 / facts.sample_time_s):
             if not isinstance(look.outcome, Refused):
                 text = f"after {test.elapsed} samples two successive evaluations still disagree on the gains"
                 look = Look(look.period, look.evaluation, Refused(Reason.UNCERTAIN, text))

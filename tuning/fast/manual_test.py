@@ -7,7 +7,9 @@ computation prolongs a pulse; if everything of ours dies meanwhile, the controll
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -24,6 +26,7 @@ from loopwright.tuning.models import Reals
 from loopwright.tuning.plan import Command, Note, Plan, Sample, SetOutput, SetPvLimits
 from loopwright.tuning.reasons import Reason, Refused
 
+T = TypeVar("T")
 TURN_STEPS, TURN_NOISES = 0.2, 8.0
 """The first pulse ends when PV has moved by this part of the permitted step, and by so many standard deviations of the
 noise. Where MV permits no larger pulse, PV has to move by the latter alone."""
@@ -68,6 +71,7 @@ class ManualTest(Experiment):
         """The time scale of the record, in samples; known after the first pulse."""
         self._ordered = self.home
         self._follows_at = 0
+        self._waited = 0
 
     def start(self) -> Plan[None]:
         """Hands the limits of PV to the controller, which ends the test by itself where PV leaves them."""
@@ -136,10 +140,23 @@ class ManualTest(Experiment):
         """Lets one sample pass."""
         self._commands = self._on_sample((yield self._commands))
 
+    def computed(self, compute: Callable[[], T]) -> Plan[T]:
+        """As of every experiment, with the samples counted that it takes."""
+        begun = len(self.trace)
+        result = yield from super().computed(compute)
+        self._waited += len(self.trace) - begun
+        return result
+
     @property
     def elapsed(self) -> int:
         """The number of samples since the first pulse."""
         return len(self.trace) - self.listened
+
+    @property
+    def spent(self) -> int:
+        """The number of samples since the first pulse that pulses and rests have taken: a slow computation is no
+        reason to end them."""
+        return self.elapsed - self._waited
 
     def experiment_record(self) -> ExperimentRecord:
         """The record so far, as deviations from rest; `period` must be known. Raises Refused as `ExperimentRecord`."""
