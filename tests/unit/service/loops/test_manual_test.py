@@ -10,7 +10,9 @@ import pytest
 
 from loopwright.controller.channel import Mode
 from loopwright.protocol.bus import BusError
-from loopwright.protocol.profile import Cause
+from loopwright.protocol.objects import lookup
+from loopwright.protocol.profile import Cause, Order
+from loopwright.protocol.session import STAGED, object_of
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.runner import RunResult, run
 from loopwright.tuning.analysis.margins import margins
@@ -196,6 +198,20 @@ def test_MV_at_its_limit_is_refused_before_anything_moves() -> None:
     found, taken = of_a_test(site, mv_high=51.0)
     assert found.ended is not None and found.ended.reason is Reason.SATURATED
     assert {sample.mv for sample in taken} == {HOME}
+    assert is_home(site)
+
+
+@pytest.mark.parametrize("known", [(), STAGED[Order.WATCH]], ids=["nothing", "values"])
+def test_a_controller_without_the_order_WATCH_is_refused_before_anything_moves(known: tuple[str, ...]) -> None:
+    """One of an older version, and one that knows the values of the order."""
+    site = in_manual(pace=0.0)
+    for name in {object_of(Order.WATCH), *STAGED[Order.WATCH]} - set(known):
+        del site.controller.dictionary.by_index[lookup(name).index]
+    found, taken = of_a_test(site)
+    assert found.ended is not None and found.ended.reason is Reason.DEVICE_MISMATCH
+    assert "20h does not know the order WATCH (object 2178h)" in found.ended.detail
+    assert {sample.mv for sample in taken} == {HOME}
+    assert "controller_order_output" not in site.names()
     assert is_home(site)
 
 
