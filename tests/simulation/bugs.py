@@ -8,7 +8,7 @@ from typing import Any
 from loopwright.controller import session
 from loopwright.controller.channel import Channel, Home
 from loopwright.protocol.objects import Value
-from loopwright.protocol.profile import Order, RelayState
+from loopwright.protocol.profile import Mode, Order, RelayState
 from loopwright.protocol.session import check_of as check_of_order
 
 Replace = Callable[[Any, str, Any], None]
@@ -47,7 +47,21 @@ def set_point_stays(replace: Replace) -> None:
     replace(Channel, "go_home", goes_home)
 
 
+def manual_output_stays(replace: Replace) -> None:
+    """The end of a session in manual leaves the manual output where a pulse has taken it."""
+    go_home = Channel.go_home
+
+    def goes_home(self: Channel, home: Home, relay_state: RelayState = RelayState.DONE) -> None:
+        output = self.manual_output
+        go_home(self, home, relay_state)
+        if home.mode is Mode.MANUAL:
+            self.manual_output = output
+
+    replace(Channel, "go_home", goes_home)
+
+
 BUGS: dict[str, Callable[[Replace], None]] = {
     "count-is-not-checked": count_is_not_checked,
     "set-point-stays": set_point_stays,
+    "manual-output-stays": manual_output_stays,
 }

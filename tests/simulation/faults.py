@@ -14,10 +14,9 @@ from loopwright.protocol.profile import (
     channel_ids,
     sdo_request_id,
 )
-from loopwright.service.inputs.config import PermittedTest
 from loopwright.service.inputs.model_json import FirstOrderModel
 from loopwright.service.inputs.request import RetuneRequest, retune_request
-from tests.simulation import plans
+from tests.simulation import manual_pulses, plans
 from tests.simulation.gateway import Gateway
 from tests.simulation.history import World
 from tests.simulation.people import Operator, Plc, Stranger
@@ -487,8 +486,12 @@ def real_setpoint(world: World) -> None:
 
 
 def real_manual(world: World) -> None:
-    world.permitted = PermittedTest(excitations=("relay", "manual"), mv_step_max=10.0)
-    _real(world, retune_request(method="fast"), 400 * world.loop.wall_s)
+    """In a phase of a pulse, mostly."""
+    if world.random.random() < 0.6:
+        manual_pulses.drawn(world)
+    else:
+        manual_pulses.expect(world)
+        _real(world, world.request, world.plan_s)
 
 
 def real_five_stage(world: World) -> None:

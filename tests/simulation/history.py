@@ -144,6 +144,8 @@ class World:
         self.clean_since = START
         self.plan_s = loop.plan_s
         self.may_stay_open = False
+        self.struck = False
+        """What is to happen at a certain point of the job has happened."""
         self.quiet = True
         """Nothing but kills: a dead tuner's session then has its time."""
         self.readings: dict[str, deque[tuple[dict[str, Any], float]]] = {}

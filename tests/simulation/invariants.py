@@ -95,6 +95,7 @@ class Invariants:
     held: list[Held] = field(default_factory=list)
     hands: list[tuple[float, str]] = field(default_factory=list)
     readings: dict[int, tuple[LoopState, float, float]] = field(default_factory=dict)
+    a_defect_is_put_in: bool = False
 
     def __post_init__(self) -> None:
         start = self.controller.start_values
@@ -384,7 +385,7 @@ class Invariants:
         self.simulation.note(gateway, f"job is {state.value} {reason} {row.detail or ''}".rstrip())
         if state in ACTIVE:
             return
-        if reason == "internal":
+        if reason == "internal" and not self.a_defect_is_put_in:
             self.say(f"internal: {row.detail}")
         restored = row.restored
         if restored is not None and (state not in (JobState.ACCEPTED, JobState.ROLLED_BACK) or row.result):

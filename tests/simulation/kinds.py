@@ -40,7 +40,12 @@ KINDS: dict[str, Kind] = {
     "mixed": Kind("two to four of all that at once", 3, faults.everything),
     "fast": Kind("the real fast procedure, with one of all that", 1, faults.real_fast, real=True),
     "setpoint": Kind("real pulses of the set-point, with one of all that", 1, faults.real_setpoint, real=True),
-    "manual": Kind("real pulses of the manual output, with one of all that", 0, faults.real_manual, real=True),
+    "manual": Kind(
+        "real pulses of the manual output, with one of all that in any phase",
+        1,
+        faults.real_manual,
+        real=True,
+    ),
     "five_stage": Kind("the real five-stage procedure, with one of all that", 0, faults.real_five_stage, real=True),
     "trial": Kind("a real set-point trial, with one of all that", 1, faults.real_trial, real=True),
 }

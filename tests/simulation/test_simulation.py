@@ -9,11 +9,15 @@ from collections.abc import Iterator
 
 import pytest
 
+from loopwright.protocol.profile import Mode
+from tests.pulse_phases import Phase
 from tests.simulation.bugs import BUGS
 from tests.simulation.every_call import RESTARTS_S
+from tests.simulation.history import Loop, World
 from tests.simulation.kinds import KINDS, play, spread
+from tests.simulation.manual_pulses import STRIKES, struck
 from tests.simulation.pool import every_call, run
-from tests.simulation.report import tell
+from tests.simulation.report import tell, words
 
 CORES = os.cpu_count() or 1
 
@@ -39,6 +43,20 @@ def test_one_job_killed_at_each_call_of_the_bus_ends_safe() -> None:
     assert not bad, "\n".join(bad)
 
 
+@pytest.mark.parametrize(("phase", "pulse"), [(Phase.UP, 1), (Phase.BACK, 1), (Phase.UP, 2), (Phase.REST, 2)])
+@pytest.mark.parametrize("name", STRIKES)
+def test_what_happens_in_a_pulse_ends_in_manual_at_the_output_found(name: str, phase: Phase, pulse: int) -> None:
+    world = World("manual pulses", 0, Loop(0.1, 10.0, Mode.MANUAL, 50.0, 50.0, 0.005, True, 100))
+    struck(world, phase, pulse, name)
+    ending = world.run()
+    assert world.struck and not ending.bad, words(ending)
+    assert " ".join(ending.jobs[0]) in STRIKES[name][1]
+    session = world.controller.device.sessions[0]
+    channel = session.channel
+    assert (session.is_open, channel.mode, channel.on_trial) == (False, Mode.MANUAL, False)
+    assert channel.manual_output == channel.mv == world.plant.mv == 50.0
+
+
 def test_a_seed_is_one_history() -> None:
     for kind, seed in spread(20, list(KINDS)):
         one, other = (play(kind, seed, keeps_log=True) for _ in range(2))
@@ -48,8 +66,9 @@ def test_a_seed_is_one_history() -> None:
 
 FOUND_BY = {
     # To search anew: python -m tests.simulation --seeds 2000 --bug NAME
-    "count-is-not-checked": ("stranger", 13),
+    "count-is-not-checked": ("stranger", 5),
     "set-point-stays": ("stalls", 1),
+    "manual-output-stays": ("manual", 767),
 }
 
 
