@@ -26,8 +26,10 @@ from loopwright.service.jsonable import to_jsonable
 from loopwright.service.results import EvidenceView, GainsView, ModelView, TransferModelView, VerificationView
 from loopwright.service.states.job_state import JobState
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.procedure import FastOptions, fast
+from loopwright.tuning.fast.excitation_choice import fast_by
+from loopwright.tuning.fast.procedure import FastOptions
 from loopwright.tuning.fast.proposal import EvaluationSummary
+from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Event, Mode, Sample, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason
@@ -46,7 +48,8 @@ def _same(value: float, t: float) -> float:
 
 @dataclass
 class Case:
-    """why: what is wrong with the plant, in words. of: the stage from which on it is."""
+    """why: what is wrong with the plant, in words. of: the stage from which on it is. excitation: with pulses of the
+    manual output the loop is in manual."""
 
     why: str
     mv: Change = _same
@@ -60,6 +63,7 @@ class Case:
     reverse: bool = True
     gains: Gains = OLD
     seed: int = 1
+    excitation: Excitation = Excitation.RELAY
 
 
 class Odd:
@@ -142,11 +146,12 @@ class Pictured:
     method: str = "fast"
 
 
-def rehearsed(reason: str, case: Case) -> Pictured:
+def rehearsed(case: Case) -> Pictured:
     """The job, as GET /jobs/{id} would show it, with its samples as columns."""
     plant = Odd(case)
     settings = Settings(mv_low=0.0, mv_high=100.0, safe_output=MIDDLE, pv_low=-1e9, pv_high=1e9, reverse=case.reverse)
-    loop = RehearsedLoop(plant, Channel(TS, settings, _parameters(case.gains), SP, int(Mode.AUTOMATIC), MIDDLE), TS)
+    mode = Mode.MANUAL if case.excitation is Excitation.MANUAL else Mode.AUTOMATIC
+    loop = RehearsedLoop(plant, Channel(TS, settings, _parameters(case.gains), SP, int(mode), MIDDLE), TS)
     stages: list[tuple[float, str]] = []
     samples: list[Sample] = []
     found: EvidenceView | None = None
@@ -169,7 +174,8 @@ def rehearsed(reason: str, case: Case) -> Pictured:
             return samples[-1]
 
     facts = Facts(TS, T95, 0.0, 100.0, 2.0, case.gains, case.reverse)
-    ran = run(fast(facts, FastOptions(**case.options, propose_anyway=True)), Heard(), limits=RunLimits(), on_event=hear)
+    plan = fast_by((case.excitation,), facts, FastOptions(**case.options, propose_anyway=True))
+    ran = run(plan, Heard(), limits=RunLimits(), on_event=hear)
     names = [next(name for first, name in reversed(stages) if first <= i) for i in range(len(samples))]
     ended = ran.ended
     columns = {"t_s": "t", "sp": "sp", "pv": "pv", "mv": "mv", "mode": "mode"}
@@ -188,13 +194,11 @@ def rehearsed(reason: str, case: Case) -> Pictured:
     )
 
 
-def draw(folder: Path, reason: str, job: Pictured) -> Path:
+def draw(path: Path, job: Pictured) -> None:
     record = stored_record(job.samples)
     assert record is not None
-    path = folder / f"{reason.replace('_', '-')}.png"
     fast_job(path, job, record, "degC")
     Image.open(path).convert("RGB").quantize(COLOURS).save(path, optimize=True)
-    return path
 
 
 def main() -> None:
@@ -208,8 +212,8 @@ def main() -> None:
     for reason, case in cases().items():
         if only and reason not in only:
             continue
-        job = rehearsed(reason, case)
-        path = draw(folder, reason, job)
+        job, path = rehearsed(case), folder / f"{reason.replace('_', '-')}.png"
+        draw(path, job)
         print(f"{reason}: {job.state} {job.reason}: {job.detail} ({path.stat().st_size // 1000} kB)", flush=True)
 
 

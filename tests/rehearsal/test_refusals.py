@@ -19,7 +19,7 @@ WITH_FIT = {"unexplained", "disturbed", "uncertain", "model_mismatch", "diverges
 
 @cache
 def job_of(reason: str) -> Pictured:
-    return rehearsed(reason, cases()[reason])
+    return rehearsed(cases()[reason])
 
 
 @pytest.mark.parametrize("reason", cases())
@@ -31,9 +31,10 @@ def test_a_fault_is_refused_with_its_reason_and_shown(reason: str, tmp_path: Pat
     assert (job.evidence is not None) == (reason in WITH_FIT)
     if reason in WITH_FIT - {"diverges"}:
         assert job.evidence is not None and job.evidence.reason == reason
-    picture = draw(tmp_path, reason, job)
-    assert 5_000 < picture.stat().st_size < 60_000
     name = reason.replace("_", "-")
+    picture = tmp_path / f"{name}.png"
+    draw(picture, job)
+    assert 5_000 < picture.stat().st_size < 60_000
     assert f"## {reason}\n" in PAGE and f"refusals/{name}.png" in PAGE
     assert " ".join(ADVICE[Reason(reason)].split()) in " ".join(PAGE.split())
 
