@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from playwright.sync_api import Page, expect
 
+from loopwright.protocol.profile import Mode
 from tests.browser import person
 from tests.browser.person import NAME
 from tests.browser.site import TAG, Site
@@ -97,3 +98,27 @@ def test_another_Ms_is_tried_on_the_loop_before_it_can_be_accepted(site: Site, p
     page.goto(f"/ui{first['url']}")
     expect(person.headline(page)).to_have_text("Proposed, not decided, a later test came")
     expect(page.get_by_role("button", name="Accept the new gains")).not_to_be_attached()
+
+
+def test_gains_are_not_offered_for_a_trial_in_manual(site: Site, page: Page) -> None:
+    assert site.finished(site.retune())["state"] == "proposed"
+    person.open_loop(page)
+    slider = page.get_by_role("slider", name="Ms", exact=True)
+    expect(slider).to_be_enabled()
+    for _ in range(4):
+        slider.press("Shift+ArrowLeft")
+    offered = page.get_by_role("button", name=f"Try Ms 1.40 on {TAG}")
+    offered.click()
+    expect(page.get_by_label("Signed")).to_be_visible()
+    site.write("controller_mode_command", Mode.MANUAL)
+    expect(person.decision(page)).to_contain_text(
+        "cannot be tried: a trial steps the set-point, and the loop is in manual"
+    )
+    expect(offered).not_to_be_attached()
+    expect(page.get_by_label("Signed")).not_to_be_attached()
+    page.get_by_role("button", name="Back to Ms 1.60").click()
+    expect(page.get_by_role("button", name="Accept the new gains")).to_be_enabled()
+    slider.press("Shift+ArrowLeft")
+    expect(person.decision(page)).to_contain_text("Put it in automatic to try them.")
+    site.write("controller_mode_command", Mode.AUTOMATIC)
+    expect(page.get_by_role("button", name=f"Try Ms 1.55 on {TAG}…")).to_be_enabled()

@@ -6,7 +6,7 @@ import { between, frequency, modelOf, slowness, step } from "../control.js";
 import { designsOf, fillDesigns } from "../designs.js";
 import { html } from "../html.js";
 import { change, fixed, known, ms as msText, msError, pvDecimals, significant, unit, withUnit } from "../numbers.js";
-import { isSilent, may, refreshLoops, sign, signature } from "../state.js";
+import { isSilent, may, refreshLoops, rowOf, sign, signature } from "../state.js";
 import { decisionRequestWords } from "../words.js";
 import { Curve, NyquistPlot, StepPlot } from "./figures.js";
 
@@ -188,6 +188,9 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
   const where = `${loop.tag}, node ${loop.controller_node.toString(16)}h channel ${loop.channel}`;
   const Signed = (/** @type {string} */ action, /** @type {() => void} */ go) => html`<span class="ask" key="ask"><label key="by">Signed <input ref=${field} type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && signature.value.trim() && !dead) go(); }} /></label>
     <button key="cancel" onClick=${close}>Cancel</button><button key="go" class="main" disabled=${dead || !signature.value.trim()} onClick=${go}>${action}</button></span>`;
+  const mode = rowOf(loop.tag).value?.mode;
+  const noTrialIn = mode === "manual" ? "in manual" : mode === "off" ? "off" : "";
+  const backButton = html`<button key="back" onClick=${back}>Back to Ms ${msText(tested)}</button>`;
   let inside = null;
   if (loop.locked) inside = html`<span class="say">Locked by ${loop.locked.by}: no decision until it is unlocked.</span>`;
   else if (job.dry_run) inside = html`<span class="say">A rehearsal: nothing was moved, and there is nothing to accept.</span>`;
@@ -196,8 +199,9 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
   else if (asking === "accept") inside = html`<span class="say">Write <b>${written}</b> into ${where}, for good.</span>${Signed(`Write to ${loop.tag}`, () => send(() => command(`${job.url}/accept`, by())))}`;
   else if (asking === "keep") inside = html`<span class="say">Keep the old gains; the proposal is declined.</span>${Signed("Keep the old gains", () => send(() => command(`${job.url}/rollback`, by())))}`;
   else if (asking === "rollback") inside = html`<span class="say">Write the old gains, <b>${written}</b>, back into ${where}.</span>${Signed(`Roll ${loop.tag} back`, () => send(() => command(`${job.url}/rollback`, by())))}`;
+  else if (!atTested && noTrialIn) inside = html`<span class="say">These gains have not been on the loop, and cannot be tried: a trial steps the set-point, and the loop is ${noTrialIn}. Put it in automatic to try them.</span>${backButton}`;
   else if (asking === "try") inside = html`<span class="say">A trial listens, steps the set-point by <b>${withUnit(fixed(loop.sp_deviation, pvDecimals(loop.pv_limits)), loop.pv_unit)}</b> under the gains for Ms ${msText(ms)}, and ends as a proposal. No relay.</span>${Signed(`Try Ms ${msText(ms)} on ${loop.tag}`, tryIt)}`;
-  else if (!atTested) inside = html`<span class="say">These gains have not been on the loop.</span><button key="back" onClick=${back}>Back to Ms ${msText(tested)}</button><button key="try" class="main" disabled=${dead} data-opens="try" onClick=${() => open("try")}>Try Ms ${msText(ms)} on ${loop.tag}…</button>`;
+  else if (!atTested) inside = html`<span class="say">These gains have not been on the loop.</span>${backButton}<button key="try" class="main" disabled=${dead} data-opens="try" onClick=${() => open("try")}>Try Ms ${msText(ms)} on ${loop.tag}…</button>`;
   else if (job.state === "proposed" && latest) inside = html`<span class="say">The loop runs on its old gains until you accept.</span><button key="keep" disabled=${dead} data-opens="keep" onClick=${() => open("keep")}>Keep the old gains…</button><button key="accept" class="main" disabled=${dead} data-opens="accept" onClick=${() => open("accept")}>Accept the new gains…</button>`;
   else if (job.state === "accepted" && latest) inside = html`<span class="say">Accepted by <b>${job.decided?.by ?? "–"}</b>${detail?.live ? html`; in effect now: Kp ${significant(detail.live.gains.Kp)}, Ti ${significant(detail.live.gains.Ti)} s` : ""}.</span><button key="rollback" disabled=${dead} data-opens="rollback" onClick=${() => open("rollback")}>Roll back to the old gains…</button>`;
   else if (job.state === "rolled_back") inside = html`<span class="say">The loop runs on its old gains${job.decided ? `; decided by ${job.decided.by}` : ""}.</span>`;
