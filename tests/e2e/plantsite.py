@@ -20,6 +20,7 @@ from loopwright.service.cli.child_process import ChildProcess
 from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.plan import Mode
+from tests.pulse_phases import Phase, PulseWatch
 
 VCAN = "socketcan:vcan0"
 HUB, ON_VCAN = "hub", pytest.param("vcan", marks=pytest.mark.vcan)
@@ -52,12 +53,18 @@ REACTOR = Case("reactor", 0.25, 0.5, 30.0, 49.2838831323648137, (30.0, 70.0), 31
 @dataclass(frozen=True)
 class Stage:
     """How to come to a stage soon. pace: of the plant, where the stage is too short for the usual one (as a factor).
-    untouched: in this stage the loop is held, but as it was."""
+    untouched: in this stage the loop is held, but as it was.  phase: of a pulse of the manual output, of a loop that is
+    found in manual; None for a loop that is found in automatic."""
 
     stage: str
     options: dict[str, Any]
     pace: float = 1.0
     untouched: bool = False
+    phase: Phase | None = None
+
+    @property
+    def in_manual(self) -> bool:
+        return self.phase is not None
 
 
 _FIVE: dict[str, Any] = {"method": "five-stage"}
@@ -77,8 +84,12 @@ STAGES = {
     "setpoint-preflight": Stage("preflight", _PULSES, 0.3, untouched=True),
     "setpoint-pulses": Stage("pulses", _PULSES),
     "setpoint-verify": Stage("verify", _PULSES, 0.4),
+    **{f"manual-{phase.value}": Stage("manual", {}, 0.15, phase=phase) for phase in Phase},
 }
-"""Of model 14."""
+"""Of model 14. Those of a loop in manual need a site of which `MANUAL_PERMITTED` permits them."""
+MANUAL_PERMITTED: Mapping[str, object] = MappingProxyType({"test": {"excitations": ["relay", "manual"]}})
+RESTED = 0.25
+"""Part of an ultimate period after a pulse of the manual output from which on PV is left to itself."""
 
 
 class Plantsite:
@@ -108,6 +119,10 @@ class Plantsite:
         self._changes = changes
         self.tag = str(changes.get("tag", TAG))
         self.data = folder / "data"
+        self.mode = Mode.AUTOMATIC
+        """In which the loop is found by a test."""
+        self.output = 0.0
+        """The manual output found, of a loop in manual."""
         self.start_controller()
         self._service = self.launch_service()
         self.controller.wait_ready()
@@ -120,12 +135,13 @@ class Plantsite:
         model = ("--model", case.model, "--ts", str(case.ts), "--speed", self._speed)
         self.plant = self.launch("plant", "loopwright.plantsim", "--bus", self.bus, *model)
 
-    def start_controller(self) -> None:
+    def start_controller(self, of: str = "loopwright.controller") -> None:
+        """of: its module."""
         case = self.case
         gains = ("--kp", str(case.kp), "--ti", str(case.ti), "--sp", str(case.sp))
         kept = ("--keep", str(self._folder / "kept.json"))
         where = ("--bus", self.bus, "--ts", str(case.ts))
-        self.controller = self.launch("controller", "loopwright.controller", *where, *gains, *kept)
+        self.controller = self.launch("controller", of, *where, *gains, *kept)
 
     def launch(self, name: str, *arguments: str) -> ChildProcess:
         """Starts a process and does not wait for it."""
@@ -176,6 +192,7 @@ class Plantsite:
         ):
             self.write(name, value)
         deadline = time.monotonic() + 30
+        self.mode = Mode.AUTOMATIC
         near = 0
         while near < 5:
             state = self.state()
@@ -185,10 +202,21 @@ class Plantsite:
         self.write("plant_pace", pace)
         assert self.is_home()
 
+    def put_in_manual(self) -> None:
+        """Where MV is."""
+        self.write("controller_mode_command", Mode.MANUAL)
+        self.mode, self.output = Mode.MANUAL, self.read("controller_manual_output")
+        assert self.is_home()
+
     def in_stage(self, stage: Stage, **options: Any) -> str:
         """A job in the middle of this stage: the loop is held, and no longer as it was where the stage moves it."""
+        if stage.in_manual:
+            self.put_in_manual()
         url = self.retune(**stage.options | options)
         self.until(url, lambda job: job["stage"] == stage.stage and job["attempts"] == 1)
+        if stage.phase is not None:
+            self._in_phase(stage.phase, url)
+            return url
         deadline = time.monotonic() + 10
         while not (self.read("controller_session") if stage.untouched else not self.is_home()):
             assert time.monotonic() < deadline, self.job(url)
@@ -196,6 +224,22 @@ class Plantsite:
         job = self.job(url)
         assert (job["state"], job["stage"]) == ("running", stage.stage)
         return url
+
+    def _in_phase(self, phase: Phase, url: str) -> None:
+        """Waits for this phase, of the first pulse of the manual output; for rest of the second one, after which PV is
+        not needed for anything."""
+        deadline = time.monotonic() + 60
+        tuner, watch = Tuner(self.bus, 0x20, 0x10), PulseWatch(RESTED * self.case.Pu_s / self.case.ts)
+        wanted = phase, 2 if phase is Phase.REST else 1
+        try:
+            while True:
+                away = tuner.number("controller_manual_output") != pytest.approx(self.output)
+                if (watch.see(away, tuner.number("sample_number")), watch.pulses) == wanted:
+                    return
+                assert watch.pulses <= 2 and time.monotonic() < deadline, self.job(url)
+                time.sleep(0.002)
+        finally:
+            tuner.close()
 
     def retune(self, tag: str | None = None, **options: Any) -> str:
         answer = self.http.post(f"/loops/{tag or self.tag}/retune", json=options)
@@ -247,10 +291,12 @@ class Plantsite:
             tuner.close()
 
     def is_home(self, sp: float | None = None) -> bool:
-        """On its accepted gains, in automatic, at its set-point."""
+        """On its accepted gains, in the mode in which it was found, at its set-point, and in manual at its output."""
         state = self.state()
+        outputs = (state.manual_output, state.mv) if self.mode is Mode.MANUAL else ()
         return (
-            state.mode is Mode.AUTOMATIC
+            state.mode is self.mode
+            and all(output == pytest.approx(self.output) for output in outputs)
             and not state.on_trial
             and state.sp == pytest.approx(self.case.sp if sp is None else sp)
             and state.gains.Kp == pytest.approx(self.case.kp)

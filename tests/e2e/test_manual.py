@@ -1,8 +1,7 @@
-"""A loop in manual, tuned through HTTP by pulses of its manual output; and where it is after each fault."""
+"""A loop in manual, tuned through HTTP by pulses of its manual output. Aborts and kills are in `test_ways_out`."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import Any
@@ -14,10 +13,9 @@ from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.plan import Mode
-from tests.e2e.plantsite import MODEL_14, TAG, Plantsite
+from tests.e2e.plantsite import MODEL_14, STAGES, TAG, Plantsite
 
-PACE = 5.0
-BACK_WITHIN_S = 2.5
+PACE = 1.0
 PERMITTED = {"test": {"excitations": ["setpoint", "manual"], "mv_step_max": 20.0}}
 
 
@@ -31,7 +29,7 @@ def processes(bus: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pl
 def here(processes: Plantsite) -> Plantsite:
     """The shared processes, the loop in manual and at rest."""
     processes.at_rest(0.0)
-    processes.write("controller_mode_command", Mode.MANUAL)
+    processes.put_in_manual()
     return processes
 
 
@@ -42,16 +40,10 @@ def output(here: Plantsite) -> tuple[int, float]:
     return int(here.read("controller_mode")), found
 
 
-def in_a_pulse(here: Plantsite, home: float, **options: Any) -> str:
+def in_a_pulse(here: Plantsite, **options: Any) -> str:
     """A job whose pulse has taken MV away from home."""
     here.write("plant_pace", PACE)
-    url = here.retune(**options)
-    deadline = time.monotonic() + 60
-    while here.read("controller_manual_output") == pytest.approx(home):
-        assert time.monotonic() < deadline, here.job(url)
-        time.sleep(0.02)
-    assert here.job(url)["stage"] == "manual"
-    return url
+    return here.in_stage(STAGES["manual-up"], **options)
 
 
 def test_it_gets_gains_that_were_never_tried_and_takes_them_without_leaving_manual(here: Plantsite) -> None:
@@ -83,52 +75,46 @@ def test_it_gets_gains_that_were_never_tried_and_takes_them_without_leaving_manu
     assert output(here) == home and here.state().gains.Kp == pytest.approx(here.case.kp)
 
 
-def test_an_abort_in_mid_pulse(here: Plantsite) -> None:
-    home = output(here)
-    url = in_a_pulse(here, home[1])
-    assert here.http.post(f"{url}/abort").status_code == 202
-    job = here.finished(url)
-    assert (job["state"], job["reason"]) == ("aborted", "operator")
-    assert output(here) == home
-
-
 def test_pv_at_its_limit_ends_the_test_in_the_controller(here: Plantsite) -> None:
     """A load takes PV over the limit while MV is away."""
     home = output(here)
-    url = in_a_pulse(here, home[1], pv_low=49.9, pv_high=50.1, sp_deviation=0.1)
+    url = in_a_pulse(here, pv_low=49.9, pv_high=50.1, sp_deviation=0.1)
     here.write("plant_disturbance", 40.0)
     job = here.finished(url)
     assert (job["state"], job["reason"]) == ("failed", "pv_limit")
     assert output(here) == home
 
 
-def test_kill_9_in_mid_pulse_leaves_the_controller_to_itself(here: Plantsite) -> None:
-    home = output(here)
-    url = in_a_pulse(here, home[1])
-    here.service.kill()
-    deadline = time.monotonic() + BACK_WITHIN_S
-    while here.read("controller_manual_output") != pytest.approx(home[1]) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert output(here) == home
-    here.serve()
-    job = here.until(url, lambda job: job["attempts"] == 2)
-    assert job["state"] == "running"
-    assert here.http.post(f"{url}/abort").status_code == 202
-    assert here.finished(url)["reason"] == "operator"
-    assert output(here) == home
-
-
 def test_another_hand_on_the_manual_output_has_the_last_word(here: Plantsite) -> None:
     home = output(here)
-    url = in_a_pulse(here, home[1])
+    url = in_a_pulse(here)
     here.write("controller_manual_output", home[1] + 1.0)
     job = here.finished(url)
     assert (job["state"], job["reason"]) == ("aborted", "output_changed")
     assert output(here) == (Mode.MANUAL, pytest.approx(home[1] + 1.0))
 
 
+def test_a_controller_of_an_older_version_is_refused_before_anything_moves(here: Plantsite) -> None:
+    """Its order WATCH is missing, with which it is to end a test by itself."""
+    here.controller.kill()
+    here.start_controller(of="tests.e2e.older_controller")
+    here.controller.wait_ready()
+    home = output(here)
+    try:
+        url = here.retune()
+        job = here.finished(url)
+        assert (job["state"], job["reason"]) == ("refused", "device_mismatch")
+        assert "node 20h does not know the order WATCH (object 2178h)" in job["detail"]
+        assert {*here.http.get(f"{url}/samples").json()["mv"]} == {home[1]}
+        assert output(here) == home
+    finally:
+        here.controller.kill()
+        here.start_controller()
+        here.controller.wait_ready()
+
+
 def test_a_loop_in_automatic_is_moved_by_its_set_point(here: Plantsite) -> None:
-    here.write("controller_mode_command", Mode.AUTOMATIC)
+    here.at_rest(0.0)
     shown = here.http.post(f"/loops/{TAG}/retune/preview", json={}).json()
     assert "pulses" in [each["stage"] for each in shown["stages"]]
     url = here.retune(excitations=["manual"])

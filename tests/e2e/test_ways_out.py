@@ -19,7 +19,7 @@ import pytest
 
 from loopwright.protocol.profile import Mode
 from loopwright.protocol.tuner import FailureKind, TunerError
-from tests.e2e.plantsite import MODEL_14, ON_VCAN, STAGES, TAG, Plantsite, Stage
+from tests.e2e.plantsite import MANUAL_PERMITTED, MODEL_14, ON_VCAN, STAGES, TAG, Plantsite, Stage
 
 PACE = 5.0
 BACK_WITHIN_S = 2.5
@@ -39,7 +39,7 @@ MORE_LOOPS = (
 @pytest.fixture(scope="module")
 def processes(bus: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plantsite]:
     with ExitStack() as stack:
-        yield Plantsite(stack, tmp_path_factory.mktemp("site"), MODEL_14, bus, MORE_LOOPS)
+        yield Plantsite(stack, tmp_path_factory.mktemp("site"), MODEL_14, bus, MORE_LOOPS, changes=MANUAL_PERMITTED)
 
 
 @pytest.fixture(params=EARLY)
@@ -53,6 +53,12 @@ def here(processes: Plantsite) -> Plantsite:
     """The shared processes, at rest."""
     processes.at_rest(PACE)
     return processes
+
+
+def brought_into(here: Plantsite, stage: str) -> str:
+    """A job in that stage, at the pace that the stage needs."""
+    here.write("plant_pace", PACE * STAGES[stage].pace)
+    return here.in_stage(STAGES[stage])
 
 
 def ended(here: Plantsite, url: str) -> tuple[str, str]:
@@ -154,10 +160,10 @@ def test_a_plant_that_falls_silent(here: Plantsite, early: Stage) -> None:
         os.kill(here.plant.pid, signal.SIGCONT)
 
 
-@pytest.mark.on_vcan("ultimate", "fast-verify", "setpoint-pulses")
+@pytest.mark.on_vcan("ultimate", "fast-verify", "setpoint-pulses", "manual-up")
 @pytest.mark.parametrize("stage", STAGES)
 def test_aborted_by_the_operator_in_each_stage(here: Plantsite, stage: str) -> None:
-    url = here.in_stage(STAGES[stage])
+    url = brought_into(here, stage)
     assert here.http.post(f"{url}/abort").status_code == 202
     assert ended(here, url) == ("aborted", "operator")
     assert here.is_home()
@@ -200,12 +206,12 @@ def test_sigterm_of_the_service(here: Plantsite, stage: str) -> None:
     assert ended(here, url) == ("aborted", "service_stopped")
 
 
-@pytest.mark.on_vcan("zn_pi", "fast-relay", "setpoint-verify")
+@pytest.mark.on_vcan("zn_pi", "fast-relay", "setpoint-verify", "manual-up", "manual-back", "manual-rest")
 @pytest.mark.parametrize(
     "stage", [*(name for name, stage in STAGES.items() if not stage.untouched), "setpoint-preflight"]
 )
 def test_kill_9_of_the_service_leaves_the_controller_to_itself_and_the_job_resumes(here: Plantsite, stage: str) -> None:
-    url = here.in_stage(STAGES[stage])
+    url = brought_into(here, stage)
     here.service.kill()
     deadline = time.monotonic() + BACK_WITHIN_S
     while not here.is_home() and time.monotonic() < deadline:
