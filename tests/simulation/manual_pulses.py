@@ -9,8 +9,8 @@ from loopwright.protocol.profile import CONTROLLER_NODE, NmtCommand
 from loopwright.service.execution.procedures import Hooks, Outcome
 from loopwright.service.inputs.config import Limits, LoopConfig, PermittedTest
 from loopwright.service.inputs.request import RetuneRequest, retune_request
-from loopwright.service.loop_state import LoopState
 from loopwright.service.loops.bus_loop import BusLoop
+from loopwright.service.states.loop_state import LoopState
 from tests.pulse_phases import Phase, PulseWatch
 from tests.simulation import plans
 from tests.simulation.gateway import Gateway
