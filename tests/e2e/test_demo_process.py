@@ -38,9 +38,9 @@ class Demo:
         self._screen = b""
         command = [str(Path(sys.executable).with_name("loopwright")), "demo", *options]
         self._master, slave = pty.openpty() if terminal else os.pipe()
-        # setsid gives it the terminal on standard input as the one whose keys are signals.
+        # setsid gives it the terminal on standard input as the one whose keys are signals; nohup has SIGHUP ignored.
         self.process = subprocess.Popen(
-            ["setsid", "--ctty", *command] if terminal else command,
+            ["env", "--default-signal=HUP", "setsid", "--ctty", *command] if terminal else command,
             stdin=slave if terminal else subprocess.DEVNULL,
             stdout=slave,
             stderr=slave,

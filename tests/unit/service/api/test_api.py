@@ -12,6 +12,7 @@ from sqlalchemy import event
 from loopwright.service.store.store import append
 from loopwright.tuning.reasons import ADVICE, Failed, Reason, Refused
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
+from tests.unit.service.processes import until
 
 GOLDEN = Path(__file__).parents[3] / "golden" / "openapi.json"
 
@@ -259,10 +260,11 @@ def test_a_list_of_jobs_asks_the_database_as_often_however_long_it_is(service: S
         if "FROM events" in statement:
             asked.append(statement)
 
-    jobs = [finished(service, client, dry_run=True) for _ in range(3)]
-    assert listed() == jobs[::-1] and len(asked) == 1
+    ids = [finished(service, client, dry_run=True)["id"] for _ in range(3)]
+    until(lambda: listed() == [client.get(f"/jobs/{each}").json() for each in ids[::-1]])
+    assert listed() and len(asked) == 1
     assert service.store.events_by_job([], limit=10) == {}
-    some = service.store.events_by_job([job["id"] for job in jobs], limit=2)
+    some = service.store.events_by_job(ids, limit=2)
     assert [[each.seq for each in found] for found in some.values()] == [[1, 2]] * 3
 
 
