@@ -21,7 +21,7 @@ from tests.e2e.plantsite import STAGES, Stage
 from tests.faults.cases import FAULTS
 from tests.faults.ending import Ending, unsafe
 from tests.faults.faulty_hub import FaultyHub
-from tests.faults.stand import HOME, LOOP, PACE, Missing, Stand, StoredSample
+from tests.faults.stand import LOOP, Missing, Stand, StoredSample
 
 HOME_WITHIN_S = 6.0
 """After the end of a job that could not restore its loop: heartbeat or lease runs out, the law brings MV to rest."""
@@ -42,9 +42,9 @@ def ending(stand: Stand, name: str, stage: str, database: str = "sqlite") -> End
     began = time.monotonic()
     url = _brought_into(stand, where)
     struck_at, struck = stand.hub.answered, time.monotonic()
-    with stand.eye.watching(HOME) as safe, fault.inject(stand, url) as other:
+    with stand.eye.watching(stand.home) as safe, fault.inject(stand, url) as other:
         job = _over(stand, url)
-        home = other or HOME
+        home = other or stand.home
         last = stand.eye.settled(home, HOME_WITHIN_S)
     if last is not None and not unsafe(last, home):
         safe.append(last.at)
@@ -73,9 +73,8 @@ def calm_ending(stand: Stand, name: str, stage: str, database: str = "sqlite") -
 def _brought_into(stand: Stand, stage: Stage) -> str:
     """The URL of a job in that stage. A busy machine alone can end a job: then it is tried again."""
     for last_try in (False, False, True):
-        stand.at_rest(PACE * stage.pace)
         try:
-            return stand.site.in_stage(stage)
+            return stand.in_stage(stage)
         except AssertionError as error:
             if last_try:
                 raise
@@ -124,7 +123,7 @@ def _first_number(hub: FaultyHub, stored: Sequence[StoredSample]) -> int:
 def run(faults: Sequence[str], stages: Sequence[str], databases: Sequence[str], at_once: int) -> Iterator[list[Ending]]:
     """The rows (a fault on a database each), each on a stand of its own, a few at a time. Prints as it goes."""
     rows = [
-        (name, database, [stage for stage in FAULTS[name].stages if stage in stages])
+        (name, database, [stage for at, stage in FAULTS[name].runs() if at == database and stage in stages])
         for database in databases
         for name in faults
         if database in FAULTS[name].databases

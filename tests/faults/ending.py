@@ -23,6 +23,7 @@ class Home:
     """What the loop must be in the end: as it was found, but for outside changes made meanwhile.
 
     mv: at which the loop rests in automatic, percent; None where that is not known beforehand.
+    output: the manual output found, percent; None where it does not matter.
     """
 
     mode: Mode
@@ -31,6 +32,7 @@ class Home:
     Ti: float
     words: str = "as found"
     mv: float | None = None
+    output: float | None = None
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,7 @@ def unsafe(glance: Glance | None, home: Home, at_rest: bool = False) -> str:
             ("set-point", glance.sp, home.sp, same(glance.sp, home.sp)),
             ("Kp", glance.Kp, home.Kp, same(glance.Kp, home.Kp)),
             ("Ti", glance.Ti, home.Ti, same(glance.Ti, home.Ti)),
+            ("manual output", glance.manual_output, home.output, home.output in (None, glance.manual_output)),
             ("on trial", glance.on_trial, False, not glance.on_trial),
             ("session", glance.session, 0, not glance.session),
             ("NMT states", glance.states, "operational", set(glance.states) == {NmtState.OPERATIONAL}),

@@ -27,6 +27,7 @@ from loopwright.protocol.profile import (
     NMT_ID,
     PLANT_NODE,
     PV_FRAME,
+    Cause,
     Mode,
     NmtCommand,
     NmtState,
@@ -44,7 +45,7 @@ from loopwright.tuning.reasons import Ended, Reason
 from tests.e2e.plantsite import TAG
 from tests.faults.ending import Home, unsafe
 from tests.faults.faulty_hub import Fault, well
-from tests.faults.stand import HOME, LOOP, Stand
+from tests.faults.stand import LOOP, Stand
 
 Harm = Iterator[Home | None]
 Injection = Callable[[Stand, str], AbstractContextManager[Home | None]]
@@ -62,12 +63,31 @@ NEXT_COMMAND_S = 2.0
 """A stage that commands nothing for so long will not do it soon: then the operator does not wait either."""
 WAY_OUT_S = 0.3
 OUT_OF_OPERATION_S = 2.0
+OTHERS_OUTPUT = 3.0
+"""Percent away from where the loop rests."""
+LOAD_PCT = 90.0
+"""Moves PV by far more than its limits are away."""
 LEFT_NEAR = 3.0
 """Percent: a loop is opened where noise and the last test have left MV."""
 _ANSWERS = (sdo_response_id(PLANT_NODE), sdo_response_id(CONTROLLER_NODE))
 
 
+# people
+@contextmanager
+def aborted(stand: Stand, url: str) -> Harm:
+    stand.site.http.post(f"{url}/abort")
+    yield None
+
+
 # processes
+@contextmanager
+def defect(stand: Stand, url: str) -> Harm:
+    """An exception that nobody expects, at the next sample."""
+    stand.defective.touch()
+    yield None
+    stand.defective.unlink()
+
+
 @contextmanager
 def service_killed(stand: Stand, url: str) -> Harm:
     stand.site.service.kill()
@@ -127,7 +147,7 @@ def second_gateway(stand: Stand, url: str) -> Harm:
     try:
         stand.site.service.kill()
         since = time.monotonic()
-        while unsafe(stand.eye.glance(), HOME):
+        while unsafe(stand.eye.glance(), stand.home):
             if time.monotonic() - since > SOON_HOME_S:
                 stand.defects.append(f"not home {SOON_HOME_S:g} s after the kill")
                 break
@@ -261,8 +281,9 @@ def foreign_gains(stand: Stand, url: str) -> Harm:
 
 @contextmanager
 def foreign_mode(stand: Stand, url: str) -> Harm:
-    stand.site.write("controller_mode_command", Mode.MANUAL)
-    yield replace(HOME, mode=Mode.MANUAL, words="in their mode")
+    others = Mode.AUTOMATIC if stand.home.mode is Mode.MANUAL else Mode.MANUAL
+    stand.site.write("controller_mode_command", others)
+    yield replace(stand.home, mode=others, words="in their mode", mv=None)
 
 
 def operators_off(samples: int) -> Injection:
@@ -276,7 +297,7 @@ def operators_off(samples: int) -> Injection:
         while hub.sample_number < hub.commanded + samples and time.monotonic() < give_up:
             time.sleep(0.001)
         stand.site.write("controller_mode_command", Mode.OFF)
-        yield replace(HOME, mode=Mode.OFF, words="off")
+        yield replace(stand.home, mode=Mode.OFF, words="off")
 
     return contextmanager(inject)
 
@@ -286,7 +307,7 @@ def off_on_the_way_out(stand: Stand, url: str) -> Harm:
     stand.site.http.post(f"{url}/abort")
     time.sleep(random.uniform(0.0, WAY_OUT_S))
     stand.site.write("controller_mode_command", Mode.OFF)
-    yield replace(HOME, mode=Mode.OFF, words="off")
+    yield replace(stand.home, mode=Mode.OFF, words="off")
 
 
 @contextmanager
@@ -311,14 +332,33 @@ def pv_gone(stand: Stand, url: str) -> Harm:
 def _look_at_mv(stand: Stand) -> None:
     """Nothing controls: MV must be that of home."""
     seen = stand.eye.glance()
-    if seen is None or abs(seen.plant_mv - (HOME.mv or 0.0)) > LEFT_NEAR:
-        stand.defects.append(f"while nothing controls, MV is {seen and seen.plant_mv}, home's was about {HOME.mv}")
+    mv = stand.home.mv
+    if seen is None or abs(seen.plant_mv - (mv or 0.0)) > LEFT_NEAR:
+        stand.defects.append(f"while nothing controls, MV is {seen and seen.plant_mv}, home's was about {mv}")
 
 
 @contextmanager
 def foreign_setpoint(stand: Stand, url: str) -> Harm:
     stand.site.write("controller_setpoint", 50.03)
-    yield replace(HOME, sp=50.03, words="on their set-point", mv=None)
+    yield replace(stand.home, sp=50.03, words="on their set-point", mv=None)
+
+
+@contextmanager
+def foreign_output(stand: Stand, url: str) -> Harm:
+    output = 50.0 + OTHERS_OUTPUT
+    stand.site.write("controller_manual_output", output)
+    yield replace(stand.home, words="with their manual output", output=output)
+
+
+@contextmanager
+def load(stand: Stand, url: str) -> Harm:
+    """On the input of the plant, which takes PV over the limit of the job; the controller itself is to end the test."""
+    stand.site.write("plant_disturbance", LOAD_PCT)
+    yield None
+    cause = Cause(int(stand.site.read("controller_cause")))
+    if cause is not Cause.PV_LIMIT:
+        stand.defects.append(f"the controller ended the session for {cause.name}, not for PV")
+    stand.site.write("plant_disturbance", 0.0)
 
 
 @contextmanager

@@ -24,9 +24,9 @@ stage, then one fault is let loose on it. The end of the loop is read from the c
 {dates}. `make faults` fails unless the last three numbers are 0.
 
 An ending is unsafe unless mode and set-point are those found, the accepted gains are in effect, nothing is on trial,
-no session is open, both nodes are operational, and MV at the plant is what the mode stands for, in automatic where the
-loop rests; what another node has chosen for itself during the job has the last word. Unsafe ends and their jobs would
-stand here by name:{bad}
+no session is open, both nodes are operational, and MV at the plant is what the mode stands for: in automatic where the
+loop rests, in manual the manual output found. What another node has chosen for itself during the job has the last word.
+Unsafe ends and their jobs would stand here by name:{bad}
 
 ## How to read it
 
@@ -38,10 +38,12 @@ Each cell: how the job ended (from the second attempt on, the number of the atte
 - wall time from the fault until the controller was seen safe (looked at every 0.1 s, through a fault of the bus too).
   A dash: the job kept the loop, and went on to its proposal.
 
-The loop is model 14 of the 50, sampled at {ts:g} s, run at {pace:g} times real time. *proposed* means that the whole
-procedure came to its end in spite of the fault. What is tried in some stages only does not hang on the stage. A run
-in which the machine itself stood still for 0.4 s is repeated, twice at most, unless its end is bad: the heartbeat time
-is 1.5 s, and `device_went_back` with no fault in sight is such a machine's.
+The loop is model 14 of the 50, sampled at {ts:g} s, run at {pace:g} times real time, slower where a stage is short.
+*proposed* means that the whole procedure came to its end in spite of the fault. What is tried in some stages only does
+not hang on the stage, or is there for a loop in manual, and pulses of its manual output: `manual-up` is the first pulse
+while MV is away, `manual-back` the same one as soon as MV is back, `manual-rest` the second one when PV is left to
+itself. A run in which the machine itself stood still for 0.4 s is repeated, twice at most, unless its end is bad: the
+heartbeat time is 1.5 s, and `device_went_back` with no fault in sight is such a machine's.
 """
 
 EARLIER = """
@@ -55,6 +57,10 @@ TAIL = """## What the faults are
 - The bus and its frames: every frame of everybody, from the hub. Random losses, late answers and doubled frames last
   until the job ends. Senseless frames: wrong lengths, not a number as set-point, unknown commands; 20 times each.
 - Other gains: Kp 999, written and put on trial; the controller refuses the trial while its relay runs.
+- The exception is raised by the check of the next sample in the service. The load, on the plant's input, takes PV over
+  a limit of the job, and the controller is the one that has to end the session for it. Where the bus between controller
+  and plant is down in a pulse, MV stays at the plant where the pulse has taken it, until the bus is back or the I/O
+  reacts (2014h): therefore the 10 s of that row.
 - Disk full: the data folder is a file system of {disk} MiB, filled to its last byte.
 - Database locked, or away with SQLite: `BEGIN EXCLUSIVE` on both files by another process's connection; with PostgreSQL
   an exclusive lock on our tables, or the server stopped as by a power cut and started again.

@@ -25,7 +25,7 @@ from loopwright.controller.retained_state import write
 from loopwright.protocol.profile import Mode
 from loopwright.service.store.sample_blocks import Block, unpack
 from loopwright.service.store.tables import ChunkRow
-from tests.e2e.plantsite import MODEL_14, Plantsite
+from tests.e2e.plantsite import MANUAL_PERMITTED, MODEL_14, Plantsite, Stage
 from tests.faults.ending import Eye, Home, Stalls
 from tests.faults.faulty_hub import FaultyHub, well
 from tests.unit.service.postgres import Server, binaries
@@ -52,6 +52,7 @@ class Needs:
 
     small_disk: bool = False
     own_clock: bool = False
+    defect: bool = False
 
 
 # python-can's socketcand client warns of every frame that TCP splits, which is what TCP does.
@@ -73,6 +74,10 @@ class Stand:
         """The job's samples in the database when its service had died."""
         self.server: Server | None = None
         self.database: str | None = None
+        self.home = HOME
+        """How the loop must end unless an outside change comes between."""
+        self.defective = folder / "defective"
+        """While this file is there, the service of a fault that needs a defect has one."""
         self.clock = folder / "clock"
         """Seconds that the service's wall clock is off, where a fault needs its own."""
         launcher: tuple[str, ...] = ()
@@ -85,6 +90,8 @@ class Stand:
             _mount(stack, folder / "data")
         if needs.own_clock:
             launcher = ("tests.faults.own_clock", str(self.clock))
+        if needs.defect:
+            launcher = ("tests.faults.defect", str(self.defective))
         self.hub = FaultyHub()
         threading.Thread(target=self.hub.serve, daemon=True).start()
         stack.callback(self.hub.stop)
@@ -96,7 +103,7 @@ class Stand:
         others = replace(LOOP, kp=LOOP.kp / 2, ti=2 * LOOP.ti)
         self.site = Plantsite(
             stack, folder, others, bus=self.hub.url, launcher=launcher, served_with=served_with, speed=str(PACE),
-            on_answer=self._heard,
+            on_answer=self._heard, changes=MANUAL_PERMITTED,
         )  # fmt: skip
         self.site.case = LOOP
 
@@ -104,9 +111,19 @@ class Stand:
         self.hub.fault, self.hub.pv_broken = well, False
         self.site.at_rest(pace)
         self.hub.new_job()
+        self.home = HOME
+        self.defective.unlink(missing_ok=True)
         self.defects.clear()
         self.left = None
         self.stalls.longest_s = 0.0
+
+    def in_stage(self, stage: Stage) -> str:
+        """The URL of a job in that stage, of a loop that was at rest."""
+        self.at_rest(PACE * stage.pace)
+        url = self.site.in_stage(stage)
+        if stage.in_manual:
+            self.home = replace(HOME, mode=Mode.MANUAL, mv=self.site.output, output=self.site.output)
+        return url
 
     def serve_again(self, url: str) -> None:
         """The service that has died is started, as a supervisor would. Counts first what it has left of the job."""

@@ -24,10 +24,12 @@ PROPOSED = "proposed None"
 SILENT = ("failed node_lost", "failed samples_lost", "failed device_went_back")
 EXPECTED: dict[tuple[str, str], tuple[str, ...]] = {
     ("service-killed", "zn_pi"): (PROPOSED,),
+    ("service-killed", "manual-up"): (PROPOSED,),
     ("plant-killed", "ultimate"): ("failed node_lost", "failed samples_lost"),
     ("controller-killed", "verify"): ("failed node_lost",),
     ("bus-down-0.1", "verify"): (PROPOSED, "failed samples_lost"),
     ("bus-down-1", "zn_pi"): SILENT,
+    ("bus-down-1", "manual-up"): SILENT,
     ("bus-down-10", "baseline"): ("failed node_lost", "failed restore_unconfirmed"),
     ("lost-1", "verify"): (PROPOSED, *SILENT),
     ("lost-10", "verify"): (PROPOSED, *SILENT),
@@ -38,6 +40,10 @@ EXPECTED: dict[tuple[str, str], tuple[str, ...]] = {
     ("foreign-gains", "setpoint-pulses"): ("aborted gains_changed",),
     ("foreign-gains", "verify"): ("aborted gains_changed",),
     ("foreign-setpoint", "setpoint-verify"): ("aborted setpoint_changed",),
+    ("foreign-output", "manual-back"): ("aborted output_changed",),
+    ("load", "manual-rest"): ("failed pv_limit",),
+    ("load", "manual-up"): ("failed pv_limit",),
+    ("defect", "manual-back"): ("failed internal",),
     ("deaf-listener", "verify"): (PROPOSED,),
     ("deaf-listener", "setpoint-pulses"): (PROPOSED,),
     ("clients", "ultimate"): ("aborted operator",),
@@ -49,6 +55,7 @@ EXPECTED: dict[tuple[str, str], tuple[str, ...]] = {
     ("off-40", "setpoint-pulses"): ("aborted mode_changed",),
     ("off-way-out", "fast-relay"): ("aborted operator", "aborted mode_changed"),
     ("pre-operational", "fast-relay"): ("failed node_not_operational",),
+    ("pre-operational", "manual-rest"): ("failed node_not_operational",),
     ("pv-gone", "fast-relay"): ("failed bad_sample",),
     ("two-tuners", "fast-relay"): (PROPOSED,),
     ("second-gateway", "verify"): (PROPOSED,),
@@ -109,14 +116,15 @@ WELL: dict[str, Any] = {
 @pytest.mark.parametrize(
     "change",
     [
-        {"mode": 3}, {"mode": 1}, {"sp": 50.1}, {"on_trial": True}, {"session": 5}, {"Kp": 40.0}, {"Ti": 2.4},
-        {"plant_mv": 60.0}, {"states": (127, 5)}, {"states": (5, 4)},
+        {"mode": 3}, {"mode": 1}, {"sp": 50.1}, {"manual_output": 31.0}, {"on_trial": True}, {"session": 5},
+        {"Kp": 40.0}, {"Ti": 2.4}, {"plant_mv": 60.0}, {"states": (127, 5)}, {"states": (5, 4)},
     ],
     ids=str,
 )  # fmt: skip
 def test_what_is_unsafe(change: dict[str, Any]) -> None:
-    assert unsafe(Glance(**WELL), HOME, at_rest=True) == ""
-    assert unsafe(Glance(**WELL | change), HOME, at_rest=True)
+    home = replace(HOME, output=30.0)
+    assert unsafe(Glance(**WELL), home, at_rest=True) == ""
+    assert unsafe(Glance(**WELL | change), home, at_rest=True)
     assert unsafe(None, HOME)
 
 
@@ -131,9 +139,6 @@ def test_the_page_is_that_of_the_results() -> None:
     entries = campaign.load()
     assert report.TABLE.read_text(encoding="utf-8") == report.text(entries)
     assert {(entry["fault"], entry["stage"], entry["database"]) for entry in entries} == {
-        (name, stage, database)
-        for name, fault in FAULTS.items()
-        for stage in fault.stages
-        for database in fault.databases
+        (name, stage, database) for name, fault in FAULTS.items() for database, stage in fault.runs()
     }
     assert "0 unsafe endings" in report.text(entries)
