@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from typing import Any
+from unittest.mock import patch
 
 from loopwright.controller import __main__ as process
 from loopwright.controller.device import ControllerDevice
@@ -20,5 +21,5 @@ class OlderDevice(ControllerDevice):
 
 
 if __name__ == "__main__":
-    process.ControllerDevice = OlderDevice  # type: ignore[misc]
-    sys.exit(process.main())
+    with patch.object(process, "ControllerDevice", OlderDevice):
+        sys.exit(process.main())

@@ -119,6 +119,7 @@ class Plantsite:
         self._changes = changes
         self.tag = str(changes.get("tag", TAG))
         self.data = folder / "data"
+        self.controller_module = "loopwright.controller"
         self.mode = Mode.AUTOMATIC
         """In which the loop is found by a test."""
         self.output = 0.0
@@ -135,13 +136,12 @@ class Plantsite:
         model = ("--model", case.model, "--ts", str(case.ts), "--speed", self._speed)
         self.plant = self.launch("plant", "loopwright.plantsim", "--bus", self.bus, *model)
 
-    def start_controller(self, of: str = "loopwright.controller") -> None:
-        """of: its module."""
+    def start_controller(self) -> None:
         case = self.case
         gains = ("--kp", str(case.kp), "--ti", str(case.ti), "--sp", str(case.sp))
         kept = ("--keep", str(self._folder / "kept.json"))
         where = ("--bus", self.bus, "--ts", str(case.ts))
-        self.controller = self.launch("controller", of, *where, *gains, *kept)
+        self.controller = self.launch("controller", self.controller_module, *where, *gains, *kept)
 
     def launch(self, name: str, *arguments: str) -> ChildProcess:
         """Starts a process and does not wait for it."""

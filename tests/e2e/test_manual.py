@@ -40,6 +40,14 @@ def output(here: Plantsite) -> tuple[int, float]:
     return int(here.read("controller_mode")), found
 
 
+def restarted(here: Plantsite, module: str) -> None:
+    """The controller anew, of this module, on what it has kept."""
+    here.controller.kill()
+    here.controller_module = module
+    here.start_controller()
+    here.controller.wait_ready()
+
+
 def in_a_pulse(here: Plantsite, **options: Any) -> str:
     """A job whose pulse has taken MV away from home."""
     here.write("plant_pace", PACE)
@@ -96,10 +104,8 @@ def test_another_hand_on_the_manual_output_has_the_last_word(here: Plantsite) ->
 
 def test_a_controller_of_an_older_version_is_refused_before_anything_moves(here: Plantsite) -> None:
     """Its order WATCH is missing, with which it is to end a test by itself."""
-    here.controller.kill()
-    here.start_controller(of="tests.e2e.older_controller")
-    here.controller.wait_ready()
     home = output(here)
+    restarted(here, "tests.e2e.older_controller")
     try:
         url = here.retune()
         job = here.finished(url)
@@ -108,9 +114,7 @@ def test_a_controller_of_an_older_version_is_refused_before_anything_moves(here:
         assert {*here.http.get(f"{url}/samples").json()["mv"]} == {home[1]}
         assert output(here) == home
     finally:
-        here.controller.kill()
-        here.start_controller()
-        here.controller.wait_ready()
+        restarted(here, "loopwright.controller")
 
 
 def test_a_loop_in_automatic_is_moved_by_its_set_point(here: Plantsite) -> None:
