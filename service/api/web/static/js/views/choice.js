@@ -190,7 +190,7 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
     <button key="cancel" onClick=${close}>Cancel</button><button key="go" class="main" disabled=${dead || !signature.value.trim()} onClick=${go}>${action}</button></span>`;
   const mode = rowOf(loop.tag).value?.mode;
   const noTrialIn = mode === "manual" ? "in manual" : mode === "off" ? "off" : "";
-  const backButton = html`<button key="back" onClick=${back}>Back to Ms ${msText(tested)}</button>`;
+  const backButton = html`<button key="back" onClick=${() => { close(); back(); }}>Back to Ms ${msText(tested)}</button>`;
   let inside = null;
   if (loop.locked) inside = html`<span class="say">Locked by ${loop.locked.by}: no decision until it is unlocked.</span>`;
   else if (job.dry_run) inside = html`<span class="say">A rehearsal: nothing was moved, and there is nothing to accept.</span>`;
@@ -199,7 +199,7 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
   else if (asking === "accept") inside = html`<span class="say">Write <b>${written}</b> into ${where}, for good.</span>${Signed(`Write to ${loop.tag}`, () => send(() => command(`${job.url}/accept`, by())))}`;
   else if (asking === "keep") inside = html`<span class="say">Keep the old gains; the proposal is declined.</span>${Signed("Keep the old gains", () => send(() => command(`${job.url}/rollback`, by())))}`;
   else if (asking === "rollback") inside = html`<span class="say">Write the old gains, <b>${written}</b>, back into ${where}.</span>${Signed(`Roll ${loop.tag} back`, () => send(() => command(`${job.url}/rollback`, by())))}`;
-  else if (!atTested && noTrialIn) inside = html`<span class="say">These gains have not been on the loop, and cannot be tried: a trial steps the set-point, and the loop is ${noTrialIn}. Put it in automatic to try them.</span>${backButton}`;
+  else if (noTrialIn && (!atTested || asking === "try")) inside = html`<span class="say">These gains have not been on the loop, and cannot be tried: a trial steps the set-point, and the loop is ${noTrialIn}. Put it in automatic to try them.</span>${backButton}`;
   else if (asking === "try") inside = html`<span class="say">A trial listens, steps the set-point by <b>${withUnit(fixed(loop.sp_deviation, pvDecimals(loop.pv_limits)), loop.pv_unit)}</b> under the gains for Ms ${msText(ms)}, and ends as a proposal. No relay.</span>${Signed(`Try Ms ${msText(ms)} on ${loop.tag}`, tryIt)}`;
   else if (!atTested) inside = html`<span class="say">These gains have not been on the loop.</span>${backButton}<button key="try" class="main" disabled=${dead} data-opens="try" onClick=${() => open("try")}>Try Ms ${msText(ms)} on ${loop.tag}…</button>`;
   else if (job.state === "proposed" && latest) inside = html`<span class="say">The loop runs on its old gains until you accept.</span><button key="keep" disabled=${dead} data-opens="keep" onClick=${() => open("keep")}>Keep the old gains…</button><button key="accept" class="main" disabled=${dead} data-opens="accept" onClick=${() => open("accept")}>Accept the new gains…</button>`;
