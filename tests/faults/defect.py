@@ -5,6 +5,7 @@ python -m tests.faults.defect FILE MODULE ARGS
 
 from __future__ import annotations
 
+import argparse
 import runpy
 import sys
 from pathlib import Path
@@ -25,7 +26,11 @@ def install(file: Path) -> None:
 
 
 if __name__ == "__main__":
-    _, own_file, module, *arguments = sys.argv
-    install(Path(own_file))
-    sys.argv = [module, *arguments]
-    runpy.run_module(module, run_name="__main__", alter_sys=True)
+    parser = argparse.ArgumentParser(prog="python -m tests.faults.defect", description=__doc__)
+    parser.add_argument("file", type=Path, metavar="FILE", help="the defect is there as long as this file is")
+    parser.add_argument("module", metavar="MODULE")
+    parser.add_argument("arguments", nargs=argparse.REMAINDER, metavar="ARGS")
+    asked = parser.parse_args()
+    install(asked.file)
+    sys.argv = [asked.module, *asked.arguments]
+    runpy.run_module(asked.module, run_name="__main__", alter_sys=True)

@@ -52,7 +52,9 @@ export function LoopView({ tag }) {
       setTests(entries);
       const latest = entries.find((/** @type {any} */ each) => !each.dry_run && !["queued", "running"].includes(each.state));
       setResult(latest ? await ask(latest.url, stop.signal) : null);
-    }).catch(() => {});
+    }).catch(() => {
+      if (!stop.signal.aborted) setResult((/** @type {any} */ known) => known ?? null);
+    });
     const timer = setInterval(() => {
       if (!document.hidden && !isSilent.peek()) void read();
     }, REREAD_MS);
@@ -94,7 +96,7 @@ export function LoopView({ tag }) {
   return html`<div>
     <div class="looptitle" key="title"><h1 class="tag">${tag}</h1><span class="what">${loop.description}</span>
       <span class="where">${[loop.area, loop.bus, `node ${loop.controller_node.toString(16)}h`, `channel ${loop.channel}`].filter(Boolean).join(" · ")}${elsewhere && html` · by way of ${GatewayName(loop)}`}</span>
-      ${!job && !formOpen && may.operate.value && html`<button key="retune" id="retune" onClick=${() => setOpen(true)}>Retune…</button>`}
+      ${!job && !formOpen && result !== undefined && may.operate.value && html`<button key="retune" id="retune" onClick=${() => setOpen(true)}>Retune…</button>`}
       ${!may.operate.value && html`<span key="may" class="quiet">Your key may read. To retune it needs the scope operate.</span>`}
     </div>
     ${mine.map((each) => html`<div class="abnormal" key=${each.id}>${AlarmSymbol(each.level)}<span><b>${each.text}.</b> <span class="quiet">${each.advice}</span></span>${SignOffButton(each)}
