@@ -104,9 +104,10 @@ def test_another_hand_on_the_manual_output_has_the_last_word(here: Plantsite) ->
 
 def test_a_controller_of_an_older_version_is_refused_before_anything_moves(here: Plantsite) -> None:
     """Its order WATCH is missing, with which it is to end a test by itself."""
-    home = output(here)
     restarted(here, "tests.e2e.older_controller")
     try:
+        here.put_in_manual()  # the one before may have been killed before it had stored its mode
+        home = output(here)
         url = here.retune()
         job = here.finished(url)
         assert (job["state"], job["reason"]) == ("refused", "device_mismatch")
