@@ -34,11 +34,15 @@ COLUMNS = """(plot) => {
 
 @dataclass(frozen=True)
 class Gap:
-    """Columns between which no PV is drawn. seconds: how long that is, of the window."""
+    """Columns between which no PV is drawn.
+
+    seconds: how long that is, of the window.  ago_s: how long ago it began, if the window ends now.
+    """
 
     left: int
     right: int
     seconds: float
+    ago_s: float
 
 
 def columns(page: Page) -> tuple[list[int], int]:
@@ -51,4 +55,4 @@ def gaps(page: Page, window_s: float = 120.0) -> list[Gap]:
     """The gaps in PV, not counting what is empty at the left of the first sample."""
     found, width = columns(page)
     wide = [(a, b) for a, b in pairwise(found) if b - a > MIN_GAP_PX]
-    return [Gap(a, b, (b - a) * window_s / width) for a, b in wide]
+    return [Gap(a, b, (b - a) * window_s / width, (width - a) * window_s / width) for a, b in wide]
