@@ -24,6 +24,8 @@ from tests.unit.service import processes
 
 PATIENCE_S = 60.0
 WINDOW_S = 30.0
+MIN_COLUMNS = 150
+"""Of the trend's 1,000: 4.5 s of 30 s, 37 columns of the trend of 2 min."""
 AGE = re.compile(r"^\d.* old$")
 SHORT_S = 1.5
 """Shorter than the silence after which values count as old."""
@@ -60,10 +62,10 @@ def empty_at_the_right(page: Page) -> float:
 
 
 def watched(page: Page) -> None:
-    """The loop's page with its trend, up to the present."""
+    """The loop's page with its trend of 30 s, up to the present and with enough before it to be seen in that of 2 min."""
     person.open_loop(page)
     page.get_by_role("button", name="30 s").click()
-    until(page, lambda: len(trend.columns(page)[0]) > 0 and empty_at_the_right(page) < 0.02)
+    until(page, lambda: len(trend.columns(page)[0]) > MIN_COLUMNS and empty_at_the_right(page) < 0.02)
 
 
 def one_gap(page: Page, window_s: float = WINDOW_S) -> float:
