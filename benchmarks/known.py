@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.cases import ASKED, PI
 from benchmarks.command import check_names, parser_of
-from benchmarks.drawn_runs import Draw, run_all
+from benchmarks.drawn_runs import Draw, DrawNames, run_all
 from benchmarks.operation import KINDS, LOOKS, PRESENT, SAMPLES, SPACING, WRONG, chosen, operation, present_gains
 from benchmarks.plants import Plant
 from benchmarks.tuning import T95_PERIODS, spread
@@ -100,6 +100,10 @@ class KnownRun:
     passed: float
     Ms: float | None
     seconds: float
+
+    @property
+    def draw(self) -> DrawNames:
+        return self.plant, self.present, self.change, self.seed
 
     @property
     def error(self) -> float:

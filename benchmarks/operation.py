@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.cases import ASKED, PI
 from benchmarks.command import check_names, parser_of
-from benchmarks.drawn_runs import Draw, run_all
+from benchmarks.drawn_runs import Draw, DrawNames, run_all
 from benchmarks.plants import Plant, plants
 from benchmarks.tuning import cost_over_best, optimum, spread
 from loopwright.controller.channel import Channel, Settings
@@ -100,6 +100,10 @@ class Operated:
     Ms: float | None
     ratio: float | None
     seconds: float
+
+    @property
+    def draw(self) -> DrawNames:
+        return self.plant, self.present, self.kind, self.seed
 
     @property
     def error(self) -> float:

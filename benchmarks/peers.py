@@ -23,18 +23,17 @@ import numpy as np
 
 from benchmarks.cases import ASKED, CASES, PLAIN, Case
 from benchmarks.command import check_names
-from benchmarks.plants import Plant
+from benchmarks.drawn_runs import kept, saved
+from benchmarks.plants import Plant, plants
 from benchmarks.tuning import (
     T95_PERIODS,
     WRONG,
     Ran,
     evaluated,
-    kept,
     loads,
     loop_of,
     runs_of,
     runs_parser,
-    saved,
     some,
     span_of,
     spread,
@@ -162,9 +161,9 @@ def main() -> None:
 
 
 def _runs(given: argparse.Namespace) -> Iterator[Ran]:
-    chosen, seeds = some(given)
-    done = {(ran.case, ran.plant, ran.seed): ran for ran in saved(given.save)} if given.save else {}
-    for seed in seeds:
+    chosen = some(plants(), given)
+    done = {(ran.case, ran.plant, ran.seed): ran for ran in saved(Ran, given.save)}
+    for seed in given.seeds:
         for plant in chosen:
             for name in METHODS_COMPARED:
                 found = done.get((name, plant.name, seed))

@@ -16,25 +16,23 @@ The plants of the batch are those on which rules are set (--of-batch); the other
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from multiprocessing import Pool
-from pathlib import Path
 
 import numpy as np
 
 from benchmarks.cases import ASKED, ONE, TWO, Case
 from benchmarks.command import check_names
 from benchmarks.disturbances import Disturbance, Disturbed
+from benchmarks.drawn_runs import Draw, DrawNames, run_all, saved
 from benchmarks.operation import PRESENT, chosen, present_gains
 from benchmarks.plants import Plant, plants
-from benchmarks.tuning import T95_PERIODS, WRONG, Ran, evaluated, loads
+from benchmarks.tuning import T95_PERIODS, WRONG, Ran, evaluated, loads, some
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
@@ -114,6 +112,10 @@ class Pulsed(Ran):
     at_limit_trial: float = 0.0
     beyond: float | None = None
 
+    @property
+    def draw(self) -> DrawNames:
+        return self.plant, self.present, self.case, self.seed
+
 
 class PulsedLoop(RehearsedLoop):
     """Loads count from the first pulse; the samples since then are kept by stage."""
@@ -184,7 +186,7 @@ def measure(plant: Plant, present: str, case: Case, seed: int, method: str = SET
     return found
 
 
-def _measured(given: tuple[Plant, str, str, int], method: str) -> Pulsed:
+def _measured(given: Draw, method: str) -> Pulsed:
     plant, present, case, seed = given
     return measure(plant, present, EVERY[case], seed, method)
 
@@ -230,13 +232,6 @@ def table(runs: Sequence[Pulsed]) -> Iterator[str]:
             yield line(name, "all", of_case)
 
 
-def saved(file: Path) -> list[Pulsed]:
-    """The runs of a file. A last line that is not whole, of a run that was cut off, does not count."""
-    if not file.exists():
-        return []
-    return [Pulsed(**json.loads(text)) for text in file.read_text().split("\n")[:-1]]
-
-
 def runs(given: argparse.Namespace) -> Iterator[Pulsed]:
     """The runs asked for: those that the file holds, and the others, on so many processes."""
     cases = given.cases.split(";")
@@ -244,37 +239,22 @@ def runs(given: argparse.Namespace) -> Iterator[Pulsed]:
     if given.of_batch:
         apart = chosen("kept-apart", 1)
         which = [each for each in which if each not in apart]
-    step = len(which) / min(given.plants or len(which), len(which))
-    which = [which[int(i * step)] for i in range(round(len(which) / step))]
-    part, parts = given.part
-    which = which[part::parts]
-    found = saved(given.save) if given.save else []
-    if given.save and given.save.exists():
-        given.save.write_text("".join(f"{json.dumps(asdict(each))}\n" for each in found))
-    done = {(each.plant, each.present, each.case, each.seed): each for each in found}
-    todo: list[tuple[Plant, str, str, int]] = []
-    for seed in given.seeds:
-        # a batch that is stopped leaves rows of the same plants, drawn at random
-        for i in np.random.default_rng(seed).permutation(len(which)):
-            for present, case in product(PRESENT, cases):
-                key = (which[i].name, present, case, seed)
-                if key in done:
-                    yield done[key]
-                else:
-                    todo.append((which[i], present, case, seed))
-    with Pool(given.processes) as pool:
-        for ran in pool.imap_unordered(partial(_measured, method=given.method), todo):
-            if given.save:
-                with given.save.open("a") as file:
-                    file.write(f"{json.dumps(asdict(ran))}\n")
-            yield ran
+    which = some(which, given)
+    # a batch that is stopped leaves rows of the same plants, drawn at random
+    todo: list[Draw] = [
+        (which[i], present, case, seed)
+        for seed in given.seeds
+        for i in np.random.default_rng(seed).permutation(len(which))
+        for present, case in product(PRESENT, cases)
+    ]
+    return run_all(Pulsed, partial(_measured, method=given.method), todo, given.save, given.processes)
 
 
 def main(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     """parser, given: of `benchmarks.tuning`."""
     given.cases = given.cases or ";".join(CASES)
     check_names(parser, "case", given.cases.split(";"), EVERY)
-    found = saved(given.of) if given.of else list(runs(given))
+    found = saved(Pulsed, given.of) if given.of else list(runs(given))
     if not found:
         parser.exit(2, f"{parser.prog}: no run: {given.of or 'no plants or no seeds'}\n")
     print(*table(found), sep="\n")

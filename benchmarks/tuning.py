@@ -16,12 +16,11 @@ than 0.1.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -30,6 +29,7 @@ import numpy as np
 from benchmarks.cases import ASKED, CASES, FURTHER, PI, PLAIN, Case
 from benchmarks.command import check_names, parser_of
 from benchmarks.disturbances import Disturbed
+from benchmarks.drawn_runs import kept, saved
 from benchmarks.plants import REACTOR, SAMPLES_PER_PERIOD, Plant, plants
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
@@ -298,7 +298,7 @@ def _seeds(text: str) -> range:
 
 def runs_of(parser: argparse.ArgumentParser, given: argparse.Namespace, runs: Iterator[Ran]) -> list[Ran]:
     """Those of the file that was asked for, or what is run now; at least one."""
-    found = saved(given.of) if given.of else list(runs)
+    found = saved(Ran, given.of) if given.of else list(runs)
     if not found:
         parser.exit(2, f"{parser.prog}: no run: {given.of or 'no plants or no seeds'}\n")
     return found
@@ -336,38 +336,26 @@ def main() -> None:
             print(f"{each.case}, {each.plant}, seed {each.seed}: Ms {each.Ms}")
 
 
-def some(given: argparse.Namespace) -> tuple[list[Plant], range]:
-    """The plants and seeds that were asked for."""
-    everything = plants()
+def some(everything: Sequence[Plant], given: argparse.Namespace) -> list[Plant]:
+    """As many of these plants as were asked for, spread over the list."""
     step = len(everything) / min(given.plants or len(everything), len(everything))
     part, parts = given.part
     chosen = [everything[int(i * step)] for i in range(round(len(everything) / step))]
-    return chosen[part::parts], given.seeds
-
-
-def saved(file: Path) -> list[Ran]:
-    return [Ran(**json.loads(text)) for text in file.read_text().splitlines()] if file.exists() else []
+    return chosen[part::parts]
 
 
 def _runs(given: argparse.Namespace) -> Iterator[Ran]:
-    chosen, seeds = some(given)
+    chosen = some(plants(), given)
     cases = given.cases.split(";")
-    done = {(ran.case, ran.plant, ran.seed): ran for ran in saved(given.save)} if given.save else {}
+    done = {(ran.case, ran.plant, ran.seed): ran for ran in saved(Ran, given.save)}
     # a batch that is stopped leaves rows of the same plants, drawn at random
-    for seed in seeds:
+    for seed in given.seeds:
         shuffled = [chosen[i] for i in np.random.default_rng(seed).permutation(len(chosen))]
         for plant in shuffled:
             for case in ((CASES | FURTHER)[name] for name in cases):
                 if case.nonlinear and plant.name != REACTOR:
                     continue
                 yield done.get((case.name, plant.name, seed)) or kept(measure(case, plant, seed), given.save)
-
-
-def kept(ran: Ran, file: Path | None) -> Ran:
-    if file:
-        with file.open("a") as out:
-            out.write(json.dumps(asdict(ran)) + "\n")
-    return ran
 
 
 if __name__ == "__main__":

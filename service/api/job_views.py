@@ -362,6 +362,10 @@ class JobView(BaseModel):
         description="Sampling period of the controller as the job found it, s; null: the job has not read the loop",
         examples=[0.1],
     )
+    mode_found: str | None = Field(
+        description="Mode of the loop as the job found it: manual or automatic; null: the job has not read the loop",
+        examples=["automatic"],
+    )
     record: Literal["kept", "deleted", "none"] = Field(
         description="kept: `GET /jobs/ID/record` has the record of the job; deleted: its samples were deleted, the "
         "result stays; none: the job is not over, or it ended before its second sample"
@@ -490,6 +494,7 @@ def job_view(
         superseded_by=f"/jobs/{latest.id}" if later and latest is not None else None,
         stopping=next((_stopping(event) for event in reversed(events) if event.kind == "abort_requested"), None),
         sample_time_s=None if row.found is None else number(row.found["sample_time_s"]),
+        mode_found=None if row.found is None else str(row.found["mode"]),
         record=_record(state, events, has_record),
     )
 

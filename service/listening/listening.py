@@ -52,6 +52,7 @@ HOLE_S = 128.0
 """Wall time without a stored sample at the edge of what is known that is shown as a gap, s: blocks are stored once a
 minute, and a bin of the coarsest level is 32 s."""
 _STOP_S = 5.0
+NOT_BEGUN = "listening has not begun yet"
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,7 @@ class Listening:
         url = self._loops[tag].bus
         if url in self.off:
             return self.off[url]
-        return self._down.get(url) if self._started else "listening has not begun yet"
+        return self._down.get(url) if self._begun else NOT_BEGUN
 
     def gains_of(self, tag: str) -> Gains | None:
         """Returns the gains of a loop as they were read last; None where they are not known."""
@@ -179,7 +180,7 @@ class Listening:
         if url in self.off:
             return None, self.off[url]
         if not self._started:
-            return None, "listening has not begun yet"
+            return None, NOT_BEGUN
         try:
             return self.process.ask(tag, from_s, to_s, points), self._down.get(url)
         except NotListening as why:

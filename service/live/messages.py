@@ -71,7 +71,8 @@ class Loops(BaseModel):
 
 
 class BusView(BaseModel):
-    """A bus of a gateway. up: null where the bus is not listened to, or is of a gateway that does not answer."""
+    """A bus of a gateway. up: null where the bus is not listened to, or not yet, or is of a gateway that does not
+    answer."""
 
     host: str
     bus: str

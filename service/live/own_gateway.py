@@ -64,9 +64,9 @@ class OwnGateway:
 
     def buses(self) -> list[BusView]:
         """Returns its buses as they are."""
-        off = self._listening.off
+        off, begun = self._listening.off, self._listening.begun
         return [
-            BusView(host=self.name, bus=url, up=None if url in off else why is None, why=why)
+            BusView(host=self.name, bus=url, up=why is None if begun and url not in off else None, why=why)
             for url, why in self._listening.buses().items()
         ]
 

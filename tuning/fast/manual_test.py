@@ -69,6 +69,10 @@ class ManualTest(Experiment):
         self.turns: list[int] = []  # samples at which MV left home, or came back
         self.period = 0.0
         """The time scale of the record, in samples; known after the first pulse."""
+        self._begun = len(self.trace)
+        """The sample at which the first pulse, or its larger repetition, began."""
+        self._farthest = 0.0
+        """The largest deviation of PV from rest since then, PV units, of the mean of the last samples."""
         self._ordered = self.home
         self._follows_at = 0
         self._waited = 0
@@ -87,19 +91,19 @@ class ManualTest(Experiment):
         Raises Refused: NO_RESPONSE, NOT_SELF_REGULATING.
         """
         for raised in range(MAX_RAISES + 1):
-            begun = len(self.trace)
+            self._begun, self._farthest = len(self.trace), 0.0
             yield from self._turn(self.home + self.side * self.size)
             longest = self._samples(LONGEST_PULSE_T95 * self.facts.T95_s)
-            while len(self.trace) - begun < longest and abs(self._moved()) < self._turns_at:
+            while len(self.trace) - self._begun < longest and abs(self._moved()) < self._turns_at:
                 yield from self.sample()
-            width = len(self.trace) - begun
+            width = len(self.trace) - self._begun
             yield from self._turn(self.home)
-            answered = begun + width + self._samples(ANSWER_T95 * self.facts.T95_s)
-            while len(self.trace) < answered and self._farthest(begun) < self._turns_at:
+            answered = self._begun + width + self._samples(ANSWER_T95 * self.facts.T95_s)
+            while len(self.trace) < answered and self._farthest < self._turns_at:
                 yield from self.sample()
             is_largest = raised == MAX_RAISES or self.size >= self.largest
-            if self._farthest(begun) >= (TURN_NOISES * self.noise if is_largest else self._turns_at):
-                return (yield from self._until_back(begun, width))
+            if self._farthest >= (TURN_NOISES * self.noise if is_largest else self._turns_at):
+                return (yield from self._until_back(width))
             if not is_largest:
                 size = min(RAISE * self.size, self.largest)
                 yield from self.report(
@@ -110,7 +114,7 @@ class ManualTest(Experiment):
             break
         text = (
             f"a pulse of {self.size:.4g} of MV, {width * self.facts.sample_time_s:.3g} s long, moved PV by "
-            f"{self._farthest(begun):.3g}, and {TURN_NOISES:g} times the noise of {self.noise:.3g} are needed"
+            f"{self._farthest:.3g}, and {TURN_NOISES:g} times the noise of {self.noise:.3g} are needed"
         )
         raise Refused(Reason.NO_RESPONSE, text)
 
@@ -194,14 +198,14 @@ class ManualTest(Experiment):
         u, y = self._deviations()
         return u[self.listened :], y[self.listened :]
 
-    def _until_back(self, begun: int, width: int) -> Plan[None]:
-        """Waits until PV has come back by half from its farthest point since this sample. Raises Refused,
+    def _until_back(self, width: int) -> Plan[None]:
+        """Waits until PV has come back by half from its farthest point of this pulse. Raises Refused,
         NOT_SELF_REGULATING: it does not, so it would stay away, or run away, at the manual output found."""
         facts = self.facts
         longest = max(self._samples(BACK_T95 * facts.T95_s), BACK_PULSES * width)
         back = len(self.trace)
         while True:
-            farthest, away = self._farthest(begun), abs(self._moved())
+            farthest, away = self._farthest, abs(self._moved())
             if farthest - away >= max(CAME_BACK * farthest, MIN_BACK_NOISES * self.noise):
                 return
             if len(self.trace) - back > longest:
@@ -231,6 +235,8 @@ class ManualTest(Experiment):
     def _add(self, sample: Sample) -> None:
         super()._add(sample)
         facts, trace = self.facts, self.trace
+        if len(trace) - self._begun >= SAMPLES_AVERAGED:
+            self._farthest = max(self._farthest, abs(self._moved()))
         hair = HAIR * (facts.mv_high - facts.mv_low)
         if len(trace) <= self._follows_at or not self.turns or abs(sample.mv - self._ordered) <= hair:
             return
@@ -241,13 +247,6 @@ class ManualTest(Experiment):
     def _moved(self) -> float:
         """By how much PV is away from rest, the mean of the last samples, PV units."""
         return float(np.mean(self.trace.pv[-SAMPLES_AVERAGED:])) - self.point.pv
-
-    def _farthest(self, begun: int) -> float:
-        """The largest deviation of PV from rest since this sample, PV units."""
-        if len(self.trace) - begun < SAMPLES_AVERAGED:
-            return 0.0
-        means = np.convolve(self.trace.pv[begun:], np.full(SAMPLES_AVERAGED, 1.0 / SAMPLES_AVERAGED), mode="valid")
-        return float(np.max(np.abs(means - self.point.pv)))
 
     @property
     def _turns_at(self) -> float:

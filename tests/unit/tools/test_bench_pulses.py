@@ -11,9 +11,10 @@ from unittest.mock import patch
 
 import pytest
 
-from benchmarks import pulses
+from benchmarks import drawn_runs, pulses
+from benchmarks.drawn_runs import saved
 from benchmarks.plants import plants
-from benchmarks.pulses import Pulsed, line, saved
+from benchmarks.pulses import Pulsed, line
 
 PLANT = plants()[0].name
 
@@ -42,10 +43,10 @@ def test_a_run_that_is_cut_off_in_the_file_is_made_again_and_the_others_are_not(
             asked.extend((present, case) for _, present, case, _ in todo)
             return [ran(present) for _, present, _, _ in todo]
 
-    with patch.object(pulses, "Pool", OneByOne):
+    with patch.object(drawn_runs, "get_context", lambda _: argparse.Namespace(Pool=OneByOne)):
         found = list(pulses.runs(given))
     assert asked == [("nearly unstable", "PI 1 %")]
-    assert len(found) == 3 and saved(file) == found
+    assert len(found) == 3 and saved(Pulsed, file) == found
 
 
 def test_a_row_counts_proposals_errors_and_refusals() -> None:

@@ -31,7 +31,7 @@ export function stagesOf(job) {
   let expected;
   if (method === "fast" && request.start === "design") expected = ["preflight", "design", "verify"];
   else if (method === "setpoint") expected = ["preflight", "pulses", "design", "verify", "redesign"];
-  else if (done.includes("manual")) expected = ["preflight", "manual", "design"];
+  else if (done.includes("manual") || (method === "fast" && job.mode_found === "manual")) expected = ["preflight", "manual", "design"];
   else if (method === "fast") expected = ["preflight", done.includes("pulses") && !done.includes("relay") ? "pulses" : "relay", "design", "verify", "redesign"];
   else expected = ["preflight", ...(request.baseline === false ? [] : ["baseline"]), "relay", "ultimate", "zn_pi", "estimate", "optimise", "verify"];
   if (request.verify === false) expected = expected.filter((each) => each !== "verify" && each !== "redesign");
