@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from loopwright.tuning.analysis.comparison import Comparison
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.design import frequencies
 from loopwright.tuning.fast.evaluation import Evaluation
 from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.outcome import evaluated
+from loopwright.tuning.fast.outcome import refusal_of
 from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.record_evaluation import evaluate_excitation
 from loopwright.tuning.fast.uncertainty import peak
 from loopwright.tuning.reasons import Refused
 
@@ -26,28 +26,28 @@ class Look:
 
     period: the time scale of the fit, in samples.
     evaluation: the evaluation, None where the record could not be evaluated.
-    outcome: the refusal that follows from the look, or the comparison of old and new gains.
+    refusal: the refusal that follows from the look; None where its gains may be proposed.
     """
 
     period: float
     evaluation: Evaluation | None
-    outcome: Refused | Comparison
+    refusal: Refused | None
 
 
 def look_at(facts: Facts, options: DesignOptions, record: ExperimentRecord) -> Look:
     """One look at the record so far."""
     try:
-        evaluation, outcome = evaluated(facts, options, record)
+        evaluation = evaluate_excitation(record, options.spec(), test_follows=options.verify)
     except Refused as refused:
         return Look(record.period, None, refused)
-    return Look(evaluation.fit.period, evaluation, outcome)
+    return Look(evaluation.fit.period, evaluation, refusal_of(facts, evaluation))
 
 
 def settled(look: Look, last: Look, samples: int, asked: float, max_disagreement: float = MAX_DISAGREEMENT) -> bool:
     """Whether the pulses may end: the look has no objection, the record is long enough for its own model, and this
     look and the one before agree on each other's gains."""
     now, before = look.evaluation, last.evaluation
-    if now is None or before is None or isinstance(look.outcome, Refused):
+    if now is None or before is None or look.refusal is not None:
         return False
     if samples < MIN_OWN_PERIODS * now.period / now.fit.record.Ts:
         return False

@@ -18,7 +18,7 @@ from loopwright.tuning.fast.look import Look, look_at, settled
 from loopwright.tuning.fast.manual_test import ManualTest
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.outcome import OPEN_REASONS
-from loopwright.tuning.fast.proposal import FastProposal, evaluation_summary, proposed
+from loopwright.tuning.fast.proposal import FastProposal, comparison_of, evaluation_summary, proposed
 from loopwright.tuning.fast.record import MIN_LISTENED
 from loopwright.tuning.fast.record_evaluation import first_period
 from loopwright.tuning.plan import Mode, Note, Plan, StageDone, StageStarted
@@ -78,23 +78,24 @@ def by_manual(facts: Facts, options: DesignOptions, method: str) -> Plan[FastPro
             test.period = look.period
             if settled(look, last, looked_at, options.Ms, MAX_DISAGREEMENT):
                 break
-            if isinstance(look.outcome, Refused):
-                yield from test.report(Note(f"after {looked_at} samples: {look.outcome.detail}"))
-            lasting = isinstance(look.outcome, Refused) and look.outcome.reason not in OPEN_REASONS
+            if look.refusal is not None:
+                yield from test.report(Note(f"after {looked_at} samples: {look.refusal.detail}"))
+            lasting = look.refusal is not None and look.refusal.reason not in OPEN_REASONS
             objections = objections + 1 if lasting else 0
             if objections == MAX_OBJECTIONS:
                 break
         if test.spent - begun >= max(MAX_PERIODS * test.period, MAX_T95 * T95 / facts.sample_time_s):
-            if not isinstance(look.outcome, Refused):
+            if look.refusal is None:
                 text = f"after {test.elapsed} samples two successive evaluations still disagree on the gains"
                 look = Look(look.period, look.evaluation, Refused(Reason.UNCERTAIN, text))
             break
-    evaluation, outcome = look.evaluation, look.outcome
+    evaluation = look.evaluation
     yield from test.report(StageDone(MANUAL, test.figures()), *started("design"))
     if evaluation is not None:
         yield from test.report(StageDone("design", evaluation_summary(evaluation)))
-    if isinstance(outcome, Refused):
-        raise outcome
+    if look.refusal is not None:
+        raise look.refusal
     assert evaluation is not None
+    outcome = yield from test.computed(partial(comparison_of, evaluation, facts, spec, options.propose_anyway))
     begun_at_s = test.trace.t[test.listened]
     return (yield from test.computed(partial(proposed, method, facts, spec, evaluation, outcome, None, begun_at_s)))

@@ -21,8 +21,7 @@ def outcome_of(facts: Facts, options: DesignOptions, evaluation: Evaluation) -> 
 
     Raises Refused, NOT_ROBUST.
     """
-    refusal = _refusal(facts, evaluation)
-    return refusal or comparison_of(evaluation, facts, options.spec(), options.propose_anyway)
+    return refusal_of(facts, evaluation) or comparison_of(evaluation, facts, options.spec(), options.propose_anyway)
 
 
 def evaluated(
@@ -41,7 +40,7 @@ def evaluated(
     return evaluation, outcome_of(facts, options, evaluation)
 
 
-def _refusal(facts: Facts, evaluation: Evaluation) -> Refused | None:
+def refusal_of(facts: Facts, evaluation: Evaluation) -> Refused | None:
     """The refusal that follows from an evaluation, None where its gains may be proposed."""
     model = evaluation.model
     if (sign(model) > 0.0) != facts.reverse:

@@ -1,7 +1,7 @@
 """The evaluation of the records of either excitation.
 
-The relay's record has a time scale, the period of the oscillation. The time scale of pulses of the set-point is found
-with the model.
+The relay's record has a time scale, the period of the oscillation. That of pulses is found with the model: it begins
+with `first_period`, or with what a look at the same record, shorter then, has found.
 """
 
 from __future__ import annotations
@@ -35,14 +35,11 @@ def evaluate_excitation(record: ExperimentRecord, spec: DesignSpec, test_follows
 
     test_follows: whether the gains are to be tested next, see `evaluate`.
 
-    Under pulses of the set-point the time scale of the record is found first, and found again where the model's own
-    ultimate period is another one.
+    Under pulses the record is fitted again where the model's own ultimate period is another one than its time scale.
     """
     if record.excitation is Excitation.RELAY:
         return evaluate(record, spec, test_follows=test_follows)
-    pulses = slice(record.listened, record.excited)
-    first = first_period(record.u[pulses], record.y[pulses], record.Ts)
-    found = evaluate(replace(record, period=first), spec)
+    found = evaluate(record, spec)
     for _ in range(MAX_REFITS):
         own = own_period(found)
         if own is None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from functools import partial
 
+from loopwright.tuning.analysis.comparison import Comparison
 from loopwright.tuning.experiments.preflight import at_rest
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.ramp import check_ramp, ramped, slow_words
@@ -20,6 +21,7 @@ from loopwright.tuning.fast.outcome import OPEN_REASONS, evaluated
 from loopwright.tuning.fast.proposal import (
     FastProposal,
     VerifiedStep,
+    comparison_of,
     evaluation_summary,
     proposed,
     verified_step,
@@ -133,27 +135,30 @@ def by_pulses(
             MAX_TURNS_IN_ALL * turned_at,
         )
         if looked_at >= longest:
-            if not isinstance(look.outcome, Refused):
+            if look.refusal is None:
                 text = f"after {looked_at} samples two successive evaluations still disagree on the gains"
                 look = Look(look.period, look.evaluation, Refused(Reason.UNCERTAIN, text))
-            elif math.isfinite(facts.sp_rate_max_per_s) and look.outcome.reason is Reason.UNCERTAIN:
-                text = f"{look.outcome.detail}; {slow_words(facts)}, which excites little"
+            elif math.isfinite(facts.sp_rate_max_per_s) and look.refusal.reason is Reason.UNCERTAIN:
+                text = f"{look.refusal.detail}; {slow_words(facts)}, which excites little"
                 look = Look(look.period, look.evaluation, Refused(Reason.UNCERTAIN, text))
             break
-        if isinstance(look.outcome, Refused):
+        if look.refusal is not None:
             if relay_follows and _relay_is_shorter(look, looked_at):
-                raise TooLittleExcited(look.outcome, test)
-            yield from test.report(Note(f"after {looked_at} samples: {look.outcome.detail}"))
+                raise TooLittleExcited(look.refusal, test)
+            yield from test.report(Note(f"after {looked_at} samples: {look.refusal.detail}"))
         looks += 1
         growth = NEXT_LOOK if looks < LOOKS_OFTEN else LATER_LOOK
         at = min(growth * looked_at + NEXT_LOOK_PERIODS * own, longest)
-    evaluation, outcome = look.evaluation, look.outcome
+    evaluation = look.evaluation
     yield from test.report(StageDone("pulses", test.figures()), *started("design"))
     if evaluation is not None:
         yield from test.report(StageDone("design", evaluation_summary(evaluation)))
-    if isinstance(outcome, Refused):
-        raise outcome
+    if look.refusal is not None:
+        raise look.refusal
     assert evaluation is not None
+    outcome: Refused | Comparison = yield from test.computed(
+        partial(comparison_of, evaluation, facts, spec, options.propose_anyway)
+    )
 
     shown: VerifiedStep | None = None
     if options.verify and (outcome.gain or options.propose_anyway):

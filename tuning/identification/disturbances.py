@@ -22,6 +22,7 @@ from loopwright.tuning.identification.output_error import (
     RecordToFit,
     averaged,
 )
+from loopwright.tuning.identification.shifts import SAMPLES_TOGETHER, products_within, shifted_products
 from loopwright.tuning.identification.structures import (
     FIRST,
     FIRST_WITH_FEED_THROUGH,
@@ -198,9 +199,10 @@ def _with_load_time(fit: Fit[S], structure: Structure, loads: int, thetas: Seque
     times = np.arange(0.0, len(fit.u) - 0.2 * fit.period, LOAD_TIME_SPACING * fit.period)
     shifts = np.round(times / fit.block).astype(np.int64)
     guesses: list[tuple[float, Reals]] = []
-    for theta in thetas:
-        rss = _rss_by_load_time(fit, structure, theta, shifts)
-        guesses += [(float(rss[i]), np.append(theta, shifts[i] * fit.block)) for i in np.argsort(rss)[:3]]
+    together = max(1, SAMPLES_TOGETHER // fit.samples)
+    for part in (thetas[i : i + together] for i in range(0, len(thetas), together)):
+        for theta, rss in zip(part, rss_by_load_time(fit, structure, np.array(part), shifts), strict=True):
+            guesses += [(float(rss[i]), np.append(theta, shifts[i] * fit.block)) for i in np.argsort(rss)[:3]]
     guesses.sort(key=lambda each: each[0])
     starts = fit.distinct([theta for _, theta in guesses], structure, 6)
     rough = sorted(fit.descended(structure, hypothesis, starts, FIRST_STEPS), key=by_bic)
@@ -212,30 +214,36 @@ def search_last_load_again(fit: Fit[S], found: Fitted) -> list[Fitted]:
     return _with_load_time(fit, found.structure, found.hypothesis.load_disturbances - 1, [found.theta[:-1]])
 
 
-def answer_to_load(structure: Structure, theta: Reals, samples: int, block: int) -> Reals:
-    """The states of the plant after a step at its input, each in its largest value, averaged, shape (rows, states)."""
-    monic = structure.monic(theta[: structure.searched])[None, :]
-    answer = averaged(pulses(monic, [0.0], structure.order).drive(np.ones(samples))[0], block)
-    return np.asarray(answer / np.max(np.abs(answer), axis=0))
+def answers_to_load(structure: Structure, thetas: Reals, samples: int, block: int) -> Reals:
+    """The states of each plant after a step at its input, each in its largest value, averaged, shape (thetas, rows,
+    states)."""
+    monics = structure.monic(thetas[:, : structure.searched])
+    answers = averaged(pulses(monics, np.zeros(len(thetas)), structure.order).drive(np.ones(samples)), block, 1)
+    return np.asarray(answers / np.max(np.abs(answers), axis=1, keepdims=True))
 
 
-def _rss_by_load_time(fit: Fit[S], structure: Structure, theta: Reals, shifts: NDArray[np.int64]) -> Reals:
-    """The residual sums of squares with one more load disturbance at each of these rows, shape (shifts,).
+def rss_by_load_time(fit: Fit[S], structure: Structure, thetas: Reals, shifts: NDArray[np.int64]) -> Reals:
+    """The residual sums of squares of each theta with one more load disturbance at each of these rows, shape (thetas,
+    shifts).
 
     The time of a load disturbance only shifts its response, so one response serves all times.
     """
     order = structure.order
-    base = fit.regressors(structure, DisturbanceHypothesis(len(theta) - structure.searched), theta[None])[0]
-    q = np.linalg.qr(base)[0]
-    rest = fit.y - q @ (q.T @ fit.y)
-    answer = answer_to_load(structure, theta, len(fit.u), fit.block)
-    shifted = np.zeros((len(shifts), fit.samples, order))
-    for i, m in enumerate(shifts):
-        end = fit.end_of_piece(int(m))
-        shifted[i, m:end] = answer[: end - m]
-    across = np.einsum("nk,snj->skj", q, shifted, optimize=True)
-    gram = np.swapaxes(shifted, 1, 2) @ shifted - np.swapaxes(across, 1, 2) @ across
-    scale = np.maximum(np.einsum("sii->s", gram), 1e-12)[:, None, None]
-    along = np.einsum("snj,n->sj", shifted, rest, optimize=True)
-    weights = np.linalg.solve(gram + 1e-9 * scale * np.eye(order), along[:, :, None])[:, :, 0]
-    return np.asarray(rest @ rest - np.einsum("si,si->s", weights, along))
+    columns = fit.regressors(structure, DisturbanceHypothesis(thetas.shape[1] - structure.searched), thetas)
+    base = np.linalg.qr(columns)[0]
+    basis = np.swapaxes(base, 1, 2)
+    rest = fit.y - (base @ (basis @ fit.y)[:, :, None])[:, :, 0]
+    answers = np.swapaxes(answers_to_load(structure, thetas, len(fit.u), fit.block), 1, 2)
+    fixed, within = np.concatenate((rest[:, None], basis), axis=1), products_within(answers)
+    products = np.empty((*fixed.shape[:2], order, len(shifts)))
+    last = np.empty(len(shifts), dtype=np.int64)  # of the samples of the response that count
+    for rows in fit.rows:
+        mine = (shifts >= rows.start) & (shifts < rows.stop)
+        products[..., mine] = shifted_products(fixed[..., : rows.stop], answers[..., : rows.stop])[..., shifts[mine]]
+        last[mine] = rows.stop - shifts[mine] - 1
+    along, across = products[:, 0], products[:, 1:]
+    gram = np.moveaxis(within[..., last] - np.einsum("pqis,pqjs->pijs", across, across), -1, 1)
+    scale = np.maximum(np.einsum("psii->ps", gram), 1e-12)[:, :, None, None]
+    along = np.swapaxes(along, 1, 2)
+    weights = np.linalg.solve(gram + 1e-9 * scale * np.eye(order), along[..., None])[..., 0]
+    return np.asarray(np.einsum("pn,pn->p", rest, rest)[:, None] - np.einsum("psi,psi->ps", weights, along))

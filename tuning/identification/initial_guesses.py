@@ -8,14 +8,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.fft import next_fast_len
 
-from loopwright.tuning.analysis.zero_order_hold import states
+from loopwright.tuning.analysis.zero_order_hold import pulses
+from loopwright.tuning.identification.shifts import SAMPLES_TOGETHER, products_within, shifted_products
 from loopwright.tuning.identification.structures import Structure
 from loopwright.tuning.models import Reals
 
 RATIO = 2.0
 DAMPING_RATIOS = (0.15, 0.4, 0.7)
+REDUNDANT = 1e-9
+"""Size of a response of unit length, less what the other columns show of it, below which it adds nothing."""
 
 
 def starts(structure: Structure, u: Reals, y: Reals, max_dead_time: int, nuisance: bool, keep: int) -> list[Reals]:
@@ -27,15 +29,20 @@ def starts(structure: Structure, u: Reals, y: Reals, max_dead_time: int, nuisanc
     nuisance: a load disturbance at the start of the record, with the same denominator, is allowed for.
     """
     found: list[tuple[float, Reals]] = []
-    for logs in _denominators(structure, len(u)):
-        monic = structure.monic(np.append(logs, 0.0))
-        response = states(monic, 0.0, u, structure.inputs)
-        others = np.ones((len(u), 1))
+    denominators = _denominators(structure, len(u))
+    together = max(1, SAMPLES_TOGETHER // len(u))
+    for part in (denominators[i : i + together] for i in range(0, len(denominators), together)):
+        monics = structure.monic(np.array([np.append(logs, 0.0) for logs in part]))
+        plants = pulses(monics, np.zeros(len(part)), structure.order)
+        responses = np.swapaxes(plants.drive(u, structure.inputs), 1, 2)
+        others = np.ones((len(u), 1))[None]
         if nuisance:
-            others = np.concatenate((others, states(monic, 0.0, np.ones(len(u)), structure.order)), axis=1)
-        rss = _of_all_shifts(response, y, others, max_dead_time)
-        m = int(np.argmin(rss))
-        found.append((float(rss[m]), np.append(logs, float(m))))
+            loads = plants.drive(np.ones(len(u)))
+            others = np.concatenate((np.broadcast_to(others, (len(part), len(u), 1)), loads), axis=2)
+        rss = _of_all_shifts(responses, y, others, max_dead_time)
+        for logs, row in zip(part, rss, strict=True):
+            m = int(np.argmin(row))
+            found.append((float(row[m]), np.append(logs, float(m))))
     found.sort(key=lambda each: each[0])
     kept: list[Reals] = []
     for _, theta in found:
@@ -65,25 +72,21 @@ def _denominators(structure: Structure, samples: int) -> list[Reals]:
 
 
 def _of_all_shifts(responses: Reals, y: Reals, others: Reals, maximum: int) -> Reals:
-    """The residual sums of squares of fits of y by the responses, shifted by 0, 1, ... `maximum` samples, and the
-    other columns; shape (maximum + 1,)."""
-    columns = responses / np.maximum(np.sqrt(np.sum(responses**2, axis=0)), 1e-300)
-    basis = np.linalg.qr(others)[0]
-    rest = y - basis @ (basis.T @ y)
-    products = _shifted_products(np.column_stack((rest, basis)), columns, maximum)
+    """The residual sums of squares of fits of y by the responses of each plant, shifted by 0, 1, ... `maximum` samples,
+    and the other columns; shape (plants, maximum + 1).
+
+    responses: shape (plants, responses, N).  others: shape (plants, N, columns), or (1, N, columns) for all plants.
+    """
+    lengths = np.sqrt(np.einsum("prn,prn->pr", responses, responses))
+    rows = responses / np.maximum(lengths, 1e-300)[:, :, None]
+    basis = np.swapaxes(np.linalg.qr(others)[0], 1, 2)
+    rest = y - (np.swapaxes(basis, 1, 2) @ (basis @ y)[:, :, None])[:, :, 0]
+    products = shifted_products(np.concatenate((rest[:, None], basis), axis=1), rows)[..., : maximum + 1]
     with_y, with_basis = products[:, 0], products[:, 1:]
-    count = columns.shape[1]
-    gram = 1e-9 * np.eye(count) - np.einsum("mqi,mqj->mij", with_basis, with_basis)
-    for i in range(count):
-        for j in range(count):
-            # samples shifted beyond the end do not count
-            gram[:, i, j] += np.cumsum(columns[:, i] * columns[:, j])[::-1][: maximum + 1]
-    weights = np.linalg.solve(gram, with_y[:, :, None])[:, :, 0]
-    return np.asarray(rest @ rest - np.sum(weights * with_y, axis=1))
-
-
-def _shifted_products(fixed: Reals, shifted: Reals, maximum: int) -> Reals:
-    """The sums over k of fixed[k, q]*shifted[k-m, i] for m = 0 ... maximum, shape (maximum + 1, columns of each)."""
-    size = next_fast_len(2 * len(fixed), real=True)
-    spectrum = np.fft.rfft(fixed, size, axis=0)[:, :, None] * np.fft.rfft(shifted, size, axis=0).conj()[:, None, :]
-    return np.asarray(np.fft.irfft(spectrum, size, axis=0)[: maximum + 1])
+    gram = products_within(rows)[..., ::-1][..., : maximum + 1] - np.einsum("pqim,pqjm->pijm", with_basis, with_basis)
+    left = np.einsum("bn,bn->b", rest, rest)[:, None]
+    if rows.shape[1] == 1:
+        return np.asarray(left - with_y[:, 0] ** 2 / (gram[:, 0, 0] + REDUNDANT))
+    gram = np.moveaxis(gram, -1, 1) + REDUNDANT * np.eye(rows.shape[1])
+    weights = np.linalg.solve(gram, np.swapaxes(with_y, 1, 2)[..., None])[..., 0]
+    return np.asarray(left - np.einsum("pmi,pim->pm", weights, with_y))

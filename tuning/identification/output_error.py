@@ -143,6 +143,7 @@ class Fit(Generic[S]):
             for function in (np.ones, lambda length: np.linspace(-1.0, 1.0, length))
         )
         self._rate = math.log(1.0 / self.period)
+        self._grids: dict[tuple[Structure, int, float | None, tuple[float, ...]], list[Reals]] = {}
 
     # what is fitted
 
@@ -192,10 +193,6 @@ class Fit(Generic[S]):
             out[:, rows, at : at + order] = moved[loads * many :, : rows.stop - rows.start]
             at += order
         return out
-
-    def end_of_piece(self, row: int) -> int:
-        """The row after the last one of the piece that this row belongs to."""
-        return int(next(rows.stop for rows in self.rows if row < rows.stop))
 
     def _delayed(self, delay: NDArray[np.int64]) -> Reals:
         """MV a sample and the whole samples of the dead time later, shape (plants, N); 0 before each piece."""
@@ -292,11 +289,19 @@ class Fit(Generic[S]):
         load_at: float | None = None,
         dead_times: Sequence[float] = DEAD_TIMES,
     ) -> list[Reals]:
-        """The `keep` best distinct theta of a grid, best first.
+        """The `keep` best distinct theta of a grid, best first. Several disturbance hypotheses begin with one grid.
 
         load_at: each theta has one load disturbance at this sample, None for none.
         dead_times: the dead times of the grid, in periods.
         """
+        asked = structure, keep, load_at, tuple(dead_times)
+        if asked not in self._grids:
+            self._grids[asked] = self._best_of_grid(structure, keep, load_at, dead_times)
+        return self._grids[asked]
+
+    def _best_of_grid(
+        self, structure: Structure, keep: int, load_at: float | None, dead_times: Sequence[float]
+    ) -> list[Reals]:
         thetas = [
             np.append(logs, max(L, 0.0) * self.period) for logs in self.denominators(structure) for L in dead_times
         ]

@@ -12,7 +12,7 @@ import numpy as np
 from loopwright.tuning.fast.evaluation import NEGLIGIBLE_RESIDUAL
 from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.fast.uncertainty import durbin_watson_ratio
-from loopwright.tuning.identification.disturbances import answer_to_load, by_bic, fit_structures
+from loopwright.tuning.identification.disturbances import answers_to_load, by_bic, fit_structures
 from loopwright.tuning.identification.output_error import UNDISTURBED, Fit, Fitted
 from loopwright.tuning.models import Reals
 
@@ -71,7 +71,7 @@ def _undisturbed(fit: Fit[ExperimentRecord], found: Fitted) -> bool:
     noise = max(fit.record.noise / fit.record.output_range, NEGLIGIBLE_RESIDUAL / MAX_RESIDUAL)
     variance = noise**2 * max(fit.record.durbin_watson_ratio_at_rest, durbin_watson_ratio(found.linear.residual))
     longest = max(piece.stop - piece.start for piece in fit.pieces)
-    answer = answer_to_load(found.structure, found.theta, longest, fit.block)
+    answer = answers_to_load(found.structure, found.theta[None], longest, fit.block)[0]
     spacing = max(1, round(LOAD_TIME_SPACING * fit.period / fit.block))
     for rows in fit.rows[1:]:
         left = found.linear.residual[rows]
