@@ -62,7 +62,7 @@ def empty_at_the_right(page: Page) -> float:
 
 
 def watched(page: Page) -> None:
-    """The loop's page with its trend of 30 s, up to the present and with enough before it to be seen in that of 2 min."""
+    """The loop's page with its trend of 30 s, up to the present, with enough before it to be seen in that of 2 min."""
     person.open_loop(page)
     page.get_by_role("button", name="30 s").click()
     until(page, lambda: len(trend.columns(page)[0]) > MIN_COLUMNS and empty_at_the_right(page) < 0.02)

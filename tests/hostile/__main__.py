@@ -66,6 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def judged(found: Found, unsafe: dict[str, str]) -> list[tuple[str, str, str, bool]]:
     abort, late, memory = p99(found.abort_s), max(found.late_s, default=float("inf")), found.memory_MB
     growth = memory[-1] / memory[len(memory) // 5]
+    course = ", ".join(f"{memory[len(memory) * tenth // 10]:.0f}" for tenth in range(10))
     ended = {end: number for end, number in found.ends.items() if end not in EXPECTED_ENDS}
     return [
         (f"{len(found.abort_s)} aborts answered, p99", f"{abort:.3f} s", f"{ABORT_P99_S} s", abort < ABORT_P99_S),
@@ -91,6 +92,7 @@ def judged(found: Found, unsafe: dict[str, str]) -> list[tuple[str, str, str, bo
         ("the same, at most", f"{1e3 * max(found.machine_late_s, default=0.0):.0f} ms", "", True),
         ("memory at most", f"{max(memory):.0f} MB", f"{MAX_MB:.0f} MB", max(memory) <= MAX_MB),
         ("memory, end to beginning", f"{growth:.2f}", f"{GROWTH}", growth <= GROWTH),
+        ("memory at each tenth of the time", f"{course} MB", "", True),
         ("loops not as they were", str(unsafe or 0), "0", not unsafe),
         ("tests that came to their end", str(sum(found.ends.values())), "", True),
         ("tests that ended otherwise", str(ended or 0), "0", not ended),

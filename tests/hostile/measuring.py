@@ -26,7 +26,7 @@ class Found:
     home_s: until the job was over, its loop read back as home.
     late_s: by which the service's heartbeat came later than it is due.  machine_late_s: by which a process that only
     sleeps was woken later than it had asked.  late_alone_s: late_s while that one was not late.
-    ends: of the tests, by state and reason."""
+    ends: of the tests, by state, those that are not expected with the whole cause."""
 
     abort_s: list[float] = field(default_factory=list)
     effect_s: list[float] = field(default_factory=list)
@@ -134,7 +134,8 @@ class Measuring:
         return found
 
     def _note_end(self, job: dict[str, Any]) -> None:
-        end = job["state"] if job["state"] in EXPECTED_ENDS else f"{job['state']} {job['reason']}"
+        expected = job["state"] in EXPECTED_ENDS
+        end = job["state"] if expected else f"{job['state']} {job['reason']} in {job['stage']}: {job['detail']}"
         self.found.ends[end] = self.found.ends.get(end, 0) + 1
 
     def _keep_testing(self) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from functools import partial
 
-from loopwright.tuning.analysis.comparison import Comparison
 from loopwright.tuning.experiments.preflight import at_rest
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.ramp import check_ramp, ramped, slow_words
@@ -156,12 +155,10 @@ def by_pulses(
     if look.refusal is not None:
         raise look.refusal
     assert evaluation is not None
-    outcome: Refused | Comparison = yield from test.computed(
-        partial(comparison_of, evaluation, facts, spec, options.propose_anyway)
-    )
+    comparison = yield from test.computed(partial(comparison_of, evaluation, facts, spec, options.propose_anyway))
 
     shown: VerifiedStep | None = None
-    if options.verify and (outcome.gain or options.propose_anyway):
+    if options.verify and (comparison.gain or options.propose_anyway):
         yield from test.report(*started("verify"))
         first = evaluation
         tested = first.best.gains
@@ -182,8 +179,9 @@ def by_pulses(
         yield (StageDone("verify", shown), *started("redesign"), StageDone("redesign", evaluation_summary(evaluation)))
         if isinstance(outcome, Refused):
             raise outcome
+        comparison = outcome
     begun_at_s = test.trace.t[test.listened]
-    return (yield from test.computed(partial(proposed, method, facts, spec, evaluation, outcome, shown, begun_at_s)))
+    return (yield from test.computed(partial(proposed, method, facts, spec, evaluation, comparison, shown, begun_at_s)))
 
 
 def _relay_is_shorter(look: Look, samples: int) -> bool:
