@@ -64,6 +64,7 @@ def test_it_gets_gains_that_were_never_tried_and_takes_them_without_leaving_manu
     url = here.retune(propose_anyway=True)
     job = here.finished(url)
     assert job["state"] == "proposed", (job["reason"], job["detail"])
+    assert job["mode_found"] == "manual"
     assert job["tried"] is False and any("never tried" in note for note in job["notes"])
     samples = here.http.get(f"{url}/samples").json()
     assert set(samples["mode"]) == {int(Mode.MANUAL)}
@@ -90,6 +91,7 @@ def test_pv_at_its_limit_ends_the_test_in_the_controller(here: Plantsite) -> Non
     here.write("plant_disturbance", 40.0)
     job = here.finished(url)
     assert (job["state"], job["reason"]) == ("failed", "pv_limit")
+    assert job["detail"] == "PV left its limits; the controller ended the test", "not the service, which sees it later"
     assert output(here) == home
 
 

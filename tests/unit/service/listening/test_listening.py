@@ -10,8 +10,9 @@ import pytest
 
 from loopwright.service.inputs.config import LoopConfig, parse_site
 from loopwright.service.listening.bins import GAP_BEFORE, Rows, packed
-from loopwright.service.listening.listening import HOLE_S, Listening
+from loopwright.service.listening.listening import HOLE_S, NOT_BEGUN, Listening
 from loopwright.service.listening.messages import HistoryAnswer
+from loopwright.service.listening.process import ListeningProcess
 from loopwright.service.listening.rings import Rings
 from loopwright.service.store import history
 from loopwright.service.store.history import HistoryBlock
@@ -118,3 +119,14 @@ def test_a_bus_that_is_not_listened_to_says_why(store: Store, bus: str, on: bool
     assert found.not_heard is not None and why in found.not_heard
     assert (bus in listening.off) == (why != "has not begun")
     assert "another host" in (listening.history("ELSEWHERE", T0, T0 + 10.0, 10).not_heard or "")
+
+
+def test_a_bus_is_not_called_heard_before_the_first_report(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("start", "close"):
+        monkeypatch.setattr(ListeningProcess, name, lambda process: None)
+    site = parse_site({"loops": [loop_entry() | {"bus": "socketcan:can0"}]}, "test")
+    listening = Listening(site.loops, store, lambda tag: None)
+    listening.start()
+    assert not listening.off and not listening.begun
+    assert listening.why_not_heard(next(iter(site.loops))) == NOT_BEGUN and [*listening.buses().values()] == [NOT_BEGUN]
+    listening.close()
