@@ -43,8 +43,9 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
 
 
 def with_later_fields(golden: dict[str, Any]) -> dict[str, Any]:
-    """The golden job with what is shown of it since: nobody has decided, a live test knows how fast it sampled, and
-    whether its gains were tried; it has no samples. Its advice is not stored, but today's for its reason."""
+    """The golden job with what is shown of it since: nobody has decided, a live test knows how fast it sampled, in
+    which mode it found the loop, and whether its gains were tried; it has no samples.
+    Its advice is not stored, but today's for its reason."""
     advice = None if golden["reason"] is None else ADVICE[Reason(golden["reason"])]
     sample_time_s = None if golden["dry_run"] else 0.1
     proposed_live = not golden["dry_run"] and golden["new_gains"] is not None
@@ -57,6 +58,7 @@ def with_later_fields(golden: dict[str, Any]) -> dict[str, Any]:
         "stopping": None,
         "model_from": None,
         "sample_time_s": sample_time_s,
+        "mode_found": None if golden["dry_run"] else "automatic",
         "tried": tried,
         "record": "none",
     }
