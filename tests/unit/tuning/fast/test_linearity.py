@@ -48,8 +48,10 @@ def test_a_gain_that_differs_above_and_below_rest_is_no_evidence(name: str, belo
     evaluation = evaluate(pulse_record(*LOOPS[name], noise=0.005, below=below), DesignSpec(1.6))
     assert evaluation.reason is not None
     size, deviation = LinearityTest(evaluation.fit, evaluation.chosen.best).score(above_rest)
-    assert deviation > 0.0
-    assert abs(size) < 2.0 * deviation or (size > 0.0) == (below < 1.0), "a clear size has the right sign"
+    if (name, below) == ("first order", 0.7):  # 0.1 +- 0.6: the sign is chance
+        assert deviation > 2.0 * abs(size)
+    else:
+        assert (size > 0.0) == (below < 1.0) and deviation > 0.0
 
 
 def test_the_size_is_that_of_the_plant() -> None:
