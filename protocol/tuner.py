@@ -121,6 +121,8 @@ class Tuner(ProcessData):
         self.session = 0
         """Number of the session whose lease is renewed during every wait; 0 for none."""
         self._renewed_at = 0.0
+        self.longest_between_renewals_s = 0.0
+        """Longest time between two renewals of the session, as this tuner sent them, s."""
         self._check_stop_request: Callable[[], None] = lambda: None
         self.node_states: dict[int, int] = {}
         """NMT states of controller and plant from their latest heartbeats, by node-ID."""
@@ -144,6 +146,8 @@ class Tuner(ProcessData):
         check_stop_request: called while the loop waits for a node's lock; it raises when the job is asked to stop.
         """
         self.session, self._renewed_at, self._check_stop_request = session, self.station.monotonic(), check_stop_request
+        if session:
+            self.longest_between_renewals_s = 0.0
 
     def heartbeat(self) -> float:
         """Sends the heartbeat when it is due and no other loop on this bus has sent it, and the renewal of the session.
@@ -152,6 +156,7 @@ class Tuner(ProcessData):
             return self.station.monotonic()
         now = self.station.beat_if_due(self._url, self._bus)
         if self.session and now - self._renewed_at >= RENEWAL_S:
+            self.longest_between_renewals_s = max(self.longest_between_renewals_s, now - self._renewed_at)
             self._renewed_at = now
             self._bus.send(renewal_id(self._controller), RENEWAL_FRAME.pack(self.session, self._channel))
         return now

@@ -58,7 +58,10 @@ def why_over(reading: BusReading, number: int, pv_silence_s: float) -> Ended:
         case Cause.NMT:
             node = f"controller node {reading.controller:02X}h"
             return Failed(Reason.NODE_NOT_OPERATIONAL, f"{node} has left the operational state, by an NMT command")
-    return Failed(Reason.DEVICE_WENT_BACK, f"the controller ended the test by itself ({words_of(cause)})")
+    text = f"the controller ended the test by itself ({words_of(cause)})"
+    if cause is Cause.LEASE:
+        text += f"; at most {tuner.longest_between_renewals_s:.1f} s passed between two renewals of the lease"
+    return Failed(Reason.DEVICE_WENT_BACK, text)
 
 
 def read_back(reading: BusReading, home: LoopState, number: int, how: str) -> Restored:

@@ -50,6 +50,7 @@ from loopwright.service.live.live import Live
 from loopwright.service.live.other_gateways import OtherGateways
 from loopwright.service.live.own_gateway import Announcing, OwnGateway
 from loopwright.service.loops.loop import Loop
+from loopwright.service.server.arenas import limit_arenas
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.server.signals import Signals
 from loopwright.service.server.watchdog import Watchdog, interval_s
@@ -194,6 +195,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
     Raises ConfigError, FolderInUse, ForeignLoop, BadDatabase, NotSafe, OSError (the address cannot be used),
     SQLAlchemyError (the database cannot be reached).
     """
+    limit_arenas()
     logs.configure(setup.log_format)
     # python-can's socketcand client warns about every frame that TCP splits, although TCP may split any.
     logging.getLogger("can").setLevel(logging.ERROR)

@@ -388,8 +388,7 @@ def _identified(
 
 
 def _designed(options: Options, model: EstimatedModel, ultimate: Ultimate | None) -> Plan[Designed]:
+    """The design of the fifth stage, computed while the loop goes on: 50 ms of processor time can become seconds in a
+    process that shares its interpreter with many requests, and the lease would be used up."""
     rule = rule_of(options.method)
-    compute = partial(design, rule, model.plant(), ultimate, options.method_options)
-    if METHODS[rule].slow:
-        return (yield from worked(compute))
-    return compute()
+    return (yield from worked(partial(design, rule, model.plant(), ultimate, options.method_options)))

@@ -93,7 +93,7 @@ class Method:
     lag: whether an `Integrating` model may have a lag.
     reaction_curve: True for a rule made on the tangent of a step response.
     measured: the same rule from a measured (Ku, Pu), None without one.
-    slow: True if the computation takes longer than 0.2 s, the time for which a loop may be left unattended.
+    slow: True if the computation takes longer than 0.2 s, so that it is left out where all rules are shown at once.
     filter: Td/Tf where the loop realises an ideal derivative.
     """
 

@@ -223,6 +223,18 @@ class TestLease:
                 site.loop.step(())
         assert site.wire.clock.now - began_at < 2 * RENEWAL_S
 
+    def test_says_how_long_it_was_not_paid_when_it_is_used_up(self, site: Site) -> None:
+        """A thread that computes for four seconds, while other loops of this process send its heartbeat."""
+        site.begun()
+        site.loop.step(())
+        others = site.wire.open()
+        for _ in range(40):
+            site.pass_time(0.1)
+            others.send(heartbeat_id(TUNER_NODE), HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL))
+        with pytest.raises(Failed, match=r"cause: lease\); at most 4\.[0-5] s passed between two renewals"):
+            for _ in range(100):
+                site.loop.step(())
+
     def test_is_paid_while_home_is_read_beside_many_others(self, site: Site) -> None:
         """Thirty answers, for each of which a loop may have to wait for fifty others that begin, too."""
         site.slow_s = 0.2
