@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from loopwright.plantsim.catalogue import find
+from loopwright.plantsim.catalogue import find, own_plant
 from loopwright.plantsim.device import PlantChannel, PlantDevice
 from loopwright.protocol.device_process import DeviceConfigError, node_id, read_channels, run_device
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE
@@ -43,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _channel(model: str, noise_std: float) -> PlantChannel:
-    entry = find(model)
+    entry = own_plant(model) if model.lstrip().startswith("{") else find(model)
     return PlantChannel(entry.build, entry.facts.mv_nominal_pct, noise_std)
 
 
@@ -67,7 +67,15 @@ def _positive(text: str) -> float:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="plantsim", description="A simulated plant as a CANopen I/O device.")
     parser.add_argument("--bus", required=True, metavar="URL", help="socketcan:vcan0, socketcand:HOST:PORT, ...")
-    parser.add_argument("--model", action="append", default=[], metavar="NAME", help="one channel each")
+    parser.add_argument(
+        "--model",
+        action="append",
+        default=[],
+        metavar="MODEL",
+        help="one channel each: a name such as model-4, or the plant itself as JSON, "
+        '{"num": [0.8], "den": [120, 1], "dead_time_s": 15, "mv": 40, "pv": 65}, in PV units per percent of MV, with '
+        "MV and PV where it starts; `loopwright plant` takes K, T_s, L_s and a file.json too",
+    )
     parser.add_argument("--config", metavar="FILE", help="YAML list of channels: model, noise")
     parser.add_argument("--ts", type=_positive, default=0.1, metavar="S", help="sample time, process seconds")
     parser.add_argument("--speed", type=_speed, default=1.0, metavar="FACTOR", help="times real time, or max")

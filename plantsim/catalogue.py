@@ -90,6 +90,36 @@ def find(name: str) -> Entry:
     return CATALOGUE[name]
 
 
+def own_plant(text: str) -> Entry:
+    """Returns the entry of a plant that is in no catalogue, in PV units per percent of MV.
+
+    text: the JSON object {"num": [0.8], "den": [120, 1], "dead_time_s": 15, "mv": 40, "pv": 65}: coefficients from the
+    highest power down, and MV (percent) and PV where the plant starts, 50 where they are left out.
+    Raises ValueError.
+    """
+    data = json.loads(text)
+    known = {"num", "den", "dead_time_s", "mv", "pv"}
+    if not isinstance(data, dict) or not {"num", "den"} <= data.keys() <= known:
+        raise ValueError(f"a plant is a JSON object with num, den and perhaps dead_time_s, mv and pv, not {text}")
+    numbers = {name: float(data.get(name, other)) for name, other in (("dead_time_s", 0.0), ("mv", 50.0), ("pv", 50.0))}
+    if not 0.0 <= numbers["mv"] <= 100.0:
+        raise ValueError(f"mv is {numbers['mv']:g}: MV is in percent, 0 to 100")
+    num, den = (tuple(float(each) for each in data[name]) for name in ("num", "den"))
+    gain = num[-1] / den[-1] if den[-1] else None
+    facts = PlantFacts(
+        description="a user's own plant",
+        Ku=None,
+        Pu_s=None,
+        T95_s=None,
+        static_gain=gain,
+        reverse=num[-1] > 0.0,
+        mv_nominal_pct=numbers["mv"],
+        pv_nominal=numbers["pv"],
+        mv_per_unit=1.0,
+    )
+    return Entry("own", facts, CatalogueModel(num, den, numbers["dead_time_s"]))
+
+
 def _printed_models() -> list[Entry]:
     data = json.loads(files("loopwright.plantsim").joinpath("models-50.json").read_text(encoding="utf-8"))
     entries = []

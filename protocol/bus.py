@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import errno
+import logging
 import select
 import socket
 import struct
 import time
 from collections.abc import Callable, Collection
 from functools import partial
+from pathlib import Path
 from typing import Any, Protocol
 
 import can
@@ -33,6 +35,7 @@ _SHORTEST_ARMED_S = 0.02  # SO_RCVTIMEO counts in kernel ticks (up to 10 ms): sh
 _SEND_PATIENCE_S = 1.0
 SO_RCVBUFFORCE = 33
 _CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h
+_ARPHRD_CAN = "280"  # linux/if_arp.h
 _PASSED_OVER_S = 0.05  # how long filtered-out frames may prolong a wait beyond its time-out
 
 
@@ -171,6 +174,15 @@ class RawBus:
         self._socket.close()
 
 
+def can_interfaces(devices: Path = Path("/sys/class/net")) -> list[str]:
+    """Returns the names of the CAN interfaces of this machine.
+
+    devices: the folder in which Linux describes each network interface.
+    """
+    types = {file.parent.name: file.read_text().strip() for file in devices.glob("*/type")}
+    return sorted(name for name, kind in types.items() if kind == _ARPHRD_CAN)
+
+
 def _opened(interface: str) -> socket.socket:
     """Returns a raw socket that receives all data frames, and the error frames that report the controller's state."""
     if not hasattr(socket, "AF_CAN"):
@@ -185,6 +197,10 @@ def _opened(interface: str) -> socket.socket:
         sock.bind((interface,))
     except OSError as error:
         sock.close()
+        if error.errno == errno.ENODEV:
+            there = can_interfaces()
+            here = f"there are: {', '.join(there)}" if there else "there is none"
+            raise BusError(f"this machine has no CAN interface {interface!r}; {here}") from error
         raise BusError(f"CAN interface {interface!r} cannot be opened: {error.strerror}") from error
     return sock
 
@@ -235,6 +251,9 @@ class _Socketcand(SocketCanDaemonBus):
         except OSError as error:
             raise can.CanError(f"the connection is lost: {error}") from error
 
+
+# The library's client warns about every frame that TCP splits, although TCP may split any.
+logging.getLogger(SocketCanDaemonBus.__module__).setLevel(logging.ERROR)
 
 _LIBRARY_STATES = {can.BusState.PASSIVE: BusState.PASSIVE, can.BusState.ERROR: BusState.BUS_OFF}
 

@@ -4,7 +4,6 @@ file."""
 from __future__ import annotations
 
 import argparse
-import logging
 import signal
 import sys
 from collections.abc import Callable, Iterable
@@ -61,8 +60,6 @@ def read_channels(path: str, keys: Iterable[str]) -> list[dict[str, Any]]:
 
 def run_device(name: str, bus_url: str, make: Callable[[Bus], DeviceProcess], description: str) -> int:
     """Runs a device until SIGTERM or SIGINT. Returns exit status 0, or 1 when the bus cannot be used."""
-    # python-can's socketcand client warns about every frame that TCP splits, although TCP may split any.
-    logging.getLogger("can").setLevel(logging.ERROR)
     try:
         bus = open_bus(bus_url)
     except BusError as error:

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import ClassVar
 
 from loopwright.tuning.reasons import Failed, Reason, Refused
 
 
 class UnknownLoop(Exception):
-    """No loop of that tag is configured."""
+    """No loop of that tag is configured.
 
-    def __init__(self, tag: str) -> None:
-        super().__init__(f"there is no loop {tag}")
+    tags: the tags that there are; one that is written alike is named.
+    """
+
+    def __init__(self, tag: str, tags: Iterable[str] = ()) -> None:
+        alike = next((each for each in tags if _letters(each) == _letters(tag)), None)
+        super().__init__(f"there is no loop {tag}" + (f"; did you mean {alike}?" if alike else ""))
         self.tag = tag
+
+
+def _letters(tag: str) -> str:
+    """Returns the letters and digits of a tag, in one case."""
+    return "".join(filter(str.isalnum, tag.casefold()))
 
 
 class Stopping(Exception):

@@ -124,7 +124,7 @@ ADVICE: dict[Reason, str] = {
     Reason.MODE_CHANGED: "Somebody else changed the mode during the test; agree on the time and repeat.",
     Reason.GAINS_CHANGED: "Somebody else tried other gains during the test; agree on the time and repeat.",
     Reason.NODE_LOST: "The device fell silent: check power and cable; it goes home by itself.",
-    Reason.BUS_LOST: "The CAN bus is gone: check the interface; the device goes home by itself.",
+    Reason.BUS_LOST: "Check the CAN interface, its name and whether it is up; the device goes home by itself.",
     Reason.GATEWAY_LOST: "The gateway of the loop alone reaches it: see that its service runs and reaches the "
     "database. What is under test there goes on, or ends safely by itself.",
     Reason.NODE_NOT_OPERATIONAL: "The node does not control: start it (NMT) and look at the loop; Loopwright looks at "

@@ -153,12 +153,16 @@ def install(
         response: Response,
         loop: Annotated[str | None, Query(description="Only jobs of this loop", examples=["TIC-101"])] = None,
         state: Annotated[JobState | None, Query(description="Only jobs in this state")] = None,
+        id_begins: Annotated[
+            str | None,
+            Query(alias="id", description="Only jobs whose id begins so", max_length=32, examples=["4f0c"]),
+        ] = None,
         limit: JobLimit = 50,
         cursor: Cursor = None,
     ) -> Response:
-        rows = jobs.store.recent(loop, state, limit + 1, cursor)
+        rows = jobs.store.recent(loop, state, limit + 1, cursor, id_begins)
         if len(rows) > limit:
-            more(response, "/jobs", rows[limit - 1].number, loop=loop, state=state, limit=limit)
+            more(response, "/jobs", rows[limit - 1].number, loop=loop, state=state, id=id_begins, limit=limit)
         return listed(response, views(rows[:limit]))
 
     @router.post(

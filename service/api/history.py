@@ -115,7 +115,7 @@ def router(directory: LoopDirectory, listening: Listening) -> APIRouter:
         from_s = _seconds(from_, to_s - USUAL_S)
         if not 0.0 < to_s - from_s <= LONGEST_S:
             why = f"must be before `to` (and now), by {LONGEST_S / 86_400:g} days at most"
-            raise RequestValidationError([{"loc": ("query", "from"), "msg": why}])
+            raise RequestValidationError([{"type": "value_error", "loc": ("query", "from"), "msg": why}])
         disturbed = directory.disturbed(tag, from_s, to_s)
         return _view(config, listening.history(tag, from_s, to_s, points), from_s, to_s, disturbed)
 

@@ -64,7 +64,7 @@ def router(live: Live, directory: LoopDirectory, keyring: Keyring | None, sessio
         tags = tuple(dict.fromkeys(tag for part in loops.split(",") if (tag := part.strip())))
         if len(tags) > MOST_LOOPS:
             why = f"must name {MOST_LOOPS} loops at most, not {len(tags)}"
-            raise RequestValidationError([{"loc": ("query", "loops"), "msg": why}])
+            raise RequestValidationError([{"type": "value_error", "loc": ("query", "loops"), "msg": why}])
         for tag in tags:
             directory.owner(tag)
         known = _EVENT_ID.fullmatch(last_event_id)

@@ -107,8 +107,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(_request: Request, error: RequestValidationError) -> JSONResponse:
-        # The input itself is left out, because it may be NaN, which JSON cannot represent.
-        errors = [InvalidValue(where=place(e["loc"]), why=words(e["msg"])) for e in error.errors()]
+        errors = [InvalidValue(where=place(each["loc"]), why=words(each)) for each in error.errors()]
         detail = "; ".join(f"{each.where}: {each.why}" for each in errors)
         return problem(422, detail, reason=Reason.BAD_INPUT, errors=errors)
 

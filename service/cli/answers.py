@@ -72,12 +72,19 @@ class FleetLoop(BaseModel):
     reason: str | None
 
 
-class FleetRetune(BaseModel):
-    """A retune of many loops, as GET /retunes/{id} returns it. counts: the number of loops in each state."""
+class FleetSummary(BaseModel):
+    """A retune of many loops, as GET /retunes returns it. counts: the number of loops in each state."""
 
     id: str
     url: str
     state: str
     detail: str | None
     counts: dict[str, int]
+    requested_by: str
+    created_at: str
+
+
+class FleetRetune(FleetSummary):
+    """A retune of many loops, as GET /retunes/{id} returns it."""
+
     loops: list[FleetLoop]

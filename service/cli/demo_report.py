@@ -60,13 +60,13 @@ def demonstrate(client: Client, tag: str, methods: Sequence[str]) -> Demonstrati
     started = time.monotonic()
     if url := _loop(client, tag).active_job:
         job_tables.console.print(f"GET        {client.url}{url}: a retune is on its way", highlight=False)
-        return Demonstration([job_tables.follow(client, url)], time.monotonic() - started)
+        return Demonstration([job_tables.follow(client, url, job_tables.console)], time.monotonic() - started)
     jobs = []
     for method in methods:
         path = f"/loops/{tag}/retune"
         job_tables.console.print(f"POST       {client.url}{path}  method {method}", highlight=False)
         begun = JobView.model_validate(client.post(path, {"method": method, "requested_by": "demo"}))
-        jobs.append(job_tables.follow(client, begun.url))
+        jobs.append(job_tables.follow(client, begun.url, job_tables.console))
     return Demonstration(jobs, time.monotonic() - started)
 
 

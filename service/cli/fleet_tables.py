@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable, Mapping
+from datetime import datetime
 
-from loopwright.service.cli.answers import FleetRetune
+from loopwright.service.cli.answers import FleetRetune, FleetSummary
 from loopwright.service.cli.client import Client
-from loopwright.service.cli.job_tables import console, rows
+from loopwright.service.cli.job_tables import ago, console, rows
 
 POLL_S = 1.0
 _OVER = ("done", "stopped", "aborted")
@@ -20,15 +22,26 @@ def follow(client: Client, url: str, quiet: bool = False) -> object:
         found = FleetRetune.model_validate(answer)
         if found.counts != shown and not quiet:
             shown = found.counts
-            console.print("  " + ", ".join(f"{count} {state}" for state, count in shown.items()), highlight=False)
+            console.print(f"  {counted(shown)}", highlight=False)
         if found.state in _OVER:
             return answer
         time.sleep(POLL_S)
 
 
+def counted(counts: Mapping[str, int]) -> str:
+    """Returns how many loops are in which state, in words."""
+    return ", ".join(f"{count} {state}" for state, count in counts.items())
+
+
+def summaries(found: Iterable[FleetSummary], now: datetime) -> None:
+    """Shows a table with a retune of many loops on each row. now: the present time."""
+    lines = ((x.id, x.state, counted(x.counts), x.requested_by, ago(x.created_at, now)) for x in found)
+    rows("retunes", ("id", "state", "loops", "by", "created"), lines, never_cut=("id", "created"))
+
+
 def report(found: FleetRetune) -> None:
     """Shows each loop with the state of its job."""
     loops = ((each.loop, each.state, each.job, each.reason) for each in found.loops)
-    rows(f"retune {found.id}: {found.state}", ("loop", "state", "job", "reason"), loops)
+    rows(f"retune {found.id}: {found.state}", ("loop", "state", "job", "reason"), loops, never_cut=("job",))
     if found.detail:
         console.print(found.detail, highlight=False)

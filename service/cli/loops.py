@@ -1,18 +1,86 @@
-"""`loopwright loop`, `loopwright observe`, `loopwright lock` and `loopwright unlock`."""
+"""`loopwright check`, `probe`, `loop`, `observe`, `lock` and `unlock`."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 from urllib.parse import quote
 
 import typer
 
 from loopwright.service.cli.client import DEFAULT_URL, Client
-from loopwright.service.cli.output import AsJson, Url, print_json, user
+from loopwright.service.cli.output import AsJson, Url, die, print_json, user
 
 app = typer.Typer()
 
 Tag = Annotated[str, typer.Argument(help="Tag of the loop.")]
+
+
+@app.command()
+def check(
+    loops: Annotated[Path, typer.Argument(metavar="LOOPS.yaml", help="Configuration of the loops.")] = Path(
+        "loops.yaml"
+    ),
+    as_json: AsJson = False,
+) -> None:
+    """Read every loop of a configuration over its bus, without the service; nothing is written to any device.
+
+    Exit status 0: every loop answers as configured; 2: the file cannot be used; 3: a loop does not answer so.
+    """
+    from loopwright.protocol.station import Station
+    from loopwright.service.cli import check_tables
+    from loopwright.service.inputs.config import ConfigError, load_site
+    from loopwright.service.loops.bus_check import check_loop
+
+    try:
+        configured = list(load_site(loops).loops.values())
+    except ConfigError as error:
+        die(str(error), 2)
+    station = Station()
+    found = [(config, check_loop(config, station)) for config in configured]
+    if as_json:
+        print_json([check_tables.as_json(config, each) for config, each in found])
+    else:
+        check_tables.show(found)
+    if any(each.problem for _, each in found):
+        raise typer.Exit(3)
+
+
+@app.command()
+def probe(
+    bus: Annotated[str, typer.Option(metavar="URL", help="socketcan:can0, socketcand:HOST:PORT, ...")],
+    node: Annotated[
+        list[str] | None, typer.Option(help="A node to ask also where no heartbeat is heard; may be repeated.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show what is on a bus: the nodes, what they are, and what prevents a retune with them. Nothing is written.
+
+    Exit status 0: a controller was found and nothing is wrong; 3: otherwise.
+    """
+    from argparse import ArgumentTypeError
+
+    from loopwright.protocol.device_process import node_id
+    from loopwright.protocol.objects import Device
+    from loopwright.protocol.station import Station
+    from loopwright.service.cli import check_tables
+    from loopwright.service.loops import bus_probe
+    from loopwright.tuning.reasons import Failed
+
+    try:
+        asked = [node_id(each) for each in node or ()]
+    except (ValueError, ArgumentTypeError):
+        die(f"--node must be a CANopen node id, 1 to 127 (0x01 to 0x7F), not {', '.join(node or ())}", 2)
+    try:
+        found = bus_probe.probe(bus, Station(), asked)
+    except Failed as error:
+        die(f"{error.detail}. {error.advice}", 1)
+    if as_json:
+        print_json([check_tables.node_as_json(each) for each in found])
+    else:
+        check_tables.show_nodes(bus, found)
+    if any(each.problems for each in found) or not any(each.device is Device.CONTROLLER for each in found):
+        raise typer.Exit(3)
 
 
 @app.command("loop")

@@ -5,26 +5,41 @@ from __future__ import annotations
 import errno
 import re
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
-from loopwright.service.cli import alarms, data, keys, loops, tuning
+from loopwright.service.cli import alarms, data, jobs, keys, loops, tuning
 from loopwright.service.cli.client import DEFAULT_URL, ApiError, Client
 from loopwright.service.cli.output import AsJson, Url, die, on_terminal, print_json, read_json_object, shown_on_terminal
 
 app = typer.Typer(
-    help="Retunes PI loops automatically over CANopen, and restores the loop whatever fails.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 app.add_typer(keys.app, name="key")
 app.add_typer(data.app)
 app.add_typer(loops.app)
+app.add_typer(jobs.app)
 app.add_typer(alarms.app)
 _HAND_OVER: dict[str, object] = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(f"loopwright {version('loopwright')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Retunes PI loops automatically over CANopen, and restores the loop whatever fails."""
 
 
 def main() -> None:
@@ -40,8 +55,9 @@ def main() -> None:
 def plant(context: typer.Context) -> None:
     """Run a simulated plant on the bus (see plant --help)."""
     from loopwright.plantsim.__main__ import main as run
+    from loopwright.service.cli.plant_model import with_own_plants
 
-    sys.exit(run(context.args))
+    sys.exit(run(with_own_plants(context.args)))
 
 
 @app.command(context_settings=_HAND_OVER, add_help_option=False)
@@ -281,6 +297,14 @@ def retune(
             "--propose-anyway", help="Propose the gains also where nothing asked for improves by more than 5 %."
         ),
     ] = False,
+    from_job: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="JOB",
+            help="Try other gains for the model that this job found, by --ms or --method, without another experiment.",
+        ),
+    ] = None,
     wait: Annotated[bool, typer.Option(help="Show the progress until the job is over.")] = True,
     url: Url = DEFAULT_URL,
     as_json: AsJson = False,
@@ -301,6 +325,10 @@ def retune(
     }  # fmt: skip
     body = {name: value for name, value in options.items() if value is not None} | {"requested_by": "cli"}
     path = "/retunes" if many else f"/loops/{loop}/retune"
+    if from_job is not None:
+        if many:
+            die("--from takes one loop, not a pattern", 2)
+        body |= _other_gains(client, from_job, loop, method, 1.6 if ms is None and method is None else ms, derivative)
     if preview:
         raise typer.Exit(0 if _previewed(client, path, body, alone=True, as_json=as_json) else 3)
     if not (yes or dry_run):
@@ -311,6 +339,24 @@ def retune(
     if many:
         raise typer.Exit(_many(client, started, wait, as_json))
     raise typer.Exit(_one(client, started, wait, as_json))
+
+
+def _other_gains(
+    client: Client, job: str, loop: str, method: str | None, ms: float | None, derivative: bool
+) -> dict[str, object]:
+    """Returns the request that tries other gains for the model of a job. Ends the command where there are none."""
+    from loopwright.service.api.tuning_views import AlternativesView
+
+    wanted = str(derivative).lower() if ms is not None else None
+    found = AlternativesView.model_validate(
+        client.get(f"{jobs.path_of(client, job)}/alternatives", ms=ms, derivative=wanted, method=method)
+    )
+    if found.loop != loop:
+        die(f"job {found.job} is of loop {found.loop}, not of {loop}", 2)
+    (each,) = found.methods
+    if each.retune is None:
+        die(f"{each.title}: {each.detail or 'its gains are not robust enough to be tried'}. {each.advice or ''}", 1)
+    return dict(each.retune)
 
 
 def _previewed(
@@ -386,124 +432,6 @@ def dismiss(
     print(f"{loop} is looked after no more ({', '.join(jobs)})" if jobs else f"{loop} was not looked after")
 
 
-@app.command("jobs")
-def list_jobs(
-    loop: Annotated[str | None, typer.Option(help="Only jobs of this loop.")] = None,
-    url: Url = DEFAULT_URL,
-    as_json: AsJson = False,
-) -> None:
-    """List the latest jobs."""
-    from pydantic import TypeAdapter
-
-    from loopwright.service.api.job_views import JobView
-    from loopwright.service.cli import job_tables
-
-    found = Client(url).get("/jobs", loop=loop)
-    if as_json:
-        print_json(found)
-        return
-    jobs = TypeAdapter(list[JobView]).validate_python(found)
-    lines = ((x.id, x.loop, x.state, x.stage, x.progress, x.reason, x.created_at) for x in jobs)
-    job_tables.rows("jobs", ("id", "loop", "state", "stage", "progress", "reason", "created"), lines)
-
-
-@app.command("job")
-def one_job(
-    job_id: Annotated[str, typer.Argument(metavar="ID", help="Id of the job.")],
-    follow: Annotated[bool, typer.Option("--follow", help="Show the progress until the job is over.")] = False,
-    abort: Annotated[bool, typer.Option("--abort", help="Abort the job; its loop is restored.")] = False,
-    accept: Annotated[
-        bool, typer.Option("--accept", help="Accept the proposal: write its gains to the controller.")
-    ] = False,
-    rollback: Annotated[
-        bool, typer.Option("--rollback", help="Decline the proposal, or restore the old gains.")
-    ] = False,
-    plot: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write a plot of the job: .png, .svg or .pdf.")
-    ] = None,
-    url: Url = DEFAULT_URL,
-    as_json: AsJson = False,
-) -> None:
-    """Show a job, or decide on it."""
-    from loopwright.service.api.job_views import JobView, LoopDetail
-    from loopwright.service.cli import job_tables
-
-    client = Client(url)
-    path = f"/jobs/{job_id}"
-    decisions = [name for name, wanted in (("abort", abort), ("accept", accept), ("rollback", rollback)) if wanted]
-    if len(decisions) > 1:
-        die("only one of --abort, --accept and --rollback can be given", 2)
-    job = JobView.model_validate(
-        client.post(f"{path}/{decisions[0]}", {"by": "cli"}) if decisions else client.get(path)
-    )
-    if follow:
-        job = job_tables.follow(client, path)
-    if plot is not None:
-        from loopwright.service.cli.plots.job import NoPicture, job_picture
-
-        tuning.check_plot(plot)
-        unit = LoopDetail.model_validate(client.get(f"/loops/{job.loop}")).pv_unit
-        try:
-            job_picture(plot, client.samples_of(job.url), job, unit)
-        except NoPicture as error:
-            die(str(error), 1)
-        except OSError as error:
-            die(f"{plot}: {error.strerror}", 2)
-    if as_json:
-        print_json(job.model_dump(mode="json"))
-    else:
-        job_tables.job_report(job)
-
-
-@app.command("report")
-def report_of_job(
-    job_id: Annotated[str, typer.Argument(metavar="ID", help="Id of the job.")],
-    output: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="File to write; default: loopwright-LOOP-ID.html in this folder; -: print."),
-    ] = None,
-    url: Url = DEFAULT_URL,
-) -> None:
-    """Write the report of a job that is over: one HTML file, to be printed or filed."""
-    name, text = Client(url).file(f"/jobs/{job_id}/report")
-    if output == Path("-"):
-        print(text, end="")
-        return
-    file = output or Path(name)
-    if output is None and file.exists():
-        die(f"{file} exists already: name another file with --output, or the same to replace it", 2)
-    try:
-        file.write_text(text, encoding="utf-8")
-    except OSError as error:
-        die(f"{file}: {error.strerror}", 2)
-    print(file)
-
-
-@app.command("alternatives")
-def alternatives_of_job(
-    job_id: Annotated[str, typer.Argument(metavar="ID", help="Id of the job.")],
-    ms: Annotated[float | None, typer.Option(help="Gains that fast designs for this Ms from the same record.")] = None,
-    derivative: Annotated[
-        bool | None, typer.Option(help="With --ms: design a PID where it is better than a PI.")
-    ] = None,
-    method: Annotated[str | None, typer.Option(help="Only this method.")] = None,
-    url: Url = DEFAULT_URL,
-    as_json: AsJson = False,
-) -> None:
-    """Show other gains for the model that a job found, with their figures; no experiment is made."""
-    wanted = None if derivative is None else str(derivative).lower()
-    found = Client(url).get(f"/jobs/{job_id}/alternatives", ms=ms, derivative=wanted, method=method)
-    if as_json:
-        print_json(found)
-        return
-    from loopwright.service.api.tuning_views import AlternativesView
-    from loopwright.service.cli import tuning_tables
-
-    alternatives = AlternativesView.model_validate(found)
-    tuning_tables.tunings(alternatives)
-    tuning_tables.to_try(alternatives)
-
-
 @app.command("rehearse")
 def rehearse_file(
     plant_file: Annotated[Path, typer.Argument(metavar="PLANT.json", help="Plant file, see docs/offline.md.")],
@@ -520,28 +448,37 @@ def rehearse_file(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Rehearse the whole procedure on a plant model, in memory at full speed. Exit status 0: there is an answer."""
+    """Rehearse the whole procedure on a plant model, in memory at full speed. Exit status 0: there is an answer; 2: the
+    plant file cannot be used."""
+    from loopwright.service.api.report.words import stage_found, stage_name
     from loopwright.service.cli import job_tables
     from loopwright.service.execution.rehearsal import rehearse
-    from loopwright.tuning.plan import Event, StageStarted
+    from loopwright.service.jsonable import to_json_object
+    from loopwright.tuning.plan import Event, Note, StageDone
+    from loopwright.tuning.reasons import Reason
 
     spec = read_json_object(plant_file)
 
     def show(event: Event) -> None:
-        if isinstance(event, StageStarted):
-            job_tables.console.print(f"  {event.stage:<10} about {event.expected_s:.0f} s")
+        text = f"note: {event.text}" if isinstance(event, Note) else None
+        if isinstance(event, StageDone):
+            found = stage_found(event.stage, to_json_object(event.result), "")
+            text = f"{stage_name(event.stage)}: {found or 'done'}"
+        if text is not None:
+            job_tables.progress_console.print(f"  {text}", highlight=False, markup=False, soft_wrap=True)
 
-    # with --json standard output has the answer only
-    listener = None if as_json else show
     given = {"Ms": ms, "derivative": derivative or None}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if options and method not in ("fast", "setpoint"):
         die(f"--ms and --derivative are options of the methods fast and setpoint, not of {method}", 2)
-    answer = rehearse(spec, method=method, on_event=listener, propose_anyway=propose_anyway, **options).as_json()
+    listener = None if as_json else show
+    found = rehearse(spec, method=method, on_event=listener, propose_anyway=propose_anyway, **options)
     if as_json:
-        print_json(answer)
+        print_json(found.as_json())
     else:
-        job_tables.console.print_json(data={k: v for k, v in answer.items() if k not in ("stages", "input")})
+        job_tables.rehearsal_report(found)
+    if found.plant is None and found.ended is not None and found.ended.reason is Reason.BAD_INPUT:
+        raise typer.Exit(2)
 
 
 app.command("methods")(tuning.methods)

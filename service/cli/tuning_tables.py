@@ -92,12 +92,18 @@ def _parallel_form(each: TunedView) -> None:
 
 
 def to_try(found: AlternativesView) -> None:
-    """Shows the request that tries the gains on the loop, where there are gains of one method or for one Ms."""
-    if len(found.methods) == 1 and (body := found.methods[0].retune):
-        console.print(
-            f"\nTo try them on the loop: POST /loops/{escape(found.loop)}/retune with\n{json.dumps(body)}",
-            markup=False, soft_wrap=True,
-        )  # fmt: skip
+    """Shows how to try the gains on the loop, where there are gains of one method or for one Ms."""
+    if len(found.methods) != 1 or not (body := found.methods[0].retune):
+        return
+    ms = body.get("ms")
+    wanted = f"--ms {ms:g}" if isinstance(ms, int | float) else f"--method {found.methods[0].method}"
+    if body.get("derivative"):
+        wanted += " --derivative"
+    console.print(
+        f"\nTo try them on the loop: loopwright retune {found.loop} --from {found.job} {wanted}\n"
+        f"or POST /loops/{found.loop}/retune with\n{json.dumps(body)}",
+        markup=False, soft_wrap=True,
+    )  # fmt: skip
 
 
 def not_identified(refusal: Refused) -> None:

@@ -19,6 +19,7 @@ from loopwright.plantsim.plant import LinearPlant, SimulatedProcess
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.result import result_of
 from loopwright.service.execution.runner import RunResult, run
+from loopwright.service.inputs.model_json import parse_model
 from loopwright.service.inputs.plausible import (
     Finite,
     Gain,
@@ -186,6 +187,19 @@ class PlantFile(BaseModel):
     sp_deviation: Annotated[Value, Field(gt=0)] | None = None
     gains: PresentGains | None = Field(None, description="present gains of the loop")
     reverse_acting: bool | None = Field(None, description="the controller's action; left out: right for the plant")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _any_form(cls, data: object) -> object:
+        """Takes a model in any form, such as K, T_s, L_s, in place of num, den and dead_time_s."""
+        if not isinstance(data, Mapping) or "num" in data or "den" in data:
+            return data
+        form = {name: value for name, value in data.items() if name not in cls.model_fields}
+        if not form:
+            return data
+        model = parse_model(form)
+        polynomials = {"num": list(model.num), "den": list(model.den), "dead_time_s": model.L}
+        return {name: value for name, value in data.items() if name not in form} | polynomials
 
     @model_validator(mode="after")
     def _proper(self) -> PlantFile:

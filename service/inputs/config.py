@@ -5,8 +5,8 @@ All errors of a file are reported together, so that its author need not load it 
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -15,6 +15,8 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from loopwright.service.inputs.plausible import Positive, Size, Time, Value, check_step
+from loopwright.service.inputs.validation import did_you_mean, listed, words
+from loopwright.service.inputs.yaml_file import Place, YamlFile
 
 Node = Annotated[int, Field(ge=1, le=127)]
 ExcitationName = Literal["observe", "setpoint", "relay", "manual"]
@@ -28,7 +30,7 @@ class ConfigError(Exception):
     """The file cannot be used; `problems` holds every error found, one line each."""
 
     def __init__(self, source: str, problems: Sequence[str]) -> None:
-        super().__init__("\n".join([f"{source}: {len(problems)} error(s)", *(f"  {p}" for p in problems)]))
+        super().__init__(listed(source, len(problems), problems))
         self.problems = list(problems)
 
 
@@ -186,82 +188,107 @@ class Site:
             raise ConfigError(source, ours)
 
 
-class _OnceEach(yaml.SafeLoader):
-    """A YAML loader that refuses a duplicate key, of which PyYAML would silently use the last value.
-
-    The loader looks for duplicates before keys are merged (`<<`), because a mapping may override merged keys.
-    """
-
-    def compose_mapping_node(self, anchor: dict[object, yaml.Node]) -> yaml.MappingNode:
-        node: yaml.MappingNode = super().compose_mapping_node(anchor)
-        seen: set[str] = set()
-        for name in (name for name, _ in node.value if isinstance(name, yaml.ScalarNode)):
-            if name.value in seen:
-                raise yaml.composer.ComposerError(None, None, f"{name.value!r} is given twice", name.start_mark)
-            seen.add(name.value)
-        return node
-
-
 def load_site(path: Path) -> Site:
     """Reads the site from a file. Raises ConfigError with all errors of the file."""
     try:
-        document = yaml.load(path.read_text(encoding="utf-8"), _OnceEach)
+        file = YamlFile(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(str(path), [error.strerror or str(error)]) from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(str(path), [f"not YAML: {error}"]) from error
     except RecursionError:
         raise ConfigError(str(path), ["not a list of loops: nested too deeply"]) from None
-    return parse_site(document, str(path))
+    return parse_site(file.document, str(path), file.line_of)
 
 
-def parse_site(document: object, source: str) -> Site:
-    """The site of a parsed document `{"loops": [...], "buses": {BUS: {"at_once": ...}}}`."""
+def parse_site(document: object, source: str, line_of: Callable[[Place], int] | None = None) -> Site:
+    """The site of a parsed document `{"loops": [...], "buses": {BUS: {"at_once": ...}}}`.
+
+    line_of: the line of the file that a place of the document is on; None for a document that was in no file.
+    """
     if not isinstance(document, dict) or not isinstance(entries := document.get("loops"), list) or not entries:
         raise ConfigError(source, ["expected a list of loops under the key 'loops'"])
-    problems = [f"{key}: unknown key" for key in document if key not in ("loops", "buses")]
-    loops: list[LoopConfig] = []
+    problems = _Problems(line_of)
+    for key in document:
+        if key not in ("loops", "buses"):
+            problems.add((key,), str(key), f"unknown name{did_you_mean(str(key), ('loops', 'buses'))}")
+    loops: dict[int, LoopConfig] = {}
     for number, entry in enumerate(entries):
         try:
-            loops.append(LoopConfig.model_validate(entry))
+            loops[number] = LoopConfig.model_validate(entry)
         except ValidationError as error:
-            problems += [_line(number, entry, e["loc"], e["msg"]) for e in error.errors(include_url=False)]
-    problems += _repeated("tag", [_tag(entry) for entry in entries])
-    problems += _repeated(
-        "channel", [f"{loop.bus} node {loop.controller_node} channel {loop.channel}" for loop in loops]
+            for each in error.errors(include_url=False):
+                name, tag = ".".join([f"loops[{number}]", *map(str, each["loc"])]), _tag(entry)
+                problems.add(
+                    ("loops", number, *each["loc"]), f"{name} ({tag})" if tag else name, words(each, _LOOP_NAMES)
+                )
+    problems.add_repeated("tag", {number: _tag(entry) for number, entry in enumerate(entries)})
+    problems.add_repeated(
+        "channel",
+        {n: f"{loop.bus} node {loop.controller_node} channel {loop.channel}" for n, loop in loops.items()},
     )
-    buses = _buses(document.get("buses") or {}, {loop.bus for loop in loops}, problems)
-    if problems:
-        raise ConfigError(source, problems)
-    return Site({loop.tag: loop for loop in loops}, buses)
+    named = {bus for entry in entries if isinstance(entry, dict) and isinstance(bus := entry.get("bus"), str)}
+    buses = _buses(document.get("buses") or {}, named, problems)
+    if problems.found:
+        raise ConfigError(source, problems.in_order())
+    return Site({loop.tag: loop for loop in loops.values()}, buses)
 
 
-def _buses(entries: object, known: set[str], problems: list[str]) -> dict[str, BusConfig]:
+_LOOP_NAMES = sorted({name for kind in (LoopConfig, PermittedTest, Limits) for name in kind.model_fields})
+
+
+class _Problems:
+    """The errors of a file, each with its place."""
+
+    def __init__(self, line_of: Callable[[Place], int] | None) -> None:
+        self.found: list[tuple[int, str]] = []
+        self._line_of = line_of
+
+    def add(self, place: Place, name: str, text: str) -> None:
+        """Adds one error.
+
+        name: how the place is called in the message.
+        """
+        line = 0 if self._line_of is None else self._line_of(place)
+        self.found.append((line, f"{f'line {line}: ' if line else ''}{name}: {text}"))
+
+    def add_repeated(self, what: str, values: Mapping[int, str | None]) -> None:
+        """Adds an error for each value that several loops have in common.
+
+        values: the value by the number of the loop; None for a loop without one.
+        """
+        loops = defaultdict(list)
+        for number, value in values.items():
+            if value is not None:
+                loops[value].append(number)
+        for value, numbers in loops.items():
+            if len(numbers) > 1:
+                by = ", ".join(f"loops[{number}]" for number in numbers)
+                self.add(("loops", numbers[-1], what), f"{what} {value!r}", f"it is used by {len(numbers)} loops: {by}")
+
+    def in_order(self) -> list[str]:
+        """Returns the errors in the order of the file."""
+        return [text for _, text in sorted(self.found, key=lambda each: each[0])]
+
+
+def _buses(entries: object, known: set[str], problems: _Problems) -> dict[str, BusConfig]:
     if not isinstance(entries, dict):
-        problems.append("buses: expected a mapping from the name of a bus to its settings")
+        problems.add(("buses",), "buses", "expected a mapping from the name of a bus to its settings")
         return {}
     found = {}
     for bus, entry in entries.items():
         if bus not in known:
-            problems.append(f"buses.{bus}: no loop is on this bus")
+            text = f"no loop is on this bus{did_you_mean(str(bus), sorted(known))}"
+            problems.add(("buses", bus), f"buses.{bus}", text)
         try:
             found[bus] = BusConfig.model_validate(entry)
         except ValidationError as error:
-            problems += [f"buses.{bus}.{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
+            for each in error.errors(include_url=False):
+                name = ".".join(["buses", str(bus), *map(str, each["loc"])])
+                problems.add(("buses", bus, *each["loc"]), name, words(each, sorted(BusConfig.model_fields)))
     return found
 
 
 def _tag(entry: object) -> str | None:
     tag = entry.get("tag") if isinstance(entry, dict) else None
     return tag if isinstance(tag, str) else None
-
-
-def _line(number: int, entry: object, where: tuple[int | str, ...], message: str) -> str:
-    name = ".".join([f"loops[{number}]", *map(str, where)])
-    tag = _tag(entry)
-    return f"{name}{f' ({tag})' if tag else ''}: {message.removeprefix('Value error, ')}"
-
-
-def _repeated(what: str, values: Sequence[str | None]) -> list[str]:
-    counts = Counter(value for value in values if value is not None)
-    return [f"{what} {value!r} is used by {n} loops" for value, n in counts.items() if n > 1]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from difflib import get_close_matches
 
 from pydantic import Tag, ValidationError
 from pydantic_core import ErrorDetails
@@ -25,14 +26,69 @@ def place(loc: Sequence[int | str]) -> str:
     return ".".join(str(part) for part in loc if not str(part).startswith(_BRANCH))
 
 
-def words(message: str) -> str:
-    """A message of pydantic without the prefix that pydantic adds to the text of a ValueError."""
-    return message.removeprefix("Value error, ")
+def words(error: ErrorDetails, known: Sequence[str] = ()) -> str:
+    """One of `ValidationError.errors()` in words, without its place.
+
+    known: the names that the sender may have meant by an unknown one.
+    """
+    kind, context, given = error["type"], error.get("ctx", {}), _shown(error.get("input"))
+    match kind:
+        case "missing":
+            return "it is missing"
+        case "extra_forbidden":
+            return f"unknown name{did_you_mean(str(error['loc'][-1]), known)}"
+        case "greater_than" | "greater_than_equal" | "less_than" | "less_than_equal":
+            bound = next(context[name] for name in ("gt", "ge", "lt", "le") if name in context)
+            return f"{_COMPARED[kind]} {bound:g} is expected, not {given}"
+        case "literal_error" | "enum":
+            return f"{context['expected']} is expected, not {given}"
+        case "string_pattern_mismatch":
+            return f"{given} is not of the form {context['pattern']}"
+    if kind in _EXPECTED:
+        return f"{_EXPECTED[kind]} is expected, not {given}"
+    return error["msg"].removeprefix("Value error, ")
+
+
+_COMPARED = {
+    "greater_than": "a number greater than",
+    "greater_than_equal": "a number of at least",
+    "less_than": "a number less than",
+    "less_than_equal": "a number of at most",
+}
+_EXPECTED = {
+    "float_type": "a number", "float_parsing": "a number", "finite_number": "a finite number",
+    "int_type": "a whole number", "int_parsing": "a whole number", "int_from_float": "a whole number",
+    "bool_type": "true or false", "bool_parsing": "true or false",
+    "string_type": "a text",
+    "list_type": "a list", "tuple_type": "a list",
+    "dict_type": "a mapping of names to values", "model_type": "a mapping of names to values",
+}  # fmt: skip
+_LONGEST = 40
+
+
+def _shown(value: object) -> str:
+    """Returns a value as its sender may recognise it."""
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    text = repr(value)
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 4]} ..."
+
+
+def did_you_mean(given: str, known: Sequence[str]) -> str:
+    """Returns the question whether the most similar of the known names was meant; nothing where none is similar."""
+    alike = {name.lower(): name for name in known}
+    found = get_close_matches(given.lower(), alike, 1)
+    return f"; did you mean {alike[found[0]]}?" if found else ""
+
+
+def listed(source: str, count: int, shown: Iterable[str]) -> str:
+    """Returns the errors of a file as one text: their number, then the shown ones, each on a line."""
+    return "\n".join([f"{source}: {count} {'error' if count == 1 else 'errors'}", *(f"  {text}" for text in shown)])
 
 
 def line(error: ErrorDetails) -> str:
     """One of `ValidationError.errors()` as text: path and message, or the message alone if it begins with the path."""
-    where, text = place(error["loc"]), words(error["msg"])
+    where, text = place(error["loc"]), words(error)
     return text if text.startswith(where) else f"{where}: {text}"
 
 

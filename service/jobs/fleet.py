@@ -175,7 +175,7 @@ class Fleet:
         for tag in tags:
             try:
                 if tag not in known:
-                    raise UnknownLoop(tag)
+                    raise UnknownLoop(tag, known)
                 within(known[tag][0], options)
             except (BadLimits, UnknownLoop) as error:
                 wrong.append(str(error) if tag not in known else f"{tag}: {error}")
@@ -191,7 +191,7 @@ class Fleet:
         """Returns the loops of the request, in their order. Raises BadFleet when one of them is unknown."""
         known = self._known()
         tags = _tags(request, known)
-        wrong = [str(UnknownLoop(tag)) for tag in tags if tag not in known]
+        wrong = [str(UnknownLoop(tag, known)) for tag in tags if tag not in known]
         if wrong:
             raise BadFleet("; ".join(wrong))
         return [known[tag][0] for tag in tags]

@@ -69,7 +69,7 @@ class LoopDirectory:
             return self.loops[tag], self.store.host
         row = self.store.foreign_loop(tag)
         if row is None:
-            raise UnknownLoop(tag)
+            raise UnknownLoop(tag, (config.tag for config, _ in self.everywhere()))
         return LoopConfig.model_validate(row.config), row.host
 
     def everywhere(self) -> list[tuple[LoopConfig, str]]:

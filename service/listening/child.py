@@ -7,7 +7,6 @@ FD is its connection to the service, which starts it; it ends with the service. 
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
 import struct
@@ -284,7 +283,6 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)  # the service alone ends it, by closing the connection
     with suppress(OSError):  # where there is none, or it may not be written
         Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_DIE)
-    logging.getLogger("can").setLevel(logging.ERROR)  # as in the service
     connection = Connection(int(sys.argv[1]))
     with suppress(EOFError, OSError):
         first = connection.recv()

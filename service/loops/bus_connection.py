@@ -15,7 +15,7 @@ from loopwright.tuning.reasons import Failed, Reason, Refused
 AGAIN_S = 0.05
 """Wall time between two tries of a request that a controller does not fulfil at once, s."""
 
-_NOT_OURS = (Abort.NO_OBJECT, Abort.NO_SUBINDEX, Abort.LENGTH, Abort.READ_ONLY, Abort.WRITE_ONLY)
+_NOT_OURS = (Abort.NO_OBJECT, Abort.LENGTH, Abort.READ_ONLY, Abort.WRITE_ONLY)
 
 Read = Callable[[Tuner, int, int | None, int], BusReading]
 
@@ -58,8 +58,11 @@ class BusConnection:
         except TunerError as error:
             if error.kind is FailureKind.TIMEOUT:
                 raise self._no_answer(error) from error
+            if error.code == Abort.NO_SUBINDEX:
+                text = f"controller node {self.controller:02X}h has no channel {self.channel}, says the device: {error}"
+                raise Refused(Reason.DEVICE_MISMATCH, f"{text}; see the channel in loops.yaml") from error
             if error.code in _NOT_OURS:
-                raise Refused(Reason.DEVICE_MISMATCH, str(error)) from error
+                raise self._mismatch(error) from error
             raise Refused(Reason.BAD_INPUT, f"the controller refused: {error}") from error
 
     def reading(self, tuner: Tuner) -> BusReading:
@@ -77,6 +80,17 @@ class BusConnection:
         if self._tuner is not None:
             self._tuner.close()
             self._tuner = None
+
+    def _mismatch(self, error: TunerError) -> Refused:
+        """Returns the error for a node that is not the expected device: what it is, where it says so."""
+        try:
+            assert self._tuner is not None
+            self.reading(self._tuner).identify_controller()
+        except Refused as what_it_is:
+            return what_it_is
+        except (TunerError, BusError, OSError, Failed):
+            pass
+        return Refused(Reason.DEVICE_MISMATCH, str(error))
 
     def _no_answer(self, error: TunerError) -> Failed:
         """Distinguishes a node in the state stopped, which sends heartbeats and answers no SDO, from one that is

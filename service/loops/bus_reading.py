@@ -48,6 +48,11 @@ class BusReading:
         device_type = int(self.tuner.number("device_type", node=node))
         expected = int(default_of(lookup("device_type"), 0, device))
         if device_type != expected:
+            other = Device.PLANT if device is Device.CONTROLLER else Device.CONTROLLER
+            if device_type == int(default_of(lookup("device_type"), 0, other)):
+                text = f"node {node:02X}h ({node}) is a {other.value}, not a {device.value}"
+                swapped = "controller_node and plant_node seem to be swapped in loops.yaml"
+                raise Refused(Reason.DEVICE_MISMATCH, f"{text}: {swapped}")
             text = f"node {node:02X}h is of type {device_type:08X}h, not a {device.value} ({expected:08X}h)"
             raise Refused(Reason.DEVICE_MISMATCH, text)
         revision = int(self.tuner.number("identity", 3, node=node))
@@ -90,7 +95,7 @@ class BusReading:
         number = self.tuner.number
         plant_state, when_silent = self._plant_state()
         own = int(number("node_state", node=self.controller))
-        away = [] if own == NmtState.OPERATIONAL else [f"node {self.controller:02X}h is {_state_name(own)}"]
+        away = [] if own == NmtState.OPERATIONAL else [f"node {self.controller:02X}h is {state_name(own)}"]
         if plant_state != OPERATIONAL:
             away.append(self._plant_is(plant_state))
         return LoopState(
@@ -141,7 +146,7 @@ class BusReading:
         if self.plant is None:
             return OPERATIONAL, ""
         try:
-            state = _state_name(int(self.tuner.number("node_state", node=self.plant)))
+            state = state_name(int(self.tuner.number("node_state", node=self.plant)))
             reaction = int(self.tuner.number("plant_on_missing_answer"))
             words = _WHEN_SILENT.get(reaction, "")
             if reaction == OnMissingAnswer.SAFE_OUTPUT:
@@ -153,9 +158,10 @@ class BusReading:
 
 def not_operational(node: int, state: int) -> Failed:
     """Returns the error for a node that is not operational."""
-    text = f"node {node:02X}h is {_state_name(state)}: it controls nothing, MV stays where it is"
+    text = f"node {node:02X}h is {state_name(state)}: it controls nothing, MV stays where it is"
     return Failed(Reason.NODE_NOT_OPERATIONAL, text)
 
 
-def _state_name(state: int) -> str:
+def state_name(state: int) -> str:
+    """Returns the name of an NMT state."""
     return NmtState(state).name.lower().replace("_", "-") if state in list(NmtState) else f"in NMT state {state}"

@@ -19,6 +19,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.service.inputs.validation import listed
+
 Reals = NDArray[np.float64]
 
 _NAMES = {"t": ("t", "time", "t_s"), "u": ("u", "mv"), "y": ("y", "pv"), "sp": ("sp",)}
@@ -34,7 +36,7 @@ class RecordError(Exception):
         shown = list(problems[:_MAX_PROBLEMS])
         if len(problems) > _MAX_PROBLEMS:
             shown.append(f"and {len(problems) - _MAX_PROBLEMS} more")
-        super().__init__("\n".join([f"{source}: {len(problems)} error(s)", *(f"  {p}" for p in shown)]))
+        super().__init__(listed(source, len(problems), shown))
         self.problems = shown
 
 

@@ -197,8 +197,6 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
     """
     limit_arenas()
     logs.configure(setup.log_format)
-    # python-can's socketcand client warns about every frame that TCP splits, although TCP may split any.
-    logging.getLogger("can").setLevel(logging.ERROR)
     site = load_site(setup.loops_file)
     site.check_own_node(setup.node, str(setup.loops_file))
     if setup.database is not None and setup.host is None:

@@ -388,9 +388,14 @@ class Store:
             }
 
     def recent(
-        self, loop: str | None = None, state: JobState | None = None, limit: int = 50, before: int | None = None
+        self,
+        loop: str | None = None,
+        state: JobState | None = None,
+        limit: int = 50,
+        before: int | None = None,
+        id_begins: str | None = None,
     ) -> Sequence[Job]:
-        """The latest jobs first; before: only those with a smaller number."""
+        """The latest jobs first; before: only those with a smaller number; id_begins: how their ids begin."""
         wanted = select(JobRow).order_by(JobRow.number.desc()).limit(limit)
         if before is not None:
             wanted = wanted.where(JobRow.number < before)
@@ -398,6 +403,8 @@ class Store:
             wanted = wanted.where(JobRow.loop == loop)
         if state is not None:
             wanted = wanted.where(is_shown_as(state))
+        if id_begins is not None:
+            wanted = wanted.where(JobRow.id.startswith(id_begins, autoescape=True))
         with self._session() as session:
             return [Job.from_row(row) for row in session.scalars(wanted)]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import socket
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -23,8 +22,6 @@ ABSENT = MappingProxyType(
 )
 """An entry of loops.yaml that no controller answers for."""
 
-# python-can's socketcand client warns of every frame that TCP splits, which is what TCP does.
-logging.getLogger("can").setLevel(logging.ERROR)
 
 
 class Site(Plantsite):

@@ -6,7 +6,6 @@ gains of its options would be seen.
 
 from __future__ import annotations
 
-import logging
 import os
 import subprocess
 import threading
@@ -55,8 +54,6 @@ class Needs:
     defect: bool = False
 
 
-# python-can's socketcand client warns of every frame that TCP splits, which is what TCP does.
-logging.getLogger("can").setLevel(logging.ERROR)
 
 
 class Missing(Exception):

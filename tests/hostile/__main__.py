@@ -6,7 +6,6 @@ It fails when an abort waits, supervision is late, memory grows, a loop is not a
 from __future__ import annotations
 
 import argparse
-import logging
 import sys
 import tempfile
 import time
@@ -31,7 +30,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--loops", type=int, default=100, help="in operation (default: %(default)s)")
     parser.add_argument("--tests", type=int, default=10, help="under test at the same time (default: %(default)s)")
     asked = parser.parse_args(argv)
-    logging.getLogger("can").setLevel(logging.ERROR)  # its socketcand client tells of every frame that TCP splits
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         site = Site(stack, folder, asked.loops)

@@ -12,7 +12,6 @@ What the machine does to a process that wants nothing but 10 ms of sleep it does
 from __future__ import annotations
 
 import json
-import logging
 import signal
 import sys
 import threading
@@ -26,7 +25,6 @@ NAP_S = 0.01
 
 
 def main() -> None:
-    logging.getLogger("can").setLevel(logging.ERROR)  # its socketcand client tells of every frame that TCP splits
     over = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: over.set())
     heartbeat: list[tuple[float, float]] = []

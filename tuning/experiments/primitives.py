@@ -216,7 +216,8 @@ def no_oscillation(facts: Facts, point: OperatingPoint, trace: Trace, switches: 
     """
     moved = float(np.mean(trace.pv[trace.tail(facts.T95_s / 5)])) - point.pv
     expected = 1.0 if facts.reverse else -1.0
-    after = f"{trace.t[-1] - trace.t[0]:.3g} s of relay (+-{point.room:.3g}, {switches} cycles) PV is {moved:+.3g} away"
+    cycles = f"{switches} cycle{'' if switches == 1 else 's'}"
+    after = f"{trace.t[-1] - trace.t[0]:.3g} s of relay (+-{point.room:.3g}, {cycles}) PV is {moved:+.3g} away"
     if abs(moved) < max(5 * point.noise, 1e-3 * facts.sp_deviation):
         return Refused(Reason.NO_RESPONSE, "after " + after)
     if switches == 0 and moved * expected < 0:

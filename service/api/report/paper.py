@@ -118,7 +118,12 @@ def paper(source: ReportSource) -> str:
         with_error=_with_error(source.designs),
         asked=_asked(source),
         stages=[
-            (stage_name(each.stage), each.state, stage_found(each, pv_unit), n.duration(each.plant_time_s))
+            (
+                stage_name(each.stage),
+                each.state,
+                stage_found(each.stage, each.result, pv_unit),
+                n.duration(each.plant_time_s),
+            )
             for each in job.stages
         ],
         notes=[sentence(each) for each in job.notes],

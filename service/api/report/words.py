@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from loopwright.service.api.job_views import JobView, StageView
+from collections.abc import Mapping
+
+from loopwright.service.api.job_views import JobView
 from loopwright.service.api.report.numbers import Ms_error, duration, fixed, significant, with_unit
 from loopwright.service.states.job_state import JobState
 from loopwright.service.store.jobs import JobEvent
@@ -23,6 +25,7 @@ STAGES = {
     "estimate": "Model",
     "optimise": "Gains",
 }
+_STRUCTURES = {"fopdt": "first order", "sopdt": "second order"}
 _REASONS = {
     Reason.OPERATOR: "by an operator",
     Reason.SERVICE_STOPPED: "the service ended",
@@ -53,6 +56,12 @@ _WITH_REASON = (JobState.REFUSED, JobState.ABORTED, JobState.FAILED, JobState.IN
 def stage_name(stage: str | None) -> str:
     """Returns the name of a stage."""
     return "" if stage is None else STAGES.get(stage, stage.replace("_", " "))
+
+
+def structure_words(structure: str) -> str:
+    """Returns the name of a model structure in words."""
+    first, _, rest = structure.partition(" ")
+    return " ".join(filter(None, (_STRUCTURES.get(first, first), rest)))
 
 
 def reason_words(reason: Reason) -> str:
@@ -99,29 +108,35 @@ def trust(job: JobView) -> list[str]:
     return said
 
 
-def stage_found(stage: StageView, pv_unit: str) -> str:
+def stage_found(stage: str, result: Mapping[str, object] | None, pv_unit: str) -> str:
     """Returns what a stage found, in a few words."""
-    result = dict(stage.result or {})
+    result = result or {}
 
     def value(name: str) -> float | None:
         found = result.get(name)
         return float(found) if isinstance(found, int | float) and not isinstance(found, bool) else None
 
     said = []
-    if (noise := value("noise")) is not None and stage.stage == "preflight":
-        said.append(f"noise {with_unit(significant(noise, 2), pv_unit)}")
+    if (noise := value("noise")) is not None and stage == "preflight":
+        said.append(f"noise {with_unit(significant(noise, 2), pv_unit)}".rstrip())
     if (switches := value("switches")) is not None:
         said.append(f"{switches:.0f} switches, period {with_unit(significant(value('period_s'), 3), 's')}")
     if (turns := value("turns")) is not None:
         said.append(f"{turns:.0f} turns of the set-point")
+    if (Ku_a := value("Ku_a")) is not None:
+        said.append(f"Ku about {significant(Ku_a)}, Pu about {with_unit(significant(value('Pu_a_s'), 3), 's')}")
+    if (structure := result.get("structure")) is not None:
+        said.append(structure_words(str(structure)))
+    if (K := value("K")) is not None and (T := value("T_s")) is not None and (L := value("L_s")) is not None:
+        said.append(f"K {significant(K)}, T {with_unit(significant(T), 's')}, L {with_unit(significant(L), 's')}")
     if (Ku := value("Ku")) is not None:
         said.append(f"Ku {significant(Ku)}, Pu {with_unit(significant(value('Pu_s')), 's')}")
-    if (Ms := value("Ms")) is not None and stage.stage != "verify":
+    if (Ms := value("Ms")) is not None and stage != "verify":
         unsure = value("uncertainty")
         said.append(f"Ms {fixed(Ms, 2)}" + (f" ± {Ms_error(unsure)}" if unsure is not None else ""))
     gains = result.get("gains")
     of = gains if isinstance(gains, dict) else result
-    if stage.stage != "verify" and isinstance(Kp := of.get("Kp"), int | float):
+    if stage != "verify" and isinstance(Kp := of.get("Kp"), int | float):
         Ti = of.get("Ti", of.get("Ti_s"))
         said.append(f"Kp {significant(Kp)}" + (f", Ti {significant(Ti)} s" if isinstance(Ti, int | float) else ""))
     if (fit := value("fit_pct")) is not None:

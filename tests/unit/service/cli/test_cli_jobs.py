@@ -6,6 +6,8 @@ import json
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import pytest
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner, Result
 
+from loopwright.service.cli import job_tables, jobs
 from loopwright.service.cli import main as cli
 from loopwright.service.cli.client import ApiError, Client
 from loopwright.tuning.plan import Mode
@@ -64,7 +67,8 @@ class Through:
 @pytest.fixture
 def through(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> Through:
     through = Through(client)
-    monkeypatch.setattr(cli, "Client", lambda _url: through)
+    for module in (cli, jobs):
+        monkeypatch.setattr(module, "Client", lambda _url: through)
     return through
 
 
@@ -211,6 +215,21 @@ def test_a_job_and_its_picture_and_another_Ms(rehearsed: str, tmp_path: Path) ->
     assert run("job", rehearsed, "--plot", "job.doc").exit_code == 2
 
 
+def test_other_gains_for_the_model_of_a_job(rehearsed: str, service: Service, through: Through) -> None:
+    options = ("--dry-run", "--no-wait", "--json")
+    begun = run("retune", TAG, "--from", rehearsed[:8], "--ms", "1.4", *options)
+    assert begun.exit_code == 0, begun.output
+    asked = through.posted[-1]
+    assert asked["start"] == "design" and asked["ms"] == 1.4 and asked["model"] and asked["requested_by"] == "cli"
+    service.wait(json.loads(begun.stdout)["id"])
+    by_rule = run("retune", TAG, "--from", "last", "--method", "lambda", *options)
+    assert by_rule.exit_code == 0 and through.posted[-1]["method"] == "lambda", by_rule.output
+    other = run("retune", "FIC-2", "--from", rehearsed, "--ms", "1.4", *options)
+    assert other.exit_code == 2 and f"is of loop {TAG}, not of FIC-2" in other.output
+    many = run("retune", "T*", "--from", rehearsed, *options)
+    assert many.exit_code == 2 and "one loop" in many.output
+
+
 def test_the_report_of_a_job(rehearsed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     named = tmp_path / "filed.html"
@@ -226,7 +245,75 @@ def test_the_report_of_a_job(rehearsed: str, tmp_path: Path, monkeypatch: pytest
     assert run("report", rehearsed, "--output", "-").stdout.startswith("<!doctype html>")
     lost = run("report", rehearsed, "--output", str(tmp_path / "none" / "file.html"))
     assert lost.exit_code == 2 and "file.html" in lost.output
-    assert isinstance(run("report", "none").exception, ApiError)
+    assert isinstance(run("report", "000000000000").exception, ApiError)
+
+
+class TestWhichJob:
+    """A job is named by its id, by as much of its beginning as no other has, or as the last one."""
+
+    @pytest.fixture
+    def ids(self, service: Service, through: Through) -> list[str]:
+        found = []
+        for _ in range(3):
+            found.append(str(through.post(f"/loops/{TAG}/retune")["id"]))
+            service.wait(found[-1])
+        return found
+
+    def test_the_last_one(self, ids: list[str]) -> None:
+        assert json.loads(run("job", "last", "--json").stdout)["id"] == ids[-1]
+
+    def test_the_beginning_of_an_id(self, ids: list[str]) -> None:
+        for each in ids:
+            begun = next(each[:n] for n in range(1, 13) if sum(other.startswith(each[:n]) for other in ids) == 1)
+            assert json.loads(run("job", begun, "--json").stdout)["id"] == each
+
+    def test_the_beginning_of_several(self, ids: list[str]) -> None:
+        several = run("job", "")
+        assert several.exit_code == 2 and "several jobs" in several.output
+        assert all(each in several.output for each in ids)
+
+    @pytest.mark.parametrize("given", ["nope", "%", "_", "last "])
+    def test_of_none(self, ids: list[str], given: str) -> None:
+        none = run("report", given)
+        assert none.exit_code == 2 and f"begins with {given!r}; see: loopwright jobs" in none.output
+
+    def test_none_at_all(self, service: Service, through: Through) -> None:
+        none = run("job", "last")
+        assert none.exit_code == 2 and "loopwright retune TAG" in none.output
+
+
+def test_ids_and_times_are_whole_on_eighty_columns(service: Service, through: Through) -> None:
+    job = through.post(f"/loops/{TAG}/retune")["id"]
+    service.wait(job)
+    (line,) = (line for line in run("jobs").output.splitlines() if TAG in line)
+    assert job in line and " s ago" in line and len(line) <= 80
+    state = service.store.get(job).state
+    assert job in run("jobs", "--state", state).output and job not in run("jobs", "--state", "queued").output
+    assert run("jobs", "--state", "nonsense").exit_code == 2
+
+
+def test_how_long_ago() -> None:
+    now = datetime(2026, 11, 25, 12, 0, 0, tzinfo=UTC)
+    words = {
+        0.4: "0 s ago", 59.7: "59 s ago", 60.0: "1 min ago", 3599.0: "59 min ago", 3600.0: "1 h ago",
+        47.9 * 3600.0: "47 h ago", 48.0 * 3600.0: "2 days ago", 900 * 86400.0: "900 days ago",
+        -0.5: "0 s ago", -3.0: "2026-11-25T12:00:03+00:00",
+    }  # fmt: skip
+    for passed, expected in words.items():
+        assert job_tables.ago((now - timedelta(seconds=passed)).isoformat(), now) == expected
+    assert job_tables.ago("2026-11-25T11:59:00.000Z", now) == "1 min ago"
+
+
+def test_the_retunes_of_many_loops(service: Service, through: Through) -> None:
+    retune = through.post("/retunes", {"pattern": "*"})["id"]
+    listed = run("retunes")
+    assert listed.exit_code == 0 and retune in listed.output and " s ago" in listed.output
+    assert json.loads(run("retunes", "--json").stdout)[0]["id"] == retune
+
+
+def test_the_version() -> None:
+    shown = run("--version")
+    assert shown.exit_code == 0 and shown.output == f"loopwright {version('loopwright')}\n"
 
 
 def test_a_job_without_a_record_has_no_picture(service: Service, through: Through, tmp_path: Path) -> None:
@@ -245,3 +332,33 @@ def test_rehearse_is_fast_unless_told_otherwise(tmp_path: Path) -> None:
     assert answer["predicted_before"]["Ms"] < 1.4
     assert json.loads(run("rehearse", str(file), "--method", "five-stage", "--json").stdout)["method"] == "five-stage"
     assert run("rehearse", str(file), "--method", "five-stage", "--ms", "1.4").exit_code == 2
+
+
+def test_rehearse_speaks_like_retune(tmp_path: Path) -> None:
+    file = tmp_path / "heater.json"
+    file.write_text(json.dumps({"name": "heater", "K": 0.8, "T_s": 120, "L_s": 15, "noise_std": 0.0005}))
+    told = run("rehearse", str(file))
+    assert told.exit_code == 0, told.output
+    for words in ("Relay: ", "Model and gains: ", "rehearsal on heater", "predicted overshoot", "MV unit per PV unit"):
+        assert words in told.output
+    assert "{" not in told.output
+    echoed = json.loads(run("rehearse", str(file), "--json").stdout)["input"]
+    assert echoed["num"] == [0.8] and echoed["den"] == [120.0, 1.0] and echoed["dead_time_s"] == 15.0
+
+
+@pytest.mark.parametrize(
+    ("plant", "words"),
+    [
+        ({"K": 0.8, "T": 120, "L_s": 15}, "T: not a quantity of the form {K, T_s, L_s}"),
+        ({"num": [1.0]}, "den: it is missing"),
+        ({"K": 0.8, "T_s": 120, "L_s": 15, "seed": -1}, "seed: a number of at least 0 is expected, not -1"),
+    ],
+)
+def test_a_plant_file_that_cannot_be_used_is_refused_in_words(
+    tmp_path: Path, plant: dict[str, Any], words: str
+) -> None:
+    file = tmp_path / "plant.json"
+    file.write_text(json.dumps(plant))
+    refused = run("rehearse", str(file))
+    assert refused.exit_code == 2 and words in refused.output.replace("\n", " ")
+    assert run("rehearse", str(file), "--json").exit_code == 2

@@ -142,9 +142,9 @@ def test_a_retune_that_is_on_its_way_is_followed_instead_of_starting_others(
     assert service.tune.inside.wait(20)
     follow = job_tables.follow
 
-    def as_it_ends(client: Client, job_url: str) -> JobView:
+    def as_it_ends(client: Client, job_url: str, to: Console) -> JobView:
         service.tune.hold.set()
-        return follow(client, job_url)
+        return follow(client, job_url, to)
 
     monkeypatch.setattr(job_tables, "follow", as_it_ends)
     shown = demonstrate(through, TAG, METHODS)

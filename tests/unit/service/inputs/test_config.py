@@ -45,12 +45,55 @@ def test_every_error_is_listed_at_once() -> None:
         "loops[0].t95_s (TIC-101)", "loops[0].colour (TIC-101)", "socketcan:vcan0",
         "low (5) must be less than high (5)",
         "loops[3].t95_s (D)", "loops[3].controller_node (D)", "are both 32", "twice", "0..100 percent",
-        "loops[7].pv_unit (H): Field required",
+        "loops[7].pv_unit (H): it is missing",
         "loops[8].test.excitations (I): relay, relay: each excitation is named once",
-        "loops[9].test.excitations (J)", "loops[10].test.excitations.0 (K)", "loops[11]", "extra: unknown key",
+        "loops[9].test.excitations (J)", "loops[10].test.excitations.0 (K)", "loops[11]", "extra: unknown name",
         "loops[12].test (L): directions up exclude the relay",
     ):  # fmt: skip
         assert words in text
+
+
+def test_each_error_has_its_line_and_says_what_is_expected(tmp_path: Path) -> None:
+    file = tmp_path / "loops.yaml"
+    file.write_text("""\
+loop: []
+loops:
+- &first
+  tag: TIC-101
+  bus: socketcan:vcan0
+  controller_node: 16
+  pv_unit: degC
+  pv_limits: {low: 0, high: 100}
+  t95: 9
+  sp_deviation: five
+- <<: *first
+  tag: TIC 102
+  channel: 2.5
+  t95_s: -1
+  sp_deviation: 1
+  test: {excitations: relay,
+    directions: sideways}
+buses:
+  socketcan:vcan1: {at_once: 0, listens: true}
+""")
+    with pytest.raises(ConfigError) as caught:
+        load_site(file)
+    assert str(caught.value).splitlines() == [
+        f"{file}: 13 errors",
+        "  line 1: loop: unknown name; did you mean loops?",
+        "  line 3: loops[0].t95_s (TIC-101): it is missing",
+        "  line 9: loops[0].t95 (TIC-101): unknown name; did you mean t95_s?",
+        "  line 9: loops[1].t95 (TIC 102): unknown name; did you mean t95_s?",
+        "  line 10: loops[0].sp_deviation (TIC-101): a number is expected, not 'five'",
+        "  line 12: loops[1].tag (TIC 102): 'TIC 102' is not of the form ^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$",
+        "  line 13: loops[1].channel (TIC 102): a whole number is expected, not 2.5",
+        "  line 14: loops[1].t95_s (TIC 102): a number greater than 0 is expected, not -1",
+        "  line 16: loops[1].test.excitations (TIC 102): a list is expected, not 'relay'",
+        "  line 17: loops[1].test.directions (TIC 102): 'both', 'up' or 'down' is expected, not 'sideways'",
+        "  line 19: buses.socketcan:vcan1: no loop is on this bus; did you mean socketcan:vcan0?",
+        "  line 19: buses.socketcan:vcan1.at_once: a number of at least 1 is expected, not 0",
+        "  line 19: buses.socketcan:vcan1.listens: unknown name; did you mean listen?",
+    ]
 
 
 def test_two_loops_may_not_share_a_tag_or_a_channel() -> None:

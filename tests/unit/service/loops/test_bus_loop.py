@@ -227,10 +227,7 @@ class TestLease:
         """A thread that computes for four seconds, while other loops of this process send its heartbeat."""
         site.begun()
         site.loop.step(())
-        others = site.wire.open()
-        for _ in range(40):
-            site.pass_time(0.1)
-            others.send(heartbeat_id(TUNER_NODE), HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL))
+        site.pass_time(4.0, beating=TUNER_NODE)
         with pytest.raises(Failed, match=r"cause: lease\); at most 4\.[0-5] s passed between two renewals"):
             for _ in range(100):
                 site.loop.step(())

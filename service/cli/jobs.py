@@ -1,0 +1,196 @@
+"""`loopwright jobs`, `loopwright retunes`, `loopwright job`, `loopwright report` and `loopwright alternatives`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+from urllib.parse import quote
+
+import typer
+
+from loopwright.service.cli.client import DEFAULT_URL, Client
+from loopwright.service.cli.output import AsJson, Url, die, print_json
+from loopwright.service.cli.tuning import check_plot
+from loopwright.service.states.job_state import JobState
+
+app = typer.Typer()
+
+LAST = "last"
+ID_LENGTH = 12
+"""Number of characters of the id of a job; fewer are the beginning of an id."""
+_FEW = 5
+JobId = Annotated[
+    str,
+    typer.Argument(metavar="ID", help="Id of the job, or as much of its beginning as no other has; last: the latest."),
+]
+
+
+def path_of(client: Client, given: str) -> str:
+    """Returns the path of a job. Ends the command with status 2 where several jobs, or none, may be meant.
+
+    given: the id of the job, the beginning of it, or `last`.
+    """
+    from pydantic import TypeAdapter
+
+    from loopwright.service.api.job_views import JobView
+
+    if given == LAST:
+        wanted: dict[str, str | float | None] = {"limit": 1}
+    elif len(given) < ID_LENGTH:
+        wanted = {"id": given, "limit": _FEW}
+    else:
+        return f"/jobs/{quote(given, safe='')}"
+    found = TypeAdapter(list[JobView]).validate_python(client.get("/jobs", **wanted))
+    if not found and given == LAST:
+        die("there is no job yet; begin one with: loopwright retune TAG", 2)
+    if not found:
+        die(f"no job has an id that begins with {given!r}; see: loopwright jobs", 2)
+    if len(found) > 1:
+        ids = ", ".join(f"{job.id} ({job.loop})" for job in found)
+        more = " and perhaps more" if len(found) == _FEW else ""
+        die(f"several jobs have an id that begins with {given!r}: {ids}{more}; give more of the id", 2)
+    return f"/jobs/{found[0].id}"
+
+
+@app.command("jobs")
+def list_jobs(
+    loop: Annotated[str | None, typer.Option(help="Only jobs of this loop.")] = None,
+    state: Annotated[JobState | None, typer.Option(help="Only jobs in this state.")] = None,
+    url: Url = DEFAULT_URL,
+    as_json: AsJson = False,
+) -> None:
+    """List the latest jobs."""
+    from datetime import UTC, datetime
+
+    from pydantic import TypeAdapter
+
+    from loopwright.service.api.job_views import JobView
+    from loopwright.service.cli import job_tables
+
+    found = Client(url).get("/jobs", loop=loop, state=state)
+    if as_json:
+        print_json(found)
+        return
+    jobs, now = TypeAdapter(list[JobView]).validate_python(found), datetime.now(UTC)
+    job_tables.rows(
+        "jobs",
+        ("id", "loop", "state", "reason", "created"),
+        ((x.id, x.loop, job_tables.doing(x), x.reason, job_tables.ago(x.created_at, now)) for x in jobs),
+        never_cut=("id", "created"),
+    )
+
+
+@app.command("retunes")
+def list_retunes(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
+    """List the latest retunes of many loops."""
+    from datetime import UTC, datetime
+
+    from pydantic import TypeAdapter
+
+    from loopwright.service.cli import fleet_tables
+    from loopwright.service.cli.answers import FleetSummary
+
+    found = Client(url).get("/retunes")
+    if as_json:
+        print_json(found)
+        return
+    fleet_tables.summaries(TypeAdapter(list[FleetSummary]).validate_python(found), datetime.now(UTC))
+
+
+@app.command("job")
+def one_job(
+    job_id: JobId,
+    follow: Annotated[bool, typer.Option("--follow", help="Show the progress until the job is over.")] = False,
+    abort: Annotated[bool, typer.Option("--abort", help="Abort the job; its loop is restored.")] = False,
+    accept: Annotated[
+        bool, typer.Option("--accept", help="Accept the proposal: write its gains to the controller.")
+    ] = False,
+    rollback: Annotated[
+        bool, typer.Option("--rollback", help="Decline the proposal, or restore the old gains.")
+    ] = False,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a plot of the job: .png, .svg or .pdf.")
+    ] = None,
+    url: Url = DEFAULT_URL,
+    as_json: AsJson = False,
+) -> None:
+    """Show a job, or decide on it."""
+    from loopwright.service.api.job_views import JobView, LoopDetail
+    from loopwright.service.cli import job_tables
+
+    client = Client(url)
+    path = path_of(client, job_id)
+    decisions = [name for name, wanted in (("abort", abort), ("accept", accept), ("rollback", rollback)) if wanted]
+    if len(decisions) > 1:
+        die("only one of --abort, --accept and --rollback can be given", 2)
+    job = JobView.model_validate(
+        client.post(f"{path}/{decisions[0]}", {"by": "cli"}) if decisions else client.get(path)
+    )
+    if follow:
+        job = job_tables.follow(client, path)
+    if plot is not None:
+        from loopwright.service.cli.plots.job import NoPicture, job_picture
+
+        check_plot(plot)
+        unit = LoopDetail.model_validate(client.get(f"/loops/{job.loop}")).pv_unit
+        try:
+            job_picture(plot, client.samples_of(job.url), job, unit)
+        except NoPicture as error:
+            die(str(error), 1)
+        except OSError as error:
+            die(f"{plot}: {error.strerror}", 2)
+    if as_json:
+        print_json(job.model_dump(mode="json"))
+    else:
+        job_tables.job_report(job)
+
+
+@app.command("report")
+def report_of_job(
+    job_id: JobId,
+    output: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="File to write; default: loopwright-LOOP-ID.html in this folder; -: print."),
+    ] = None,
+    url: Url = DEFAULT_URL,
+) -> None:
+    """Write the report of a job that is over: one HTML file, to be printed or filed."""
+    client = Client(url)
+    name, text = client.file(f"{path_of(client, job_id)}/report")
+    if output == Path("-"):
+        print(text, end="")
+        return
+    file = output or Path(name)
+    if output is None and file.exists():
+        die(f"{file} exists already: name another file with --output, or the same to replace it", 2)
+    try:
+        file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        die(f"{file}: {error.strerror}", 2)
+    print(file)
+
+
+@app.command("alternatives")
+def alternatives_of_job(
+    job_id: JobId,
+    ms: Annotated[float | None, typer.Option(help="Gains that fast designs for this Ms from the same record.")] = None,
+    derivative: Annotated[
+        bool | None, typer.Option(help="With --ms: design a PID where it is better than a PI.")
+    ] = None,
+    method: Annotated[str | None, typer.Option(help="Only this method.")] = None,
+    url: Url = DEFAULT_URL,
+    as_json: AsJson = False,
+) -> None:
+    """Show other gains for the model that a job found, with their figures; no experiment is made."""
+    wanted = None if derivative is None else str(derivative).lower()
+    client = Client(url)
+    found = client.get(f"{path_of(client, job_id)}/alternatives", ms=ms, derivative=wanted, method=method)
+    if as_json:
+        print_json(found)
+        return
+    from loopwright.service.api.tuning_views import AlternativesView
+    from loopwright.service.cli import tuning_tables
+
+    alternatives = AlternativesView.model_validate(found)
+    tuning_tables.tunings(alternatives)
+    tuning_tables.to_try(alternatives)
