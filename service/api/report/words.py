@@ -119,7 +119,7 @@ def stage_found(stage: str, result: Mapping[str, object] | None, pv_unit: str) -
     said = []
     if (noise := value("noise")) is not None and stage == "preflight":
         said.append(f"noise {with_unit(significant(noise, 2), pv_unit)}".rstrip())
-    if (switches := value("switches")) is not None:
+    if (switches := value("switches")) is not None and stage == "relay":
         said.append(f"{switches:.0f} switches, period {with_unit(significant(value('period_s'), 3), 's')}")
     if (turns := value("turns")) is not None:
         said.append(f"{turns:.0f} turns of the set-point")
@@ -142,9 +142,10 @@ def stage_found(stage: str, result: Mapping[str, object] | None, pv_unit: str) -
     if (fit := value("fit_pct")) is not None:
         said.append(f"{fixed(fit, 1)} % of the step explained")
     if (overshoot := value("overshoot_pct")) is not None:
-        settled = value("settling_s")
-        how = f"settled in {duration(settled)}" if settled is not None else "not settled"
-        said.append(f"overshoot {fixed(overshoot, 0)} %, {how}")
+        said.append(f"overshoot {fixed(overshoot, 0)} %")
+        if "settling_s" in result:
+            settled = value("settling_s")
+            said.append("not settled" if settled is None else f"settled in {duration(settled)}")
     reason = result.get("reason")
     if isinstance(reason, str) and reason in set(Reason):
         said.append(f"not enough: {reason_words(Reason(reason))}")
