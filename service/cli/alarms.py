@@ -46,9 +46,9 @@ def alarms(
     if not found:
         print("Nothing is abnormal.")
         return
-    from loopwright.service.cli import job_tables
+    from loopwright.service.cli import terminal
 
     rows = ((each.level, each.subject, each.text, each.since, each.id if each.to_sign else "") for each in found)
-    job_tables.rows("alarms", ("level", "of", "what", "since", "sign off with"), rows)
+    terminal.rows("alarms", ("level", "of", "what", "since", "sign off with"), rows)
     for advice in dict.fromkeys(f"{each.subject}: {each.advice}" for each in found):
-        job_tables.console.print(advice, highlight=False, soft_wrap=True)
+        terminal.console.print(advice, highlight=False, soft_wrap=True)

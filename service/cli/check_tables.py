@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 
 from loopwright.protocol.objects import Device
-from loopwright.service.cli.job_tables import console, rows
+from loopwright.service.cli.terminal import console, rows
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.loops.bus_check import LoopCheck
 from loopwright.service.loops.bus_probe import FoundNode

@@ -15,7 +15,7 @@ from pathlib import Path
 import yaml
 
 from loopwright.protocol.tuner import TunerError
-from loopwright.service.cli import demo_live, job_tables
+from loopwright.service.cli import demo_live, terminal
 from loopwright.service.cli.child_process import ChildProcess, NotReady
 from loopwright.service.cli.client import ApiError, Client
 from loopwright.service.cli.demo_report import METHODS, PLANT, PLANT_MODEL, Demonstration, demonstrate, report
@@ -243,4 +243,4 @@ class _Demo:
 
 
 def _say(line: str) -> None:
-    job_tables.console.print(line, highlight=False, markup=False, soft_wrap=True)
+    terminal.console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from rich.table import Table
 
 from loopwright.service.api.job_views import JobView, LiveView, LoopDetail
-from loopwright.service.cli import job_tables
+from loopwright.service.cli import job_tables, terminal
 from loopwright.service.cli.client import ApiError, Client
 from loopwright.service.states.job_state import JobState
 from loopwright.tuning.analysis.comparison import LoopPerformance, loop_performance
@@ -59,14 +59,14 @@ def demonstrate(client: Client, tag: str, methods: Sequence[str]) -> Demonstrati
     """
     started = time.monotonic()
     if url := _loop(client, tag).active_job:
-        job_tables.console.print(f"GET        {client.url}{url}: a retune is on its way", highlight=False)
-        return Demonstration([job_tables.follow(client, url, job_tables.console)], time.monotonic() - started)
+        terminal.console.print(f"GET        {client.url}{url}: a retune is on its way", highlight=False)
+        return Demonstration([job_tables.follow(client, url, terminal.console)], time.monotonic() - started)
     jobs = []
     for method in methods:
         path = f"/loops/{tag}/retune"
-        job_tables.console.print(f"POST       {client.url}{path}  method {method}", highlight=False)
+        terminal.console.print(f"POST       {client.url}{path}  method {method}", highlight=False)
         begun = JobView.model_validate(client.post(path, {"method": method, "requested_by": "demo"}))
-        jobs.append(job_tables.follow(client, begun.url, job_tables.console))
+        jobs.append(job_tables.follow(client, begun.url, terminal.console))
     return Demonstration(jobs, time.monotonic() - started)
 
 
@@ -87,22 +87,22 @@ def report(client: Client, tag: str, shown: Demonstration, plant: TransferFuncti
             job_tables.job_report(job, loop.pv_unit)
         if job.method == "five-stage":
             _stages(job, loop.pv_unit)
-    job_tables.console.print(_table(loop, live, shown.jobs, plant))
+    terminal.console.print(_table(loop, live, shown.jobs, plant))
     if plant is not None:
         on = f"num {_row(plant.num)}, den {_row(plant.den)}, dead time {plant.L:g} s"
         text = (
             "Ms, overshoot and IAE (of unit steps) are computed on the plant itself, which is simulated and known: "
             f"{on}, and half a sample of delay for the sampling."
         )
-        job_tables.console.print(text, highlight=False)
-    held = ", ".join(f"{name} {job_tables.figure(live.gains, name)}" for name in ("Kp", "Ti"))
-    held = f"{held}, set-point {job_tables.cell(live.sp)}"
+        terminal.console.print(text, highlight=False)
+    held = ", ".join(f"{name} {terminal.figure(live.gains, name)}" for name in ("Kp", "Ti"))
+    held = f"{held}, set-point {terminal.cell(live.sp)}"
     plant_s = sum(job.plant_time_s for job in shown.jobs)
     lines = (
         f"controller       {live.mode}, {held}: its own until a proposal is accepted",
         f"time             {plant_s:.0f} s of plant time in {shown.seconds:.1f} s of wall time",
     )
-    job_tables.console.print("\n".join(lines), highlight=False, soft_wrap=True)
+    terminal.console.print("\n".join(lines), highlight=False, soft_wrap=True)
 
 
 def _loop(client: Client, tag: str) -> LoopDetail:
@@ -119,9 +119,9 @@ def _stages(job: JobView, pv_unit: str) -> None:
     lines = []
     for number, (stage, (name, words)) in enumerate(_STAGES.items(), 1):
         if done := results.get(stage):
-            found = words.format_map(dict(job_tables.leaves(done.result)))
+            found = words.format_map(dict(terminal.leaves(done.result)))
             lines.append((f"{number} {name}", f"{done.plant_time_s or 0.0:.1f} s", found))
-    job_tables.rows(f"the five stages; gains in % per {pv_unit}", ("stage", "plant time", "found"), lines)
+    terminal.rows(f"the five stages; gains in % per {pv_unit}", ("stage", "plant time", "found"), lines)
 
 
 def _table(loop: LoopDetail, live: LiveView, jobs: Sequence[JobView], plant: TransferFunction | None) -> Table:
@@ -134,7 +134,7 @@ def _table(loop: LoopDetail, live: LiveView, jobs: Sequence[JobView], plant: Tra
     table.add_row("before any move", "", *(f"{_rest_s(job):.1f}" for job in jobs), "s")
     gains = [live.gains, *(job.new_gains for job in jobs)]
     for name, of in (("Kp", f"% per {unit}"), ("Ti", "s")):
-        table.add_row(name, *(job_tables.figure(each, name) for each in gains), of)
+        table.add_row(name, *(terminal.figure(each, name) for each in gains), of)
     if plant is None:
         return table
     found = [None if each is None else _on(plant, each.gains(), live.sample_time_s) for each in gains]
@@ -162,4 +162,4 @@ def _figure(found: LoopPerformance | None, part: str | None, name: str) -> str:
         return "-"
     if not found.stable:
         return "unstable"
-    return job_tables.cell(getattr(getattr(found, part) if part else found, name))
+    return terminal.cell(getattr(getattr(found, part) if part else found, name))

@@ -8,7 +8,7 @@ from datetime import datetime
 
 from loopwright.service.cli.answers import FleetRetune, FleetSummary
 from loopwright.service.cli.client import Client
-from loopwright.service.cli.job_tables import ago, console, rows
+from loopwright.service.cli.terminal import ago, console, rows
 
 POLL_S = 1.0
 _OVER = ("done", "stopped", "aborted")

@@ -65,17 +65,17 @@ def list_jobs(
     from pydantic import TypeAdapter
 
     from loopwright.service.api.job_views import JobView
-    from loopwright.service.cli import job_tables
+    from loopwright.service.cli import job_tables, terminal
 
     found = Client(url).get("/jobs", loop=loop, state=state)
     if as_json:
         print_json(found)
         return
     jobs, now = TypeAdapter(list[JobView]).validate_python(found), datetime.now(UTC)
-    job_tables.rows(
+    terminal.rows(
         "jobs",
         ("id", "loop", "state", "reason", "created"),
-        ((x.id, x.loop, job_tables.doing(x), x.reason, job_tables.ago(x.created_at, now)) for x in jobs),
+        ((x.id, x.loop, job_tables.doing(x), x.reason, terminal.ago(x.created_at, now)) for x in jobs),
         never_cut=("id", "created"),
     )
 

@@ -62,9 +62,9 @@ def list_keys(data: Data = Path("data"), database: Database = None, as_json: AsJ
     if as_json:
         print(json.dumps(found, indent=2))
         return
-    from loopwright.service.cli import job_tables
+    from loopwright.service.cli import terminal
 
-    job_tables.rows("keys", (*names, "valid"), (tuple(row.values()) for row in found))
+    terminal.rows("keys", (*names, "valid"), (tuple(row.values()) for row in found))
 
 
 @app.command()

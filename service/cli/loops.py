@@ -119,7 +119,7 @@ def observe(
         print_json(found)
     else:
         from loopwright.service.cli import observation_tables
-        from loopwright.service.cli.job_tables import console
+        from loopwright.service.cli.terminal import console
 
         observation_tables.show(shown, console)
     if shown.state is not ObservationState.PROPOSAL:

@@ -248,7 +248,7 @@ def serve(
 def list_loops(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
     """List the configured loops."""
     from loopwright.service.api.job_views import LoopView
-    from loopwright.service.cli import job_tables
+    from loopwright.service.cli import job_tables, terminal
 
     found = Client(url).pages("/loops")
     if as_json:
@@ -256,7 +256,7 @@ def list_loops(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
         return
     loops = [LoopView.model_validate(each) for each in found]
     shown = ("tag", "description", "bus", "controller_node", "pv_unit", "t95_s", "active_job")
-    job_tables.rows(
+    terminal.rows(
         "loops",
         ("tag", "description", "bus", "node", "unit", "T95 s", "job", "locked"),
         ((*(getattr(each, name) for name in shown), job_tables.lock(each.locked)) for each in loops),
@@ -451,7 +451,7 @@ def rehearse_file(
     """Rehearse the whole procedure on a plant model, in memory at full speed. Exit status 0: there is an answer; 2: the
     plant file cannot be used."""
     from loopwright.service.api.report.words import stage_found, stage_name
-    from loopwright.service.cli import job_tables
+    from loopwright.service.cli import job_tables, terminal
     from loopwright.service.execution.rehearsal import rehearse
     from loopwright.service.jsonable import to_json_object
     from loopwright.tuning.plan import Event, Note, StageDone
@@ -465,7 +465,7 @@ def rehearse_file(
             found = stage_found(event.stage, to_json_object(event.result), "")
             text = f"{stage_name(event.stage)}: {found or 'done'}"
         if text is not None:
-            job_tables.progress_console.print(f"  {text}", highlight=False, markup=False, soft_wrap=True)
+            terminal.progress_console.print(f"  {text}", highlight=False, markup=False, soft_wrap=True)
 
     given = {"Ms": ms, "derivative": derivative or None}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}

@@ -9,7 +9,7 @@ from datetime import datetime
 from rich.console import Console
 from rich.table import Table
 
-from loopwright.service.cli.job_tables import cell
+from loopwright.service.cli.terminal import cell
 from loopwright.service.inputs.model_json import describe
 from loopwright.service.observing.exported import ExportedView
 from loopwright.service.observing.observed import ObservationView, ObservedChangeView, OperationView

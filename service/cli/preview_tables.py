@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 from rich.table import Table
 
-from loopwright.service.cli.job_tables import number
+from loopwright.service.cli.terminal import number
 from loopwright.service.planning.preview import FleetPreview, Preview, duration_text
 
 

@@ -169,7 +169,7 @@ def _identify_operation(
         print_json(found.model_dump(mode="json"))
     else:
         from loopwright.service.cli import observation_tables
-        from loopwright.service.cli.job_tables import console
+        from loopwright.service.cli.terminal import console
 
         observation_tables.show_exported(found, console)
     if found.state is not ObservationState.PROPOSAL:

@@ -15,7 +15,7 @@ import pytest
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner, Result
 
-from loopwright.service.cli import job_tables, jobs
+from loopwright.service.cli import jobs, terminal
 from loopwright.service.cli import main as cli
 from loopwright.service.cli.client import ApiError, Client
 from loopwright.tuning.plan import Mode
@@ -300,8 +300,8 @@ def test_how_long_ago() -> None:
         -0.5: "0 s ago", -3.0: "2026-11-25T12:00:03+00:00",
     }  # fmt: skip
     for passed, expected in words.items():
-        assert job_tables.ago((now - timedelta(seconds=passed)).isoformat(), now) == expected
-    assert job_tables.ago("2026-11-25T11:59:00.000Z", now) == "1 min ago"
+        assert terminal.ago((now - timedelta(seconds=passed)).isoformat(), now) == expected
+    assert terminal.ago("2026-11-25T11:59:00.000Z", now) == "1 min ago"
 
 
 def test_the_retunes_of_many_loops(service: Service, through: Through) -> None:

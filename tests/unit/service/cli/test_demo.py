@@ -20,7 +20,7 @@ from loopwright.controller.pid import Parameters
 from loopwright.plantsim.catalogue import find
 from loopwright.service.api.app import create_app
 from loopwright.service.api.job_views import JobView
-from loopwright.service.cli import demo, demo_live, job_tables
+from loopwright.service.cli import demo, demo_live, job_tables, terminal
 from loopwright.service.cli import main as cli
 from loopwright.service.cli.client import Client
 from loopwright.service.cli.demo_report import METHODS, PLANT, PLANT_MODEL, demonstrate, report
@@ -61,7 +61,7 @@ def in_memory(tmp_path: Path) -> Iterator[Through]:
 @pytest.fixture
 def screen(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
     text = io.StringIO()
-    monkeypatch.setattr(job_tables, "console", Console(file=text, width=160))
+    monkeypatch.setattr(terminal, "console", Console(file=text, width=160))
     return text
 
 

@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 
 from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
-from loopwright.service.cli import job_tables
 from loopwright.service.cli import main as cli
+from loopwright.service.cli import terminal
 from loopwright.service.cli.client import Client
 from loopwright.service.errors import Locked, UnknownLoop
 from loopwright.service.inputs.config import parse_site
@@ -432,7 +432,7 @@ def test_the_commands(run: Any, service: Service) -> None:
 def test_the_table_of_loops_shows_it(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     run("lock", TAG, "--reason", "valve", "--by", "me")
     shown = io.StringIO()
-    monkeypatch.setattr(job_tables, "console", Console(width=200, file=shown))
+    monkeypatch.setattr(terminal, "console", Console(width=200, file=shown))
     run("loops")
     run("loop", TAG)
     assert shown.getvalue().count("by me: valve") == 2 and "automatic" in shown.getvalue()
