@@ -337,11 +337,11 @@ def test_rehearse_is_fast_unless_told_otherwise(tmp_path: Path) -> None:
 def test_rehearse_speaks_like_retune(tmp_path: Path) -> None:
     file = tmp_path / "heater.json"
     file.write_text(json.dumps({"name": "heater", "K": 0.8, "T_s": 120, "L_s": 15, "noise_std": 0.0005}))
-    told = run("rehearse", str(file))
-    assert told.exit_code == 0, told.output
+    shown = run("rehearse", str(file))
+    assert shown.exit_code == 0, shown.output
     for words in ("Relay: ", "Model and gains: ", "rehearsal on heater", "predicted overshoot", "MV unit per PV unit"):
-        assert words in told.output
-    assert "{" not in told.output
+        assert words in shown.output
+    assert "{" not in shown.output
     echoed = json.loads(run("rehearse", str(file), "--json").stdout)["input"]
     assert echoed["num"] == [0.8] and echoed["den"] == [120.0, 1.0] and echoed["dead_time_s"] == 15.0
 
