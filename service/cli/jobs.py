@@ -123,6 +123,9 @@ def one_job(
     decisions = [name for name, wanted in (("abort", abort), ("accept", accept), ("rollback", rollback)) if wanted]
     if len(decisions) > 1:
         die("only one of --abort, --accept and --rollback can be given", 2)
+    if job_id == LAST and (accept or rollback):  # somebody else's job may have begun meanwhile
+        found = JobView.model_validate(client.get(path))
+        die(f"--{decisions[0]} writes to a loop and takes an id: the last job is {found.id}, of {found.loop}", 2)
     job = JobView.model_validate(
         client.post(f"{path}/{decisions[0]}", {"by": "cli"}) if decisions else client.get(path)
     )

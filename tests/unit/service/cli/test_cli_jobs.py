@@ -262,6 +262,12 @@ class TestWhichJob:
     def test_the_last_one(self, ids: list[str]) -> None:
         assert json.loads(run("job", "last", "--json").stdout)["id"] == ids[-1]
 
+    def test_the_last_one_is_not_decided_on(self, service: Service, ids: list[str]) -> None:
+        refused = run("job", "last", "--accept")
+        assert refused.exit_code == 2 and f"the last job is {ids[-1]}, of {TAG}" in refused.output
+        assert service.store.get(ids[-1]).state == "proposed"
+        assert run("job", ids[-1], "--rollback").exit_code == 0
+
     def test_the_beginning_of_an_id(self, ids: list[str]) -> None:
         for each in ids:
             begun = next(each[:n] for n in range(1, 13) if sum(other.startswith(each[:n]) for other in ids) == 1)
