@@ -105,6 +105,8 @@ def own_plant(text: str) -> Entry:
     if not 0.0 <= numbers["mv"] <= 100.0:
         raise ValueError(f"mv is {numbers['mv']:g}: MV is in percent, 0 to 100")
     num, den = (tuple(float(each) for each in data[name]) for name in ("num", "den"))
+    if not num or not any(den):
+        raise ValueError(f"num and den need coefficients, den one that is not 0, not {text}")
     gain = num[-1] / den[-1] if den[-1] else None
     facts = PlantFacts(
         description="a user's own plant",

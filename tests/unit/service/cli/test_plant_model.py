@@ -48,7 +48,8 @@ def test_what_is_no_model_is_refused_in_words(given: str, capsys: pytest.Capture
 
 
 @pytest.mark.parametrize("text", ["{}", '{"num": [1]}', '{"num": [1], "den": [1, 1], "colour": 1}',
-                                  '{"num": [1], "den": [1, 1], "mv": 140}'])  # fmt: skip
+                                  '{"num": [1], "den": [1, 1], "mv": 140}', '{"num": [], "den": [1]}',
+                                  '{"num": [1], "den": [0]}'])  # fmt: skip
 def test_the_plant_process_refuses_what_is_no_plant(text: str) -> None:
-    with pytest.raises(ValueError, match=r"a plant is a JSON object|MV is in percent"):
+    with pytest.raises(ValueError, match=r"a plant is a JSON object|MV is in percent|need coefficients"):
         own_plant(text)
