@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from loopwright.service.cli import alarms, data, jobs, keys, loops, tuning
+from loopwright.service.cli import alarms, data, identification, jobs, keys, loops, tuning
 from loopwright.service.cli.client import DEFAULT_URL, ApiError, Client
 from loopwright.service.cli.output import AsJson, Url, die, on_terminal, print_json, read_json_object, shown_on_terminal
 
@@ -483,7 +483,7 @@ def rehearse_file(
 
 app.command("methods")(tuning.methods)
 app.command("tune")(tuning.tune)
-app.command("identify")(tuning.identify)
+app.command("identify")(identification.identify)
 
 
 @app.command()

@@ -1,19 +1,15 @@
-"""`loopwright methods`, `tune` and `identify`, which need no service."""
+"""`loopwright methods` and `tune`, which need no service."""
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from loopwright.service.cli.output import AsJson, die, json_object, print_json, read_json_object
-
-if TYPE_CHECKING:
-    from loopwright.service.offline.csv_record import Record
 
 PICTURES = (".png", ".svg", ".pdf")
 Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Write a plot: .png, .svg or .pdf.")]
@@ -45,7 +41,7 @@ def tune(
     as_json: AsJson = False,
 ) -> None:
     """Tunes a process model by one method or all, and compares the gains. Exit status 0: gains found, 3: none."""
-    _one_thread()
+    one_thread()
     from loopwright.service.inputs.model_json import BadModel, parse_model
     from loopwright.service.offline import tunings
 
@@ -61,7 +57,7 @@ def tune(
     if plot is not None:
         from loopwright.service.cli.plots.tunings import responses
 
-        _save(plot, responses, plant, found)
+        save(plot, responses, plant, found)
     if as_json:
         print_json(answer)
     else:
@@ -73,110 +69,7 @@ def tune(
         raise typer.Exit(3)
 
 
-def identify(
-    data: Annotated[Path, typer.Argument(metavar="DATA.csv", help="Columns t, u (or mv), y (or pv).")],
-    mv_before: Annotated[
-        float | None, typer.Option(help="MV before the record; needed if the record begins with the move.")
-    ] = None,
-    plot: Plot = None,
-    as_json: AsJson = False,
-    closed_loop: Annotated[
-        bool,
-        typer.Option(
-            "--closed-loop", help="The file is of normal operation in automatic, with a column sp; needs --kp."
-        ),
-    ] = False,
-    kp: Annotated[float | None, typer.Option(help="Kp in effect, ISA form; with --closed-loop.")] = None,
-    ti: Annotated[
-        float | None, typer.Option(help="Ti in effect, s, with --closed-loop; default: no integral action.")
-    ] = None,
-    td: Annotated[float | None, typer.Option(help="Td in effect, s, with --closed-loop; default: 0.")] = None,
-    b: Annotated[float | None, typer.Option(help="Set-point weight in effect, with --closed-loop; default: 1.")] = None,
-    ms: Annotated[
-        float | None, typer.Option(help="Ms that gains are designed for, with --closed-loop; default: 1.6.")
-    ] = None,
-) -> None:
-    """Identifies a process model from a recorded test of any shape. Exit status 0: a model found, 3: none.
-
-    With --closed-loop: gains from the set-point changes of normal operation, as `loopwright observe`. Exit status 0:
-    gains are proposed, 3: none.
-    """
-    _one_thread()
-    in_effect = (kp, ti, td, b, ms)
-    if closed_loop and (kp is None or mv_before is not None or plot is not None):
-        die("--closed-loop needs --kp, and takes neither --mv-before nor --plot", 2)
-    if not closed_loop and any(each is not None for each in in_effect):
-        die("--kp, --ti, --td, --b and --ms need --closed-loop", 2)
-    from loopwright.service.offline.csv_record import RecordError, load_record
-    from loopwright.service.offline.identification import identified, refused
-    from loopwright.tuning.identification.identify import identify as fit
-    from loopwright.tuning.reasons import Reason, Refused
-
-    check_plot(plot)
-    try:
-        record = load_record(data)
-    except RecordError as error:
-        die(str(error), 2)
-    if kp is not None:
-        gains = (kp, ti or 0.0, td or 0.0, 1.0 if b is None else b)
-        _identify_operation(data, record, gains, 1.6 if ms is None else ms, as_json)
-        return
-    try:
-        found = fit(record.t, record.u, record.y, mv_before)
-    except Refused as refusal:
-        if refusal.reason is Reason.BAD_INPUT:
-            die(f"{data}: {refusal.detail}", 2)
-        if as_json:
-            print_json(refused(refusal))
-        else:
-            from loopwright.service.cli import tuning_tables
-
-            tuning_tables.not_identified(refusal)
-        raise typer.Exit(3) from None
-    if plot is not None:
-        from loopwright.service.cli.plots.tunings import record_and_model
-
-        _save(plot, record_and_model, record, found)
-    if as_json:
-        print_json(identified(found, record))
-    else:
-        from loopwright.service.cli import tuning_tables
-
-        tuning_tables.identified(found, len(record.t))
-
-
-def _identify_operation(
-    data: Path, record: Record, gains: tuple[float, float, float, float], ms: float, as_json: bool
-) -> None:
-    from loopwright.service.observing.exported import exported
-    from loopwright.service.observing.observed import ObservationState
-    from loopwright.tuning.fast.design import DesignSpec
-    from loopwright.tuning.gains import Gains
-    from loopwright.tuning.reasons import Reason, Refused
-
-    kp, ti, td, b = gains
-    if not (math.isfinite(kp) and kp > 0.0 and math.isfinite(b) and all(0.0 <= each < math.inf for each in (ti, td))):
-        die(f"--kp must be positive, --ti and --td at least 0, not {kp:g}, {ti:g}, {td:g}", 2)
-    try:
-        spec = DesignSpec(ms)
-    except Refused as refusal:
-        die(f"--ms: {refusal.detail}", 2)
-    try:
-        found = exported(record, Gains(kp, ti, td, td / 10.0, b), spec)
-    except Refused as refusal:
-        die(f"{data}: {refusal.detail}", 2 if refusal.reason is Reason.BAD_INPUT else 3)
-    if as_json:
-        print_json(found.model_dump(mode="json"))
-    else:
-        from loopwright.service.cli import observation_tables
-        from loopwright.service.cli.terminal import console
-
-        observation_tables.show_exported(found, console)
-    if found.state is not ObservationState.PROPOSAL:
-        raise typer.Exit(3)
-
-
-def _one_thread() -> None:
+def one_thread() -> None:
     """Threads of the linear algebra cost more than they save on small matrices. To be called before numpy is loaded."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -187,7 +80,8 @@ def check_plot(plot: Path | None) -> None:
         die(f"--plot must end in {', '.join(PICTURES)}, not {plot}", 2)
 
 
-def _save(plot: Path, draw: Callable[..., None], *what: object) -> None:
+def save(plot: Path, draw: Callable[..., None], *what: object) -> None:
+    """Writes a plot; ends the command with status 2 where the file cannot be written."""
     try:
         draw(plot, *what)
     except OSError as error:

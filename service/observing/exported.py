@@ -6,7 +6,7 @@ from pydantic import Field
 
 from loopwright.service.jsonable import json_object
 from loopwright.service.observing.observed import OperationView, operation_fields
-from loopwright.service.offline.csv_record import Record
+from loopwright.service.offline.csv_record.record import Record
 from loopwright.service.results import Figures
 from loopwright.tuning.analysis.comparison import Comparison
 from loopwright.tuning.experiments.primitives import Facts

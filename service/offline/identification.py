@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 from loopwright.service.inputs.model_json import dump_model
 from loopwright.service.jsonable import JsonObject, json_object
-from loopwright.service.offline.csv_record import Record
+from loopwright.service.offline.csv_record.record import Record
 from loopwright.tuning.identification.identify import Identified
 from loopwright.tuning.reasons import Refused
 
@@ -36,7 +36,7 @@ def identified(found: Identified, record: Record) -> JsonObject:
             "noise_std": found.noise_std,
             "whiteness": found.whiteness,
             "explained": found.explained,
-            "samples": len(record.t),
+            "record": recorded(record),
             "candidates": [asdict(each) for each in found.candidates],
             "notes": list(found.notes),
         }
@@ -48,12 +48,33 @@ def named(values: Mapping[str, float]) -> dict[str, float]:
     return {_IN_JSON.get(name, name): value for name, value in values.items()}
 
 
-def refused(refusal: Refused) -> dict[str, object]:
-    """Returns the JSON object of a refusal: the first fields of that of a model, and no model."""
+def recorded(record: Record) -> dict[str, object]:
+    """Returns what was read from a file as JSON: the samples, and the column, range and unit of each quantity."""
+    columns = {"mv": ("u", record.u), "pv": ("y", record.y), "sp": ("sp", record.sp)}
+    return {
+        "samples": len(record.t),
+        "sample_time_s": float(record.t[-1] - record.t[0]) / max(len(record.t) - 1, 1),
+        "columns": {
+            name: {
+                "column": record.names.get(key),
+                "unit": record.units.get(key),
+                "minimum": float(values.min()),
+                "maximum": float(values.max()),
+            }
+            for name, (key, values) in columns.items()
+            if values is not None
+        },
+        "notes": list(record.notes),
+    }
+
+
+def refused(refusal: Refused, record: Record) -> dict[str, object]:
+    """Returns the JSON object of a refusal: the first fields of that of a model, no model, and the record."""
     return {
         "outcome": "refused",
         "reason": refusal.reason.value,
         "detail": refusal.detail,
         "advice": refusal.advice,
         "model": None,
+        "record": recorded(record),
     }

@@ -9,7 +9,7 @@ import pytest
 
 from loopwright.service.observing.exported import exported
 from loopwright.service.observing.observed import ObservationState
-from loopwright.service.offline.csv_record import Record
+from loopwright.service.offline.csv_record.record import Record
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, TransferFunction

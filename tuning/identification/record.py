@@ -57,7 +57,7 @@ def recorded_test(t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | No
     if not len(moved):
         raise _bad(
             f"the input is constant at {before:g}: nothing can be learnt from it; MV must move at least "
-            "once (if it moved when the record began, say from where: u_before)"
+            "once (if it moved when the record began, say from where: u_before, --mv-before)"
         )
     first = int(moved[0])
     if len(time) - first - 1 < MIN_AFTER_THE_FIRST_MOVE:

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from loopwright.service.inputs.model_json import describe, dump_model
-from loopwright.service.offline.csv_record import Record
+from loopwright.service.offline.csv_record.record import Record
 from loopwright.service.offline.tunings import MethodResult
 from loopwright.tuning.analysis.step_response import Response, step_response
 from loopwright.tuning.identification.identify import Identified

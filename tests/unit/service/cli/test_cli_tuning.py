@@ -231,7 +231,7 @@ def test_identify_finds_the_plant(record: Path, tmp_path: Path) -> None:
     for name, value in truth.items():
         assert abs(found["model"][name] - value) < 4.0 * found["standard_errors"][name]
         assert found["standard_errors"][name] < 0.02 * value
-    assert found["outcome"] == "identified" and found["fit_pct"] > 99.0 and found["samples"] == 600
+    assert found["outcome"] == "identified" and found["fit_pct"] > 99.0 and found["record"]["samples"] == 600
     assert [each["structure"] for each in found["candidates"] if each["chosen"]] == ["sopdt"]
     assert picture.read_bytes().startswith(b"\x89PNG")
     # what it found is what tune takes
@@ -320,7 +320,7 @@ def test_identify_without_an_answer_in_pv(tmp_path: Path) -> None:
     ("text", "words"),
     [
         ("", "is empty"),
-        ("t,u\n0,1\n", "no column y or pv"),
+        ("t,u\n0,1\n", "no column for PV"),
         ("t,u,y\n0,1,x\n", "line 2: y is not a number"),
         ("t,u,y\n" + "".join(f"{k},5,{k % 3}\n" for k in range(50)), "u"),
         ("t,u,y\n0,1,2\n1,1,2\n", "too few samples: 2"),
@@ -330,8 +330,45 @@ def test_bad_records(tmp_path: Path, text: str, words: str) -> None:
     file = tmp_path / "data.csv"
     file.write_text(text)
     result = run("identify", str(file))
-    assert result.exit_code == 2 and result.stdout == ""
+    # what was read is said before what is wrong with it
+    assert result.exit_code == 2
+    assert result.stdout == "" or (result.stdout.count("\n") == 1 and "; MV" in result.stdout)
     assert str(file) in result.stderr and words in result.stderr
+
+
+def test_identify_goes_on_to_gains(record: Path) -> None:
+    found = answer("identify", str(record), "--tune")
+    assert found["tunings"] == answer("tune", "--model", json.dumps(found["model"]))
+    shown = run("identify", str(record), "--tune").stdout
+    assert shown.startswith("600 samples every 0.4 s, 4.0\u202fmin; MV 47..55, PV ")
+    assert shown.index("standard error") < shown.index("MV per PV unit")
+    both = run("identify", str(record), "--tune", "--closed-loop", "--kp", "1")
+    assert both.exit_code == 2 and "nor --tune" in both.stderr
+
+
+def test_identify_asks_whether_columns_are_swapped(record: Path) -> None:
+    swapped = run("identify", str(record), "--u", "y")
+    assert swapped.exit_code == 2 and "more than one quantity" in swapped.stderr
+    file = record.with_name("swapped.csv")
+    file.write_text(record.read_text().replace("t,u,y", "t,y,u"))
+    asked = run("identify", str(file))
+    assert asked.exit_code == 2 and 'Say which is which: --u "y" --y "u"' in asked.stderr
+    assert answer("identify", str(file), "--u", "y", "--y", "u")["model"] == answer("identify", str(record))["model"]
+    # who says it is not asked
+    assert run("identify", str(file), "--u", "u", "--y", "y").exit_code in (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--resample", "5 days"], "--resample: a time such as 5s, 500ms or 1min is expected, not '5 days'"),
+        (["--u", "valve"], "--u: no column 'valve'; there are: t, u, y, operator"),
+        (["--time-format", "%H:%M"], "600 values of t are no times of the form '%H:%M', such as '0.000'"),
+    ],
+)
+def test_identify_of_a_file_that_is_read_otherwise(record: Path, arguments: list[str], words: str) -> None:
+    result = run("identify", str(record), *arguments)
+    assert result.exit_code == 2 and words in result.stderr and result.stdout == ""
 
 
 def test_identify_of_no_file() -> None:

@@ -6,7 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopwright.service.offline.csv_record import RecordError, load_record, parse_record
+from loopwright.service.offline.csv_record.errors import RecordError
+from loopwright.service.offline.csv_record.record import ReadOptions, Record, load_record, parse_record
+from loopwright.service.offline.csv_record.sampling import duration
+from loopwright.service.offline.csv_record.swapped import may_be_swapped
 from loopwright.tuning.identification.identify import identify
 from loopwright.tuning.models import FOPDT
 from tests.unit.tuning.recordings import FIRST_ORDER, open_loop, step
@@ -70,18 +73,29 @@ def test_a_file_with_a_byte_order_mark(tmp_path: Path) -> None:
 
 
 def test_every_error_is_listed_with_its_line() -> None:
-    text = "# log\nt,u,y,sp\n0,1,2,3\n1,x,2,3\n1.5,,2,3\n2,1,nan,3\n\n3,1\n1,1,2,inf\n4,1,2,3\n"
+    text = "# log\nt,u,y,sp\n0,1,2,3\n1,x,2,3\n1.5,,2,3\n2,1,nan,3\n\n3,1\nzwei,y,2,inf\n4,1,2,3\n"
     with pytest.raises(RecordError) as caught:
         parse_record(text, "log.csv")
-    assert str(caught.value).startswith("log.csv: 6 errors")
+    assert str(caught.value).startswith("log.csv: 4 errors")
     assert caught.value.problems == [
-        "line 4: u is not a number: 'x'",
-        "line 5: u is missing",
-        "line 6: y is not finite: 'nan'",
-        "line 8: 2 values where the first line names 4 columns",
-        "line 9: t does not increase (1)",
-        "line 9: sp is not finite: 'inf'",
+        "line 9: t is neither a number of s nor a date and time: 'zwei'; --time-format says how it is written",
+        "line 8: values are missing, or too many: line 2 names 4 columns",
+        "2 values of u are not numbers, such as 'x', in lines 4, 9",
+        "line 9: sp is not a number: 'inf'",
     ]
+
+
+def test_of_each_kind_of_error_the_first_lines_are_named() -> None:
+    with pytest.raises(RecordError) as caught:
+        parse_record("t,u,y\n" + "".join(f"{k},?!,1\n" for k in range(400)), "log.csv")
+    assert caught.value.problems == ["400 values of u are not numbers, such as '?!', first in lines 2, 3, 4, 5, 6"]
+
+
+def test_times_that_do_not_increase() -> None:
+    with pytest.raises(RecordError, match=r"line 4: the time does not increase$"):
+        parse_record("t,u,y\n0,1,2\n2,1,2\n1,1,2\n3,1,2\n", "log.csv")
+    with pytest.raises(RecordError, match="2 times do not increase, in lines 3, 5: samples of the same time"):
+        parse_record("t,u,y\n10:00:00,1,2\n10:00:00,1,3\n10:00:01,1,4\n10:00:01,1,5\n", "log.csv")
 
 
 @pytest.mark.parametrize(
@@ -90,11 +104,11 @@ def test_every_error_is_listed_with_its_line() -> None:
         ("", "is empty"),
         ("# nothing\n\n", "is empty"),
         ("t,u,y\n", "no samples"),
-        ("t,u\n0,1\n", "line 1: no column y or pv; there are: t, u"),
-        ("0,1,2\n1,1,2\n", "no column t or time or t_s; there are: 0, 1, 2"),
-        ("t,time,u,y\n0,0,1,2\n", "more than one column for t: t, time"),
-        ("t,u,y\n2024-05-01T00:00:00,1,2\n5,1,2\n", "line 3: t is not a date and time: '5'"),
-        ("t,u,y\n0,1,2\n2024-05-01T00:00:00,1,2\n", "line 3: t is not a number"),
+        ("t,u\n0,1\n", "process variable, ...); there are: t, u. Say which: --y NAME"),
+        ("0,1,2\n1,1,2\n", "no column for the time: the line has no names. Give its number: --t 2, from 1 on"),
+        ("t,time,u,y\n0,0,1,2\n", "more than one column for the time: t, time. Say which: --t NAME"),
+        ("t,u,y\n2024-05-01T00:00:00,1,2\n5,1,2\n", "line 3: t is no time that is known; --time-format says"),
+        ("t,u,y\n0,1,2\n2024-05-01T00:00:00,1,2\n", "neither a number of s nor a date and time: '2024-05-01T00:00:00'"),
     ],
 )
 def test_unusable_files(text: str, words: str) -> None:
@@ -103,17 +117,15 @@ def test_unusable_files(text: str, words: str) -> None:
     assert words in str(caught.value)
 
 
-def test_only_the_first_errors_are_shown() -> None:
-    with pytest.raises(RecordError, match=r"(?s)400 errors.*and 380 more"):
-        parse_record("t,u,y\n" + "".join(f"{k},?,1\n" for k in range(400)), "log.csv")
-
-
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(RecordError, match=r"cannot be read: No such file"):
         load_record(tmp_path / "none.csv")
     binary = tmp_path / "binary.csv"
-    binary.write_bytes(b"\xff\xfe\x00t")
-    with pytest.raises(RecordError, match="not text in UTF-8"):
+    binary.write_bytes(b"\xff\xfe\x00\xd8\x01\x00")
+    with pytest.raises(RecordError, match="not text in UTF-16-LE: byte 0"):
+        load_record(binary)
+    binary.write_bytes(b"PK\x03\x04\x14\x00\x06\x00\x08\x00sheet")
+    with pytest.raises(RecordError, match=r"is not text: byte 5 is 0\. Export it as CSV"):
         load_record(binary)
 
 
@@ -126,3 +138,142 @@ def test_from_the_file_to_the_model(tmp_path: Path) -> None:
     found = identify(record.t, record.u, record.y)
     assert isinstance(found.model, FOPDT)
     assert pytest.approx((2.0, 10.0, 2.03), rel=1e-3) == (found.model.K, found.model.T, found.model.L)
+
+
+def seconds_of(header: str, *times: str) -> list[float]:
+    return values(parse_record(f"{header};u;y\n" + "".join(f"{each};1;2\n" for each in times), "log.csv").t)
+
+
+@pytest.mark.parametrize(
+    ("header", "times", "found"),
+    [
+        ("time (ms)", ("0", "500", "1000"), [0.0, 0.5, 1.0]),
+        ("time [min]", ("0", "0,5", "1"), [0.0, 30.0, 60.0]),
+        ("t_h", ("0", "0.5", "1"), [0.0, 1800.0, 3600.0]),
+        ("time", ("1795600000", "1795600002"), [0.0, 2.0]),  # s since 1970
+        ("time", ("1795600000000000000", "1795600000500000000"), [0.0, 0.5]),  # ns since 1970
+        ("time", ("134400000000000000", "134400000005000000"), [0.0, 0.5]),  # 100 ns since 1601
+        ("timestamp", ("46351.5", "46351.50005787037"), [0.0, 5.0]),  # days of a spreadsheet
+        ("time", ("23:59:55", "00:00:00", "0:00:05"), [86395.0, 86400.0, 86405.0]),
+        ("time", ("12:00:00 AM", "12:00:05 a.m."), [0.0, 5.0]),
+        ("time", ("25-Nov-2026 23:59:59,5", "26-Nov-2026 00:00:00,0"), [0.0, 0.5]),
+        ("time", ("2026/11/25 10:00", "2026/11/25 10:01"), [0.0, 60.0]),
+        ("time", ("31.12.26 23:59:59", "01.01.27 00:00:00"), [0.0, 1.0]),
+        ("time", ("12/31/2026 23:59:59", "01/01/2027 00:00:00"), [0.0, 1.0]),
+        ("time", ("01/02/2026 23:59:59", "02/02/2026 00:00:00"), [0.0, 1.0]),
+        ("time", ("02/01/2026 23:59:59", "02/02/2026 00:00:00"), [0.0, 1.0]),
+    ],
+)
+def test_times_as_systems_write_them(header: str, times: tuple[str, ...], found: list[float]) -> None:
+    assert seconds_of(header, *times) == pytest.approx(found, abs=1e-4)
+
+
+def test_a_time_format_that_is_given() -> None:
+    text = "when;u;y\nday 330, 10h00;1;2\nday 330, 10h01;1;2\n"
+    reading = ReadOptions({"t": "when"}, "day %j, %Hh%M")
+    assert values(parse_record(text, "log.csv", reading).t) == [0.0, 60.0]
+    with pytest.raises(RecordError, match="2 values of when are no times of the form '%H:%M', such as 'day 330, 10h00"):
+        parse_record(text, "log.csv", ReadOptions({"t": "when"}, "%H:%M"))
+
+
+@pytest.mark.parametrize(
+    ("cell", "value"),
+    [
+        ("1.234,5", 1234.5),
+        ("1,234.5", 1234.5),
+        ("1 234,5", 1234.5),
+        ("1\u00a0234,5", 1234.5),
+        ("35,2 %", 35.2),
+        ("-1,5e-3", -0.0015),
+    ],
+)
+def test_numbers_as_people_write_them(cell: str, value: float) -> None:
+    assert values(parse_record(f"t;u;y\n0;{cell};2\n1;{cell};2\n", "log.csv").u) == [value, value]
+
+
+def test_columns_by_number_where_there_are_no_names() -> None:
+    reading = ReadOptions({"t": "1", "u": "3", "y": "2"})
+    for text in ("0 5 1\n2 6 1\n", "  0   5   1\n  2   6   1\n", "0\t5\t1\n2\t6\t1\n"):
+        record = parse_record(text, "log.txt", reading)
+        assert (values(record.t), values(record.u), values(record.y)) == ([0.0, 2.0], [1.0, 1.0], [5.0, 6.0])
+
+
+@pytest.mark.parametrize(
+    ("chosen", "words"),
+    [
+        ({"u": "valve"}, "--u: no column 'valve'; did you mean Valve 2?; there are: t, Valve 1, Valve 2, y"),
+        ({"u": "9"}, "--u: no column '9'"),
+        ({"u": "y"}, "column 'y' is chosen for more than one quantity"),
+    ],
+)
+def test_columns_that_are_not_there(chosen: dict[str, str], words: str) -> None:
+    with pytest.raises(RecordError) as caught:
+        parse_record("t,Valve 1,Valve 2,y\n0,1,2,3\n", "log.csv", ReadOptions(chosen))
+    assert words in str(caught.value)
+
+
+def test_a_file_in_utf_16_without_a_mark(tmp_path: Path) -> None:
+    file = tmp_path / "record.csv"
+    file.write_bytes("t,u,y\n0,1,2\n1,1,3\n".encode("utf-16-le"))
+    assert values(load_record(file).y) == [2.0, 3.0]
+
+
+def rows(*cells: str) -> str:
+    return "t,u,y\n" + "".join(f"{k},1,{cell}\n" for k, cell in enumerate(cells))
+
+
+def test_values_that_are_missing() -> None:
+    there = ["2"] * 60
+    record = parse_record(rows(*there, "3", "Bad", "", "6", *there, "No Data"), "log.csv")
+    assert values(record.y[60:64]) == [3.0, 4.0, 5.0, 6.0]
+    assert record.notes == (
+        "1 sample without values at the ends was left out.",
+        "2 samples without a value, at most 2 in a row, were filled: MV and set-point held, PV in a straight line.",
+    )
+    with pytest.raises(RecordError, match="4 samples in a row have no value, from 60 s on"):
+        parse_record(rows(*there, *[""] * 4, *there), "log.csv")
+    with pytest.raises(RecordError, match="9 of 68 samples have no value; at most 5 % are filled"):
+        parse_record(rows(*["2", ""] * 9, *["2"] * 50), "log.csv")
+    with pytest.raises(RecordError, match="no sample has values of all columns"):
+        parse_record(rows("", "", "nan"), "log.csv")
+
+
+def test_lines_that_are_missing_or_repeated() -> None:
+    lines = [f"{k},1,{k}" for k in range(100)]
+    record = parse_record("\n".join(["t,u,y", *lines[:50], lines[49], *lines[52:]]), "log.csv")
+    assert values(record.t) == values(record.y) == [float(k) for k in range(100)]
+    assert record.notes[0] == "1 line that repeats the one before was left out."
+    with pytest.raises(RecordError, match=r"line 52: 5 s after the sample before, where 1 s is usual \(1 such gap\)"):
+        parse_record("\n".join(["t,u,y", *lines[:50], *lines[54:]]), "log.csv")
+    with pytest.raises(RecordError, match=r"line 3 comes 1\.4 s after the sample before.*--resample 1s"):
+        parse_record("\n".join(["t,u,y", lines[0], "1.4,1,1", *lines[2:]]), "log.csv")
+
+
+def test_resampling_keeps_what_mv_did_to_the_plant() -> None:
+    text = "t,u,y\n0,0,0\n1.5,4,3\n4,4,8\n6,4,12\n"
+    record = parse_record(text, "log.csv", ReadOptions(resample_s=2.0))
+    # MV moves at 1.5 s: a quarter of the interval is left; PV is 2 t
+    assert (values(record.t), values(record.u)) == ([0.0, 2.0, 4.0, 6.0], [1.0, 4.0, 4.0, 4.0])
+    assert values(record.y) == [0.0, 4.0, 8.0, 12.0]
+    assert "PV every 2 s, at most 2.5 s apart" in record.notes[0]
+
+
+@pytest.mark.parametrize(("text", "s"), [("5s", 5.0), ("500 ms", 0.5), ("1,5", 1.5), ("2min", 120.0), ("1 h", 3600.0)])
+def test_durations(text: str, s: float) -> None:
+    assert duration(text) == s
+
+
+@pytest.mark.parametrize("text", ["", "s", "0s", "-5s", "5 days", "nan"])
+def test_what_is_no_duration(text: str) -> None:
+    with pytest.raises(ValueError, match="a time such as 5s"):
+        duration(text)
+
+
+def test_columns_that_may_be_swapped() -> None:
+    t, u, y = open_loop(FIRST_ORDER, step())
+    relay = np.where(np.sin(t) > 0.0, 5.0, -5.0)
+    answer = np.cumsum(relay) + np.random.default_rng(1).normal(size=len(t))
+    for mv, pv, swapped in ((u, y, False), (y, u, True), (relay, answer, False), (answer, relay, True)):
+        assert may_be_swapped(Record(t, mv, pv)) is swapped
+    noise = np.random.default_rng(2).normal(size=(2, len(t)))
+    assert not may_be_swapped(Record(t, noise[0], noise[1])) and not may_be_swapped(Record(t, u, u))

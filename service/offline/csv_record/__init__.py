@@ -1,0 +1,1 @@
+"""Recorded tests as control systems, historians and spreadsheets write them, read into evenly spaced samples."""

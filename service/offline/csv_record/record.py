@@ -1,0 +1,129 @@
+"""Reads a recorded test of a loop from a file: time, MV and PV, optionally the set-point.
+
+    Timestamp;MV (%);PV (degC)          the names that control systems, historians and spreadsheets use
+    25.11.2026 10:00:00;35,0;61,24      numbers with decimal point or comma, times with or without a date
+
+All errors of a file are reported at once, each kind with its number and its first lines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from loopwright.service.offline.csv_record.columns import SHOWN
+from loopwright.service.offline.csv_record.errors import RecordError, Unusable, counted
+from loopwright.service.offline.csv_record.numbers import numbers
+from loopwright.service.offline.csv_record.sampling import sampled
+from loopwright.service.offline.csv_record.table import Table, read_table
+from loopwright.service.offline.csv_record.text import decoded
+from loopwright.service.offline.csv_record.times import seconds
+from loopwright.tuning.models import Reals
+
+
+@dataclass(frozen=True, slots=True)
+class ReadOptions:
+    """How a file is to be read, where that is not to be found out.
+
+    columns: the column of a quantity (t, u, y, sp), by its name or its number from 1 on.
+    time_format: how times are written, as `datetime.strptime` describes it.
+    resample_s: the sample time that the samples are brought to, s.
+    """
+
+    columns: Mapping[str, str] = field(default_factory=dict)
+    time_format: str | None = None
+    resample_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Record:
+    """The samples of a recorded test, all of shape (N,), finite, and evenly spaced.
+
+    t: time, s, increasing.
+    u: MV, MV units.
+    y: PV, PV units.
+    sp: set-point, PV units; None if the file has none.
+    units: the unit of u, y and sp where the file names it.
+    names: the column that u, y and sp were read from.
+    notes: what was changed when the file was read, one sentence each.
+    """
+
+    t: Reals
+    u: Reals
+    y: Reals
+    sp: Reals | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+    names: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+def load_record(path: Path, options: ReadOptions = ReadOptions()) -> Record:
+    """Returns the record in a file. Raises RecordError for a file that cannot be read or used."""
+    try:
+        text = decoded(path.read_bytes())
+    except OSError as error:
+        raise RecordError(str(path), [f"cannot be read: {error.strerror}"]) from None
+    except Unusable as error:
+        raise RecordError(str(path), error.problems) from None
+    return parse_record(text, str(path), options)
+
+
+def parse_record(text: str, source: str, options: ReadOptions = ReadOptions()) -> Record:
+    """Returns the record in the text of a file. Raises RecordError, in which `source` names the file."""
+    try:
+        return _record(read_table(text, options.columns), options)
+    except Unusable as error:
+        raise RecordError(source, error.problems) from None
+
+
+def _record(table: Table, options: ReadOptions) -> Record:
+    at, names = table.columns.at, table.columns.names
+    values: dict[str, Reals] = {}
+    problems = list(table.problems)
+    for quantity in ("u", "y", "sp"):
+        if quantity in at:
+            cells = [row[at[quantity]] for row in table.rows]
+            values[quantity], wrong = numbers(cells, decimal_comma=table.delimiter != ",")
+            problems += _no_numbers(names[at[quantity]].strip(), cells, [table.lines[i] for i in wrong], wrong)
+    try:
+        t = _times(table, options)
+    except Unusable as error:
+        problems = [*error.problems, *problems]
+    if problems:
+        raise Unusable(*problems)
+    found = sampled(t, values, table.lines, options.resample_s)
+    notes = list(found.notes)
+    if table.skipped:
+        above = "line" if table.skipped == 1 else "lines"
+        notes.insert(0, f"{table.skipped} {above} above the names of the columns were not used.")
+    columns = found.columns
+    used = {quantity: names[at[quantity]].strip() for quantity in values}
+    units = {quantity: unit for quantity, unit in table.columns.units.items() if quantity in values}
+    return Record(found.t, columns["u"], columns["y"], columns.get("sp"), units, used, tuple(notes))
+
+
+def _no_numbers(name: str, cells: list[str], lines: list[int], wrong: list[int]) -> list[str]:
+    if not wrong:
+        return []
+    given = cells[wrong[0]].strip()
+    many = f"values of {name} are not numbers, such as {given!r}"
+    return [counted(lines, f"{name} is not a number: {given!r}", many)]
+
+
+def _times(table: Table, options: ReadOptions) -> Reals:
+    columns = table.columns
+    if "t" not in columns.at:
+        raise Unusable(f"no column for {SHOWN['t']}")
+    cells = [row[columns.at["t"]] for row in table.rows]
+    if columns.date is not None:
+        cells = [f"{row[columns.date].strip()} {cell.strip()}" for row, cell in zip(table.rows, cells, strict=True)]
+    unit, name = columns.units.get("t", ""), columns.names[columns.at["t"]].strip() or "the first column"
+    t = seconds(cells, table.lines, unit, options.time_format, name)
+    if columns.milliseconds is not None and columns.milliseconds != columns.at["t"]:
+        fractions, wrong = numbers([row[columns.milliseconds] for row in table.rows], decimal_comma=True)
+        if not wrong and np.all((fractions >= 0.0) & (fractions < 1000.0)):
+            t = t + fractions / 1000.0
+    return t

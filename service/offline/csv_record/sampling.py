@@ -1,0 +1,237 @@
+"""From the lines of a file to evenly spaced samples: order, values that are missing, gaps, resampling.
+
+Whatever is changed is said in a note; what cannot be repaired without inventing the loop is an error.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopwright.service.offline.csv_record.errors import Unusable, counted
+from loopwright.tuning.identification.record import GAP, UNEVEN
+from loopwright.tuning.models import Reals
+
+Whole = NDArray[np.intp]
+
+MAX_GAP = 3
+"""Largest number of samples missing in a row that are filled."""
+MAX_FILLED = 0.05
+"""Largest part of the samples that is filled."""
+MAX_SAMPLES = 10_000_000
+_HELD = ("u", "sp")
+"""What holds its value until the next sample; PV goes on in a straight line."""
+_DURATION = re.compile(r"^\s*(?P<number>\d+(?:[.,]\d+)?)\s*(?P<unit>ms|s|sec|min|m|h)?\s*$")
+_SECONDS = {"ms": 1e-3, "s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
+_NAMES = {"u": "MV", "y": "PV", "sp": "SP"}
+
+
+@dataclass(frozen=True, slots=True)
+class EvenSamples:
+    """Samples in the order of their times. t: s, shape (N,). columns: the values, each of shape (N,). notes: what was
+    changed, one sentence each."""
+
+    t: Reals
+    columns: dict[str, Reals]
+    notes: tuple[str, ...]
+
+
+def duration(text: str) -> float:
+    """Returns the seconds of "5s", "500 ms", "1 min" or "5". Raises ValueError."""
+    found = _DURATION.match(text)
+    value = float(found["number"].replace(",", ".")) * _SECONDS[found["unit"] or "s"] if found else 0.0
+    if not value > 0.0:
+        raise ValueError(f"a time such as 5s, 500ms or 1min is expected, not {text!r}")
+    return value
+
+
+def sampled(t: Reals, columns: Mapping[str, Reals], lines: Sequence[int], resample_s: float | None) -> EvenSamples:
+    """Returns the samples of a record.
+
+    t: the times as they stand in the file, s, shape (N,). columns: MV `u`, PV `y` and perhaps `sp`, NaN where there is
+    no value. lines: the number of the line of each sample. resample_s: the sample time asked for, s, or None for that
+    of the file. Raises Unusable.
+    """
+    notes: list[str] = []
+    order = np.arange(len(t))
+    if len(t) > 1 and np.all(np.diff(t) <= 0.0) and t[-1] < t[0]:
+        order = order[::-1]
+        notes.append("The file has its latest sample first; the record begins with the last line.")
+    t, at = t[order], np.asarray(lines, dtype=np.intp)[order]
+    values = {name: column[order] for name, column in columns.items()}
+    keep = _without_repeated(t, values, at, notes)
+    t, at = t[keep], at[keep]
+    values = {name: column[keep] for name, column in values.items()}
+    if order[0] != 0 and t[0] < 0.0:
+        t = t - t[0]  # dates count from the first line
+    if resample_s is not None:
+        return _resampled(t, values, resample_s, notes)
+    t, values = _rows_filled_in(t, values, at)
+    return _filled(t, values, notes)
+
+
+def _without_repeated(t: Reals, values: Mapping[str, Reals], lines: Whole, notes: list[str]) -> list[int]:
+    """The places of the samples that do not repeat the one before. Raises Unusable: times that do not increase."""
+    steps = np.diff(t)
+    doubtful = np.flatnonzero(steps <= 0.0)
+    repeated = {
+        int(i) + 1
+        for i in doubtful
+        if steps[i] == 0.0 and all(_same(column[i], column[i + 1]) for column in values.values())
+    }
+    wrong = [int(lines[i + 1]) for i in doubtful if int(i) + 1 not in repeated]
+    if wrong:
+        why = ": samples of the same time and other values; export fractions of a second, too"
+        same = all(steps[i] == 0.0 for i in doubtful)
+        raise Unusable(counted(wrong, "the time does not increase", "times do not increase") + (why if same else ""))
+    if repeated:
+        lines_left_out = _count(len(repeated), "line that repeats", "lines that repeat")
+        notes.append(f"{lines_left_out} the one before {_were(len(repeated))} left out.")
+    return [i for i in range(len(t)) if i not in repeated]
+
+
+def _same(a: float, b: float) -> bool:
+    return bool(a == b) or (bool(np.isnan(a)) and bool(np.isnan(b)))
+
+
+def _rows_filled_in(t: Reals, values: Mapping[str, Reals], lines: Whole) -> tuple[Reals, dict[str, Reals]]:
+    """The samples with empty ones where a few lines are missing. Raises Unusable: gaps, times that are not even."""
+    steps = np.diff(t)
+    if not len(steps):
+        return t, dict(values)
+    usual = float(np.median(steps))
+    many = np.rint(steps / usual)
+    gaps = np.flatnonzero(many - 1 > MAX_GAP)
+    if len(gaps):
+        worst = int(gaps[np.argmax(steps[gaps])])
+        raise Unusable(
+            f"line {lines[worst + 1]}: {steps[worst]:.4g} s after the sample before, where {usual:.4g} s is usual "
+            f"({_count(len(gaps), 'such gap', 'such gaps')}). At most {MAX_GAP} missing samples in a row are filled: "
+            "use a part of the file without gaps, or --resample where the historian stores changes alone"
+        )
+    uneven = np.flatnonzero(np.abs(steps - many * usual) > UNEVEN * usual)
+    if len(uneven):
+        raise Unusable(
+            f"the samples are not evenly spaced within {100 * UNEVEN:.0f} %: line {lines[uneven[0] + 1]} comes "
+            f"{steps[uneven[0]]:.4g} s after the sample before, where {usual:.4g} s is usual ({len(uneven)} in all). "
+            f"--resample {_round(usual):g}s makes even ones of them"
+        )
+    if not np.any(steps > GAP * usual):
+        return t, dict(values)
+    places = np.concatenate([[0], np.cumsum(many)]).astype(int)
+    grid = np.interp(np.arange(places[-1] + 1), places, t)
+    spread = {}
+    for name, column in values.items():
+        spread[name] = np.full(len(grid), np.nan)
+        spread[name][places] = column
+    return grid, spread
+
+
+def _filled(t: Reals, values: Mapping[str, Reals], notes: list[str]) -> EvenSamples:
+    """The samples without those at the ends that lack a value, and with short gaps filled. Raises Unusable."""
+    missing = np.any([np.isnan(column) for column in values.values()], axis=0)
+    there = np.flatnonzero(~missing)
+    if not len(there):
+        raise Unusable("no sample has values of all columns")
+    first, last = int(there[0]), int(there[-1]) + 1
+    if cut := len(t) - (last - first):
+        notes.append(f"{_count(cut, 'sample', 'samples')} without values at the ends {_were(cut)} left out.")
+    t, missing = t[first:last], missing[first:last]
+    columns = {name: column[first:last].copy() for name, column in values.items()}
+    filled = int(np.count_nonzero(missing))
+    if not filled:
+        return EvenSamples(t, columns, tuple(notes))
+    longest, at = _longest_run(missing)
+    if longest > MAX_GAP:
+        raise Unusable(
+            f"{longest} samples in a row have no value, from {t[at]:.6g} s on. At most {MAX_GAP} are filled: use a "
+            "part of the file without gaps, or --resample where the historian stores changes alone"
+        )
+    if filled > MAX_FILLED * len(t):
+        raise Unusable(
+            f"{filled} of {len(t)} samples have no value; at most {100 * MAX_FILLED:.0f} % are filled: export all, or "
+            "use --resample where the historian stores changes alone"
+        )
+    for name, column in columns.items():
+        columns[name] = _interpolated(t, t, column, held=name in _HELD)
+    notes.append(
+        f"{_count(filled, 'sample', 'samples')} without a value, at most {longest} in a row, {_were(filled)} filled: "
+        "MV and set-point held, PV in a straight line."
+    )
+    return EvenSamples(t, columns, tuple(notes))
+
+
+def _resampled(t: Reals, values: Mapping[str, Reals], Ts: float, notes: list[str]) -> EvenSamples:
+    start = max(float(t[~np.isnan(column)][0]) for column in values.values() if not np.all(np.isnan(column)))
+    ends = [t[~np.isnan(column)] for column in values.values()]
+    if any(len(each) < 2 for each in ends):
+        raise Unusable("a column has fewer than two values: there is nothing to resample")
+    stop = float(t[-1])
+    count = int((stop - start) / Ts + 1e-9) + 1
+    if count > MAX_SAMPLES:
+        raise Unusable(f"--resample would make {count} samples; at most {MAX_SAMPLES} are possible: ask for fewer")
+    grid: Reals = np.asarray(start + Ts * np.arange(count), dtype=np.float64)
+    columns = {
+        name: _held_means(grid, t, column) if name in _HELD else _interpolated(grid, t, column, held=False)
+        for name, column in values.items()
+    }
+    times = ends[list(values).index("y")]
+    longest = float(np.max(np.diff(times)))
+    usual = float(np.median(np.diff(times)))
+    notes.append(
+        f"The samples were made every {Ts:g} s from values of PV every {usual:.3g} s, at most {longest:.3g} s apart: "
+        "PV in a straight line, MV and set-point held. A move of MV is taken as made at the time of the line that "
+        "shows it first; the dead time comes out short by as much as the line was late."
+    )
+    if longest > 5.0 * Ts:
+        notes.append("Where PV is far between, the record shows straight lines, and the fit knows less than it says.")
+    return EvenSamples(grid - grid[0], columns, tuple(notes))
+
+
+def _held_means(grid: Reals, t: Reals, column: Reals) -> Reals:
+    """The means, from each point of an even grid to the next, of a column that holds its value from line to line: a
+    move between two points acts on the plant for the rest of the interval."""
+    if len(grid) < 2:
+        return _interpolated(grid, t, column, held=True)
+    edges = np.append(grid, 2.0 * grid[-1] - grid[-2])
+    there = ~np.isnan(column)
+    times, held = np.append(t[there], max(float(edges[-1]), float(t[-1]))), column[there]
+    integral = np.concatenate([[0.0], np.cumsum(held * np.diff(times))])
+    means = np.diff(np.interp(edges, times, integral)) / np.diff(edges)
+    moves, tolerance = times[1:-1][np.diff(held) != 0.0], 1e-6 * float(edges[1] - edges[0])
+    moved = np.searchsorted(moves, edges[1:] - tolerance) > np.searchsorted(moves, edges[:-1] + tolerance)
+    # where nothing moves the value itself, which the mean is only to rounding: MV at rest must be at rest
+    return np.asarray(np.where(moved, means, _interpolated(grid, t, column, held=True)))
+
+
+def _interpolated(grid: Reals, t: Reals, column: Reals, held: bool) -> Reals:
+    there = ~np.isnan(column)
+    if not held:
+        return np.asarray(np.interp(grid, t[there], column[there]))
+    tolerance = 1e-9 * max(float(t[-1] - t[0]), 1.0)  # of times that are sums of steps
+    at = np.searchsorted(t[there], grid + tolerance, side="right") - 1
+    return np.asarray(column[there][np.maximum(at, 0)])
+
+
+def _longest_run(missing: NDArray[np.bool_]) -> tuple[int, int]:
+    """The length and the place of the longest run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], missing.astype(int), [0]])))
+    starts, ends = edges[::2], edges[1::2]
+    which = int(np.argmax(ends - starts))
+    return int(ends[which] - starts[which]), int(starts[which])
+
+
+def _round(value: float) -> float:
+    return float(f"{value:.2g}")
+
+
+def _count(count: int, one: str, many: str) -> str:
+    return f"{count} {one if count == 1 else many}"
+
+
+def _were(count: int) -> str:
+    return "was" if count == 1 else "were"

@@ -1,0 +1,182 @@
+"""Times as control systems, historians and spreadsheets write them, as seconds.
+
+Dates are read day first, month first or year first, whichever all of a column are; where both of the first two are
+possible, the one by which the record is shorter. A time without a zone is read as UTC: neither the zone of this machine
+nor its summer time must change a record.
+"""
+
+from __future__ import annotations
+
+import re
+from calendar import month_abbr
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
+from typing import TypeVar
+
+import numpy as np
+
+from loopwright.service.offline.csv_record.errors import Unusable, counted
+from loopwright.service.offline.csv_record.numbers import numbers
+from loopwright.tuning.models import Reals
+
+_UNITS = {"": 1.0, "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "min": 60.0, "h": 3600.0}
+_EPOCHS = ((1e18, 1e-9), (1e17, 1e-7), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))
+"""Times from so large a number on count from an epoch, in units of so many s: ns, Windows' 100 ns, us, ms, s."""
+_SPREADSHEET_DAYS = (20000.0, 80000.0)
+"""Days that a spreadsheet counts from 1900 on, for dates from 1954 to 2119."""
+_MONTHS = {name.lower(): i for i, name in enumerate(month_abbr) if name}
+_MOMENT = re.compile(
+    r"^(?:(?P<a>\d{1,4})(?P<sign>[./\- ])(?P<b>\d{1,2}|[A-Za-z]{3,9})[./\- ](?P<c>\d{2,4})(?:[T, ]\s*|$))?"
+    r"(?:(?P<hour>\d{1,2}):(?P<minute>\d{2})(?::(?P<second>\d{2})(?:[.,:](?P<fraction>\d{1,9}))?)?"
+    r"\s*(?P<half>[AaPp]\.?\s?[Mm]\.?)?)?(?:\s*(?:UTC|GMT|Z))?$"
+)
+_DAY = 86400.0
+
+Value = TypeVar("Value")
+Parts = tuple[str, str, str, str, float]
+"""The three parts of a date, the sign between them, and the seconds since midnight."""
+
+
+def seconds(cells: Sequence[str], lines: Sequence[int], unit: str, form: str | None, name: str) -> Reals:
+    """Returns the times of a column, s; those with a date, or that count from an epoch, from the first one on.
+
+    unit: the unit of times that are numbers ("" for s).
+    form: how times are written, as `datetime.strptime` describes it, or None to find out.
+    name: the name of the column, for errors.
+    Raises Unusable, naming the lines.
+    """
+    if form is not None:
+        moments = _each(cells, lines, name, lambda cell: _by_form(cell, form), f"of the form {form!r}")
+        return _from_first(np.array(moments))
+    first = cells[0].strip()
+    if ":" not in first and not _has_date(first):
+        return _of_numbers(cells, lines, unit, name)
+    try:
+        return _from_first(np.array([_iso(cell) for cell in cells]))
+    except ValueError:
+        return _written(cells, lines, name)
+
+
+def _has_date(cell: str) -> bool:
+    found = _MOMENT.match(cell)
+    return bool(found and found["a"])
+
+
+def _from_first(times: Reals) -> Reals:
+    return np.asarray(times - times[0])  # s since 1970 are too large for exact differences of time
+
+
+def _by_form(cell: str, form: str) -> float:
+    moment = datetime.strptime(cell.strip(), form)
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
+def _iso(cell: str) -> float:
+    moment = datetime.fromisoformat(cell.strip())
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
+def _each(
+    cells: Sequence[str], lines: Sequence[int], name: str, read: Callable[[str], Value], what: str
+) -> list[Value]:
+    """What `read` makes of each cell. Raises Unusable with the lines for which it raises ValueError."""
+    found, wrong = [], []
+    for i, cell in enumerate(cells):
+        try:
+            found.append(read(cell))
+        except ValueError:
+            wrong.append(i)
+    if wrong:
+        places = [lines[i] for i in wrong]
+        one = f"{name} is no time {what}: {cells[wrong[0]].strip()!r}"
+        many = f"values of {name} are no times {what}, such as {cells[wrong[0]].strip()!r}"
+        raise Unusable(counted(places, one, many))
+    return found
+
+
+def _of_numbers(cells: Sequence[str], lines: Sequence[int], unit: str, name: str) -> Reals:
+    times, wrong = numbers(cells, decimal_comma=True)
+    wrong = sorted({*wrong, *np.flatnonzero(np.isnan(times)).tolist()})
+    if wrong:
+        places = [lines[i] for i in wrong]
+        given = cells[wrong[0]].strip()
+        if not given:
+            raise Unusable(counted(places, f"{name} is missing", f"values of {name} are missing"))
+        one = f"{name} is neither a number of s nor a date and time: {given!r}; --time-format says how it is written"
+        raise Unusable(counted(places, one, f"values of {name} are not numbers as those before, such as {given!r}"))
+    for smallest, size in _EPOCHS:
+        if times[0] >= smallest:
+            return _from_first(times) * size
+    low, high = _SPREADSHEET_DAYS
+    named_unit = unit.lower() in _UNITS and bool(unit)
+    if not named_unit and low <= times.min() and times.max() < high and np.ptp(times) < 0.1 * len(times):
+        return np.asarray((times - times[0]) * _DAY)
+    return np.asarray(times * _UNITS.get(unit.lower(), 1.0))
+
+
+def _parts(cell: str) -> Parts:
+    found = _MOMENT.match(cell.strip())
+    if not found or not (found["a"] or found["hour"]):
+        raise ValueError(cell)
+    hour = int(found["hour"] or 0)
+    if half := found["half"]:
+        if not 1 <= hour <= 12:
+            raise ValueError(cell)
+        hour = hour % 12 + (12 if half[0] in "Pp" else 0)
+    minute, second = int(found["minute"] or 0), int(found["second"] or 0)
+    if hour > 24 or minute > 59 or second > 60:
+        raise ValueError(cell)
+    fraction = float("0." + found["fraction"]) if found["fraction"] else 0.0
+    clock = 3600.0 * hour + 60.0 * minute + second + fraction
+    return found["a"] or "", found["b"] or "", found["c"] or "", found["sign"] or "", clock
+
+
+def _written(cells: Sequence[str], lines: Sequence[int], name: str) -> Reals:
+    hint = "that is known; --time-format says how it is written, such as '%d.%m.%Y %H:%M:%S'"
+    parts = _each(cells, lines, name, _parts, hint)
+    clock = np.array([each[4] for each in parts])
+    dated = [bool(each[0]) for each in parts]
+    if not any(dated):
+        return _over_midnight(clock)
+    if not all(dated):
+        places = [lines[i] for i, there in enumerate(dated) if not there]
+        raise Unusable(counted(places, f"{name} has no date", f"values of {name} have no date"))
+    dates = {each[:4] for each in parts}
+    possible = {order: days for order in ("day", "month", "year") if (days := _days(dates, order)) is not None}
+    if not possible:
+        raise Unusable(f"the dates of {name} are of no single order; {hint.partition('; ')[2]}")
+    found = {order: np.array([days[each[:4]] for each in parts]) * _DAY + clock for order, days in possible.items()}
+    # the wrong order of day and month makes months of the days between the first sample and the last
+    return _from_first(min(found.values(), key=lambda times: float(np.ptp(times))))
+
+
+def _days(dates: set[tuple[str, str, str, str]], order: str) -> dict[tuple[str, str, str, str], float] | None:
+    """The day number of each date, its first part being the day, the month or the year; None where that cannot be."""
+    epoch, found = datetime(1970, 1, 1), {}
+    for date in dates:
+        first, second, third, sign = date
+        if (order == "year") != (len(first) == 4) or (order == "month" and sign == "."):
+            return None
+        try:
+            month = _MONTHS.get(second[:3].lower())
+            match order:
+                case "year":
+                    day = datetime(int(first), month or int(second), int(third))
+                case "day":
+                    day = datetime(_year(third), month or int(second), int(first))
+                case _:
+                    day = datetime(_year(third), int(first), int(second))
+        except ValueError:
+            return None
+        found[date] = (day - epoch) / timedelta(days=1)
+    return found
+
+
+def _year(text: str) -> int:
+    return int(text) if len(text) == 4 else 2000 + int(text)
+
+
+def _over_midnight(clock: Reals) -> Reals:
+    """Times of day, s, as times that go on over midnight, forwards or backwards."""
+    steps = np.diff(clock, prepend=clock[0])
+    return clock + _DAY * np.cumsum((steps < -_DAY / 2).astype(float) - (steps > _DAY / 2).astype(float))

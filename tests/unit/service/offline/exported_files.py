@@ -1,0 +1,181 @@
+"""One recorded test as twelve systems write it: two steps of MV on a heater, sampled every 5 s.
+
+The forms are those that the systems' manuals and their users' files show; the record is our own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+
+from loopwright.plantsim.plant import LinearPlant
+
+TS, SAMPLES = 5.0, 300
+K, T, L = 0.8, 120.0, 15.0
+"""The heater: degC per %, s, s."""
+NOISE = 0.05
+FINE = 0.5
+"""Sampling of the simulation, s."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A line of the record. t: s. mv: %. pv and sp: degC."""
+
+    t: float
+    mv: float
+    pv: float
+    sp: float = 62.0
+
+
+@dataclass(frozen=True)
+class ExportedFile:
+    """A file as a system writes it. system: which kind of system. arguments: what `identify` is to be given with it.
+    repaired: whether samples of it are missing or come at other times than in the others."""
+
+    system: str
+    content: bytes
+    arguments: tuple[str, ...] = ()
+    repaired: bool = False
+
+
+def _mv(t: float) -> float:
+    return 35.0 if t < 125.0 else 41.0 if t < 800.0 else 32.0
+
+
+def _recorded() -> tuple[list[Sample], list[Sample]]:
+    """The record every 5 s, and at uneven times: 1 to 3 s apart, and whenever MV moves."""
+    plant = LinearPlant([K], [T, 1.0], L, FINE, mv_low=-100.0, mv_high=100.0)
+    noise = np.random.default_rng(11)
+    even: list[Sample] = []
+    uneven: list[Sample] = []
+    times, due = np.random.default_rng(7), 0.0
+    for k in range(int(SAMPLES * TS / FINE)):
+        t = k * FINE
+        sample = Sample(t, _mv(t), round(60.0 + plant.pv + NOISE * noise.standard_normal(), 2))
+        if k % int(TS / FINE) == 0:
+            even.append(sample)
+        if t >= due or sample.mv != uneven[-1].mv:
+            uneven.append(sample)
+            due = t + float(times.uniform(1.0, 3.0))
+        plant.step(_mv(t) - 35.0)
+    return even, uneven
+
+
+RECORD, UNEVEN = _recorded()
+_START = datetime(2026, 11, 25, 10, 0, 0, tzinfo=UTC)
+
+
+def _moments(form: str, start: datetime = _START) -> Callable[[Sample], str]:
+    return lambda sample: (start + timedelta(seconds=sample.t)).strftime(form)
+
+
+def _comma(value: float) -> str:
+    return f"{value:.2f}".replace(".", ",")
+
+
+def _text(*above: str, lines: Callable[[Sample], str], of: Sequence[Sample] = RECORD, end: str = "\n") -> str:
+    return end.join([*above, *map(lines, of)]) + end
+
+
+def _iso(sample: Sample) -> str:
+    return (_START + timedelta(seconds=sample.t)).isoformat(timespec="milliseconds")
+
+
+def _logger() -> str:
+    """A data logger: a title, date and time apart, a line of units, values and lines missing, a line at the end."""
+    when = _moments("%d-%m-%Y,%H:%M:%S")
+    lines = []
+    for k, each in enumerate(RECORD):
+        if k in (100, 101, 230):
+            continue
+        pv = "Bad" if k in (40, 41, 210) else f"{each.pv:.2f}"
+        lines.append(f"{when(each)},{each.mv:.1f},{pv},{each.sp:.1f}")
+    above = ["Logger 7, unit 3", "Group: Heater", "", "Date,Time,Output,Measurement,Setpoint", ",,%,degC,degC"]
+    return "\r\n".join([*above, *lines, "EOF"]) + "\r\n"
+
+
+def _files() -> dict[str, ExportedFile]:
+    day_first, us = _moments("%d.%m.%Y %H:%M:%S"), _moments("%m/%d/%Y %I:%M:%S %p", _START.replace(hour=11, minute=50))
+    quoted = _moments("%m/%d/%Y %H:%M:%S")
+    archive = _moments("%d/%m/%Y %H:%M:%S", datetime(2026, 5, 4, 23, 50, tzinfo=UTC))
+    named = _moments("%d-%b-%y %H:%M:%S.0")
+    scada = _moments("%Y/%m/%d %H:%M:%S")
+    analyst = _moments("%d/%m/%Y %H:%M:%S", datetime(2026, 2, 1, 23, 55, tzinfo=UTC))
+    return {
+        "plain": ExportedFile("a script", _text("t,u,y", lines=lambda s: f"{s.t:g},{s.mv:g},{s.pv}").encode()),
+        "spreadsheet": ExportedFile(
+            "a spreadsheet with decimal comma",
+            _text(
+                "Zeit;Stellwert (%);Istwert (°C)",
+                lines=lambda s: f"{day_first(s)};{_comma(s.mv)};{_comma(s.pv)}", end="\r\n",
+            ).encode("cp1252"),
+            ("--t", "Zeit", "--u", "Stellwert (%)", "--y", "Istwert (°C)"),
+        ),
+        "scada": ExportedFile(
+            "a SCADA system in UTF-16",
+            _text(
+                "Timestamp\tTIC101.SP\tTIC101.PV\tTIC101.OP",
+                lines=lambda s: f"{scada(s)}\t{_comma(s.sp)}\t{_comma(s.pv)}\t{_comma(s.mv)}", end="\r\n",
+            ).encode("utf-16"),
+        ),
+        "dcs": ExportedFile(
+            "a control system, month first, over noon",
+            _text(
+                "Date/Time,CO (%),PV (degC),Comment", lines=lambda s: f"{us(s)},{s.mv:.3f},{s.pv:.3f},", end="\r\n"
+            ).encode("utf-8-sig"),
+        ),
+        "trend": ExportedFile(
+            "a trend tool with three header lines",
+            _text(
+                '" ","5RT101 op","5RT101 pv"', '" ","%","DEG C"', '"Derived va","R5101 REAC","R5101 REAC"',
+                lines=lambda s: f'"{quoted(s)}", {s.mv:g}, {s.pv:g}',
+            ).encode(),
+        ),
+        "analyst": ExportedFile(
+            "a process analyst: ms apart, day first over the end of a day",
+            _text(
+                "Time\tMilliseconds\tPane1-OP\tPane1-PV", lines=lambda s: f"{analyst(s)}\t0\t{s.mv:g}\t{s.pv:g}"
+            ).encode(),
+        ),
+        "archive": ExportedFile(
+            "a SCADA archive with descriptions and a separator at the end",
+            _text(
+                "Timestamp; F101.OP; F101.PV;", "; Valve; Temperature;",
+                lines=lambda s: f"{archive(s)}; {s.mv:g}; {s.pv:g};",
+            ).encode(),
+        ),
+        "gateway": ExportedFile(
+            "an SQL historian with qualities",
+            _text(
+                "t_stamp,tic101/op,tic101/op_q,tic101/pv,tic101/pv_q",
+                lines=lambda s: f'"{_iso(s)}",{s.mv:.4f},192,{s.pv:.4f},192',
+            ).encode(),
+        ),
+        "database": ExportedFile(
+            "a time series database: ms since 1970",
+            _text(
+                "time,mv,pv", lines=lambda s: f"{int((_START.timestamp() + s.t) * 1000)},{s.mv!r},{s.pv!r}"
+            ).encode(),
+        ),
+        "historian": ExportedFile(
+            "a historian: month by name, latest first",
+            _text(
+                "TIMESTAMP,TIC101.CO,TIC101.PV", lines=lambda s: f"{named(s).upper()},{s.mv:.2f},{s.pv:.2f}",
+                of=RECORD[::-1],
+            ).encode(),
+        ),
+        "logger": ExportedFile("a data logger with values missing", _logger().encode(), repaired=True),
+        "uneven": ExportedFile(
+            "a recorder without an even clock",
+            _text("time,op,pv", lines=lambda s: f"{s.t:.1f},{s.mv:g},{s.pv:g}", of=UNEVEN).encode(),
+            ("--resample", "5s"),
+            repaired=True,
+        ),
+    }  # fmt: skip
+
+
+FILES = _files()
