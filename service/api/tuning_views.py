@@ -126,11 +126,22 @@ class TunedView(BaseModel):
     load: FiguresView | None = Field(description="Figures of a unit step of the load; null for an unstable loop")
 
 
+class RecommendedView(BaseModel):
+    """The method to take first."""
+
+    method: str = Field(examples=["simc"])
+    reason: str = Field(description="Why it is recommended, with its figures")
+
+
 class TuningsView(BaseModel):
     """A model and its tunings by the methods."""
 
     model: ShownModel = Field(description="The model as understood", examples=[{"K": 0.8, "T_s": 3.0, "L_s": 1.0}])
     methods: list[TunedView]
+    recommended: RecommendedView | None = Field(
+        description="The method of lowest IAE among those with Ms of at most 1.7; null: fewer than two methods gave "
+        "gains, or none is as robust"
+    )
     form: str = Field(description="The controller that the gains belong to")
     figures_are: str = Field(description="What margins and figures were computed with")
     units: dict[str, str]

@@ -10,7 +10,9 @@ from typing import Annotated
 import typer
 
 from loopwright.service.cli.output import AsJson, die, json_object, print_json, read_json_object
+from loopwright.service.offline.controller_forms import EQUATIONS, ISA_IN_S, VENDORS, BadForm, ControllerForm, Faceplate
 
+_SHOWN = "How gains are shown"
 PICTURES = (".png", ".svg", ".pdf")
 Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Write a plot: .png, .svg or .pdf.")]
 
@@ -37,15 +39,37 @@ def tune(
         list[str] | None,
         typer.Option(metavar="NAME=VALUE", help="Option of the method, such as lambda_s=5; may be repeated."),
     ] = None,
+    form: Annotated[
+        ControllerForm,
+        typer.Option(
+            help="Form of the controller that the gains are shown for.", rich_help_panel=_SHOWN,
+        ),
+    ] = ControllerForm.ISA,
+    pv_span: Annotated[
+        float | None,
+        typer.Option(
+            help="Span of PV, such as 200 for 0..200 degC: gains in per cent per per cent, as faceplates have them.",
+            rich_help_panel=_SHOWN,
+        ),
+    ] = None,
+    mv_span: Annotated[
+        float, typer.Option(help="Span of MV, with --pv-span; 100 for an MV in per cent.", rich_help_panel=_SHOWN)
+    ] = 100.0,
+    minutes: Annotated[bool, typer.Option("--minutes", help="Times in minutes.", rich_help_panel=_SHOWN)] = False,
     plot: Plot = None,
     as_json: AsJson = False,
-) -> None:
-    """Tunes a process model by one method or all, and compares the gains. Exit status 0: gains found, 3: none."""
+) -> None:  # fmt: skip
     one_thread()
     from loopwright.service.inputs.model_json import BadModel, parse_model
     from loopwright.service.offline import tunings
 
     check_plot(plot)
+    try:
+        faceplate = Faceplate(form, pv_span, mv_span, minutes)
+    except BadForm as error:
+        die(str(error), 2)
+    if as_json and faceplate != ISA_IN_S:
+        die("--json has the gains in ISA and in parallel form; --form, --pv-span and --minutes are for the table", 2)
     try:
         typed = model.lstrip().startswith(("{", "["))
         given = json_object(model, "--model") if typed else read_json_object(Path(model))
@@ -64,9 +88,18 @@ def tune(
         from loopwright.service.api.tuning_views import TuningsView
         from loopwright.service.cli import tuning_tables
 
-        tuning_tables.tunings(TuningsView.model_validate(answer))
+        tuning_tables.tunings(TuningsView.model_validate(answer), faceplate)
     if all(each.refusal is not None for each in found):
         raise typer.Exit(3)
+
+
+tune.__doc__ = """Tunes a process model by one method or all, and compares the gains.
+
+Exit status 0: gains found, 3: none.
+
+The forms of the controller for --form, and where they are found (a block's own manual decides):
+
+""" + "\n\n".join(f"{form.value}: {EQUATIONS[form]}; {VENDORS[form]}" for form in ControllerForm)
 
 
 def one_thread() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from rich import box
 from rich.console import Console
@@ -13,24 +13,22 @@ from rich.table import Table
 
 from loopwright.service.api.tuning_views import AlternativesView, FiguresView, MarginsView, TunedView, TuningsView
 from loopwright.service.inputs.model_json import describe, dump_model
+from loopwright.service.offline.controller_forms import EQUATIONS, ISA_IN_S, Faceplate
 from loopwright.service.offline.identification import named
-from loopwright.service.results import GainsView
 from loopwright.tuning.identification.identify import Candidate, Identified
-from loopwright.tuning.reasons import Refused
+from loopwright.tuning.models import sign
+from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.registry import Method, Option
 
 console = Console(highlight=False)
 
 MAX_CANDIDATES = 8
 _COLUMNS = (
-    ("", "Kp", "gains"),
-    ("", "Ti", "gains"),
-    ("", "Td", "gains"),
-    ("", "Ms", "margins"),
-    ("", "GM", "margins"),
-    ("PM", "PM_deg", "margins"),
-    ("over\nshoot", "overshoot_pct", "setpoint"),
-    ("sett\nling", "settling_s", "setpoint"),
+    ("Ms\n", "Ms", "margins"),
+    ("GM\n", "GM", "margins"),
+    ("PM\ndeg", "PM_deg", "margins"),
+    ("over-\nshoot, %", "overshoot_pct", "setpoint"),
+    ("settling\ns", "settling_s", "setpoint"),
     ("IAE\nSP", "IAE", "setpoint"),
     ("peak\nload", "peak", "load"),
     ("IAE\nload", "IAE", "load"),
@@ -49,31 +47,30 @@ def methods(found: Iterable[Method]) -> None:
     )
 
 
-def tunings(answer: TuningsView | AlternativesView) -> None:
-    """Shows a line for each method that gave gains; below them the refusals and the notes."""
+def tunings(answer: TuningsView | AlternativesView, faceplate: Faceplate = ISA_IN_S) -> None:
+    """Shows a line for each method that gave gains; below them the recommended one, the refusals and the notes.
+
+    faceplate: how the gains are shown.
+    """
     tuned = [each for each in answer.methods if each.outcome == "tuned"]
     refused = [each for each in answer.methods if each.outcome == "refused"]
     console.print(f"Model {escape(describe(answer.model.model_dump()))}")
+    first = answer.recommended if isinstance(answer, TuningsView) else None
     if tuned:
-        table = Table("method", box=None, padding=(0, 0, 0, 1), pad_edge=False)
-        for heading, name, _ in _COLUMNS:
-            table.add_column(heading or name, justify="right")
-        for each in tuned:
-            parts = {"gains": each.gains, "margins": each.margins, "setpoint": each.setpoint, "load": each.load}
-            cells = [_cell(name, _figure(parts[part], name)) for _, name, part in _COLUMNS]
-            if each.margins is None or not each.margins.stable:
-                cells[3:] = ["unstable", *[""] * (len(cells) - 4)]
-            table.add_row(each.method, *cells)
-        console.print(table)
+        console.print(_table(tuned, faceplate, first.method if first else None))
         console.print(
-            "Kp: MV per PV unit, ISA form; times: s; PM: degrees; overshoot: %; settling: to 2 %; IAE and peak: for "
-            "unit steps of the set-point and of the load at the plant's input. The figures are computed with these "
-            "gains on the model with its exact dead time; an ideal derivative is filtered first."
+            f"Controller {EQUATIONS[faceplate.form]}; overshoot and settling (to 2 %) of "
+            "a step of the set-point; IAE and peak for unit steps of the set-point and of the load at the plant's "
+            "input, with these gains on the model with its exact dead time; an ideal derivative is filtered first.",
+            markup=False,
         )
+        if sign(answer.model.plant()) < 0.0:
+            console.print("The plant's gain is negative: the controller acts directly. Kp is given positive.")
+    if first:
+        console.print(f"\n[bold]* {first.method}[/bold] is recommended: {escape(first.reason)}.")
     if refused:
-        console.print("\nRefused:")
-        _hanging([(each.method, f"{each.reason}: {each.detail}") for each in refused])
-    if len(tuned) == 1:
+        _refusals(refused)
+    if len(tuned) == 1 and faceplate == ISA_IN_S:
         _parallel_form(tuned[0])
     notes: dict[str, list[str]] = {}
     for each in tuned:
@@ -82,6 +79,40 @@ def tunings(answer: TuningsView | AlternativesView) -> None:
     if notes:
         console.print("\nNotes:")
         _hanging([(", ".join(who), note) for note, who in notes.items()])
+
+
+def _table(tuned: Sequence[TunedView], faceplate: Faceplate, recommended: str | None) -> Table:
+    """The gains and figures of each method, with the units in the second line of the headings."""
+    table = Table("method", box=None, padding=(0, 0, 0, 1), pad_edge=False)
+    for name, unit in faceplate.columns:
+        table.add_column(f"{name}\n{unit}", justify="right")
+    for heading, _, _ in _COLUMNS:
+        table.add_column(heading, justify="right")
+    for each in tuned:
+        parts = {"margins": each.margins, "setpoint": each.setpoint, "load": each.load}
+        cells = [_cell(name, _figure(parts[part], name)) for _, name, part in _COLUMNS]
+        if each.margins is None or not each.margins.stable:
+            cells = ["unstable", *[""] * (len(cells) - 1)]
+        numbers = None if each.gains is None else faceplate.numbers(each.gains.gains())
+        gains = ["-"] * 3 if numbers is None else [short(value) for value in numbers]
+        mark = "* " if each.method == recommended else ""
+        table.add_row(f"{mark}{each.method}", *gains, *cells, style="bold" if mark else None)
+    return table
+
+
+def _refusals(refused: Sequence[TunedView]) -> None:
+    """Shows the methods that refused by their reason: one alone with its numbers, several with what to do."""
+    console.print("\nRefused:")
+    reasons: dict[Reason, list[TunedView]] = {}
+    for each in refused:
+        if each.reason is not None:
+            reasons.setdefault(each.reason, []).append(each)
+    for reason, those in reasons.items():
+        if len(those) == 1:
+            text = f"{reason.value}: {those[0].detail}"
+        else:
+            text = f"{reason.value}: {those[0].advice} (what each takes: `loopwright methods`)"
+        _hanging([(", ".join(each.method for each in those), text)])
 
 
 def _parallel_form(each: TunedView) -> None:
@@ -150,7 +181,7 @@ def _disturbance(candidate: Candidate) -> str:
     return "a drift" if candidate.drift else loads
 
 
-def _figure(part: GainsView | MarginsView | FiguresView | None, name: str) -> float | None:
+def _figure(part: MarginsView | FiguresView | None, name: str) -> float | None:
     value = getattr(part, name, None)
     return value if isinstance(value, int | float) else None
 

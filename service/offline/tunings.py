@@ -6,13 +6,14 @@ computed with these gains on the model as given, with its exact dead time.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TypedDict
 
 from loopwright.service.inputs.model_json import dump_model
 from loopwright.service.inputs.plausible import Implausible, check_option
 from loopwright.service.jsonable import JsonObject, json_object
+from loopwright.service.offline.recommendation import recommended
 from loopwright.tuning.analysis.assessment import Assessment
 from loopwright.tuning.analysis.step_figures import StepFigures
 from loopwright.tuning.gains import Gains, to_parallel
@@ -89,21 +90,31 @@ def tunings(model: Model, method: str = ALL, options: Mapping[str, object] | Non
     return {**answer(model, tune_model(model, method, options))}
 
 
+class RecommendedMethod(TypedDict):
+    """The method to take first, and why."""
+
+    method: str
+    reason: str
+
+
 class Tunings(TypedDict):
     """The JSON object of the tunings of one model, as `tuning_views.TuningsView` describes it."""
 
     model: JsonObject
     methods: list[JsonObject]
+    recommended: RecommendedMethod | None
     form: str
     figures_are: str
     units: dict[str, str]
 
 
-def answer(model: Model, found: Iterable[MethodResult]) -> Tunings:
+def answer(model: Model, found: Sequence[MethodResult]) -> Tunings:
     """Returns the JSON object of `loopwright tune --json` and POST /tunings; what is not known is null."""
+    first = recommended({each.method.name: each.assessment for each in found if each.assessment is not None})
     return {
         "model": dump_model(model),
         "methods": [as_json(each) for each in found],
+        "recommended": {"method": first.method, "reason": first.reason} if first else None,
         "form": FORM,
         "figures_are": FIGURES_ARE,
         "units": UNITS,

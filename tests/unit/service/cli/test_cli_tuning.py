@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -139,7 +140,7 @@ def test_an_unstable_loop_is_said_to_be_one() -> None:
         assert (roots.real.max() < 0.0) == stable == found["margins"]["stable"]
         assert (found["setpoint"] is not None) == (found["load"] is not None) == stable
         assert any("unstable" in note for note in found["notes"]) != stable
-        assert ("direct-synthesis" in run(*arguments, f"c={c}").stdout.split("Kp: MV")[0]) is True
+        assert ("direct-synthesis" in run(*arguments, f"c={c}").stdout.split("Controller Kp")[0]) is True
         assert ("unstable" in run(*arguments, f"c={c}").stdout) != stable
     assert {value for name, value in found["margins"].items() if name != "stable"} == {None}
 
@@ -149,9 +150,57 @@ def test_the_table_names_methods_and_refusals() -> None:
     assert result.exit_code == 0
     rows, refusals = result.stdout.split("Refused:")
     for name in METHODS:
-        where = refusals if name in SELF_REGULATING_ONLY | {"s-plane"} else rows
-        assert any(line.startswith(name) for line in where.splitlines()), name
-    assert "not_self_regulating" in refusals and "MV per PV unit" in rows
+        refused = name in SELF_REGULATING_ONLY | {"s-plane"}
+        assert any(line.removeprefix("* ").startswith(f"{name} ") for line in rows.splitlines()) != refused, name
+        assert (re.search(rf"(?<!\S){name}(,| )", refusals.split("Notes:")[0]) is not None) == refused, name
+    assert "not_self_regulating" in refusals and "MV/PV" in rows
+
+
+def test_refusals_of_one_reason_are_said_once() -> None:
+    refusals = run("tune", "--model", MODELS["integrating"]).stdout.split("Refused:")[1]
+    assert refusals.count("not_self_regulating") == 1 and "what each takes: `loopwright methods`" in " ".join(
+        refusals.split()
+    )
+
+
+def test_a_controller_that_acts_directly_is_said_to_do_so() -> None:
+    said = "The plant's gain is negative: the controller acts directly."
+    assert said in run("tune", "--model", '{"K": -2, "T_s": 10, "L_s": 8}', "--method", "simc").stdout
+    assert said in run("tune", "--model", '{"K": -2, "L_s": 8, "integrating": true}', "--method", "simc").stdout
+    assert said not in run("tune", "--model", MODELS["balanced"], "--method", "simc").stdout
+
+
+def test_one_method_is_recommended_with_its_reason() -> None:
+    found = answer("tune", "--model", MODELS["balanced"])
+    robust = {e["method"]: e for e in found["methods"] if e["outcome"] == "tuned" and e["margins"]["Ms"] <= 1.7}
+    best = [min(each[part]["IAE"] for each in robust.values()) for part in ("setpoint", "load")]
+    chosen = robust[found["recommended"]["method"]]
+    total = chosen["setpoint"]["IAE"] / best[0] + chosen["load"]["IAE"] / best[1]
+    assert all(e["setpoint"]["IAE"] / best[0] + e["load"]["IAE"] / best[1] >= total for e in robust.values())
+    assert f"of the {len(robust)} methods with Ms at most 1.7" in found["recommended"]["reason"]
+    shown = run("tune", "--model", MODELS["balanced"]).stdout
+    assert f"* {chosen['method']} is recommended" in shown
+    # there is nothing to recommend among one
+    assert answer("tune", "--model", MODELS["balanced"], "--method", "simc")["recommended"] is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "headings", "row"),
+    [
+        ([], "Kp Ti Td", "0.417 10 0"),
+        (["--minutes"], "Kp Ti Td", "0.417 0.167 0"),
+        (["--pv-span", "200"], "Kp Ti Td", "0.833 10 0"),
+        (["--form", "parallel"], "Kp Ki Kd", "0.417 0.0417 0"),
+        (["--form", "series"], "Kp Ti Td", "0.417 10 0"),
+        (["--form", "pb", "--pv-span", "200"], "PB Ti Td", "120 10 0"),
+        (["--form", "repeats"], "Kp Ri Td", "0.417 6 0"),
+    ],
+)
+def test_gains_as_a_faceplate_has_them(arguments: list[str], headings: str, row: str) -> None:
+    # simc with tau_c 4: Kp = 10/(2 * 12) = 0.417 MV per PV unit, Ti = 10 s
+    shown = run("tune", "--model", MODELS["balanced"], "--method", "simc", "--option", "tau_c_s=4", *arguments).stdout
+    lines = [" ".join(line.split()) for line in shown.splitlines()]
+    assert lines[1].startswith(headings) and any(line.startswith(f"simc {row} ") for line in lines), shown
 
 
 def test_exit_status_3_when_no_method_gave_gains() -> None:
@@ -165,6 +214,10 @@ def test_exit_status_3_when_no_method_gave_gains() -> None:
     ("arguments", "words"),
     [
         (["--model", "{"], "--model: not JSON"),
+        (["--model", MODELS["balanced"], "--form", "pb"], "give --pv-span, such as 200 for 0..200"),
+        (["--model", MODELS["balanced"], "--pv-span", "0"], "--pv-span is the span of PV in PV units, greater than 0"),
+        (["--model", MODELS["balanced"], "--mv-span", "-1"], "--mv-span is the span of MV in MV units, greater than 0"),
+        (["--model", MODELS["balanced"], "--minutes", "--json"], "--form, --pv-span and --minutes"),
         (["--model", '{"K": 2}'], "T_s, L_s: missing"),
         (["--model", '{"K": NaN, "T_s": 1, "L_s": 1}'], "--model: K: NaN, Infinity and what is beyond"),
         (["--model", '{"K": 2, "T_s": -1, "L_s": 1}'], "T_s must be a number > 0 (s), not -1"),
