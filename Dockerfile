@@ -10,7 +10,7 @@ WORKDIR /source
 RUN python -m venv /opt/loopwright
 COPY pyproject.toml constraints.txt ./
 # The dependencies first: this layer is used again as long as these two files stay.
-RUN python -c 'import tomllib; print("\n".join(tomllib.load(open("pyproject.toml", "rb"))["project"]["dependencies"]))' > needed.txt \
+RUN python -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; extras = p["optional-dependencies"]; print("\n".join(p["dependencies"] + extras["service"] + extras["plot"]))' > needed.txt \
     && /opt/loopwright/bin/pip install --no-cache-dir --quiet --constraint constraints.txt --requirement needed.txt
 COPY README.md LICENSE ./
 COPY tuning tuning

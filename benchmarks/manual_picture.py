@@ -21,8 +21,8 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("picture", type=Path, help="where the picture goes")
     path = parser.parse_args().picture
-    job = rehearsed(LOOP)
-    draw(path, job)
+    job, samples = rehearsed(LOOP)
+    draw(path, job, samples)
     print(f"{job.state}: {job.new_gains} ({path.stat().st_size // 1000} kB)")
 
 

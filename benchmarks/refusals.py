@@ -17,13 +17,14 @@ from benchmarks.command import check_names, parser_of
 from loopwright.controller.channel import Channel, Settings
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.cli.plots.fast_job import fast_job
+from loopwright.service.cli.rehearsed import RehearsedJob, RehearsedSamples
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.rehearsal import RehearsedLoop, _parameters
 from loopwright.service.execution.result import result_of
 from loopwright.service.execution.runner import run
 from loopwright.service.jobs.stored_record import stored_record
 from loopwright.service.jsonable import to_jsonable
-from loopwright.service.results import EvidenceView, GainsView, ModelView, TransferModelView, VerificationView
+from loopwright.service.results import EvidenceView, GainsView
 from loopwright.service.states.job_state import JobState
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.excitation_choice import fast_by
@@ -31,8 +32,7 @@ from loopwright.tuning.fast.procedure import FastOptions
 from loopwright.tuning.fast.proposal import EvaluationSummary
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.plan import Event, Mode, Sample, StageDone, StageStarted
-from loopwright.tuning.reasons import Reason
+from loopwright.tuning.plan import Event, Mode, StageDone, StageStarted
 
 TS, T95, MIDDLE, SP = 0.1, 26.0, 50.0, 20.0
 OLD = Gains(1.0, 10.0)
@@ -127,75 +127,46 @@ def cases() -> dict[str, Case]:
     }  # fmt: skip
 
 
-@dataclass
-class Pictured:
-    """A job as its picture needs it (`service.cli.plots.shown`), with its samples as columns."""
-
-    loop: str
-    state: JobState
-    reason: Reason | None
-    detail: str | None
-    advice: str | None
-    old_gains: GainsView | None
-    new_gains: GainsView | None
-    evidence: EvidenceView | None
-    model: ModelView | TransferModelView | None
-    samples: dict[str, Any]
-    verification: VerificationView | None = None
-    id: str = ""
-    method: str = "fast"
-
-
-def rehearsed(case: Case) -> Pictured:
-    """The job, as GET /jobs/{id} would show it, with its samples as columns."""
+def rehearsed(case: Case) -> tuple[RehearsedJob, RehearsedSamples]:
+    """The job, as GET /jobs/{id} would show it, and its samples."""
     plant = Odd(case)
     settings = Settings(mv_low=0.0, mv_high=100.0, safe_output=MIDDLE, pv_low=-1e9, pv_high=1e9, reverse=case.reverse)
     mode = Mode.MANUAL if case.excitation is Excitation.MANUAL else Mode.AUTOMATIC
     loop = RehearsedLoop(plant, Channel(TS, settings, _parameters(case.gains), SP, int(mode), MIDDLE), TS)
-    stages: list[tuple[float, str]] = []
-    samples: list[Sample] = []
+    samples = RehearsedSamples()
     found: EvidenceView | None = None
 
     def hear(event: Event) -> None:
         nonlocal found
-        if isinstance(event, StageStarted):
-            stages.append((len(samples), event.stage))
-            if event.stage == case.of:
-                plant.t = 0.0
+        samples.on_event(event)
+        if isinstance(event, StageStarted) and event.stage == case.of:
+            plant.t = 0.0
         elif isinstance(event, StageDone) and isinstance(event.result, EvaluationSummary):
             found = EvidenceView.model_validate(to_jsonable(event.result))
 
-    class Heard:
-        def __getattr__(self, name: str) -> Any:
-            return getattr(loop, name)
-
-        def step(self, commands: Any) -> Sample:
-            samples.append(loop.step(commands))
-            return samples[-1]
-
     facts = Facts(TS, T95, 0.0, 100.0, 2.0, case.gains, case.reverse)
     plan = fast_by((case.excitation,), facts, FastOptions(**case.options, propose_anyway=True))
-    ran = run(plan, Heard(), limits=RunLimits(), on_event=hear)
-    names = [next(name for first, name in reversed(stages) if first <= i) for i in range(len(samples))]
+    ran = run(plan, loop, limits=RunLimits(), on_event=hear, on_samples=samples.on_samples)
     ended = ran.ended
-    columns = {"t_s": "t", "sp": "sp", "pv": "pv", "mv": "mv", "mode": "mode"}
     result = None if ran.value is None else result_of(ran.value)
-    return Pictured(
+    job = RehearsedJob(
         loop=case.why,
+        method="fast",
         state=JobState.PROPOSED if ran.value else JobState.REFUSED,
         reason=ended.reason if ended else None,
         detail=ended.detail if ended else None,
         advice=ended.advice if ended else None,
+        model=None if result is None else result.model,
         old_gains=GainsView.of(case.gains),
         new_gains=None if result is None else result.new_gains,
         evidence=found,
-        model=None if result is None else result.model,
-        samples={"stage": names, **{key: [getattr(s, name) for s in samples] for key, name in columns.items()}},
+        verification=None,
     )
+    return job, samples
 
 
-def draw(path: Path, job: Pictured) -> None:
-    record = stored_record(job.samples)
+def draw(path: Path, job: RehearsedJob, samples: RehearsedSamples) -> None:
+    record = stored_record(samples.columns(None).columns())
     assert record is not None
     fast_job(path, job, record, "degC")
     Image.open(path).convert("RGB").quantize(COLOURS).save(path, optimize=True)
@@ -212,8 +183,9 @@ def main() -> None:
     for reason, case in cases().items():
         if only and reason not in only:
             continue
-        job, path = rehearsed(case), folder / f"{reason.replace('_', '-')}.png"
-        draw(path, job)
+        path = folder / f"{reason.replace('_', '-')}.png"
+        job, samples = rehearsed(case)
+        draw(path, job, samples)
         print(f"{reason}: {job.state} {job.reason}: {job.detail} ({path.stat().st_size // 1000} kB)", flush=True)
 
 

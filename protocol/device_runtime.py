@@ -27,6 +27,7 @@ from loopwright.protocol.profile import (
     NmtState,
     emcy_id,
     heartbeat_id,
+    node_name,
     sdo_request_id,
     sdo_response_id,
 )
@@ -132,7 +133,7 @@ class Runtime:
         """Prints a bus error once, as long as it stays the same."""
         now = self.clock()
         if str(error) != self._told or now - self._told_at > _REPORTED_AGAIN_AFTER_S:
-            print(f"node {self.node:02X}h: {error}", file=sys.stderr, flush=True)
+            print(f"node {node_name(self.node)}: {error}", file=sys.stderr, flush=True)
         self._told, self._told_at = str(error), now
 
     def poll(self, idle_s: float = _IDLE_S) -> bool:

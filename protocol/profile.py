@@ -191,6 +191,11 @@ class Abort(IntEnum):
     NO_DATA = 0x08000024
 
 
+def node_name(node: int) -> str:
+    """Returns a node-ID as it stands on the bus and as it stands in most configurations: 20h (32)."""
+    return f"{node:02X}h ({node})"
+
+
 def samples_between(earlier: int, later: int) -> int:
     """Returns how many samples `later` comes after `earlier`; numbers wrap from FFFFFFFFh to 1, because 0 is UNASKED.
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 from loopwright.protocol.bus import Bus, open_bus
 from loopwright.protocol.fair_lock import FairLock
-from loopwright.protocol.profile import HEARTBEAT_FRAME, TUNER_NODE, NmtState, heartbeat_id
+from loopwright.protocol.profile import HEARTBEAT_FRAME, TUNER_NODE, NmtState, heartbeat_id, node_name
 
 HEARTBEAT_S = 0.1
 """Longest wall time between two heartbeats of this process, s."""
@@ -104,7 +104,7 @@ class Station:
                     return  # a delayed loop of this process sends heartbeats again
                 if heard is not None and heard[0] == heartbeat_id(self.node):  # not a frame from before the filter
                     raise NodeTaken(
-                        f"another gateway on {url!r} has node-ID {self.node:02X}h: give each one its own (--node)"
+                        f"another gateway on {url!r} has node-ID {node_name(self.node)}: give each one its own (--node)"
                     )
         finally:
             bus.close()

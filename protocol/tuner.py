@@ -23,6 +23,7 @@ from loopwright.protocol.profile import (
     NmtState,
     channel_ids,
     heartbeat_id,
+    node_name,
     renewal_id,
     sdo_request_id,
     sdo_response_id,
@@ -305,7 +306,7 @@ class Tuner(ProcessData):
                     raise _aborted(entry, answer)
                 if answer[0] & 0xE0 == expected:
                     return answer
-        raise TunerError(FailureKind.TIMEOUT, f"node {node:02X}h does not answer ({entry.name})")
+        raise TunerError(FailureKind.TIMEOUT, f"node {node_name(node)} does not answer ({entry.name})")
 
     def _segments(self, entry: Object, node: int) -> bytes:
         """Returns the rest of a value that is longer than one frame, such as a string."""
@@ -314,7 +315,7 @@ class Tuner(ProcessData):
             self._bus.send(sdo_request_id(node), bytes([0x60 | toggle, 0, 0, 0, 0, 0, 0, 0]))
             answer = self._answer(node, self.station.monotonic() + self._sdo_timeout_s)
             if answer is None:
-                raise TunerError(FailureKind.TIMEOUT, f"node {node:02X}h stopped in the middle of {entry.name}")
+                raise TunerError(FailureKind.TIMEOUT, f"node {node_name(node)} stopped in the middle of {entry.name}")
             if answer[0] == _ABORT:
                 raise _aborted(entry, answer)
             if answer[0] & 0xF0 != toggle:

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 
-from loopwright.protocol.profile import Mode, NmtState
+from loopwright.protocol.profile import Mode, NmtState, node_name
 from loopwright.service.alarms.alarm import RULES, Alarm, AlarmKind
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.listening.heard_loop import Heard
@@ -217,14 +217,14 @@ def _nodes(known: AlarmFacts) -> Iterator[Condition]:
         if heard.silent:
             yield Condition(
                 alarm_id(AlarmKind.NODE_LOST, known.host, url, str(node)), AlarmKind.NODE_LOST, subject,
-                f"Node {node:02X}h is lost: its heartbeat has stopped", ADVICE[Reason.NODE_LOST], known.host,
+                f"Node {node_name(node)} is lost: its heartbeat has stopped", ADVICE[Reason.NODE_LOST], known.host,
                 loops=loops, since_s=heard.at_s, from_s=max(heard.at_s, up_s[url]),
             )  # fmt: skip
         elif heard.state in (NmtState.PRE_OPERATIONAL, NmtState.STOPPED):
             state = heard.state.name.lower().replace("_", "-")
             yield Condition(
                 alarm_id(AlarmKind.NODE_NOT_OPERATIONAL, known.host, url, str(node)), AlarmKind.NODE_NOT_OPERATIONAL,
-                subject, f"Node {node:02X}h is {state}: it controls nothing",
+                subject, f"Node {node_name(node)} is {state}: it controls nothing",
                 "Start the node (NMT) and look at its loops. Loopwright sends no NMT command.", known.host, loops=loops,
             )  # fmt: skip
 

@@ -21,13 +21,13 @@ def install(app: FastAPI, watch: AlarmWatch) -> None:
     router = new_router("alarms")
 
     @router.get("/alarms", summary="What is abnormal now, the worst first")
-    def alarms() -> AlarmList:
+    def list_alarms() -> AlarmList:
         return AlarmList(alarms=list(watch.look(FRESH_S)))
 
     @router.get(
         "/alarms/{alarm_id}", summary="An alarm, also one that was signed off", responses=problems.responses(404)
     )
-    def alarm(alarm_id: AlarmId) -> Alarm:
+    def get_alarm(alarm_id: AlarmId) -> Alarm:
         return watch.find(alarm_id)
 
     @router.post(
@@ -35,11 +35,11 @@ def install(app: FastAPI, watch: AlarmWatch) -> None:
         summary="Sign an alarm off: a person answers for it, and it ends",
         responses=problems.responses(404, 409, 422),
     )
-    def sign_off(alarm_id: AlarmId, decision: Annotated[Decision | None, Body()] = None) -> Alarm:
+    def sign_off_alarm(alarm_id: AlarmId, decision: Annotated[Decision | None, Body()] = None) -> Alarm:
         return watch.sign_off(alarm_id, (decision or Decision()).by)
 
     add(app, router)
 
     @app.exception_handler(NoSuchAlarm)
     async def _unknown(_request: Request, error: NoSuchAlarm) -> JSONResponse:
-        return problems.problem(404, str(error))
+        return problems.problem(404, str(error), reason=problems.ProblemReason.UNKNOWN_ALARM)

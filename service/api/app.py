@@ -36,6 +36,7 @@ from loopwright.service.api.events import event_stream, still_permitted
 from loopwright.service.api.gate.access_log import Access
 from loopwright.service.api.gate.gate import Gate, Policy
 from loopwright.service.api.gate.key_checks import KeyChecks
+from loopwright.service.api.heads import Head
 from loopwright.service.api.idempotency import Idempotent
 from loopwright.service.api.job_views import (
     Decision,
@@ -128,6 +129,7 @@ def create_app(
         openapi_url=None,  # FastAPI would encode the document for each request; operations.py does it once
         docs_url=None,  # the page would load scripts from a CDN
         redoc_url=None,
+        redirect_slashes=False,  # FastAPI redirects to the host that it sees, which behind a proxy is another
         generate_unique_id_function=name_of,
     )
     app.router.route_class = JsonRoute
@@ -135,6 +137,7 @@ def create_app(
     key_checks = None if keyring is None else KeyChecks(keyring, policy.limits)
     gateway = jobs.store.host if jobs.store.shared else None
     app.add_middleware(Gate, policy=policy, checks=key_checks, gateway=gateway)
+    app.add_middleware(Head)
     app.add_middleware(Access)
     problems.install(app)
     openapi.install(app)
@@ -184,7 +187,7 @@ def create_app(
     @app.get(
         "/loops/{tag}", tags=["loops"], summary="A loop and its present state", responses=problems.responses(404, 503)
     )
-    def loop(tag: Tag) -> LoopDetail:
+    def get_loop(tag: Tag) -> LoopDetail:
         config, host = jobs.directory.owner(tag)
         not_home = next(iter(jobs.aftercare.not_home(tag)), None)
         elsewhere = host != jobs.store.host
@@ -216,7 +219,7 @@ def create_app(
         summary="Take responsibility for a loop whose restoration is not confirmed: the service stops checking it",
         responses=problems.responses(404, 409, 422),
     )
-    def dismiss(tag: Tag, decision: Annotated[Decision | None, Body()] = None) -> DismissedView:
+    def dismiss_loop(tag: Tag, decision: Annotated[Decision | None, Body()] = None) -> DismissedView:
         found = jobs.aftercare.dismiss(tag, (decision or Decision()).by)
         return DismissedView(loop=tag, jobs=[f"/jobs/{job_id}" for job_id in found])
 
@@ -227,15 +230,15 @@ def create_app(
         status_code=202,
         responses=problems.responses(404, 409, 422, 503),
     )
-    def retune(
+    def retune_loop(
         tag: Tag, request: Request, response: Response, options: Annotated[RetuneRequest | None, Body()] = None
     ) -> JobView:
         row = jobs.start(tag, options or FastRetune())
-        response.headers["Location"] = str(request.url_for("job", job_id=row.id).path)
+        response.headers["Location"] = str(request.url_for("get_job", job_id=row.id).path)
         return view(row)
 
     @app.get("/jobs/{job_id}", tags=["jobs"], summary="A job", responses=problems.responses(404))
-    def job(job_id: JobId) -> JobView:
+    def get_job(job_id: JobId) -> JobView:
         return view(jobs.store.get(job_id))
 
     @app.get(
@@ -252,7 +255,7 @@ def create_app(
             **problems.responses(404, 422),
         },
     )
-    def events(
+    def stream_job_events(
         job_id: JobId,
         last_event_id: Annotated[
             int,
@@ -281,23 +284,29 @@ def create_app(
         "days has millions of samples.",
         responses={
             200: {"content": {"text/csv": {"example": "stage,t_s,sp,pv,mv,mode\nrelay,12.3,50,50.2,45,3\n"}}},
+            304: {"description": "No samples have come since the answer with this ETag"},
             **problems.responses(404, 422),
         },
     )
-    def samples(
+    def get_samples(
         job_id: JobId,
         stage: Annotated[str | None, Query(description="Only samples of this stage", examples=["baseline"])] = None,
         format: Annotated[
             Literal["json", "csv"], Query(description="json: one list per column; csv: one row per sample")
         ] = "json",
         accept_encoding: Annotated[str, Header(include_in_schema=False)] = "",
-    ) -> StreamingResponse:
+        if_none_match: Annotated[
+            str, Header(description="The ETag of an earlier answer; 304 where no samples have come since")
+        ] = "",
+    ) -> Response:
         jobs.store.get(job_id)
         of = Reading(jobs.store, job_id, stage)
+        if of.etag in (each.strip() for each in if_none_match.split(",")):
+            return Response(status_code=304, headers={"ETag": of.etag})
         as_csv = format == "csv"
         text, media_type = (csv_text(of.blocks()), "text/csv") if as_csv else (json_text(of), "application/json")
         compress = takes_gzip(accept_encoding)
-        headers = {"Vary": "Accept-Encoding"} | ({"Content-Encoding": "gzip"} if compress else {})
+        headers = {"ETag": of.etag, "Vary": "Accept-Encoding"} | ({"Content-Encoding": "gzip"} if compress else {})
         return StreamingResponse(parts(text, compress), media_type=media_type, headers=headers)
 
     @app.post(
@@ -307,7 +316,7 @@ def create_app(
         status_code=202,
         responses=problems.responses(404, 409, 422),
     )
-    def abort(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
+    def abort_job(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
         return view(jobs.abort(job_id, (decision or Decision()).by))
 
     not_yet: problems.Responses = {
@@ -331,7 +340,7 @@ def create_app(
         summary="Write the proposed gains to the controller permanently",
         responses={**not_yet, **problems.responses(404, 409, 422, 503)},
     )
-    def accept(job_id: JobId, response: Response, decision: Annotated[Decision | None, Body()] = None) -> JobView:
+    def accept_job(job_id: JobId, response: Response, decision: Annotated[Decision | None, Body()] = None) -> JobView:
         row = jobs.decisions.accept(job_id, (decision or Decision()).by)
         return decided(row, JobState.ACCEPTED, response)
 
@@ -341,12 +350,15 @@ def create_app(
         summary="Decline the proposal, or write the old gains back after it was accepted",
         responses={**not_yet, **problems.responses(404, 409, 422, 503)},
     )
-    def rollback(job_id: JobId, response: Response, decision: Annotated[Decision | None, Body()] = None) -> JobView:
+    def roll_back_job(
+        job_id: JobId, response: Response, decision: Annotated[Decision | None, Body()] = None
+    ) -> JobView:
         row = jobs.decisions.rollback(job_id, (decision or Decision()).by)
         return decided(row, JobState.ROLLED_BACK, response)
 
     app.mount("/ui", Pages(), name="page")
-    app.add_route("/", lambda _: RedirectResponse("/ui/"), include_in_schema=False)
+    for path in ("/", "/ui"):
+        app.add_route(path, lambda _: RedirectResponse("/ui/"), include_in_schema=False)
     add(app, sessions.router(jobs.store, key_checks, policy.sessions))
     add(app, decisions.router(jobs))
     add(app, locks.router(jobs.locking))

@@ -1,4 +1,5 @@
-"""Routes whose request body must be strict JSON (see `service.api.strict_json`) with a JSON content type."""
+"""Routes whose request body must be strict JSON (see `service.api.strict_json`) with a JSON content type, and whose
+query parameters must be known."""
 
 from __future__ import annotations
 
@@ -9,6 +10,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.routing import APIRoute
 
 from loopwright.service.api import strict_json
+from loopwright.service.api.parameters import parameters_of, refuse_others
 
 _SHORT = 16_384
 """Bytes. A longer body is parsed in a thread, because parsing it would block the event loop."""
@@ -23,14 +25,16 @@ class BadBody(HTTPException):
 
 
 class JsonRoute(APIRoute):
-    """The class of every route that takes a body; a test checks that."""
+    """The class of every route: its body is strict JSON, its query parameters are those that it has."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[object, object, Response]]:
         handle = super().get_route_handler()
-        if self.body_field is None:
-            return handle
+        takes_body, known = self.body_field is not None, parameters_of(self.dependant)
 
         async def strictly(request: Request) -> Response:
+            refuse_others(request, known)
+            if not takes_body:
+                return await handle(request)
             strict = _JsonRequest(request.scope, request.receive)
             if await strict.body():
                 _check_type(request.headers.get("content-type", ""))

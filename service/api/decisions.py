@@ -56,7 +56,7 @@ def router(jobs: Jobs) -> APIRouter:
         summary="Who began, stopped, accepted and rolled back tests, the latest first",
         responses={**problems.responses(422), **LINK},
     )
-    def decisions(
+    def list_decisions(
         response: Response,
         loop: Annotated[
             str | None, Query(max_length=64, description="Only decisions about this loop", examples=["TIC-101"])

@@ -23,6 +23,8 @@ from loopwright.service.states.job_state import ACTIVE, JobState
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.keyring import REVOKED_WITHIN_S, Keyring
 
+RETRY_MS = 2000
+"""Time after which a client whose stream was cut off connects again, ms."""
 _POLL_S = 0.2
 _AWAY_S = 1.0
 _EVENTS_AT_ONCE = 200
@@ -51,6 +53,7 @@ async def event_stream(
 
     elsewhere: how far a job of another gateway has come; None where it has not said so.
     """
+    yield f"retry: {RETRY_MS}\n\n"
     sent = ""
     silent = 0
     asked = time.monotonic()

@@ -100,7 +100,7 @@ def install(
         summary="The configured loops of every host, sorted by tag",
         responses={**LINK, **problems.responses(422)},
     )
-    def loops(
+    def list_loops(
         response: Response,
         state: Annotated[
             LoopFilter | None,
@@ -135,7 +135,7 @@ def install(
         summary="The jobs of a loop, latest first",
         responses={**LINK, **problems.responses(404, 422)},
     )
-    def history(tag: Tag, response: Response, limit: JobLimit = 50, cursor: Cursor = None) -> Response:
+    def list_jobs_of_loop(tag: Tag, response: Response, limit: JobLimit = 50, cursor: Cursor = None) -> Response:
         jobs.directory.owner(tag)
         rows = jobs.store.recent(tag, None, limit + 1, cursor)
         if len(rows) > limit:
@@ -149,7 +149,7 @@ def install(
         summary="The jobs of every loop, latest first",
         responses={**LINK, **problems.responses(422)},
     )
-    def job_list(
+    def list_jobs(
         response: Response,
         loop: Annotated[str | None, Query(description="Only jobs of this loop", examples=["TIC-101"])] = None,
         state: Annotated[JobState | None, Query(description="Only jobs in this state")] = None,
@@ -172,9 +172,9 @@ def install(
         status_code=202,
         responses=problems.responses(422, 503),
     )
-    def retune_many(request: Request, response: Response, body: Annotated[FleetRequest, Body()]) -> RetuneView:
+    def retune_loops(request: Request, response: Response, body: Annotated[FleetRequest, Body()]) -> RetuneView:
         row = fleet.start(body)
-        response.headers["Location"] = str(request.url_for("retunes_one", retune_id=row.id).path)
+        response.headers["Location"] = str(request.url_for("get_retune", retune_id=row.id).path)
         return _view(*fleet.get(row.id))
 
     @router.get(
@@ -183,7 +183,7 @@ def install(
         summary="The retunes of many loops, latest first",
         responses={**LINK, **problems.responses(422)},
     )
-    def retunes_list(response: Response, limit: Limit = 20, cursor: Cursor = None) -> list[RetuneSummary]:
+    def list_retunes(response: Response, limit: Limit = 20, cursor: Cursor = None) -> list[RetuneSummary]:
         found = fleet.recent(limit + 1, cursor)
         if len(found) > limit:
             more(response, "/retunes", found[limit - 1][0].number, limit=limit)
@@ -195,7 +195,7 @@ def install(
         summary="A retune of many loops and its progress",
         responses=problems.responses(404),
     )
-    def retunes_one(retune_id: RetuneId) -> RetuneView:
+    def get_retune(retune_id: RetuneId) -> RetuneView:
         return _view(*fleet.get(retune_id))
 
     @router.post(
@@ -205,7 +205,7 @@ def install(
         status_code=202,
         responses=problems.responses(404, 409, 422),
     )
-    def retunes_abort(retune_id: RetuneId, decision: Annotated[Decision | None, Body()] = None) -> RetuneView:
+    def abort_retune(retune_id: RetuneId, decision: Annotated[Decision | None, Body()] = None) -> RetuneView:
         fleet.abort(retune_id, (decision or Decision()).by)
         return _view(*fleet.get(retune_id))
 
@@ -217,11 +217,11 @@ def install(
 
     @app.exception_handler(NoSuchRetune)
     async def _unknown(_request: Request, error: NoSuchRetune) -> JSONResponse:
-        return problems.problem(404, str(error))
+        return problems.problem(404, str(error), reason=problems.ProblemReason.UNKNOWN_RETUNE)
 
     @app.exception_handler(RetuneOver)
     async def _over(_request: Request, error: RetuneOver) -> JSONResponse:
-        return problems.problem(409, str(error))
+        return problems.problem(409, str(error), reason=problems.ProblemReason.WRONG_STATE)
 
 
 def _is(wanted: LoopFilter | None, busy: bool, last: str | None) -> bool:

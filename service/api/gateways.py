@@ -62,7 +62,7 @@ def router(directory: LoopDirectory, own: OwnGateway, others: OtherGateways) -> 
         summary="The gateways that share the database, sorted by name",
         responses=problems.responses(503),
     )
-    def gateways() -> list[GatewayView]:
+    def list_gateways() -> list[GatewayView]:
         others.look()
         loops = Counter(host for _, host in directory.everywhere())
         found = [_here(own, loops[own.name])]

@@ -93,7 +93,7 @@ def router(directory: LoopDirectory, listening: Listening) -> APIRouter:
         summary="PV, MV, set-point, mode and gains of a loop as heard on its bus, in normal operation and under test",
         responses=problems.responses(404, 422, 503),
     )
-    def process_history(
+    def get_history(
         tag: Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])],
         from_: Annotated[
             datetime | None,

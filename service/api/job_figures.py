@@ -93,7 +93,7 @@ def router(jobs: Jobs, figures: KeptFigures) -> APIRouter:
         summary="The record of a job with its model and what the model leaves, thinned for a plot",
         responses=problems.responses(404, 409, 422, 503),
     )
-    async def job_record(
+    async def get_job_record(
         job_id: JobId,
         points: Annotated[int, Query(ge=1, le=MAX_POINTS, description="Maximum number of bins", examples=[600])] = 600,
     ) -> RecordView:
@@ -110,7 +110,7 @@ def router(jobs: Jobs, figures: KeptFigures) -> APIRouter:
         summary="The gains of fast for each Ms from robust to fast, with their figures, on one model",
         responses=problems.responses(404, 409, 422, 503),
     )
-    async def job_designs(job_id: JobId) -> DesignsView:
+    async def get_designs(job_id: JobId) -> DesignsView:
         row, found = await figures_of(jobs, figures, job_id)
         if found.designs is None:
             events = await run_in_threadpool(jobs.store.events, job_id)

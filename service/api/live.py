@@ -39,7 +39,7 @@ def router(live: Live, directory: LoopDirectory, keyring: Keyring | None, sessio
             **problems.responses(404, 422),
         },
     )
-    def live_stream(
+    def stream_live(
         loops: Annotated[
             str,
             Query(

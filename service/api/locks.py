@@ -60,7 +60,7 @@ def router(locking: Locking) -> APIRouter:
         summary="Lock a loop: no test begins on it and no decision writes to it until it is unlocked",
         responses=problems.responses(404, 409, 422),
     )
-    def lock(tag: Tag, asked: Annotated[LockWish, Body()]) -> LockedView:
+    def lock_loop(tag: Tag, asked: Annotated[LockWish, Body()]) -> LockedView:
         row, running = locking.lock(tag, asked.reason, asked.by)
         url = note = None
         if running is not None:
@@ -74,7 +74,7 @@ def router(locking: Locking) -> APIRouter:
         summary="Unlock a loop",
         responses=problems.responses(404, 422),
     )
-    def unlock(tag: Tag, decision: Annotated[Decision | None, Body()] = None) -> UnlockedView:
+    def unlock_loop(tag: Tag, decision: Annotated[Decision | None, Body()] = None) -> UnlockedView:
         row = locking.unlock(tag, (decision or Decision()).by)
         return UnlockedView(loop=tag, was_locked=None if row is None else LockView.of(row))
 

@@ -32,7 +32,7 @@ def router(jobs: Jobs, readings: SharedReading[LoopState | None], listening: Lis
         summary="Gains from the set-point changes that operators made: nothing is moved or written on the loop",
         responses=problems.responses(404, 409, 422, 503),
     )
-    async def observation(
+    async def get_observation(
         http: Request,
         tag: Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])],
         ms: Annotated[

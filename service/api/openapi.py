@@ -10,7 +10,7 @@ from fastapi import FastAPI
 from loopwright.service.api import problems
 from loopwright.service.api.gate.gate import ALWAYS, scope_for
 from loopwright.service.api.idempotency import HEADER, MAX_CHARACTERS, PATTERN
-from loopwright.service.api.openapi_document import Document, Operation, Parameter, as_document
+from loopwright.service.api.openapi_document import Document, HeaderField, Operation, Parameter, as_document
 from loopwright.service.store.idempotency import KEPT_H
 
 _KEY = "key"
@@ -27,6 +27,9 @@ _IDEMPOTENCY_KEY: Parameter = {
 }
 
 
+_LOCATION: HeaderField = {"description": "URL of the job or the retune", "schema": {"type": "string"}}
+
+
 def install(app: FastAPI) -> None:
     """Makes `app.openapi` return the completed document."""
     make = app.openapi
@@ -40,7 +43,24 @@ def install(app: FastAPI) -> None:
     app.openapi = complete  # type: ignore[method-assign]
 
 
+_TAGS = {
+    "loops": "Loops, their present state, their history, and the start of a retune",
+    "jobs": "Retunes of one loop: what they found, and the decision on it",
+    "retunes": "Retunes of many loops",
+    "tunings": "Gains for a model, without a loop",
+    "alarms": "What is abnormal now",
+    "live": "Values as they are heard, as a stream",
+    "operations": "The service itself: health, changes, keys and sessions",
+}
+
+
 def _complete(document: Document) -> None:
+    document["info"] |= {
+        "contact": {"name": "The developers of Loopwright"},
+        "license": {"name": "Apache License 2.0", "identifier": "Apache-2.0"},
+    }
+    document["servers"] = [{"url": "/", "description": "The service that this document comes from"}]
+    document["tags"] = [{"name": name, "description": text} for name, text in _TAGS.items()]
     schemas = document.setdefault("components", {})
     schemas["securitySchemes"] = {
         _KEY: {
@@ -68,6 +88,9 @@ def _one(path: str, method: str, operation: Operation) -> None:
             part for part in (operation.get("description"), f"Scope: {needed.value}.") if part
         )
         more += (401,)
+    operation.setdefault("description", operation.get("summary", ""))
+    if "202" in operation["responses"]:
+        operation["responses"]["202"]["headers"] = {"Location": _LOCATION}
     if method != "get":
         more += (408, 413)  # the body did not arrive, or is too long
     if method == "post":
@@ -85,3 +108,5 @@ def _one(path: str, method: str, operation: Operation) -> None:
         if status == 422:  # FastAPI documents a schema that the service never answers with
             operation["responses"][str(status)] = documented
         operation["responses"].setdefault(str(status), documented)
+        if "headers" in documented:
+            operation["responses"][str(status)].setdefault("headers", documented["headers"])

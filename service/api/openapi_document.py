@@ -29,8 +29,14 @@ class RequestBody(TypedDict, total=False):
     content: dict[str, MediaType]
 
 
+class HeaderField(TypedDict, total=False):
+    description: str
+    schema: Schema
+
+
 class DocumentedResponse(TypedDict, total=False):
     description: str
+    headers: dict[str, HeaderField]
     content: dict[str, MediaType]
 
 
@@ -55,6 +61,13 @@ class Info(TypedDict, total=False):
     title: str
     version: str
     description: str
+    contact: dict[str, str]
+    license: dict[str, str]
+
+
+class TagObject(TypedDict):
+    name: str
+    description: str
 
 
 class Components(TypedDict, total=False):
@@ -62,8 +75,10 @@ class Components(TypedDict, total=False):
     securitySchemes: dict[str, dict[str, str]]
 
 
-class Document(TypedDict):
+class Document(TypedDict, total=False):
     info: Info
+    servers: list[dict[str, str]]
+    tags: list[TagObject]
     paths: dict[str, dict[str, Operation]]
     components: Components
 

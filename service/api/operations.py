@@ -171,7 +171,7 @@ def install(
     counted = metrics.registry(jobs.directory.loops, jobs.store, sdo_retries, alarms.counts)
 
     @router.get("/healthz", summary="Whether the process is alive")
-    async def healthz() -> Alive:
+    async def get_health() -> Alive:
         return Alive(status="alive")
 
     @router.get(
@@ -180,7 +180,7 @@ def install(
         response_model=Ready,
         responses={503: {"model": Ready, "description": "At least one part is not ready"}},
     )
-    async def readyz() -> JSONResponse:
+    async def get_readiness() -> JSONResponse:
         found = await readiness.ask()
         return JSONResponse(found.model_dump(), status_code=200 if found.ready else 503)
 
@@ -190,11 +190,11 @@ def install(
         response_class=Response,
         responses={200: {"content": {"text/plain": {}}, "description": "Metrics in the text format of Prometheus"}},
     )
-    def counts() -> Response:
+    def get_metrics() -> Response:
         return Response(metrics.exposition(counted), media_type=metrics.MEDIA_TYPE)
 
     @router.get("/audit", summary="The audit trail, latest change first", responses=problems.responses(422))
-    def changes(
+    def list_changes(
         limit: Annotated[int, Query(ge=1, le=1000, description="Maximum number of changes")] = 100,
         before: Annotated[
             int | None, Query(ge=1, le=LARGEST, description="Only changes with a smaller number", examples=[17])

@@ -32,7 +32,7 @@ def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
         summary="Preview a retune: its moves, time and limits, and every reason why it would be refused now",
         responses=problems.responses(404, 422, 503),
     )
-    def retune_preview(tag: Tag, options: Annotated[RetuneRequest | None, Body()] = None) -> Preview:
+    def preview_retune(tag: Tag, options: Annotated[RetuneRequest | None, Body()] = None) -> Preview:
         request = options or FastRetune()
         config, _ = jobs.directory.owner(tag)
         now = _now(jobs, tag, request)
@@ -45,7 +45,7 @@ def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
         summary="Preview a retune of many loops from configuration and earlier jobs, without reading the controllers",
         responses=problems.responses(422, 503),
     )
-    def retune_many_preview(request: Annotated[FleetRequest, Body()]) -> FleetPreview:
+    def preview_retunes(request: Annotated[FleetRequest, Body()]) -> FleetPreview:
         options, busy, models = request.each(), jobs.store.busy(), jobs.store.last_models()
         locked = _locked(jobs)
         return fleet_preview([

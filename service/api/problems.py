@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import StrEnum
 from http import HTTPStatus
 from typing import Any
 
@@ -16,7 +17,8 @@ from sqlalchemy.exc import DataError, SQLAlchemyError
 from starlette.exceptions import HTTPException
 
 from loopwright.service.api.bodies import BadBody
-from loopwright.service.api.openapi_document import DocumentedResponse, MediaType, Schema
+from loopwright.service.api.openapi_document import DocumentedResponse, HeaderField, MediaType, Schema
+from loopwright.service.api.parameters import UnknownParameter
 from loopwright.service.errors import Conflict, Locked, NotKnown, RemoteSetpoint, Stopping, UnknownLoop
 from loopwright.service.execution.computing.pool import NotWanted
 from loopwright.service.inputs.model_json import BadModel
@@ -24,7 +26,7 @@ from loopwright.service.inputs.request import BadLimits
 from loopwright.service.inputs.validation import place, words
 from loopwright.service.jobs.journal import temporary
 from loopwright.service.offline.tunings import BadTuning
-from loopwright.service.states.job_state import IllegalMove
+from loopwright.service.states.job_state import IllegalMove, JobState
 from loopwright.service.store.claims import StillAnswering
 from loopwright.service.store.damage import is_damage
 from loopwright.service.store.store import Busy, FolderInUse, NoSuchJob
@@ -37,6 +39,42 @@ CLIENT_GONE = 499
 """The status that nginx logs when the client has disconnected; nobody reads the answer."""
 
 
+class ProblemReason(StrEnum):
+    """Reasons of the API itself, beside those for which a retune ends."""
+
+    BAD_REQUEST = "bad_request"
+    UNAUTHORIZED = "unauthorized"
+    FORBIDDEN = "forbidden"
+    NOT_FOUND = "not_found"
+    UNKNOWN_LOOP = "unknown_loop"
+    UNKNOWN_JOB = "unknown_job"
+    UNKNOWN_RETUNE = "unknown_retune"
+    UNKNOWN_ALARM = "unknown_alarm"
+    METHOD_NOT_ALLOWED = "method_not_allowed"
+    REQUEST_TIMEOUT = "request_timeout"
+    CONFLICT = "conflict"
+    LOOP_BUSY = "loop_busy"
+    WRONG_STATE = "wrong_state"
+    STILL_ANSWERING = "still_answering"
+    TOO_LARGE = "too_large"
+    UNSUPPORTED_MEDIA_TYPE = "unsupported_media_type"
+    INVALID = "invalid"
+    TOO_MANY_REQUESTS = "too_many_requests"
+    INTERNAL_ERROR = "internal_error"
+    NOT_READY = "not_ready"
+
+
+_BY_STATUS = {
+    400: ProblemReason.BAD_REQUEST, 401: ProblemReason.UNAUTHORIZED, 403: ProblemReason.FORBIDDEN,
+    404: ProblemReason.NOT_FOUND, 405: ProblemReason.METHOD_NOT_ALLOWED, 408: ProblemReason.REQUEST_TIMEOUT,
+    409: ProblemReason.CONFLICT, 413: ProblemReason.TOO_LARGE, 415: ProblemReason.UNSUPPORTED_MEDIA_TYPE,
+    422: ProblemReason.INVALID, 429: ProblemReason.TOO_MANY_REQUESTS, 503: ProblemReason.NOT_READY,
+}  # fmt: skip
+"""What the status says alone."""
+TYPE = "urn:loopwright:problem:"
+"""What the type of a problem begins with; its reason follows."""
+
+
 class InvalidValue(BaseModel):
     """An invalid value of a request."""
 
@@ -47,16 +85,23 @@ class InvalidValue(BaseModel):
 class Problem(BaseModel):
     """RFC 9457 problem details."""
 
-    type: str = Field(description="Kind of problem", examples=["about:blank"])
+    type: str = Field(
+        description=f"URI of the kind of problem: {TYPE} and the reason", examples=[f"{TYPE}loop_busy"]
+    )
     title: str = Field(description="Title of the HTTP status", examples=["Conflict"])
     status: int = Field(description="HTTP status", examples=[409])
     detail: str = Field(
         description="Explanation of this occurrence",
         examples=["loop TIC-101 is locked by night shift since 2026-01-31T12:00:00.000Z: valve"],
     )
-    reason: Reason | None = Field(default=None, description="Reason code from the closed list", examples=["node_lost"])
+    reason: Reason | ProblemReason = Field(
+        description="Reason code: why a retune would end, or of the API itself", examples=["node_lost"]
+    )
     advice: str | None = Field(default=None, description="What the client or the operator should do")
     job: str | None = Field(default=None, description="URL of the active job", examples=["/jobs/4f0c2a9be113"])
+    state: JobState | None = Field(
+        default=None, description="State of the job, where the state does not permit what was asked"
+    )
     errors: list[InvalidValue] | None = Field(default=None, description="The invalid values of the request")
 
 
@@ -64,20 +109,26 @@ def problem(
     status: int,
     detail: str,
     *,
-    reason: Reason | None = None,
+    reason: Reason | ProblemReason | None = None,
     headers: dict[str, str] | None = None,
     job: str | None = None,
+    state: JobState | None = None,
     errors: Sequence[InvalidValue] = (),
 ) -> JSONResponse:
-    """The response with the problem. job: URL of the active job."""
+    """The response with the problem.
+
+    reason: None for what the status says alone. job: URL of the active job. state: of the job that is asked for.
+    """
+    why = reason or _BY_STATUS.get(status, ProblemReason.INTERNAL_ERROR)
     body = Problem(
-        type="about:blank",
+        type=f"{TYPE}{why.value}",
         title=HTTPStatus(status).phrase,
         status=status,
         detail=detail,
-        reason=reason,
-        advice=None if reason is None else ADVICE[reason],
+        reason=why,
+        advice=ADVICE[why] if isinstance(why, Reason) else None,
         job=job,
+        state=state,
         errors=list(errors) or None,
     )
     content = body.model_dump(mode="json", exclude_none=True)
@@ -99,7 +150,7 @@ def of_database(error: SQLAlchemyError) -> JSONResponse:
 
 
 def still_answering(error: StillAnswering) -> JSONResponse:
-    return problem(409, str(error), headers={"Retry-After": "1"})
+    return problem(409, str(error), reason=ProblemReason.STILL_ANSWERING, headers={"Retry-After": "1"})
 
 
 def install(app: FastAPI) -> None:
@@ -112,7 +163,8 @@ def install(app: FastAPI) -> None:
         return problem(422, detail, reason=Reason.BAD_INPUT, errors=errors)
 
     @app.exception_handler(BadBody)
-    async def _body(_request: Request, error: BadBody) -> JSONResponse:
+    @app.exception_handler(UnknownParameter)
+    async def _body(_request: Request, error: BadBody | UnknownParameter) -> JSONResponse:
         errors = [InvalidValue(where=error.where, why=error.detail)]
         return problem(422, f"{error.where}: {error.detail}", reason=Reason.BAD_INPUT, errors=errors)
 
@@ -130,16 +182,22 @@ def install(app: FastAPI) -> None:
         return problem(422, str(error), reason=Reason.BAD_INPUT)
 
     @app.exception_handler(UnknownLoop)
+    async def _unknown_loop(_request: Request, error: UnknownLoop) -> JSONResponse:
+        return problem(404, str(error), reason=ProblemReason.UNKNOWN_LOOP)
+
     @app.exception_handler(NoSuchJob)
-    async def _unknown(_request: Request, error: Exception) -> JSONResponse:
-        return problem(404, str(error))
+    async def _unknown_job(_request: Request, error: NoSuchJob) -> JSONResponse:
+        return problem(404, str(error), reason=ProblemReason.UNKNOWN_JOB)
 
     @app.exception_handler(Busy)
     async def _busy(_request: Request, error: Busy) -> JSONResponse:
         url = f"/jobs/{error.job_id}"
-        return problem(409, str(error), job=url, headers={"Location": url})
+        return problem(409, str(error), reason=ProblemReason.LOOP_BUSY, job=url, headers={"Location": url})
 
     @app.exception_handler(IllegalMove)
+    async def _wrong_state(_request: Request, error: IllegalMove) -> JSONResponse:
+        return problem(409, str(error), reason=ProblemReason.WRONG_STATE, state=error.now)
+
     @app.exception_handler(Conflict)
     async def _conflict(_request: Request, error: Exception) -> JSONResponse:
         return problem(409, str(error))
@@ -185,6 +243,7 @@ def install(app: FastAPI) -> None:
         return problem(500, f"{type(error).__name__}: {error}", reason=Reason.INTERNAL)
 
 
+RETRY_AFTER: HeaderField = {"description": "Seconds to wait before another request", "schema": {"type": "integer"}}
 _REFERENCE: MediaType = {"schema": {"$ref": "#/components/schemas/Problem"}}
 
 
@@ -206,5 +265,9 @@ def schemas() -> dict[str, Schema]:
 
 def documented(*statuses: int) -> dict[int, DocumentedResponse]:
     """The same responses for an OpenAPI document that FastAPI has already generated."""
-    content = {MEDIA_TYPE: _REFERENCE}
-    return {status: {"content": content, "description": HTTPStatus(status).phrase} for status in statuses}
+    found: dict[int, DocumentedResponse] = {}
+    for status in statuses:
+        found[status] = {"content": {MEDIA_TYPE: _REFERENCE}, "description": HTTPStatus(status).phrase}
+        if status in (429, 503):
+            found[status]["headers"] = {"Retry-After": RETRY_AFTER}
+    return found

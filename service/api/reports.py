@@ -51,7 +51,7 @@ def router(jobs: Jobs, figures: KeptFigures, pool: Pool, view: Callable[[Job], J
             **problems.responses(404, 409, 422, 503),
         },
     )
-    async def job_report(job_id: JobId, http: Request) -> HTMLResponse:
+    async def get_job_report(job_id: JobId, http: Request) -> HTMLResponse:
         not_computed = None
         try:
             row, found = await figures_of(jobs, figures, job_id)

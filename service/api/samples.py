@@ -6,6 +6,7 @@ column, so the blocks are read once for each column.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import zlib
 from collections.abc import Iterable, Iterator
@@ -35,6 +36,12 @@ class Reading:
         self._store, self._stage = store, stage
         self._last = store.last_block(job_id)
         self._count: int | None = None
+
+    @property
+    def etag(self) -> str:
+        """What changes when samples come: the tag of an answer with these samples. Weak: they may be compressed."""
+        of = f"{self.job_id} {self._stage} {self._last}".encode()
+        return f'W/"{hashlib.sha256(of).hexdigest()[:16]}"'
 
     def blocks(self) -> Iterator[Block]:
         """The blocks in order. Raises Gone when the number of samples differs from the previous pass."""

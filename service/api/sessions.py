@@ -88,7 +88,7 @@ def router(store: Store, checks: KeyChecks | None, open_sessions: BrowserSession
         )  # fmt: skip
 
     @routes.get("/session", summary="Who is asking, and what the caller may do", responses=problems.responses())
-    def session() -> SessionView:
+    def get_session() -> SessionView:
         who = current.get()
         found = open_sessions.use(who.session) if who.session else None
         return view(who, found.csrf if found else None)

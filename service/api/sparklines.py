@@ -44,7 +44,7 @@ def router(directory: LoopDirectory, listening: Listening) -> APIRouter:
     @routes.get(
         "/history", summary="PV and set-point of all loops in the last minutes", responses=problems.responses(422)
     )
-    def sparklines(
+    def list_sparklines(
         seconds: Annotated[
             float,
             Query(gt=0, le=LONGEST_S, allow_inf_nan=False, description="How far to go back, s", examples=[300]),

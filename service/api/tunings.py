@@ -27,7 +27,7 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
     routes = new_router()
 
     @routes.get("/methods", tags=["tunings"], summary="The tuning methods")
-    def methods() -> list[MethodView]:
+    def list_methods() -> list[MethodView]:
         return [MethodView.model_validate(each) for each in tunings.methods_json()]
 
     @routes.post(
@@ -36,7 +36,7 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
         summary="Tune a model by one method or all",
         responses=problems.responses(422),
     )
-    async def tune(request: TuningRequest, http: Request) -> TuningsView:
+    async def tune_model(request: TuningRequest, http: Request) -> TuningsView:
         work = partial(tunings.tunings, request.model.plant(), request.method, request.options)
         return TuningsView.model_validate(await computed(pool, work, http, lambda: jobs.stopping))
 
@@ -46,7 +46,7 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
         summary="Tunings of the model that a job found, by other methods or by fast for another Ms",
         responses=problems.responses(404, 409, 422),
     )
-    async def job_alternatives(
+    async def list_alternatives(
         http: Request,
         job_id: Annotated[str, Path(description="Id of the job", examples=["4f0c2a9be113"])],
         method: Annotated[

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 
 from loopwright.protocol.objects import Device
+from loopwright.protocol.profile import node_name
+from loopwright.service.cli.site_table import where
 from loopwright.service.cli.terminal import console, rows
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.loops.bus_check import LoopCheck
@@ -32,11 +34,9 @@ def show(found: Sequence[tuple[LoopConfig, LoopCheck]]) -> None:
 
 def _line(config: LoopConfig, check: LoopCheck) -> tuple[object, ...]:
     state = check.state
-    node = f"{config.controller_node:02X}h ({config.controller_node})"
-    where = f"{config.bus} node {node} channel {config.channel}"
     if state is None:
-        return config.tag, where, "no", None, None, None, config.pv_unit, None
-    return config.tag, where, "yes", state.mode.name.lower(), state.sp, state.pv, config.pv_unit, state.mv
+        return config.tag, where(config), "no", None, None, None, config.pv_unit, None
+    return config.tag, where(config), "yes", state.mode.name.lower(), state.sp, state.pv, config.pv_unit, state.mv
 
 
 def as_json(config: LoopConfig, check: LoopCheck) -> dict[str, object]:
@@ -59,7 +59,7 @@ def show_nodes(bus: str, found: Sequence[FoundNode]) -> None:
         ("node", "is", "state", "channels", "sample time s"),
         (
             (
-                f"{each.node:02X}h ({each.node})",
+                f"{node_name(each.node)}",
                 "?" if each.device is None else each.device.value,
                 each.state or "no heartbeat",
                 each.channels,
@@ -70,7 +70,7 @@ def show_nodes(bus: str, found: Sequence[FoundNode]) -> None:
     )
     for each in found:
         for problem in each.problems:
-            text = f"node {each.node:02X}h ({each.node}): {problem}"
+            text = f"node {node_name(each.node)}: {problem}"
             console.print(text, markup=False, highlight=False, soft_wrap=True)
     if not any(each.device is Device.CONTROLLER for each in found):
         console.print("no controller that can be retuned answers on this bus", highlight=False)

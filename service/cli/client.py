@@ -31,6 +31,8 @@ class Client:
     def __init__(self, url: str) -> None:
         import httpx
 
+        if not url.startswith(("http://", "https://")):
+            raise ApiError(f"--url takes the address of a service as http://HOST:PORT, or https, not {url!r}")
         self.url = url.rstrip("/")
         key = os.environ.get(KEY_VARIABLE)
         headers = {"Authorization": f"Bearer {key}"} if key else {}

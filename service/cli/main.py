@@ -7,13 +7,13 @@ import re
 import sys
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
-from loopwright.service.cli import alarms, data, identification, jobs, keys, loops, tuning
+from loopwright.service.cli import alarms, data, identification, jobs, keys, loops, rehearse, tuning
 from loopwright.service.cli.client import DEFAULT_URL, ApiError, Client
-from loopwright.service.cli.output import AsJson, Url, die, on_terminal, print_json, read_json_object, shown_on_terminal
+from loopwright.service.cli.output import AsJson, Url, die, on_terminal, print_json, shown_on_terminal
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -48,6 +48,14 @@ def main() -> None:
     except ApiError as error:
         print(f"loopwright: {error}", file=sys.stderr)
         sys.exit(1)
+    except ModuleNotFoundError as error:
+        missing = (error.name or "").partition(".")[0]
+        if missing in ("", "loopwright"):
+            raise
+        extra = "plot" if missing == "matplotlib" else "service"
+        what = "plots need" if extra == "plot" else "this command needs"
+        print(f"loopwright: {what} {missing}: pip install 'loopwright[{extra}]'", file=sys.stderr)
+        sys.exit(2)
 
 
 # The service imports these processes nowhere else: it reaches them over the bus only.
@@ -193,8 +201,9 @@ def serve(
 
         from loopwright.protocol.device_process import node_id
         from loopwright.service.api.gate.limits import RequestLimits
+        from loopwright.service.cli import site_table
         from loopwright.service.execution.computing.limits import ComputingLimits
-        from loopwright.service.inputs.config import ConfigError
+        from loopwright.service.inputs.config import ConfigError, load_site
         from loopwright.service.jobs.retention import RetentionPolicy
         from loopwright.service.server.serving import NotSafe, Setup
         from loopwright.service.server.serving import serve as run
@@ -231,6 +240,8 @@ def serve(
         computing=ComputingLimits(live_cpu_s, tuning_cpu_s, dry_run_cpu_s, computation_memory_mb),
     )  # fmt: skip
     try:
+        if shown_on_terminal():
+            site_table.show(list(load_site(loops).loops.values()))
         run(setup)
     except (ConfigError, FolderInUse, ForeignLoop, BadDatabase, NotSafe) as error:
         die(str(error), 2)
@@ -432,58 +443,10 @@ def dismiss(
     print(f"{loop} is looked after no more ({', '.join(jobs)})" if jobs else f"{loop} was not looked after")
 
 
-@app.command("rehearse")
-def rehearse_file(
-    plant_file: Annotated[Path, typer.Argument(metavar="PLANT.json", help="Plant file, see docs/offline.md.")],
-    method: Annotated[str, typer.Option(help="fast, setpoint, five-stage, or one of `loopwright methods`.")] = "fast",
-    ms: Annotated[float | None, typer.Option(help="Ms that is designed for: 1.2 robust .. 1.6 .. 2.0 fast.")] = None,
-    derivative: Annotated[
-        bool, typer.Option("--derivative", help="Design a PID where it is better than a PI.")
-    ] = False,
-    propose_anyway: Annotated[
-        bool,
-        typer.Option(
-            "--propose-anyway", help="Propose the gains also where nothing asked for improves by more than 5 %."
-        ),
-    ] = False,
-    as_json: AsJson = False,
-) -> None:
-    """Rehearse the whole procedure on a plant model, in memory at full speed. Exit status 0: there is an answer; 2: the
-    plant file cannot be used."""
-    from loopwright.service.api.report.words import stage_found, stage_name
-    from loopwright.service.cli import job_tables, terminal
-    from loopwright.service.execution.rehearsal import rehearse
-    from loopwright.service.jsonable import to_json_object
-    from loopwright.tuning.plan import Event, Note, StageDone
-    from loopwright.tuning.reasons import Reason
-
-    spec = read_json_object(plant_file)
-
-    def show(event: Event) -> None:
-        text = f"note: {event.text}" if isinstance(event, Note) else None
-        if isinstance(event, StageDone):
-            found = stage_found(event.stage, to_json_object(event.result), "")
-            text = f"{stage_name(event.stage)}: {found or 'done'}"
-        if text is not None:
-            terminal.progress_console.print(f"  {text}", highlight=False, markup=False, soft_wrap=True)
-
-    given = {"Ms": ms, "derivative": derivative or None}
-    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    if options and method not in ("fast", "setpoint"):
-        die(f"--ms and --derivative are options of the methods fast and setpoint, not of {method}", 2)
-    listener = None if as_json else show
-    found = rehearse(spec, method=method, on_event=listener, propose_anyway=propose_anyway, **options)
-    if as_json:
-        print_json(found.as_json())
-    else:
-        job_tables.rehearsal_report(found)
-    if found.plant is None and found.ended is not None and found.ended.reason is Reason.BAD_INPUT:
-        raise typer.Exit(2)
-
-
 app.command("methods")(tuning.methods)
 app.command("tune")(tuning.tune)
 app.command("identify")(identification.identify)
+app.command("rehearse")(rehearse.rehearse)
 
 
 @app.command()

@@ -62,7 +62,8 @@ def json_object(text: str, source: str) -> dict[str, object]:
     try:
         found = strict_json.loads(text)
     except strict_json.BadJson as error:
-        die(f"{source}: {error}", 2)
+        curly = "; quotes in JSON are straight: \"" if any(quote in text for quote in "“”„‘’«»") else ""
+        die(f"{source}: {error}{curly}", 2)
     if not isinstance(found, dict):
         die(f"{source}: expected one JSON object", 2)
     return found

@@ -9,14 +9,15 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from loopwright.service.inputs.plausible import Positive, Size, Time, Value, check_step
 from loopwright.service.inputs.validation import did_you_mean, listed, words
-from loopwright.service.inputs.yaml_file import Place, YamlFile
+
+if TYPE_CHECKING:
+    from loopwright.service.inputs.yaml_file import Place
 
 Node = Annotated[int, Field(ge=1, le=127)]
 ExcitationName = Literal["observe", "setpoint", "relay", "manual"]
@@ -190,12 +191,16 @@ class Site:
 
 def load_site(path: Path) -> Site:
     """Reads the site from a file. Raises ConfigError with all errors of the file."""
+    from loopwright.service.inputs.yaml_file import NotYaml, YamlFile  # a rehearsal needs no YAML
+
     try:
         file = YamlFile(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(str(path), [error.strerror or str(error)]) from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
         raise ConfigError(str(path), [f"not YAML: {error}"]) from error
+    except NotYaml as error:
+        raise ConfigError(str(path), [str(error)]) from error
     except RecursionError:
         raise ConfigError(str(path), ["not a list of loops: nested too deeply"]) from None
     return parse_site(file.document, str(path), file.line_of)

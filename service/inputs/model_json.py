@@ -27,7 +27,7 @@ from pydantic import (
 )
 
 from loopwright.service.inputs.plausible import MAX_TIME_S, MIN_TIME_S, Implausible, check_damping, check_model
-from loopwright.service.inputs.validation import branch, branch_of, lines
+from loopwright.service.inputs.validation import branch, branch_of, did_you_mean, lines
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 
 MAX_COEFFICIENTS = 12
@@ -141,7 +141,9 @@ class _Form(BaseModel):
             raise ValueError(f"a model must be a JSON object, not {_shown(data)}; {accepted()}")
         foreign = [str(name) for name in data if name not in cls.model_fields]
         if foreign:
-            raise ValueError(f"{', '.join(foreign)}: not a quantity of the form {cls.quantities()}; {accepted()}")
+            meant = next(filter(None, (did_you_mean(name, list(cls.model_fields)) for name in foreign)), "")
+            of = f"not a quantity of the form {cls.quantities()}{meant}"
+            raise ValueError(f"{', '.join(foreign)}: {of}; {accepted()}")
         missing = [name for name, field in cls.model_fields.items() if field.is_required() and name not in data]
         if missing:
             raise ValueError(f"{', '.join(missing)}: missing in the form {cls.quantities()}; {accepted()}")

@@ -76,6 +76,8 @@ def _shown(value: object) -> str:
 
 def did_you_mean(given: str, known: Sequence[str]) -> str:
     """Returns the question whether the most similar of the known names was meant; nothing where none is similar."""
+    if (with_unit := f"{given}_s") in known:
+        return f"; did you mean {with_unit}?"
     alike = {name.lower(): name for name in known}
     found = get_close_matches(given.lower(), alike, 1)
     return f"; did you mean {alike[found[0]]}?" if found else ""

@@ -26,10 +26,22 @@ class _OnceEach(yaml.SafeLoader):
         return node
 
 
+class NotYaml(ValueError):
+    """The text is not YAML; the message has the line."""
+
+
 class YamlFile:
-    """The content of a YAML file. Raises yaml.YAMLError, and RecursionError for a file that is nested too deeply."""
+    """The content of a YAML file. Raises NotYaml, and RecursionError for a file that is nested too deeply."""
 
     def __init__(self, text: str) -> None:
+        try:
+            self._load(text)
+        except yaml.MarkedYAMLError as error:
+            raise NotYaml(_where_and_why(error)) from error
+        except yaml.YAMLError as error:
+            raise NotYaml(f"not YAML: {error}") from error
+
+    def _load(self, text: str) -> None:
         loader = _OnceEach(text)
         try:
             self._root = loader.get_single_node()
@@ -54,3 +66,10 @@ class YamlFile:
             else:
                 break
         return line
+
+
+def _where_and_why(error: yaml.MarkedYAMLError) -> str:
+    mark = error.problem_mark
+    where = "" if mark is None else f"line {mark.line + 1}, column {mark.column + 1}: "
+    tab = "; YAML is indented by spaces, never by tabs" if error.problem and "\\t" in error.problem else ""
+    return f"{where}not YAML: {error.problem or error.context}{tab}"

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from loopwright.protocol.bus import BusError
-from loopwright.protocol.profile import Abort, NmtState
+from loopwright.protocol.profile import Abort, NmtState, node_name
 from loopwright.protocol.station import NodeTaken, Station
 from loopwright.protocol.tuner import FailureKind, Tuner, TunerError
 from loopwright.service.loops.bus_reading import BusReading, not_operational
@@ -59,7 +59,8 @@ class BusConnection:
             if error.kind is FailureKind.TIMEOUT:
                 raise self._no_answer(error) from error
             if error.code == Abort.NO_SUBINDEX:
-                text = f"controller node {self.controller:02X}h has no channel {self.channel}, says the device: {error}"
+                node = f"controller node {node_name(self.controller)}"
+                text = f"{node} has no channel {self.channel}, says the device: {error}"
                 raise Refused(Reason.DEVICE_MISMATCH, f"{text}; see the channel in loops.yaml") from error
             if error.code in _NOT_OURS:
                 raise self._mismatch(error) from error

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from loopwright.protocol.profile import Cause, OutsideChange
+from loopwright.protocol.profile import Cause, OutsideChange, node_name
 from loopwright.protocol.real32 import same
 from loopwright.protocol.tuner import Tuner
 from loopwright.service.loops.bus_reading import BusReading
@@ -41,7 +41,7 @@ def why_over(reading: BusReading, number: int, pv_silence_s: float) -> Ended:
     """Returns why the session of that number has ended without its tuner. Raises Failed(NODE_NOT_OPERATIONAL)."""
     tuner = reading.tuner
     if int(tuner.number("controller_session_last")) != number:
-        return Failed(Reason.NODE_LOST, f"controller node {reading.controller:02X}h restarted")
+        return Failed(Reason.NODE_LOST, f"controller node {node_name(reading.controller)} restarted")
     cause = cause_of(tuner)
     match cause:
         case Cause.OUTSIDE_CHANGE:
@@ -56,7 +56,7 @@ def why_over(reading: BusReading, number: int, pv_silence_s: float) -> Ended:
             text = f"the controller has had no valid PV for {pv_silence_s:g} s"
             return Failed(Reason.BAD_SAMPLE, f"{text}; it ended the test and holds the MV of before")
         case Cause.NMT:
-            node = f"controller node {reading.controller:02X}h"
+            node = f"controller node {node_name(reading.controller)}"
             return Failed(Reason.NODE_NOT_OPERATIONAL, f"{node} has left the operational state, by an NMT command")
     text = f"the controller ended the test by itself ({words_of(cause)})"
     if cause is Cause.LEASE:
@@ -84,7 +84,7 @@ def read_back(reading: BusReading, home: LoopState, number: int, how: str) -> Re
     changes = outside_changes_of(tuner)  # read last, so that it includes every change so far
     differing = differences(state, home)
     if holder:
-        differing["session"] = f"the tuner with node-ID {holder:02X}h holds the loop"
+        differing["session"] = f"the tuner with node-ID {node_name(holder)} holds the loop"
     explained = set(differing)
     if is_own:
         explained = set().union(*(may_differ for bit, (_, _, may_differ) in _OUTSIDE_CHANGES.items() if bit in changes))

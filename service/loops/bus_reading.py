@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from loopwright.protocol.objects import Device, default_of, lookup
-from loopwright.protocol.profile import REVISION, NmtState, OnMissingAnswer
+from loopwright.protocol.profile import REVISION, NmtState, OnMissingAnswer, node_name
 from loopwright.protocol.session import GAINS
 from loopwright.protocol.tuner import Tuner, TunerError
 from loopwright.service.states.loop_state import OPERATIONAL, LoopState
@@ -50,17 +50,17 @@ class BusReading:
         if device_type != expected:
             other = Device.PLANT if device is Device.CONTROLLER else Device.CONTROLLER
             if device_type == int(default_of(lookup("device_type"), 0, other)):
-                text = f"node {node:02X}h ({node}) is a {other.value}, not a {device.value}"
+                text = f"node {node_name(node)} is a {other.value}, not a {device.value}"
                 swapped = "controller_node and plant_node seem to be swapped in loops.yaml"
                 raise Refused(Reason.DEVICE_MISMATCH, f"{text}: {swapped}")
-            text = f"node {node:02X}h is of type {device_type:08X}h, not a {device.value} ({expected:08X}h)"
+            text = f"node {node_name(node)} is of type {device_type:08X}h, not a {device.value} ({expected:08X}h)"
             raise Refused(Reason.DEVICE_MISMATCH, text)
         revision = int(self.tuner.number("identity", 3, node=node))
         if revision >> 16 != REVISION >> 16:
             raise Refused(
                 Reason.DEVICE_MISMATCH,
-                f"{device.value} node {node:02X}h speaks revision {revision >> 16}.{revision & 0xFFFF} of the profile, "
-                f"this service {REVISION >> 16}.{REVISION & 0xFFFF}: bring both to the same version",
+                f"{device.value} node {node_name(node)} speaks revision {revision >> 16}.{revision & 0xFFFF} of the "
+                f"profile, this service {REVISION >> 16}.{REVISION & 0xFFFF}: bring both to the same version",
             )
         self._check_operational(node)
 
@@ -73,8 +73,8 @@ class BusReading:
             self.tuner.number("sample_time", node=node) / 1e6 for node in (self.controller, self.plant)
         )
         if controller_s != plant_s:
-            text = f"controller node {self.controller:02X}h has a sample time of {controller_s:g} s"
-            raise Refused(Reason.DEVICE_MISMATCH, f"{text}, plant node {self.plant:02X}h one of {plant_s:g} s")
+            text = f"controller node {node_name(self.controller)} has a sample time of {controller_s:g} s"
+            raise Refused(Reason.DEVICE_MISMATCH, f"{text}, plant node {node_name(self.plant)} one of {plant_s:g} s")
 
     def check_controller_operational(self) -> None:
         """Raises Failed(NODE_NOT_OPERATIONAL) unless the controller is operational."""
@@ -95,7 +95,7 @@ class BusReading:
         number = self.tuner.number
         plant_state, when_silent = self._plant_state()
         own = int(number("node_state", node=self.controller))
-        away = [] if own == NmtState.OPERATIONAL else [f"node {self.controller:02X}h is {state_name(own)}"]
+        away = [] if own == NmtState.OPERATIONAL else [f"node {node_name(self.controller)} is {state_name(own)}"]
         if plant_state != OPERATIONAL:
             away.append(self._plant_is(plant_state))
         return LoopState(
@@ -138,7 +138,7 @@ class BusReading:
         return Gains(*(self.tuner.number(f"controller_{which}_{name}") for name in GAINS))
 
     def _plant_is(self, state: str) -> str:
-        return f"node {self.plant or 0:02X}h is {state}"
+        return f"node {node_name(self.plant or 0)} is {state}"
 
     def _plant_state(self) -> tuple[str, str]:
         """Returns the plant's NMT state, and its action when the controller is silent. A plant that is away must not
@@ -158,7 +158,7 @@ class BusReading:
 
 def not_operational(node: int, state: int) -> Failed:
     """Returns the error for a node that is not operational."""
-    text = f"node {node:02X}h is {state_name(state)}: it controls nothing, MV stays where it is"
+    text = f"node {node_name(node)} is {state_name(state)}: it controls nothing, MV stays where it is"
     return Failed(Reason.NODE_NOT_OPERATIONAL, text)
 
 

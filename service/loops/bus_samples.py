@@ -12,7 +12,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from loopwright.protocol.process_data import BusSample
-from loopwright.protocol.profile import FOREVER, samples_between
+from loopwright.protocol.profile import FOREVER, node_name, samples_between
 from loopwright.protocol.station import WAIT_S
 from loopwright.protocol.tuner import Tuner
 from loopwright.service.loops.bus_connection import BusConnection
@@ -83,7 +83,7 @@ class BusSamples:
             return
         lock = self._station.plant_lock(self._connection.url, plant)
         while not lock.acquire(timeout=0.1):
-            self._check_stop_request(f"while another test was using plant node {plant:02X}h")
+            self._check_stop_request(f"while another test was using plant node {node_name(plant)}")
         self._plant_lock = lock
 
     def begin(self, tuner: Tuner) -> None:
@@ -117,8 +117,8 @@ class BusSamples:
             self._check_stop_request("while the plant was brought to a halt")
             self._session.confirm_if_due(tuner)
             if now > give_up:
-                text = f"plant node {self._connection.plant:02X}h runs on although it has been told to halt (2011h)"
-                raise Failed(Reason.SAMPLES_LOST, text)
+                node = f"plant node {node_name(self._connection.plant or 0)}"
+                raise Failed(Reason.SAMPLES_LOST, f"{node} runs on although it has been told to halt (2011h)")
 
     def release(self) -> None:
         """Lets a plant that was run in blocks run on by itself, and releases its lock."""

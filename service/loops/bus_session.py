@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 
 from loopwright.protocol.objects import lookup
-from loopwright.protocol.profile import FOREVER, Abort, Order
+from loopwright.protocol.profile import FOREVER, Abort, Order, node_name
 from loopwright.protocol.session import object_of
 from loopwright.protocol.tuner import FailureKind, Tuner, TunerError
 from loopwright.protocol.tuner_session import Lease, TunerSession
@@ -124,7 +124,8 @@ class BusSession:
         self._connection.reading(tuner).check_controller_operational()
         holder = int(tuner.number("controller_session_holder"))
         if holder:
-            return Refused(Reason.LOOP_IN_USE, f"the tuner with node-ID {holder:02X}h holds a session on this loop")
+            text = f"the tuner with node-ID {node_name(holder)} holds a session on this loop"
+            return Refused(Reason.LOOP_IN_USE, text)
         if tuner.number("controller_on_trial"):
             text = "an operator tries other gains by hand: accept them or take them back (2120h), then repeat"
             return Refused(Reason.GAINS_CHANGED, text)
@@ -145,8 +146,8 @@ class BusSession:
                 index = lookup(object_of(order)).index
                 raise Refused(
                     Reason.DEVICE_MISMATCH,
-                    f"controller node {self._connection.controller:02X}h does not know the order {order.name} (object "
-                    f"{index:04X}h): bring it to the version of this service",
+                    f"controller node {node_name(self._connection.controller)} does not know the order {order.name} "
+                    f"(object {index:04X}h): bring it to the version of this service",
                 ) from error
             raise
 

@@ -28,17 +28,26 @@ def recommended(assessed: Mapping[str, Assessment]) -> Recommendation | None:
     assessed: the assessment of the gains of each method that gave some, by its name.
     None: fewer than two methods gave gains, or none of them is as robust.
     """
-    robust = {name: figures for name, each in assessed.items() if (figures := _figures(each)) is not None}
-    if len(assessed) < 2 or not robust:
+    order = ranked(assessed)
+    if len(assessed) < 2 or not order:
         return None
-    least = [min(figures[i] for figures in robust.values()) for i in (0, 1)]
-    name = min(robust, key=lambda each: robust[each][0] / least[0] + robust[each][1] / least[1])
-    setpoint, load, Ms = robust[name]
+    figures = _figures(assessed[order[0]])
+    assert figures is not None
+    setpoint, load, Ms = figures
     return Recommendation(
-        name,
-        f"of the {len(robust)} methods with Ms at most {MAX_MS:g} it has the lowest IAE of set-point "
+        order[0],
+        f"of the {len(order)} methods with Ms at most {MAX_MS:g} it has the lowest IAE of set-point "
         f"({setpoint:.3g}) and load ({load:.3g}) together; Ms {Ms:.2f}",
     )
+
+
+def ranked(assessed: Mapping[str, Assessment]) -> list[str]:
+    """Returns the methods with an Ms of at most 1.7, that with the lowest IAE of set-point and load first."""
+    robust = {name: figures for name, each in assessed.items() if (figures := _figures(each)) is not None}
+    if not robust:
+        return []
+    least = [min(figures[i] for figures in robust.values()) for i in (0, 1)]
+    return sorted(robust, key=lambda name: robust[name][0] / least[0] + robust[name][1] / least[1])
 
 
 def _figures(assessed: Assessment) -> tuple[float, float, float] | None:

@@ -12,6 +12,7 @@ from typing import TypedDict
 
 from loopwright.service.inputs.model_json import dump_model
 from loopwright.service.inputs.plausible import Implausible, check_option
+from loopwright.service.inputs.validation import did_you_mean
 from loopwright.service.jsonable import JsonObject, json_object
 from loopwright.service.offline.recommendation import recommended
 from loopwright.tuning.analysis.assessment import Assessment
@@ -77,7 +78,8 @@ def tune_each(model: Model, names: Sequence[str], options: Mapping[str, object] 
     """Tunes the model by the methods named, in this order, as `tune_model` does. Raises BadTuning."""
     for name in names:
         if name not in METHODS:
-            raise BadTuning(f"method must be one of {', '.join(METHODS)}, not {name!r}")
+            meant = did_you_mean(name, list(METHODS))
+            raise BadTuning(f"method must be one of {', '.join(METHODS)}, not {name!r}{meant}")
     methods = [METHODS[name] for name in names]
     asked = options or {}
     for name, value in asked.items():

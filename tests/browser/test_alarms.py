@@ -33,14 +33,14 @@ def test_a_plant_that_is_switched_off_in_a_test(site: Site, pages: Pages) -> Non
     until(lambda: site.http.get(job).json()["stage"] == "relay")
     site.plant.stop()
 
-    lost = abnormal.get_by_role("row", name=re.compile("Node 10h is lost: its heartbeat has stopped"))
+    lost = abnormal.get_by_role("row", name=re.compile(r"Node 10h \(16\) is lost: its heartbeat has stopped"))
     expect(lost.get_by_role("link", name=TAG)).to_be_visible()
     failed = abnormal.get_by_role("row", name=re.compile("The last test failed"))
     expect(failed.get_by_role("link", name="the test")).to_have_attribute("href", f"/ui{job}")
     expect(abnormal).to_have_title("(2) Loopwright")
     expect(abnormal.get_by_role("link", name="2 abnormal")).to_be_visible()
     expect(lost.get_by_role("button")).to_have_count(0)
-    expect(loops.get_by_role("row", name=TAG)).to_contain_text("Node 10h is lost")
+    expect(loops.get_by_role("row", name=TAG)).to_contain_text("Node 10h (16) is lost")
 
     failed.get_by_role("button", name="Sign off").click()
     field = abnormal.get_by_label("Signed")
@@ -57,6 +57,6 @@ def test_a_plant_that_is_switched_off_in_a_test(site: Site, pages: Pages) -> Non
         assert site.service.stop() == 0
         silent = abnormal.get_by_role("row", name=re.compile("No word from the service"))
         expect(silent).to_be_visible()
-        expect(abnormal.get_by_role("row", name=re.compile("Node 10h is lost"))).to_have_class("old")
+        expect(abnormal.get_by_role("row", name=re.compile(r"Node 10h \(16\) is lost"))).to_have_class("old")
         expect(abnormal).to_have_title("(2) Loopwright")
         expect(abnormal.locator("body")).to_contain_text("What is shown is old")

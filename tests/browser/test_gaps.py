@@ -111,7 +111,7 @@ def test_the_plant_stops_and_then_the_bus_goes_and_comes_back(site: Site, page: 
     site.plant.kill()
     expect(row.locator(".age")).to_have_text(AGE)
     expect(row.locator(".pvnum")).to_have_text("50.000")
-    expect(row).to_contain_text("Node 10h is lost")
+    expect(row).to_contain_text("Node 10h (16) is lost")
     expect(page.get_by_role("link", name="1 abnormal")).to_be_visible()
     site.hub.kill()
     expect(row).to_contain_text(f"Bus {site.bus} is down")

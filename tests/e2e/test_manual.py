@@ -113,7 +113,7 @@ def test_a_controller_of_an_older_version_is_refused_before_anything_moves(here:
         url = here.retune()
         job = here.finished(url)
         assert (job["state"], job["reason"]) == ("refused", "device_mismatch")
-        assert "node 20h does not know the order WATCH (object 2178h)" in job["detail"]
+        assert "node 20h (32) does not know the order WATCH (object 2178h)" in job["detail"]
         assert {*here.http.get(f"{url}/samples").json()["mv"]} == {home[1]}
         assert output(here) == home
     finally:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.refusals import Pictured, cases, draw, rehearsed
+from benchmarks.refusals import cases, draw, rehearsed
+from loopwright.service.cli.rehearsed import RehearsedJob, RehearsedSamples
 from loopwright.service.jobs.stored_record import stored_record
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.record_evaluation import evaluate_again
@@ -18,13 +19,13 @@ WITH_FIT = {"unexplained", "disturbed", "uncertain", "model_mismatch", "diverges
 
 
 @cache
-def job_of(reason: str) -> Pictured:
+def job_of(reason: str) -> tuple[RehearsedJob, RehearsedSamples]:
     return rehearsed(cases()[reason])
 
 
 @pytest.mark.parametrize("reason", cases())
 def test_a_fault_is_refused_with_its_reason_and_shown(reason: str, tmp_path: Path) -> None:
-    job = job_of(reason)
+    job, samples = job_of(reason)
     assert (job.state, job.reason) == ("refused", reason), job.detail
     assert job.detail and job.advice == ADVICE[Reason(reason)]
     # what the record came to is told wherever it was enough for a fit
@@ -33,7 +34,7 @@ def test_a_fault_is_refused_with_its_reason_and_shown(reason: str, tmp_path: Pat
         assert job.evidence is not None and job.evidence.reason == reason
     name = reason.replace("_", "-")
     picture = tmp_path / f"{name}.png"
-    draw(picture, job)
+    draw(picture, job, samples)
     assert 5_000 < picture.stat().st_size < 60_000
     assert f"## {reason}\n" in PAGE and f"refusals/{name}.png" in PAGE
     assert " ".join(ADVICE[Reason(reason)].split()) in " ".join(PAGE.split())
@@ -42,7 +43,7 @@ def test_a_fault_is_refused_with_its_reason_and_shown(reason: str, tmp_path: Pat
 @pytest.mark.parametrize("Ms", [1.4, 1.6])
 def test_what_the_step_has_refuted_is_no_alternative_either(Ms: float) -> None:
     """The record as a whole fits well, with load disturbances added: only its parts tell."""
-    record = stored_record(job_of("model_mismatch").samples)
+    record = stored_record(job_of("model_mismatch")[1].columns(None).columns())
     assert record is not None
     evidence = record.experiment_record()
     assert evidence is not None and len(evidence.steps) == 2

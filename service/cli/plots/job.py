@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+import numpy as np
 
+from loopwright.service.cli.plots import style
 from loopwright.service.cli.plots.shown import Shown, ShownSamples
 from loopwright.service.jobs.stored_record import stored_record
 from loopwright.service.results import DESIGNED
@@ -47,25 +47,24 @@ def before_after(path: Path, title: str, pv_unit: str, stages: dict[str, ShownSa
 
     stages: the samples of the stages with the label "before" or "after".
     """
-    figure = Figure(figsize=(9, 6), layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    top, bottom = figure.subplots(2, 1, sharex=True)
-    figure.suptitle(title)
-    for (label, columns), colour in zip(stages.items(), ("tab:red", "tab:blue"), strict=False):
+    figure = style.new_figure(9, 6)
+    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.6))
+    figure.suptitle(title, fontsize=10.5)
+    drawn = []
+    for label, columns in stages.items():
+        colour, line = style.LOOKS[label]
         first, last = step_up(columns.sp)
         shown = slice(max(first - LEAD_IN, 0), last)
-        t, sp, pv, mv = (column[shown] for column in (columns.t_s, columns.sp, columns.pv, columns.mv))
-        shifted = [x - columns.t_s[first] for x in t]
-        top.plot(shifted, pv, color=colour, label=f"PV {label}")
-        top.step(shifted, sp, color=colour, linestyle=":", linewidth=1, where="post")
-        bottom.step(shifted, mv, color=colour, label=f"MV {label}", where="post")
-    top.set_ylabel(f"PV, {pv_unit}")
-    bottom.set_ylabel("MV, %")
-    bottom.set_xlabel("plant time since the set-point step, s")
-    for axes in (top, bottom):
-        axes.legend(loc="lower right")
-        axes.grid(alpha=0.3)
-    canvas.print_figure(path, dpi=110)
+        t, sp, pv, mv = (np.asarray(column[shown]) for column in (columns.t_s, columns.sp, columns.pv, columns.mv))
+        shifted = t - columns.t_s[first]
+        top.plot(shifted, pv, color=colour, linestyle=line, linewidth=1.5)
+        top.step(shifted, sp, color=style.SETPOINT, linestyle=":", linewidth=0.9, where="post")
+        bottom.step(shifted, mv, color=colour, linestyle=line, linewidth=1.2, where="post")
+        drawn.append((f"PV {label}", colour, shifted, pv))
+    style.name_curves(top, drawn)
+    style.plain(top, f"PV, {pv_unit}")
+    style.plain(bottom, "MV, %", "plant time since the set-point step, s")
+    style.write(figure, path)
 
 
 def step_up(sp: list[float]) -> tuple[int, int]:

@@ -18,6 +18,8 @@ NAMES = {
 """The names of each quantity in small letters; a unit may follow (`MV (%)`, `t_s`), a tag precede (`FIC101.OP`)."""
 DATE, CLOCK, MILLISECONDS = ("date",), ("time",), ("ms", "msec", "millisecond", "milliseconds")
 SHOWN = {"t": "the time", "u": "MV", "y": "PV", "sp": "the set-point"}
+_USUAL = {"t": 1, "u": 2, "y": 3, "sp": 4}
+"""The number of the column of each quantity in the files that most people make."""
 _OPTIONAL = frozenset({"sp"})
 _UNIT = re.compile(r"^(?P<name>.*?)\s*[(\[{](?P<unit>[^)\]}]*)[)\]}]\s*$")
 _TIME_UNITS = re.compile(r"^(?P<name>t|time|timestamp)[_ ](?P<unit>ms|s|sec|min|h)$")
@@ -124,7 +126,8 @@ def _missing(header: Sequence[str], accepted: Sequence[str], quantity: str) -> s
         return "one column alone; columns are separated by comma, semicolon or tab"
     numbered = all(_is_number(cell) for cell in header)
     if numbered:
-        return f"no column for {SHOWN[quantity]}: the line has no names. Give its number: --{quantity} 2, from 1 on"
+        number = f"--{quantity} {_USUAL[quantity]}"
+        return f"no column for {SHOWN[quantity]}: the line has no names. Give its number, as {number}"
     known = ", ".join(accepted[:4])
     return f"no column for {SHOWN[quantity]} ({known}, ...); {_list(header)}. Say which: --{quantity} NAME"
 

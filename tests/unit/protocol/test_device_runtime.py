@@ -344,4 +344,4 @@ def test_trouble_with_the_bus_is_said_once(
     monkeypatch.setattr("loopwright.protocol.device_runtime._PAUSE_AFTER_BUS_ERROR_S", 0.0)
     monkeypatch.setattr(rig.runtime, "poll", poll)
     rig.runtime.run()
-    assert capsys.readouterr().err.splitlines() == ["node 20h: bus-off", "node 20h: it is down"]
+    assert capsys.readouterr().err.splitlines() == ["node 20h (32): bus-off", "node 20h (32): it is down"]

@@ -132,7 +132,7 @@ def test_a_lost_answer_is_asked_for_again(tuner: Tuner, bus: ListBus) -> None:
 
 def test_a_silent_node_is_a_timeout(tuner: Tuner, bus: ListBus) -> None:
     bus.mute = 100
-    with pytest.raises(TunerError, match="20h does not answer") as caught:
+    with pytest.raises(TunerError, match=r"20h \(32\) does not answer") as caught:
         tuner.read("controller_mode")
     assert caught.value.kind is FailureKind.TIMEOUT
 

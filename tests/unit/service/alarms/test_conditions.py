@@ -129,13 +129,13 @@ def test_a_node_that_is_lost_is_one_alarm_which_names_its_loops() -> None:
     none, (alarm,) = steps(known, 2.9, 3.0)
     assert not none and (alarm.level, alarm.kind) == (2, AlarmKind.NODE_LOST)
     assert alarm.subject == f"node 20h on {BUS}" and alarm.loops == ["A", "B"] and alarm.since == AT
-    assert alarm.text == "Node 20h is lost: its heartbeat has stopped"
+    assert alarm.text == "Node 20h (32) is lost: its heartbeat has stopped"
 
 
 def test_a_node_that_is_not_operational_says_its_state() -> None:
     known = facts(LoopFacts(config()), nodes={(BUS, 16): HeardHeartbeat(T0, False, NmtState.PRE_OPERATIONAL)})
     none, (alarm,) = steps(known, 0.0, 3.0)
-    assert not none and (alarm.level, alarm.text) == (2, "Node 10h is pre-operational: it controls nothing")
+    assert not none and (alarm.level, alarm.text) == (2, "Node 10h (16) is pre-operational: it controls nothing")
 
 
 @pytest.mark.parametrize("state", [NmtState.OPERATIONAL, NmtState.BOOT_UP, None])

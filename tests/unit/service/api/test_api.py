@@ -217,7 +217,8 @@ def events(text: str) -> list[tuple[int, str, dict[str, Any]]]:
     found = []
     for block in text.strip().split("\n\n"):
         fields = dict(line.split(": ", 1) for line in block.splitlines() if not line.startswith(":"))
-        found.append((int(fields.get("id", 0)), fields["event"], json.loads(fields["data"])))
+        if "event" in fields:  # else the time after which to come back
+            found.append((int(fields.get("id", 0)), fields["event"], json.loads(fields["data"])))
     return found
 
 

@@ -25,9 +25,9 @@ import sys
 import time
 
 from {PACKAGE} import AuthenticatedClient
-from {PACKAGE}.api.jobs import job
-from {PACKAGE}.api.loops import loops, retune
-from {PACKAGE}.api.tunings import tune
+from {PACKAGE}.api.jobs import get_job
+from {PACKAGE}.api.loops import list_loops, retune_loop
+from {PACKAGE}.api.tunings import tune_model
 from {PACKAGE}.models import (
     FastRetune,
     FirstOrderModel,
@@ -46,17 +46,17 @@ PLANT = FirstOrderModel(k=0.2, t_s=2.4, l_s=1.8)
 
 
 def first_loop(client: AuthenticatedClient) -> LoopView:
-    found = loops.sync(client=client)
+    found = list_loops.sync(client=client)
     assert isinstance(found, list)
     return found[0]
 
 
 def rehearsed(client: AuthenticatedClient, tag: str, wanted: FastRetune | FiveStageRetune | RuleRetune) -> GainsView:
-    started = retune.sync(tag, client=client, body=wanted)
+    started = retune_loop.sync(tag, client=client, body=wanted)
     assert isinstance(started, JobView), started
     while started.state in (JobState.QUEUED, JobState.RUNNING):
         time.sleep(0.05)
-        now = job.sync(started.id, client=client)
+        now = get_job.sync(started.id, client=client)
         assert isinstance(now, JobView), now
         started = now
     assert started.state is JobState.REHEARSED and started.new_gains is not None, started
@@ -70,9 +70,9 @@ def main(url: str, key: str) -> None:
         print(loop.tag, gains.kp, gains.ti)
         gains = rehearsed(client, loop.tag, RuleRetune(method=RuleRetuneMethod.SIMC, dry_run=True, model=PLANT))
         print(loop.tag, gains.kp, gains.ti)
-        refused = retune.sync(loop.tag, client=client, body=FastRetune(start="start", ms=1.4))  # WRONG
+        refused = retune_loop.sync(loop.tag, client=client, body=FastRetune(start="start", ms=1.4))  # WRONG
         assert isinstance(refused, Problem), refused
-        tuned = tune.sync(client=client, body=TuningRequest(model=PLANT, method="simc"))
+        tuned = tune_model.sync(client=client, body=TuningRequest(model=PLANT, method="simc"))
         assert not isinstance(tuned, Problem) and tuned is not None
         (simc,) = tuned.methods
         assert simc.gains is not None and tuned.model == PLANT

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, NmtCommand, sdo_request_id
+from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, NmtCommand, node_name, sdo_request_id
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.loops.bus_check import LoopCheck, check_loop
 from loopwright.tuning.plan import Mode
@@ -41,13 +41,13 @@ def test_nodes_that_are_swapped_are_named(site: Site) -> None:
 
 def test_a_channel_beyond_the_device_is_named(site: Site) -> None:
     found = checked(site, channel=7)
-    assert found.problem is not None and f"controller node {CONTROLLER_NODE:02X}h has no channel 7" in found.problem
+    assert found.problem is not None and f"controller node {node_name(CONTROLLER_NODE)} has no channel 7" in found.problem
     assert "see the channel in loops.yaml" in found.problem
 
 
 def test_a_node_that_is_not_there_is_named(site: Site) -> None:
     found = checked(site, controller_node=0x55)
-    assert found.problem is not None and "node 55h does not answer" in found.problem
+    assert found.problem is not None and "node 55h (85) does not answer" in found.problem
 
 
 def test_a_node_that_does_not_control_is_named(site: Site) -> None:

@@ -27,6 +27,7 @@ from loopwright.protocol.profile import (
     channel_ids,
     emcy_id,
     heartbeat_id,
+    node_name,
 )
 from loopwright.protocol.tuner import RENEWAL_S, TURN_S
 from loopwright.service.loops.bus_loop import BusLoop
@@ -86,10 +87,10 @@ class TestBeginning:
     @pytest.mark.parametrize("node", [CONTROLLER_NODE, PLANT_NODE])
     def test_a_node_that_is_not_operational_is_named(self, site: Site, node: int) -> None:
         site.nmt(NmtCommand.PRE_OPERATIONAL, node)
-        with pytest.raises(Failed, match=f"{node:02X}h is pre-operational") as caught:
+        with pytest.raises(Failed, match=rf"{node:02X}h \({node}\) is pre-operational") as caught:
             site.loop.begin()
         assert caught.value.reason is Reason.NODE_NOT_OPERATIONAL
-        assert site.loop.read().node_state == f"node {node:02X}h is pre-operational"
+        assert site.loop.read().node_state == f"node {node_name(node)} is pre-operational"
 
     def test_a_stopped_controller_answers_no_sdo_and_is_named_all_the_same(self, site: Site) -> None:
         site.loop.read()
@@ -389,7 +390,7 @@ class TestSamples:
     def test_a_plant_that_is_gone_is_named_though_the_controller_has_ended_the_test(self, site: Site) -> None:
         site.begun()
         site.plant.runtime.poll = lambda idle_s=0.0: False  # type: ignore[method-assign, assignment]
-        with pytest.raises(Failed, match="node 10h does not answer") as caught:
+        with pytest.raises(Failed, match=r"node 10h \(16\) does not answer") as caught:
             for _ in range(30):
                 site.loop.step(())
         assert caught.value.reason is Reason.NODE_LOST
@@ -466,7 +467,7 @@ class TestRestoring:
         site.loop.step((RELAY, SetMode(Mode.EXPERIMENT)))
         site.plant.runtime.poll = lambda idle_s=0.0: False  # type: ignore[method-assign, assignment]
         restored = site.loop.restore(home)
-        assert "node 10h is silent" in restored.state.node_state and site.is_home()
+        assert "node 10h (16) is silent" in restored.state.node_state and site.is_home()
 
     @pytest.mark.parametrize("name", Gains.__dataclass_fields__)
     def test_all_six_gains_are_compared(self, site: Site, name: str) -> None:
@@ -628,7 +629,7 @@ class TestAccepting:
             site.controller.sessions[0].renew(site.controller.sessions[0].number, site.wire.clock.now)
 
         gateway.before = first_lives
-        with pytest.raises(Refused, match="7Dh holds a session") as caught:
+        with pytest.raises(Refused, match=r"7Dh \(125\) holds a session") as caught:
             second.accept(NEW, self.OLD)
         assert caught.value.reason is Reason.LOOP_IN_USE
         assert site.channel.on_trial and site.channel.in_effect.Kp == 80.0

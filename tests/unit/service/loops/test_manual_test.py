@@ -209,7 +209,7 @@ def test_a_controller_without_the_order_WATCH_is_refused_before_anything_moves(k
         del site.controller.dictionary.by_index[lookup(name).index]
     found, taken = of_a_test(site)
     assert found.ended is not None and found.ended.reason is Reason.DEVICE_MISMATCH
-    assert "20h does not know the order WATCH (object 2178h)" in found.ended.detail
+    assert "20h (32) does not know the order WATCH (object 2178h)" in found.ended.detail
     assert {sample.mv for sample in taken} == {HOME}
     assert "controller_order_output" not in site.names()
     assert is_home(site)

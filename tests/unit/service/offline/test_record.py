@@ -105,7 +105,7 @@ def test_times_that_do_not_increase() -> None:
         ("# nothing\n\n", "is empty"),
         ("t,u,y\n", "no samples"),
         ("t,u\n0,1\n", "process variable, ...); there are: t, u. Say which: --y NAME"),
-        ("0,1,2\n1,1,2\n", "no column for the time: the line has no names. Give its number: --t 2, from 1 on"),
+        ("0,1,2\n1,1,2\n", "no column for the time: the line has no names. Give its number, as --t 1"),
         ("t,time,u,y\n0,0,1,2\n", "more than one column for the time: t, time. Say which: --t NAME"),
         ("t,u,y\n2024-05-01T00:00:00,1,2\n5,1,2\n", "line 3: t is no time that is known; --time-format says"),
         ("t,u,y\n0,1,2\n2024-05-01T00:00:00,1,2\n", "neither a number of s nor a date and time: '2024-05-01T00:00:00'"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
@@ -20,10 +21,10 @@ def test_the_step_is_shown_whole_whichever_way_the_loop_was_stepped(step: float 
         process_model=lambda: parse_model({"num": [0.03, 0.02], "den": [3, 4, 1], "dead_time_s": 1.0})
     )
     verification = None if step is None else SimpleNamespace(step=step)
-    job: Any = SimpleNamespace(model=model, old_gains=gains, new_gains=gains, verification=verification)
-    top, bottom = Figure().subplots(2, 1)
-    before_after(top, bottom, cast(Shown, job), "degC")
-    for axes in (top, bottom):
+    job: Any = SimpleNamespace(loop="TIC-1", model=model, old_gains=gains, new_gains=gains, verification=verification)
+    figure = Figure()
+    before_after(figure, cast(Shown, job), "degC")
+    for axes in figure.axes:
         low, high = axes.get_ylim()
-        drawn = [value for line in axes.get_lines() for value in line.get_ydata()]
+        drawn = [float(value) for line in axes.get_lines() for value in np.asarray(line.get_ydata())]
         assert low <= min(drawn) and max(drawn) <= high

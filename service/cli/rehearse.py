@@ -1,0 +1,89 @@
+"""`loopwright rehearse`, which needs no service."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from loopwright.service.cli.output import AsJson, die, print_json, read_json_object
+from loopwright.service.cli.tuning import Plot, check_plot
+
+if TYPE_CHECKING:
+    from loopwright.service.cli.rehearsed import RehearsedSamples
+    from loopwright.service.execution.rehearsal import Rehearsal
+
+
+def rehearse(
+    plant_file: Annotated[Path, typer.Argument(metavar="PLANT.json", help="Plant file, see docs/offline.md.")],
+    method: Annotated[str, typer.Option(help="fast, setpoint, five-stage, or one of `loopwright methods`.")] = "fast",
+    ms: Annotated[float | None, typer.Option(help="Ms that is designed for: 1.2 robust .. 1.6 .. 2.0 fast.")] = None,
+    derivative: Annotated[
+        bool, typer.Option("--derivative", help="Design a PID where it is better than a PI.")
+    ] = False,
+    propose_anyway: Annotated[
+        bool,
+        typer.Option(
+            "--propose-anyway", help="Propose the gains also where nothing asked for improves by more than 5 %."
+        ),
+    ] = False,
+    plot: Plot = None,
+    as_json: AsJson = False,
+) -> None:
+    """Rehearse the whole procedure on a plant model, in memory at full speed. Exit status 0: there is an answer; 2: the
+    plant file cannot be used."""
+    from loopwright.service.api.report.words import stage_found, stage_name
+    from loopwright.service.cli import job_tables, terminal
+    from loopwright.service.cli.rehearsed import RehearsedSamples
+    from loopwright.service.execution import rehearsal
+    from loopwright.service.jsonable import to_json_object
+    from loopwright.tuning.plan import Event, Note, StageDone
+    from loopwright.tuning.reasons import Reason
+
+    spec = read_json_object(plant_file)
+
+    def show(event: Event) -> None:
+        text = f"note: {event.text}" if isinstance(event, Note) else None
+        if isinstance(event, StageDone):
+            found = stage_found(event.stage, to_json_object(event.result), "")
+            text = f"{stage_name(event.stage)}: {found or 'done'}"
+        if text is not None:
+            terminal.progress_console.print(f"  {text}", highlight=False, markup=False, soft_wrap=True)
+
+    given = {"Ms": ms, "derivative": derivative or None}
+    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    if options and method not in ("fast", "setpoint"):
+        die(f"--ms and --derivative are options of the methods fast and setpoint, not of {method}", 2)
+    check_plot(plot)
+    samples = RehearsedSamples()
+
+    def hear(event: Event) -> None:
+        samples.on_event(event)
+        if not as_json:
+            show(event)
+
+    found = rehearsal.rehearse(
+        spec, method=method, on_event=hear, on_samples=samples.on_samples, propose_anyway=propose_anyway, **options
+    )
+    if plot is not None:
+        _save_rehearsal(plot, found, method, samples)
+    if as_json:
+        print_json(found.as_json())
+    else:
+        job_tables.rehearsal_report(found)
+    if found.plant is None and found.ended is not None and found.ended.reason is Reason.BAD_INPUT:
+        raise typer.Exit(2)
+
+
+def _save_rehearsal(plot: Path, found: Rehearsal, method: str, samples: RehearsedSamples) -> None:
+    from loopwright.service.cli.plots.job import NoPicture, job_picture
+    from loopwright.service.cli.rehearsed import rehearsed_job
+
+    try:
+        job_picture(plot, samples.columns, rehearsed_job(found, method), "PV units")
+    except NoPicture as error:
+        print(f"loopwright: no plot: {error}", file=sys.stderr)
+    except OSError as error:
+        die(f"{plot}: {error.strerror}", 2)

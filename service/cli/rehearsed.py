@@ -1,0 +1,89 @@
+"""The samples of a rehearsal by stages, and the rehearsal as a plot takes a job."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from loopwright.service.cli.plots.shown import ShownSamples
+from loopwright.service.execution.rehearsal import Rehearsal
+from loopwright.service.results import (
+    EvidenceView,
+    FastResult,
+    GainsView,
+    ModelView,
+    TransferModelView,
+    VerificationView,
+)
+from loopwright.service.states.job_state import JobState, state_after
+from loopwright.tuning.plan import Event, Sample, StageStarted
+from loopwright.tuning.reasons import Reason
+
+
+@dataclass
+class RehearsedSamples:
+    """The samples of a rehearsal, as its events and samples come."""
+
+    stage: str = "preflight"
+    stages: list[str] = field(default_factory=list)
+    samples: list[Sample] = field(default_factory=list)
+
+    def on_event(self, event: Event) -> None:
+        """Notes the stage that begins; the samples of a stage that is done have come before."""
+        if isinstance(event, StageStarted):
+            self.stage = event.stage
+
+    def on_samples(self, samples: Sequence[Sample]) -> None:
+        """Takes samples of the present stage."""
+        self.stages += [self.stage] * len(samples)
+        self.samples += samples
+
+    def columns(self, stage: str | None) -> ShownSamples:
+        """Returns the samples of one stage, or all for None, as columns."""
+        pairs = zip(self.stages, self.samples, strict=True)
+        of = [(name, each) for name, each in pairs if stage is None or name == stage]
+        return ShownSamples(
+            stage=[name for name, _ in of],
+            t_s=[each.t for _, each in of],
+            sp=[each.sp for _, each in of],
+            pv=[each.pv for _, each in of],
+            mv=[each.mv for _, each in of],
+            mode=[int(each.mode) for _, each in of],
+        )
+
+
+@dataclass
+class RehearsedJob:
+    """A rehearsal as a plot takes a job; see `Shown`."""
+
+    loop: str
+    method: str
+    state: JobState
+    reason: Reason | None
+    detail: str | None
+    advice: str | None
+    model: ModelView | TransferModelView | None
+    old_gains: GainsView | None
+    new_gains: GainsView | None
+    evidence: EvidenceView | None
+    verification: VerificationView | None
+    id: str = "of this rehearsal"
+
+
+def rehearsed_job(found: Rehearsal, method: str) -> RehearsedJob:
+    """Returns a rehearsal as a job."""
+    ended, result = found.ended, found.result
+    fast = result if isinstance(result, FastResult) else None
+    return RehearsedJob(
+        loop="rehearsal" if found.plant is None or not found.plant.name else found.plant.name,
+        method=method,
+        state=JobState.PROPOSED if ended is None else state_after(ended),
+        reason=ended.reason if ended else None,
+        detail=ended.detail if ended else None,
+        advice=ended.advice if ended else None,
+        model=result.model,
+        old_gains=result.old_gains,
+        new_gains=result.new_gains,
+        evidence=fast.evidence if fast else None,
+        verification=fast.verification if fast else None,
+    )
