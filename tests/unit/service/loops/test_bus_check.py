@@ -41,7 +41,8 @@ def test_nodes_that_are_swapped_are_named(site: Site) -> None:
 
 def test_a_channel_beyond_the_device_is_named(site: Site) -> None:
     found = checked(site, channel=7)
-    assert found.problem is not None and f"controller node {node_name(CONTROLLER_NODE)} has no channel 7" in found.problem
+    assert found.problem is not None
+    assert f"controller node {node_name(CONTROLLER_NODE)} has no channel 7" in found.problem
     assert "see the channel in loops.yaml" in found.problem
 
 
