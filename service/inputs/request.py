@@ -346,6 +346,7 @@ class FiveStages(_Retune):
         default=(10.0, 50.0),
         description="Permitted overshoot of the PI step, percent: low, high; 0 < low < high < 74",
         examples=[[8.0, 50.0]],
+        json_schema_extra={"items": {"type": "number"}},  # for readers of OpenAPI that know no prefixItems
     )
 
     _options: Options = PrivateAttr()
