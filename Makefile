@@ -2,7 +2,7 @@
 # make setup   the Python environment in .venv         make check   types, style, import directions, packages
 # make bench   every benchmark, in one table           make validate    the five papers, recomputed
 # make faults  every fault in every stage, live: 30 min    make simulate    thousands of simulated disasters
-# make hostile an hour of hostile clients, live
+# make hostile an hour of hostile clients, live           make docs  the documents as a site
 # make compose-test    the containers, with a real engine      make bench-tuning    how well "fast" tunes 121 plants
 
 PYTHON ?= python3
@@ -14,7 +14,7 @@ DEBIAN := $(UML) tshark can-utils postgresql systemd chromium $(shell command -v
 ENGINE := docker.io docker-compose
 BESIDE := $(UML) debootstrap e2fsprogs
 
-.PHONY: setup demo test compose-test check bench bench-tuning validate faults simulate hostile system clean
+.PHONY: setup demo test compose-test check docs bench bench-tuning validate faults simulate hostile system clean
 
 setup: $(VENV)/.installed
 
@@ -48,6 +48,11 @@ check: setup
 	$(BIN)/deno check --quiet service/api/web/static/js
 	$(BIN)/deno lint --quiet
 	$(BIN)/python tools/audit_dependencies.py
+
+# The documents as a site, in build/docs; fails on a link that leads nowhere.
+docs: setup
+	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -n docs build/docs
+	@echo build/docs/index.html
 
 # Without them the others are measured, and the table says what was not.
 bench: setup

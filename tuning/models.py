@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -109,6 +109,25 @@ class SOPDT:
         """The frequency response at the angular frequencies w, rad/s."""
         return _response(self.num, self.den, self.L, w)
 
+    @staticmethod
+    def from_control(system: LinearSystem, dead_time_s: float = 0.0) -> TransferFunction:
+        """The model for a transfer function of control or scipy.signal; see `as_model`."""
+        found = as_model(system, dead_time_s)
+        return TransferFunction(found.num, found.den, found.L)
+
+    def to_control(self, pade_order: int = 0) -> Any:
+        """This model as control.TransferFunction, which has no dead time: a Pade approximation takes its place.
+
+        pade_order: the order of the approximation; 0 is for models without dead time.
+        Raises ValueError for a dead time without an order. Needs the library control.
+        """
+        import control
+
+        if self.L and not pade_order:
+            raise ValueError(f"control has no dead time: give pade_order for that of {self.L:g} s")
+        system = control.TransferFunction(list(self.num), list(self.den))
+        return system * control.TransferFunction(*control.pade(self.L, pade_order)) if self.L else system
+
 
 @dataclass(frozen=True, slots=True)
 class Integrating:
@@ -197,12 +216,13 @@ class LinearSystem(Protocol):
     def dt(self) -> Any: ...
 
 
-def as_model(system: Model | LinearSystem, dead_time_s: float = 0.0) -> Model:
+def as_model(system: Model | LinearSystem | tuple[ArrayLike, ArrayLike], dead_time_s: float = 0.0) -> Model:
     """The model of this library for a transfer function of another, which has no dead time of its own.
 
-    system: the transfer function; a model of this library is returned as it is.
+    system: the transfer function; a model of this library is returned as it is. scipy's forms are accepted: numerator
+    and denominator as a pair, zeros and poles, a state space.
     dead_time_s: the dead time of a system of another library, s.
-    Raises ValueError: more than one input or output, discrete time, a dead time given twice, coefficients that make no
+    Raises TypeError for what is no model. Raises ValueError: more than one input or output, discrete time, a dead time given twice, coefficients that make no
     model.
     """
     if isinstance(system, Model):
@@ -211,6 +231,15 @@ def as_model(system: Model | LinearSystem, dead_time_s: float = 0.0) -> Model:
                 f"the model has a dead time of its own ({system.L:g} s): dead_time_s={dead_time_s:g} is one too many"
             )
         return system
+    if isinstance(system, tuple) and len(system) == 2:
+        return TransferFunction(tuple(np.atleast_1d(system[0])), tuple(np.atleast_1d(system[1])), dead_time_s)
+    if hasattr(system, "to_tf"):  # scipy's zeros and poles, and its state space
+        system = system.to_tf()
+    if not all(hasattr(system, name) for name in ("num", "den", "dt")):
+        raise TypeError(
+            f"{type(system).__name__} is no model: give FOPDT(K, T, L), SOPDT, Integrating, TransferFunction(num, den, "
+            "L), or a transfer function of control or scipy.signal"
+        )
     if system.dt:
         raise ValueError(f"the transfer function is in discrete time (dt={system.dt}): a model here is continuous")
     num, den = (np.squeeze(np.asarray(each, dtype=float)) for each in (system.num, system.den))

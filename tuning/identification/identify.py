@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,6 +30,10 @@ from loopwright.tuning.identification.record import recorded_test
 from loopwright.tuning.identification.structure_search import StructureSearch, confounded
 from loopwright.tuning.identification.structures import FIRST, INTEGRATOR, LAGGED_INTEGRATOR, SECOND
 from loopwright.tuning.models import Integrating, Model, Reals, TransferFunction
+from loopwright.tuning.notebook import as_html
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 STRUCTURES = (INTEGRATOR, FIRST, LAGGED_INTEGRATOR, SECOND)
 RIVAL_BIC = 4.0
@@ -115,6 +120,7 @@ class Identified:
     drift: True if PV drifted at a steady rate, which the fit allows for.
     whiteness: the Ljung-Box p-value of the residual; below 0.001 the residual is not white noise.
     explained: True if the residual is white or negligible (0.15 % of the range of PV, or the rounding error of PV).
+    t, u, y: the record: times, s, MV, MV units, and PV, PV units, all of shape (N,).
     fitted: PV as modelled, PV units, shape (N,).
     candidates: all candidate models, the lowest BIC first.
     notes: what the user should know, one sentence each.
@@ -131,9 +137,40 @@ class Identified:
     drift: bool
     whiteness: float
     explained: bool
+    t: Reals
+    u: Reals
+    y: Reals
     fitted: Reals
     candidates: tuple[Candidate, ...]
     notes: tuple[str, ...]
+
+    def __str__(self) -> str:
+        known = ", ".join(f"{n} {v:.4g} ± {self.standard_errors[n]:.2g}" for n, v in self.parameters.items())
+        return f"{known}; fit {self.fit_pct:.1f} %"
+
+    def plot(self) -> Figure:
+        """The picture of PV as recorded and as modelled, of the residual and of MV; needs matplotlib."""
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(9, 5.5), layout="constrained")
+        pv, rest, mv = figure.subplots(3, 1, sharex=True, height_ratios=(3, 1, 1.3))
+        pv.plot(self.t, self.y, ".", color="0.5", markersize=3, label="PV recorded")
+        pv.plot(self.t, self.fitted, label="model")
+        pv.legend()
+        rest.plot(self.t, self.y - self.fitted, ".", color="0.5", markersize=3)
+        mv.step(self.t, self.u, where="post")
+        for axes, name in ((pv, "PV"), (rest, "residual"), (mv, "MV")):
+            axes.set_ylabel(name)
+        mv.set_xlabel("time, s")
+        figure.suptitle(str(self))
+        return figure
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the parameters with their standard errors, the notes, and the picture."""
+        rows = [(name, f"{value:.4g}", f"{self.standard_errors[name]:.2g}") for name, value in self.parameters.items()]
+        explained = "The model explains the record." if self.explained else "The model does not explain the record."
+        title = f"Fit {self.fit_pct:.2f} %"
+        return as_html(title, [("", "value", "standard error"), *rows], (explained, *self.notes), self.plot)
 
 
 def identify(
@@ -237,6 +274,9 @@ def _result(problem: IdentificationProblem, best: Fitted, ranked: Sequence[Fitte
         drift=best.hypothesis.drift,
         whiteness=problem.whiteness(best),
         explained=problem.explains(best),
+        t=t0 + record.Ts * np.arange(len(record.y)),
+        u=record.u,
+        y=record.y,
         fitted=record.y - residual,
         candidates=tuple(
             Candidate(

@@ -10,6 +10,7 @@ from loopwright.tuning.analysis.assessment import Assessment, assess
 from loopwright.tuning.analysis.step_response import step_response
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import LinearSystem, Model, as_model
+from loopwright.tuning.notebook import as_html
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.design import realisable
 from loopwright.tuning.rules.registry import METHODS, Method
@@ -64,6 +65,21 @@ class Tuned:
         axes[1, 0].set_ylabel("change of MV")
         figure.suptitle(str(self))
         return figure
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: gains, margins and figures, the notes, and the picture."""
+        g, found = self.gains, self.assessment
+        figures = [("Kp", f"{g.Kp:.4g}", "MV units per PV unit"), ("Ti", f"{g.Ti:.4g}", "s")]
+        if g.Td:
+            figures += [("Td", f"{g.Td:.4g}", "s"), ("Tf", f"{g.Tf:.4g}", "s")]
+        if found.stable and found.margins.Ms is not None and found.setpoint and found.load:
+            figures += [
+                ("Ms", f"{found.margins.Ms:.3g}", ""),
+                ("overshoot", f"{found.setpoint.overshoot_pct:.3g}", "%"),
+                ("IAE, set-point", f"{found.setpoint.IAE:.4g}", "PV units s, unit step"),
+                ("IAE, load", f"{found.load.IAE:.4g}", "PV units s, unit step of MV"),
+            ]
+        return as_html(str(self), [("", "", "unit"), *figures], self.notes, self.plot if found.stable else None)
 
     def _repr_png_(self) -> bytes | None:
         """The picture that a notebook shows."""

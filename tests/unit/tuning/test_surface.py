@@ -46,6 +46,10 @@ def test_tune_says_gains_and_margins() -> None:
         control.TransferFunction([2.0], [10.0, 1.0]),
         control.tf([2.0], [10.0, 1.0]),
         signal.TransferFunction([2.0], [10.0, 1.0]),
+        signal.ZerosPolesGain([], [-0.1], 0.2),
+        signal.StateSpace([[-0.1]], [[1.0]], [[0.2]], [[0.0]]),
+        ([2.0], [10.0, 1.0]),
+        tuning.TransferFunction((2.0,), (10.0, 1.0)).to_control(),
     ],
 )
 def test_models_of_other_libraries_are_tuned(system: tuning.Model) -> None:
@@ -66,6 +70,44 @@ def test_models_of_other_libraries_are_tuned(system: tuning.Model) -> None:
 def test_what_is_no_model_is_refused(system: tuning.Model, dead_time_s: float, why: str) -> None:
     with pytest.raises(ValueError, match=why):
         tuning.as_model(system, dead_time_s)
+
+
+@pytest.mark.parametrize("thing", ["simc", 3.0, {"K": 2.0, "T": 10.0, "L": 1.0}, None, [2.0, 10.0, 1.0]])
+def test_what_is_nothing_of_the_kind_is_a_type_error(thing: object) -> None:
+    with pytest.raises(TypeError, match=r"is no model: give FOPDT\(K, T, L\)"):
+        tuning.tune(thing, "simc")
+
+
+def test_to_control_and_back() -> None:
+    model = tuning.TransferFunction((1.0, 2.0), (20.0, 9.0, 1.0))
+    assert tuning.TransferFunction.from_control(model.to_control()) == model
+    assert tuning.TransferFunction.from_control(model.to_control(), 3.0).L == 3.0
+    late = tuning.TransferFunction((2.0,), (10.0, 1.0), 1.0)
+    with pytest.raises(ValueError, match="give pade_order for that of 1 s"):
+        late.to_control()
+    w = np.array([0.01, 0.3])
+    assert np.allclose(late.to_control(pade_order=5)(1j * w), late.frequency_response(w), atol=1e-6)
+
+
+def test_results_show_themselves_in_a_notebook() -> None:
+    found = tuning.tune(PLANT, "imc-pid")
+    shown = found._repr_html_()
+    assert f"<td>{found.gains.Kp:.4g}</td>" in shown and "<svg" in shown and "filtered with Tf" in shown
+    t = np.arange(0.0, 100.0, 0.5)
+    u = np.where(t < 5.0, 0.0, 1.0)
+    y = np.where(t < 6.0, 0.0, 2.0 * (1.0 - np.exp(-(t - 6.0) / 10.0)))
+    record = tuning.identify(t, u, y)
+    shown = record._repr_html_()
+    assert "<th>standard error</th>" in shown and "The model explains the record." in shown and "<svg" in shown
+    dots, line = record.plot().axes[0].lines
+    assert np.array_equal(dots.get_ydata(), y) and np.allclose(line.get_ydata(), y, atol=1e-3)
+    assert str(record).startswith("K 2 ± ")
+
+
+def test_without_matplotlib_a_notebook_shows_the_table_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    shown = tuning.tune(PLANT, "simc")._repr_html_()
+    assert "<table>" in shown and "<svg" not in shown
 
 
 def test_an_unknown_method_is_refused_with_those_that_are() -> None:
