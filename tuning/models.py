@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -109,25 +110,6 @@ class SOPDT:
         """The frequency response at the angular frequencies w, rad/s."""
         return _response(self.num, self.den, self.L, w)
 
-    @staticmethod
-    def from_control(system: LinearSystem, dead_time_s: float = 0.0) -> TransferFunction:
-        """The model for a transfer function of control or scipy.signal; see `as_model`."""
-        found = as_model(system, dead_time_s)
-        return TransferFunction(found.num, found.den, found.L)
-
-    def to_control(self, pade_order: int = 0) -> Any:
-        """This model as control.TransferFunction, which has no dead time: a Pade approximation takes its place.
-
-        pade_order: the order of the approximation; 0 is for models without dead time.
-        Raises ValueError for a dead time without an order. Needs the library control.
-        """
-        import control
-
-        if self.L and not pade_order:
-            raise ValueError(f"control has no dead time: give pade_order for that of {self.L:g} s")
-        system = control.TransferFunction(list(self.num), list(self.den))
-        return system * control.TransferFunction(*control.pade(self.L, pade_order)) if self.L else system
-
 
 @dataclass(frozen=True, slots=True)
 class Integrating:
@@ -197,6 +179,25 @@ class TransferFunction:
         """The frequency response at the angular frequencies w, rad/s."""
         return _response(self.num, self.den, self.L, w)
 
+    @staticmethod
+    def from_control(system: LinearSystem, dead_time_s: float = 0.0) -> TransferFunction:
+        """The model for a transfer function of control or scipy.signal; see `as_model`."""
+        found = as_model(system, dead_time_s)
+        return TransferFunction(found.num, found.den, found.L)
+
+    def to_control(self, pade_order: int = 0) -> Any:
+        """This model as control.TransferFunction, which has no dead time: a Pade approximation takes its place.
+
+        pade_order: the order of the approximation; 0 is for models without dead time.
+        Raises ValueError for a dead time without an order. Needs the library control.
+        """
+        import control
+
+        if self.L and not pade_order:
+            raise ValueError(f"control has no dead time: give pade_order for that of {self.L:g} s")
+        system = control.TransferFunction(list(self.num), list(self.den))
+        return system * control.TransferFunction(*control.pade(self.L, pade_order)) if self.L else system
+
 
 Model = FOPDT | SOPDT | Integrating | TransferFunction
 
@@ -222,8 +223,8 @@ def as_model(system: Model | LinearSystem | tuple[ArrayLike, ArrayLike], dead_ti
     system: the transfer function; a model of this library is returned as it is. scipy's forms are accepted: numerator
     and denominator as a pair, zeros and poles, a state space.
     dead_time_s: the dead time of a system of another library, s.
-    Raises TypeError for what is no model. Raises ValueError: more than one input or output, discrete time, a dead time given twice, coefficients that make no
-    model.
+    Raises TypeError for what is no model. Raises ValueError for more than one input or output, discrete time, a dead
+    time given twice, and coefficients that make no model.
     """
     if isinstance(system, Model):
         if dead_time_s:
@@ -232,12 +233,17 @@ def as_model(system: Model | LinearSystem | tuple[ArrayLike, ArrayLike], dead_ti
             )
         return system
     if isinstance(system, tuple) and len(system) == 2:
-        return TransferFunction(tuple(np.atleast_1d(system[0])), tuple(np.atleast_1d(system[1])), dead_time_s)
-    if hasattr(system, "to_tf"):  # scipy's zeros and poles, and its state space
-        system = system.to_tf()
+        num, den = (np.atleast_1d(np.asarray(each, dtype=float)).tolist() for each in system)
+        return TransferFunction(tuple(num), tuple(den), dead_time_s)
+    return _of_another_library(system, dead_time_s)
+
+
+def _of_another_library(given: Any, dead_time_s: float) -> TransferFunction:
+    """The model for an object of control or scipy.signal; raises as `as_model`."""
+    system = _as_fraction(given)
     if not all(hasattr(system, name) for name in ("num", "den", "dt")):
         raise TypeError(
-            f"{type(system).__name__} is no model: give FOPDT(K, T, L), SOPDT, Integrating, TransferFunction(num, den, "
+            f"{type(given).__name__} is no model: give FOPDT(K, T, L), SOPDT, Integrating, TransferFunction(num, den, "
             "L), or a transfer function of control or scipy.signal"
         )
     if system.dt:
@@ -246,6 +252,16 @@ def as_model(system: Model | LinearSystem | tuple[ArrayLike, ArrayLike], dead_ti
     if num.ndim > 1 or den.ndim > 1:
         raise ValueError("the transfer function has more than one input or output")
     return TransferFunction(tuple(np.atleast_1d(num).tolist()), tuple(np.atleast_1d(den).tolist()), dead_time_s)
+
+
+def _as_fraction(system: Any) -> Any:
+    """scipy's zeros and poles, and its state space, as its transfer function; anything else as it is."""
+    if not hasattr(system, "to_tf"):
+        return system
+    with warnings.catch_warnings():
+        # scipy calls a numerator badly conditioned whose first coefficients are 0, as they are for a state space
+        warnings.filterwarnings("ignore", message="Badly conditioned filter coefficients")
+        return system.to_tf()
 
 
 def time_constants(model: Model) -> Reals:

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from loopwright.tuning.analysis.notebook import as_html
 from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN, by_bic
 from loopwright.tuning.identification.feedback_test import follows_from_pv
 from loopwright.tuning.identification.output_error import NOT_AT_REST_INITIALLY, UNDISTURBED, Fitted, count
@@ -30,7 +31,6 @@ from loopwright.tuning.identification.record import recorded_test
 from loopwright.tuning.identification.structure_search import StructureSearch, confounded
 from loopwright.tuning.identification.structures import FIRST, INTEGRATOR, LAGGED_INTEGRATOR, SECOND
 from loopwright.tuning.models import Integrating, Model, Reals, TransferFunction
-from loopwright.tuning.notebook import as_html
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -274,7 +274,7 @@ def _result(problem: IdentificationProblem, best: Fitted, ranked: Sequence[Fitte
         drift=best.hypothesis.drift,
         whiteness=problem.whiteness(best),
         explained=problem.explains(best),
-        t=t0 + record.Ts * np.arange(len(record.y)),
+        t=np.asarray(t0 + record.Ts * np.arange(len(record.y)), dtype=np.float64),
         u=record.u,
         y=record.y,
         fitted=record.y - residual,

@@ -6,11 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from numpy.typing import ArrayLike
+
 from loopwright.tuning.analysis.assessment import Assessment, assess
+from loopwright.tuning.analysis.notebook import as_html
 from loopwright.tuning.analysis.step_response import step_response
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import LinearSystem, Model, as_model
-from loopwright.tuning.notebook import as_html
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.design import realisable
 from loopwright.tuning.rules.registry import METHODS, Method
@@ -92,14 +94,19 @@ class Tuned:
         return found.getvalue()
 
 
-def tune(model: Model | LinearSystem, method: str = "simc", dead_time_s: float = 0.0, **options: object) -> Tuned:
+def tune(
+    model: Model | LinearSystem | tuple[ArrayLike, ArrayLike],
+    method: str = "simc",
+    dead_time_s: float = 0.0,
+    **options: object,
+) -> Tuned:
     """The gains that a method gives for a model, with their assessment.
 
     model: a model of this library, or a transfer function of another one (control, scipy.signal).
     method, options: a name of `METHODS`, and options of that method.
     dead_time_s: the dead time of a transfer function of another library, s.
     Raises Refused: BAD_INPUT (method, option), or as the rule does: NOT_SELF_REGULATING, OUTSIDE_RANGE,
-    CANNOT_OSCILLATE. Raises ValueError for coefficients that make no model.
+    CANNOT_OSCILLATE. Raises TypeError for what is no model, ValueError for coefficients that make none.
     """
     if method not in METHODS:
         raise Refused(Reason.BAD_INPUT, f"method must be one of {', '.join(METHODS)}, not {method!r}")

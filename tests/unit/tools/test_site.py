@@ -30,4 +30,4 @@ def test_a_broken_link_is_seen(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "docs", source)
     (source / "methods.md").write_text("# Methods\n\n[nowhere](nothing.md) [no heading](safety.md#nothing)\n")
     ended = built(source, tmp_path / "site")
-    assert ended.returncode != 0 and "nothing.md" in ended.stderr and "safety.md#nothing" in ended.stderr
+    assert ended.returncode != 0 and "'nothing.md'" in ended.stderr and "not found in doc 'safety'" in ended.stderr
