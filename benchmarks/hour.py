@@ -3,7 +3,8 @@
 The page is the real one, from a real service, which answers its requests. In place of its EventSource is a stand-in
 that is given messages as this service has just sent them, with later times and other values; the page's clock and its
 intervals go on by the time that the messages say has passed. A request that is under way is waited for, so that they
-do not pile up as they would not in an hour.
+do not pile up as they would not in an hour. What is read from a controller is asked for once and answered again: there
+is none here, and each time its silence would be waited for.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from typing import Any
 
 from playwright.sync_api import CDPSession, Page
 
-STAND_IN = """(() => {
-  let ahead_ms = 0, asking = 0, intervals = [], number = 0, source = null;
+STAND_IN = r"""(() => {
+  const asking = new Set();
+  let ahead_ms = 0, intervals = [], number = 0, source = null;
   const now = Date.now, since = performance.now.bind(performance), ask = window.fetch.bind(window);
   Date.now = () => now() + ahead_ms;
   performance.now = () => since() + ahead_ms;
@@ -23,9 +25,18 @@ STAND_IN = """(() => {
     return number;
   };
   window.clearInterval = (id) => { intervals = intervals.filter((each) => each.id !== id); };
-  window.fetch = async (...asked) => {
-    asking++;
-    try { return await ask(...asked); } finally { asking--; }
+  const read = /\/loops\/[^/?]+(\/retune\/preview)?$/, first = new Map();
+  const answered = (...asked) => {
+    const url = String(asked[0]);
+    if (!read.test(url)) return ask(...asked);
+    if (!first.has(url)) first.set(url, ask(...asked));
+    return first.get(url).then((answer) => answer.clone());
+  };
+  window.fetch = (...asked) => {
+    const answer = answered(...asked);
+    const over = answer.then(() => {}, () => {}).finally(() => asking.delete(over));
+    asking.add(over);
+    return answer;
   };
   window.EventSource = class extends EventTarget {
     constructor(url) {
@@ -36,11 +47,9 @@ STAND_IN = """(() => {
     close() { if (source === this) source = null; }
   };
   const send = (name, message) => source?.dispatchEvent(new MessageEvent(name, { data: JSON.stringify(message) }));
-  const turn = () => new Promise((done) => {
-    const channel = new MessageChannel();
-    channel.port1.onmessage = () => { channel.port1.close(); done(); };
-    channel.port2.postMessage(null);
-  });
+  const channel = new MessageChannel(), waiting = [];
+  channel.port1.onmessage = () => waiting.shift()();
+  const turn = () => new Promise((done) => { waiting.push(done); channel.port2.postMessage(null); });
   let n = 0;
   const pv = (at_s, loop) => 50 + Math.sin(at_s / (3 + loop % 7));
   const job = (heard, tag, s) => s % 300 < 60 ? [{ id: "0123456789ab", url: "/jobs/0123456789ab", loop: tag,
@@ -66,7 +75,7 @@ STAND_IN = """(() => {
         await turn();
       }
       await new Promise(requestAnimationFrame);
-      while (asking > 0) await turn();
+      while (asking.size > 0) { await Promise.all(asking); await turn(); }
     }
   };
 })();"""
