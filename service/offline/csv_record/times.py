@@ -19,11 +19,14 @@ from loopwright.service.offline.csv_record.errors import Unusable, counted
 from loopwright.service.offline.csv_record.numbers import numbers
 from loopwright.tuning.models import Reals
 
-_UNITS = {"": 1.0, "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "min": 60.0, "h": 3600.0}
+_UNITS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "min": 60.0, "h": 3600.0}
 _EPOCHS = ((1e18, 1e-9), (1e17, 1e-7), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))
 """Times from so large a number on count from an epoch, in units of so many s: ns, Windows' 100 ns, us, ms, s."""
 _SPREADSHEET_DAYS = (20000.0, 80000.0)
 """Days that a spreadsheet counts from 1900 on, for dates from 1954 to 2119."""
+_SPREADSHEET_STEP = 0.005
+"""Largest time between samples, in days, for which numbers of that size are days: seven minutes, or, of a clock in s, 200
+samples a second."""
 _MONTHS = {name.lower(): i for i, name in enumerate(month_abbr) if name}
 _MOMENT = re.compile(
     r"^(?:(?P<a>\d{1,4})(?P<sign>[./\- ])(?P<b>\d{1,2}|[A-Za-z]{3,9})[./\- ](?P<c>\d{2,4})(?:[T, ]\s*|$))?"
@@ -104,14 +107,16 @@ def _of_numbers(cells: Sequence[str], lines: Sequence[int], unit: str, name: str
             raise Unusable(counted(places, f"{name} is missing", f"values of {name} are missing"))
         one = f"{name} is neither a number of s nor a date and time: {given!r}; --time-format says how it is written"
         raise Unusable(counted(places, one, f"values of {name} are not numbers as those before, such as {given!r}"))
+    if unit.lower() in _UNITS:
+        return np.asarray(times * _UNITS[unit.lower()])
     for smallest, size in _EPOCHS:
         if times[0] >= smallest:
             return _from_first(times) * size
     low, high = _SPREADSHEET_DAYS
-    named_unit = unit.lower() in _UNITS and bool(unit)
-    if not named_unit and low <= times.min() and times.max() < high and np.ptp(times) < 0.1 * len(times):
-        return np.asarray((times - times[0]) * _DAY)
-    return np.asarray(times * _UNITS.get(unit.lower(), 1.0))
+    steps = np.abs(np.diff(times))
+    if low <= times.min() and times.max() < high and len(steps) and np.median(steps) < _SPREADSHEET_STEP:
+        return _from_first(times) * _DAY
+    return times
 
 
 def _parts(cell: str) -> Parts:
