@@ -25,8 +25,9 @@ _EPOCHS = ((1e18, 1e-9), (1e17, 1e-7), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))
 _SPREADSHEET_DAYS = (20000.0, 80000.0)
 """Days that a spreadsheet counts from 1900 on, for dates from 1954 to 2119."""
 _SPREADSHEET_STEP = 0.005
-"""Largest time between samples, in days, for which numbers of that size are days: seven minutes, or, of a clock in s, 200
-samples a second."""
+"""Largest time between samples, in days, for which numbers of that size are days: seven minutes.
+
+Of a clock in s it would be 200 samples a second."""
 _MONTHS = {name.lower(): i for i, name in enumerate(month_abbr) if name}
 _MOMENT = re.compile(
     r"^(?:(?P<a>\d{1,4})(?P<sign>[./\- ])(?P<b>\d{1,2}|[A-Za-z]{3,9})[./\- ](?P<c>\d{2,4})(?:[T, ]\s*|$))?"
