@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import Counter as Tally
 from collections.abc import Callable, Iterable, Mapping
+from importlib.metadata import version
+from platform import python_version
 
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -33,6 +35,15 @@ class _Alarms(Collector):
         )
         for level, count in self._counts().items():
             found.add_metric([str(level)], count)
+        yield found
+
+
+class _Build(Collector):
+    def collect(self) -> Iterable[Metric]:
+        found = GaugeMetricFamily(
+            "loopwright_build_info", "1; the labels have the versions", labels=["version", "python"]
+        )
+        found.add_metric([version("loopwright"), python_version()], 1)
         yield found
 
 
@@ -92,7 +103,7 @@ def registry(
     """The registry of the metrics of a service. sdo_retries: SDO retries by bus, as counted in this process.
     alarms: returns the number of alarms by level, 0 included."""
     found = CollectorRegistry()
-    for collector in (*OF_THIS_PROCESS, _OfTheStore(loops, store, sdo_retries), _Alarms(alarms)):
+    for collector in (*OF_THIS_PROCESS, _Build(), _OfTheStore(loops, store, sdo_retries), _Alarms(alarms)):
         found.register(collector)
     return found
 
