@@ -34,6 +34,7 @@ from loopwright.service.loops.observed_loop import ObservedLoop
 from loopwright.service.loops.restoration import restore_abandoned
 from loopwright.service.observing.kept_knowledge import KeptKnowledge
 from loopwright.service.planning.known_loop import known
+from loopwright.service.planning.t95 import t95_mismatch
 from loopwright.service.states.job_state import ACTIVE, GOOD, JobState, state_after
 from loopwright.service.states.loop_state import LoopState, differences, loop_state, same_gains, state_json
 from loopwright.service.store import looked_after
@@ -44,7 +45,7 @@ from loopwright.service.telemetry.logs import about
 from loopwright.tuning.fast.excitation_choice import NOT_ASKED
 from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
 from loopwright.tuning.fast.record import Excitation
-from loopwright.tuning.plan import Event
+from loopwright.tuning.plan import Event, Note
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
 
 log = logging.getLogger(__name__)
@@ -131,8 +132,13 @@ class Worker:
             request = retune_request(**row.request)
             config = within(self._directory.config(row.loop), request)
             check_setpoint_source(config, request)
-            run = self._dry if row.dry_run else self._live
-            return run(running, row, config, request)
+            if row.dry_run:
+                return self._dry(running, row, config, request)
+            outcome = self._live(running, row, config, request)
+            model = None if outcome.result is None else outcome.result.model
+            if model is not None and (text := t95_mismatch(model.process_model(), config.t95_s)):
+                running.on_event(Note(text))
+            return outcome
         except Ended as ended:
             return Outcome(None, ended, None, {})
         except BadLimits as error:
