@@ -29,6 +29,6 @@ def t95_mismatch(model: Model, t95_s: float) -> str | None:
     else:
         many, effect = f"{found / t95_s:.0f} times too short", "tests of it may be ended too early"
     return (
-        f"t95_s is {t95_s:g} s in the configuration, about {many}: by the model found PV covers 95 % of a step in about "
-        f"{found:.3g} s. Correct t95_s; {effect}"
+        f"t95_s is {t95_s:g} s in the configuration, about {many}: by the model found PV covers 95 % of a step in "
+        f"about {found:.3g} s. Correct t95_s; {effect}"
     )
