@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
 
 from loopwright.tuning.models import Reals
 
@@ -61,12 +60,11 @@ def measured(axes: Axes, t: Reals, values: Reals, colour: str = MEASURED) -> Non
 
 
 def text_at(axes: Axes, x: float, y: float, text: str, colour: str, below: bool = False) -> None:
-    """Writes a name beside a point, with a white rim so that it is read over lines. below: below the point."""
-    written = axes.annotate(
+    """Writes a name beside a point, on white so that it is read over lines. below: below the point."""
+    axes.annotate(
         text, (x, y), xytext=(4, -3 if below else 3), textcoords="offset points", color=colour, fontsize=8.5,
-        va="top" if below else "baseline",
+        va="top" if below else "baseline", bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.6},
     )  # fmt: skip
-    written.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
 
 
 def name_curves(axes: Axes, curves: Sequence[tuple[str, str, Reals, Reals]]) -> None:

@@ -449,4 +449,5 @@ def test_a_stream_ends_with_the_key_that_it_was_opened_with(
                 session.execute(update(KeyRow).values(expires_at="2020-01-01T00:00:00.000Z"))
         text = answer.result(30).text
     assert service.store.get(job).state == "running"
-    assert text.startswith("id: 1\n") and text.endswith(": the key of this stream was revoked or has expired\n\n")
+    assert text.startswith("retry: 2000\n\nid: 1\n")
+    assert text.endswith(": the key of this stream was revoked or has expired\n\n")
