@@ -59,7 +59,7 @@ def show_nodes(bus: str, found: Sequence[FoundNode]) -> None:
         ("node", "is", "state", "channels", "sample time s"),
         (
             (
-                f"{node_name(each.node)}",
+                node_name(each.node),
                 "?" if each.device is None else each.device.value,
                 each.state or "no heartbeat",
                 each.channels,

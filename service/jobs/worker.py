@@ -135,9 +135,7 @@ class Worker:
             if row.dry_run:
                 return self._dry(running, row, config, request)
             outcome = self._live(running, row, config, request)
-            model = None if outcome.result is None else outcome.result.model
-            if model is not None and (text := t95_mismatch(model.process_model(), config.t95_s)):
-                running.on_event(Note(text))
+            self._compare_t95(running, outcome, config)
             return outcome
         except Ended as ended:
             return Outcome(None, ended, None, {})
@@ -146,6 +144,16 @@ class Worker:
         except Exception as error:
             log.exception("a defect in the job")
             return Outcome(None, Failed(Reason.INTERNAL, f"{type(error).__name__}: {error}"), None, {})
+
+    def _compare_t95(self, running: Running, outcome: Outcome, config: LoopConfig) -> None:
+        """Notes where T95 of the configuration is not that of the model found. The end of the job does not depend on
+        it."""
+        try:
+            model = None if outcome.result is None else outcome.result.model
+            if model is not None and (text := t95_mismatch(model.process_model(), config.t95_s)):
+                running.on_event(Note(text))
+        except Exception:
+            log.exception("T95 could not be compared with the model found")
 
     def _live(self, running: Running, row: Job, config: LoopConfig, request: RetuneRequest) -> Outcome:
         self._check_stop_request(running)

@@ -27,7 +27,6 @@ _HELD = ("u", "sp")
 """What holds its value until the next sample; PV goes on in a straight line."""
 _DURATION = re.compile(r"^\s*(?P<number>\d+(?:[.,]\d+)?)\s*(?P<unit>ms|s|sec|min|m|h)?\s*$")
 _SECONDS = {"ms": 1e-3, "s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
-_NAMES = {"u": "MV", "y": "PV", "sp": "SP"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,10 +165,10 @@ def _filled(t: Reals, values: Mapping[str, Reals], notes: list[str]) -> EvenSamp
 
 
 def _resampled(t: Reals, values: Mapping[str, Reals], Ts: float, notes: list[str]) -> EvenSamples:
-    start = max(float(t[~np.isnan(column)][0]) for column in values.values() if not np.all(np.isnan(column)))
-    ends = [t[~np.isnan(column)] for column in values.values()]
-    if any(len(each) < 2 for each in ends):
+    there = {name: t[~np.isnan(column)] for name, column in values.items()}
+    if any(len(each) < 2 for each in there.values()):
         raise Unusable("a column has fewer than two values: there is nothing to resample")
+    start = max(float(each[0]) for each in there.values())
     stop = float(t[-1])
     count = int((stop - start) / Ts + 1e-9) + 1
     if count > MAX_SAMPLES:
@@ -179,7 +178,7 @@ def _resampled(t: Reals, values: Mapping[str, Reals], Ts: float, notes: list[str
         name: _held_means(grid, t, column) if name in _HELD else _interpolated(grid, t, column, held=False)
         for name, column in values.items()
     }
-    times = ends[list(values).index("y")]
+    times = there["y"]
     longest = float(np.max(np.diff(times)))
     usual = float(np.median(np.diff(times)))
     notes.append(

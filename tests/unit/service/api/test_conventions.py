@@ -58,6 +58,12 @@ def test_an_unknown_query_parameter_is_refused(client: TestClient, path: str, wo
     assert words in body["detail"] and body["errors"][0]["where"].startswith("query.")
 
 
+def test_an_abort_is_never_refused_for_a_parameter(service: Service, client: TestClient) -> None:
+    service.tune.hold.clear()
+    job_id = start(client)
+    assert client.post(f"/jobs/{job_id}/abort?now=1").status_code == 202
+
+
 @pytest.mark.parametrize("path", ["/healthz", "/loops", f"/loops/{TAG}", "/methods", "/openapi.json", "/nothing"])
 def test_head_is_get_without_the_body(client: TestClient, path: str) -> None:
     got, head = client.get(path), client.head(path)

@@ -260,6 +260,12 @@ def test_resampling_keeps_what_mv_did_to_the_plant() -> None:
     assert "PV every 2 s, at most 2.5 s apart" in record.notes[0]
 
 
+def test_nothing_to_resample() -> None:
+    for text in ("t,u,y\n0,Bad,Bad\n1,Bad,Bad\n", "t,u,y\n0,1,Bad\n1,1,2\n"):
+        with pytest.raises(RecordError, match="there is nothing to resample"):
+            parse_record(text, "log.csv", ReadOptions(resample_s=1.0))
+
+
 @pytest.mark.parametrize(("text", "s"), [("5s", 5.0), ("500 ms", 0.5), ("1,5", 1.5), ("2min", 120.0), ("1 h", 3600.0)])
 def test_durations(text: str, s: float) -> None:
     assert duration(text) == s
