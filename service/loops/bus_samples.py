@@ -118,7 +118,7 @@ class BusSamples:
             self._session.confirm_if_due(tuner)
             if now > give_up:
                 node = f"plant node {node_name(self._connection.plant or 0)}"
-                raise Failed(Reason.SAMPLES_LOST, f"{node} runs on although it has been told to halt (2011h)")
+                raise Failed(Reason.SAMPLES_LOST, f"{node} runs on although it was ordered to halt (2011h)")
 
     def release(self) -> None:
         """Lets a plant that was run in blocks run on by itself, and releases its lock."""

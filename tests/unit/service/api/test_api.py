@@ -9,6 +9,8 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import event
 
+from loopwright.service.jobs import worker
+from loopwright.service.planning.t95 import t95_mismatch
 from loopwright.service.store.store import append
 from loopwright.tuning.reasons import ADVICE, Failed, Reason, Refused
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
@@ -211,6 +213,26 @@ def test_samples_as_columns_and_as_csv(service: Service, client: TestClient) -> 
     assert only.headers["content-type"].startswith("text/csv")
     lines = only.text.splitlines()
     assert lines[0] == "stage,t_s,sp,pv,mv,mode" and lines[1] == "relay,1.1,50.0,50.0,40.0,2" and len(lines) == 11
+
+
+def test_a_t95_that_is_wrong_is_noted(
+    service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The plant of these tests has about the T95 of its configuration, 9 s."""
+    monkeypatch.setattr(worker, "t95_mismatch", lambda model, t95_s: t95_mismatch(model, 10.0 * t95_s))
+    job = finished(service, client)
+    noted = [data["text"] for _, kind, data in events(client.get(f"{job['url']}/events").text) if kind == "note"]
+    assert job["state"] == "proposed" and any("about 9 times too long" in text for text in noted), noted
+
+
+def test_the_end_of_a_job_does_not_depend_on_t95(
+    service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(model: object, t95_s: float) -> str:
+        raise ArithmeticError("no roots")
+
+    monkeypatch.setattr(worker, "t95_mismatch", broken)
+    assert finished(service, client)["state"] == "proposed"
 
 
 def events(text: str) -> list[tuple[int, str, dict[str, Any]]]:
