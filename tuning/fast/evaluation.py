@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 from loopwright.tuning.fast.design import DesignSpec, GainDesign, OptimalGains
-from loopwright.tuning.fast.linearity import LinearityTest
+from loopwright.tuning.fast.score_tests import ScoreTests
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.fast.structure_choice import StructureChoice, choose_structure
 from loopwright.tuning.fast.uncertainty import difference_of_rivals, durbin_watson_ratio, peak, uncertainty_of_Ms
@@ -147,7 +147,7 @@ def evaluate(
 
 def _nonlinearity(fit: Fit[ExperimentRecord], found: Fitted) -> tuple[Reason, str] | None:
     """The reason and the detail where the record shows a plant that is not linear, or leaves that open."""
-    test = LinearityTest(fit, found)
+    test = ScoreTests(fit, found)
     if (shown := test.nonlinearity()) is not None:
         return Reason.UNEXPLAINED, f"{shown.what}, +-{2.0 * shown.deviation:.2g}"
     if fit.record.one_sided:  # such a record cannot tell how far the sides differ, and its proposal says so

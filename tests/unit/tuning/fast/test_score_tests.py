@@ -6,7 +6,7 @@ import pytest
 
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.evaluation import evaluate
-from loopwright.tuning.fast.linearity import LinearityTest, above_rest, squared
+from loopwright.tuning.fast.score_tests import ScoreTests, above_rest, squared
 from loopwright.tuning.fast.structure_choice import choose_structure
 from loopwright.tuning.identification.output_error import Fit
 from loopwright.tuning.reasons import Reason
@@ -19,7 +19,7 @@ LOOPS = {"first order": (FIRST, 1.0, 10.0), "three lags": (THREE_LAGS, 0.8, 3.0)
 @pytest.mark.parametrize("name", LOOPS)
 def test_a_linear_plant_is_not_told_to_be_another(name: str, seed: int) -> None:
     fit = Fit(pulse_record(*LOOPS[name], noise=0.01, seed=seed))
-    linearity = LinearityTest(fit, choose_structure(fit).best)
+    linearity = ScoreTests(fit, choose_structure(fit).best)
     assert linearity.nonlinearity() is None
     for changed in (above_rest, squared):
         size, deviation = linearity.score(changed)
@@ -47,7 +47,7 @@ def test_a_gain_that_differs_above_and_below_rest_is_no_evidence(name: str, belo
     """Load disturbances can stand for a part of the difference: the record is then called uncertain, and goes on."""
     evaluation = evaluate(pulse_record(*LOOPS[name], noise=0.005, below=below), DesignSpec(1.6))
     assert evaluation.reason is not None
-    size, deviation = LinearityTest(evaluation.fit, evaluation.chosen.best).score(above_rest)
+    size, deviation = ScoreTests(evaluation.fit, evaluation.chosen.best).score(above_rest)
     if (name, below) == ("first order", 0.7):  # 0.1 +- 0.6: the sign is chance
         assert deviation > 2.0 * abs(size)
     else:
@@ -58,5 +58,5 @@ def test_the_size_is_that_of_the_plant() -> None:
     """For a small difference the fit hardly bends: the score is then the difference itself."""
     bench: Bench = FIRST
     fit = Fit(pulse_record(bench, 1.0, 10.0, noise=0.001, below=0.97))
-    size, deviation = LinearityTest(fit, choose_structure(fit).best).score(above_rest)
+    size, deviation = ScoreTests(fit, choose_structure(fit).best).score(above_rest)
     assert size == pytest.approx(0.03, abs=4.0 * deviation + 0.01)

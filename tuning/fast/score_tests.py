@@ -1,0 +1,177 @@
+"""Score tests of what else the plant may be: one whose gain differs above and below rest, changes with MV or in the
+course of the test, or one with a second path that acts later.
+
+After a fit, the fitted model is driven with a changed input. What the parameters, the load disturbances, a drift and a
+start that was not at rest could explain is projected out of that response and of the residual; the regression of the
+residual on the response gives the size of the alternative and its standard deviation, without a new fit. Source: the
+Lagrange multiplier test, C. R. Rao, Proc. Cambridge Phil. Soc. 44, 1948.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.uncertainty import durbin_watson_ratio, unknown_columns
+from loopwright.tuning.identification.output_error import UNDISTURBED, Fit, Fitted
+from loopwright.tuning.models import Reals
+
+STANDARD_DEVIATIONS = 4.0
+"""Size of an alternative, in its standard deviations, above which the record shows it."""
+STANDARD_DEVIATIONS_LATER = 4.5
+"""The same for a second path, of which many delays are tried."""
+MIN_LATER = 0.05
+"""Smallest second path that matters, a fraction of the plant's effect."""
+FIRST_DELAY, DELAY_RATIO = 0.4, 1.25
+"""The shortest delay of a second path that is tried, in periods, and the ratio of each delay to the one before."""
+NOTABLE_LATER = 0.3
+"""Size of a second path that a record should show: with the gains for Ms 1.6 it makes Ms about 2."""
+NEGLIGIBLE_DIRECTION = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Alternative:
+    """An alternative to the plant of the model that the record shows.
+
+    what: the alternative in words, with its size.
+    size: its size, a fraction of the plant's gain.
+    deviation: the standard deviation of the size.
+    """
+
+    what: str
+    size: float
+    deviation: float
+
+
+def above_rest(record: ExperimentRecord) -> Reals:
+    """MV above rest alone, MV units, shape (N,)."""
+    return np.maximum(record.u, 0.0)
+
+
+def squared(record: ExperimentRecord) -> Reals:
+    """MV times its part of its largest deviation, MV units, shape (N,)."""
+    return np.asarray(np.square(record.u) / record.input_range)
+
+
+def fading(record: ExperimentRecord) -> Reals:
+    """MV times a factor that grows from 0 at the end of the rest to 1 at the end of the record, MV units, shape (N,)."""
+    grown = np.clip(np.arange(len(record.u)) - record.listened, 0.0, None)
+    return np.asarray(record.u * grown / max(float(grown[-1]), 1.0))
+
+
+def late(samples: int) -> Callable[[ExperimentRecord], Reals]:
+    """MV so many samples later, 0 before each piece of the record, MV units, shape (N,)."""
+
+    def of(record: ExperimentRecord) -> Reals:
+        moved = np.zeros(len(record.u))
+        begin = 0
+        for length in record.pieces:
+            end = begin + length
+            moved[begin + samples : end] = record.u[begin : max(end - samples, begin)]
+            begin = end
+        return moved
+
+    return of
+
+
+class ScoreTests:
+    """The score tests of one fit. What the fit can explain by itself is computed once for all of them."""
+
+    def __init__(self, fit: Fit[ExperimentRecord], found: Fitted) -> None:
+        self._fit, self._found = fit, found
+        known = unknown_columns(fit, found)
+        lengths = np.linalg.norm(known, axis=0)
+        basis, singular, _ = np.linalg.svd(known[:, lengths > 0.0] / lengths[lengths > 0.0], full_matrices=False)
+        self._basis = basis[:, singular > NEGLIGIBLE_DIRECTION * singular[0]]
+        residual = found.linear.residual
+        self._unexplained = self._without_known(residual)
+        self._variance = found.linear.rss / max(fit.samples - found.parameters, 1) * durbin_watson_ratio(residual)
+
+    def nonlinearity(self) -> Alternative | None:
+        """The clearest alternative to a linear plant, None where the record shows none of a size that matters for
+        Ms."""
+        shown = []
+        for changed, minimum, words in ALTERNATIVES:
+            size, deviation = self.score(changed)
+            if abs(size) > max(minimum, STANDARD_DEVIATIONS * deviation):
+                shown.append(Alternative(words(size), size, deviation))
+        return max(shown, key=lambda each: abs(each.size) / each.deviation, default=None)
+
+    def second_path(self) -> Alternative | None:
+        """The clearest second path, None where the record shows none of a size that matters for Ms."""
+        shown = []
+        for samples in self._delays():
+            size, deviation = self.score(late(samples))
+            if abs(size) > max(MIN_LATER, STANDARD_DEVIATIONS_LATER * deviation):
+                what = f"{100.0 * size:+.0f} % of MV's effect seem to come {samples * self._fit.record.Ts:.3g} s later"
+                shown.append(Alternative(what, size, deviation))
+        return max(shown, key=lambda each: abs(each.size) / each.deviation, default=None)
+
+    def longest_delay_seen(self) -> float:
+        """The longest delay, s, up to which the record would show a second path of 30 % of the plant's effect; 0 where
+        it would show none."""
+        seen = 0.0
+        for samples in self._delays():
+            if STANDARD_DEVIATIONS_LATER * self.score(late(samples))[1] > NOTABLE_LATER:
+                break
+            seen = samples * self._fit.record.Ts
+        return seen
+
+    def unknown_difference(self) -> float:
+        """By how much the gain may differ above and below rest without a trace in the record, as a fraction of the
+        gain: two standard deviations. Load disturbances in the model can stand for such a difference."""
+        return 2.0 * self.score(above_rest)[1]
+
+    def score(self, changed: Callable[[ExperimentRecord], Reals]) -> tuple[float, float]:
+        """The size of an alternative, as a fraction of the plant's gain, and its standard deviation.
+
+        changed: the further input of the alternative, MV units, shape (N,), from the record; the size multiplies it.
+        """
+        fit, found = self._fit, self._found
+        structure, inputs = found.structure, found.structure.inputs
+        moved = changed(fit.record)
+        if not np.any(moved):  # MV was never above rest, or the record ends before the delay
+            return 0.0, math.inf
+        further = Fit(replace(fit.record, u=moved))
+        # a record's input range is its own: the scale of MV must stay that of the fit
+        scale = further.record.input_range / fit.record.input_range
+        columns = further.regressors(structure, UNDISTURBED, found.theta[None, : structure.searched])[0]
+        response = self._without_known(scale * (columns[:, :inputs] @ found.linear.coefficients[:inputs]))
+        power = float(response @ response)
+        if power <= 0.0:
+            return 0.0, math.inf
+        return float(response @ self._unexplained) / power, math.sqrt(self._variance / power)
+
+    def _delays(self) -> list[int]:
+        """The delays of a second path that are tried, in samples, up to the length of the longest piece's test."""
+        record = self._fit.record
+        longest = max(record.pieces) if len(record.pieces) > 1 else len(record.u) - record.listened
+        found, at = [], FIRST_DELAY * record.period
+        while at < longest:
+            found.append(round(at))
+            at *= DELAY_RATIO
+        return found
+
+    def _without_known(self, values: Reals) -> Reals:
+        """What is left of a column of the record, shape (rows,), by everything that the fit can explain."""
+        return np.asarray(values - self._basis @ (self._basis.T @ values))
+
+
+def _sides(size: float) -> str:
+    return f"the plant's gain above the operating point is {max(1.0 + size, 0.0):.2g} times that below"
+
+
+def _curve(size: float) -> str:
+    return f"the plant's gain changes by {200.0 * size:+.0f} % from the operating point to the largest MV"
+
+
+def _fading(size: float) -> str:
+    return f"the plant's gain changes by {100.0 * size:+.0f} % in the course of the test"
+
+
+ALTERNATIVES = ((above_rest, 0.05, _sides), (squared, 0.03, _curve), (fading, 0.15, _fading))
+"""The further input of each alternative, the smallest size that matters, and the alternative in words."""
