@@ -42,12 +42,12 @@ def plants() -> list[Plant]:
     batch = json.loads((Path(__file__).parent.parent / "tests/data/plants-batch.json").read_text())["processes"]
     found = [Plant(p["id"], tuple(p["num"]), tuple(p["den"]), p["delay"], p["Ku"], p["Tu"]) for p in batch]
     for m in json.loads((files("loopwright.plantsim") / "models-50.json").read_text())["models"]:
-        found.append(_of(f"model-{m['id']}", TransferFunction(tuple(m["num"]), tuple(m["den"]), m["delay"])))
-    found.append(_of(REACTOR, linear_reactor()))
+        found.append(plant_of(f"model-{m['id']}", TransferFunction(tuple(m["num"]), tuple(m["den"]), m["delay"])))
+    found.append(plant_of(REACTOR, linear_reactor()))
     return found
 
 
-def _of(name: str, model: TransferFunction) -> Plant:
+def plant_of(name: str, model: TransferFunction) -> Plant:
     Ku, Pu = ultimate_point(model)
     return Plant(name, model.num, model.den, model.L, Ku, Pu)
 

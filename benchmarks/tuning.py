@@ -2,6 +2,7 @@
 
     python -m benchmarks.tuning [--plants N] [--part I/N] [--seeds N] [--cases "PI 1 %;..."] [--save FILE] [--of FILE]
     python -m benchmarks.tuning --method setpoint ...       # pulses of the set-point: `benchmarks.pulses`
+    python -m benchmarks.tuning --cases trouble [--method setpoint] ...      # plants in trouble: `benchmarks.trouble`
 
 The plants are 70 of the Astrom-Hagglund batch, the 50 models of the five-stage paper and the linearised reactor (every
 n-th with --plants N). Each run is a rehearsal: listening, relay, fit, step, fit. Noise is white, its standard deviation
@@ -307,15 +308,21 @@ def runs_of(parser: argparse.ArgumentParser, given: argparse.Namespace, runs: It
 def main() -> None:
     parser = runs_parser(__doc__)
     parser.add_argument("--method", choices=("fast", "setpoint", "manual"), default="fast")
-    parser.add_argument("--cases", help="names, separated by ';', or 'further' (fast)")
+    parser.add_argument("--cases", help="names, separated by ';', or 'further' (fast), or 'trouble'")
     apart = parser.add_mutually_exclusive_group()
     apart.add_argument("--of-batch", action="store_true", help="pulses: the plants of the batch alone")
     apart.add_argument("--kept-apart", action="store_true", help="pulses: the other plants alone")
-    parser.add_argument("--processes", type=int, default=2, help="of pulses, at the same time (default: %(default)s)")
+    parser.add_argument(
+        "--processes", type=int, default=2, help="of pulses and of trouble, at the same time (default: %(default)s)"
+    )
     given = parser.parse_args()
-    if given.method != "fast":
-        from benchmarks import pulses  # it needs this module
+    from benchmarks import pulses  # these need this module
+    from benchmarks.trouble import report
 
+    if given.cases and report.is_trouble(given.cases):
+        report.main(parser, given)
+        return
+    if given.method != "fast":
         pulses.main(parser, given)
         return
     given.cases = given.cases or ";".join(CASES)
