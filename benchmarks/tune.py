@@ -18,11 +18,11 @@ from statistics import median
 from benchmarks.command import command
 
 MODELS = {
-    "lag-dominant": '{"K": 2, "T": 50, "L": 2}',
-    "balanced": '{"K": 2, "T": 10, "L": 8}',
-    "delay-dominant": '{"K": 1, "T": 2, "L": 10}',
-    "second order": '{"K": 2, "T1": 10, "T2": 4, "L": 3}',
-    "integrating": '{"K": 0.1, "L": 3, "integrating": true}',
+    "lag-dominant": '{"K": 2, "T_s": 50, "L_s": 2}',
+    "balanced": '{"K": 2, "T_s": 10, "L_s": 8}',
+    "delay-dominant": '{"K": 1, "T_s": 2, "L_s": 10}',
+    "second order": '{"K": 2, "T1_s": 10, "T2_s": 4, "L_s": 3}',
+    "integrating": '{"K": 0.1, "L_s": 3, "integrating": true}',
     "inverse response": '{"num": [-2, 1], "den": [15, 8, 1], "dead_time_s": 1}',
 }
 REPEATS = 5

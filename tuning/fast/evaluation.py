@@ -7,11 +7,13 @@ from dataclasses import dataclass, replace
 
 from loopwright.tuning.fast.design import DesignSpec, GainDesign, OptimalGains
 from loopwright.tuning.fast.score_tests import ScoreTests
+from loopwright.tuning.fast.second_path import find_second_path
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
-from loopwright.tuning.fast.structure_choice import StructureChoice, choose_structure
+from loopwright.tuning.fast.structure_choice import RIVAL_BIC, StructureChoice, choose_structure
 from loopwright.tuning.fast.uncertainty import difference_of_rivals, durbin_watson_ratio, peak, uncertainty_of_Ms
 from loopwright.tuning.fast.valve_faults import find_valve_fault
 from loopwright.tuning.gains import Gains
+from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN
 from loopwright.tuning.identification.output_error import Fit, Fitted
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.reasons import Reason
@@ -56,6 +58,7 @@ class Evaluation:
     chosen, fit: the choice of the structure, and the fits of the record behind it.
     design_delay: the delay of the sampling, s.
     period: the ultimate period of the model, s.
+    longest_delay_seen_s: how much later a second path of 30 % of the plant's effect may act and still show, s.
     """
 
     reason: Reason | None
@@ -71,6 +74,7 @@ class Evaluation:
     fit: Fit[ExperimentRecord]
     design_delay: float
     period: float
+    longest_delay_seen_s: float
 
 
 def evaluate(
@@ -80,9 +84,10 @@ def evaluate(
 
     spec: the design specification.
     earlier: the evaluation of the first part of the record, whose gains were tested in the rest of it.
-    test_follows: whether the gains are to be tested next. The record of a relay alone is then not asked whether the
-    plant is linear: a load disturbance or backlash can look like a gain that differs above and below rest there, and
-    the test tells them apart.
+    test_follows: whether the gains are to be tested next. The record is then not asked whether a second path stands
+    behind its load disturbances, which the test shows, and that of a relay is not asked whether the plant is linear: a
+    load disturbance or backlash can look like a gain that differs above and below rest there, and the test tells them
+    apart.
     Raises Refused, NOT_ROBUST, where the model permits no such controller.
     """
     fit = Fit(record)
@@ -128,6 +133,8 @@ def evaluate(
             reason, detail = _nonlinearity(fit, found) or (None, "")
         if reason is None:
             reason, detail = _load_with_the_step(fit, found, earlier, best.gains)
+    if earlier is not None or not test_follows:
+        reason, detail = _second_path(fit, found, reason, detail)
     return Evaluation(
         reason=reason,
         detail=detail,
@@ -142,6 +149,7 @@ def evaluate(
         fit=fit,
         design_delay=delay,
         period=design.period,
+        longest_delay_seen_s=ScoreTests(fit, found).longest_delay_seen(),
     )
 
 
@@ -158,6 +166,26 @@ def _nonlinearity(fit: Fit[ExperimentRecord], found: Fitted) -> tuple[Reason, st
         what = f"the gain above and below the operating point may differ by {by}"
         return Reason.UNCERTAIN, f"{what}, the record does not tell"
     return None
+
+
+def _second_path(
+    fit: Fit[ExperimentRecord], found: Fitted, reason: Reason | None, detail: str
+) -> tuple[Reason | None, str]:
+    """The reason and the detail with what a second path in place of the load disturbances says to them.
+
+    Where it explains the record as well as the load disturbances do, the model is ambiguous: PV answers the next step
+    twice where there is a second path, and a load disturbance stays as it is.
+    """
+    second = find_second_path(fit, found)
+    if second is None or second.gain < -RIVAL_BIC:
+        return reason, detail
+    what = f"{100.0 * second.share:.0f} % of MV's effect came {second.later_s:.3g} s later than the rest"
+    if reason is None:
+        return Reason.AMBIGUOUS, f"the record looks as if {what}, as much as if a load disturbance had come"
+    noise = fit.record.noise / fit.record.output_range
+    if second.gain > MIN_BIC_GAIN and second.rms <= max(MAX_RESIDUAL * noise, NEGLIGIBLE_RESIDUAL):
+        detail = f"{detail}; the record looks as if {what}"
+    return reason, detail
 
 
 def _load_with_the_step(

@@ -39,13 +39,13 @@ def evaluate_excitation(record: ExperimentRecord, spec: DesignSpec, test_follows
     """
     if record.excitation is Excitation.RELAY:
         return evaluate(record, spec, test_follows=test_follows)
-    found = evaluate(record, spec)
+    found = evaluate(record, spec, test_follows=test_follows)
     for _ in range(MAX_REFITS):
         own = own_period(found)
         if own is None:
             break
         try:
-            again = evaluate(replace(record, period=own), spec)
+            again = evaluate(replace(record, period=own), spec, test_follows=test_follows)
         except Refused:
             break
         if again.residual > AS_GOOD * found.residual:
