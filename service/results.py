@@ -177,6 +177,12 @@ class EvidenceView(Figures):
         description="Why the evidence is not enough for a proposal; reason code from the closed list"
     )
     detail: str = Field(description="The numbers behind the reason")
+    longest_delay_seen_s: float | None = Field(
+        default=None,
+        description="How much later a second path of 30 % of MV's effect may act and still show in the record, s; null: "
+        "not known, of a job of an earlier version",
+        examples=[48.0],
+    )
 
 
 class VerificationView(Figures):

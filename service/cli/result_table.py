@@ -152,6 +152,8 @@ def _certainty(job: ShownResult, mv_unit: str) -> Iterator[tuple[str, str, str]]
     if found is not None:
         yield "uncertainty of Ms", cell(found.uncertainty), "(2 std. dev.)"
         yield "Ms, other models", cell(found.ambiguity), "(max. diff.)"
+        if found.longest_delay_seen_s is not None:
+            yield "second path seen up to", cell(found.longest_delay_seen_s), "s later (30 % of the effect)"
         for load in found.loads:
             yield "load disturbance", f"{load.size:+.4g} at {load.t_s:.4g}", f"{mv_unit}, s into the test"
     if step is not None:

@@ -183,7 +183,7 @@ def _second_path(
     if reason is None:
         return Reason.AMBIGUOUS, f"the record looks as if {what}, as much as if a load disturbance had come"
     noise = fit.record.noise / fit.record.output_range
-    if second.gain > MIN_BIC_GAIN and second.rms <= max(MAX_RESIDUAL * noise, NEGLIGIBLE_RESIDUAL):
+    if second.share < 1.0 and second.gain > MIN_BIC_GAIN and second.rms <= max(MAX_RESIDUAL * noise, NEGLIGIBLE_RESIDUAL):
         detail = f"{detail}; the record looks as if {what}"
     return reason, detail
 

@@ -124,6 +124,7 @@ class EvaluationSummary:
     record, s.
     reason: the reason why the result is not good enough for a proposal, None if it is.
     detail: the sentence with the numbers behind that reason.
+    longest_delay_seen_s: how much later a second path of 30 % of MV's effect may act and still show in the record, s.
     """
 
     structure: str
@@ -141,6 +142,7 @@ class EvaluationSummary:
     period_s: float
     reason: Reason | None
     detail: str
+    longest_delay_seen_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,6 +227,7 @@ def evaluation_summary(evaluation: Evaluation) -> EvaluationSummary:
         period_s=record.period * record.Ts,
         reason=evaluation.reason,
         detail=evaluation.detail,
+        longest_delay_seen_s=evaluation.longest_delay_seen_s,
     )
 
 

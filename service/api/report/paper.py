@@ -344,6 +344,9 @@ def _model_rows(source: ReportSource, pv_unit: str) -> list[Row]:
         left = "–" if found.residual is None else f"{n.fixed(found.residual, 2)} times the noise at rest"
         rows.append(("not explained", left, False))
         rows.append(("excitation", f"{found.switches} switches or turns, {n.significant(found.period_s, 3)} s", False))
+        if (seen := found.longest_delay_seen_s) is not None:
+            text = f"would show up to {n.significant(seen, 3)} s later, with 30 % of the effect of MV; not a later one"
+            rows.append(("second path", text, True))
         rows += [("drift", "a steady drift of PV was found", False)] if found.drift else []
         for load in found.loads:
             text = f"{load.size:+.3g} % at {n.significant(load.t_s, 3)} s after the excitation began"

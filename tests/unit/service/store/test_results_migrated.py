@@ -44,7 +44,8 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
 
 def with_later_fields(golden: dict[str, Any]) -> dict[str, Any]:
     """The golden job with what is shown of it since: nobody has decided, a live test knows how fast it sampled, in
-    which mode it found the loop, and whether its gains were tried; it has no samples.
+    which mode it found the loop, and whether its gains were tried; it has no samples. How late a second path would have
+    shown is not known.
     Its advice is not stored, but today's for its reason."""
     advice = None if golden["reason"] is None else ADVICE[Reason(golden["reason"])]
     sample_time_s = None if golden["dry_run"] else 0.1
@@ -61,6 +62,7 @@ def with_later_fields(golden: dict[str, Any]) -> dict[str, Any]:
         "mode_found": None if golden["dry_run"] else "automatic",
         "tried": tried,
         "record": "none",
+        "evidence": golden["evidence"] and {**golden["evidence"], "longest_delay_seen_s": None},
     }
 
 

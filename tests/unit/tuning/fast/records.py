@@ -84,21 +84,39 @@ def record(
 
 
 def pulse_record(
-    bench: Bench, Kp: float, Ti: float, noise: float, below: float = 1.0, seed: int = 1
+    bench: Bench,
+    Kp: float,
+    Ti: float,
+    noise: float,
+    below: float = 1.0,
+    seed: int = 1,
+    end: float = 1.0,
+    share: float = 0.0,
+    later: float = 0.0,
+    load: float = 0.0,
+    periods: float = 3.0,
 ) -> ExperimentRecord:
     """Pulses of the set-point by 1 up, down and up, turned after 0.7 and 1.7 ultimate periods, over three periods.
 
-    below: the plant's gain below rest, as a part of that above.
+    below: the plant's gain below rest, as a part of that above.  end: the gain at the end over that at rest.
+    share, later: a second path, a part of the first one, ultimate periods later.  load: MV units, 1.3 periods
+    before the end.  periods: the length of the test.
     """
     plant = LinearPlant(bench.num, bench.den, bench.L, bench.Ts, noise_std=noise, seed=seed)
     channel = Channel(bench.Ts, Settings(-50.0, 50.0, 0.0), Parameters(Kp, Ti), 0.0, Mode.AUTOMATIC)
     period = ultimate_point(bench.model)[1] / bench.Ts
     u, y = [], []
-    for k in range(LISTENED + round(3.0 * period)):
+    samples = LISTENED + round(periods * period)
+    for k in range(samples):
         channel.setpoint = 0.0 if k < LISTENED else -1.0 if 0.7 < (k - LISTENED) / period < 1.7 else 1.0
+        if load and k == samples - round(1.3 * period):
+            plant.disturbance = load
         y.append(plant.pv)
         u.append(channel.step(y[-1]))
-        plant.step(u[-1] if u[-1] > 0.0 else below * u[-1])
+        gain = 1.0 + (end - 1.0) * max(k - LISTENED, 0) / (samples - LISTENED)
+        moved = u[-1] if u[-1] > 0.0 else below * u[-1]
+        before = k - round(later * period)
+        plant.step(gain * moved + (share * u[before] if share and before >= 0 else 0.0))
     at, pv = np.array(u), np.array(y)
     rest = slice(LISTENED)
     return ExperimentRecord(

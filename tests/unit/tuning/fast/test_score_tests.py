@@ -1,12 +1,14 @@
-"""The score tests of a plant that is not linear, on records of pulses of the set-point and of a relay."""
+"""The score tests of what else a plant may be, on records of pulses of the set-point and of a relay."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import pytest
 
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.evaluation import evaluate
-from loopwright.tuning.fast.score_tests import ScoreTests, above_rest, squared
+from loopwright.tuning.fast.score_tests import ScoreTests, above_rest, fading, late, squared
 from loopwright.tuning.fast.structure_choice import choose_structure
 from loopwright.tuning.identification.output_error import Fit
 from loopwright.tuning.reasons import Reason
@@ -60,3 +62,38 @@ def test_the_size_is_that_of_the_plant() -> None:
     fit = Fit(pulse_record(bench, 1.0, 10.0, noise=0.001, below=0.97))
     size, deviation = ScoreTests(fit, choose_structure(fit).best).score(above_rest)
     assert size == pytest.approx(0.03, abs=4.0 * deviation + 0.01)
+
+
+@pytest.mark.parametrize("end", [1.2, 1.3])
+@pytest.mark.parametrize("name", LOOPS)
+def test_a_gain_that_changes_in_the_course_of_the_test_is_seen_with_its_size(name: str, end: float) -> None:
+    fit = Fit(pulse_record(*LOOPS[name], noise=0.002, end=end))
+    size, deviation = ScoreTests(fit, choose_structure(fit).best).score(fading)
+    # the gain of the model is that of about the middle of the test
+    assert abs(size) > 4.0 * deviation and size / (end - 1.0) == pytest.approx(1.0, abs=0.4)
+    assert evaluate(fit.record, DesignSpec(1.6)).reason is not None
+
+
+def test_a_second_path_shows_until_about_the_end_of_the_record() -> None:
+    bench: Bench = FIRST
+    evaluation = evaluate(pulse_record(bench, 1.0, 10.0, noise=0.01), DesignSpec(1.6))
+    record = evaluation.fit.record
+    lasted_s = (len(record.y) - record.listened) * record.Ts
+    assert 0.5 * lasted_s < evaluation.longest_delay_seen_s < lasted_s
+
+
+def test_under_more_noise_a_second_path_has_to_come_earlier() -> None:
+    seen = []
+    for noise in (0.01, 0.3):
+        fit = Fit(pulse_record(FIRST, 1.0, 10.0, noise=noise))
+        seen.append(ScoreTests(fit, choose_structure(fit).best).longest_delay_seen())
+    assert seen[1] < seen[0]
+
+
+def test_mv_that_is_late_begins_each_piece_with_nothing() -> None:
+    record = pulse_record(FIRST, 1.0, 10.0, noise=0.01)
+    half = len(record.u) // 2
+    moved = late(40)(replace(record, lengths=(half, len(record.u) - half)))
+    assert moved[:40] == pytest.approx(0.0) and moved[half : half + 40] == pytest.approx(0.0)
+    assert moved[40:half] == pytest.approx(record.u[: half - 40])
+    assert moved[half + 40 :] == pytest.approx(record.u[half:-40])

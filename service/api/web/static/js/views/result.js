@@ -37,6 +37,7 @@ function trustWords(job) {
   const parts = [];
   if (job.verification) parts.push(html`The model explains <b>${fixed(job.verification.fit_pct, 1)} %</b> of the measured step. `);
   if (job.evidence) parts.push(html`Ms <b>${ms(job.predicted?.Ms ?? job.evidence.Ms)}</b>${known(job.evidence.uncertainty) ? html`, known to within ${msError(job.evidence.uncertainty)}` : ""}. `);
+  if (known(job.evidence?.longest_delay_seen_s)) parts.push(html`What MV does more than ${duration(job.evidence.longest_delay_seen_s)} later than the rest would not show in this test. `);
   if (job.tried === false) parts.push(html`The new gains were <b>never tried</b> on this loop. `);
   if (job.rehearsed_on) parts.push(html`Computed on ${job.rehearsed_on.plant_text}; the loop was not moved. `);
   if (job.after && !job.verification) parts.push(html`Measured with the new gains: overshoot <b>${fixed(job.after.overshoot_pct, 0)} %</b>, ${job.after.settled ? `settled in ${duration(job.after.settling_s)}` : "not settled"}. `);
