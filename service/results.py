@@ -179,8 +179,8 @@ class EvidenceView(Figures):
     detail: str = Field(description="The numbers behind the reason")
     longest_delay_seen_s: float | None = Field(
         default=None,
-        description="How much later a second path of 30 % of MV's effect may act and still show in the record, s; null: "
-        "not known, of a job of an earlier version",
+        description="How much later a second path of 30 % of MV's effect may act and still show in the record, s; "
+        "null: not known, of a job of an earlier version",
         examples=[48.0],
     )
 

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass, replace
 
 from loopwright.tuning.fast.design import DesignSpec, GainDesign, OptimalGains
+from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.fast.score_tests import ScoreTests
 from loopwright.tuning.fast.second_path import find_second_path
-from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.fast.structure_choice import RIVAL_BIC, StructureChoice, choose_structure
 from loopwright.tuning.fast.uncertainty import difference_of_rivals, durbin_watson_ratio, peak, uncertainty_of_Ms
 from loopwright.tuning.fast.valve_faults import find_valve_fault

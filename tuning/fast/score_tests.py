@@ -54,7 +54,7 @@ def squared(record: ExperimentRecord) -> Reals:
 
 
 def fading(record: ExperimentRecord) -> Reals:
-    """MV times a factor that grows from 0 at the end of the rest to 1 at the end of the record, MV units, shape (N,)."""
+    """MV times a factor that grows from 0 at the end of the rest to 1 at the end of the record, shape (N,)."""
     grown = np.clip(np.arange(len(record.u)) - record.listened, 0.0, None)
     return np.asarray(record.u * grown / max(float(grown[-1]), 1.0))
 
