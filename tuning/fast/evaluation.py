@@ -182,8 +182,8 @@ def _second_path(
     what = f"{100.0 * second.share:.0f} % of MV's effect came {second.later_s:.3g} s later than the rest"
     if reason is None:
         return Reason.AMBIGUOUS, f"the record looks as if {what}, as much as if a load disturbance had come"
-    noise = fit.record.noise / fit.record.output_range
-    if second.share < 1.0 and second.gain > MIN_BIC_GAIN and second.rms <= max(MAX_RESIDUAL * noise, NEGLIGIBLE_RESIDUAL):
+    explained = max(MAX_RESIDUAL * fit.record.noise / fit.record.output_range, NEGLIGIBLE_RESIDUAL)
+    if second.share < 1.0 and second.gain > MIN_BIC_GAIN and second.rms <= explained:
         detail = f"{detail}; the record looks as if {what}"
     return reason, detail
 
