@@ -11,7 +11,8 @@ import numpy as np
 from benchmarks.cases import ASKED
 from benchmarks.command import check_names
 from benchmarks.drawn_runs import Draw, run_all, saved
-from benchmarks.trouble.cases import TROUBLES, trouble_plants
+from benchmarks.trouble.kinds import TROUBLES
+from benchmarks.trouble.plants import trouble_plants
 from benchmarks.trouble.runs import TroubledRun, measure
 from benchmarks.tuning import some
 

@@ -13,8 +13,9 @@ from benchmarks.cases import ASKED
 from benchmarks.drawn_runs import Draw, DrawNames
 from benchmarks.operation import present_gains
 from benchmarks.plants import SAMPLES_PER_PERIOD, Plant
-from benchmarks.trouble.cases import TROUBLES, Trouble
+from benchmarks.trouble.cases import Trouble
 from benchmarks.trouble.chain import Chain, Setting
+from benchmarks.trouble.kinds import TROUBLES
 from benchmarks.tuning import T95_PERIODS, span_of
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
@@ -33,7 +34,7 @@ from loopwright.tuning.reasons import Ended
 PRESENT = "typical"
 """The gains in effect under pulses of the set-point: Ms 1.3 to 2 on the plant without trouble."""
 ROOM = 10.0
-"""MV's limits under pulses of the set-point, permitted steps."""
+"""MV's limits under pulses of the set-point, in what the permitted step needs, at rest or at once by Kp."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +86,7 @@ def measure(given: Draw) -> TroubledRun:
     """given: its second is the procedure."""
     plant, method, case, seed = given
     trouble = TROUBLES[case]
-    plant = replace(plant, samples=trouble.samples)
+    plant = replace(trouble.of(plant), samples=trouble.samples)
     begun = time.process_time()
     process, ran, ended, stages = _run(plant, method, trouble, seed)
     seconds = time.process_time() - begun
@@ -105,7 +106,8 @@ def _run(
     step = trouble.amplitude
     if method == SETPOINT:
         random = np.random.default_rng([seed, len(plant.name), int(1e6 * plant.Pu)])
-        gains, noise, deviation, limit = present_gains(plant, PRESENT, random), trouble.noise * step, step, ROOM * step
+        gains, noise, deviation = present_gains(plant, PRESENT, random), trouble.noise * step, step
+        limit = ROOM * step * max(1.0, gains.Kp)
     else:
         span = step * span_of(replace(plant, samples=SAMPLES_PER_PERIOD))
         # a step that the preflight can tell from the noise

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from benchmarks.plants import Plant
-from benchmarks.trouble.cases import plain, trouble_plants
+from benchmarks.trouble.cases import build
 from benchmarks.trouble.chain import Chain, Part, Parts, Setting
+from benchmarks.trouble.plants import trouble_plants
 from benchmarks.trouble.processes import DriftingGain, Recirculation, SecondPath, linear
 from benchmarks.trouble.response import Response, delayed, gain, judged, rational, series
 from loopwright.tuning.analysis.margins import margins
@@ -105,7 +106,7 @@ def test_gains_are_judged_on_the_worst_linearisation() -> None:
             return [gain(1.0), gain(1.4)]
 
     gains = Gains(0.4 * PLANT.Ku, PLANT.Pu)
-    once = Chain(setting(), plain).worst(gains)
+    once = Chain(setting(), build()).worst(gains)
     steep = Chain(setting(), lambda given: Parts([Steep(), linear(given)], []))
     assert steep.worst(gains).Ms == pytest.approx(
         margins(TransferFunction((1.4,), PLANT.den, PLANT.L + 0.5 * PLANT.Ts), gains).Ms, rel=1e-4
