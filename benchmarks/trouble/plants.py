@@ -13,7 +13,7 @@ from benchmarks.plants import Plant, plant_of
 from loopwright.tuning.models import TransferFunction
 
 MODES = 10
-"""Of a rod: its slowest, by which it is simulated."""
+"""Of a rod: its slowest, by which it is simulated; the faster ones are a dead time."""
 
 
 @cache
@@ -52,19 +52,23 @@ def antiresonant(plant: Plant, frequency: float, damping: float, apart: float) -
 
 
 def rod(plant: Plant, kind: str) -> Plant:
-    """Heat along a rod of diffusion time 1 s, by the products of its slowest modes; a tenth of the plant's dead time
-    more.
+    """Heat along a rod of diffusion time 1 s, by the product of its modes; a tenth of the plant's dead time more.
 
     cosh: 1/cosh(sqrt(s)), the far end of an insulated rod.  mid, near: cosh(x sqrt(s))/cosh(sqrt(s)), x 0.5 and 0.8 of
     the rod from that end.  tanh: tanh(sqrt(s))/sqrt(s), where the heat enters.
     """
     k = np.arange(1, MODES + 1)
     poles = ((k - 0.5) * math.pi) ** 2
-    zeros = {
-        "cosh": poles[:0], "mid": poles[:-1] / 0.5**2, "near": poles[:-1] / 0.8**2, "tanh": (k[:-1] * math.pi) ** 2,
-    }[kind]  # fmt: skip
-    num, den = (np.poly(-roots) / np.prod(roots) for roots in (zeros, poles))
-    return plant_of(plant.name, TransferFunction(tuple(num), tuple(den), 0.1 * plant.L))
+    # the zeros, and the sum of the time constants of all of them: those of the poles make 1/2
+    zeros, leads_s = {
+        "cosh": (poles[:0], 0.0),
+        "mid": (poles[:-1] / 0.5**2, 0.5**3),
+        "near": (poles[:-1] / 0.8**2, 0.5 * 0.8**2),
+        "tanh": ((k[:-1] * math.pi) ** 2, 1.0 / 6.0),
+    }[kind]
+    faster_s = (0.5 - float(np.sum(1.0 / poles))) - (leads_s - float(np.sum(1.0 / zeros)))
+    num, den = (np.atleast_1d(np.poly(-roots) / np.prod(roots)) for roots in (zeros, poles))
+    return plant_of(plant.name, TransferFunction(tuple(num), tuple(den), 0.1 * plant.L + max(faster_s, 0.0)))
 
 
 def _with(plant: Plant, num: Iterable[float], den: Iterable[float]) -> Plant:

@@ -130,9 +130,9 @@ def steep_middle(slope: float, width: float, off: float) -> Characteristic:
 
     def slopes(low: float, high: float) -> list[float]:
         seen = []
-        if low + off < width and high + off > -width:
+        if low + off <= width and high + off >= -width:
             seen.append(slope)
-        if low + off < -width or high + off > width:
+        if low + off <= -width or high + off >= width:
             seen.append(1.0)
         return seen
 
