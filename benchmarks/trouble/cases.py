@@ -23,7 +23,7 @@ class Trouble:
     build: the parts of its plant.  of: the plant that it makes of one of the three.  later: it acts later than the
     record: what the test shows is not all of it.  noise: of the span.
     substeps: of the parts before the sensor, in a sample.  samples: in Pu.
-    amplitude: of the relay, and the permitted step of the set-point, percent.
+    amplitude: of the relay's higher side, percent; half of it is the permitted step of the set-point.
     """
 
     kind: str
@@ -34,7 +34,7 @@ class Trouble:
     noise: float = NOISE
     substeps: int = 1
     samples: int = SAMPLES_PER_PERIOD
-    amplitude: float = 5.0
+    amplitude: float = 10.0
 
     @property
     def name(self) -> str:

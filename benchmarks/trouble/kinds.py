@@ -115,8 +115,8 @@ def actuators() -> Iterator[Trouble]:
     for band in (0.2, 0.5, 1, 2):
         yield Trouble("stiction", f"S = J = {band:g} % of MV", build(before=partial(valves.Stiction, band=band)))
     for part in (0.3, 0.5, 0.7, 0.9):
-        made = build(before=_alone(valves.ends, -100.0, 5.0 * part))
-        yield Trouble("valve ends", f"{5.0 * part:g} % above rest", made)
+        made = build(before=_alone(valves.ends, -100.0, 10.0 * part))
+        yield Trouble("valve ends", f"{10.0 * part:g} % above rest", made)
     for part in (0.2, 0.5):
         made = build(before=_alone(valves.ends, -5.0 * part, 100.0))
         yield Trouble("valve ends", f"{5.0 * part:g} % below rest", made)

@@ -103,16 +103,16 @@ def _run(
     plant: Plant, method: str, trouble: Trouble, seed: int
 ) -> tuple[Chain, Gains | None, Ended | None, dict[str, float]]:
     """The plant after the run, the gains proposed, why there are none, and the plant time of each stage, s."""
-    step = trouble.amplitude
     if method == SETPOINT:
+        step = 0.5 * trouble.amplitude
         random = np.random.default_rng([seed, len(plant.name), int(1e6 * plant.Pu)])
         gains, noise, deviation = present_gains(plant, PRESENT, random), trouble.noise * step, step
         limit = ROOM * step * max(1.0, gains.Kp)
     else:
-        span = step * span_of(replace(plant, samples=SAMPLES_PER_PERIOD))
+        span = trouble.amplitude * span_of(replace(plant, samples=SAMPLES_PER_PERIOD))
         # a step that the preflight can tell from the noise
         deviation = span * max(0.5, 12.0 * trouble.noise)
-        gains, noise, limit = Gains(0.15 * plant.Ku, 2.0 * plant.Pu), trouble.noise * span, 2.0 * step
+        gains, noise, limit = Gains(0.15 * plant.Ku, 2.0 * plant.Pu), trouble.noise * span, 2.0 * trouble.amplitude
     process = Chain(Setting(plant, trouble.substeps, noise, seed), trouble.build)
     settings = Settings(mv_low=-limit, mv_high=limit, pv_low=-1e9, pv_high=1e9, reverse=True)
     channel = Channel(plant.Ts, settings, Parameters(gains.Kp, gains.Ti), 0.0, int(Mode.AUTOMATIC), 0.0)
@@ -122,7 +122,7 @@ def _run(
     if method == SETPOINT:
         plan = setpoint(facts, DesignOptions(ASKED, propose_anyway=True))
     else:
-        plan = fast(facts, FastOptions(ASKED, amplitude=step, propose_anyway=True))
+        plan = fast(facts, FastOptions(ASKED, amplitude=trouble.amplitude, propose_anyway=True))
     loop = TroubledLoop(process, channel, plant.Ts)
     result = run(plan, loop, limits=RunLimits(max_time_s=100.0 * plant.Pu))
     return process, result.value.gains if result.value else None, result.ended, result.plant_time_s
