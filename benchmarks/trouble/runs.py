@@ -24,11 +24,12 @@ from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.execution.runner import run
 from loopwright.tuning.experiments.preflight import PREFLIGHT, SETTLE
 from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.fast.manual_procedure import MANUAL, by_manual
 from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.procedure import FastOptions, FastProposal, fast
-from loopwright.tuning.fast.setpoint_procedure import SETPOINT, setpoint
+from loopwright.tuning.fast.procedure import FAST, FastOptions, FastProposal, fast
+from loopwright.tuning.fast.setpoint_procedure import setpoint
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.plan import Command, Mode, Plan, Sample, SetGains, SetMode, SetSetpoint
+from loopwright.tuning.plan import Command, Mode, Plan, Sample, SetGains, SetMode, SetOutput, SetSetpoint
 from loopwright.tuning.reasons import Ended
 
 PRESENT = "typical"
@@ -73,8 +74,10 @@ class TroubledLoop(RehearsedLoop):
         self._process, self._begun = process, False
 
     def step(self, commands: Sequence[Command]) -> Sample:
-        tests = any(isinstance(each, SetSetpoint) or each == SetMode(Mode.EXPERIMENT) for each in commands)
-        if tests and not self._begun:
+        begins = any(
+            isinstance(each, SetSetpoint | SetOutput) or each == SetMode(Mode.EXPERIMENT) for each in commands
+        )
+        if begins and not self._begun:
             self._begun = True
             self._process.begin()
         if any(isinstance(each, SetGains) for each in commands):
@@ -103,7 +106,7 @@ def _run(
     plant: Plant, method: str, trouble: Trouble, seed: int
 ) -> tuple[Chain, Gains | None, Ended | None, dict[str, float]]:
     """The plant after the run, the gains proposed, why there are none, and the plant time of each stage, s."""
-    if method == SETPOINT:
+    if method != FAST:
         step = 0.5 * trouble.amplitude
         random = np.random.default_rng([seed, len(plant.name), int(1e6 * plant.Pu)])
         gains, noise, deviation = present_gains(plant, PRESENT, random), trouble.noise * step, step
@@ -115,14 +118,16 @@ def _run(
         gains, noise, limit = Gains(0.15 * plant.Ku, 2.0 * plant.Pu), trouble.noise * span, 2.0 * trouble.amplitude
     process = Chain(Setting(plant, trouble.substeps, noise, seed), trouble.build)
     settings = Settings(mv_low=-limit, mv_high=limit, pv_low=-1e9, pv_high=1e9, reverse=True)
-    channel = Channel(plant.Ts, settings, Parameters(gains.Kp, gains.Ti), 0.0, int(Mode.AUTOMATIC), 0.0)
+    mode = Mode.MANUAL if method == MANUAL else Mode.AUTOMATIC
+    channel = Channel(plant.Ts, settings, Parameters(gains.Kp, gains.Ti), 0.0, int(mode), 0.0)
     facts = Facts(plant.Ts, T95_PERIODS * plant.Pu, -limit, limit, deviation, gains, True)
     # what is judged is the design, whatever it is worth beside the gains that the loop has to begin with
     plan: Plan[FastProposal]
-    if method == SETPOINT:
-        plan = setpoint(facts, DesignOptions(ASKED, propose_anyway=True))
-    else:
+    options = DesignOptions(ASKED, propose_anyway=True)
+    if method == FAST:
         plan = fast(facts, FastOptions(ASKED, amplitude=trouble.amplitude, propose_anyway=True))
+    else:
+        plan = by_manual(facts, options, MANUAL) if method == MANUAL else setpoint(facts, options)
     loop = TroubledLoop(process, channel, plant.Ts)
     result = run(plan, loop, limits=RunLimits(max_time_s=100.0 * plant.Pu))
     return process, result.value.gains if result.value else None, result.ended, result.plant_time_s
