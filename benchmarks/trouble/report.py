@@ -80,10 +80,11 @@ def is_trouble(names: str) -> bool:
 
 def runs(given: argparse.Namespace) -> Iterator[TroubledRun]:
     """The runs asked for: those that the file holds, and the others, on so many processes."""
+    # a batch that is stopped leaves all cases with fewer seeds
     todo: list[Draw] = [
         (plant, given.method, case, seed)
-        for case in cases_of(given.cases)
         for seed in given.seeds
+        for case in cases_of(given.cases)
         for plant in some(trouble_plants(), given)
     ]
     return run_all(TroubledRun, measure, todo, given.save, given.processes)
