@@ -57,6 +57,8 @@ def beside_the_record() -> Iterator[Trouble]:
         yield Trouble("recirculation", f"{share:g} comes back {LATER} Pu later", made, later=True, substeps=4)
     for T in (20.0, 100.0):
         yield Trouble("slow lag", f"{T:g} s in series", build(), partial(plants.slower_lag, T_s=T))
+        short = partial(plants.slower_lag, T_s=T, dead_time=0.1)
+        yield Trouble("slow lag", f"{T:g} s in series, a tenth of the dead time", build(), short)
     for share in (0.3, 0.6):
         creeps = partial(plants.creep, share=share, T_s=100.0)
         yield Trouble("slow lag", f"{share:g} of the effect through 100 s", build(), creeps, later=True)

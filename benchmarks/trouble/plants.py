@@ -26,9 +26,9 @@ def trouble_plants() -> tuple[Plant, ...]:
     )
 
 
-def slower_lag(plant: Plant, T_s: float) -> Plant:
-    """With one more lag in series."""
-    return _with(plant, plant.num, np.convolve(plant.den, (T_s, 1.0)))
+def slower_lag(plant: Plant, T_s: float, dead_time: float = 1.0) -> Plant:
+    """With one more lag in series, and so many times the dead time."""
+    return _with(replace(plant, L=dead_time * plant.L), plant.num, np.convolve(plant.den, (T_s, 1.0)))
 
 
 def creep(plant: Plant, share: float, T_s: float) -> Plant:

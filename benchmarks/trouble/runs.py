@@ -44,6 +44,7 @@ class TroubledRun:
 
     passed: from the beginning of the test, Pu.  seconds: of processor.  reason: why nothing was proposed, None if
     something was.  Ms: of the worst linearisation, None where that is unstable or nothing was proposed.
+    Kp, Ti (s): what was proposed.
     """
 
     case: str
@@ -55,6 +56,8 @@ class TroubledRun:
     reason: str | None = None
     detail: str = ""
     Ms: float | None = None
+    Kp: float | None = None
+    Ti: float | None = None
 
     @property
     def draw(self) -> DrawNames:
@@ -99,7 +102,7 @@ def measure(given: Draw) -> TroubledRun:
         assert ended is not None
         return replace(found, reason=ended.reason.value, detail=ended.detail)
     worst = process.worst(ran)
-    return replace(found, Ms=worst.Ms if worst.stable else None)
+    return replace(found, Ms=worst.Ms if worst.stable else None, Kp=ran.Kp, Ti=ran.Ti)
 
 
 def _run(
