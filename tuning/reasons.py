@@ -43,6 +43,7 @@ class Reason(StrEnum):
     UNCERTAIN = "uncertain"
     AMBIGUOUS = "ambiguous"
     MODEL_MISMATCH = "model_mismatch"
+    CONTROLLER_MISMATCH = "controller_mismatch"
     DIVERGES = "diverges"
     LOCKED = "locked"
     # no gain
@@ -111,6 +112,8 @@ ADVICE: dict[Reason, str] = {
     Reason.AMBIGUOUS: "Several models explain the record and disagree: permit more MV, or retune in a steady time.",
     Reason.MODEL_MISMATCH: "The loop behaved differently under the new gains than before: look for changes of "
     "the load or of the plant, then retune.",
+    Reason.CONTROLLER_MISMATCH: "The controller does not do what its gains say: correct in its settings, or in the "
+    "gains that are stored for it, what the message names, then retune.",
     Reason.DIVERGES: "PV ran away under the new gains, which were taken back: keep the present gains, and repeat.",
     Reason.LOCKED: "Somebody has locked the loop: ask them, or unlock it (loopwright unlock TAG), then ask again.",
     Reason.NO_GAIN: "The loop is already tuned as well as asked: nothing needs to be done. For a faster or a more "

@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from loopwright.tuning.experiments.controller_mismatch import check_law_at_rest
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, record
 from loopwright.tuning.plan import Mode, Note, Plan, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
@@ -46,7 +47,7 @@ def at_rest(
     min_samples: the smallest number of samples of a check.
     mode: the mode that the test needs, automatic or manual. In manual the set-point drives nothing: it may be
     anywhere, and may move.
-    Raises Refused: WRONG_MODE, SETPOINT_IS_DRIVEN, NOT_AT_REST, NOISE_TOO_HIGH, SATURATED.
+    Raises Refused: WRONG_MODE, SETPOINT_IS_DRIVEN, NOT_AT_REST, NOISE_TOO_HIGH, SATURATED, CONTROLLER_MISMATCH.
     """
     once_s = facts.T95_s / 2
     begin = (StageStarted(PREFLIGHT, once_s, after_s),)
@@ -107,5 +108,7 @@ def check_at_rest(
             f"within {trace.t[-1] - trace.t[0]:.3g} s PV drifted by {drift:+.3g}, {off}varies by {spread:.3g} "
             f"(noise {noise:.3g}); the step would be {step:.3g}",
         )
+    if by_setpoint:
+        check_law_at_rest(facts, trace)
     room = min(room, 0.5 * facts.mv_step_max)
     return OperatingPoint(sample.sp, float(pv.mean()), float(mv.mean()), noise, room), trace

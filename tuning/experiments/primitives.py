@@ -104,12 +104,17 @@ class OperatingPoint:
 
 @dataclass(slots=True)
 class Trace:
-    """Consecutive samples as columns; t is plant time in s."""
+    """Consecutive samples as columns; t is plant time in s.
+
+    mode: the mode of the controller. filled: the samples that were lost, and are interpolated.
+    """
 
     t: list[float] = field(default_factory=list)
     sp: list[float] = field(default_factory=list)
     pv: list[float] = field(default_factory=list)
     mv: list[float] = field(default_factory=list)
+    mode: list[int] = field(default_factory=list)
+    filled: list[int] = field(default_factory=list)
 
     def add(self, sample: Sample) -> None:
         """Appends a sample."""
@@ -117,6 +122,7 @@ class Trace:
         self.sp.append(sample.sp)
         self.pv.append(sample.pv)
         self.mv.append(sample.mv)
+        self.mode.append(sample.mode)
 
     def __len__(self) -> int:
         return len(self.t)

@@ -7,8 +7,10 @@ from typing import TypeVar
 
 import numpy as np
 
+from loopwright.tuning.experiments.control_record import ControlRecord, control_record
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace
 from loopwright.tuning.fast.record import ExperimentRecord, noise_of
+from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Reals
 from loopwright.tuning.plan import Command, Event, Plan, Sample, SetSetpoint, Work
 from loopwright.tuning.reasons import Reason, Refused
@@ -38,6 +40,7 @@ class Experiment:
         self._steps: list[int] = []
         self._commands: tuple[Command, ...] = ()
         self._step = 0.0
+        self._gains_tried: Gains | None = None
 
     @property
     def stepped(self) -> tuple[float, float]:
@@ -70,6 +73,20 @@ class Experiment:
         rest = slice(0, self.listened)
         mv, pv = np.asarray(self.trace.mv), np.asarray(self.trace.pv)
         return mv - float(np.mean(mv[rest])), pv - float(np.mean(pv[rest]))
+
+    def _control(self) -> ControlRecord:
+        """What the record so far shows of the controller.
+
+        New gains are in effect once the set-point, which is commanded after them, has moved: a command may be late.
+        """
+        facts, trace, samples = self.facts, self.trace, len(self.trace)
+        if self._gains_tried is None or not self._steps:
+            return control_record(facts, trace, [(0, samples, facts.old_gains)])
+        moved = np.flatnonzero(np.diff(trace.sp[self._steps[0] - 1 :]))
+        begun = self._steps[0] + int(moved[0]) if len(moved) else samples
+        return control_record(
+            facts, trace, [(0, self.excited, facts.old_gains), (begun, samples, self._gains_tried)]
+        )
 
     @property
     def _direction(self) -> float:
@@ -106,6 +123,7 @@ class Experiment:
         t, pv = trace.t[-1], trace.pv[-1]
         for k in range(1, lost + 1):
             between = pv + (sample.pv - pv) * k / (lost + 1)
+            trace.filled.append(len(trace))
             trace.add(sample._replace(t=t + k * Ts, pv=between, mv=trace.mv[-1]))
         trace.add(sample)
 

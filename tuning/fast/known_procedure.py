@@ -9,7 +9,7 @@ has changed since shows there: in the residual, in the models of both records, a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from loopwright.tuning.analysis.comparison import Comparison
@@ -108,6 +108,7 @@ class KnownTrial(Experiment):
         self._period = model_period
         self._follow_s = VERIFICATION_PERIODS * model_period
         self.excited = len(self.trace)
+        self._gains_tried = gains
         commands = (*self._commands, SetGains(gains), SetSetpoint(self.point.sp + self._step))
         self._commands = ()
         yield from self._follow(commands, size, FARTHEST)
@@ -121,7 +122,8 @@ class KnownTrial(Experiment):
         """The record of operation with the step as its last piece."""
         rest = max(round(REST_PERIODS * self._period / self.facts.sample_time_s), 2 * self._known.together)
         first = max(self._steps[0] - rest, 0)
-        return self._known.with_trial(self.trace, first, self._steps, self._known.record.period)
+        record = self._known.with_trial(self.trace, first, self._steps, self._known.record.period)
+        return replace(record, control=self._control())
 
     def _on_sample(self, sample: Sample) -> tuple[Command, ...]:
         self._add(sample)
@@ -191,6 +193,8 @@ def _tried(
         refused = raised
     outdated = refused.detail if refused is not None and refused.reason in OUTDATED else None
     yield from test.report(StageDone(TRIAL, _figures(known, test, tested, looked, outdated)))
+    if refused is not None and refused.reason is Reason.CONTROLLER_MISMATCH:
+        raise refused
     if refused is not None:
         yield (SetGains(facts.old_gains), SetSetpoint(test.point.sp))
         raise ObservedPlantFails(refused.reason, refused.detail, moved=True)

@@ -116,7 +116,7 @@ def by_relay(facts: Facts, options: FastOptions, experiment: RelayTest) -> Plan[
             evaluation, outcome = yield from experiment.computed(partial(evaluated, facts, options, record))
         except Refused as refused:
             outcome = refused
-        if isinstance(outcome, Comparison) or not in_time:
+        if isinstance(outcome, Comparison) or not in_time or outcome.reason is Reason.CONTROLLER_MISMATCH:
             break
         yield from experiment.report(Note(f"after {switches} switches: {outcome.detail}"))
     # the evaluation is reported even if the record is refused: its numbers say why

@@ -19,6 +19,7 @@ from loopwright.tuning.analysis.comparison import (
 from loopwright.tuning.analysis.margins import Ultimate, margins, ultimate_point
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.step_test import StepResult
+from loopwright.tuning.fast.controller_effect import note_of
 from loopwright.tuning.fast.design import DesignSpec, OptimalGains
 from loopwright.tuning.fast.evaluation import Evaluation
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
@@ -350,6 +351,8 @@ def proposed(
             f"{moved} was moved {facts.directions} only. A gain of the plant that differs above and below where "
             f"the test began cannot be seen in such a record: the gains hold for the side that was tested."
         )
+    if (note := note_of(evaluation)) is not None:
+        notes.append(note)
     if found.drift:
         notes.append("PV drifted at a steady rate during the test; this was allowed for.")
     return FastProposal(

@@ -177,7 +177,7 @@ class PulseTest(Experiment):
         output_range = self.experiment_record().output_range
         self._step = point.sp - self.trace.sp[-1]
         self.excited = len(self.trace)
-        self._gains = gains
+        self._gains = self._gains_tried = gains
         self._commands = ()
         yield from self._follow((SetGains(gains), SetSetpoint(point.sp)), output_range)
 
@@ -204,6 +204,7 @@ class PulseTest(Experiment):
             steps=tuple(self._steps),
             excitation=Excitation.SETPOINT,
             one_sided=self.facts.one_sided,
+            control=self._control(),
         )
 
     def figures(self) -> PulseFigures:

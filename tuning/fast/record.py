@@ -9,6 +9,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from loopwright.tuning.experiments.control_record import ControlRecord
 from loopwright.tuning.identification.output_error import averaged
 from loopwright.tuning.models import Reals
 from loopwright.tuning.reasons import Reason, Refused
@@ -58,6 +59,7 @@ class ExperimentRecord:
     lengths: the number of samples of each piece of the record, where there are several: the time at rest, then each
     set-point change of normal operation. MV and PV are deviations from the rest before each change.
     one_sided: whether the set-point went to one side of its rest only.
+    control: what the record shows of the controller; None where it is not known.
     held_s: the time for which the controller holds MV, s; None where it is the sample time.
     Raises Refused: BAD_INPUT, NO_RESPONSE.
     """
@@ -75,6 +77,7 @@ class ExperimentRecord:
     lengths: tuple[int, ...] = ()
     held_s: float | None = None
     one_sided: bool = False
+    control: ControlRecord | None = None
 
     @property
     def sampling_delay_s(self) -> float:

@@ -131,6 +131,7 @@ class RelayTest(Experiment):
         output_range = self.experiment_record().output_range
         size = min(0.5 * output_range, self.amplitude / gains.Kp, facts.sp_deviation)
         self.excited = len(self.trace)
+        self._gains_tried = gains
         self._commands = ()
         # A bumpless transfer from the relay would start the integral at the relay's output, which acts like a load
         # disturbance. The output is set to the proportional part first, so that the integral starts at rest.
@@ -155,6 +156,7 @@ class RelayTest(Experiment):
             turns=len(self.switches),
             period=oscillation_period(self.switches),
             steps=tuple(self._steps),
+            control=self._control(),
         )
 
     def _on_sample(self, sample: Sample) -> tuple[Command, ...]:

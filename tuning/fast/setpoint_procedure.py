@@ -127,6 +127,8 @@ def by_pulses(
         test.period = look.period
         if settled(look, last, looked_at, options.Ms):
             break
+        if look.refusal is not None and look.refusal.reason is Reason.CONTROLLER_MISMATCH:
+            break
         own = look.period
         longest = min(
             max(MAX_PERIODS * own, MAX_T95 * facts.T95_s / facts.sample_time_s, MAX_TURNS * turned_at),

@@ -1,0 +1,332 @@
+"""The controller check: the law that the device is said to have, run on the recorded set-point and PV, gives the MV.
+
+Each piece of the record has a constant of its own (the integral before it is not known) and a start of filter and
+derivative of its own; both are projected out. What is left of MV less the computed one is the deviation. Where it is
+more than rounding, the laws of `control_law` are tried one by one; of a law with a size the size is fitted (least
+squares) with its standard deviation, the variance widened for what is left that is not white.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from loopwright.tuning.experiments.control_law import Alternative, ControlLaw, Deviation, alternatives
+from loopwright.tuning.experiments.control_record import REAL32, ControlPiece, ControlRecord
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.models import Reals
+
+EXACT = 5.0
+"""What may be left between MV and the computed one as rounding of REAL32 values, in their rounding errors."""
+SHIFTS = (0, 1, -1)
+"""Samples by which the recorded MV may be later than the PV that it answers: values that are not of one instant."""
+EXPLAINED = 0.5
+"""An alternative explains the record where it leaves this part of the deviation at most."""
+AS_GOOD = 1.5
+"""An alternative without a size is named rather than one with, where it leaves so many times as much at most."""
+LAWS_TRIED_ON = 4000
+"""Number of samples on which alternatives are tried at most: the latest ones."""
+STEP_OF_SIZE = 1e-4
+CLEAR = 5.0
+"""Standard deviations by which a size has to differ from the law as said."""
+
+
+@dataclass(frozen=True, slots=True)
+class OtherLaw:
+    """The law that fits in place of the one that the device is said to have.
+
+    kind: in what it differs.
+    size, deviation: its size and the standard deviation of that: a factor, a filter's time constant (s) or a weight;
+    None for a form, which has none.
+    left: what it leaves of the deviation of MV, in the motion of MV.
+    """
+
+    kind: Deviation
+    size: float | None
+    deviation: float | None
+    left: float
+
+
+@dataclass(frozen=True, slots=True)
+class ControllerCheck:
+    """How far the recorded MV is from the one that the said law gives.
+
+    samples: the number of samples compared.
+    away: the rms of the difference, in the rms of MV's motion; 0 where MV did not move.
+    rounded: the same of the steps in which MV and PV are recorded.
+    exact: whether the difference is no more than the rounding of REAL32 values.
+    other: the law that fits instead, None where none does or none is needed.
+    gain_error, integral_error, filter_error_s: the smallest factors (less 1) and the shortest filter of PV, s, that
+    would show in the record, as one standard deviation; infinite where nothing would.
+    """
+
+    samples: int
+    away: float
+    rounded: float
+    exact: bool
+    other: OtherLaw | None
+    gain_error: float
+    integral_error: float
+    filter_error_s: float
+
+
+def check_controller(record: ControlRecord) -> ControllerCheck:
+    """Compares the recorded MV with what the said law makes of set-point and PV, and finds what fits instead."""
+    if not record.pieces:
+        return ControllerCheck(0, 0.0, 0.0, True, None, math.inf, math.inf, math.inf)
+    whole = _Comparison(record.pieces, record.Ts, record.reverse)
+    left = whole.left(ControlLaw)
+    rounding = whole.rounding
+    if left.rms <= EXACT * rounding:
+        return _checked(whole, left, True, None, max(left.rms, rounding))
+    part = _Comparison(_latest(record.pieces), record.Ts, record.reverse)
+    shift = min(SHIFTS, key=lambda each: (part.left(ControlLaw, each).rms, abs(each)))
+    before = part.left(ControlLaw, shift)
+    other, rest = _other(part, before, shift)
+    return _checked(part, before, False, other, max(rest, rounding))
+
+
+def _checked(
+    compared: _Comparison, left: _Left, exact: bool, other: OtherLaw | None, error: float
+) -> ControllerCheck:
+    said = compared.pieces[-1].gains
+    motion = left.motion
+    gain = compared.response(lambda g: ControlLaw(_times(g, Kp=1.0 + STEP_OF_SIZE)), STEP_OF_SIZE)
+    integral = compared.response(lambda g: ControlLaw(_times(g, Ti=1.0 + STEP_OF_SIZE)), STEP_OF_SIZE)
+    short = compared.Ts
+    filtered = compared.response(lambda g: ControlLaw(g, short), short)
+    return ControllerCheck(
+        samples=compared.samples,
+        away=left.rms / motion if motion > 0.0 else 0.0,
+        rounded=compared.quantum / motion if motion > 0.0 else 0.0,
+        exact=exact,
+        other=other,
+        gain_error=error / gain if gain > 0.0 else math.inf,
+        integral_error=(error / integral if integral > 0.0 else math.inf) if said.Ti > 0.0 else 0.0,
+        filter_error_s=error / filtered if filtered > 0.0 else math.inf,
+    )
+
+
+def _times(gains: Gains, Kp: float = 1.0, Ti: float = 1.0) -> Gains:
+    return Gains(Kp * gains.Kp, Ti * gains.Ti, gains.Td, gains.Tf, gains.b, gains.c)
+
+
+@dataclass(frozen=True, slots=True)
+class _Left:
+    """What a law leaves. rms: of the difference, motion: of MV without the starts, MV units. ratio: the variance
+    inflation for what is not white, see `durbin_watson`."""
+
+    rms: float
+    motion: float
+    ratio: float
+
+
+LawOf = Callable[[Gains], ControlLaw | None]
+
+
+class _Comparison:
+    """Recorded and computed MV, piece by piece, without the starts of the pieces."""
+
+    def __init__(self, pieces: Sequence[ControlPiece], Ts: float, reverse: bool) -> None:
+        self.pieces, self.Ts, self._reverse = pieces, Ts, reverse
+        self._starts: dict[tuple[int, tuple[float, ...]], Reals] = {}
+
+    @property
+    def samples(self) -> int:
+        return sum(len(each.mv) for each in self.pieces)
+
+    @property
+    def rounding(self) -> float:
+        """The rounding error of REAL32 values, MV units: of MV, and of PV and set-point by the gain."""
+        return REAL32 * max(
+            float(np.abs(each.mv).max())
+            + each.gains.Kp * float(np.abs(each.pv).max() + (1.0 + abs(each.gains.b)) * np.abs(each.sp).max())
+            for each in self.pieces
+        )
+
+    @property
+    def quantum(self) -> float:
+        """The standard deviation of the rounding errors of coarse values, MV units: of MV, and of PV by the gain."""
+        mv, pv = (np.concatenate([getattr(each, name) for each in self.pieces]) for name in ("mv", "pv"))
+        Kp = max(each.gains.Kp for each in self.pieces)
+        return math.hypot(_resolution(mv), Kp * _resolution(pv)) / math.sqrt(12.0)
+
+    def left(self, law_of: LawOf, shift: int = 0) -> _Left:
+        """What a law leaves; infinite where there is no such law. shift: see `SHIFTS`."""
+        parts = self.differences(law_of, shift)
+        if parts is None:
+            return _Left(math.inf, 0.0, 1.0)
+        motions = ([each.mv for each in self.pieces], self._computed(ControlLaw) or [])
+        motion = max(_rms([each - each.mean() for each in columns]) for columns in motions)
+        return _Left(_rms(parts), motion, _inflation(parts))
+
+    def response(self, law_of: LawOf, size: float) -> float:
+        """How far MV would move for one unit of an alternative's size in standard deviations of one error: the norm of
+        the response. size: the size in `law_of`, small."""
+        parts = self._computed(law_of)
+        said = self._computed(ControlLaw)
+        if parts is None or said is None:
+            return 0.0
+        rest = [
+            self._without_start(a - b, ControlLaw(piece.gains).poles(self.Ts))
+            for a, b, piece in zip(parts, said, self.pieces, strict=True)
+        ]
+        return math.sqrt(sum(float(each @ each) for each in rest)) / size
+
+    def differences(self, law_of: LawOf, shift: int = 0) -> list[Reals] | None:
+        """Recorded less computed MV of each piece; None where there is no such law."""
+        computed = self._computed(law_of)
+        if computed is None:
+            return None
+        return [
+            self._without_start(
+                _shifted(piece.mv, -shift) - _shifted(each, shift), cast(ControlLaw, law_of(piece.gains)).poles(self.Ts)
+            )
+            for each, piece in zip(computed, self.pieces, strict=True)
+        ]
+
+    def _computed(self, law_of: LawOf) -> list[Reals] | None:
+        found = []
+        for each in self.pieces:
+            law = law_of(each.gains)
+            if law is None:
+                return None
+            found.append(law.output(each.sp, each.pv, self.Ts, self._reverse))
+        return found
+
+    def _without_start(self, column: Reals, poles: tuple[float, ...]) -> Reals:
+        """A column without what the unknown start of its piece may have put there: a constant, and what dies away."""
+        if not poles:
+            return np.asarray(column - column.mean())
+        key = len(column), poles
+        if key not in self._starts:
+            k = np.arange(len(column))
+            with np.errstate(under="ignore"):
+                columns = [np.ones(len(column)), *(np.power(pole, k) for pole in poles)]
+            self._starts[key], _ = np.linalg.qr(np.stack(columns, axis=1))
+        q = self._starts[key]
+        return np.asarray(column - q @ (q.T @ column))
+
+
+def _other(compared: _Comparison, before: _Left, shift: int) -> tuple[OtherLaw | None, float]:
+    """The law that fits better than the said one, None where none does well enough; and what the best leaves, MV
+    units. shift: that which suits the said law best."""
+    said = compared.pieces[-1].gains
+    moved = any(np.any(each.sp != each.sp[0]) for each in compared.pieces)
+    found = [
+        one
+        for each in alternatives(said, compared.Ts)
+        if moved or not each.by_setpoint
+        if (one := _tried(compared, each, {0, shift})) is not None
+    ]
+    smallest = max(min((one.left.rms for one in found), default=math.inf), compared.rounding)
+    best = next(
+        (one for one in found if one.size is None and one.left.rms <= AS_GOOD * smallest),
+        min(found, key=lambda one: one.left.rms, default=None),
+    )
+    if best is None or best.left.rms > EXPLAINED * before.rms:
+        return None, before.rms
+    if best.size is not None and abs(best.size - best.law.neutral) <= CLEAR * best.deviation:
+        return None, best.left.rms
+    left = best.left.rms / before.motion if before.motion > 0.0 else 0.0
+    deviation = None if best.size is None else best.deviation
+    return OtherLaw(best.law.kind, best.size, deviation, left), best.left.rms
+
+
+@dataclass(frozen=True, slots=True)
+class _Tried:
+    """One alternative with the size that fits best, and what it leaves."""
+
+    law: Alternative
+    size: float | None
+    deviation: float
+    left: _Left
+
+
+def _tried(compared: _Comparison, each: Alternative, shifts: set[int]) -> _Tried | None:
+    """An alternative as it fits best, None where it is no law for these gains."""
+    found = []
+    for shift in shifts:
+        size = _fitted(compared, each, shift) if each.sizes else None
+        left = compared.left(_law(each, size), shift)
+        if math.isfinite(left.rms):
+            deviation = 0.0 if size is None else _deviation(compared, each, size, left, shift)
+            found.append(_Tried(each, size, deviation, left))
+    return min(found, key=lambda one: one.left.rms, default=None)
+
+
+def _law(each: Alternative, size: float | None) -> LawOf:
+    return lambda gains: each.law(gains, each.neutral if size is None else size)
+
+
+def _fitted(compared: _Comparison, each: Alternative, shift: int) -> float:
+    """The size of an alternative that leaves the minimum."""
+    sizes = each.sizes
+    rms = [compared.left(_law(each, size), shift).rms for size in sizes]
+    at = int(np.argmin(rms))
+    low, high = sizes[max(at - 1, 0)], sizes[min(at + 1, len(sizes) - 1)]
+    if not math.isfinite(rms[at]) or low == high:
+        return sizes[at]
+    found = minimize_scalar(
+        lambda size: compared.left(_law(each, float(size)), shift).rms ** 2,
+        bounds=(low, high),
+        method="bounded",
+        options={"xatol": 1e-6 * (high - low)},
+    )
+    return float(found.x) if found.fun <= rms[at] ** 2 else sizes[at]
+
+
+def _deviation(compared: _Comparison, each: Alternative, size: float, left: _Left, shift: int) -> float:
+    """The standard deviation of a fitted size."""
+    h = STEP_OF_SIZE * max(abs(size), compared.Ts if each.kind is Deviation.PV_FILTER else 0.1)
+    above, below = (compared.differences(_law(each, size + s * h), shift) for s in (1.0, -1.0))
+    if above is None or below is None:
+        return math.inf
+    slope = sum(float((a - b) @ (a - b)) / (4.0 * h * h) for a, b in zip(above, below, strict=True))
+    return max(left.rms, compared.rounding) * math.sqrt(left.ratio / slope) if slope > 0.0 else math.inf
+
+
+def _latest(pieces: Sequence[ControlPiece]) -> list[ControlPiece]:
+    """The latest pieces, of so many samples together that trying laws on them takes no long time."""
+    kept: list[ControlPiece] = []
+    samples = 0
+    for each in reversed(pieces):
+        if samples >= LAWS_TRIED_ON:
+            break
+        more = min(len(each.mv), LAWS_TRIED_ON - samples)
+        if more < len(each.mv) and kept:
+            break
+        at = slice(len(each.mv) - more, None)
+        kept.insert(0, ControlPiece(each.gains, each.sp[at], each.pv[at], each.mv[at]))
+        samples += more
+    return kept
+
+
+def _shifted(column: Reals, by: int) -> Reals:
+    """A column of which the last samples are left out (by > 0), or the first ones (by < 0)."""
+    return column[: len(column) - by] if by > 0 else column[-by:]
+
+
+def _rms(parts: Sequence[Reals]) -> float:
+    n = sum(map(len, parts))
+    return math.sqrt(sum(float(each @ each) for each in parts) / n) if n else 0.0
+
+
+def _inflation(parts: Sequence[Reals]) -> float:
+    """By how much neighbours that are alike widen a variance: 2/d with the Durbin-Watson statistic d, at least 1."""
+    whole = sum(float(each @ each) for each in parts)
+    moves = 0.5 * sum(float(np.sum(np.diff(each) ** 2)) for each in parts)
+    return max(whole / moves, 1.0) if moves > 0.0 else 1.0
+
+
+def _resolution(column: Reals) -> float:
+    """The steps in which a column is recorded; 0 where hardly a value comes twice."""
+    values = np.unique(column)
+    if len(values) < 2 or 2 * len(values) > len(column):
+        return 0.0
+    return float(np.diff(values).min())
