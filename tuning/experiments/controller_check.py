@@ -59,7 +59,7 @@ class ControllerCheck:
     samples: the number of samples compared.
     away: the rms of the difference, in the rms of MV's motion; 0 where MV did not move.
     rounded: the same of the steps in which MV and PV are recorded.
-    exact: whether the difference is no more than the rounding of REAL32 values.
+    roundings: the rms of the difference in roundings of REAL32 values.
     other: the law that fits instead, None where none does or none is needed.
     gain_error, integral_error, filter_error_s: the smallest factors (less 1) and the shortest filter of PV, s, that
     would show in the record, as one standard deviation; infinite where nothing would.
@@ -68,32 +68,35 @@ class ControllerCheck:
     samples: int
     away: float
     rounded: float
-    exact: bool
+    roundings: float
     other: OtherLaw | None
     gain_error: float
     integral_error: float
     filter_error_s: float
 
+    @property
+    def exact(self) -> bool:
+        """Whether the difference is no more than rounding."""
+        return self.roundings <= EXACT
+
 
 def check_controller(record: ControlRecord) -> ControllerCheck:
     """Compares the recorded MV with what the said law makes of set-point and PV, and finds what fits instead."""
     if not record.pieces:
-        return ControllerCheck(0, 0.0, 0.0, True, None, math.inf, math.inf, math.inf)
+        return ControllerCheck(0, 0.0, 0.0, 0.0, None, math.inf, math.inf, math.inf)
     whole = _Comparison(record.pieces, record.Ts, record.reverse)
     left = whole.left(ControlLaw)
     rounding = whole.rounding
     if left.rms <= EXACT * rounding:
-        return _checked(whole, left, True, None, max(left.rms, rounding))
+        return _checked(whole, left, None, max(left.rms, rounding))
     part = _Comparison(_latest(record.pieces), record.Ts, record.reverse)
     shift = min(SHIFTS, key=lambda each: (part.left(ControlLaw, each).rms, abs(each)))
     before = part.left(ControlLaw, shift)
     other, rest = _other(part, before, shift)
-    return _checked(part, before, False, other, max(rest, rounding))
+    return _checked(part, before, other, max(rest, rounding))
 
 
-def _checked(
-    compared: _Comparison, left: _Left, exact: bool, other: OtherLaw | None, error: float
-) -> ControllerCheck:
+def _checked(compared: _Comparison, left: _Left, other: OtherLaw | None, error: float) -> ControllerCheck:
     said = compared.pieces[-1].gains
     motion = left.motion
     gain = compared.response(lambda g: ControlLaw(_times(g, Kp=1.0 + STEP_OF_SIZE)), STEP_OF_SIZE)
@@ -104,7 +107,7 @@ def _checked(
         samples=compared.samples,
         away=left.rms / motion if motion > 0.0 else 0.0,
         rounded=compared.quantum / motion if motion > 0.0 else 0.0,
-        exact=exact,
+        roundings=left.rms / compared.rounding,
         other=other,
         gain_error=error / gain if gain > 0.0 else math.inf,
         integral_error=(error / integral if integral > 0.0 else math.inf) if said.Ti > 0.0 else 0.0,
