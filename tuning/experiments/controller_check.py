@@ -31,6 +31,8 @@ AS_GOOD = 1.5
 """An alternative without a size is named rather than one with, where it leaves so many times as much at most."""
 LAWS_TRIED_ON = 4000
 """Number of samples on which alternatives are tried at most: the latest ones."""
+FARTHEST = 0.03
+"""Part of the samples that may be far from any law: a set-point on record a sample late."""
 STEP_OF_SIZE = 1e-4
 CLEAR = 5.0
 """Standard deviations by which a size has to differ from the law as said."""
@@ -58,6 +60,7 @@ class ControllerCheck:
 
     samples: the number of samples compared.
     away: the rms of the difference, in the rms of MV's motion; 0 where MV did not move.
+    usually_away: the same without the samples that are the furthest away, see `FARTHEST`.
     rounded: the same of the steps in which MV and PV are recorded.
     roundings: the rms of the difference in roundings of REAL32 values.
     other: the law that fits instead, None where none does or none is needed.
@@ -67,6 +70,7 @@ class ControllerCheck:
 
     samples: int
     away: float
+    usually_away: float
     rounded: float
     roundings: float
     other: OtherLaw | None
@@ -83,7 +87,7 @@ class ControllerCheck:
 def check_controller(record: ControlRecord) -> ControllerCheck:
     """Compares the recorded MV with what the said law makes of set-point and PV, and finds what fits instead."""
     if not record.pieces:
-        return ControllerCheck(0, 0.0, 0.0, 0.0, None, math.inf, math.inf, math.inf)
+        return ControllerCheck(0, 0.0, 0.0, 0.0, 0.0, None, math.inf, math.inf, math.inf)
     whole = _Comparison(record.pieces, record.Ts, record.reverse)
     left = whole.left(ControlLaw)
     rounding = whole.rounding
@@ -106,6 +110,7 @@ def _checked(compared: _Comparison, left: _Left, other: OtherLaw | None, error: 
     return ControllerCheck(
         samples=compared.samples,
         away=left.rms / motion if motion > 0.0 else 0.0,
+        usually_away=left.usual / motion if motion > 0.0 else 0.0,
         rounded=compared.quantum / motion if motion > 0.0 else 0.0,
         roundings=left.rms / compared.rounding,
         other=other,
@@ -121,10 +126,15 @@ def _times(gains: Gains, Kp: float = 1.0, Ti: float = 1.0) -> Gains:
 
 @dataclass(frozen=True, slots=True)
 class _Left:
-    """What a law leaves. rms: of the difference, motion: of MV without the starts, MV units. ratio: the variance
-    inflation for what is not white, see `durbin_watson`."""
+    """What a law leaves.
+
+    rms, usual: of the difference, and without the samples that are the furthest away, MV units.
+    motion: the rms of MV without the starts, MV units.
+    ratio: the variance inflation for what is not white.
+    """
 
     rms: float
+    usual: float
     motion: float
     ratio: float
 
@@ -163,10 +173,10 @@ class _Comparison:
         """What a law leaves; infinite where there is no such law. shift: see `SHIFTS`."""
         parts = self.differences(law_of, shift)
         if parts is None:
-            return _Left(math.inf, 0.0, 1.0)
+            return _Left(math.inf, math.inf, 0.0, 1.0)
         motions = ([each.mv for each in self.pieces], self._computed(ControlLaw) or [])
         motion = max(_rms([each - each.mean() for each in columns]) for columns in motions)
-        return _Left(_rms(parts), motion, _inflation(parts))
+        return _Left(_rms(parts), _usual(parts), motion, _inflation(parts))
 
     def response(self, law_of: LawOf, size: float) -> float:
         """How far MV would move for one unit of an alternative's size in standard deviations of one error: the norm of
@@ -318,6 +328,12 @@ def _shifted(column: Reals, by: int) -> Reals:
 def _rms(parts: Sequence[Reals]) -> float:
     n = sum(map(len, parts))
     return math.sqrt(sum(float(each @ each) for each in parts) / n) if n else 0.0
+
+
+def _usual(parts: Sequence[Reals]) -> float:
+    """The rms without the samples that are the furthest away."""
+    squares = np.sort(np.concatenate([np.square(each) for each in parts]))
+    return math.sqrt(float(np.mean(squares[: max(math.floor((1.0 - FARTHEST) * len(squares)), 1)])))
 
 
 def _inflation(parts: Sequence[Reals]) -> float:

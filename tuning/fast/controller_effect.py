@@ -41,7 +41,7 @@ def mismatch(evaluation: Evaluation) -> Refused | None:
     assert control is not None
     said = control.pieces[-1].gains
     if check.other is None:
-        unexplained = check.away > max(MAX_AWAY, ROUNDINGS * check.rounded)
+        unexplained = check.usually_away > max(MAX_AWAY, ROUNDINGS * check.rounded)
         return Refused(Reason.CONTROLLER_MISMATCH, in_words(check, said)) if unexplained else None
     text = in_words(check, said)
     kind, size = check.other.kind, check.other.size

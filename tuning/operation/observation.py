@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from loopwright.tuning.experiments.control_record import ControlPiece, ControlRecord, rows_without_limit
+from loopwright.tuning.fast.controller_effect import mismatch
 from loopwright.tuning.fast.design import DesignSpec, frequencies
 from loopwright.tuning.fast.evaluation import Evaluation, evaluate
 from loopwright.tuning.fast.record import MIN_LISTENED, Excitation, ExperimentRecord, noise_of
@@ -133,6 +135,8 @@ def _at(period: float, stretches: Sequence[Stretch], reverse: bool, spec: Design
     evaluation = evaluate(_record(rest, used, reverse, period), spec)
     dropped = tuple(each for each in latest if each not in used)
     reason, detail = evaluation.reason, evaluation.detail
+    if (refused := mismatch(evaluation)) is not None:
+        reason, detail = refused.reason, refused.detail
     if reason is None and len(dropped) > len(used):
         reason = Reason.DISTURBED
         detail = f"one plant without disturbances explains only {len(used)} of {len(latest)} set-point changes"
@@ -174,6 +178,20 @@ def _record(
         excitation=Excitation.OBSERVE,
         lengths=lengths,
         held_s=stretch.held_s,
+        control=_control(pieces, stretch.Ts, reverse) if stretch.held_s is None else None,
+    )
+
+
+def _control(pieces: Sequence[tuple[Stretch, slice, slice]], Ts: float, reverse: bool) -> ControlRecord:
+    """What the samples of the pieces show of the controller; means of several samples would not tell."""
+    return ControlRecord(
+        Ts,
+        reverse,
+        tuple(
+            ControlPiece(stretch.gains, stretch.sp[at][part], stretch.pv[at][part], stretch.mv[at][part])
+            for stretch, at, _ in pieces
+            for part in rows_without_limit(stretch.mv[at])
+        ),
     )
 
 
