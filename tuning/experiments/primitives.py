@@ -124,6 +124,12 @@ class Trace:
         self.mv.append(sample.mv)
         self.mode.append(sample.mode)
 
+    def extend(self, later: Trace) -> None:
+        """Appends the samples of another trace."""
+        for name in ("t", "sp", "pv", "mv", "mode"):
+            getattr(self, name).extend(getattr(later, name))
+        self.filled.extend(len(self) - len(later) + at for at in later.filled)
+
     def __len__(self) -> int:
         return len(self.t)
 

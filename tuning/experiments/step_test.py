@@ -77,9 +77,11 @@ def step_test(
     while not same(sample.sp, target):
         sample = yield ()
     later, settled = yield from settle(target, band * abs(step), facts.T95_s / 5, max_s, point.noise)
-    trace = Trace([sample.t, *later.t], [sample.sp, *later.sp], [sample.pv, *later.pv], [sample.mv, *later.mv])
+    trace = Trace()
+    trace.add(sample)
+    trace.extend(later)
     if into is not None:
-        into.t, into.sp, into.pv, into.mv = trace.t, trace.sp, trace.pv, trace.mv
+        into.t, into.sp, into.pv, into.mv, into.mode = trace.t, trace.sp, trace.pv, trace.mv, trace.mode
     t, pv, mv = (np.asarray(column) for column in (trace.t, trace.pv, trace.mv))
     t = t - t[0]
     tail = trace.tail(facts.T95_s / 5)

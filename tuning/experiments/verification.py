@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 from loopwright.tuning.analysis.comparison import Predicted
-from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, settle
+from loopwright.tuning.experiments.controller_mismatch import check_law_in_step
+from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, settle
 from loopwright.tuning.experiments.step_test import StepResult, allowed_step, step_test, unlimited
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode, Plan, SetGains, SetMode, SetSetpoint
@@ -20,7 +21,7 @@ def verification(
     predicted: what the model predicts for the new gains.
     static_gain: the static gain of the model, PV units per MV unit, nan where it is not known.
     dead_time_s: the dead time of the model, s.
-    Raises Refused: NOT_CONFIRMED, MV_LIMIT.
+    Raises Refused: CONTROLLER_MISMATCH, NOT_CONFIRMED, MV_LIMIT.
     """
     step = min(
         allowed_step(facts, point, gains.Kp, abs(static_gain)),
@@ -29,7 +30,11 @@ def verification(
     commands = (SetGains(gains), SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp))
     yield from settle(point.sp, 0.02 * step, facts.T95_s / 5, 3 * facts.T95_s, point.noise, commands)
     to = facts.side * step
-    result = yield from step_test(facts, point, to, band=0.05, max_s=5 * facts.T95_s, smooth_s=dead_time_s / 2)
+    trace = Trace()
+    result = yield from step_test(
+        facts, point, to, band=0.05, max_s=5 * facts.T95_s, smooth_s=dead_time_s / 2, into=trace
+    )
+    check_law_in_step(facts, trace, gains)
     unlimited(facts, result, gains)
     maximum = max(40.0, predicted.overshoot_pct + 25.0)
     if not result.settled or result.overshoot_pct > maximum:

@@ -9,7 +9,7 @@ import numpy as np
 
 from loopwright.tuning.experiments.control_law import ControlLaw, Deviation
 from loopwright.tuning.experiments.controller_check import ControllerCheck, check_controller
-from loopwright.tuning.experiments.controller_mismatch import in_words, law_instead
+from loopwright.tuning.experiments.controller_mismatch import in_words, law_instead, mismatch_of
 from loopwright.tuning.fast.design import frequencies
 from loopwright.tuning.fast.evaluation import Evaluation
 from loopwright.tuning.fast.record import Excitation
@@ -19,14 +19,11 @@ from loopwright.tuning.reasons import Reason, Refused
 
 MAX_DIFFERENCE = 0.1
 """Largest difference of Ms that another law of the controller may make."""
-MAX_WEIGHT = 0.2
-"""Largest difference of a set-point weight, which does not change Ms but how PV answers the set-point."""
-MAX_AWAY, ROUNDINGS = 0.15, 2.0
-"""MV that no law explains is that of another controller where it is further away from the computed MV than this part
-of its motion, and further than this many rounding errors of the record."""
 GAIN_KNOWN, INTEGRAL_KNOWN, FILTER_KNOWN = 0.03, 0.1, 0.02
 """Standard deviations up to which a record tells of a controller: of the factors of gain and integral, and of a filter
 of PV, in ultimate periods."""
+WITHOUT_MODEL = (Deviation.DERIVATIVE_ON_ERROR, Deviation.SETPOINT_WEIGHT, Deviation.NO_DERIVATIVE_FILTER)
+"""Other laws that are refused whatever they do to Ms."""
 DIRECT = 1e-6
 """Filter of a derivative without one, in derivative times."""
 
@@ -40,22 +37,14 @@ def mismatch(evaluation: Evaluation) -> Refused | None:
     control = evaluation.fit.record.control
     assert control is not None
     said = control.pieces[-1].gains
-    if check.other is None:
-        unexplained = check.usually_away > max(MAX_AWAY, ROUNDINGS * check.rounded)
-        return Refused(Reason.CONTROLLER_MISMATCH, in_words(check, said)) if unexplained else None
-    text = in_words(check, said)
-    kind, size = check.other.kind, check.other.size
-    if kind in (Deviation.DERIVATIVE_ON_ERROR, Deviation.SETPOINT_WEIGHT):
-        weight = said.c if kind is Deviation.DERIVATIVE_ON_ERROR else said.b
-        far = size is not None and abs(size - weight) > MAX_WEIGHT
-        return Refused(Reason.CONTROLLER_MISMATCH, f"{text}: PV would answer the set-point otherwise") if far else None
+    if check.other is None or check.other.kind in WITHOUT_MODEL:
+        text = mismatch_of(check, said, math.inf)
+        return None if text is None else Refused(Reason.CONTROLLER_MISMATCH, text)
     Ms = Ms_instead(evaluation, check)
-    if abs(Ms - evaluation.Ms) > MAX_DIFFERENCE:
-        text = f"{text}: with the gains designed Ms would be {Ms:.2f} in place of {evaluation.Ms:.2f}"
-        return Refused(Reason.CONTROLLER_MISMATCH, text)
-    if kind is Deviation.NO_DERIVATIVE_FILTER:
-        return Refused(Reason.CONTROLLER_MISMATCH, f"{text}: the noise would move MV far more than the design says")
-    return None
+    if abs(Ms - evaluation.Ms) <= MAX_DIFFERENCE:
+        return None
+    text = f"{in_words(check, said)}: with the gains designed Ms would be {Ms:.2f} in place of {evaluation.Ms:.2f}"
+    return Refused(Reason.CONTROLLER_MISMATCH, text)
 
 
 def note_of(evaluation: Evaluation) -> str | None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from loopwright.tuning.experiments.controller_mismatch import check_law_in_step
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, settle
 from loopwright.tuning.experiments.step_test import StepResult, allowed_step, step_test, unlimited
 from loopwright.tuning.gains import Gains
@@ -52,7 +53,7 @@ def zn_pi(
     window: the overshoots that are accepted, percent.
     factor: the factor by which Kp is changed, None for the increment of the paper.
     into: a trace that is filled with the samples of the last step.
-    Raises Refused: NO_OVERSHOOT, MV_LIMIT.
+    Raises Refused: CONTROLLER_MISMATCH, NO_OVERSHOOT, MV_LIMIT.
     """
     Kp, Ti = Ku / 2.2, Pu / 1.2
     increment = 0.1 * (Ku - Kp)
@@ -69,6 +70,7 @@ def zn_pi(
         found = yield from step_test(
             facts, point, step, band=0.01, max_s=max(6 * facts.T95_s, 15 * Pu), smooth_s=Pu / 5, into=into
         )
+        check_law_in_step(facts, into, gains)
         unlimited(facts, found, gains)
         seen.append(found)
         tests += 1

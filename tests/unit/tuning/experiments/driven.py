@@ -12,7 +12,8 @@ from loopwright.controller.channel import Channel, RelaySettings, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.protocol.real32 import nearest, shortest
-from loopwright.tuning.experiments.control_record import ControlRecord, control_record
+from loopwright.tuning.experiments.control_law import ControlLaw
+from loopwright.tuning.experiments.control_record import ControlPiece, ControlRecord, control_record
 from loopwright.tuning.experiments.primitives import Facts, Trace
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode, Sample
@@ -140,3 +141,27 @@ def _changes(samples: int, random: np.random.Generator) -> set[int]:
 
 def _parameters(gains: Gains) -> Parameters:
     return Parameters(gains.Kp, gains.Ti, gains.Td, gains.Tf, gains.b, gains.c)
+
+
+def recorded(
+    gains: Gains, law: ControlLaw, rest: bool = False, noise: float = 0.01, mv_step: float = 0.0
+) -> ControlRecord:
+    """A closed loop around a lag of 5 s, sample by sample, with a law in place of the said one."""
+    random, n = np.random.default_rng(3), 400
+    sp = np.zeros(n) if rest else np.repeat([0.0, 1.0, -1.0, 1.0], n // 4)
+    pv, mv = np.zeros(n), np.zeros(n)
+    x, seen, line = 0.0, 0.0, [0.0] * 10
+    integral = d = last = 0.0
+    said, lag = law.gains, law.filter_s
+    for k in range(n):
+        pv[k] = x + noise * random.standard_normal()
+        seen += (pv[k] - seen) * TS / (lag + TS)
+        moved = said.c * sp[k] - seen
+        d = (said.Tf * d + said.Kp * said.Td * (moved - last)) / (said.Tf + TS) if said.Td else 0.0
+        last = moved
+        u = said.Kp * (said.b * sp[k] - seen) + integral + d
+        integral += said.Kp * TS / said.Ti * (sp[k] - seen)
+        mv[k] = round(u / mv_step) * mv_step if mv_step else u
+        line.append(mv[k])
+        x += (line.pop(0) - x) * TS / 5.0
+    return ControlRecord(TS, True, (ControlPiece(gains, sp[40:], pv[40:], mv[40:]),))

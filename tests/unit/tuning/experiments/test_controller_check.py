@@ -13,7 +13,7 @@ from loopwright.tuning.experiments.control_record import ControlPiece, ControlRe
 from loopwright.tuning.experiments.controller_check import ControllerCheck, check_controller
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Reals
-from tests.unit.tuning.experiments.driven import TS, Drive, driven, random_drive
+from tests.unit.tuning.experiments.driven import TS, Drive, driven, random_drive, recorded
 
 PI = Gains(2.0, 5.0)
 PID = Gains(2.0, 4.0, 0.8, 0.08)
@@ -36,30 +36,6 @@ def test_it_never_fires_for_our_own_controller(part: int) -> None:
         assert check.roundings < 1.0 and check.other is None, (drive, check)
         compared += check.samples
     assert compared > 5000
-
-
-def recorded(
-    gains: Gains, law: ControlLaw, rest: bool = False, noise: float = 0.01, mv_step: float = 0.0
-) -> ControlRecord:
-    """A closed loop around a lag of 5 s, sample by sample, with a law in place of the said one."""
-    random, n = np.random.default_rng(3), 400
-    sp = np.zeros(n) if rest else np.repeat([0.0, 1.0, -1.0, 1.0], n // 4)
-    pv, mv = np.zeros(n), np.zeros(n)
-    x, seen, line = 0.0, 0.0, [0.0] * 10
-    integral = d = last = 0.0
-    said, lag = law.gains, law.filter_s
-    for k in range(n):
-        pv[k] = x + noise * random.standard_normal()
-        seen += (pv[k] - seen) * TS / (lag + TS)
-        moved = said.c * sp[k] - seen
-        d = (said.Tf * d + said.Kp * said.Td * (moved - last)) / (said.Tf + TS) if said.Td else 0.0
-        last = moved
-        u = said.Kp * (said.b * sp[k] - seen) + integral + d
-        integral += said.Kp * TS / said.Ti * (sp[k] - seen)
-        mv[k] = round(u / mv_step) * mv_step if mv_step else u
-        line.append(mv[k])
-        x += (line.pop(0) - x) * TS / 5.0
-    return ControlRecord(TS, True, (ControlPiece(gains, sp[40:], pv[40:], mv[40:]),))
 
 
 BY_SETPOINT = (Deviation.SETPOINT_WEIGHT, Deviation.DERIVATIVE_ON_ERROR)
