@@ -82,7 +82,7 @@ def measure(plant: Plant, kind: str, seed: int, method: str, checked: bool = Tru
     plan = fast(facts, options) if isinstance(options, FastOptions) else setpoint(facts, options)
     with ExitStack() as patched:
         if not checked:
-            patched.enter_context(patch("loopwright.tuning.fast.outcome.mismatch", lambda evaluation: None))
+            patched.enter_context(patch("loopwright.tuning.fast.controller_effect.mismatch", lambda evaluation: None))
             patched.enter_context(patch("loopwright.tuning.experiments.preflight.check_law_at_rest", lambda *_: None))
         ran = run(plan, loop, limits=RunLimits(max_time_s=100.0 * plant.Pu))
     found = Controlled(kind, method, plant.name, seed)

@@ -14,6 +14,7 @@ from typing import Any
 from PIL import Image
 
 from benchmarks.command import check_names, parser_of
+from benchmarks.other_controllers import Other, OtherChannel
 from loopwright.controller.channel import Channel, Settings
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.cli.plots.fast_job import fast_job
@@ -36,6 +37,8 @@ from loopwright.tuning.plan import Event, Mode, StageDone, StageStarted
 
 TS, T95, MIDDLE, SP = 0.1, 26.0, 50.0, 20.0
 OLD = Gains(1.0, 10.0)
+PERIOD_S = 7.4
+"""The ultimate period of the plant."""
 COLOURS = 48
 """Of a picture that goes into the documents: a third of the bytes."""
 Change = Callable[[float, float], float]
@@ -49,7 +52,7 @@ def _same(value: float, t: float) -> float:
 @dataclass
 class Case:
     """why: what is wrong with the plant, in words. of: the stage from which on it is. excitation: with pulses of the
-    manual output the loop is in manual."""
+    manual output the loop is in manual. other: what the controller does in place of what its gains say."""
 
     why: str
     mv: Change = _same
@@ -64,6 +67,7 @@ class Case:
     gains: Gains = OLD
     seed: int = 1
     excitation: Excitation = Excitation.RELAY
+    other: Other | None = None
 
 
 class Odd:
@@ -122,6 +126,9 @@ def cases() -> dict[str, Case]:
         "model_mismatch": Case(
             "the plant's gain doubles as the new gains are tried", mv=lambda mv, t: 2.0 * mv, of="verify", seed=5
         ),
+        "controller_mismatch": Case(
+            "the controller has a filter of PV of 1 s inside", other=Other(filter=1.0 / PERIOD_S)
+        ),
         "diverges": Case("the sensor's range is switched as the new gains are tried", pv=lambda pv, t: 100.0 * pv,
                          of="verify"),
     }  # fmt: skip
@@ -132,7 +139,9 @@ def rehearsed(case: Case) -> tuple[RehearsedJob, RehearsedSamples]:
     plant = Odd(case)
     settings = Settings(mv_low=0.0, mv_high=100.0, safe_output=MIDDLE, pv_low=-1e9, pv_high=1e9, reverse=case.reverse)
     mode = Mode.MANUAL if case.excitation is Excitation.MANUAL else Mode.AUTOMATIC
-    loop = RehearsedLoop(plant, Channel(TS, settings, _parameters(case.gains), SP, int(mode), MIDDLE), TS)
+    start = (TS, settings, _parameters(case.gains), SP, int(mode), MIDDLE)
+    channel = Channel(*start) if case.other is None else OtherChannel(case.other, PERIOD_S, *start)
+    loop = RehearsedLoop(plant, channel, TS)
     samples = RehearsedSamples()
     found: EvidenceView | None = None
 

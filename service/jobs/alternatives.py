@@ -35,6 +35,8 @@ def _rule(model: Model, Ms: float = 1.6, derivative: bool = False) -> Setting:
 
 ANYWAY = {"propose_anyway": True}
 """Option of such a request: the operator who chooses the gains has seen their figures."""
+NO_GAINS = (Reason.WRONG_SIGN, Reason.CONTROLLER_MISMATCH)
+"""Reasons for which a job ends that speak against gains for this controller on any model."""
 FAST_DESIGN = Method(
     name=FAST,
     title="The design of fast",
@@ -118,7 +120,7 @@ def designable(row: Job, events: Sequence[JobEvent], has_record: bool) -> FoundM
     has_record: whether the record is evaluated again; then its evaluation finds what else speaks against the model.
     """
     model = job_model(row, events)
-    _not_disproved(row, (Reason.WRONG_SIGN,) if has_record else DISPROVED)
+    _not_disproved(row, NO_GAINS if has_record else (*DISPROVED, *NO_GAINS))
     return model
 
 
@@ -130,7 +132,8 @@ def _typed_in(row: Job) -> FoundModel | None:
 
 def _not_disproved(row: Job, reasons: Sequence[Reason]) -> None:
     if row.reason in reasons:
-        text = f"job {row.id} ended as {row.reason}, which speaks against its model ({row.detail})"
+        what = "its controller" if row.reason == Reason.CONTROLLER_MISMATCH else "its model"
+        text = f"job {row.id} ended as {row.reason}, which speaks against {what} ({row.detail})"
         raise Conflict(f"{text}: retune instead")
 
 

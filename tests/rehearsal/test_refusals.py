@@ -15,7 +15,7 @@ from loopwright.tuning.fast.record_evaluation import evaluate_again
 from loopwright.tuning.reasons import ADVICE, Reason
 
 PAGE = (Path(__file__).parents[2] / "docs" / "refusals.md").read_text(encoding="utf-8")
-WITH_FIT = {"unexplained", "disturbed", "uncertain", "model_mismatch", "diverges"}
+WITH_FIT = {"unexplained", "disturbed", "uncertain", "model_mismatch", "controller_mismatch", "diverges"}
 
 
 @cache

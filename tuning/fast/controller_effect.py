@@ -28,6 +28,13 @@ DIRECT = 1e-6
 """Filter of a derivative without one, in derivative times."""
 
 
+def with_controller(evaluation: Evaluation) -> Evaluation:
+    """The evaluation, with the reason for a refusal where its record shows another controller: longer records, and
+    other models, would not change that."""
+    refused = mismatch(evaluation)
+    return evaluation if refused is None else replace(evaluation, reason=refused.reason, detail=refused.detail)
+
+
 def mismatch(evaluation: Evaluation) -> Refused | None:
     """The refusal where the record shows a controller under which the gains designed would not do what they promise;
     None where it does not, or does not tell."""

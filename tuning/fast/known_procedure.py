@@ -18,6 +18,7 @@ from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trac
 from loopwright.tuning.experiments.ramp import MIN_NOISES_OF_TRIAL, too_slow
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.agreement import Agreement, agreement
+from loopwright.tuning.fast.controller_effect import with_controller
 from loopwright.tuning.fast.evaluation import NEGLIGIBLE_RESIDUAL, Evaluation, evaluate
 from loopwright.tuning.fast.experiment import STEP_BACK_FRACTION, VERIFICATION_PERIODS, Experiment
 from loopwright.tuning.fast.known_plant import ObservedPlant
@@ -222,13 +223,14 @@ def _designed(facts: Facts, options: DesignOptions, known: ObservedPlant) -> tup
 
 def _look(facts: Facts, options: DesignOptions, record: ExperimentRecord, first: Evaluation) -> _Look:
     try:
-        evaluation = evaluate(record, options.spec(), first)
+        evaluation = with_controller(evaluate(record, options.spec(), first))
         outcome = outcome_of(facts, options, evaluation)
     except Refused as raised:
         return _Look(None, None, raised)
     compared = agreement(evaluation)
     refused = _another_plant(evaluation, compared)
-    if refused is None and isinstance(outcome, Refused):
+    another = evaluation.reason is Reason.CONTROLLER_MISMATCH
+    if (refused is None or another) and isinstance(outcome, Refused):
         refused = outcome
     return _Look(evaluation, compared, refused)
 

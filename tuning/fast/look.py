@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.fast.controller_effect import with_controller
 from loopwright.tuning.fast.design import frequencies
 from loopwright.tuning.fast.evaluation import Evaluation
 from loopwright.tuning.fast.options import DesignOptions
@@ -37,7 +38,7 @@ class Look:
 def look_at(facts: Facts, options: DesignOptions, record: ExperimentRecord) -> Look:
     """One look at the record so far."""
     try:
-        evaluation = evaluate_excitation(record, options.spec(), test_follows=options.verify)
+        evaluation = with_controller(evaluate_excitation(record, options.spec(), test_follows=options.verify))
     except Refused as refused:
         return Look(record.period, None, refused)
     return Look(evaluation.fit.period, evaluation, refusal_of(facts, evaluation))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from loopwright.tuning.analysis.comparison import Comparison
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.controller_effect import mismatch
+from loopwright.tuning.fast.controller_effect import with_controller
 from loopwright.tuning.fast.evaluation import Evaluation, evaluate
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.proposal import comparison_of
@@ -38,6 +38,7 @@ def evaluated(
         evaluation = evaluate_excitation(record, spec, test_follows=options.verify)
     else:
         evaluation = evaluate(record, spec, first)
+    evaluation = with_controller(evaluation)
     return evaluation, outcome_of(facts, options, evaluation)
 
 
@@ -50,6 +51,4 @@ def refusal_of(facts: Facts, evaluation: Evaluation) -> Refused | None:
             f"the record fits a plant of {'positive' if sign(model) > 0.0 else 'negative'} gain; the controller acts "
             f"{'reverse' if facts.reverse else 'direct'}",
         )
-    if (refused := mismatch(evaluation)) is not None:
-        return refused
     return None if evaluation.reason is None else Refused(evaluation.reason, evaluation.detail)

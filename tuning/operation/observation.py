@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopwright.tuning.experiments.control_record import ControlPiece, ControlRecord, rows_without_limit
-from loopwright.tuning.fast.controller_effect import mismatch
+from loopwright.tuning.fast.controller_effect import with_controller
 from loopwright.tuning.fast.design import DesignSpec, frequencies
 from loopwright.tuning.fast.evaluation import Evaluation, evaluate
 from loopwright.tuning.fast.record import MIN_LISTENED, Excitation, ExperimentRecord, noise_of
@@ -132,11 +132,9 @@ def _at(period: float, stretches: Sequence[Stretch], reverse: bool, spec: Design
         latest[i]
         for i in consistent(lambda which: _record(rest, [latest[i] for i in which], reverse, period), len(latest))
     ]
-    evaluation = evaluate(_record(rest, used, reverse, period), spec)
+    evaluation = with_controller(evaluate(_record(rest, used, reverse, period), spec))
     dropped = tuple(each for each in latest if each not in used)
     reason, detail = evaluation.reason, evaluation.detail
-    if (refused := mismatch(evaluation)) is not None:
-        reason, detail = refused.reason, refused.detail
     if reason is None and len(dropped) > len(used):
         reason = Reason.DISTURBED
         detail = f"one plant without disturbances explains only {len(used)} of {len(latest)} set-point changes"
