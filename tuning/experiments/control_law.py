@@ -64,7 +64,7 @@ class ControlLaw:
         return np.asarray(seen)
 
 
-class Deviation(StrEnum):
+class LawDifference(StrEnum):
     """In what a controller may differ from the law that it is said to have."""
 
     GAIN = "gain"
@@ -88,7 +88,7 @@ class Alternative:
     by_setpoint: whether it differs only where the set-point moves.
     """
 
-    kind: Deviation
+    kind: LawDifference
     law: Callable[[Gains, float], ControlLaw | None]
     sizes: tuple[float, ...] = ()
     neutral: float = 1.0
@@ -131,20 +131,20 @@ def alternatives(said: Gains, Ts: float) -> tuple[Alternative, ...]:
     times = tuple(Ts * 2.0**k for k in range(-1, 11))
     factors = (0.1, 0.25, 0.5, 0.7, 0.85, 1.0, 1.2, 1.4, 2.0, 4.0, 10.0)
     return (
-        Alternative(Deviation.PARALLEL, _parallel),
-        Alternative(Deviation.SERIES, _series),
-        Alternative(Deviation.NO_DERIVATIVE_FILTER, _without_filter),
-        Alternative(Deviation.DERIVATIVE_ON_ERROR, _on_error, (0.0, 0.5, 1.0), said.c, by_setpoint=True),
+        Alternative(LawDifference.PARALLEL, _parallel),
+        Alternative(LawDifference.SERIES, _series),
+        Alternative(LawDifference.NO_DERIVATIVE_FILTER, _without_filter),
+        Alternative(LawDifference.DERIVATIVE_ON_ERROR, _on_error, (0.0, 0.5, 1.0), said.c, by_setpoint=True),
         Alternative(
-            Deviation.SETPOINT_WEIGHT,
+            LawDifference.SETPOINT_WEIGHT,
             lambda gains, size: ControlLaw(replace(gains, b=size)),
             (0.0, 0.5, 1.0),
             said.b,
             by_setpoint=True,
         ),
         Alternative(
-            Deviation.GAIN, lambda gains, size: ControlLaw(replace(gains, Kp=size * gains.Kp)), factors
+            LawDifference.GAIN, lambda gains, size: ControlLaw(replace(gains, Kp=size * gains.Kp)), factors
         ),
-        Alternative(Deviation.INTEGRAL_TIME, _integral_time, factors),
-        Alternative(Deviation.PV_FILTER, lambda gains, size: ControlLaw(gains, size), times, 0.0),
+        Alternative(LawDifference.INTEGRAL_TIME, _integral_time, factors),
+        Alternative(LawDifference.PV_FILTER, lambda gains, size: ControlLaw(gains, size), times, 0.0),
     )

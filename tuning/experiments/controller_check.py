@@ -1,38 +1,34 @@
 """The controller check: the law that the device is said to have, run on the recorded set-point and PV, gives the MV.
 
-Each piece of the record has a constant of its own (the integral before it is not known) and a start of filter and
-derivative of its own; both are projected out. What is left of MV less the computed one is the deviation. Where it is
-more than rounding, the laws of `control_law` are tried one by one; of a law with a size the size is fitted (least
-squares) with its standard deviation, the variance widened for what is left that is not white.
+Where more than rounding is left between both (see `control_comparison`), the laws of `control_law` are tried one by
+one; of a law with a size the size is fitted (least squares) with its standard deviation, the variance widened for what
+is left that is not white.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from loopwright.tuning.experiments.control_law import Alternative, ControlLaw, Deviation, alternatives
-from loopwright.tuning.experiments.control_record import REAL32, ControlPiece, ControlRecord
+from loopwright.tuning.experiments.control_comparison import LawComparison, LawOf, Left
+from loopwright.tuning.experiments.control_law import Alternative, ControlLaw, LawDifference, alternatives
+from loopwright.tuning.experiments.control_record import ControlPiece, ControlRecord
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.models import Reals
 
 EXACT = 5.0
 """What may be left between MV and the computed one as rounding of REAL32 values, in their rounding errors."""
 SHIFTS = (0, 1, -1)
 """Samples by which the recorded MV may be later than the PV that it answers: values that are not of one instant."""
 EXPLAINED = 0.5
-"""An alternative explains the record where it leaves this part of the deviation at most."""
+"""An alternative explains the record where it leaves this part of the difference at most."""
 AS_GOOD = 1.5
 """An alternative without a size is named rather than one with, where it leaves so many times as much at most."""
 LAWS_TRIED_ON = 4000
 """Number of samples on which alternatives are tried at most: the latest ones."""
-FARTHEST = 0.03
-"""Part of the samples that may be far from any law: a set-point on record a sample late."""
 STEP_OF_SIZE = 1e-4
 CLEAR = 5.0
 """Standard deviations by which a size has to differ from the law as said."""
@@ -45,10 +41,10 @@ class OtherLaw:
     kind: in what it differs.
     size, deviation: its size and the standard deviation of that: a factor, a filter's time constant (s) or a weight;
     None for a form, which has none.
-    left: what it leaves of the deviation of MV, in the motion of MV.
+    left: the rms of what it leaves, in the rms of MV's motion.
     """
 
-    kind: Deviation
+    kind: LawDifference
     size: float | None
     deviation: float | None
     left: float
@@ -60,7 +56,7 @@ class ControllerCheck:
 
     samples: the number of samples compared.
     away: the rms of the difference, in the rms of MV's motion; 0 where MV did not move.
-    usually_away: the same without the samples that are the furthest away, see `FARTHEST`.
+    usually_away: the same without the samples that are the furthest away, see `control_comparison`.
     rounded: the same of the steps in which MV and PV are recorded.
     roundings: the rms of the difference in roundings of REAL32 values.
     other: the law that fits instead, None where none does or none is needed.
@@ -88,21 +84,21 @@ def check_controller(record: ControlRecord) -> ControllerCheck:
     """Compares the recorded MV with what the said law makes of set-point and PV, and finds what fits instead."""
     if not record.pieces:
         return ControllerCheck(0, 0.0, 0.0, 0.0, 0.0, None, math.inf, math.inf, math.inf)
-    whole = _Comparison(record.pieces, record.Ts, record.reverse)
+    whole = LawComparison(record.pieces, record.Ts, record.reverse)
     left = whole.left(ControlLaw)
     rounding = whole.rounding
     if left.rms <= EXACT * rounding:
         return _checked(whole, left, None, max(left.rms, rounding))
-    part = _Comparison(_latest(record.pieces), record.Ts, record.reverse)
+    part = LawComparison(_latest(record.pieces), record.Ts, record.reverse)
     shift = min(SHIFTS, key=lambda each: (part.left(ControlLaw, each).rms, abs(each)))
     before = part.left(ControlLaw, shift)
     other, rest = _other(part, before, shift)
     return _checked(part, before, other, max(rest, rounding))
 
 
-def _checked(compared: _Comparison, left: _Left, other: OtherLaw | None, error: float) -> ControllerCheck:
+def _checked(compared: LawComparison, left: Left, other: OtherLaw | None, error: float) -> ControllerCheck:
     said = compared.pieces[-1].gains
-    motion = left.motion
+    motion = compared.motion
     gain = compared.response(lambda g: ControlLaw(_times(g, Kp=1.0 + STEP_OF_SIZE)), STEP_OF_SIZE)
     integral = compared.response(lambda g: ControlLaw(_times(g, Ti=1.0 + STEP_OF_SIZE)), STEP_OF_SIZE)
     short = compared.Ts
@@ -124,109 +120,7 @@ def _times(gains: Gains, Kp: float = 1.0, Ti: float = 1.0) -> Gains:
     return Gains(Kp * gains.Kp, Ti * gains.Ti, gains.Td, gains.Tf, gains.b, gains.c)
 
 
-@dataclass(frozen=True, slots=True)
-class _Left:
-    """What a law leaves.
-
-    rms, usual: of the difference, and without the samples that are the furthest away, MV units.
-    motion: the rms of MV without the starts, MV units.
-    ratio: the variance inflation for what is not white.
-    """
-
-    rms: float
-    usual: float
-    motion: float
-    ratio: float
-
-
-LawOf = Callable[[Gains], ControlLaw | None]
-
-
-class _Comparison:
-    """Recorded and computed MV, piece by piece, without the starts of the pieces."""
-
-    def __init__(self, pieces: Sequence[ControlPiece], Ts: float, reverse: bool) -> None:
-        self.pieces, self.Ts, self._reverse = pieces, Ts, reverse
-        self._starts: dict[tuple[int, tuple[float, ...]], Reals] = {}
-
-    @property
-    def samples(self) -> int:
-        return sum(len(each.mv) for each in self.pieces)
-
-    @property
-    def rounding(self) -> float:
-        """The rounding error of REAL32 values, MV units: of MV, and of PV and set-point by the gain."""
-        return REAL32 * max(
-            float(np.abs(each.mv).max())
-            + each.gains.Kp * float(np.abs(each.pv).max() + (1.0 + abs(each.gains.b)) * np.abs(each.sp).max())
-            for each in self.pieces
-        )
-
-    @property
-    def quantum(self) -> float:
-        """The standard deviation of the rounding errors of coarse values, MV units: of MV, and of PV by the gain."""
-        mv, pv = (np.concatenate([getattr(each, name) for each in self.pieces]) for name in ("mv", "pv"))
-        Kp = max(each.gains.Kp for each in self.pieces)
-        return math.hypot(_resolution(mv), Kp * _resolution(pv)) / math.sqrt(12.0)
-
-    def left(self, law_of: LawOf, shift: int = 0) -> _Left:
-        """What a law leaves; infinite where there is no such law. shift: see `SHIFTS`."""
-        parts = self.differences(law_of, shift)
-        if parts is None:
-            return _Left(math.inf, math.inf, 0.0, 1.0)
-        motions = ([each.mv for each in self.pieces], self._computed(ControlLaw) or [])
-        motion = max(_rms([each - each.mean() for each in columns]) for columns in motions)
-        return _Left(_rms(parts), _usual(parts), motion, _inflation(parts))
-
-    def response(self, law_of: LawOf, size: float) -> float:
-        """How far MV would move for one unit of an alternative's size in standard deviations of one error: the norm of
-        the response. size: the size in `law_of`, small."""
-        parts = self._computed(law_of)
-        said = self._computed(ControlLaw)
-        if parts is None or said is None:
-            return 0.0
-        rest = [
-            self._without_start(a - b, ControlLaw(piece.gains).poles(self.Ts))
-            for a, b, piece in zip(parts, said, self.pieces, strict=True)
-        ]
-        return math.sqrt(sum(float(each @ each) for each in rest)) / size
-
-    def differences(self, law_of: LawOf, shift: int = 0) -> list[Reals] | None:
-        """Recorded less computed MV of each piece; None where there is no such law."""
-        computed = self._computed(law_of)
-        if computed is None:
-            return None
-        return [
-            self._without_start(
-                _shifted(piece.mv, -shift) - _shifted(each, shift), cast(ControlLaw, law_of(piece.gains)).poles(self.Ts)
-            )
-            for each, piece in zip(computed, self.pieces, strict=True)
-        ]
-
-    def _computed(self, law_of: LawOf) -> list[Reals] | None:
-        found = []
-        for each in self.pieces:
-            law = law_of(each.gains)
-            if law is None:
-                return None
-            found.append(law.output(each.sp, each.pv, self.Ts, self._reverse))
-        return found
-
-    def _without_start(self, column: Reals, poles: tuple[float, ...]) -> Reals:
-        """A column without what the unknown start of its piece may have put there: a constant, and what dies away."""
-        if not poles:
-            return np.asarray(column - column.mean())
-        key = len(column), poles
-        if key not in self._starts:
-            k = np.arange(len(column))
-            with np.errstate(under="ignore"):
-                columns = [np.ones(len(column)), *(np.power(pole, k) for pole in poles)]
-            self._starts[key], _ = np.linalg.qr(np.stack(columns, axis=1))
-        q = self._starts[key]
-        return np.asarray(column - q @ (q.T @ column))
-
-
-def _other(compared: _Comparison, before: _Left, shift: int) -> tuple[OtherLaw | None, float]:
+def _other(compared: LawComparison, before: Left, shift: int) -> tuple[OtherLaw | None, float]:
     """The law that fits better than the said one, None where none does well enough; and what the best leaves, MV
     units. shift: that which suits the said law best."""
     said = compared.pieces[-1].gains
@@ -246,7 +140,7 @@ def _other(compared: _Comparison, before: _Left, shift: int) -> tuple[OtherLaw |
         return None, before.rms
     if best.size is not None and abs(best.size - best.law.neutral) <= CLEAR * best.deviation:
         return None, best.left.rms
-    left = best.left.rms / before.motion if before.motion > 0.0 else 0.0
+    left = best.left.rms / compared.motion if compared.motion > 0.0 else 0.0
     deviation = None if best.size is None else best.deviation
     return OtherLaw(best.law.kind, best.size, deviation, left), best.left.rms
 
@@ -258,10 +152,10 @@ class _Tried:
     law: Alternative
     size: float | None
     deviation: float
-    left: _Left
+    left: Left
 
 
-def _tried(compared: _Comparison, each: Alternative, shifts: set[int]) -> _Tried | None:
+def _tried(compared: LawComparison, each: Alternative, shifts: set[int]) -> _Tried | None:
     """An alternative as it fits best, None where it is no law for these gains."""
     found = []
     for shift in shifts:
@@ -277,7 +171,7 @@ def _law(each: Alternative, size: float | None) -> LawOf:
     return lambda gains: each.law(gains, each.neutral if size is None else size)
 
 
-def _fitted(compared: _Comparison, each: Alternative, shift: int) -> float:
+def _fitted(compared: LawComparison, each: Alternative, shift: int) -> float:
     """The size of an alternative that leaves the minimum."""
     sizes = each.sizes
     rms = [compared.left(_law(each, size), shift).rms for size in sizes]
@@ -294,9 +188,9 @@ def _fitted(compared: _Comparison, each: Alternative, shift: int) -> float:
     return float(found.x) if found.fun <= rms[at] ** 2 else sizes[at]
 
 
-def _deviation(compared: _Comparison, each: Alternative, size: float, left: _Left, shift: int) -> float:
+def _deviation(compared: LawComparison, each: Alternative, size: float, left: Left, shift: int) -> float:
     """The standard deviation of a fitted size."""
-    h = STEP_OF_SIZE * max(abs(size), compared.Ts if each.kind is Deviation.PV_FILTER else 0.1)
+    h = STEP_OF_SIZE * max(abs(size), compared.Ts if each.kind is LawDifference.PV_FILTER else 0.1)
     above, below = (compared.differences(_law(each, size + s * h), shift) for s in (1.0, -1.0))
     if above is None or below is None:
         return math.inf
@@ -318,34 +212,3 @@ def _latest(pieces: Sequence[ControlPiece]) -> list[ControlPiece]:
         kept.insert(0, ControlPiece(each.gains, each.sp[at], each.pv[at], each.mv[at]))
         samples += more
     return kept
-
-
-def _shifted(column: Reals, by: int) -> Reals:
-    """A column of which the last samples are left out (by > 0), or the first ones (by < 0)."""
-    return column[: len(column) - by] if by > 0 else column[-by:]
-
-
-def _rms(parts: Sequence[Reals]) -> float:
-    n = sum(map(len, parts))
-    return math.sqrt(sum(float(each @ each) for each in parts) / n) if n else 0.0
-
-
-def _usual(parts: Sequence[Reals]) -> float:
-    """The rms without the samples that are the furthest away."""
-    squares = np.sort(np.concatenate([np.square(each) for each in parts]))
-    return math.sqrt(float(np.mean(squares[: max(math.floor((1.0 - FARTHEST) * len(squares)), 1)])))
-
-
-def _inflation(parts: Sequence[Reals]) -> float:
-    """By how much neighbours that are alike widen a variance: 2/d with the Durbin-Watson statistic d, at least 1."""
-    whole = sum(float(each @ each) for each in parts)
-    moves = 0.5 * sum(float(np.sum(np.diff(each) ** 2)) for each in parts)
-    return max(whole / moves, 1.0) if moves > 0.0 else 1.0
-
-
-def _resolution(column: Reals) -> float:
-    """The steps in which a column is recorded; 0 where hardly a value comes twice."""
-    values = np.unique(column)
-    if len(values) < 2 or 2 * len(values) > len(column):
-        return 0.0
-    return float(np.diff(values).min())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from loopwright.tuning.experiments.control_law import ControlLaw, Deviation, alternatives
+from loopwright.tuning.experiments.control_law import ControlLaw, LawDifference, alternatives
 from loopwright.tuning.experiments.control_record import control_record
 from loopwright.tuning.experiments.controller_check import ControllerCheck, OtherLaw, check_controller
 from loopwright.tuning.experiments.primitives import Facts, Trace
@@ -42,20 +42,20 @@ def in_words(check: ControllerCheck, gains: Gains) -> str:
 def _instead(other: OtherLaw, gains: Gains) -> str:
     size = "" if other.size is None else f"{other.size:.3g} +- {2.0 * (other.deviation or 0.0):.1g}"
     match other.kind:
-        case Deviation.GAIN:
+        case LawDifference.GAIN:
             return f"Kp times {size}"
-        case Deviation.INTEGRAL_TIME:
+        case LawDifference.INTEGRAL_TIME:
             return f"Ti times {size}"
-        case Deviation.PV_FILTER:
+        case LawDifference.PV_FILTER:
             return f"a filter of PV inside the controller of {size} s"
-        case Deviation.SETPOINT_WEIGHT:
+        case LawDifference.SETPOINT_WEIGHT:
             return f"a set-point weight b of {size} in place of {gains.b:.3g}"
-        case Deviation.DERIVATIVE_ON_ERROR:
+        case LawDifference.DERIVATIVE_ON_ERROR:
             return f"a derivative of the error (set-point weight c of {size} in place of {gains.c:.3g})"
-        case Deviation.PARALLEL:
+        case LawDifference.PARALLEL:
             same = f", here Ti times {gains.Kp:.3g}" if gains.Ti > 0.0 else ""
             return f"the parallel form (integral{' and derivative' if gains.Td > 0.0 else ''} not times Kp{same})"
-        case Deviation.SERIES:
+        case LawDifference.SERIES:
             return "the series form (Kp, Ti and Td interact)"
     return "a derivative without its filter"
 
@@ -72,20 +72,20 @@ def mismatch_of(check: ControllerCheck, gains: Gains, T95_s: float) -> str | Non
     if other is None:
         return text if is_unexplained(check) else None
     kind, size = other.kind, other.size
-    if kind is Deviation.PARALLEL:
-        kind, size = Deviation.INTEGRAL_TIME, gains.Kp
+    if kind is LawDifference.PARALLEL:
+        kind, size = LawDifference.INTEGRAL_TIME, gains.Kp
     match kind:
-        case Deviation.NO_DERIVATIVE_FILTER:
+        case LawDifference.NO_DERIVATIVE_FILTER:
             return f"{text}: the noise would move MV far more than the gains say"
-        case Deviation.SETPOINT_WEIGHT | Deviation.DERIVATIVE_ON_ERROR:
-            weight = gains.b if kind is Deviation.SETPOINT_WEIGHT else gains.c
+        case LawDifference.SETPOINT_WEIGHT | LawDifference.DERIVATIVE_ON_ERROR:
+            weight = gains.b if kind is LawDifference.SETPOINT_WEIGHT else gains.c
             far = size is not None and abs(size - weight) > MAX_WEIGHT
             return f"{text}: PV would answer the set-point otherwise" if far else None
-        case Deviation.GAIN:
+        case LawDifference.GAIN:
             low, high = GAIN
-        case Deviation.INTEGRAL_TIME:
+        case LawDifference.INTEGRAL_TIME:
             low, high = INTEGRAL_TIME
-        case Deviation.PV_FILTER:
+        case LawDifference.PV_FILTER:
             low, high = 0.0, FILTER_T95 * T95_s
         case _:
             return None

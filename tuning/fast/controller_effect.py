@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from loopwright.tuning.experiments.control_law import ControlLaw, Deviation
+from loopwright.tuning.experiments.control_law import ControlLaw, LawDifference
 from loopwright.tuning.experiments.controller_check import ControllerCheck, check_controller
 from loopwright.tuning.experiments.controller_mismatch import in_words, law_instead, mismatch_of
 from loopwright.tuning.fast.design import frequencies
@@ -22,7 +22,7 @@ MAX_DIFFERENCE = 0.1
 GAIN_KNOWN, INTEGRAL_KNOWN, FILTER_KNOWN = 0.03, 0.1, 0.02
 """Standard deviations up to which a record tells of a controller: of the factors of gain and integral, and of a filter
 of PV, in ultimate periods."""
-WITHOUT_MODEL = (Deviation.DERIVATIVE_ON_ERROR, Deviation.SETPOINT_WEIGHT, Deviation.NO_DERIVATIVE_FILTER)
+WITHOUT_MODEL = (LawDifference.DERIVATIVE_ON_ERROR, LawDifference.SETPOINT_WEIGHT, LawDifference.NO_DERIVATIVE_FILTER)
 """Other laws that are refused whatever they do to Ms."""
 DIRECT = 1e-6
 """Filter of a derivative without one, in derivative times."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from loopwright.controller.pid import Parameters, Pid
-from loopwright.tuning.experiments.control_law import ControlLaw, Deviation, alternatives
+from loopwright.tuning.experiments.control_law import ControlLaw, LawDifference, alternatives
 from loopwright.tuning.gains import Gains
 
 TS = 0.1
@@ -15,7 +15,7 @@ PI = Gains(2.0, 5.0)
 PID = Gains(2.0, 5.0, 0.5, 0.05, 0.7, 0.2)
 
 
-def law(kind: Deviation, gains: Gains, size: float = 1.0) -> ControlLaw:
+def law(kind: LawDifference, gains: Gains, size: float = 1.0) -> ControlLaw:
     found = next(each for each in alternatives(gains, TS) if each.kind is kind).law(gains, size)
     assert found is not None
     return found
@@ -54,13 +54,13 @@ def test_it_is_the_law_of_the_controller(gains: Gains, reverse: bool) -> None:
 
 
 def test_the_parallel_form_does_not_multiply_by_the_gain() -> None:
-    gains = law(Deviation.PARALLEL, PID).gains
+    gains = law(LawDifference.PARALLEL, PID).gains
     assert (gains.Kp / gains.Ti, gains.Kp * gains.Td) == pytest.approx((1.0 / 5.0, 0.5))
     assert (gains.b, gains.c) == (0.7, 0.2)
 
 
 def test_the_series_form_multiplies_two_first_orders() -> None:
-    found = law(Deviation.SERIES, PID).gains
+    found = law(LawDifference.SERIES, PID).gains
     s = 1j * np.geomspace(0.01, 100.0, 20)
     isa = found.Kp * (1.0 + 1.0 / (found.Ti * s) + found.Td * s / (1.0 + found.Tf * s))
     assert isa == pytest.approx(2.0 * (1.0 + 1.0 / (5.0 * s)) * (1.0 + 0.5 * s) / (1.0 + 0.05 * s))
@@ -68,7 +68,7 @@ def test_the_series_form_multiplies_two_first_orders() -> None:
 
 def test_a_pi_has_none_of_the_laws_of_a_derivative() -> None:
     none = [each.kind for each in alternatives(PI, TS) if each.law(PI, 1.0) is None]
-    assert none == [Deviation.SERIES, Deviation.NO_DERIVATIVE_FILTER, Deviation.DERIVATIVE_ON_ERROR]
+    assert none == [LawDifference.SERIES, LawDifference.NO_DERIVATIVE_FILTER, LawDifference.DERIVATIVE_ON_ERROR]
 
 
 @pytest.mark.parametrize("gains", [PI, PID])

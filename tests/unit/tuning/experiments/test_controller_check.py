@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopwright.tuning.experiments.control_law import ControlLaw, Deviation, alternatives
+from loopwright.tuning.experiments.control_law import ControlLaw, LawDifference, alternatives
 from loopwright.tuning.experiments.control_record import ControlPiece, ControlRecord
 from loopwright.tuning.experiments.controller_check import ControllerCheck, check_controller
 from loopwright.tuning.gains import Gains
@@ -18,11 +18,11 @@ from tests.unit.tuning.experiments.driven import TS, Drive, driven, random_drive
 PI = Gains(2.0, 5.0)
 PID = Gains(2.0, 4.0, 0.8, 0.08)
 SIZES = {
-    Deviation.GAIN: 1.4,
-    Deviation.INTEGRAL_TIME: 0.5,
-    Deviation.PV_FILTER: 0.35,
-    Deviation.SETPOINT_WEIGHT: 0.0,
-    Deviation.DERIVATIVE_ON_ERROR: 1.0,
+    LawDifference.GAIN: 1.4,
+    LawDifference.INTEGRAL_TIME: 0.5,
+    LawDifference.PV_FILTER: 0.35,
+    LawDifference.SETPOINT_WEIGHT: 0.0,
+    LawDifference.DERIVATIVE_ON_ERROR: 1.0,
 }
 
 
@@ -38,14 +38,14 @@ def test_it_never_fires_for_our_own_controller(part: int) -> None:
     assert compared > 5000
 
 
-BY_SETPOINT = (Deviation.SETPOINT_WEIGHT, Deviation.DERIVATIVE_ON_ERROR)
+BY_SETPOINT = (LawDifference.SETPOINT_WEIGHT, LawDifference.DERIVATIVE_ON_ERROR)
 
 
 @pytest.mark.parametrize(
     ("kind", "rest"),
-    [(kind, rest) for kind in Deviation for rest in (False, True) if not (rest and kind in BY_SETPOINT)],
+    [(kind, rest) for kind in LawDifference for rest in (False, True) if not (rest and kind in BY_SETPOINT)],
 )
-def test_each_other_law_is_named_with_its_size(kind: Deviation, rest: bool) -> None:
+def test_each_other_law_is_named_with_its_size(kind: LawDifference, rest: bool) -> None:
     found = next(each for each in alternatives(PID, TS) if each.kind is kind)
     law = found.law(PID, SIZES.get(kind, 0.0))
     assert law is not None
@@ -65,7 +65,7 @@ def test_the_standard_deviation_of_a_size_covers_what_coarse_values_do() -> None
     errors = []
     for steps in (0.05, 0.1, 0.2, 0.3):
         other = check_controller(recorded(PI, law, noise=0.03, mv_step=steps)).other
-        assert other is not None and other.kind is Deviation.GAIN and other.size is not None and other.deviation
+        assert other is not None and other.kind is LawDifference.GAIN and other.size is not None and other.deviation
         errors.append((other.size - 1.4) / other.deviation)
     assert max(map(abs, errors)) < 4.0 and max(map(abs, errors)) > 0.1
 
@@ -114,7 +114,7 @@ def test_coarse_pv_at_rest_tells_less_than_a_set_point_that_moves() -> None:
 def test_several_pieces_under_several_gains_tell_of_one_law() -> None:
     """Under Kp 1 alone the parallel form is that of ISA; the next gains tell."""
     one, two = Gains(1.0, 5.0), Gains(2.0, 5.0)
-    parallel = next(each for each in alternatives(one, TS) if each.kind is Deviation.PARALLEL)
+    parallel = next(each for each in alternatives(one, TS) if each.kind is LawDifference.PARALLEL)
     pieces = []
     for gains in (one, two):
         law = parallel.law(gains, 1.0)
@@ -122,7 +122,7 @@ def test_several_pieces_under_several_gains_tell_of_one_law() -> None:
         pieces += recorded(gains, law).pieces
     assert check_controller(ControlRecord(TS, True, (pieces[0],))).exact
     other = check_controller(ControlRecord(TS, True, tuple(pieces))).other
-    assert other is not None and other.kind is Deviation.PARALLEL
+    assert other is not None and other.kind is LawDifference.PARALLEL
 
 
 def test_at_rest_a_weight_of_the_set_point_does_not_show() -> None:
