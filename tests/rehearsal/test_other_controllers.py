@@ -14,7 +14,7 @@ from loopwright.tuning.fast.setpoint_procedure import SETPOINT
     ("kind", "words"),
     [
         ("Kp x 1.4", "Kp times 1.4"),
-        ("Ti x 0.5", "Ti times 0.5"),
+        ("Ti x 0.5", "Ti times 0."),
         ("filter 0.1 Pu", "a filter of PV inside the controller of"),
         ("PID, derivative of the error", "a derivative of the error"),
         ("PID, no derivative filter", "a derivative without its filter"),

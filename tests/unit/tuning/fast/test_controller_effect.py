@@ -14,7 +14,7 @@ from loopwright.tuning.experiments.control_law import ControlLaw
 from loopwright.tuning.experiments.control_record import ControlPiece, ControlRecord
 from loopwright.tuning.experiments.controller_check import check_controller
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.controller_effect import Ms_instead, mismatch, note_of
+from loopwright.tuning.fast.controller_effect import Ms_instead, mismatch, note_of, with_controller
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.evaluation import Evaluation, evaluate
 from loopwright.tuning.fast.outcome import refusal_of
@@ -64,7 +64,10 @@ def test_a_gain_that_is_another_one_changes_Ms(factor: float) -> None:
     if abs(expected - 1.6) > 0.1:
         assert refused is not None and refused.reason is Reason.CONTROLLER_MISMATCH
         assert f"Kp times {factor:g} " in refused.detail and f"Ms would be {expected:.2f} in place of" in refused.detail
-        assert refusal_of(Facts(FIRST.Ts, 30.0, -1.0, 1.0, 1.0, SAID), evaluation) is not None
+        facts = Facts(FIRST.Ts, 30.0, -1.0, 1.0, 1.0, SAID)
+        assert refusal_of(facts, evaluation) is None
+        named = refusal_of(facts, with_controller(evaluation))
+        assert named is not None and (named.reason, named.detail) == (refused.reason, refused.detail)
     else:
         assert refused is None
         note = note_of(evaluation)
