@@ -11,6 +11,7 @@ from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.tuning.analysis.margins import margins
+from loopwright.tuning.experiments.controller_check import check_controller
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, Reals, TransferFunction
@@ -124,3 +125,22 @@ def test_mv_of_the_set_point_alone_is_that_of_the_loop_without_noise() -> None:
     found = mv_of_setpoint(TransferFunction(LAG.num, LAG.den, LAG.L + 0.5 * TS), change)
     # the model's controller acts at once, that of the loop at its samples
     assert np.max(np.abs(found - history.mv[change.samples])) < 0.06 * np.max(np.abs(history.mv))
+
+
+def test_a_controller_that_does_not_do_what_its_gains_say_gets_no_gains() -> None:
+    history = operated(LAG, PI, changes([0.8, -0.3, 0.6], 300.0))
+    found = observe([replace(history, gains=Gains(PI.Kp / 1.4, PI.Ti))], True, ASKED)
+    assert found.reason is Reason.CONTROLLER_MISMATCH and "Kp times 1.4 " in found.detail
+
+
+def test_the_resolution_of_a_history_is_no_other_controller() -> None:
+    """Values as the listener keeps them: the shortest decimals of a REAL32."""
+    history = operated(LAG, PI, changes([0.8, -0.3, 0.6], 300.0))
+    columns = {
+        name: getattr(history, name).astype(np.float32).astype(str).astype(np.float64) for name in ("mv", "pv", "sp")
+    }
+    found = observe([replace(history, **columns)], True, ASKED)
+    assert found.reason is None and found.evaluation is not None
+    control = found.evaluation.fit.record.control
+    assert control is not None and control.samples > 500
+    assert check_controller(control).exact
