@@ -25,7 +25,8 @@ def test_it_is_refused_with_what_it_does_instead(kind: str, words: str, method: 
 
 
 @pytest.mark.parametrize(
-    ("kind", "words"), [("PID, derivative of the error", "a derivative of the error"), ("b = 0", "a set-point weight b")]
+    ("kind", "words"),
+    [("PID, derivative of the error", "a derivative of the error"), ("b = 0", "a set-point weight b")],
 )
 def test_what_answers_the_set_point_otherwise_shows_where_it_moves(kind: str, words: str) -> None:
     """Under the relay it moves only as the new gains take over: Ms is as asked for, and nothing tells."""
