@@ -78,7 +78,7 @@ class LawDifference(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Alternative:
+class AlternativeLaw:
     """A law that a controller may have in place of the one that it is said to have.
 
     kind: in what it differs.
@@ -126,25 +126,25 @@ def _integral_time(gains: Gains, size: float) -> ControlLaw | None:
     return ControlLaw(replace(gains, Ti=size * gains.Ti)) if gains.Ti > 0.0 else None
 
 
-def alternatives(said: Gains, Ts: float) -> tuple[Alternative, ...]:
+def alternatives(said: Gains, Ts: float) -> tuple[AlternativeLaw, ...]:
     """The laws that are tried, those without a size first. said: the gains as they are said to be."""
     times = tuple(Ts * 2.0**k for k in range(-1, 11))
     factors = (0.1, 0.25, 0.5, 0.7, 0.85, 1.0, 1.2, 1.4, 2.0, 4.0, 10.0)
     return (
-        Alternative(LawDifference.PARALLEL, _parallel),
-        Alternative(LawDifference.SERIES, _series),
-        Alternative(LawDifference.NO_DERIVATIVE_FILTER, _without_filter),
-        Alternative(LawDifference.DERIVATIVE_ON_ERROR, _on_error, (0.0, 0.5, 1.0), said.c, by_setpoint=True),
-        Alternative(
+        AlternativeLaw(LawDifference.PARALLEL, _parallel),
+        AlternativeLaw(LawDifference.SERIES, _series),
+        AlternativeLaw(LawDifference.NO_DERIVATIVE_FILTER, _without_filter),
+        AlternativeLaw(LawDifference.DERIVATIVE_ON_ERROR, _on_error, (0.0, 0.5, 1.0), said.c, by_setpoint=True),
+        AlternativeLaw(
             LawDifference.SETPOINT_WEIGHT,
             lambda gains, size: ControlLaw(replace(gains, b=size)),
             (0.0, 0.5, 1.0),
             said.b,
             by_setpoint=True,
         ),
-        Alternative(
+        AlternativeLaw(
             LawDifference.GAIN, lambda gains, size: ControlLaw(replace(gains, Kp=size * gains.Kp)), factors
         ),
-        Alternative(LawDifference.INTEGRAL_TIME, _integral_time, factors),
-        Alternative(LawDifference.PV_FILTER, lambda gains, size: ControlLaw(gains, size), times, 0.0),
+        AlternativeLaw(LawDifference.INTEGRAL_TIME, _integral_time, factors),
+        AlternativeLaw(LawDifference.PV_FILTER, lambda gains, size: ControlLaw(gains, size), times, 0.0),
     )

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from loopwright.tuning.experiments.control_comparison import LawComparison, LawOf, Left
-from loopwright.tuning.experiments.control_law import Alternative, ControlLaw, LawDifference, alternatives
+from loopwright.tuning.experiments.control_law import AlternativeLaw, ControlLaw, LawDifference, alternatives
 from loopwright.tuning.experiments.control_record import ControlPiece, ControlRecord
 from loopwright.tuning.gains import Gains
 
@@ -149,13 +149,13 @@ def _other(compared: LawComparison, before: Left, shift: int) -> tuple[OtherLaw 
 class _Tried:
     """One alternative with the size that fits best, and what it leaves."""
 
-    law: Alternative
+    law: AlternativeLaw
     size: float | None
     deviation: float
     left: Left
 
 
-def _tried(compared: LawComparison, each: Alternative, shifts: set[int]) -> _Tried | None:
+def _tried(compared: LawComparison, each: AlternativeLaw, shifts: set[int]) -> _Tried | None:
     """An alternative as it fits best, None where it is no law for these gains."""
     found = []
     for shift in shifts:
@@ -167,11 +167,11 @@ def _tried(compared: LawComparison, each: Alternative, shifts: set[int]) -> _Tri
     return min(found, key=lambda one: one.left.rms, default=None)
 
 
-def _law(each: Alternative, size: float | None) -> LawOf:
+def _law(each: AlternativeLaw, size: float | None) -> LawOf:
     return lambda gains: each.law(gains, each.neutral if size is None else size)
 
 
-def _fitted(compared: LawComparison, each: Alternative, shift: int) -> float:
+def _fitted(compared: LawComparison, each: AlternativeLaw, shift: int) -> float:
     """The size of an alternative that leaves the minimum."""
     sizes = each.sizes
     rms = [compared.left(_law(each, size), shift).rms for size in sizes]
@@ -188,7 +188,7 @@ def _fitted(compared: LawComparison, each: Alternative, shift: int) -> float:
     return float(found.x) if found.fun <= rms[at] ** 2 else sizes[at]
 
 
-def _deviation(compared: LawComparison, each: Alternative, size: float, left: Left, shift: int) -> float:
+def _deviation(compared: LawComparison, each: AlternativeLaw, size: float, left: Left, shift: int) -> float:
     """The standard deviation of a fitted size."""
     h = STEP_OF_SIZE * max(abs(size), compared.Ts if each.kind is LawDifference.PV_FILTER else 0.1)
     above, below = (compared.differences(_law(each, size + s * h), shift) for s in (1.0, -1.0))
