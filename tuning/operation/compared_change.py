@@ -1,0 +1,246 @@
+"""One set-point change, or load, of operation compared with what the accepted model says.
+
+The model is driven with the MV recorded; what is not known of it, a level, a trend of PV and a start that was not at
+rest are fitted beside. Alternatives to the model are named: another gain, a longer dead time, a second path that acts
+later. Each has one parameter more, so that its size and standard deviation follow by a projection, as in a score test.
+Source: the Lagrange multiplier test, C. R. Rao, Proc. Cambridge Phil. Soc. 44, 1948; what is known of the model
+beforehand enters as further rows of the least squares, the mixed estimation of H. Theil, A. S. Goldberger, Int. Econ.
+Rev. 2, 1961.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from loopwright.tuning.fast.evaluation import NEGLIGIBLE_RESIDUAL
+from loopwright.tuning.fast.record import noise_of
+from loopwright.tuning.fast.uncertainty import durbin_watson_ratio
+from loopwright.tuning.identification.output_error import averaged
+from loopwright.tuning.models import Reals, TransferFunction
+from loopwright.tuning.operation.accepted_model import AcceptedModel, answers_to_step, driven
+from loopwright.tuning.operation.history import Stretch
+
+BEFORE, AFTER = 1.0, 10.0
+"""Ultimate periods before and after its first move in which a change is compared: a second path that acts eight of
+them later still shows."""
+MV_BEFORE = 10.0
+"""Ultimate periods before that from which MV is taken, where it is known: what it did then may act later."""
+ROWS_PER_PERIOD = 40
+"""Averages of the samples in an ultimate period."""
+PATHS = tuple(0.5 * n for n in range(1, 18))
+"""Delays of a second path that are looked for, in ultimate periods."""
+SEEN_AFTER = 1.5
+"""Ultimate periods of a change in which a second path must have acted before its share is known."""
+LATER = 0.02
+"""By how much the dead time is made longer for its sensitivity, in ultimate periods."""
+MAX_RESIDUAL = 1.5
+"""Largest residual of a change, in standard deviations of the noise, that the model explains."""
+CLEAR = 4.0
+"""Size of an alternative, in its standard deviations, from which it is shown by a change."""
+MATTERS = 0.2
+"""Change of Ms from which an alternative matters."""
+WELL_KNOWN = 0.12
+"""Largest standard deviation of the gain, and of the share of a second path, as a fraction of the gain, with which a
+change can confirm the model."""
+UNSEEN = 1e-9
+"""Singular value, of columns of unit length, below which a direction does not show."""
+LOAD_SPACING = 0.25
+"""Distance of the times at which a step of the load is looked for, in ultimate periods."""
+
+
+class Kind(StrEnum):
+    """What may differ from the model."""
+
+    GAIN = "gain"
+    DEAD_TIME = "dead_time"
+    SECOND_PATH = "second_path"
+
+
+class ChangeState(StrEnum):
+    """What one change says of the model."""
+
+    CONFIRMED = "confirmed"
+    DIFFERS = "differs"
+    DISTURBED = "disturbed"
+    NOT_ENOUGH = "not_enough_excitation"
+
+
+@dataclass(frozen=True, slots=True)
+class Alternative:
+    """What may be there instead of the model.
+
+    delay_s: by how much a second path acts later, s; 0 for other kinds.
+    size: the gain less that of the model, or the share of the second path, as fractions of the gain of the model; the
+    further dead time, s.
+    deviation: the standard deviation of the size.
+    residual: the rms of the residual with it, in standard deviations of the noise.
+    Ms: Ms of the accepted gains with it.
+    clear: whether the change shows it, of a size that matters.
+    """
+
+    kind: Kind
+    delay_s: float
+    size: float
+    deviation: float
+    residual: float
+    Ms: float
+    clear: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedChange:
+    """One change compared with the model.
+
+    size: the largest deviation of the set-point from before, PV units; 0 of a load.
+    residual: the rms of what the model leaves of PV, in standard deviations of the noise.
+    load: whether a step of the load explains what the model leaves.
+    alternatives: what may be there instead, in the order of KINDS and delays.
+    """
+
+    state: ChangeState
+    size: float
+    residual: float
+    load: bool
+    alternatives: tuple[Alternative, ...]
+
+    @property
+    def best(self) -> Alternative | None:
+        """The alternative that the change shows and that explains it best; None where it shows none."""
+        return min((each for each in self.alternatives if each.clear), key=lambda each: each.residual, default=None)
+
+
+def compare_change(model: AcceptedModel, stretch: Stretch, move: int, end: int) -> ComparedChange:
+    """Compares a change of a stretch with the model.
+
+    move, end: the samples at which the change begins, and until which it is looked at.
+    """
+    return _Comparison(model, stretch, move, end).compared()
+
+
+class _Comparison:
+    """The least squares of one change; PV is in standard deviations of its noise."""
+
+    def __init__(self, model: AcceptedModel, stretch: Stretch, move: int, end: int) -> None:
+        self._model, self._Ts = model, stretch.Ts
+        per_period = model.period_s / stretch.Ts
+        self._block = max(1, round(per_period / ROWS_PER_PERIOD))
+        first = max(move - round(BEFORE * per_period), 0)
+        self._skip = first - max(first - round(MV_BEFORE * per_period), 0)
+        mv = stretch.mv[first - self._skip : end]
+        self._u = mv - float(np.median(mv[: self._skip + move - first + 1]))
+        pv = averaged(stretch.pv[first:end] - stretch.pv[first], self._block)
+        self._rows = len(pv)
+        sp = stretch.sp[max(move - 1, 0) : end]
+        self._size = float(np.max(np.abs(sp - sp[0])))
+        rest = averaged(stretch.pv[first:move], self._block) if move - first > 8 * self._block else pv
+        quiet = noise_of(rest) if len(rest) > 6 else 0.0
+        self._noise = math.hypot(quiet, NEGLIGIBLE_RESIDUAL / MAX_RESIDUAL * float(np.ptp(pv))) or 1.0
+        self._begun_s = (move - first) * stretch.Ts
+        self._length_s = (end - move) * stretch.Ts
+        nominal = self._answer(model.plant)
+        self._nominal = nominal
+        unknown = [(self._answer(plant) - nominal) / distance for plant, distance in model.neighbours()]
+        t = np.linspace(-1.0, 1.0, self._rows)
+        starts = averaged(answers_to_step(model.plant, end - first, stretch.Ts), self._block)
+        self._states = starts
+        self._free = np.column_stack((np.ones(self._rows), t, starts))
+        self._known = np.column_stack(unknown) if unknown else np.zeros((self._rows, 0))
+        self._left = pv / self._noise - nominal
+
+    def compared(self) -> ComparedChange:
+        base = _Solved.of(self._free, self._known, self._left)
+        alternatives = self._alternatives(base)
+        gain = alternatives[0]
+        paths = [each for each in alternatives if each.kind is Kind.SECOND_PATH]
+        known = gain.deviation < WELL_KNOWN and all(each.deviation < WELL_KNOWN for each in paths)
+        residual = base.residual
+        load = False
+        if any(each.clear for each in alternatives):
+            state = ChangeState.DIFFERS
+            if not self._size:
+                state = ChangeState.DISTURBED
+        elif residual > MAX_RESIDUAL:
+            state = ChangeState.DISTURBED
+        else:
+            state = ChangeState.CONFIRMED if known and paths else ChangeState.NOT_ENOUGH
+        if residual > MAX_RESIDUAL:
+            load = self._with_load() <= MAX_RESIDUAL
+        return ComparedChange(state, self._size, residual, load, tuple(alternatives))
+
+    def _alternatives(self, base: _Solved) -> list[Alternative]:
+        model, period = self._model, self._model.period_s
+        later = self._answer(model.plant, LATER * period) - self._nominal
+        shown = [self._shown(base, Kind.GAIN, 0.0, self._nominal)]
+        shown.append(self._shown(base, Kind.DEAD_TIME, 0.0, later / (LATER * period)))
+        for delay in PATHS:
+            delay_s = delay * period
+            if delay_s + model.plant.L > self._length_s - SEEN_AFTER * period:
+                break
+            shown.append(self._shown(base, Kind.SECOND_PATH, delay_s, self._answer(model.plant, delay_s)))
+        return shown
+
+    def _shown(self, base: _Solved, kind: Kind, delay_s: float, column: Reals) -> Alternative:
+        size, deviation, residual = base.further(column)
+        Ms = self._model.Ms()
+        if kind is Kind.GAIN:
+            found = self._model.Ms(gain=max(1.0 + size, 0.0))
+        elif kind is Kind.DEAD_TIME:
+            found = self._model.Ms(later_s=size)
+        else:
+            found = self._model.Ms(share=size, path_s=delay_s)
+        clear = abs(size) > CLEAR * deviation and abs(found - Ms) > MATTERS
+        return Alternative(kind, delay_s, size, deviation, residual, found, clear)
+
+    def _with_load(self) -> float:
+        """The residual with one step of the load at the best time."""
+        spacing = max(1, round(LOAD_SPACING * self._model.period_s / self._Ts / self._block))
+        best = math.inf
+        for at in range(0, self._rows - 2 * self._states.shape[1], spacing):
+            load = np.zeros_like(self._states)
+            load[at:] = self._states[: self._rows - at]
+            best = min(best, _Solved.of(np.column_stack((self._free, load)), self._known, self._left).residual)
+        return best
+
+    def _answer(self, plant: TransferFunction, further_s: float = 0.0) -> Reals:
+        answer = driven(plant, self._u, self._Ts, further_s)[self._skip :]
+        return np.asarray(averaged(answer, self._block) / self._noise)
+
+
+class _Solved:
+    """A least squares solution: what is free, what is known beforehand to a standard deviation, and what is left.
+
+    rows: the number of rows of PV; what is known beforehand follows after them.
+    """
+
+    def __init__(self, basis: Reals, left: Reals, rows: int) -> None:
+        self._basis, self._rows = basis, rows
+        self._left = left - basis @ (basis.T @ left)
+        self.residual = float(np.sqrt(np.mean(self._left[:rows] ** 2)))
+
+    @classmethod
+    def of(cls, free: Reals, known: Reals, left: Reals) -> _Solved:
+        """free, known: columns, shape (rows, any). left: PV less what the model says, shape (rows,)."""
+        rows, further = len(left), known.shape[1]
+        columns = np.zeros((rows + further, free.shape[1] + further))
+        columns[:rows] = np.column_stack((free, known))
+        columns[rows:, free.shape[1] :] = np.eye(further)
+        lengths = np.linalg.norm(columns, axis=0)
+        basis, singular, _ = np.linalg.svd(columns[:, lengths > 0.0] / lengths[lengths > 0.0], full_matrices=False)
+        return cls(basis[:, singular > UNSEEN * singular[0]], np.append(left, np.zeros(further)), rows)
+
+    def further(self, column: Reals) -> tuple[float, float, float]:
+        """The coefficient of one column more, its standard deviation, and the rms of what is then left."""
+        whole = np.append(column, np.zeros(len(self._left) - self._rows))
+        apart = whole - self._basis @ (self._basis.T @ whole)
+        power = float(apart @ apart)
+        if power <= UNSEEN * float(column @ column):
+            return 0.0, math.inf, self.residual
+        size = float(apart @ self._left) / power
+        left = (self._left - size * apart)[: self._rows]
+        residual = float(np.sqrt(np.mean(left**2)))
+        variance = max(residual, 1.0) ** 2 * durbin_watson_ratio(left)
+        return size, math.sqrt(variance / power), residual
