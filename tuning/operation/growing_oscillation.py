@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopwright.tuning.identification.oscillation import fit_growth
+from loopwright.tuning.identification.output_error import averaged
 from loopwright.tuning.models import Reals
 from loopwright.tuning.operation.history import Stretch
 
@@ -54,12 +55,12 @@ def growing(stretch: Stretch, period_s: float) -> Growing | None:
     longest = round((PERIODS + 1) * PERIOD_RANGE[1] * period_s / stretch.Ts)
     moves = stretch.moves
     first = max(len(stretch.pv) - longest, moves[-1] if moves else 0)
-    pv = stretch.pv[first:]
+    pv = np.asarray(stretch.pv[first:], dtype=np.float64)
     block = max(1, round(SMOOTHED * period_s / stretch.Ts / 3.0))
     rows = len(pv) // block
     if rows < 3 * 2 * PERIODS:
         return None
-    y = pv[len(pv) - rows * block :].reshape(rows, block).mean(axis=1)
+    y = averaged(pv[len(pv) - rows * block :], block)
     noise = 0.5 * float(np.sqrt(np.mean(np.diff(y, 2) ** 2) / 1.5))
     T = block * stretch.Ts
     return _growing(y, T, noise, period_s)
@@ -80,7 +81,7 @@ def _growing(y: Reals, T: float, noise: float, period_s: float) -> Growing | Non
     if not np.all(swings[2:] >= GROWTH * swings[:-2]) or swings[-1] < MIN_NOISES * noise:
         return None
     part = y[at[0] : at[-1] + 1]
-    found = fit_growth(T * np.arange(len(part)), part, period)
+    found = fit_growth(np.asarray(T * np.arange(len(part))), part, period)
     variance = float(np.var(part))
     explained = 1.0 - found.noise**2 / variance if variance > 0.0 else 0.0
     ratio = math.exp(found.log_per_period)
