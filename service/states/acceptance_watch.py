@@ -108,6 +108,15 @@ class AcceptanceWatch(_Stored):
         return judged([each.compared for each in self.changes])
 
     @property
+    def abnormal(self) -> bool:
+        """Whether an alarm is to be made of what was found. Who has rolled back has seen it; what the watch has rolled
+        back by itself nobody has seen yet."""
+        if self.trouble is not None and self.trouble.put_back:
+            return True
+        found = self.trouble is not None or self.judgement().verdict is ModelVerdict.MISMATCH
+        return found and self.end is not WatchEnd.ROLLED_BACK
+
+    @property
     def words(self) -> str:
         """What the watch has come to, in a sentence or two."""
         found = self.judgement()

@@ -307,14 +307,16 @@ class JobFiguresRow(Base):
 
 
 class WatchRow(Base):
-    """The watch of a loop after the gains of a job were accepted. open: whether it goes on."""
+    """The watch of a loop after the gains of a job were accepted. open: whether it goes on.  abnormal: whether an alarm
+    is to be made of what it has found."""
 
     __tablename__ = "watches"
-    __table_args__ = (Index("watches_by_loop", "loop", "open"),)
+    __table_args__ = (Index("watches_by_loop", "loop", "open"), Index("abnormal_watches", "abnormal"))
 
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
     loop: Mapped[str]
     open: Mapped[bool]
+    abnormal: Mapped[bool]
     watch: Mapped[AcceptanceWatch] = mapped_column(WatchColumn)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -12,22 +13,38 @@ from loopwright.service.store.clock import now
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow, LoopRow, WatchRow
 
+
+@dataclass(frozen=True, slots=True)
+class AbnormalWatch:
+    """A watch that has found something abnormal, with its job, loop and host."""
+
+    job_id: str
+    loop: str
+    host: str
+    watch: AcceptanceWatch
+
+
 Change = Callable[[AcceptanceWatch], AcceptanceWatch]
 """Makes of a watch what it is from now on."""
 
 
 def begin(session: Session, job: JobRow, watch: AcceptanceWatch) -> None:
     """Stores a new watch in the transaction of the acceptance, and ends those of earlier acceptances of the loop."""
-    for row in session.scalars(select(WatchRow).where(WatchRow.loop == job.loop, WatchRow.open.is_(True))):
-        _set(row, ended(row.watch, WatchEnd.RETUNED))
-    session.merge(WatchRow(job_id=job.id, loop=job.loop, open=True, watch=watch))
+    noticed = WatchRow.open.is_(True) | WatchRow.abnormal.is_(True)
+    for row in session.scalars(select(WatchRow).where(WatchRow.loop == job.loop, noticed)):
+        if row.open:
+            _set(row, ended(row.watch, WatchEnd.RETUNED))
+        row.abnormal = False  # what was said of it is of gains that are no longer in effect
+    session.merge(WatchRow(job_id=job.id, loop=job.loop, open=True, abnormal=False, watch=watch))
 
 
 def rolled_back(session: Session, job: JobRow) -> None:
-    """Ends the watch in the transaction of the rollback."""
+    """Ends the watch in the transaction of the rollback; who has rolled back has seen what was wrong."""
     row = session.get(WatchRow, job.id)
-    if row is not None and row.open:
-        _set(row, ended(row.watch, WatchEnd.ROLLED_BACK))
+    if row is not None:
+        if row.open:
+            _set(row, ended(row.watch, WatchEnd.ROLLED_BACK))
+        row.abnormal = False
 
 
 def ended(watch: AcceptanceWatch, why: WatchEnd) -> AcceptanceWatch:
@@ -71,5 +88,17 @@ def settle(store: Store, job_id: str, make: Change) -> None:
             _set(row, make(row.watch))
 
 
+def abnormal(store: Store) -> list[AbnormalWatch]:
+    """Returns the watches of every host that have found something abnormal, oldest first. Raises SQLAlchemyError."""
+    wanted = (
+        select(WatchRow, JobRow.host)
+        .join(JobRow, JobRow.id == WatchRow.job_id)
+        .where(WatchRow.abnormal.is_(True))
+        .order_by(JobRow.number)
+    )
+    with store.reading() as session:
+        return [AbnormalWatch(row.job_id, row.loop, host, row.watch) for row, host in session.execute(wanted)]
+
+
 def _set(row: WatchRow, watch: AcceptanceWatch) -> None:
-    row.watch, row.open = watch, watch.end is None
+    row.watch, row.open, row.abnormal = watch, watch.end is None, watch.abnormal
