@@ -35,6 +35,7 @@ class HeardAfter(HeardBefore):
     def __init__(self) -> None:
         self.rings = Rings()
         super().__init__(self.rings)
+        self.gains_are_read = True
         self.read: tuple[Gains, float] | None = None
 
     def gains_read(self, tag: str) -> tuple[Gains, float] | None:
@@ -117,13 +118,15 @@ class WatchedLoop:
             self.now_s += TS
             self.n += 1
             if self.heard_at_all:
-                known = rings.number_of(astuple(gains))
+                read = gains if self.ears.read is None or self.ears.gains_are_read else self.ears.read[0]
+                known = rings.number_of(astuple(read))
                 rings.put(self.now_s, self.n, self.pv, mv, self.channel.setpoint, known, mode, self.gap)
                 self.gap = 0
             else:
                 self.gap = GAP_BEFORE
             self.pv = self.plant.step(50.0 + self.factor(self.n) * (mv - 50.0))
-        self.ears.read = controller.state.gains, self.now_s
+        if self.ears.gains_are_read:
+            self.ears.read = controller.state.gains, self.now_s
         self.ears.heard = {} if not self.heard_at_all else {
             TAG: Heard(self.now_s, False, self.pv, mv, self.channel.setpoint, mode, False, False)
         }  # fmt: skip
