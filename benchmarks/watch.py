@@ -38,6 +38,7 @@ from loopwright.tuning.operation.accepted_verdict import ModelVerdict, judged
 from loopwright.tuning.operation.compared_change import AFTER, ComparedChange, compare_change
 from loopwright.tuning.operation.growing_oscillation import growing
 from loopwright.tuning.operation.history import Stretch
+from loopwright.tuning.operation.load_changes import load_changes
 from loopwright.tuning.plan import Mode
 
 CHANGES = 3
@@ -55,6 +56,7 @@ class Kind:
     drift: the gain reaches this factor at the end.
     noise: in permitted steps. loads: steps of the load in all, of 0.1 to 0.5 of what moves PV by a permitted step.
     pole: of coloured noise, in a fortieth of an ultimate period. wandering: of a load, as loads.
+    moves: whether the set-point is moved.
     """
 
     share: float = 0.0
@@ -66,6 +68,7 @@ class Kind:
     loads: int = 0
     pole: float = 0.0
     wandering: float = 0.0
+    moves: bool = True
 
 
 KINDS = {
@@ -75,6 +78,7 @@ KINDS = {
     "one load": Kind(loads=1),
     "three loads": Kind(loads=3),
     "wandering load": Kind(wandering=0.02),
+    "three loads alone": Kind(loads=3, moves=False),
     "30 % of the effect 4 Pu later": Kind(share=0.3 / 0.7),
     "60 % of the effect 4 Pu later": Kind(share=0.6 / 0.4),
     "30 % of the effect 8 Pu later": Kind(share=0.3 / 0.7, later=8.0),
@@ -87,7 +91,9 @@ KINDS = {
     "dead time 0.1 Pu longer": Kind(dead_time=0.1),
     "dead time 0.2 Pu longer": Kind(dead_time=0.2),
 }
-FALSE = ("quiet", "twice the noise", "noise of pole 0.8", "one load", "three loads", "wandering load")
+FALSE = (
+    "quiet", "twice the noise", "noise of pole 0.8", "one load", "three loads", "wandering load", "three loads alone",
+)  # fmt: skip
 """Kinds of operation on the plant of the test."""
 
 
@@ -148,7 +154,7 @@ def operated(plant: Plant, found: FastProposal, kind: Kind, random: np.random.Ge
     rows = []
     clean, sp, load = 0.0, 0.0, 0.0
     for k in range(whole):
-        if k in moves:
+        if kind.moves and k in moves:
             size = random.uniform(0.3, 1.0)
             sp += size * (-1.0 if sp + size > 1.0 else 1.0 if sp - size < -1.0 else random.choice((-1.0, 1.0)))
             channel.setpoint = sp
@@ -171,10 +177,11 @@ def compared(model: AcceptedModel, stretch: Stretch) -> list[ComparedChange]:
     """The changes as the service compares them."""
     found, last = [], 0
     after = round(AFTER * model.period_s / stretch.Ts)
-    for move in stretch.moves:
+    moves = [(move, False) for move in stretch.moves]
+    for move, by_load in sorted(moves + [(at, True) for at in load_changes(stretch, model.period_s)]):
         if move >= last and move + after <= len(stretch.sp):
             last = move + after
-            found.append(compare_change(model, stretch, move, last))
+            found.append(compare_change(model, stretch, move, last, by_load))
     return found
 
 

@@ -9,7 +9,6 @@ watch from it: an alarm then says why.
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -214,8 +213,6 @@ class Watching:
             if model is None or watch.end is not None:
                 continue
             from_s = max(watch.looked_to_s, watch.since_s)
-            if not _moved(asked, from_s):
-                continue
             work = partial(compared, asked, model, from_s)
             try:
                 found = self._pool.run(ComputationKind.LOOK, work, unwanted=lambda: self._compares.closed)
@@ -294,10 +291,3 @@ def _left_automatic(asked: Question, since_s: float) -> float | None:
     later = known[int(np.argmax(automatic)) :]
     left = later[later["mode"] != Mode.AUTOMATIC]
     return float(left["at_s"][0]) if len(left) else None
-
-
-def _moved(asked: Question, from_s: float) -> bool:
-    """Whether the set-point was moved since then."""
-    bins = asked.rows.bins
-    sp = bins["sp"][(bins["at_s"] > from_s) & np.isfinite(bins["sp"])]
-    return bool(len(sp) > 1 and math.isfinite(float(sp[0])) and np.any(sp != sp[0]))

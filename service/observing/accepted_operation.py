@@ -22,6 +22,7 @@ from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.operation.accepted_model import AcceptedModel
 from loopwright.tuning.operation.compared_change import AFTER, compare_change
 from loopwright.tuning.operation.growing_oscillation import Growing, growing
+from loopwright.tuning.operation.load_changes import load_changes
 from loopwright.tuning.reasons import Ended
 
 PERIOD_OF_T95 = 0.7
@@ -77,15 +78,17 @@ def accepted_model(result: FastResult | FiveStageResult, sample_time_s: float) -
 
 
 def compared(question: Question, model: AcceptedModel, from_s: float) -> Compared:
-    """Compares the set-point changes since a time, wall time, s; a computation of a tenth of a second for each."""
+    """Compares the set-point changes and the loads since a time, wall time, s; a computation of a tenth of a second
+    for each."""
     found, looked_to_s = [], from_s
     for each in under_accepted_gains(question.heard(), model.gains):
         after = round(AFTER * model.period_s / each.stretch.Ts)
-        for move in each.stretch.moves:
+        moves = [(move, False) for move in each.stretch.moves]
+        for move, by_load in sorted(moves + [(at, True) for at in load_changes(each.stretch, model.period_s)]):
             end = move + after
             if each.at_s[move] <= looked_to_s or end > len(each.stretch.sp):
                 continue
-            change = compare_change(model, each.stretch, move, end)
+            change = compare_change(model, each.stretch, move, end, by_load)
             found.append(WatchedChange(at_s=float(each.at_s[move]), compared=change))
             looked_to_s = float(each.at_s[end - 1])
     return Compared(tuple(found), looked_to_s)

@@ -1,5 +1,6 @@
-"""A second path that the test could not show is found in operation, and rolled back, on the page. The loop, its controller
-and the clock are simulated; the API behind the page is the real one."""
+"""A second path that the test could not show is found in operation, and rolled back, on the page.
+
+The loop, its controller and the clock are simulated; the API behind the page is the real one."""
 
 from __future__ import annotations
 

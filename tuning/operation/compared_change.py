@@ -39,6 +39,11 @@ LATER = 0.02
 """By how much the dead time is made longer for its sensitivity, in ultimate periods."""
 MAX_RESIDUAL = 1.5
 """Largest residual of a change, in standard deviations of the noise, that the model explains."""
+MIN_AT_REST = 10
+"""Averages before the change from which the noise at rest is estimated."""
+EXPLAINED, NOISE_KNOWN = 0.75, 1.2
+"""Smallest part of what the model leaves beyond the noise that an alternative explains, and the factor to which the
+noise is known: a load that wanders is explained by none."""
 CLEAR = 4.0
 """Size of an alternative, in its standard deviations, from which it is shown by a change."""
 MATTERS = 0.2
@@ -48,6 +53,10 @@ WELL_KNOWN = 0.12
 change can confirm the model."""
 UNSEEN = 1e-9
 """Singular value, of columns of unit length, below which a direction does not show."""
+UNKNOWN = 1e9
+"""Standard deviation of what a change does not show."""
+DEAD_TIME_STEPS = 4
+"""Steps in which the further dead time is found."""
 LOAD_SPACING = 0.25
 """Distance of the times at which a step of the load is looked for, in ultimate periods."""
 
@@ -97,7 +106,7 @@ class ComparedChange:
 
     size: the largest deviation of the set-point from before, PV units; 0 of a load.
     residual: the rms of what the model leaves of PV, in standard deviations of the noise.
-    load: whether a step of the load explains what the model leaves.
+    load: whether a load has moved PV, or a step of it explains what the model leaves.
     alternatives: what may be there instead, in the order of KINDS and delays.
     """
 
@@ -113,18 +122,22 @@ class ComparedChange:
         return min((each for each in self.alternatives if each.clear), key=lambda each: each.residual, default=None)
 
 
-def compare_change(model: AcceptedModel, stretch: Stretch, move: int, end: int) -> ComparedChange:
+def compare_change(
+    model: AcceptedModel, stretch: Stretch, move: int, end: int, by_load: bool = False
+) -> ComparedChange:
     """Compares a change of a stretch with the model.
 
     move, end: the samples at which the change begins, and until which it is looked at.
+    by_load: whether a load has moved PV, and not the set-point. A step of it is then part of what is fitted; where
+    that does not do, the load was not a step, which tells nothing of the plant.
     """
-    return _Comparison(model, stretch, move, end).compared()
+    return _Comparison(model, stretch, move, end, by_load).compared()
 
 
 class _Comparison:
     """The least squares of one change; PV is in standard deviations of its noise."""
 
-    def __init__(self, model: AcceptedModel, stretch: Stretch, move: int, end: int) -> None:
+    def __init__(self, model: AcceptedModel, stretch: Stretch, move: int, end: int, by_load: bool) -> None:
         self._model, self._Ts = model, stretch.Ts
         per_period = model.period_s / stretch.Ts
         self._block = max(1, round(per_period / ROWS_PER_PERIOD))
@@ -136,8 +149,9 @@ class _Comparison:
         self._rows = len(pv)
         sp = stretch.sp[max(move - 1, 0) : end]
         self._size = float(np.max(np.abs(sp - sp[0])))
-        rest = averaged(stretch.pv[first:move], self._block) if move - first > 8 * self._block else pv
-        quiet = noise_of(rest) if len(rest) > 6 else 0.0
+        rest = averaged(stretch.pv[first:move], self._block)
+        fast = float(np.sqrt(np.mean(np.diff(pv, 2) ** 2) / 6.0))  # what is left of PV without its slow changes
+        quiet = max(noise_of(rest), fast) if len(rest) >= MIN_AT_REST else fast
         self._noise = math.hypot(quiet, NEGLIGIBLE_RESIDUAL / MAX_RESIDUAL * float(np.ptp(pv))) or 1.0
         self._begun_s = (move - first) * stretch.Ts
         self._length_s = (end - move) * stretch.Ts
@@ -150,6 +164,9 @@ class _Comparison:
         self._free = np.column_stack((np.ones(self._rows), t, starts))
         self._known = np.column_stack(unknown) if unknown else np.zeros((self._rows, 0))
         self._left = pv / self._noise - nominal
+        self._by_load = by_load
+        if by_load:
+            self._free = np.column_stack((self._free, self._load()))
 
     def compared(self) -> ComparedChange:
         base = _Solved.of(self._free, self._known, self._left)
@@ -158,33 +175,49 @@ class _Comparison:
         paths = [each for each in alternatives if each.kind is Kind.SECOND_PATH]
         known = gain.deviation < WELL_KNOWN and all(each.deviation < WELL_KNOWN for each in paths)
         residual = base.residual
-        load = False
         if any(each.clear for each in alternatives):
-            state = ChangeState.DIFFERS
-            if not self._size:
-                state = ChangeState.DISTURBED
+            state = ChangeState.DISTURBED if self._by_load else ChangeState.DIFFERS
         elif residual > MAX_RESIDUAL:
             state = ChangeState.DISTURBED
         else:
             state = ChangeState.CONFIRMED if known and paths else ChangeState.NOT_ENOUGH
-        if residual > MAX_RESIDUAL:
-            load = self._with_load() <= MAX_RESIDUAL
-        return ComparedChange(state, self._size, residual, load, tuple(alternatives))
+        load = self._by_load
+        if residual > MAX_RESIDUAL and not load:
+            with_load = np.column_stack((self._free, self._load()))
+            load = _Solved.of(with_load, self._known, self._left).residual <= MAX_RESIDUAL
+        size = 0.0 if self._by_load else self._size
+        return ComparedChange(state, size, residual, load, tuple(alternatives))
 
     def _alternatives(self, base: _Solved) -> list[Alternative]:
         model, period = self._model, self._model.period_s
-        later = self._answer(model.plant, LATER * period) - self._nominal
-        shown = [self._shown(base, Kind.GAIN, 0.0, self._nominal)]
-        shown.append(self._shown(base, Kind.DEAD_TIME, 0.0, later / (LATER * period)))
+        shown = [self._shown(base, Kind.GAIN, 0.0, *base.further(self._nominal))]
+        shown.append(self._shown(base, Kind.DEAD_TIME, 0.0, *self._later(base)))
         for delay in PATHS:
             delay_s = delay * period
             if delay_s + model.plant.L > self._length_s - SEEN_AFTER * period:
                 break
-            shown.append(self._shown(base, Kind.SECOND_PATH, delay_s, self._answer(model.plant, delay_s)))
+            found = base.further(self._answer(model.plant, delay_s))
+            shown.append(self._shown(base, Kind.SECOND_PATH, delay_s, *found))
         return shown
 
-    def _shown(self, base: _Solved, kind: Kind, delay_s: float, column: Reals) -> Alternative:
-        size, deviation, residual = base.further(column)
+    def _later(self, base: _Solved) -> tuple[float, float, float, float]:
+        """The further dead time, s, as `further` has it. PV is not linear in it: it is found by a few steps."""
+        plant, step = self._model.plant, LATER * self._model.period_s
+        total, deviation, residual, left = 0.0, UNKNOWN, base.residual, base.squares
+        for _ in range(DEAD_TIME_STEPS):
+            now = self._answer(plant, total)
+            column = (self._answer(plant, total + step) - now) / step
+            solved = _Solved.of(self._free, self._known, self._left + self._nominal - now)
+            size, deviation, residual, left = solved.further(column)
+            if deviation >= UNKNOWN:
+                break
+            longest = 0.25 * self._model.period_s
+            total = max(total + min(max(size, -longest), longest), -plant.L)
+        return total, deviation, residual, left
+
+    def _shown(
+        self, base: _Solved, kind: Kind, delay_s: float, size: float, deviation: float, residual: float, left: float
+    ) -> Alternative:
         Ms = self._model.Ms()
         if kind is Kind.GAIN:
             found = self._model.Ms(gain=max(1.0 + size, 0.0))
@@ -192,18 +225,22 @@ class _Comparison:
             found = self._model.Ms(later_s=size)
         else:
             found = self._model.Ms(share=size, path_s=delay_s)
-        clear = abs(size) > CLEAR * deviation and abs(found - Ms) > MATTERS
+        beyond_noise = base.squares - NOISE_KNOWN**2 * self._rows
+        fits = residual <= MAX_RESIDUAL and base.squares - left >= EXPLAINED * beyond_noise
+        clear = fits and abs(size) > CLEAR * deviation and abs(found - Ms) > MATTERS
         return Alternative(kind, delay_s, size, deviation, residual, found, clear)
 
-    def _with_load(self) -> float:
-        """The residual with one step of the load at the best time."""
+    def _load(self) -> Reals:
+        """What one step of the load makes of the states at the time at which it explains most, shape (rows, order)."""
         spacing = max(1, round(LOAD_SPACING * self._model.period_s / self._Ts / self._block))
-        best = math.inf
+        best, found = math.inf, self._states
         for at in range(0, self._rows - 2 * self._states.shape[1], spacing):
             load = np.zeros_like(self._states)
             load[at:] = self._states[: self._rows - at]
-            best = min(best, _Solved.of(np.column_stack((self._free, load)), self._known, self._left).residual)
-        return best
+            residual = _Solved.of(np.column_stack((self._free, load)), self._known, self._left).residual
+            if residual < best:
+                best, found = residual, load
+        return found
 
     def _answer(self, plant: TransferFunction, further_s: float = 0.0) -> Reals:
         answer = driven(plant, self._u, self._Ts, further_s)[self._skip :]
@@ -220,6 +257,7 @@ class _Solved:
         self._basis, self._rows = basis, rows
         self._left = left - basis @ (basis.T @ left)
         self.residual = float(np.sqrt(np.mean(self._left[:rows] ** 2)))
+        self.squares = float(self._left @ self._left)
 
     @classmethod
     def of(cls, free: Reals, known: Reals, left: Reals) -> _Solved:
@@ -232,15 +270,17 @@ class _Solved:
         basis, singular, _ = np.linalg.svd(columns[:, lengths > 0.0] / lengths[lengths > 0.0], full_matrices=False)
         return cls(basis[:, singular > UNSEEN * singular[0]], np.append(left, np.zeros(further)), rows)
 
-    def further(self, column: Reals) -> tuple[float, float, float]:
-        """The coefficient of one column more, its standard deviation, and the rms of what is then left."""
+    def further(self, column: Reals) -> tuple[float, float, float, float]:
+        """The coefficient of one column more, its standard deviation, the rms of what is then left of PV, and the sum
+        of squares of all that is left."""
         whole = np.append(column, np.zeros(len(self._left) - self._rows))
         apart = whole - self._basis @ (self._basis.T @ whole)
         power = float(apart @ apart)
         if power <= UNSEEN * float(column @ column):
-            return 0.0, math.inf, self.residual
+            return 0.0, UNKNOWN, self.residual, self.squares
         size = float(apart @ self._left) / power
-        left = (self._left - size * apart)[: self._rows]
+        whole = self._left - size * apart
+        left = whole[: self._rows]
         residual = float(np.sqrt(np.mean(left**2)))
         variance = max(residual, 1.0) ** 2 * durbin_watson_ratio(left)
-        return size, math.sqrt(variance / power), residual
+        return size, min(math.sqrt(variance / power), UNKNOWN), residual, float(whole @ whole)
