@@ -60,7 +60,7 @@ class Kind:
     """
 
     share: float = 0.0
-    later: float = 4.0
+    later: float = 4.1
     gain: float = 1.0
     dead_time: float = 0.0
     drift: float = 1.0
@@ -79,11 +79,12 @@ KINDS = {
     "three loads": Kind(loads=3),
     "wandering load": Kind(wandering=0.02),
     "three loads alone": Kind(loads=3, moves=False),
-    "30 % of the effect 4 Pu later": Kind(share=0.3 / 0.7),
-    "60 % of the effect 4 Pu later": Kind(share=0.6 / 0.4),
+    "30 % of the effect 4.1 Pu later": Kind(share=0.3 / 0.7),
+    "60 % of the effect 4.1 Pu later": Kind(share=0.6 / 0.4),
+    "30 % of the effect 2.7 Pu later": Kind(share=0.3 / 0.7, later=2.7),
     "30 % of the effect 8 Pu later": Kind(share=0.3 / 0.7, later=8.0),
-    "-30 % of the effect 4 Pu later": Kind(share=-0.3 / 1.3),
-    "30 % 4 Pu later, three loads": Kind(share=0.3 / 0.7, loads=3),
+    "-30 % of the effect 4.1 Pu later": Kind(share=-0.3 / 1.3),
+    "30 % 4.1 Pu later, three loads": Kind(share=0.3 / 0.7, loads=3),
     "gain x 1.3": Kind(gain=1.3),
     "gain x 1.6": Kind(gain=1.6),
     "gain x 0.6": Kind(gain=0.6),

@@ -33,7 +33,7 @@ from loopwright.service.observing.observed import Question
 from loopwright.service.observing.resolution import wall_period_s
 from loopwright.service.states.acceptance_watch import (
     CHANGES,
-    MAX_DISTURBED,
+    MAX_CHANGES,
     PERIODS,
     AcceptanceWatch,
     Trouble,
@@ -49,6 +49,7 @@ from loopwright.service.store.live_jobs import latest_jobs
 from loopwright.service.store.store import Busy, Store
 from loopwright.service.telemetry.logs import about
 from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.operation.accepted_verdict import ModelVerdict
 from loopwright.tuning.reasons import Ended
 
 log = logging.getLogger(__name__)
@@ -277,7 +278,8 @@ def _state(job: Job) -> LoopState:
 
 def _complete(watch: AcceptanceWatch, passed_s: float) -> bool:
     """passed_s: plant time since the acceptance, s."""
-    enough = watch.told >= CHANGES or len(watch.changes) >= MAX_DISTURBED
+    decided = watch.told >= CHANGES and watch.judgement().verdict is not ModelVerdict.OPEN
+    enough = decided or len(watch.changes) >= MAX_CHANGES
     return enough and passed_s >= PERIODS * watch.period_s
 
 

@@ -14,8 +14,8 @@ CHANGES = 3
 """Number of changes that are compared."""
 PERIODS = 10.0
 """Ultimate periods for which the loop is watched at least."""
-MAX_DISTURBED = 12
-"""Changes that tell nothing after which the watch ends all the same."""
+MAX_CHANGES = 12
+"""Number of changes after which the watch ends, whatever they tell."""
 
 
 class WatchEnd(StrEnum):
@@ -143,6 +143,11 @@ def _words_of(found: Judgement, watch: AcceptanceWatch) -> str:
             "Nothing has moved the loop while it was watched: the model is neither confirmed nor disproved."
         )  # fmt: skip
     count = len(watch.changes)
+    if found.confirmed or watch.told:
+        return (
+            f"The latest change does not fit the model, which {found.confirmed} of {count} changes confirm; a load, or "
+            "a plant that changes, looks like that. The next change will tell."
+        )
     return (
         f"{count} change{'s' * (count != 1)} of normal operation neither confirm{'s' * (count == 1)} nor "
         f"disprove{'s' * (count == 1)} the model: too small, or disturbed."

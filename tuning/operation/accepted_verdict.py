@@ -10,13 +10,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from itertools import combinations
 
-from loopwright.tuning.operation.compared_change import Alternative, ChangeState, ComparedChange, Kind
+from loopwright.tuning.operation.compared_change import Alternative, ChangeState, ComparedChange
 
-ALIKE, ALIKE_DEVIATIONS = 0.35, 3.0
+ALIKE, ALIKE_DEVIATIONS = 0.5, 3.0
 """Largest difference of the sizes of an alternative in two changes that show the same one: a fraction of the larger
 size, or this number of standard deviations, whichever is more."""
+ALIKE_DELAY = 0.1
+"""Largest difference of the delays of a second path in two changes that show the same one, as a fraction."""
 
 
 class ModelVerdict(StrEnum):
@@ -44,33 +45,44 @@ class Judgement:
 def judged(changes: Sequence[ComparedChange]) -> Judgement:
     """The judgement from all changes so far, oldest first."""
     confirmed = sum(each.state is ChangeState.CONFIRMED for each in changes)
-    shown: dict[tuple[Kind, float], list[Alternative]] = {}
-    for change in changes:
-        if change.state is ChangeState.DIFFERS:
-            for each in change.alternatives:
-                if each.clear:
-                    shown.setdefault((each.kind, each.delay_s), []).append(each)
-    found = [agreed for each in shown.values() if len(agreed := _largest_alike(each)) > 1]
+    shown = [[each for each in change.alternatives if each.clear] for change in changes if _differs(change)]
+    found = [together for first in range(len(shown)) if (together := _largest_alike(shown[first:]))]
     if found:
         best = min(found, key=lambda each: (-len(each), sum(one.residual for one in each)))
         return Judgement(ModelVerdict.MISMATCH, confirmed, _mean(best), len(best))
-    return Judgement(ModelVerdict.CONFIRMED if confirmed else ModelVerdict.OPEN, confirmed)
+    told = [each.state for each in changes if each.state in (ChangeState.CONFIRMED, ChangeState.DIFFERS)]
+    last_confirms = bool(told) and told[-1] is ChangeState.CONFIRMED
+    return Judgement(ModelVerdict.CONFIRMED if last_confirms else ModelVerdict.OPEN, confirmed)
 
 
-def _largest_alike(shown: Sequence[Alternative]) -> tuple[Alternative, ...]:
-    """The most alternatives of which any two agree; empty where no two do."""
-    for count in range(len(shown), 1, -1):
-        for some in combinations(shown, count):
-            if all(_alike(one, other) for one, other in combinations(some, 2)):
-                return some
-    return ()
+def _differs(change: ComparedChange) -> bool:
+    return change.state is ChangeState.DIFFERS
+
+
+def _largest_alike(shown: Sequence[Sequence[Alternative]]) -> tuple[Alternative, ...]:
+    """One alternative of the first change and those of the later ones that agree with it and with each other, of as
+    many changes as possible and with the least residual; empty where none agree."""
+    best: tuple[Alternative, ...] = ()
+    for first in shown[0]:
+        together = [first]
+        for later in shown[1:]:
+            alike = [each for each in later if all(_alike(each, one) for one in together)]
+            if alike:
+                together.append(min(alike, key=lambda each: each.residual))
+        better = (-len(together), sum(each.residual for each in together))
+        if len(together) > 1 and (not best or better < (-len(best), sum(each.residual for each in best))):
+            best = tuple(together)
+    return best
 
 
 def _alike(one: Alternative, other: Alternative) -> bool:
-    apart = abs(one.size - other.size)
+    if one.kind is not other.kind or one.size * other.size <= 0.0:
+        return False
+    if abs(one.delay_s - other.delay_s) > ALIKE_DELAY * max(one.delay_s, other.delay_s):
+        return False
     largest = max(abs(one.size), abs(other.size))
     permitted = max(ALIKE * largest, ALIKE_DEVIATIONS * math.hypot(one.deviation, other.deviation))
-    return one.size * other.size > 0.0 and apart <= permitted
+    return abs(one.size - other.size) <= permitted
 
 
 def _mean(shown: Sequence[Alternative]) -> Alternative:
@@ -80,4 +92,5 @@ def _mean(shown: Sequence[Alternative]) -> Alternative:
     # what is not known of the model is common to all changes, so the mean is no better known than the best of them
     deviation = min(each.deviation for each in shown)
     last = shown[-1]
-    return Alternative(last.kind, last.delay_s, size, deviation, last.residual, last.Ms, True)
+    delay_s = sum(weight * each.delay_s for weight, each in zip(weights, shown, strict=True)) / sum(weights)
+    return Alternative(last.kind, delay_s, size, deviation, last.residual, last.Ms, True)

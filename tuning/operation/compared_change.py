@@ -31,8 +31,10 @@ MV_BEFORE = 10.0
 """Ultimate periods before that from which MV is taken, where it is known: what it did then may act later."""
 ROWS_PER_PERIOD = 40
 """Averages of the samples in an ultimate period."""
-PATHS = tuple(0.5 * n for n in range(1, 18))
-"""Delays of a second path that are looked for, in ultimate periods."""
+PATHS = tuple(0.25 * n for n in range(2, 35))
+"""Delays of a second path that are looked for, in ultimate periods; the best of them is then refined."""
+REFINED = (0.125, 0.0625, 0.03125, 0.015625)
+"""Steps by which it is refined, in ultimate periods."""
 SEEN_AFTER = 1.5
 """Ultimate periods of a change in which a second path must have acted before its share is known."""
 LATER = 0.02
@@ -44,11 +46,13 @@ MIN_AT_REST = 10
 EXPLAINED, NOISE_KNOWN = 0.75, 1.2
 """Smallest part of what the model leaves beyond the noise that an alternative explains, and the factor to which the
 noise is known: a load that wanders is explained by none."""
+NEARLY_ALL = 0.2
+"""Largest residual with an alternative, as a part of that without it, which it explains in any case."""
 CLEAR = 4.0
 """Size of an alternative, in its standard deviations, from which it is shown by a change."""
 MATTERS = 0.2
 """Change of Ms from which an alternative matters."""
-WELL_KNOWN = 0.12
+WELL_KNOWN = 0.08
 """Largest standard deviation of the gain, and of the share of a second path, as a fraction of the gain, with which a
 change can confirm the model."""
 UNSEEN = 1e-9
@@ -196,9 +200,18 @@ class _Comparison:
             delay_s = delay * period
             if delay_s + model.plant.L > self._length_s - SEEN_AFTER * period:
                 break
-            found = base.further(self._answer(model.plant, delay_s))
-            shown.append(self._shown(base, Kind.SECOND_PATH, delay_s, *found))
+            shown.append(self._path(base, delay_s))
+        paths = shown[2:]
+        if paths:
+            best = min(paths, key=lambda each: each.residual)
+            for step in REFINED:
+                around = [self._path(base, best.delay_s + side * step * period) for side in (-1.0, 1.0)]
+                best = min(best, *around, key=lambda each: each.residual)
+            shown.append(best)
         return shown
+
+    def _path(self, base: _Solved, delay_s: float) -> Alternative:
+        return self._shown(base, Kind.SECOND_PATH, delay_s, *base.further(self._answer(self._model.plant, delay_s)))
 
     def _later(self, base: _Solved) -> tuple[float, float, float, float]:
         """The further dead time, s, as `further` has it. PV is not linear in it: it is found by a few steps."""
@@ -226,7 +239,8 @@ class _Comparison:
         else:
             found = self._model.Ms(share=size, path_s=delay_s)
         beyond_noise = base.squares - NOISE_KNOWN**2 * self._rows
-        fits = residual <= MAX_RESIDUAL and base.squares - left >= EXPLAINED * beyond_noise
+        most = base.squares - left >= EXPLAINED * beyond_noise
+        fits = most and residual <= max(MAX_RESIDUAL, NEARLY_ALL * base.residual)
         clear = fits and abs(size) > CLEAR * deviation and abs(found - Ms) > MATTERS
         return Alternative(kind, delay_s, size, deviation, residual, found, clear)
 

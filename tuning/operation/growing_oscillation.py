@@ -26,7 +26,7 @@ EVEN = 0.5
 """Largest difference of a half period from the median of all, as a fraction of it."""
 GROWTH = 1.12
 """Smallest ratio of a swing to that of a period before, and of the swings that the fit finds."""
-MIN_NOISES = 8.0
+MIN_NOISES = 10.0
 """Smallest last swing, in standard deviations of the noise."""
 MIN_EXPLAINED = 0.85
 """Smallest part of the variance of PV that one oscillation explains."""
