@@ -34,11 +34,11 @@ from loopwright.tuning.analysis.recursion import recursive
 from loopwright.tuning.fast.proposal import FastProposal
 from loopwright.tuning.models import Reals, TransferFunction, sign
 from loopwright.tuning.operation.accepted_model import AcceptedModel
-from loopwright.tuning.operation.accepted_verdict import ModelVerdict, judged
 from loopwright.tuning.operation.compared_change import AFTER, ComparedChange, compare_change
 from loopwright.tuning.operation.growing_oscillation import growing
 from loopwright.tuning.operation.history import Stretch
 from loopwright.tuning.operation.load_changes import load_changes
+from loopwright.tuning.operation.model_conclusion import ModelState, conclusion_of
 from loopwright.tuning.plan import Mode
 
 CHANGES = 3
@@ -202,14 +202,14 @@ def watched(given: Draw) -> WatchedRun:
     begun = time.process_time()
     changes = compared(model, stretch)
     spent = time.process_time() - begun
-    said = judged(changes)
+    said = conclusion_of(changes)
     grows = any(
         growing(replace(stretch, mv=stretch.mv[:k], pv=stretch.pv[:k], sp=stretch.sp[:k]), Pu) is not None
         for k in range(4 * SAMPLES, len(stretch.sp), SAMPLES // 4)
     )
     instead = said.instead
     return WatchedRun(
-        plant.name, present, kind, seed, said.verdict.value, said.confirmed,
+        plant.name, present, kind, seed, said.state.value, said.confirmed,
         sum(each.state.value == "differs" for each in changes),
         instead.kind.value if instead else None, instead.size if instead else 0.0,
         instead.delay_s / Pu if instead else 0.0, instead.Ms if instead else 0.0, grows,
@@ -230,8 +230,8 @@ def table(ran: list[WatchedRun]) -> Iterator[str]:
         single = sum(each.differs == 1 for each in mine)
         what = Counter(each.instead for each in mine if each.instead).most_common()
         yield (
-            f"| {kind} | {count[ModelVerdict.MISMATCH]} of {len(mine)} | {count[ModelVerdict.CONFIRMED]} | "
-            f"{count[ModelVerdict.OPEN]} | {single} | {sum(each.grows for each in mine)} | "
+            f"| {kind} | {count[ModelState.MISMATCH]} of {len(mine)} | {count[ModelState.CONFIRMED]} | "
+            f"{count[ModelState.OPEN]} | {single} | {sum(each.grows for each in mine)} | "
             f"{', '.join(f'{name} {number}' for name, number in what) or '-'} |"
         )
 
@@ -258,7 +258,7 @@ def main() -> None:
     none = len({each.plant for each in ran if each.verdict is None})
     print(f"\nOne change, processor time: {spread(spent, 2)} s (p50 / p90 / max). No proposal for {none} plants.")
     for each in ran:
-        if (each.kind in FALSE) == (each.verdict == ModelVerdict.MISMATCH) or (each.grows and each.kind in FALSE):
+        if (each.kind in FALSE) == (each.verdict == ModelState.MISMATCH) or (each.grows and each.kind in FALSE):
             what = f"{each.instead} {each.size:.3g} ({each.delay:.2g} Pu), Ms {each.Ms:.2f}" if each.instead else ""
             print(f"{each.kind}, {each.plant}, seed {each.seed}: {each.verdict} {what}{' grows' * each.grows}")
 

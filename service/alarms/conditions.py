@@ -203,7 +203,7 @@ def _watches(known: AlarmFacts) -> Iterator[Condition]:
 
 
 def _mismatch(watch: AcceptanceWatch) -> str:
-    found = watch.judgement().instead
+    found = watch.conclusion().instead
     assert found is not None
     return f"The plant is not the one of the model: {instead_in_words(found)}"
 

@@ -16,8 +16,8 @@ from loopwright.service.states.acceptance_watch import (
     instead_in_words,
 )
 from loopwright.service.states.job_state import JobState
-from loopwright.tuning.operation.accepted_verdict import ModelVerdict
 from loopwright.tuning.operation.compared_change import Alternative, ChangeState, Kind
+from loopwright.tuning.operation.model_conclusion import ModelState
 
 
 class InsteadView(BaseModel):
@@ -90,8 +90,8 @@ class WatchView(BaseModel):
     """The watch of a loop since gains were accepted: operation compared with the model of the proposal, from what is
     heard alone."""
 
-    verdict: ModelVerdict = Field(
-        description="open: operation has not told yet; confirmed: at least one change confirms the model; mismatch: "
+    verdict: ModelState = Field(
+        description="open: operation does not say yet; confirmed: at least one change confirms the model; mismatch: "
         "two changes at least show the same other plant"
     )
     words: str = Field(examples=["The model is confirmed by 3 changes of normal operation."])
@@ -115,10 +115,10 @@ class WatchView(BaseModel):
 
     @classmethod
     def of(cls, watch: AcceptanceWatch, state: JobState) -> WatchView:
-        found = watch.judgement()
-        bad = found.verdict is ModelVerdict.MISMATCH or watch.trouble is not None
+        found = watch.conclusion()
+        bad = found.state is ModelState.MISMATCH or watch.trouble is not None
         return cls(
-            verdict=found.verdict,
+            verdict=found.state,
             words=watch.words,
             since=watch.since,
             going_on=watch.end is None,

@@ -49,7 +49,7 @@ from loopwright.service.store.live_jobs import latest_jobs
 from loopwright.service.store.store import Busy, Store
 from loopwright.service.telemetry.logs import about
 from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.operation.accepted_verdict import ModelVerdict
+from loopwright.tuning.operation.model_conclusion import ModelState
 from loopwright.tuning.reasons import Ended
 
 log = logging.getLogger(__name__)
@@ -67,7 +67,7 @@ longer."""
 
 
 @dataclass
-class _Loop:
+class _LoopSeen:
     """A watched loop as this process knows it. Times are wall time, s.
 
     due_s: when its history is looked at again. inside: whether PV was within its limits since the acceptance.
@@ -96,7 +96,7 @@ class Watching:
     ) -> None:
         self._store, self._directory, self._decisions = store, directory, decisions
         self._listening, self._pool, self._wall = listening, pool, wall
-        self._loops: dict[str, _Loop] = {}
+        self._loops: dict[str, _LoopSeen] = {}
         failed = "the loops with accepted gains could not be watched"
         self._looks = Repeated(self.look, _ROUND_S, "watches accepted gains", failed)
         self._compares = Repeated(self.compare, _ROUND_S, "compares operation with models", failed, at_once=False)
@@ -130,7 +130,7 @@ class Watching:
         if why is not None:
             self._end(job_id, why)
             return
-        known = self._loops.setdefault(job_id, _Loop())
+        known = self._loops.setdefault(job_id, _LoopSeen())
         heard = self._listening.heard.get(config.tag)
         not_heard = self._listening.why_not_heard(config.tag)
         if not_heard is None and (heard is None or heard.silent):
@@ -158,7 +158,7 @@ class Watching:
         return WatchEnd.TOO_LONG if now_s - watch.since_s > LONGEST_S else None
 
     @staticmethod
-    def _outside(known: _Loop, config: LoopConfig, heard: Heard, now_s: float) -> str | None:
+    def _outside(known: _LoopSeen, config: LoopConfig, heard: Heard, now_s: float) -> str | None:
         """In words that PV has left its limits; None: it has not, or the set-point has."""
         limits = config.pv_limits
         low, high = heard.pv < limits.low, heard.pv > limits.high
@@ -174,7 +174,7 @@ class Watching:
         side, limit = ("below", limits.low) if low else ("above", limits.high)
         return f"PV went {side} its limit of {limit:g} {config.pv_unit} under the new gains"
 
-    def _look_back(self, job: Job, config: LoopConfig, watch: AcceptanceWatch, known: _Loop, now_s: float) -> None:
+    def _look_back(self, job: Job, config: LoopConfig, watch: AcceptanceWatch, known: _LoopSeen, now_s: float) -> None:
         """Looks at the history since the acceptance. Raises SQLAlchemyError, FolderInUse."""
         asked = self._question(job, config)
         bins = asked.rows.bins
@@ -188,8 +188,9 @@ class Watching:
         found = oscillation(asked, new_gains(job), watch.period_s, watch.since_s)
         if found is not None and watch.trouble is None:
             text = (
-                f"PV oscillates under the new gains with a period of {found.period_s:.3g} s, and each period is "
-                f"{found.per_period:.2f} times as large as the one before: {found.swing:.3g} {config.pv_unit} at last"
+                f"PV oscillates under the new gains with a period of {found.period_s:.3g} s, each "
+                f"{found.per_period:.2f} times as large as the one before, {found.peak_to_peak:.3g} {config.pv_unit} "
+                "from peak to peak at last"
             )
             self._trouble(job, watch, TroubleKind.GROWING_OSCILLATION, text)
             return
@@ -278,7 +279,7 @@ def _state(job: Job) -> LoopState:
 
 def _complete(watch: AcceptanceWatch, passed_s: float) -> bool:
     """passed_s: plant time since the acceptance, s."""
-    decided = watch.told >= CHANGES and watch.judgement().verdict is not ModelVerdict.OPEN
+    decided = watch.informative >= CHANGES and watch.conclusion().state is not ModelState.OPEN
     enough = decided or len(watch.changes) >= MAX_CHANGES
     return enough and passed_s >= PERIODS * watch.period_s
 

@@ -7,8 +7,8 @@ from enum import StrEnum
 
 from pydantic import BaseModel, ConfigDict
 
-from loopwright.tuning.operation.accepted_verdict import Judgement, ModelVerdict, judged
 from loopwright.tuning.operation.compared_change import Alternative, ChangeState, ComparedChange, Kind
+from loopwright.tuning.operation.model_conclusion import Conclusion, ModelState, conclusion_of
 
 CHANGES = 3
 """Number of changes that are compared."""
@@ -35,18 +35,18 @@ class TroubleKind(StrEnum):
     GROWING_OSCILLATION = "growing_oscillation"
 
 
-class _Stored(BaseModel):
+class _Kept(BaseModel):
     model_config = ConfigDict(frozen=True)
 
 
-class WatchedChange(_Stored):
+class WatchedChange(_Kept):
     """A change that was compared. at_s: its first move, wall time, seconds since 1970 UTC."""
 
     at_s: float
     compared: ComparedChange
 
 
-class Trouble(_Stored):
+class Trouble(_Kept):
     """What went wrong under the accepted gains.
 
     at: when it was seen: UTC, ISO 8601. text: in words, with the numbers.
@@ -61,7 +61,7 @@ class Trouble(_Stored):
     why_not: str | None = None
 
 
-class AcceptanceWatch(_Stored):
+class AcceptanceWatch(_Kept):
     """The watch of one acceptance.
 
     since: when the gains were accepted: UTC, ISO 8601. by: who has accepted them.
@@ -99,13 +99,13 @@ class AcceptanceWatch(_Stored):
         return self.roll_back_by_itself and self.disarmed is None and self.end is None and self.trouble is None
 
     @property
-    def told(self) -> int:
+    def informative(self) -> int:
         """The number of changes that tell something of the model."""
         return sum(each.compared.state in (ChangeState.CONFIRMED, ChangeState.DIFFERS) for each in self.changes)
 
-    def judgement(self) -> Judgement:
+    def conclusion(self) -> Conclusion:
         """What the changes say of the model together."""
-        return judged([each.compared for each in self.changes])
+        return conclusion_of([each.compared for each in self.changes])
 
     @property
     def abnormal(self) -> bool:
@@ -113,13 +113,13 @@ class AcceptanceWatch(_Stored):
         back by itself nobody has seen yet."""
         if self.trouble is not None and self.trouble.put_back:
             return True
-        found = self.trouble is not None or self.judgement().verdict is ModelVerdict.MISMATCH
+        found = self.trouble is not None or self.conclusion().state is ModelState.MISMATCH
         return found and self.end is not WatchEnd.ROLLED_BACK
 
     @property
     def words(self) -> str:
         """What the watch has come to, in a sentence or two."""
-        found = self.judgement()
+        found = self.conclusion()
         parts = [_words_of(found, self)]
         if self.trouble is not None:
             parts.append(_words_of_trouble(self.trouble))
@@ -128,22 +128,22 @@ class AcceptanceWatch(_Stored):
         return " ".join(parts)
 
 
-def _words_of(found: Judgement, watch: AcceptanceWatch) -> str:
+def _words_of(found: Conclusion, watch: AcceptanceWatch) -> str:
     if watch.model is not None:
         return f"Nothing is compared: {watch.model}."
-    if found.verdict is ModelVerdict.MISMATCH and found.instead is not None:
+    if found.state is ModelState.MISMATCH and found.instead is not None:
         return (
             f"The plant is not the one of the model: {instead_in_words(found.instead)}, as {found.changes} set-point "
             f"changes show. Ms is {found.instead.Ms:.2f} then."
         )
-    if found.verdict is ModelVerdict.CONFIRMED:
+    if found.state is ModelState.CONFIRMED:
         return f"The model is confirmed by {found.confirmed} change{'s' * (found.confirmed != 1)} of normal operation."
     if not watch.changes:
         return "Nothing has moved the loop yet since the gains were accepted." if watch.end is None else (
             "Nothing has moved the loop while it was watched: the model is neither confirmed nor disproved."
         )  # fmt: skip
     count = len(watch.changes)
-    if found.confirmed or watch.told:
+    if found.confirmed or watch.informative:
         return (
             f"The latest change does not fit the model, which {found.confirmed} of {count} changes confirm; a load, or "
             "a plant that changes, looks like that. The next change will tell."

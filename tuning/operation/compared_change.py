@@ -11,7 +11,8 @@ Rev. 2, 1961.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -48,6 +49,8 @@ EXPLAINED, NOISE_KNOWN = 0.75, 1.2
 noise is known: a load that wanders is explained by none."""
 NEARLY_ALL = 0.2
 """Largest residual with an alternative, as a part of that without it, which it explains in any case."""
+NEARLY_BEST = 1.12
+"""Largest residual of an alternative that a change shows, as a ratio to that of the one that explains it best."""
 CLEAR = 4.0
 """Size of an alternative, in its standard deviations, from which it is shown by a change."""
 MATTERS = 0.2
@@ -155,8 +158,8 @@ class _Comparison:
         self._size = float(np.max(np.abs(sp - sp[0])))
         rest = averaged(stretch.pv[first:move], self._block)
         fast = float(np.sqrt(np.mean(np.diff(pv, 2) ** 2) / 6.0))  # what is left of PV without its slow changes
-        quiet = max(noise_of(rest), fast) if len(rest) >= MIN_AT_REST else fast
-        self._noise = math.hypot(quiet, NEGLIGIBLE_RESIDUAL / MAX_RESIDUAL * float(np.ptp(pv))) or 1.0
+        noise = max(noise_of(rest), fast) if len(rest) >= MIN_AT_REST else fast
+        self._noise = math.hypot(noise, NEGLIGIBLE_RESIDUAL / MAX_RESIDUAL * float(np.ptp(pv))) or 1.0
         self._begun_s = (move - first) * stretch.Ts
         self._length_s = (end - move) * stretch.Ts
         nominal = self._answer(model.plant)
@@ -174,7 +177,7 @@ class _Comparison:
 
     def compared(self) -> ComparedChange:
         base = _Solved.of(self._free, self._known, self._left)
-        alternatives = self._alternatives(base)
+        alternatives = _nearly_best(self._alternatives(base))
         gain = alternatives[0]
         paths = [each for each in alternatives if each.kind is Kind.SECOND_PATH]
         known = gain.deviation < WELL_KNOWN and all(each.deviation < WELL_KNOWN for each in paths)
@@ -239,8 +242,8 @@ class _Comparison:
         else:
             found = self._model.Ms(share=size, path_s=delay_s)
         beyond_noise = base.squares - NOISE_KNOWN**2 * self._rows
-        most = base.squares - left >= EXPLAINED * beyond_noise
-        fits = most and residual <= max(MAX_RESIDUAL, NEARLY_ALL * base.residual)
+        enough = base.squares - left >= EXPLAINED * beyond_noise
+        fits = enough and residual <= max(MAX_RESIDUAL, NEARLY_ALL * base.residual)
         clear = fits and abs(size) > CLEAR * deviation and abs(found - Ms) > MATTERS
         return Alternative(kind, delay_s, size, deviation, residual, found, clear)
 
@@ -259,6 +262,12 @@ class _Comparison:
     def _answer(self, plant: TransferFunction, further_s: float = 0.0) -> Reals:
         answer = driven(plant, self._u, self._Ts, further_s)[self._skip :]
         return np.asarray(averaged(answer, self._block) / self._noise)
+
+
+def _nearly_best(alternatives: Sequence[Alternative]) -> list[Alternative]:
+    """The alternatives, of which those that explain clearly less than the best one are no longer called clear."""
+    best = min((each.residual for each in alternatives if each.clear), default=0.0)
+    return [replace(each, clear=each.clear and each.residual <= NEARLY_BEST * best) for each in alternatives]
 
 
 class _Solved:

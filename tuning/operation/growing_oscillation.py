@@ -25,9 +25,9 @@ the period longer, and a second path that acts later yet more."""
 EVEN = 0.5
 """Largest difference of a half period from the median of all, as a fraction of it."""
 GROWTH = 1.12
-"""Smallest ratio of a swing to that of a period before, and of the swings that the fit finds."""
+"""Smallest ratio of a height, from one extreme to the next, to that of a period before, as measured and by the fit."""
 MIN_NOISES = 10.0
-"""Smallest last swing, in standard deviations of the noise."""
+"""Smallest last height, in standard deviations of the noise."""
 MIN_EXPLAINED = 0.85
 """Smallest part of the variance of PV that one oscillation explains."""
 SMOOTHED = 0.125
@@ -38,12 +38,12 @@ SMOOTHED = 0.125
 class Growing:
     """An oscillation that grows.
 
-    period_s: its period, s. swing: the latest swing from one extreme to the next, PV units.
-    per_period: the ratio of the swings of one period and the period before.
+    period_s: its period, s. peak_to_peak: from the last extreme but one to the last, PV units.
+    per_period: the ratio of the heights of one period and the period before.
     """
 
     period_s: float
-    swing: float
+    peak_to_peak: float
     per_period: float
 
 
@@ -72,13 +72,13 @@ def _growing(y: Reals, T: float, noise: float, period_s: float) -> Growing | Non
     if len(at) < wanted:
         return None
     at = at[-wanted:]
-    halves, swings = np.diff(at) * T, np.abs(np.diff(y[at]))
+    halves, heights = np.diff(at) * T, np.abs(np.diff(y[at]))
     period = 2.0 * float(np.median(halves))
     low, high = PERIOD_RANGE
     even = np.all(np.abs(halves / (0.5 * period) - 1.0) <= EVEN)
     if not (even and low * period_s <= period <= high * period_s):
         return None
-    if not np.all(swings[2:] >= GROWTH * swings[:-2]) or swings[-1] < MIN_NOISES * noise:
+    if not np.all(heights[2:] >= GROWTH * heights[:-2]) or heights[-1] < MIN_NOISES * noise:
         return None
     part = y[at[0] : at[-1] + 1]
     found = fit_growth(np.asarray(T * np.arange(len(part))), part, period)
@@ -87,7 +87,7 @@ def _growing(y: Reals, T: float, noise: float, period_s: float) -> Growing | Non
     ratio = math.exp(found.log_per_period)
     if explained < MIN_EXPLAINED or ratio < GROWTH or found.log_per_period < 3.0 * found.error:
         return None
-    return Growing(period, float(swings[-1]), ratio)
+    return Growing(period, float(heights[-1]), ratio)
 
 
 def _extremes(y: Reals, apart: float) -> list[int]:

@@ -40,8 +40,8 @@ def load_changes(stretch: Stretch, period_s: float) -> list[int]:
             continue
         level = float(np.mean(pv[row - rest : row]))
         away = pv[row : row + 2] - level
-        quiet = float(np.ptp(pv[row - rest : row])) < MIN_NOISES * noise
-        if quiet and float(np.min(np.abs(away))) > MIN_NOISES * noise and away[0] * away[1] > 0.0:
+        rested = float(np.ptp(pv[row - rest : row])) < MIN_NOISES * noise
+        if rested and float(np.min(np.abs(away))) > MIN_NOISES * noise and away[0] * away[1] > 0.0:
             found.append(max(row - BEGAN_EARLIER, 0) * block)
             last = row
     return found

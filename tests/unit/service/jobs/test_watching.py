@@ -15,7 +15,7 @@ from loopwright.service.states.acceptance_watch import TroubleKind, WatchEnd
 from loopwright.service.states.job_state import JobState
 from loopwright.service.store import audit
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.operation.accepted_verdict import ModelVerdict
+from loopwright.tuning.operation.model_conclusion import ModelState
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Reason
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
@@ -54,7 +54,7 @@ def test_a_model_is_confirmed_by_three_changes(service: Service, client: TestCli
     assert here.watch.end is None and "Nothing has moved the loop yet" in here.watch.words
     three_changes(here)
     watch = here.watch
-    assert (watch.judgement().verdict, watch.judgement().confirmed) == (ModelVerdict.CONFIRMED, 3)
+    assert (watch.conclusion().state, watch.conclusion().confirmed) == (ModelState.CONFIRMED, 3)
     assert watch.words == "The model is confirmed by 3 changes of normal operation."
     assert watch.end is WatchEnd.COMPLETE and service.controller.state.gains == NEW
     shown = client.get(f"/jobs/{here.job_id}").json()["watch"]
@@ -69,8 +69,8 @@ def test_a_second_path_that_the_record_could_not_show_is_found_and_rolled_back(
     here = WatchedLoop(service, second_path=LATER)
     here.accept()
     three_changes(here)
-    found = here.watch.judgement()
-    assert found.verdict is ModelVerdict.MISMATCH and found.instead is not None
+    found = here.watch.conclusion()
+    assert found.state is ModelState.MISMATCH and found.instead is not None
     assert abs(found.instead.size - 0.43) < 0.05 and abs(found.instead.delay_s - 4.0 * PU) < 0.3 * PU
     shown = client.get(f"/jobs/{here.job_id}").json()["watch"]
     assert (shown["verdict"], shown["instead"]["kind"], shown["action"]) == ("mismatch", "second_path", "rollback")
@@ -180,7 +180,7 @@ def test_the_watch_goes_on_when_the_service_is_started_again(service: Service) -
     assert len(here.watch.changes) == 1
     here.watching = here.another()
     here.goes_on(13.0, -1.0)
-    assert here.watch.judgement().verdict is ModelVerdict.MISMATCH, "the first change is still known"
+    assert here.watch.conclusion().state is ModelState.MISMATCH, "the first change is still known"
 
 
 def test_what_a_service_has_left_half_done_is_not_tried_again(
@@ -228,14 +228,14 @@ def test_a_loop_that_is_not_heard_is_not_said_to_be_confirmed(service: Service, 
     here.heard_at_all = False
     three_changes(here)
     watch = here.watch
-    assert (watch.judgement().verdict, watch.end, watch.changes) == (ModelVerdict.OPEN, None, ())
+    assert (watch.conclusion().state, watch.end, watch.changes) == (ModelState.OPEN, None, ())
     assert "The loop is not heard: no data of the loop" in watch.words
     assert client.get(f"/jobs/{here.job_id}").json()["watch"]["not_heard"] == "no data of the loop"
     here.heard_at_all = True
     here.goes_on(2.0)
     assert here.watch.not_heard is None
     here.goes_on(13.0, 1.0)
-    assert here.watch.judgement().confirmed == 1, "a change of the time in which nothing was heard does not count"
+    assert here.watch.conclusion().confirmed == 1, "a change of the time in which nothing was heard does not count"
 
 
 def test_accepting_asks(service: Service, client: TestClient) -> None:

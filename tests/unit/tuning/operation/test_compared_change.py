@@ -9,9 +9,9 @@ import pytest
 
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.operation.accepted_model import AcceptedModel, driven
-from loopwright.tuning.operation.accepted_verdict import Judgement, ModelVerdict, judged
 from loopwright.tuning.operation.compared_change import AFTER, ChangeState, ComparedChange, Kind, compare_change
 from loopwright.tuning.operation.load_changes import load_changes
+from loopwright.tuning.operation.model_conclusion import Conclusion, ModelState, conclusion_of
 from tests.unit.tuning.operation.simulated import GAINS, MODEL, PLANT, PU, TS, operated, periods
 
 EVERY = periods(13.0)
@@ -25,8 +25,8 @@ def compared(model: AcceptedModel = MODEL, **changed: object) -> list[ComparedCh
     return [compare_change(model, stretch, move, move + periods(AFTER)) for move in stretch.moves]
 
 
-def said(**changed: object) -> Judgement:
-    return judged(compared(**changed))
+def said(**changed: object) -> Conclusion:
+    return conclusion_of(compared(**changed))
 
 
 @pytest.mark.parametrize("seed", range(1, 6))
@@ -35,19 +35,19 @@ def test_the_right_model_is_confirmed(seed: int) -> None:
     assert {each.state for each in changes} == {ChangeState.CONFIRMED}
     assert [each.size for each in changes] == pytest.approx([1.0, 0.7, 1.2])
     assert all(0.6 < each.residual < 1.25 and not each.load for each in changes)
-    assert judged(changes) == Judgement(ModelVerdict.CONFIRMED, 3)
+    assert conclusion_of(changes) == Conclusion(ModelState.CONFIRMED, 3)
 
 
 def test_the_model_may_be_off_by_what_is_not_known_of_it() -> None:
-    assert said(gain=lambda n: 1.04).verdict is ModelVerdict.CONFIRMED
-    assert said(dead_time_s=0.02 * PU).verdict is ModelVerdict.CONFIRMED
+    assert said(gain=lambda n: 1.04).state is ModelState.CONFIRMED
+    assert said(dead_time_s=0.02 * PU).state is ModelState.CONFIRMED
 
 
 @pytest.mark.parametrize("share", [0.43, 1.5, -0.23])
 @pytest.mark.parametrize("later", [2.7, 4.1, 8.0])
 def test_a_second_path_is_found_with_its_share_and_delay(share: float, later: float) -> None:
     found = said(share=share, later_s=later * PU)
-    assert found.verdict is ModelVerdict.MISMATCH and found.instead is not None
+    assert found.state is ModelState.MISMATCH and found.instead is not None
     assert found.instead.kind is Kind.SECOND_PATH and found.changes >= 2
     assert found.instead.size == pytest.approx(share, rel=0.1)
     assert found.instead.delay_s == pytest.approx(later * PU, rel=0.03)
@@ -58,20 +58,20 @@ def test_a_second_path_is_found_with_its_share_and_delay(share: float, later: fl
 @pytest.mark.parametrize("gain", [0.6, 1.4, 2.0])
 def test_another_gain_is_found(gain: float) -> None:
     found = said(gain=lambda n: gain)
-    assert found.verdict is ModelVerdict.MISMATCH and found.instead is not None
+    assert found.state is ModelState.MISMATCH and found.instead is not None
     assert found.instead.kind is Kind.GAIN and found.instead.size == pytest.approx(gain - 1.0, abs=0.08)
     assert found.instead.Ms == pytest.approx(MODEL.Ms(gain=gain), rel=0.15)
 
 
 def test_a_gain_that_drifts_is_found() -> None:
     found = said(gain=lambda n: 1.0 + 0.9 * n / WHOLE)
-    assert found.verdict is ModelVerdict.MISMATCH and found.instead is not None and found.instead.kind is Kind.GAIN
+    assert found.state is ModelState.MISMATCH and found.instead is not None and found.instead.kind is Kind.GAIN
 
 
 @pytest.mark.parametrize("later", [0.12, 0.3])
 def test_a_longer_dead_time_is_found(later: float) -> None:
     found = said(dead_time_s=later * PU)
-    assert found.verdict is ModelVerdict.MISMATCH and found.instead is not None
+    assert found.state is ModelState.MISMATCH and found.instead is not None
     assert found.instead.kind is Kind.DEAD_TIME and found.instead.size == pytest.approx(later * PU, rel=0.25)
 
 
@@ -79,21 +79,21 @@ def test_one_change_alone_disproves_nothing() -> None:
     """A load that steps some periods after the set-point looks like a second path."""
     changes = compared(load=lambda n: 0.25 if n >= EVERY + periods(4.0) else 0.0)
     assert changes[0].state is not ChangeState.CONFIRMED and changes[0].load
-    assert judged(changes[:1]) == Judgement(ModelVerdict.OPEN, 0)
-    assert judged(changes) == Judgement(ModelVerdict.CONFIRMED, 2)
+    assert conclusion_of(changes[:1]) == Conclusion(ModelState.OPEN, 0)
+    assert conclusion_of(changes) == Conclusion(ModelState.CONFIRMED, 2)
 
 
 def test_what_differs_last_is_not_called_confirmed() -> None:
     right, other = compared()[:2], compared(gain=lambda n: 1.5)
-    assert judged([*right, other[2]]) == Judgement(ModelVerdict.OPEN, 2)
-    assert judged([*right, *other[1:]]).verdict is ModelVerdict.MISMATCH
-    assert judged([right[0], other[1], right[1]]) == Judgement(ModelVerdict.CONFIRMED, 2)
+    assert conclusion_of([*right, other[2]]) == Conclusion(ModelState.OPEN, 2)
+    assert conclusion_of([*right, *other[1:]]).state is ModelState.MISMATCH
+    assert conclusion_of([right[0], other[1], right[1]]) == Conclusion(ModelState.CONFIRMED, 2)
 
 
 def test_a_small_change_tells_nothing() -> None:
     stretch = operated({EVERY: 0.005}, 2 * EVERY)
     change = compare_change(MODEL, stretch, EVERY, EVERY + periods(AFTER))
-    assert change.state is ChangeState.NOT_ENOUGH and judged([change]) == Judgement(ModelVerdict.OPEN, 0)
+    assert change.state is ChangeState.NOT_ENOUGH and conclusion_of([change]) == Conclusion(ModelState.OPEN, 0)
 
 
 def test_what_was_never_moved_and_never_noisy_tells_nothing() -> None:
@@ -129,8 +129,8 @@ def test_with_the_covariance_of_the_model_only_what_is_not_known_is_left_open() 
     open_ = replace(MODEL, plant=monic, covariance=known.tolist())
     sure = replace(MODEL, plant=monic, covariance=(1e-4 * known).tolist())
     assert all(each.state is not ChangeState.DIFFERS for each in compared(open_, gain=lambda n: 1.3))
-    assert judged(compared(sure, gain=lambda n: 1.3)).verdict is ModelVerdict.MISMATCH
-    assert judged(compared(sure)).verdict is ModelVerdict.CONFIRMED
+    assert conclusion_of(compared(sure, gain=lambda n: 1.3)).state is ModelState.MISMATCH
+    assert conclusion_of(compared(sure)).state is ModelState.CONFIRMED
 
 
 def test_the_answer_of_a_plant_is_that_of_plantsim() -> None:

@@ -28,7 +28,7 @@ def test_a_loop_that_has_become_unstable_is_seen_within_eight_periods_of_its_osc
     stretch = operated({at: 0.5}, periods(20.0), gain=lambda n: gain)
     (end, seen), *_ = looked_at(stretch)
     assert end <= at + periods(8.0)
-    assert 0.6 * PU < seen.period_s < 1.5 * PU and seen.per_period > 1.1 and seen.swing > 0.05
+    assert 0.6 * PU < seen.period_s < 1.5 * PU and seen.per_period > 1.1 and seen.peak_to_peak > 0.05
 
 
 @pytest.mark.parametrize("gain", [1.0, 1.6, 2.4])

@@ -20,7 +20,7 @@ ALIKE_DELAY = 0.1
 """Largest difference of the delays of a second path in two changes that show the same one, as a fraction."""
 
 
-class ModelVerdict(StrEnum):
+class ModelState(StrEnum):
     """What operation says of the model."""
 
     OPEN = "open"
@@ -29,30 +29,30 @@ class ModelVerdict(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
+class Conclusion:
     """What operation says of the model.
 
     confirmed: the number of changes that confirm it.
     instead: what fits instead, of a mismatch; its size is the mean of the changes that show it. changes: their number.
     """
 
-    verdict: ModelVerdict
+    state: ModelState
     confirmed: int
     instead: Alternative | None = None
     changes: int = 0
 
 
-def judged(changes: Sequence[ComparedChange]) -> Judgement:
-    """The judgement from all changes so far, oldest first."""
+def conclusion_of(changes: Sequence[ComparedChange]) -> Conclusion:
+    """The conclusion from all changes so far, oldest first."""
     confirmed = sum(each.state is ChangeState.CONFIRMED for each in changes)
     shown = [[each for each in change.alternatives if each.clear] for change in changes if _differs(change)]
     found = [together for first in range(len(shown)) if (together := _largest_alike(shown[first:]))]
     if found:
         best = min(found, key=lambda each: (-len(each), sum(one.residual for one in each)))
-        return Judgement(ModelVerdict.MISMATCH, confirmed, _mean(best), len(best))
-    told = [each.state for each in changes if each.state in (ChangeState.CONFIRMED, ChangeState.DIFFERS)]
-    last_confirms = bool(told) and told[-1] is ChangeState.CONFIRMED
-    return Judgement(ModelVerdict.CONFIRMED if last_confirms else ModelVerdict.OPEN, confirmed)
+        return Conclusion(ModelState.MISMATCH, confirmed, _mean(best), len(best))
+    telling = [each.state for each in changes if each.state in (ChangeState.CONFIRMED, ChangeState.DIFFERS)]
+    last_confirms = bool(telling) and telling[-1] is ChangeState.CONFIRMED
+    return Conclusion(ModelState.CONFIRMED if last_confirms else ModelState.OPEN, confirmed)
 
 
 def _differs(change: ComparedChange) -> bool:
