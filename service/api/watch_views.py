@@ -16,14 +16,14 @@ from loopwright.service.states.acceptance_watch import (
     instead_in_words,
 )
 from loopwright.service.states.job_state import JobState
-from loopwright.tuning.operation.compared_change import Alternative, ChangeState, Kind
+from loopwright.tuning.operation.compared_change import Alternative, ChangeState, DifferenceKind
 from loopwright.tuning.operation.model_conclusion import ModelState
 
 
 class InsteadView(BaseModel):
     """What fits operation instead of the model."""
 
-    kind: Kind
+    kind: DifferenceKind
     words: str = Field(examples=["a second path acts 53.2 s later, with 43 +- 1.2 % of the gain of the model"])
     size: float = Field(
         description="gain: the gain over that of the model, less 1; second_path: its gain over that of the model; "
@@ -41,7 +41,7 @@ class InsteadView(BaseModel):
             words=instead_in_words(found),
             size=found.size,
             deviation=found.deviation,
-            delay_s=found.delay_s if found.kind is Kind.SECOND_PATH else None,
+            delay_s=found.delay_s if found.kind is DifferenceKind.SECOND_PATH else None,
             Ms=found.Ms,
         )
 

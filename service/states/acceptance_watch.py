@@ -7,7 +7,7 @@ from enum import StrEnum
 
 from pydantic import BaseModel, ConfigDict
 
-from loopwright.tuning.operation.compared_change import Alternative, ChangeState, ComparedChange, Kind
+from loopwright.tuning.operation.compared_change import Alternative, ChangeState, ComparedChange, DifferenceKind
 from loopwright.tuning.operation.model_conclusion import Conclusion, ModelState, conclusion_of
 
 CHANGES = 3
@@ -157,9 +157,9 @@ def _words_of(found: Conclusion, watch: AcceptanceWatch) -> str:
 def instead_in_words(found: Alternative) -> str:
     """What fits instead of the model, with two standard deviations."""
     spread = 2.0 * found.deviation
-    if found.kind is Kind.GAIN:
+    if found.kind is DifferenceKind.GAIN:
         return f"its gain is {1.0 + found.size:.2f} +- {spread:.2g} times that of the model"
-    if found.kind is Kind.DEAD_TIME:
+    if found.kind is DifferenceKind.DEAD_TIME:
         later = "longer" if found.size > 0.0 else "shorter"
         return f"its dead time is {abs(found.size):.3g} +- {spread:.2g} s {later}"
     return (

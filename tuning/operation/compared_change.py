@@ -68,7 +68,7 @@ LOAD_SPACING = 0.25
 """Distance of the times at which a step of the load is looked for, in ultimate periods."""
 
 
-class Kind(StrEnum):
+class DifferenceKind(StrEnum):
     """What may differ from the model."""
 
     GAIN = "gain"
@@ -98,7 +98,7 @@ class Alternative:
     clear: whether the change shows it, of a size that matters.
     """
 
-    kind: Kind
+    kind: DifferenceKind
     delay_s: float
     size: float
     deviation: float
@@ -179,7 +179,7 @@ class _Comparison:
         base = _Solved.of(self._free, self._known, self._left)
         alternatives = _nearly_best(self._alternatives(base))
         gain = alternatives[0]
-        paths = [each for each in alternatives if each.kind is Kind.SECOND_PATH]
+        paths = [each for each in alternatives if each.kind is DifferenceKind.SECOND_PATH]
         known = gain.deviation < WELL_KNOWN and all(each.deviation < WELL_KNOWN for each in paths)
         residual = base.residual
         if any(each.clear for each in alternatives):
@@ -197,8 +197,8 @@ class _Comparison:
 
     def _alternatives(self, base: _Solved) -> list[Alternative]:
         model, period = self._model, self._model.period_s
-        shown = [self._shown(base, Kind.GAIN, 0.0, *base.further(self._nominal))]
-        shown.append(self._shown(base, Kind.DEAD_TIME, 0.0, *self._later(base)))
+        shown = [self._shown(base, DifferenceKind.GAIN, 0.0, *base.further(self._nominal))]
+        shown.append(self._shown(base, DifferenceKind.DEAD_TIME, 0.0, *self._later(base)))
         for delay in PATHS:
             delay_s = delay * period
             if delay_s + model.plant.L > self._length_s - SEEN_AFTER * period:
@@ -214,7 +214,8 @@ class _Comparison:
         return shown
 
     def _path(self, base: _Solved, delay_s: float) -> Alternative:
-        return self._shown(base, Kind.SECOND_PATH, delay_s, *base.further(self._answer(self._model.plant, delay_s)))
+        found = base.further(self._answer(self._model.plant, delay_s))
+        return self._shown(base, DifferenceKind.SECOND_PATH, delay_s, *found)
 
     def _later(self, base: _Solved) -> tuple[float, float, float, float]:
         """The further dead time, s, as `further` has it. PV is not linear in it: it is found by a few steps."""
@@ -232,12 +233,19 @@ class _Comparison:
         return total, deviation, residual, left
 
     def _shown(
-        self, base: _Solved, kind: Kind, delay_s: float, size: float, deviation: float, residual: float, left: float
+        self,
+        base: _Solved,
+        kind: DifferenceKind,
+        delay_s: float,
+        size: float,
+        deviation: float,
+        residual: float,
+        left: float,
     ) -> Alternative:
         Ms = self._model.Ms()
-        if kind is Kind.GAIN:
+        if kind is DifferenceKind.GAIN:
             found = self._model.Ms(gain=max(1.0 + size, 0.0))
-        elif kind is Kind.DEAD_TIME:
+        elif kind is DifferenceKind.DEAD_TIME:
             found = self._model.Ms(later_s=size)
         else:
             found = self._model.Ms(share=size, path_s=delay_s)

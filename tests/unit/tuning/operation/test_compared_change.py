@@ -9,7 +9,13 @@ import pytest
 
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.operation.accepted_model import AcceptedModel, driven
-from loopwright.tuning.operation.compared_change import AFTER, ChangeState, ComparedChange, Kind, compare_change
+from loopwright.tuning.operation.compared_change import (
+    AFTER,
+    ChangeState,
+    ComparedChange,
+    DifferenceKind,
+    compare_change,
+)
 from loopwright.tuning.operation.load_changes import load_changes
 from loopwright.tuning.operation.model_conclusion import Conclusion, ModelState, conclusion_of
 from tests.unit.tuning.operation.simulated import GAINS, MODEL, PLANT, PU, TS, operated, periods
@@ -48,7 +54,7 @@ def test_the_model_may_be_off_by_what_is_not_known_of_it() -> None:
 def test_a_second_path_is_found_with_its_share_and_delay(share: float, later: float) -> None:
     found = said(share=share, later_s=later * PU)
     assert found.state is ModelState.MISMATCH and found.instead is not None
-    assert found.instead.kind is Kind.SECOND_PATH and found.changes >= 2
+    assert found.instead.kind is DifferenceKind.SECOND_PATH and found.changes >= 2
     assert found.instead.size == pytest.approx(share, rel=0.1)
     assert found.instead.delay_s == pytest.approx(later * PU, rel=0.03)
     assert found.instead.Ms == pytest.approx(MODEL.Ms(share=share, path_s=later * PU), rel=0.15)
@@ -59,20 +65,21 @@ def test_a_second_path_is_found_with_its_share_and_delay(share: float, later: fl
 def test_another_gain_is_found(gain: float) -> None:
     found = said(gain=lambda n: gain)
     assert found.state is ModelState.MISMATCH and found.instead is not None
-    assert found.instead.kind is Kind.GAIN and found.instead.size == pytest.approx(gain - 1.0, abs=0.08)
+    assert found.instead.kind is DifferenceKind.GAIN and found.instead.size == pytest.approx(gain - 1.0, abs=0.08)
     assert found.instead.Ms == pytest.approx(MODEL.Ms(gain=gain), rel=0.15)
 
 
 def test_a_gain_that_drifts_is_found() -> None:
     found = said(gain=lambda n: 1.0 + 0.9 * n / WHOLE)
-    assert found.state is ModelState.MISMATCH and found.instead is not None and found.instead.kind is Kind.GAIN
+    assert found.state is ModelState.MISMATCH and found.instead is not None
+    assert found.instead.kind is DifferenceKind.GAIN
 
 
 @pytest.mark.parametrize("later", [0.12, 0.3])
 def test_a_longer_dead_time_is_found(later: float) -> None:
     found = said(dead_time_s=later * PU)
     assert found.state is ModelState.MISMATCH and found.instead is not None
-    assert found.instead.kind is Kind.DEAD_TIME and found.instead.size == pytest.approx(later * PU, rel=0.25)
+    assert found.instead.kind is DifferenceKind.DEAD_TIME and found.instead.size == pytest.approx(later * PU, rel=0.25)
 
 
 def test_one_change_alone_disproves_nothing() -> None:
