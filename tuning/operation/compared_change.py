@@ -32,10 +32,10 @@ MV_BEFORE = 10.0
 """Ultimate periods before that from which MV is taken, where it is known: what it did then may act later."""
 ROWS_PER_PERIOD = 40
 """Averages of the samples in an ultimate period."""
-PATHS = tuple(0.25 * n for n in range(2, 35))
-"""Delays of a second path that are looked for, in ultimate periods; the best of them is then refined."""
-REFINED = (0.125, 0.0625, 0.03125, 0.015625)
-"""Steps by which it is refined, in ultimate periods."""
+PATHS = tuple(0.125 * n for n in range(4, 69))
+"""Delays of a second path that are looked for, in ultimate periods; the best of them are then refined."""
+BASINS, REFINED = 3, (0.0625, 0.03125, 0.015625)
+"""Number of the best ones that are, and the steps by which they are refined, in ultimate periods."""
 SEEN_AFTER = 1.5
 """Ultimate periods of a change in which a second path must have acted before its share is known."""
 LATER = 0.02
@@ -205,8 +205,12 @@ class _Comparison:
                 break
             shown.append(self._path(base, delay_s))
         paths = shown[2:]
-        if paths:
-            best = min(paths, key=lambda each: each.residual)
+        lowest = [
+            each
+            for n, each in enumerate(paths)
+            if all(each.residual <= other.residual for other in paths[max(n - 1, 0) : n + 2])
+        ]
+        for best in sorted(lowest, key=lambda each: each.residual)[:BASINS]:
             for step in REFINED:
                 around = [self._path(base, best.delay_s + side * step * period) for side in (-1.0, 1.0)]
                 best = min(best, *around, key=lambda each: each.residual)
