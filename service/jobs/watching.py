@@ -64,6 +64,8 @@ _ROUND_S = 1.0
 _LEAST_S = 2.0
 """Least wall time between two looks at the history of a loop, s; a quarter of the ultimate period where that is
 longer."""
+_EACH_S = 0.1
+"""The same for each of the loops that are watched at a time, s: the thread shares its processor with the buses."""
 
 
 @dataclass
@@ -150,7 +152,7 @@ class Watching:
         if job.state is not JobState.ACCEPTED:
             return WatchEnd.ROLLED_BACK
         latest = latest_jobs(self._store, job.loop).get(job.loop)
-        if latest is not None and latest.id != job.id:
+        if latest is not None and latest.id != job.id and latest.at > watch.since:
             return WatchEnd.RETUNED
         read = self._listening.gains_read(job.loop)
         if read is not None and read[1] > watch.since_s and not same_gains(read[0], new_gains(job)):
@@ -180,7 +182,8 @@ class Watching:
         bins = asked.rows.bins
         sample_time_s = asked.state.sample_time_s
         speed = (wall_period_s(bins) or sample_time_s) / sample_time_s  # a simulated plant may run faster
-        known.due_s = now_s + max(_LEAST_S, 0.25 * watch.period_s * speed)
+        least_s = max(_LEAST_S, _EACH_S * len(self._loops))
+        known.due_s = now_s + max(least_s, 0.25 * watch.period_s * speed)
         left = _left_automatic(asked, watch.since_s)
         if left is not None and watch.disarmed is None and watch.roll_back_by_itself:
             text = f"the mode was changed at {stamp(datetime.fromtimestamp(left, UTC))}"

@@ -114,7 +114,7 @@ class ComparedChange:
     size: the largest deviation of the set-point from before, PV units; 0 of a load.
     residual: the rms of what the model leaves of PV, in standard deviations of the noise.
     load: whether a load has moved PV, or a step of it explains what the model leaves.
-    alternatives: what may be there instead, in the order of KINDS and delays.
+    alternatives: what may be there instead: another gain, another dead time, and the second paths that are clear.
     """
 
     state: ChangeState
@@ -193,7 +193,8 @@ class _Comparison:
             with_load = np.column_stack((self._free, self._load()))
             load = _Solved.of(with_load, self._known, self._left).residual <= MAX_RESIDUAL
         size = 0.0 if self._by_load else self._size
-        return ComparedChange(state, size, residual, load, tuple(alternatives))
+        kept = tuple(each for each in alternatives if each.clear or each.kind is not DifferenceKind.SECOND_PATH)
+        return ComparedChange(state, size, residual, load, kept)
 
     def _alternatives(self, base: _Solved) -> list[Alternative]:
         model, period = self._model, self._model.period_s
