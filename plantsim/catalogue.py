@@ -56,7 +56,7 @@ class CatalogueModel:
 
 
 @dataclass(frozen=True, slots=True)
-class SecondPath:
+class LaterPath:
     """A path by which MV acts again: the share of the plant's gain that it has, and how much later it acts, s."""
 
     share: float
@@ -70,7 +70,7 @@ class Entry:
     name: str
     facts: PlantFacts
     model: CatalogueModel | None
-    second_path: SecondPath | None = None
+    second_path: LaterPath | None = None
 
     def build(self, sample_time_s: float, noise_std: float = 0.0, seed: int = 1) -> Plant:
         """Returns the plant, at rest, with this sample time (s), noise (PV units) and seed."""
@@ -151,13 +151,13 @@ def own_plant(text: str) -> Entry:
     return Entry("own", facts, CatalogueModel(num, den, numbers["dead_time_s"]), _second_path(data.get("second_path")))
 
 
-def _second_path(data: object) -> SecondPath | None:
+def _second_path(data: object) -> LaterPath | None:
     """Raises ValueError."""
     if data is None:
         return None
     if not isinstance(data, dict) or data.keys() != {"share", "later_s"}:
         raise ValueError(f'second_path is a JSON object with share and later_s, not {data}')
-    path = SecondPath(float(data["share"]), float(data["later_s"]))
+    path = LaterPath(float(data["share"]), float(data["later_s"]))
     if not path.later_s >= 0.0:
         raise ValueError(f"later_s is {path.later_s:g} s: a second path acts later than the first one")
     return path

@@ -16,7 +16,7 @@ from loopwright.service.states.acceptance_watch import (
     instead_in_words,
 )
 from loopwright.service.states.job_state import JobState
-from loopwright.tuning.operation.compared_change import Alternative, ChangeState, DifferenceKind
+from loopwright.tuning.operation.compared_change import ChangeState, DifferenceKind, OtherPlant
 from loopwright.tuning.operation.model_conclusion import ModelState
 
 
@@ -35,7 +35,7 @@ class InsteadView(BaseModel):
     Ms: float = Field(description="Ms of the accepted gains with it; 100 where it is larger or the loop is not stable")
 
     @classmethod
-    def of(cls, found: Alternative) -> InsteadView:
+    def of(cls, found: OtherPlant) -> InsteadView:
         return cls(
             kind=found.kind,
             words=instead_in_words(found),

@@ -7,7 +7,7 @@ from enum import StrEnum
 
 from pydantic import BaseModel, ConfigDict
 
-from loopwright.tuning.operation.compared_change import Alternative, ChangeState, ComparedChange, DifferenceKind
+from loopwright.tuning.operation.compared_change import ChangeState, ComparedChange, DifferenceKind, OtherPlant
 from loopwright.tuning.operation.model_conclusion import Conclusion, ModelState, conclusion_of
 
 CHANGES = 3
@@ -154,7 +154,7 @@ def _words_of(found: Conclusion, watch: AcceptanceWatch) -> str:
     )
 
 
-def instead_in_words(found: Alternative) -> str:
+def instead_in_words(found: OtherPlant) -> str:
     """What fits instead of the model, with two standard deviations."""
     spread = 2.0 * found.deviation
     if found.kind is DifferenceKind.GAIN:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
-from loopwright.plantsim.catalogue import SecondPath
+from loopwright.plantsim.catalogue import LaterPath
 from loopwright.service.api.app import create_app
 from tests.browser import person
 from tests.browser.person import NAME
@@ -31,7 +31,7 @@ class SimulatedSite:
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[SimulatedSite]:
     service = Service(tmp_path)
-    loop = WatchedLoop(service, second_path=SecondPath(0.43, 4.0 * PU))
+    loop = WatchedLoop(service, second_path=LaterPath(0.43, 4.0 * PU))
     with served(create_app(service.jobs)) as server:
         yield SimulatedSite(f"http://127.0.0.1:{server.port}", loop)
     service.close()

@@ -86,7 +86,7 @@ class ChangeState(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Alternative:
+class OtherPlant:
     """What may be there instead of the model.
 
     delay_s: by how much a second path acts later, s; 0 for other kinds.
@@ -121,10 +121,10 @@ class ComparedChange:
     size: float
     residual: float
     load: bool
-    alternatives: tuple[Alternative, ...]
+    alternatives: tuple[OtherPlant, ...]
 
     @property
-    def best(self) -> Alternative | None:
+    def best(self) -> OtherPlant | None:
         """The alternative that the change shows and that explains it best; None where it shows none."""
         return min((each for each in self.alternatives if each.clear), key=lambda each: each.residual, default=None)
 
@@ -196,7 +196,7 @@ class _Comparison:
         kept = tuple(each for each in alternatives if each.clear or each.kind is not DifferenceKind.SECOND_PATH)
         return ComparedChange(state, size, residual, load, kept)
 
-    def _alternatives(self, base: _Solved) -> list[Alternative]:
+    def _alternatives(self, base: _Solved) -> list[OtherPlant]:
         model, period = self._model, self._model.period_s
         shown = [self._shown(base, DifferenceKind.GAIN, 0.0, *base.further(self._nominal))]
         shown.append(self._shown(base, DifferenceKind.DEAD_TIME, 0.0, *self._later(base)))
@@ -218,7 +218,7 @@ class _Comparison:
             shown.append(best)
         return shown
 
-    def _path(self, base: _Solved, delay_s: float) -> Alternative:
+    def _path(self, base: _Solved, delay_s: float) -> OtherPlant:
         found = base.further(self._answer(self._model.plant, delay_s))
         return self._shown(base, DifferenceKind.SECOND_PATH, delay_s, *found)
 
@@ -246,7 +246,7 @@ class _Comparison:
         deviation: float,
         residual: float,
         left: float,
-    ) -> Alternative:
+    ) -> OtherPlant:
         Ms = self._model.Ms()
         if kind is DifferenceKind.GAIN:
             found = self._model.Ms(gain=max(1.0 + size, 0.0))
@@ -258,7 +258,7 @@ class _Comparison:
         enough = base.squares - left >= EXPLAINED * beyond_noise
         fits = enough and residual <= max(MAX_RESIDUAL, NEARLY_ALL * base.residual)
         clear = fits and abs(size) > CLEAR * deviation and abs(found - Ms) > MATTERS
-        return Alternative(kind, delay_s, size, deviation, residual, found, clear)
+        return OtherPlant(kind, delay_s, size, deviation, residual, found, clear)
 
     def _load(self) -> Reals:
         """What one step of the load makes of the states at the time at which it explains most, shape (rows, order)."""
@@ -277,7 +277,7 @@ class _Comparison:
         return np.asarray(averaged(answer, self._block) / self._noise)
 
 
-def _nearly_best(alternatives: Sequence[Alternative]) -> list[Alternative]:
+def _nearly_best(alternatives: Sequence[OtherPlant]) -> list[OtherPlant]:
     """The alternatives, of which those that explain clearly less than the best one are no longer called clear."""
     best = min((each.residual for each in alternatives if each.clear), default=0.0)
     return [replace(each, clear=each.clear and each.residual <= NEARLY_BEST * best) for each in alternatives]

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from loopwright.tuning.operation.compared_change import Alternative, ChangeState, ComparedChange
+from loopwright.tuning.operation.compared_change import ChangeState, ComparedChange, OtherPlant
 
 ALIKE, ALIKE_DEVIATIONS = 0.5, 3.0
 """Largest difference of the sizes of an alternative in two changes that show the same one: a fraction of the larger
@@ -38,7 +38,7 @@ class Conclusion:
 
     state: ModelState
     confirmed: int
-    instead: Alternative | None = None
+    instead: OtherPlant | None = None
     changes: int = 0
 
 
@@ -59,10 +59,10 @@ def _differs(change: ComparedChange) -> bool:
     return change.state is ChangeState.DIFFERS
 
 
-def _largest_alike(shown: Sequence[Sequence[Alternative]]) -> tuple[Alternative, ...]:
+def _largest_alike(shown: Sequence[Sequence[OtherPlant]]) -> tuple[OtherPlant, ...]:
     """One alternative of the first change and those of the later ones that agree with it and with each other, of as
     many changes as possible and with the least residual; empty where none agree."""
-    best: tuple[Alternative, ...] = ()
+    best: tuple[OtherPlant, ...] = ()
     for first in shown[0]:
         together = [first]
         for later in shown[1:]:
@@ -75,7 +75,7 @@ def _largest_alike(shown: Sequence[Sequence[Alternative]]) -> tuple[Alternative,
     return best
 
 
-def _alike(one: Alternative, other: Alternative) -> bool:
+def _alike(one: OtherPlant, other: OtherPlant) -> bool:
     if one.kind is not other.kind or one.size * other.size <= 0.0:
         return False
     if abs(one.delay_s - other.delay_s) > ALIKE_DELAY * max(one.delay_s, other.delay_s):
@@ -85,7 +85,7 @@ def _alike(one: Alternative, other: Alternative) -> bool:
     return abs(one.size - other.size) <= permitted
 
 
-def _mean(shown: Sequence[Alternative]) -> Alternative:
+def _mean(shown: Sequence[OtherPlant]) -> OtherPlant:
     """The alternative with the mean size, each weighted with its precision; Ms and residual are the latest ones."""
     weights = [1.0 / each.deviation**2 for each in shown]
     size = sum(weight * each.size for weight, each in zip(weights, shown, strict=True)) / sum(weights)
@@ -93,4 +93,4 @@ def _mean(shown: Sequence[Alternative]) -> Alternative:
     deviation = min(each.deviation for each in shown)
     last = shown[-1]
     delay_s = sum(weight * each.delay_s for weight, each in zip(weights, shown, strict=True)) / sum(weights)
-    return Alternative(last.kind, delay_s, size, deviation, last.residual, last.Ms, True)
+    return OtherPlant(last.kind, delay_s, size, deviation, last.residual, last.Ms, True)

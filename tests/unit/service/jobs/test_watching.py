@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from loopwright.plantsim.catalogue import SecondPath
+from loopwright.plantsim.catalogue import LaterPath
 from loopwright.service.inputs.request import FastRetune
 from loopwright.service.states.acceptance_watch import TroubleKind, WatchEnd
 from loopwright.service.states.job_state import JobState
@@ -22,7 +22,7 @@ from tests.unit.service.fakes import NEW, OLD, TAG, Service
 from tests.unit.service.jobs.watched import PU, WatchedLoop
 
 CHANGES = (1.0, -1.0, 1.5)
-LATER = SecondPath(0.43, 4.0 * PU)
+LATER = LaterPath(0.43, 4.0 * PU)
 
 
 def unstable_from(periods: float) -> Callable[[int], float]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
-from loopwright.plantsim.catalogue import CatalogueModel, Entry, PlantFacts, SecondPath
+from loopwright.plantsim.catalogue import CatalogueModel, Entry, LaterPath, PlantFacts
 from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.inputs.request import FastRetune
 from loopwright.service.jobs.watching import Watching
@@ -59,7 +59,7 @@ class WatchedLoop:
     def __init__(
         self,
         service: Service,
-        second_path: SecondPath | None = None,
+        second_path: LaterPath | None = None,
         factor: Callable[[int], float] = lambda n: 1.0,
         noise: float = 0.01,
     ) -> None:
