@@ -13,7 +13,7 @@ import json
 from dataclasses import dataclass
 from importlib.resources import files
 
-from loopwright.plantsim.plant import LinearPlant, Plant
+from loopwright.plantsim.plant import LinearPlant, Plant, TwoPaths
 from loopwright.plantsim.reactor import MV_NOMINAL, STEADY_STATE, Reactor
 
 
@@ -56,24 +56,51 @@ class CatalogueModel:
 
 
 @dataclass(frozen=True, slots=True)
+class LaterPath:
+    """A path by which MV acts again: the share of the plant's gain that it has, and how much later it acts, s."""
+
+    share: float
+    later_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class Entry:
-    """One plant; `model` is None for plants that are not linear."""
+    """One plant; `model` is None for plants that are not linear. second_path: of one on which MV acts twice."""
 
     name: str
     facts: PlantFacts
     model: CatalogueModel | None
+    second_path: LaterPath | None = None
 
     def build(self, sample_time_s: float, noise_std: float = 0.0, seed: int = 1) -> Plant:
         """Returns the plant, at rest, with this sample time (s), noise (PV units) and seed."""
         if self.model is None:
             return Reactor(sample_time_s, noise_std=noise_std, seed=seed)
+        num, dead_time_s = self.model.num, self.model.dead_time_s
+        first = self._path(num, dead_time_s, sample_time_s, self.facts.pv_nominal, noise_std, seed)
+        if self.second_path is None:
+            return first
+        share, later_s = self.second_path.share, self.second_path.later_s
+        again = self._path(tuple(share * each for each in num), dead_time_s + later_s, sample_time_s, 0.0, 0.0, seed)
+        return TwoPaths(first, again)
+
+    def _path(
+        self,
+        num: tuple[float, ...],
+        dead_time_s: float,
+        sample_time_s: float,
+        pv_nominal: float,
+        noise_std: float,
+        seed: int,
+    ) -> LinearPlant:
+        assert self.model is not None
         return LinearPlant(
-            self.model.num,
+            num,
             self.model.den,
-            self.model.dead_time_s,
+            dead_time_s,
             sample_time_s,
             mv_nominal=self.facts.mv_nominal_pct,
-            pv_nominal=self.facts.pv_nominal,
+            pv_nominal=pv_nominal,
             mv_per_unit=self.facts.mv_per_unit,
             noise_std=noise_std,
             seed=seed,
@@ -94,13 +121,15 @@ def own_plant(text: str) -> Entry:
     """Returns the entry of a plant that is in no catalogue, in PV units per percent of MV.
 
     text: the JSON object {"num": [0.8], "den": [120, 1], "dead_time_s": 15, "mv": 40, "pv": 65}: coefficients from the
-    highest power down, and MV (percent) and PV where the plant starts, 50 where they are left out.
+    highest power down, and MV (percent) and PV where the plant starts, 50 where they are left out. With "second_path":
+    {"share": 0.4, "later_s": 180} MV acts again so much later, with this part of the gain.
     Raises ValueError.
     """
     data = json.loads(text)
-    known = {"num", "den", "dead_time_s", "mv", "pv"}
+    known = {"num", "den", "dead_time_s", "mv", "pv", "second_path"}
     if not isinstance(data, dict) or not {"num", "den"} <= data.keys() <= known:
-        raise ValueError(f"a plant is a JSON object with num, den and perhaps dead_time_s, mv and pv, not {text}")
+        optional = "dead_time_s, mv, pv and second_path"
+        raise ValueError(f"a plant is a JSON object with num, den and perhaps {optional}, not {text}")
     numbers = {name: float(data.get(name, other)) for name, other in (("dead_time_s", 0.0), ("mv", 50.0), ("pv", 50.0))}
     if not 0.0 <= numbers["mv"] <= 100.0:
         raise ValueError(f"mv is {numbers['mv']:g}: MV is in percent, 0 to 100")
@@ -119,7 +148,19 @@ def own_plant(text: str) -> Entry:
         pv_nominal=numbers["pv"],
         mv_per_unit=1.0,
     )
-    return Entry("own", facts, CatalogueModel(num, den, numbers["dead_time_s"]))
+    return Entry("own", facts, CatalogueModel(num, den, numbers["dead_time_s"]), _second_path(data.get("second_path")))
+
+
+def _second_path(data: object) -> LaterPath | None:
+    """Raises ValueError."""
+    if data is None:
+        return None
+    if not isinstance(data, dict) or data.keys() != {"share", "later_s"}:
+        raise ValueError(f'second_path is a JSON object with share and later_s, not {data}')
+    path = LaterPath(float(data["share"]), float(data["later_s"]))
+    if not path.later_s >= 0.0:
+        raise ValueError(f"later_s is {path.later_s:g} s: a second path acts later than the first one")
+    return path
 
 
 def _printed_models() -> list[Entry]:

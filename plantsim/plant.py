@@ -113,3 +113,37 @@ class LinearPlant:
             pv += self._random.gauss(0.0, self.noise_std)
         self._pv = pv
         return pv
+
+
+class TwoPaths:
+    """A linear plant on which MV acts twice: what it does by a first path comes again later, by a second one.
+
+    first: the plant of the first path, with the measurement noise.
+    second: that of the second path, without noise, around a PV of 0.
+    """
+
+    def __init__(self, first: LinearPlant, second: LinearPlant) -> None:
+        self._first, self._second = first, second
+
+    @property
+    def pv(self) -> float:
+        return self._first.pv + self._second.pv
+
+    @property
+    def disturbance(self) -> float:
+        return self._first.disturbance
+
+    @disturbance.setter
+    def disturbance(self, value: float) -> None:
+        self._first.disturbance = self._second.disturbance = value
+
+    @property
+    def noise_std(self) -> float:
+        return self._first.noise_std
+
+    @noise_std.setter
+    def noise_std(self, value: float) -> None:
+        self._first.noise_std = value
+
+    def step(self, mv: float) -> float:
+        return self._first.step(mv) + self._second.step(mv)

@@ -140,6 +140,11 @@ class TransferModelView(Figures):
     dead_time_error_s: float | None = Field(
         default=None, description="Standard error of the dead time, s; null: typed in"
     )
+    covariance: list[list[float]] | None = Field(
+        default=None,
+        description="Covariance of num, of den without its leading 1 and of the dead time, in this order; null: typed "
+        "in, or an earlier version has found it",
+    )
 
     @property
     def typed_in(self) -> bool:

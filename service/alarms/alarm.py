@@ -23,6 +23,9 @@ class AlarmKind(StrEnum):
     PV_OUTSIDE_LIMITS = "pv_outside_limits"
     FOREIGN_TEST = "foreign_test"
     GATEWAY_SILENT = "gateway_silent"
+    SUSPECT_GAINS = "suspect_gains"
+    ROLLED_BACK = "rolled_back"
+    MODEL_MISMATCH = "model_mismatch"
     TEST_FAILED = "test_failed"
     GAINS_DIFFER = "gains_differ"
 
@@ -51,6 +54,9 @@ RULES: dict[AlarmKind, KindRule] = {
     AlarmKind.PV_OUTSIDE_LIMITS: KindRule(2, 3.0, 3.0, False),
     AlarmKind.FOREIGN_TEST: KindRule(2, 5.0, 3.0, False),
     AlarmKind.GATEWAY_SILENT: KindRule(2, 10.0, 3.0, False),
+    AlarmKind.SUSPECT_GAINS: KindRule(1, 0.0, 0.0, True),
+    AlarmKind.ROLLED_BACK: KindRule(2, 0.0, 0.0, True),
+    AlarmKind.MODEL_MISMATCH: KindRule(2, 0.0, 0.0, True),
     AlarmKind.TEST_FAILED: KindRule(3, 0.0, 0.0, True),
     AlarmKind.GAINS_DIFFER: KindRule(3, 0.0, 0.0, True),
 }

@@ -16,10 +16,12 @@ from loopwright.service.alarms.alarm import RULES, Alarm, AlarmKind
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.listening.heard_loop import Heard
 from loopwright.service.listening.heard_node import HeardHeartbeat
+from loopwright.service.states.acceptance_watch import AcceptanceWatch, Trouble, instead_in_words
 from loopwright.service.states.job_state import JobState
 from loopwright.service.states.loop_state import LoopState, same_gains
 from loopwright.service.store.alarms import NOT_RESTORED_TEXT, UnconfirmedJob, alarm_id
 from loopwright.service.store.live_jobs import Acceptance, JobInBrief
+from loopwright.service.store.watches import AbnormalWatch
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import ADVICE, Reason
 
@@ -95,6 +97,7 @@ class AlarmFacts:
     gateways: the other gateways of the database.
     tests: the latest job of each loop of every gateway.
     unconfirmed: tests of every gateway after which the loop was not confirmed to be as before.
+    watches: those after acceptances, of every gateway, that have found something.
     signed: ids of alarms that were signed off, of those in `to_be_asked`.
     """
 
@@ -105,6 +108,7 @@ class AlarmFacts:
     gateways: Sequence[GatewayFacts] = ()
     tests: Sequence[JobInBrief] = ()
     unconfirmed: Sequence[UnconfirmedJob] = ()
+    watches: Sequence[AbnormalWatch] = ()
     signed: frozenset[str] = frozenset()
 
 
@@ -133,7 +137,7 @@ class Condition:
 
 def conditions(known: AlarmFacts) -> list[Condition]:
     """Returns everything that is abnormal at the moment of which this is known, each once."""
-    found = [*_tests(known), *_gateways(known), *_buses(known), *_nodes(known)]
+    found = [*_tests(known), *_watches(known), *_gateways(known), *_buses(known), *_nodes(known)]
     explained = {tag for each in found if each.loop is None for tag in each.loops}
     up_s = {bus.url: bus.up_s for bus in known.buses if bus.why is None}
     for loop in known.loops:
@@ -176,6 +180,36 @@ def _tests(known: AlarmFacts) -> Iterator[Condition]:
             alarm_id(AlarmKind.TEST_FAILED, test.id), AlarmKind.TEST_FAILED, test.loop, f"The last test {how}{why}",
             advice, test.host, test.loop, (test.loop,), f"/jobs/{test.id}", _seconds(test.at),
         )  # fmt: skip
+
+
+def _watches(known: AlarmFacts) -> Iterator[Condition]:
+    """What was found after acceptances."""
+    for each in known.watches:
+        trouble, job = each.watch.trouble, f"/jobs/{each.job_id}"
+        if trouble is None:
+            kind, since_s = AlarmKind.MODEL_MISMATCH, None
+            text, advice = _mismatch(each.watch), "Roll the new gains back, or retune the loop. " + _UNTIL_SIGNED
+        elif trouble.put_back:
+            kind, since_s = AlarmKind.ROLLED_BACK, _seconds(trouble.at)
+            text = f"The old gains were put back by the watch: {trouble.text}"
+            advice = f"Look at the loop, and at what was found of the model, before it is retuned. {_UNTIL_SIGNED}"
+        else:
+            kind, since_s = AlarmKind.SUSPECT_GAINS, _seconds(trouble.at)
+            text = trouble.text
+            advice = f"Look at the loop now, and roll the new gains back. {_why_not(trouble)} {_UNTIL_SIGNED}"
+        yield Condition(
+            alarm_id(kind, each.job_id), kind, each.loop, text, advice, each.host, each.loop, (each.loop,), job, since_s
+        )
+
+
+def _mismatch(watch: AcceptanceWatch) -> str:
+    found = watch.conclusion().instead
+    assert found is not None
+    return f"The plant is not the one of the model: {instead_in_words(found)}"
+
+
+def _why_not(trouble: Trouble) -> str:
+    return "" if trouble.why_not is None else f"They were not put back by the watch: {trouble.why_not}."
 
 
 def _gateways(known: AlarmFacts) -> Iterator[Condition]:

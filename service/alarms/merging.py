@@ -7,7 +7,16 @@ from collections.abc import Iterable
 from loopwright.service.alarms.alarm import Alarm, AlarmKind
 from loopwright.service.alarms.conditions import AlarmFacts
 
-_KNOWN_EVERYWHERE = frozenset({AlarmKind.NOT_RESTORED, AlarmKind.TEST_FAILED, AlarmKind.GATEWAY_SILENT})
+_KNOWN_EVERYWHERE = frozenset(
+    {
+        AlarmKind.NOT_RESTORED,
+        AlarmKind.SUSPECT_GAINS,
+        AlarmKind.ROLLED_BACK,
+        AlarmKind.MODEL_MISMATCH,
+        AlarmKind.TEST_FAILED,
+        AlarmKind.GATEWAY_SILENT,
+    }
+)
 """Kinds that every gateway finds in the database by itself."""
 
 

@@ -39,6 +39,7 @@ from loopwright.service.api.gate.key_checks import KeyChecks
 from loopwright.service.api.heads import Head
 from loopwright.service.api.idempotency import Idempotent
 from loopwright.service.api.job_views import (
+    AcceptDecision,
     Decision,
     DismissedView,
     JobView,
@@ -54,6 +55,7 @@ from loopwright.service.api.job_views import (
 from loopwright.service.api.paging import LARGEST
 from loopwright.service.api.routes import add, name_of
 from loopwright.service.api.samples import Reading, csv_text, json_text, parts
+from loopwright.service.api.watch_views import WatchView
 from loopwright.service.api.web.compressed import takes_gzip
 from loopwright.service.api.web.pages import Pages
 from loopwright.service.execution.computing.pool import Pool
@@ -70,7 +72,7 @@ from loopwright.service.live.snapshot import JobProgress
 from loopwright.service.loops.shared_reading import SharedReading
 from loopwright.service.security.principal import current
 from loopwright.service.states.job_state import ACTIVE, JobState
-from loopwright.service.store import decision_requests
+from loopwright.service.store import decision_requests, watches
 from loopwright.service.store.idempotency import IdempotencyKeys
 from loopwright.service.store.job_figures import with_record
 from loopwright.service.store.jobs import Job
@@ -155,10 +157,11 @@ def create_app(
         latest = latest_jobs(jobs.store, loops.pop() if len(loops) == 1 else None)
         asked = decision_requests.latest(jobs.store, [row.id for row in rows])
         recorded = with_record(jobs.store, [row.id for row in rows])
+        watched = watches.of_jobs(jobs.store, [row.id for row in rows])
         found = []
         for row in rows:
             of_it = jobs.running(row.id), latest.get(row.loop), asked.get(row.id), elsewhere(row), row.id in recorded
-            found.append(job_view(row, events[row.id], *of_it))
+            found.append(job_view(row, events[row.id], *of_it, watched.get(row.id)))
         return found
 
     def elsewhere(row: Job) -> JobProgress | None:
@@ -194,12 +197,14 @@ def create_app(
         present, away = there(config, host) if elsewhere else here(tag)
         last = others.values(tag, host) if elsewhere else own.values(tag, time.time())
         gains = None if present is None else present.gains.gains()
+        accepted = acceptances(jobs.store, tag).get(tag)
+        watched = None if accepted is None else watches.of_jobs(jobs.store, [accepted.job_id]).get(accepted.job_id)
         shown = loop_view(
             config,
             host,
             jobs.store.busy().get(tag),
             latest_jobs(jobs.store, tag).get(tag),
-            acceptances(jobs.store, tag).get(tag),
+            accepted,
             None if present is None or present.on_trial else gains,
             jobs.locking.locks().get(tag),
         )
@@ -211,6 +216,7 @@ def create_app(
             not_confirmed_home=NotHomeView.of(not_home) if not_home else None,
             disturbed_by=jobs.directory.disturbed_by(tag),
             knowledge=jobs.knowledge.of(tag, gains),
+            watch=None if watched is None else WatchView.of(watched, JobState.ACCEPTED),
         )
 
     @app.post(
@@ -340,8 +346,11 @@ def create_app(
         summary="Write the proposed gains to the controller permanently",
         responses={**not_yet, **problems.responses(404, 409, 422, 503)},
     )
-    def accept_job(job_id: JobId, response: Response, decision: Annotated[Decision | None, Body()] = None) -> JobView:
-        row = jobs.decisions.accept(job_id, (decision or Decision()).by)
+    def accept_job(
+        job_id: JobId, response: Response, decision: Annotated[AcceptDecision | None, Body()] = None
+    ) -> JobView:
+        given = decision or AcceptDecision()
+        row = jobs.decisions.accept(job_id, given.by, given.roll_back_by_itself)
         return decided(row, JobState.ACCEPTED, response)
 
     @app.post(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, Field
 
+from loopwright.service.api.watch_views import WatchView
 from loopwright.service.inputs.config import Limits, LoopConfig, PermittedTest
 from loopwright.service.jsonable import JsonObject, number
 from loopwright.service.results import (
@@ -27,6 +28,7 @@ from loopwright.service.results import (
     VerificationView,
     empty_result,
 )
+from loopwright.service.states.acceptance_watch import AcceptanceWatch
 from loopwright.service.states.job_state import ACTIVE, JobState, shown
 from loopwright.service.states.loop_state import LoopState, gains_of, same_gains
 from loopwright.service.store.clock import stamp
@@ -204,6 +206,10 @@ class LoopDetail(LoopView):
     knowledge: KnowledgeView | None = Field(
         description="What is known of the loop from its tests and from normal operation; null: nothing is"
     )
+    watch: WatchView | None = Field(
+        default=None,
+        description="The watch of the loop since `accepted`; null: there is none",
+    )
 
 
 class DismissedView(BaseModel):
@@ -357,6 +363,11 @@ class JobView(BaseModel):
         "this is no such proposal",
         examples=["/jobs/4f0c2a9be113"],
     )
+    watch: WatchView | None = Field(
+        default=None,
+        description="The watch of the loop since the gains were accepted; null: they were not, or under an earlier "
+        "version",
+    )
     stopping: StoppingView | None = Field(description="The request to stop the job; null: there was none")
     sample_time_s: float | None = Field(
         description="Sampling period of the controller as the job found it, s; null: the job has not read the loop",
@@ -388,6 +399,16 @@ class Decision(BaseModel):
     """The person who decides, for the audit trail."""
 
     by: str = Field(default="api", max_length=100, examples=["operator A"])
+
+
+class AcceptDecision(Decision):
+    """The person who accepts, and what the watch of the loop may do."""
+
+    roll_back_by_itself: bool = Field(
+        default=True,
+        description="Put the old gains back by itself if, while the loop is watched, PV leaves its limits or an "
+        "oscillation near the crossover grows over three periods, and nobody has changed gains or mode since",
+    )
 
 
 def loop_view(
@@ -438,12 +459,13 @@ def job_view(
     request: DecisionRequest | None = None,
     elsewhere: JobProgress | None = None,
     has_record: bool = False,
+    watch: AcceptanceWatch | None = None,
 ) -> JobView:
     """The view of a job from its row and events, and from the live progress while it runs.
 
     latest: the latest job of the loop, without dry runs.  request: the latest decision asked at another gateway.
     elsewhere: how far the job has come on the gateway that runs it, where that is another one and has said so.
-    has_record: whether its samples are stored.
+    has_record: whether its samples are stored.  watch: of the loop since its gains were accepted.
     """
     state = shown(row.state, row.dry_run)
     later = latest is not None and latest.id != row.id and state is JobState.PROPOSED
@@ -492,6 +514,7 @@ def job_view(
         decided=_decided(events),
         decision_request=DecisionRequestView.of(request, row.state),
         superseded_by=f"/jobs/{latest.id}" if later and latest is not None else None,
+        watch=None if watch is None else WatchView.of(watch, row.state),
         stopping=next((_stopping(event) for event in reversed(events) if event.kind == "abort_requested"), None),
         sample_time_s=None if row.found is None else number(row.found["sample_time_s"]),
         mode_found=None if row.found is None else str(row.found["mode"]),

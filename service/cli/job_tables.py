@@ -10,6 +10,7 @@ from rich.table import Table
 
 from loopwright.service.api.job_views import JobView, LockView, LoopDetail
 from loopwright.service.api.report.words import stage_found, stage_name
+from loopwright.service.api.watch_views import WatchView
 from loopwright.service.cli import terminal
 from loopwright.service.cli.answers import NoteEvent, ProgressEvent, StageDoneEvent, StateEvent, job_event
 from loopwright.service.cli.client import Client
@@ -79,6 +80,9 @@ def job_report(job: JobView, pv_unit: str = "PV unit") -> None:
     if on := job.rehearsed_on:
         text = f"Rehearsed on {on.plant_text}; {on.gains_text}. Nothing was tested on the loop."
         terminal.console.print(text, markup=False, highlight=False)
+    if job.watch is not None:
+        for sentence in watch(job.watch):
+            terminal.console.print(sentence, markup=False, highlight=False, soft_wrap=True)
     for step in next_steps(job):
         terminal.console.print(step, markup=False, highlight=False, soft_wrap=True)
 
@@ -140,6 +144,9 @@ def loop_report(loop: LoopDetail) -> None:
     terminal.console.print(table)
     for sentence in knowledge(loop):
         terminal.console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+    if loop.watch is not None:
+        for sentence in watch(loop.watch):
+            terminal.console.print(sentence, highlight=False, markup=False, soft_wrap=True)
     if loop.live_error:
         error = loop.live_error
         text = f"The loop cannot be read: {error.detail}. {error.advice}"
@@ -160,6 +167,18 @@ def knowledge(loop: LoopDetail) -> list[str]:
         sentences.append(f"It holds for PV {known.pv_range.low:.5g} .. {known.pv_range.high:.5g} {loop.pv_unit}.")
     if known.older_plant is not None:
         sentences.append(f"Not used any more: {known.older_plant}.")
+    return sentences
+
+
+def watch(found: WatchView) -> list[str]:
+    """Returns what the watch after an acceptance has come to, in sentences."""
+    sentences = [found.words]
+    if found.going_on:
+        sentences.append(f"The loop is watched: {len(found.changes)} of {found.wanted} changes were compared.")
+        if found.disarmed is not None:
+            sentences.append(f"The old gains are not put back by itself: {found.disarmed}.")
+        elif not found.roll_back_by_itself:
+            sentences.append("The old gains are not put back by itself: that was not asked for.")
     return sentences
 
 

@@ -105,6 +105,13 @@ def one_job(
     accept: Annotated[
         bool, typer.Option("--accept", help="Accept the proposal: write its gains to the controller.")
     ] = False,
+    roll_back_by_itself: Annotated[
+        bool,
+        typer.Option(
+            help="With --accept: have the old gains put back while the loop is watched, if PV leaves its limits or an "
+            "oscillation grows."
+        ),
+    ] = True,
     rollback: Annotated[
         bool, typer.Option("--rollback", help="Decline the proposal, or restore the old gains.")
     ] = False,
@@ -126,9 +133,10 @@ def one_job(
     if job_id == LAST and (accept or rollback):  # somebody else's job may have begun meanwhile
         found = JobView.model_validate(client.get(path))
         die(f"--{decisions[0]} writes to a loop and takes an id: the last job is {found.id}, of {found.loop}", 2)
-    job = JobView.model_validate(
-        client.post(f"{path}/{decisions[0]}", {"by": "cli"}) if decisions else client.get(path)
-    )
+    if not accept and not roll_back_by_itself:
+        die("--no-roll-back-by-itself is for --accept", 2)
+    given: dict[str, object] = {"by": "cli"} | ({"roll_back_by_itself": roll_back_by_itself} if accept else {})
+    job = JobView.model_validate(client.post(f"{path}/{decisions[0]}", given) if decisions else client.get(path))
     if follow:
         job = job_tables.follow(client, path)
     if plot is not None:

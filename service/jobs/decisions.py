@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 
 from loopwright.service.errors import Conflict, Locked
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.passing_on import PassingOn
 from loopwright.service.loops.gain_change import ForeignGains, replace_accepted
+from loopwright.service.observing.accepted_operation import watched
 from loopwright.service.observing.kept_knowledge import KeptKnowledge
 from loopwright.service.states.job_state import JobState, shown
-from loopwright.service.states.loop_state import gains_of, state_json
-from loopwright.service.store import loop_locks
+from loopwright.service.states.loop_state import LoopState, gains_of, same_gains, state_json
+from loopwright.service.store import loop_locks, watches
 from loopwright.service.store.decision_requests import What
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
 from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Ended, Reason
 
 WRITES_S = 10.0
@@ -44,15 +47,17 @@ class Decisions:
         # By loop: an event that is set when a decision that writes to its controller has ended.
         self._writes: dict[str, threading.Event] = {}
 
-    def accept(self, job_id: str, by: str) -> Job:
-        """Makes the proposed gains the accepted ones of the controller, and reads them back. Returns the job.
+    def accept(self, job_id: str, by: str, roll_back_by_itself: bool = True) -> Job:
+        """Makes the proposed gains the accepted ones of the controller, and reads them back. Returns the job. The loop
+        is watched from then on.
 
+        roll_back_by_itself: whether the watch puts the old gains back where something goes wrong.
         After an error the decision can be repeated, which completes it, or be rolled back. A job of another host whose
         gateway has not answered yet is returned as it is, not accepted.
         Raises IllegalMove, Busy, Conflict, and Failed or Refused as the loop does; of another host's also GatewayLost,
         NotKnown.
         """
-        return self._decide(job_id, JobState.ACCEPTED, by)
+        return self._decide(job_id, JobState.ACCEPTED, by, roll_back_by_itself=roll_back_by_itself)
 
     def rollback(self, job_id: str, by: str) -> Job:
         """Declines a proposal (the loop has its old gains already), or takes back an accepted or begun change. Gains
@@ -60,7 +65,31 @@ class Decisions:
         (Conflict)."""
         return self._decide(job_id, JobState.ROLLED_BACK, by)
 
-    def _decide(self, job_id: str, wanted: JobState, by: str) -> Job:
+    def roll_back_accepted(self, job_id: str, by: str) -> Job:
+        """Takes an accepted change back, without a person, where the controller still has the accepted gains in
+        automatic.
+
+        Raises as `rollback` does, Conflict also where the loop is not as it was accepted.
+        """
+        accepted = new_gains(self.store.get(job_id))
+
+        def objection(state: LoopState) -> str | None:
+            if state.mode is not Mode.AUTOMATIC:
+                return f"the loop is in {state.mode.name.lower()}"
+            if state.on_trial:
+                return "another tuner has gains on trial"
+            return None if same_gains(state.gains, accepted) else f"the controller holds {state.gains}: set by others"
+
+        return self._decide(job_id, JobState.ROLLED_BACK, by, objection)
+
+    def _decide(
+        self,
+        job_id: str,
+        wanted: JobState,
+        by: str,
+        objection: Callable[[LoopState], str | None] = lambda state: None,
+        roll_back_by_itself: bool = True,
+    ) -> Job:
         row = self.store.get(job_id)
         with self._directory.alone_with(row.loop):
             row = self.store.get(job_id)
@@ -74,7 +103,8 @@ class Decisions:
                 loop_locks.check(session, row.loop)
             config, host = self._directory.owner(row.loop)
             if host != self.store.host:  # only the service there can write to it
-                self._passing_on.ask(host, _WHAT[wanted], row.loop, job_id, by)
+                asked = roll_back_by_itself if wanted is JobState.ACCEPTED else None
+                self._passing_on.ask(host, _WHAT[wanted], row.loop, job_id, by, asked)
                 return self.store.get(job_id)
             old, new = gains_of(row.old_gains), new_gains(row)
             before, after = (old, new) if wanted is JobState.ACCEPTED else (new, old)
@@ -88,7 +118,7 @@ class Decisions:
             try:
                 loop = self._directory.open_loop(config)
                 try:
-                    state = replace_accepted(loop, before, after, begun, begin)
+                    state = replace_accepted(loop, before, after, begun, begin, objection)
                 finally:
                     loop.close()
             except ForeignGains as foreign:
@@ -107,7 +137,8 @@ class Decisions:
             finally:
                 self._writes.pop(row.loop, None)
                 over.set()
-            decided = self.store.move(job_id, wanted, by=by, restored=state_json(state))
+            also = watches.rolled_back if wanted is JobState.ROLLED_BACK else watched(by, roll_back_by_itself, config)
+            decided = self.store.move(job_id, wanted, by=by, also=also, restored=state_json(state))
             if wanted is JobState.ACCEPTED:
                 self._knowledge.accepted(decided)
             return decided

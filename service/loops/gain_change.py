@@ -25,15 +25,25 @@ class ForeignGains(Conflict):
         self.state = state
 
 
-def replace_accepted(loop: Loop, before: Gains, after: Gains, begun: bool, begin: Callable[[], None]) -> LoopState:
+def replace_accepted(
+    loop: Loop,
+    before: Gains,
+    after: Gains,
+    begun: bool,
+    begin: Callable[[], None],
+    objection: Callable[[LoopState], str | None] = lambda state: None,
+) -> LoopState:
     """Replaces the accepted gains and returns the state of the loop, read back with the new ones.
 
     begun: an earlier attempt may already have written the gains. A controller that holds the new gains then keeps them;
     where they are on trial only, they are written again.
     begin: called once, before anything is written; when it raises, the loop is not changed.
-    Raises ForeignGains, and Failed or Refused as the loop does.
+    objection: what speaks against it in the state as read, in words.
+    Raises Conflict for an objection, ForeignGains, and Failed or Refused as the loop does.
     """
     state = loop.read()
+    if (why := objection(state)) is not None:
+        raise Conflict(why)
     there = begun and same_gains(state.gains, after)
     if there and not state.on_trial:
         return state

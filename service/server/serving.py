@@ -45,6 +45,7 @@ from loopwright.service.jobs.looking import Looking
 from loopwright.service.jobs.loop_directory import LoopFactory
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.retention import Retention, RetentionPolicy
+from loopwright.service.jobs.watching import Watching
 from loopwright.service.listening.listening import Listening
 from loopwright.service.live.live import Live
 from loopwright.service.live.other_gateways import OtherGateways
@@ -246,6 +247,9 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         looking = stack.enter_context(
             closing(Looking(jobs.directory, jobs.registry, store, listening, jobs.knowledge, pool))
         )
+        watching = stack.enter_context(
+            closing(Watching(store, jobs.directory, jobs.decisions, listening, pool))
+        )
         others = OtherGateways(store)
         alarms = stack.enter_context(closing(AlarmWatch(jobs, listening, others)))
         own = OwnGateway(jobs, listening, setup.url, alarms)
@@ -269,6 +273,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         if not jobs.stopping:
             retention.start()
             announcing.start()
+            watching.start()
             if setup.listen:
                 looking.start()
             server.run(sockets=[listener])

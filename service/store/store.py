@@ -43,7 +43,7 @@ __all__ = ["Busy", "FolderInUse", "ForeignLoop", "NoSuchJob", "Store", "WithJob"
 Write = Callable[[Session], None]
 """A piece of a transaction, for the journal."""
 WithJob = Callable[[Session, JobRow], None]
-"""A piece of the transaction that makes a job."""
+"""A piece of the transaction that makes or moves a job."""
 LOCAL = "local"
 DECISIONS = {JobState.ACCEPTED: "accept", JobState.ROLLED_BACK: "rollback"}
 """What the audit log calls the moves that somebody decides."""
@@ -256,11 +256,21 @@ class Store:
                 raise
             raise busy from error
 
-    def move(self, job_id: str, wanted: JobState, by: str = "service", **columns: Unpack[JobColumns]) -> Job:
-        """Moves the job as the table allows and sets the columns, in one transaction with its event. Raises
-        IllegalMove, and Locked where its test is to begin."""
+    def move(
+        self,
+        job_id: str,
+        wanted: JobState,
+        by: str = "service",
+        also: WithJob | None = None,
+        **columns: Unpack[JobColumns],
+    ) -> Job:
+        """Moves the job as the table allows and sets the columns, in one transaction with its event and with what is
+        to be stored also. Raises IllegalMove, and Locked where its test is to begin."""
         with self.writing() as session:
-            return Job.from_row(_move(session, _find(session, job_id, lock=True), wanted, by, columns))
+            row = _move(session, _find(session, job_id, lock=True), wanted, by, columns)
+            if also is not None:
+                also(session, row)
+            return Job.from_row(row)
 
     def decline(self, job_id: str, by: str) -> Job | None:
         """Rolls back a proposal of which nothing was written to the controller; None when it is no such one."""

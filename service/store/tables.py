@@ -21,6 +21,7 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 from loopwright.service.jsonable import JsonObject
 from loopwright.service.results import RESULT, FastResult, Finding, FiveStageResult
+from loopwright.service.states.acceptance_watch import AcceptanceWatch
 from loopwright.service.states.job_state import JobState
 from loopwright.tuning.reasons import Reason
 
@@ -67,6 +68,19 @@ class FindingColumn(TypeDecorator[Finding]):
 
     def process_result_value(self, value: JsonObject | None, dialect: Dialect) -> Finding | None:
         return None if value is None else Finding.model_validate(value)
+
+
+class WatchColumn(TypeDecorator[AcceptanceWatch]):
+    """The watch of a loop after gains were accepted, as JSON."""
+
+    impl = JSON
+    cache_ok = True
+
+    def process_bind_param(self, value: AcceptanceWatch | None, dialect: Dialect) -> JsonObject | None:
+        return None if value is None else value.model_dump(mode="json")
+
+    def process_result_value(self, value: JsonObject | None, dialect: Dialect) -> AcceptanceWatch | None:
+        return None if value is None else AcceptanceWatch.model_validate(value)
 
 
 class Base(DeclarativeBase):
@@ -184,6 +198,8 @@ class DecisionRequestRow(Base):
     host: the gateway that carries it out.  asked_at: the gateway at which it was asked.
     asked_s, expires_s: seconds since 1970 UTC by the clock of the database; it is not begun after the second.
     who: the caller.  claim_...: the Idempotency-Key that the caller gave.
+    roll_back_by_itself: of an acceptance, whether the old gains are put back where something goes wrong; null: of
+    another request.
     """
 
     __tablename__ = "decision_requests"
@@ -207,6 +223,7 @@ class DecisionRequestRow(Base):
     claim_token: Mapped[str | None]
     state: Mapped[str]
     answer: Mapped[JsonObject | None]
+    roll_back_by_itself: Mapped[bool | None]
 
 
 class EventRow(Base):
@@ -287,6 +304,20 @@ class JobFiguresRow(Base):
     version: Mapped[int]
     record: Mapped[bytes | None] = mapped_column(LargeBinary)
     designs: Mapped[bytes | None] = mapped_column(LargeBinary)
+
+
+class WatchRow(Base):
+    """The watch of a loop after the gains of a job were accepted. open: whether it goes on.  abnormal: whether an alarm
+    is to be made of what it has found."""
+
+    __tablename__ = "watches"
+    __table_args__ = (Index("watches_by_loop", "loop", "open"), Index("abnormal_watches", "abnormal"))
+
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
+    loop: Mapped[str]
+    open: Mapped[bool]
+    abnormal: Mapped[bool]
+    watch: Mapped[AcceptanceWatch] = mapped_column(WatchColumn)
 
 
 class AlarmSignOffRow(Base):

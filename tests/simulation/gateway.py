@@ -29,7 +29,7 @@ from loopwright.service.server.assembly import make_jobs
 from loopwright.service.states.job_state import ACTIVE, JobState
 from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store.jobs import Job
-from loopwright.service.store.store import Store
+from loopwright.service.store.store import Store, WithJob
 from loopwright.service.store.tables import Base
 from tests.simulation.scheduler import Killed, Process, Simulation, Task
 from tests.simulation.wire import Port, Wire
@@ -266,7 +266,7 @@ class SimStore(Store):
     def empty(self) -> None:
         self.on_statement = self.on_move = None
         with self.engine.begin() as connection:
-            for table in ("sample_chunks", "events", "retune_loops", "retunes", "jobs", "loops", "audit"):
+            for table in ("watches", "sample_chunks", "events", "retune_loops", "retunes", "jobs", "loops", "audit"):
                 if table in self._tables:
                     connection.execute(text(f"DELETE FROM {table}"))
 
@@ -274,8 +274,10 @@ class SimStore(Store):
     def _tables(self) -> Collection[str]:
         return {*Base.metadata.tables}
 
-    def move(self, job_id: str, wanted: JobState, by: str = "service", **columns: Any) -> Job:
-        row = super().move(job_id, wanted, by, **columns)
+    def move(
+        self, job_id: str, wanted: JobState, by: str = "service", also: WithJob | None = None, **columns: Any
+    ) -> Job:
+        row = super().move(job_id, wanted, by, also, **columns)
         if self.on_move is not None:
             self.on_move(row, wanted)
         return row

@@ -97,6 +97,8 @@ class IdentifiedModel:
     num, den: the coefficients, highest power of s first; den begins with 1; PV units per MV unit, times in s.
     dead_time_s: the dead time, s.
     num_errors, den_errors, dead_time_error_s: the standard errors, None for a model that was typed in.
+    covariance: the covariance of num, of den without its leading 1 and of the dead time, in this order; None for a
+    model that was typed in.
     """
 
     structure: str
@@ -106,6 +108,7 @@ class IdentifiedModel:
     num_errors: tuple[float, ...] | None = None
     den_errors: tuple[float, ...] | None = None
     dead_time_error_s: float | None = None
+    covariance: tuple[tuple[float, ...], ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,21 +257,24 @@ def identified_model(fit: Fit[ExperimentRecord], found: Fitted) -> IdentifiedMod
     def coefficients(at: Reals) -> Reals:
         moved = fit.transfer(structure, at[:searched], at[searched:])
         # a leading coefficient that happens to be zero keeps its place
-        return np.concatenate((np.zeros(width - len(moved.num)), moved.num[-width:], moved.den))
+        padded = np.zeros(width - len(moved.num))
+        return np.concatenate((padded, moved.num[-width:], moved.den[1:], (moved.L,)))
 
     slopes = slopes_of(coefficients, at, searched)
     whole = fit_covariance(fit, found)
     kept = np.concatenate((np.arange(searched), len(found.theta) + np.arange(inputs)))
-    covariance = whole[np.ix_(kept, kept)]
-    errors = np.sqrt(np.maximum(np.einsum("ci,ij,cj->c", slopes, covariance, slopes), 0.0))
+    slopes[-1] = np.where(np.arange(len(at)) == structure.lags, fit.record.Ts, 0.0)  # theta has it in samples
+    covariance = slopes @ whole[np.ix_(kept, kept)] @ slopes.T
+    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return IdentifiedModel(
         structure=structure.name,
         num=model.num,
         den=model.den,
         dead_time_s=model.L,
         num_errors=tuple(map(float, errors[:width])),
-        den_errors=tuple(map(float, errors[width:])),
-        dead_time_error_s=float(np.sqrt(max(covariance[structure.lags, structure.lags], 0.0))) * fit.record.Ts,
+        den_errors=(0.0, *map(float, errors[width:-1])),
+        dead_time_error_s=float(errors[-1]),
+        covariance=tuple(tuple(map(float, row)) for row in covariance),
     )
 
 

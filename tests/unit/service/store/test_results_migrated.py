@@ -51,7 +51,12 @@ def with_later_fields(golden: dict[str, Any]) -> dict[str, Any]:
     sample_time_s = None if golden["dry_run"] else 0.1
     proposed_live = not golden["dry_run"] and golden["new_gains"] is not None
     tried = bool(golden["after"] or golden["verification"]) if proposed_live else None
+    model = golden["model"]
+    if model is not None and "num" in model:
+        model = model | {"covariance": None}
     return golden | {
+        "model": model,
+        "watch": None,
         "advice": advice,
         "decided": None,
         "decision_request": None,

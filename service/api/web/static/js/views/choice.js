@@ -132,6 +132,7 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
   const [asking, setAsking] = useState("");
   const [problem, setProblem] = useState(/** @type {any} */ (null));
   const [sending, setSending] = useState(false);
+  const [byItself, setByItself] = useState(true);
   const field = useRef(/** @type {HTMLInputElement | null} */ (null));
   const group = useRef(/** @type {HTMLElement | null} */ (null));
   const asked = useRef("");
@@ -196,7 +197,7 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
   else if (job.dry_run) inside = html`<span class="say">A rehearsal: nothing was moved, and there is nothing to accept.</span>`;
   else if (!may.operate.value) inside = html`<span class="say">${job.state === "proposed" ? "The loop runs on its old gains. To accept the new ones needs the scope operate." : ""}</span>`;
   else if (pending) inside = html`<span class="say" role="status">${decisionRequestWords(request, loop.host)}</span>`;
-  else if (asking === "accept") inside = html`<span class="say">Write <b>${written}</b> into ${where}, for good.</span>${Signed(`Write to ${loop.tag}`, () => send(() => command(`${job.url}/accept`, by())))}`;
+  else if (asking === "accept") inside = html`<span class="say">Write <b>${written}</b> into ${where}, for good.</span><label key="itself" class="itself"><input type="checkbox" checked=${byItself} onChange=${(/** @type {any} */ e) => setByItself(e.target.checked)} /> Put the old gains back by itself if, while the loop is watched, PV leaves its limits or an oscillation grows</label>${Signed(`Write to ${loop.tag}`, () => send(() => command(`${job.url}/accept`, { ...by(), roll_back_by_itself: byItself })))}`;
   else if (asking === "keep") inside = html`<span class="say">Keep the old gains; the proposal is declined.</span>${Signed("Keep the old gains", () => send(() => command(`${job.url}/rollback`, by())))}`;
   else if (asking === "rollback") inside = html`<span class="say">Write the old gains, <b>${written}</b>, back into ${where}.</span>${Signed(`Roll ${loop.tag} back`, () => send(() => command(`${job.url}/rollback`, by())))}`;
   else if (noTrialIn && (!atTested || asking === "try")) inside = html`<span class="say">These gains have not been on the loop, and cannot be tried: a trial steps the set-point, and the loop is ${noTrialIn}. Put it in automatic to try them.</span>${backButton}`;

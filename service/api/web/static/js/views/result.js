@@ -7,6 +7,7 @@ import { headline, methodName, sentence } from "../words.js";
 import { Choice } from "./choice.js";
 import { Record } from "./record.js";
 import { Stages } from "./undertest.js";
+import { Watch } from "./watch.js";
 
 /**
  * @param {{loop: any, detail: any, job: any, quiet?: boolean, own?: boolean, onChanged: (job: any) => void}} props
@@ -23,6 +24,7 @@ export function Result({ loop, detail, job, quiet = false, own = false, onChange
     ${job.reason && html`<div class="card" key="why"><p>${sentence(job.detail)}</p><p class="advice">${job.advice}</p>${After(loop, job)}</div>`}
     ${job.superseded_by && html`<p class="refusal" key="later">A later test came: <a href=${jobPath(job.superseded_by)}>its result</a>.</p>`}
     ${job.new_gains && html`<${Choice} key="choice" loop=${loop} detail=${detail} job=${job} latest=${latest} quiet=${quiet} onChanged=${onChanged} />`}
+    ${job.watch && html`<${Watch} key="watch" loop=${loop} job=${job} onChanged=${onChanged} />`}
     ${!["fast", "setpoint"].includes(job.method) || own ? html`<div class="card" key="stages" style=${{ marginTop: "16px" }}><h2 class="title">Stages</h2>${Stages(job, loop.pv_unit)}</div>` : null}
     ${job.record === "kept" && html`<${Record} key="record" loop=${loop} job=${job} />`}
     ${job.record === "deleted" && html`<p key="deleted" class="quiet">The samples of this test were deleted as old ones are; its result stays.</p>`}

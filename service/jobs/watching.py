@@ -1,0 +1,299 @@
+"""Watches loops after gains were accepted: compares operation with the model, and puts the old gains back by itself
+where something goes wrong and that was asked for.
+
+Nothing is moved for it, and nothing delays a job: the history is what the listener has heard, comparisons are made in
+other processes with the lowest priority. What speaks against putting gains back, or leaves it in doubt, keeps the
+watch from it: an alarm then says why.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import partial
+
+import numpy as np
+
+from loopwright.protocol.profile import Mode
+from loopwright.service.errors import Conflict, Locked
+from loopwright.service.execution.computing.limits import ComputationKind
+from loopwright.service.execution.computing.pool import NotWanted, Pool
+from loopwright.service.inputs.config import LoopConfig
+from loopwright.service.jobs.decisions import Decisions, new_gains
+from loopwright.service.jobs.loop_directory import LoopDirectory
+from loopwright.service.jobs.repeated import Repeated
+from loopwright.service.listening.heard_loop import Heard
+from loopwright.service.listening.listening import Listening
+from loopwright.service.observing.accepted_operation import accepted_model, compared, oscillation
+from loopwright.service.observing.hearing import question
+from loopwright.service.observing.observed import Question
+from loopwright.service.observing.resolution import wall_period_s
+from loopwright.service.states.acceptance_watch import (
+    CHANGES,
+    MAX_CHANGES,
+    PERIODS,
+    AcceptanceWatch,
+    Trouble,
+    TroubleKind,
+    WatchEnd,
+)
+from loopwright.service.states.job_state import IllegalMove, JobState
+from loopwright.service.states.loop_state import LoopState, loop_state, same_gains
+from loopwright.service.store import watches
+from loopwright.service.store.clock import now, stamp
+from loopwright.service.store.jobs import Job
+from loopwright.service.store.live_jobs import latest_jobs
+from loopwright.service.store.store import Busy, Store
+from loopwright.service.telemetry.logs import about
+from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.operation.model_conclusion import ModelState
+from loopwright.tuning.reasons import Ended
+
+log = logging.getLogger(__name__)
+
+BY = "watch after acceptance"
+"""Who puts gains back, as the audit log has it."""
+OUTSIDE_S = 3.0
+"""Wall time for which PV must be outside its limits, s."""
+LONGEST_S = 30.0 * 86_400.0
+"""Wall time after which a watch ends that has not seen enough changes, s."""
+_ROUND_S = 1.0
+_LEAST_S = 2.0
+"""Least wall time between two looks at the history of a loop, s; a quarter of the ultimate period where that is
+longer."""
+_EACH_S = 0.1
+"""The same for each of the loops that are watched at a time, s: the thread shares its processor with the buses."""
+
+
+@dataclass
+class _LoopSeen:
+    """A watched loop as this process knows it. Times are wall time, s.
+
+    due_s: when its history is looked at again. inside: whether PV was within its limits since the acceptance.
+    outside_from_s: since when PV is outside of them; None: it is not.
+    """
+
+    due_s: float = 0.0
+    inside: bool = False
+    outside_from_s: float | None = None
+
+
+class Watching:
+    """Watches the loops of this host whose gains were accepted, in a thread.
+
+    wall: the wall clock, s since 1970 UTC, and so the clock of the history.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        directory: LoopDirectory,
+        decisions: Decisions,
+        listening: Listening,
+        pool: Pool,
+        wall: Callable[[], float] = time.time,
+    ) -> None:
+        self._store, self._directory, self._decisions = store, directory, decisions
+        self._listening, self._pool, self._wall = listening, pool, wall
+        self._loops: dict[str, _LoopSeen] = {}
+        failed = "the loops with accepted gains could not be watched"
+        self._looks = Repeated(self.look, _ROUND_S, "watches accepted gains", failed)
+        self._compares = Repeated(self.compare, _ROUND_S, "compares operation with models", failed, at_once=False)
+        self._to_compare: dict[str, Question] = {}
+
+    def start(self) -> None:
+        self._looks.start()
+        self._compares.start()
+
+    def close(self) -> None:
+        self._looks.close()
+        self._compares.close()
+
+    def look(self) -> None:
+        """Looks at every watched loop once. Raises SQLAlchemyError, FolderInUse."""
+        open_ = watches.open_here(self._store)
+        for job_id in self._loops.keys() - open_.keys():
+            del self._loops[job_id]
+        for job_id, (tag, watch) in open_.items():
+            if self._looks.closed:
+                return
+            if (config := self._directory.loops.get(tag)) is not None:
+                with about(job=job_id, loop=tag):
+                    self._look(job_id, config, watch)
+
+    def _look(self, job_id: str, config: LoopConfig, watch: AcceptanceWatch) -> None:
+        job, now_s = self._store.get(job_id), self._wall()
+        if watch.trouble is not None and watch.trouble.put_back is None:  # this thread settles it before it looks again
+            self._not_put_back(job_id, "the service ended meanwhile: read the loop")
+        why = self._over(job, watch, now_s)
+        if why is not None:
+            self._end(job_id, why)
+            return
+        known = self._loops.setdefault(job_id, _LoopSeen())
+        heard = self._listening.heard.get(config.tag)
+        not_heard = self._listening.why_not_heard(config.tag)
+        if not_heard is None and (heard is None or heard.silent):
+            not_heard = "no data of the loop"
+        if not_heard != watch.not_heard:
+            watches.change(self._store, job_id, lambda now: now.model_copy(update={"not_heard": not_heard}))
+        if not_heard is not None or heard is None:
+            known.outside_from_s = None
+            return
+        if (text := self._outside(known, config, heard, now_s)) is not None:
+            self._trouble(job, watch, TroubleKind.PV_OUTSIDE_LIMITS, text)
+        elif now_s >= known.due_s:
+            self._look_back(job, config, watch, known, now_s)
+
+    def _over(self, job: Job, watch: AcceptanceWatch, now_s: float) -> WatchEnd | None:
+        """Why a watch is over; None: it goes on."""
+        if job.state is not JobState.ACCEPTED:
+            return WatchEnd.ROLLED_BACK
+        latest = latest_jobs(self._store, job.loop).get(job.loop)
+        if latest is not None and latest.id != job.id and latest.at > watch.since:
+            return WatchEnd.RETUNED
+        read = self._listening.gains_read(job.loop)
+        if read is not None and read[1] > watch.since_s and not same_gains(read[0], new_gains(job)):
+            return WatchEnd.GAINS_CHANGED
+        return WatchEnd.TOO_LONG if now_s - watch.since_s > LONGEST_S else None
+
+    @staticmethod
+    def _outside(known: _LoopSeen, config: LoopConfig, heard: Heard, now_s: float) -> str | None:
+        """In words that PV has left its limits; None: it has not, or the set-point has."""
+        limits = config.pv_limits
+        low, high = heard.pv < limits.low, heard.pv > limits.high
+        if heard.mode != Mode.AUTOMATIC or not limits.low <= heard.sp <= limits.high or not (low or high):
+            known.inside = known.inside or (limits.low <= heard.pv <= limits.high)
+            known.outside_from_s = None
+            return None
+        if not known.inside:
+            return None
+        known.outside_from_s = now_s if known.outside_from_s is None else min(known.outside_from_s, now_s)
+        if now_s - known.outside_from_s < OUTSIDE_S:
+            return None
+        side, limit = ("below", limits.low) if low else ("above", limits.high)
+        return f"PV went {side} its limit of {limit:g} {config.pv_unit} under the new gains"
+
+    def _look_back(self, job: Job, config: LoopConfig, watch: AcceptanceWatch, known: _LoopSeen, now_s: float) -> None:
+        """Looks at the history since the acceptance. Raises SQLAlchemyError, FolderInUse."""
+        asked = self._question(job, config)
+        bins = asked.rows.bins
+        sample_time_s = asked.state.sample_time_s
+        speed = (wall_period_s(bins) or sample_time_s) / sample_time_s  # a simulated plant may run faster
+        least_s = max(_LEAST_S, _EACH_S * len(self._loops))
+        known.due_s = now_s + max(least_s, 0.25 * watch.period_s * speed)
+        left = _left_automatic(asked, watch.since_s)
+        if left is not None and watch.disarmed is None and watch.roll_back_by_itself:
+            text = f"the mode was changed at {stamp(datetime.fromtimestamp(left, UTC))}"
+            watch = watches.change(self._store, job.id, partial(_with, disarmed=text)) or watch
+        found = oscillation(asked, new_gains(job), watch.period_s, watch.since_s)
+        if found is not None and watch.trouble is None:
+            text = (
+                f"PV oscillates under the new gains with a period of {found.period_s:.3g} s, each "
+                f"{found.per_period:.2f} times as large as the one before, {found.peak_to_peak:.3g} {config.pv_unit} "
+                "from peak to peak at last"
+            )
+            self._trouble(job, watch, TroubleKind.GROWING_OSCILLATION, text)
+            return
+        self._to_compare[job.id] = asked
+        if _complete(watch, (now_s - watch.since_s) / speed):
+            self._end(job.id, WatchEnd.COMPLETE)
+
+    def _question(self, job: Job, config: LoopConfig) -> Question:
+        state = _state(job)
+        disturbers = self._directory.disturbers(config.tag)
+        return question(self._listening, self._store, config, state, DesignSpec(), disturbers, self._wall)
+
+    # what is compared
+
+    def compare(self) -> None:
+        """Compares what is new with the models. Raises SQLAlchemyError, FolderInUse."""
+        while self._to_compare and not self._compares.closed:
+            job_id, asked = self._to_compare.popitem()
+            job = self._store.get(job_id)
+            watch = watches.of_jobs(self._store, [job_id])[job_id]
+            model = None if job.result is None else accepted_model(job.result, asked.state.sample_time_s)
+            if model is None or watch.end is not None:
+                continue
+            from_s = max(watch.looked_to_s, watch.since_s)
+            work = partial(compared, asked, model, from_s)
+            try:
+                found = self._pool.run(ComputationKind.LOOK, work, unwanted=lambda: self._compares.closed)
+            except NotWanted:
+                return
+            except Ended as ended:
+                log.warning("a change could not be compared with the model of job %s: %s", job_id, ended.detail)
+                continue
+            if found.changes:
+                changes = (*watch.changes, *found.changes)
+                make = partial(_with, changes=changes, looked_to_s=found.looked_to_s)
+                later = watches.change(self._store, job_id, make)
+                log.info("watched %s: %s", job.loop, later.words if later else "the watch has ended")
+
+    # what goes wrong
+
+    def _trouble(self, job: Job, watch: AcceptanceWatch, kind: TroubleKind, text: str) -> None:
+        """Notes what went wrong, and puts the old gains back where that was asked for."""
+        if watch.trouble is not None:
+            return
+        trouble = Trouble(kind=kind, at=now(), text=text)
+        noted = watches.change(self._store, job.id, partial(_with, trouble=trouble))
+        if noted is None:
+            return
+        log.warning("%s: %s", job.loop, text)
+        if not watch.armed:
+            self._not_put_back(job.id, watch.disarmed or "that was not asked for as the new ones were accepted")
+            return
+        try:
+            self._decisions.roll_back_accepted(job.id, BY)
+        except (Ended, Conflict, Locked, Busy, IllegalMove) as error:
+            why = error.detail if isinstance(error, Ended) else str(error)
+            log.error("the old gains of %s could not be put back: %s", job.loop, why)
+            self._not_put_back(job.id, why)
+        else:
+            watches.settle(self._store, job.id, partial(_settled, put_back=True, why_not=None))
+
+    def _not_put_back(self, job_id: str, why: str) -> None:
+        watches.settle(self._store, job_id, partial(_settled, put_back=False, why_not=why))
+
+    def _end(self, job_id: str, why: WatchEnd) -> None:
+        log.info("the watch of job %s has ended: %s", job_id, why)
+        watches.change(self._store, job_id, lambda watch: watches.ended(watch, why))
+
+
+def _with(watch: AcceptanceWatch, **fields: object) -> AcceptanceWatch:
+    return watch.model_copy(update=fields)
+
+
+def _settled(watch: AcceptanceWatch, put_back: bool, why_not: str | None) -> AcceptanceWatch:
+    assert watch.trouble is not None
+    return _with(watch, trouble=watch.trouble.model_copy(update={"put_back": put_back, "why_not": why_not}))
+
+
+def _state(job: Job) -> LoopState:
+    """The loop as it was accepted; its gains are the new ones."""
+    data = job.restored or job.found
+    if data is None:
+        raise Conflict(f"job {job.id} has not read its loop")
+    return replace(loop_state(data), gains=new_gains(job))
+
+
+def _complete(watch: AcceptanceWatch, passed_s: float) -> bool:
+    """passed_s: plant time since the acceptance, s."""
+    decided = watch.informative >= CHANGES and watch.conclusion().state is not ModelState.OPEN
+    enough = decided or len(watch.changes) >= MAX_CHANGES
+    return enough and passed_s >= PERIODS * watch.period_s
+
+
+def _left_automatic(asked: Question, since_s: float) -> float | None:
+    """When a loop that was in automatic since then has left it, wall time, s; None: it has not."""
+    bins = asked.rows.bins
+    known = bins[(bins["at_s"] > since_s) & (bins["mode"] >= 0)]
+    automatic = known["mode"] == Mode.AUTOMATIC
+    if not automatic.any():
+        return None
+    later = known[int(np.argmax(automatic)) :]
+    left = later[later["mode"] != Mode.AUTOMATIC]
+    return float(left["at_s"][0]) if len(left) else None

@@ -1,0 +1,247 @@
+"""A loop is watched after gains were accepted: what operation shows of the model, and when the old gains come back."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from loopwright.plantsim.catalogue import LaterPath
+from loopwright.service.inputs.request import FastRetune
+from loopwright.service.states.acceptance_watch import TroubleKind, WatchEnd
+from loopwright.service.states.job_state import JobState
+from loopwright.service.store import audit
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.operation.model_conclusion import ModelState
+from loopwright.tuning.plan import Mode
+from loopwright.tuning.reasons import Reason
+from tests.unit.service.fakes import NEW, OLD, TAG, Service
+from tests.unit.service.jobs.watched import PU, WatchedLoop
+
+CHANGES = (1.0, -1.0, 1.5)
+LATER = LaterPath(0.43, 4.0 * PU)
+
+
+def unstable_from(periods: float) -> Callable[[int], float]:
+    """The plant's gain grows beyond what the accepted gains bear, so many ultimate periods after the acceptance."""
+    return lambda n: 1.0 if n < periods * PU / 0.1 else 3.5
+
+
+def three_changes(here: WatchedLoop) -> None:
+    for size in CHANGES:
+        here.goes_on(13.0, size)
+
+
+def alarms(client: TestClient, *kinds: str) -> list[dict[str, Any]]:
+    """The alarms, when they are of these kinds; a look at what is abnormal serves all who ask for a quarter second."""
+    found: list[dict[str, Any]] = []
+    for _ in range(600):
+        found = client.get("/alarms").json()["alarms"]
+        if [each["kind"] for each in found] == list(kinds):
+            break
+        time.sleep(0.05)
+    assert [each["kind"] for each in found] == list(kinds)
+    return found
+
+
+def test_a_model_is_confirmed_by_three_changes(service: Service, client: TestClient) -> None:
+    here = WatchedLoop(service)
+    here.accept()
+    here.goes_on(2.0)
+    assert here.watch.end is None and "Nothing has moved the loop yet" in here.watch.words
+    three_changes(here)
+    watch = here.watch
+    assert (watch.conclusion().state, watch.conclusion().confirmed) == (ModelState.CONFIRMED, 3)
+    assert watch.words == "The model is confirmed by 3 changes of normal operation."
+    assert watch.end is WatchEnd.COMPLETE and service.controller.state.gains == NEW
+    shown = client.get(f"/jobs/{here.job_id}").json()["watch"]
+    assert (shown["verdict"], shown["confirmed"], shown["action"]) == ("confirmed", 3, None)
+    assert client.get(f"/loops/{TAG}").json()["watch"] == shown
+    alarms(client)
+
+
+def test_a_second_path_that_the_record_could_not_show_is_found_and_rolled_back(
+    service: Service, client: TestClient
+) -> None:
+    here = WatchedLoop(service, second_path=LATER)
+    here.accept()
+    three_changes(here)
+    found = here.watch.conclusion()
+    assert found.state is ModelState.MISMATCH and found.instead is not None
+    assert abs(found.instead.size - 0.43) < 0.05 and abs(found.instead.delay_s - 4.0 * PU) < 0.3 * PU
+    shown = client.get(f"/jobs/{here.job_id}").json()["watch"]
+    assert (shown["verdict"], shown["instead"]["kind"], shown["action"]) == ("mismatch", "second_path", "rollback")
+    assert "a second path acts" in shown["words"]
+    (alarm,) = alarms(client, "model_mismatch")
+    assert alarm["job"] == f"/jobs/{here.job_id}"
+    assert "a second path acts" in alarm["text"] and "Roll the new gains back" in alarm["advice"]
+    answer = client.post(f"/jobs/{here.job_id}/rollback", json={"by": "operator B"}).json()
+    assert (answer["watch"]["end"], answer["watch"]["action"]) == ("rolled_back", None)
+    assert service.controller.state.gains == OLD
+    alarms(client)
+
+
+def test_a_loop_that_becomes_unstable_gets_its_old_gains_back(service: Service, client: TestClient) -> None:
+    here = WatchedLoop(service, factor=unstable_from(10.0))
+    here.accept()
+    here.goes_on(20.0, 1.0)
+    trouble = here.watch.trouble
+    assert trouble is not None and trouble.put_back is True
+    assert trouble.kind is TroubleKind.GROWING_OSCILLATION and "PV oscillates under the new gains" in trouble.text
+    assert service.controller.state.gains == OLD and here.watch.end is WatchEnd.ROLLED_BACK
+    last = audit.trail(service.store.engine, 1)[0]
+    assert (last.what, last.said_by, last.who) == ("rollback", "watch after acceptance", "service")
+    (alarm,) = alarms(client, "rolled_back")
+    assert alarm["to_sign"] and "put back by the watch" in alarm["text"]
+    client.post(f"/alarms/{alarm['id']}/sign-off", json={"by": "operator B"})
+    alarms(client)
+    here.goes_on(3.0)
+    assert service.store.get(here.job_id).state is JobState.ROLLED_BACK
+
+
+def test_pv_that_leaves_its_limits_is_a_reason_too(service: Service) -> None:
+    limits = service.loops[TAG].pv_limits.model_copy(update={"high": 50.5})
+    service.loops[TAG] = service.loops[TAG].model_copy(update={"pv_limits": limits})
+    here = WatchedLoop(service)
+    here.accept()
+    here.goes_on(2.0)
+    here.goes_on(3.0, 1.0)
+    assert here.watch.trouble is None, "an operator has put the set-point there"
+    here.goes_on(4.0, -0.7)
+    here.plant.disturbance = 2.0
+    here.goes_on(3.0)
+    trouble = here.watch.trouble
+    assert trouble is not None and trouble.kind is TroubleKind.PV_OUTSIDE_LIMITS
+    assert trouble.text == "PV went above its limit of 50.5 degC under the new gains"
+    assert trouble.put_back and service.controller.state.gains == OLD
+
+
+def _not_asked_for(here: WatchedLoop) -> None:
+    pass
+
+
+def _gains_by_hand(here: WatchedLoop) -> None:
+    here.service.controller.by_hand(gains=Gains(0.74, 3.0))
+    here.ears.gains_are_read = False  # the listener has not read the loop since
+
+
+def _in_manual_meanwhile(here: WatchedLoop) -> None:
+    here.service.controller.by_hand(mode=Mode.MANUAL)
+    here.goes_on(1.0)
+    here.service.controller.by_hand(mode=Mode.AUTOMATIC)
+
+
+def _not_reached(here: WatchedLoop) -> None:
+    here.service.controller.absent = Reason.NODE_LOST
+
+
+def _locked(here: WatchedLoop) -> None:
+    here.service.jobs.locking.lock(TAG, "valve is being overhauled", "night shift")
+
+
+@pytest.mark.parametrize(
+    ("meanwhile", "why"),
+    [
+        (_not_asked_for, "that was not asked for"),
+        (_gains_by_hand, "set by others"),
+        (_in_manual_meanwhile, "the mode was changed at"),
+        (_not_reached, "node 32 does not answer"),
+        (_locked, "night shift"),
+    ],
+)
+def test_the_old_gains_are_not_put_back_where_that_is_in_doubt(
+    service: Service, client: TestClient, meanwhile: Callable[[WatchedLoop], None], why: str
+) -> None:
+    here = WatchedLoop(service, factor=unstable_from(10.0))
+    here.accept(roll_back_by_itself=meanwhile is not _not_asked_for)
+    here.goes_on(2.0)
+    meanwhile(here)
+    held = service.controller.state.gains
+    here.goes_on(20.0, 1.0)
+    trouble = here.watch.trouble
+    assert trouble is not None and trouble.put_back is False
+    assert trouble.why_not is not None and why in trouble.why_not
+    assert service.controller.state.gains == held and service.store.get(here.job_id).state is JobState.ACCEPTED
+    service.controller.absent = None
+    alarm = client.get("/alarms").json()["alarms"][0]
+    assert (alarm["level"], alarm["kind"]) == (1, "suspect_gains") and why in alarm["advice"]
+    here.goes_on(5.0)
+    assert here.watch.trouble == trouble, "it is tried once"
+
+
+def test_the_watch_goes_on_when_the_service_is_started_again(service: Service) -> None:
+    here = WatchedLoop(service, second_path=LATER)
+    here.accept()
+    here.goes_on(2.0)
+    here.goes_on(13.0, 1.0)
+    assert len(here.watch.changes) == 1
+    here.watching = here.another()
+    here.goes_on(13.0, -1.0)
+    assert here.watch.conclusion().state is ModelState.MISMATCH, "the first change is still known"
+
+
+def test_what_a_service_has_left_half_done_is_not_tried_again(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = WatchedLoop(service, factor=unstable_from(5.0))
+    here.accept()
+
+    def killed(job_id: str, by: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(service.jobs.decisions, "roll_back_accepted", killed)
+    with pytest.raises(KeyboardInterrupt):
+        here.goes_on(20.0, 1.0)
+    monkeypatch.undo()
+    here.watching = here.another()
+    here.goes_on(1.0)
+    trouble = here.watch.trouble
+    assert trouble is not None and trouble.put_back is False and "the service ended meanwhile" in str(trouble.why_not)
+    assert service.controller.state.gains == NEW
+
+
+def test_gains_that_somebody_else_has_set_end_the_watch(service: Service) -> None:
+    here = WatchedLoop(service)
+    here.accept()
+    here.goes_on(2.0)
+    service.controller.by_hand(gains=Gains(0.6, 3.0))
+    here.goes_on(2.0)
+    assert here.watch.end is WatchEnd.GAINS_CHANGED and service.controller.state.gains == Gains(0.6, 3.0)
+
+
+def test_the_next_retune_ends_the_watch(service: Service) -> None:
+    here = WatchedLoop(service)
+    here.accept()
+    here.goes_on(2.0)
+    service.wait(service.jobs.start(TAG, FastRetune()).id)
+    here.goes_on(1.0)
+    assert here.watch.end is WatchEnd.RETUNED
+
+
+def test_a_loop_that_is_not_heard_is_not_said_to_be_confirmed(service: Service, client: TestClient) -> None:
+    here = WatchedLoop(service)
+    here.accept()
+    here.goes_on(2.0)
+    here.heard_at_all = False
+    three_changes(here)
+    watch = here.watch
+    assert (watch.conclusion().state, watch.end, watch.changes) == (ModelState.OPEN, None, ())
+    assert "The loop is not heard: no data of the loop" in watch.words
+    assert client.get(f"/jobs/{here.job_id}").json()["watch"]["not_heard"] == "no data of the loop"
+    here.heard_at_all = True
+    here.goes_on(2.0)
+    assert here.watch.not_heard is None
+    here.goes_on(13.0, 1.0)
+    assert here.watch.conclusion().confirmed == 1, "a change of the time in which nothing was heard does not count"
+
+
+def test_accepting_asks(service: Service, client: TestClient) -> None:
+    here = WatchedLoop(service)
+    answer = client.post(f"/jobs/{here.job_id}/accept", json={"by": "A", "roll_back_by_itself": False}).json()
+    assert (answer["watch"]["roll_back_by_itself"], answer["watch"]["going_on"]) == (False, True)
+    client.post(f"/jobs/{here.job_id}/rollback", json={"by": "A"})
+    again = WatchedLoop(service)
+    assert client.post(f"/jobs/{again.job_id}/accept").json()["watch"]["roll_back_by_itself"] is True, "the default"
