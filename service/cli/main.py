@@ -408,7 +408,7 @@ def _one(client: Client, started: object, wait: bool, as_json: bool) -> int:
     if as_json:
         print_json(job.model_dump(mode="json"))
     else:
-        job_tables.job_report(job)
+        job_tables.job_report(job, jobs.unit_of(client, job.loop))
     return 3 if wait and job.state not in GOOD else 0
 
 
