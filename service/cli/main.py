@@ -204,6 +204,7 @@ def serve(
         from loopwright.service.cli import site_table
         from loopwright.service.execution.computing.limits import ComputingLimits
         from loopwright.service.inputs.config import ConfigError, load_site
+        from loopwright.service.inputs.webhooks import BadSecret
         from loopwright.service.jobs.retention import RetentionPolicy
         from loopwright.service.server.serving import NotSafe, Setup
         from loopwright.service.server.serving import serve as run
@@ -243,7 +244,7 @@ def serve(
         if shown_on_terminal():
             site_table.show(list(load_site(loops).loops.values()))
         run(setup)
-    except (ConfigError, FolderInUse, ForeignLoop, BadDatabase, NotSafe) as error:
+    except (ConfigError, BadSecret, FolderInUse, ForeignLoop, BadDatabase, NotSafe) as error:
         die(str(error), 2)
     except SQLAlchemyError as error:
         die(f"the database cannot be used: {getattr(error, 'orig', None) or error}", 2)

@@ -546,8 +546,8 @@ def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[s
     deviation = request.sp_deviation or loop.sp_deviation
     if deviation > loop.sp_deviation:
         problems.append(
-            f"sp_deviation {deviation:g} is more than the configured {loop.sp_deviation:g} {loop.pv_unit}: a request may "
-            "narrow what loops.yaml permits, not widen it"
+            f"sp_deviation {deviation:g} is more than the configured {loop.sp_deviation:g} {loop.pv_unit}: a request "
+            "may narrow what loops.yaml permits, not widen it"
         )
     if 2 * deviation > limits["pv_limits"].high - limits["pv_limits"].low and not problems:
         problems.append(f"sp_deviation {deviation:g} {loop.pv_unit} needs at least twice that between the PV limits")
