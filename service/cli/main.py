@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from loopwright.service.cli import alarms, data, identification, jobs, keys, loops, rehearse, tuning
+from loopwright.service.cli import alarms, data, identification, jobs, keys, loops, rehearse, tuning, webhooks
 from loopwright.service.cli.client import DEFAULT_URL, ApiError, Client
 from loopwright.service.cli.output import AsJson, Url, die, on_terminal, print_json, shown_on_terminal
 
@@ -24,6 +24,7 @@ app.add_typer(data.app)
 app.add_typer(loops.app)
 app.add_typer(jobs.app)
 app.add_typer(alarms.app)
+app.add_typer(webhooks.app)
 _HAND_OVER: dict[str, object] = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
 

@@ -34,7 +34,7 @@ from loopwright.service.inputs.plausible import (
     check_option,
     check_step,
 )
-from loopwright.service.inputs.validation import branch, branch_of
+from loopwright.service.inputs.validation import branch, branch_of, did_you_mean
 from loopwright.tuning.experiments.primitives import Directions
 from loopwright.tuning.experiments.step_limits import not_kept
 from loopwright.tuning.fast.design_trial import trial_stages
@@ -170,8 +170,9 @@ class _Retune(Bounds):
             raise ValueError(f"{why}; its options are {', '.join(cls.model_fields)}")
         unknown = [str(name) for name in data if name not in cls.model_fields]
         if unknown:
-            known = ", ".join(cls.model_fields)
-            raise ValueError(f"{', '.join(unknown)}: no option of {data.get('method', FAST)}; its options are {known}")
+            known = list(cls.model_fields)
+            why = f"{', '.join(unknown)}: no option of {data.get('method', FAST)}{did_you_mean(unknown[0], known)}"
+            raise ValueError(f"{why}; its options are {', '.join(known)}")
         return data
 
     @model_validator(mode="after")
