@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.transcript import Shell, alike, blocks, written
+from tests.e2e.transcript import Shell, alike, blocks, differences, written
 from tests.unit.service.offline.exported_files import FILES
 
 FOLDER = Path(__file__).parents[2] / "docs" / "transcripts"
@@ -60,7 +60,7 @@ def test_a_day_goes_as_it_is_told(day: Day, tmp_path: Path) -> None:
                 if alike(said.shown, answer, day.within):
                     answer = said.shown
                 elif not write:
-                    assert answer == said.shown, f"{day.name}: {said.command}"
+                    pytest.fail("\n".join([said.command, *differences(said.shown, answer, day.within), answer]))
                 after += written(said, answer)
     if write:
         page.write_text(after + text[at:], encoding="utf-8")

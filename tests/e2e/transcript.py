@@ -24,7 +24,8 @@ from typing import IO, Self
 COLUMNS = 100
 _BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _FILE = re.compile(r"# ([\w.-]+\.\w+)\n")
-_NUMBER = re.compile(r"(?<![\w.])[-+±]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+_NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+_ERROR = re.compile(r"±[\d.e+-]+")
 _ID = re.compile(r"\b(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{12}\b")
 _SAME = (
     (re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?Z"), "2026-01-31T12:00:00.000Z"),
@@ -83,18 +84,30 @@ def written(said: Said, answer: str) -> str:
     return "$ " + said.command.replace("\n", "\n> ") + "\n" + answer
 
 
-def alike(shown: str, answer: str, within: float) -> bool:
-    """Whether two answers have the same words, and numbers that differ by that part of them at most, or by 0.02 where
-    the part is not 0. Widths of columns and where lines are broken do not count."""
-    one, other = (_BOX.sub(" ", text).strip() for text in (shown, answer))
-    if _NUMBER.sub("\0", one) != _NUMBER.sub("\0", other):
-        return False
-    pairs = zip(_NUMBER.findall(one), _NUMBER.findall(other), strict=True)
+def differences(shown: str, answer: str, within: float) -> list[str]:
+    """Where two answers differ: in their words, or in numbers by more than that part of them, or more than 0.02 where
+    the numbers are measured. Widths of columns, where lines are broken, and standard errors do not count: the last are
+    left out where they are small.
+
+    within: 0.02 at most where nothing is measured.
+    """
+    one, other = (_BOX.sub(" ", _ERROR.sub("", text)).strip() for text in (shown, answer))
+    words, others = (_NUMBER.sub("#", text) for text in (one, other))
+    if words != others:
+        unlike = (i for i, (a, b) in enumerate(zip(words, others, strict=False)) if a != b)
+        at = next(unlike, min(len(words), len(others)))
+        return [f"words: {words[max(0, at - 40) : at + 40]!r} is {others[max(0, at - 40) : at + 40]!r}"]
     slack = 0.02 if within > 0.02 else 0.0
-    return all(
-        abs(a - b) <= max(within * max(abs(a), abs(b)), slack)
-        for a, b in ((float(x.lstrip("±")), float(y.lstrip("±"))) for x, y in pairs)
-    )
+    found = []
+    for shown_number, number in zip(_NUMBER.finditer(one), _NUMBER.finditer(other), strict=True):
+        a, b = (float(each.group()) for each in (shown_number, number))
+        if abs(a - b) > max(within * max(abs(a), abs(b)), slack):
+            found.append(f"...{one[max(0, shown_number.start() - 40) : shown_number.end()]} is {number.group()}")
+    return found
+
+
+def alike(shown: str, answer: str, within: float) -> bool:
+    return not differences(shown, answer, within)
 
 
 class Shell:
