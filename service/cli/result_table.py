@@ -66,12 +66,14 @@ def result_table(
     """
     table = Table(title=title)
     for heading in ("", "before", heading_new, "unit"):
-        table.add_column(heading, justify="left" if heading in ("", "unit") else "right", no_wrap=heading == "")
+        table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
     for label, before, after, unit in _figures(shown, pv_unit, mv_unit):
         if before not in _NOTHING or after not in _NOTHING:
             table.add_row(label, before, after, unit)
     if table.row_count > 1:  # the plant time alone is no result
         terminal.console.print(table)
+        if shown.model_from is not None:
+            terminal.console.print(f"The model is from {shown.model_from}.", markup=False, highlight=False)
 
 
 def _figures(job: ShownResult, pv_unit: str, mv_unit: str) -> Iterator[tuple[str, str, str, str]]:
@@ -129,12 +131,11 @@ def _model(
     """Yields lines of the table: label, value, unit."""
     if model is None:
         return
-    if not isinstance(model, TransferModelView):
-        values = ", ".join(figure(model, name) for name in ("K", "T_s", "L_s"))
-        yield "model K, T, L", values, f"{pv_unit} per {mv_unit}, s, s"
-        return
-    if (first_order := _first_order(model)) is not None:
-        yield "model K, T, L", first_order, f"{pv_unit} per {mv_unit}, s, s"
+    first_order = _first_order(model)
+    if first_order is not None:
+        for name, value, unit in zip("KTL", first_order, (f"{pv_unit} per {mv_unit}", "s", "s"), strict=True):
+            yield f"model {name}", value, unit
+    if first_order is not None or not isinstance(model, TransferModelView):
         return
     for label, coefficients, errors, unit in (
         ("model num", model.num, model.num_errors, f"{pv_unit} per {mv_unit}"),
@@ -145,8 +146,10 @@ def _model(
     yield "model dead time", _with_error(model.dead_time_s, model.dead_time_error_s), "s"
 
 
-def _first_order(model: TransferModelView) -> str | None:
+def _first_order(model: ModelView | TransferModelView) -> tuple[str, ...] | None:
     """Returns K, T and L of a model of first order whose lag the record determines; None for any other model."""
+    if not isinstance(model, TransferModelView):
+        return tuple(figure(model, name) for name in ("K", "T_s", "L_s"))
     if len(model.num) != 1 or len(model.den) != 2 or model.den[1] <= 0.0:
         return None
     (b,), (_, a) = model.num, model.den
@@ -156,7 +159,7 @@ def _first_order(model: TransferModelView) -> str | None:
     gain_error = 0.0 if model.num_errors is None else abs(model.num_errors[0] / b)
     K, T = b / a, 1.0 / a
     shown = (K, abs(K) * hypot(error, gain_error)), (T, T * error), (model.dead_time_s, model.dead_time_error_s)
-    return ", ".join(_with_error(*each) for each in shown)
+    return tuple(_with_error(*each) for each in shown)
 
 
 def _with_error(value: float, error: float | None) -> str:
@@ -174,8 +177,6 @@ def _of_ms(difference: float | None) -> str:
 def _certainty(job: ShownResult, mv_unit: str) -> Iterator[tuple[str, str, str]]:
     """Yields lines of the table on how certain the result of fast is: label, value, unit."""
     found, step = job.evidence, job.verification
-    if job.model_from is not None:
-        yield "model from", job.model_from, ""
     if job.tried is False:
         yield "tried on the loop", "never", ""
     if found is not None:

@@ -65,7 +65,7 @@ def test_a_day_goes_as_it_is_told(day: Day, tmp_path: Path) -> None:
     if write:
         page.write_text(after + text[at:], encoding="utf-8")
     assert all((tmp_path / name).stat().st_size > 1000 for name in day.pictures)
-    if write:
+    if write and after + text[at:] != text:
         for name in day.pictures:
             shutil.copy(tmp_path / name, FOLDER / f"{page.stem}-{name}")
 

@@ -40,7 +40,7 @@ _GONE = 410
 
 
 @dataclass(frozen=True)
-class Clock:
+class DeliveryTimes:
     """The wall clock, s since 1970 UTC, and the delays between attempts, s."""
 
     now_s: Callable[[], float] = time.time
@@ -62,10 +62,10 @@ class Webhooks:
         folder: Path,
         store: Store,
         own_url: str | None = None,
-        clock: Clock | None = None,
+        clock: DeliveryTimes | None = None,
     ) -> None:
         self.configs = configs
-        self._store, self._own_url, self._clock = store, own_url, clock or Clock()
+        self._store, self._own_url, self._clock = store, own_url, clock or DeliveryTimes()
         self._senders = [Sender(each, read_secret(each, folder), store, self._clock) for each in configs]
         if configs:
             store.on_move = self._note
@@ -105,7 +105,7 @@ class Webhooks:
 class Sender:
     """Delivers the messages of one webhook, in a thread of its own."""
 
-    def __init__(self, config: WebhookConfig, secret: bytes, store: Store, clock: Clock) -> None:
+    def __init__(self, config: WebhookConfig, secret: bytes, store: Store, clock: DeliveryTimes) -> None:
         self._config, self._secret, self._store, self._clock = config, secret, store, clock
         self._forgotten_s = 0.0
         name = f"webhook {config.name}"

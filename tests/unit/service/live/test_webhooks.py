@@ -25,7 +25,7 @@ from loopwright.service.inputs.request import retune_request
 from loopwright.service.inputs.webhooks import BadSecret, WebhookConfig, read_secret
 from loopwright.service.live.webhooks import connection
 from loopwright.service.live.webhooks.connection import NotDelivered, post
-from loopwright.service.live.webhooks.webhooks import Clock, Webhooks
+from loopwright.service.live.webhooks.webhooks import DeliveryTimes, Webhooks
 from loopwright.service.states.job_state import JobState
 from loopwright.service.store import webhook_deliveries
 from loopwright.service.store.store import Store
@@ -35,7 +35,7 @@ from tests.unit.service.fakes import TAG, Service, loop_entry
 from tests.unit.service.processes import until
 
 SECRET = bytes(range(32))
-SOON = Clock(delays_s=(0.01,) * 3, look_s=0.01)
+SOON = DeliveryTimes(delays_s=(0.01,) * 3, look_s=0.01)
 
 
 class Receiver:
@@ -95,7 +95,9 @@ def config(url: str, **changes: Any) -> WebhookConfig:
 
 
 @contextmanager
-def webhooks(service: Service, folder: Path, *configs: WebhookConfig, clock: Clock = SOON) -> Iterator[Webhooks]:
+def webhooks(
+    service: Service, folder: Path, *configs: WebhookConfig, clock: DeliveryTimes = SOON
+) -> Iterator[Webhooks]:
     (folder / "secret").write_text("whsec_" + base64.b64encode(SECRET).decode())
     with closing(Webhooks(configs, folder, service.store, "https://gw-1.example.com", clock)) as made:
         made.start()
@@ -266,7 +268,7 @@ def test_what_was_not_delivered_is_delivered_after_a_restart(
     service: Service, tmp_path: Path, receiver: Callable[..., Receiver]
 ) -> None:
     hook = receiver(200)
-    later = Clock(look_s=3600.0)
+    later = DeliveryTimes(look_s=3600.0)
     with webhooks(service, tmp_path, config(hook.url), clock=later):
         until(lambda: not webhook_deliveries.waiting(service.store, "plant-it"))
         ended(service)
@@ -278,9 +280,9 @@ def test_what_was_not_delivered_is_delivered_after_a_restart(
 
 
 def test_what_waits_for_a_webhook_that_is_gone_is_given_up(service: Service, tmp_path: Path, hanging: str) -> None:
-    with webhooks(service, tmp_path, config(hanging), clock=Clock(look_s=3600.0)):
+    with webhooks(service, tmp_path, config(hanging), clock=DeliveryTimes(look_s=3600.0)):
         ended(service)
-    with webhooks(service, tmp_path, config(hanging, name="another"), clock=Clock(look_s=3600.0)):
+    with webhooks(service, tmp_path, config(hanging, name="another"), clock=DeliveryTimes(look_s=3600.0)):
         (message,) = webhook_deliveries.latest(service.store, 1)
     assert message.state is DeliveryState.GIVEN_UP and message.error == "the webhook is not configured any more"
 
