@@ -14,7 +14,6 @@ from ipaddress import ip_address
 from typing import Any
 
 import httpcore
-import httpx
 
 from loopwright.service.inputs.public_addresses import is_public
 
@@ -31,7 +30,7 @@ def post(url: str, headers: Mapping[str, str], body: bytes, allow_private: bool,
     checked = CheckedAddresses(allow_private, time.monotonic() + timeout_s)
     try:
         with (
-            httpcore.ConnectionPool(ssl_context=_ssl_context(), network_backend=checked, max_connections=1) as pool,
+            httpcore.ConnectionPool(ssl_context=_authorities(url), network_backend=checked, max_connections=1) as pool,
             pool.stream("POST", url, headers=list(headers.items()), content=body) as answer,
         ):
             return int(answer.status)
@@ -43,9 +42,9 @@ def post(url: str, headers: Mapping[str, str], body: bytes, allow_private: bool,
         raise NotDelivered(str(error) or type(error).__name__) from None
 
 
-def _ssl_context() -> ssl.SSLContext:
-    """The certificates that httpx trusts; SSL_CERT_FILE and SSL_CERT_DIR name others."""
-    return httpx.create_ssl_context()
+def _authorities(url: str) -> ssl.SSLContext | None:
+    """The authorities that this machine trusts, a company's own among them; SSL_CERT_FILE names others."""
+    return ssl.create_default_context() if url.startswith("https:") else None
 
 
 class CheckedAddresses(httpcore.NetworkBackend):

@@ -25,7 +25,8 @@ from loopwright.service.inputs.request import retune_request
 from loopwright.service.inputs.webhooks import BadSecret, WebhookConfig, read_secret
 from loopwright.service.live.webhooks import connection
 from loopwright.service.live.webhooks.connection import NotDelivered, post
-from loopwright.service.live.webhooks.webhooks import DeliveryTimes, Webhooks
+from loopwright.service.live.webhooks.times import DeliveryTimes
+from loopwright.service.live.webhooks.webhooks import Webhooks
 from loopwright.service.states.job_state import JobState
 from loopwright.service.store import webhook_deliveries
 from loopwright.service.store.store import Store
@@ -203,9 +204,10 @@ def test_the_whole_request_has_one_time(hanging: str) -> None:
 
 def test_a_receiver_that_drips_is_cut_off() -> None:
     def drip(server: socket.socket) -> None:
+        server.settimeout(60.0)
         caller, _ = server.accept()
         with caller:
-            caller.settimeout(30.0)
+            caller.settimeout(60.0)
             try:
                 caller.sendall(b"HTTP/1.1 200 OK\r\n")
                 while True:
@@ -218,7 +220,7 @@ def test_a_receiver_that_drips_is_cut_off() -> None:
         thread = threading.Thread(target=drip, args=(server,))
         thread.start()
         with pytest.raises(NotDelivered, match="no answer"):
-            post(f"http://127.0.0.1:{server.getsockname()[1]}/", {}, b"{}", allow_private=True, timeout_s=0.3)
+            post(f"http://127.0.0.1:{server.getsockname()[1]}/", {}, b"{}", allow_private=True, timeout_s=3.0)
         thread.join()
 
 
