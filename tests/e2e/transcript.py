@@ -25,7 +25,7 @@ COLUMNS = 116
 _BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _FILE = re.compile(r"# ([\w.-]+\.\w+)\n")
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
-_ERROR = re.compile(r"±[\d.e+-]+")
+_ERROR = re.compile(r"±[\d.e+-]+|below (?=0\.001)")
 _ID = re.compile(r"\b(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{12}\b")
 _SAME = (
     (re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?Z"), "2026-01-31T12:00:00.000Z"),
@@ -88,7 +88,7 @@ def written(said: Said, answer: str) -> str:
 def differences(shown: str, answer: str, within: float) -> list[str]:
     """Where two answers differ: in their words, or in numbers by more than that part of them, or more than 0.02 where
     the numbers are measured. Widths of columns, where lines are broken, and standard errors do not count: the last are
-    left out where they are small.
+    left out where they are small, as is whether a difference of Ms is just below 0.001.
 
     within: 0.02 at most where nothing is measured.
     """
