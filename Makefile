@@ -10,7 +10,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 # A compiler: user-mode Linux alone runs on no processor with AMX (tools/uml_xstate.c).
 UML := user-mode-linux iproute2 $(shell grep -qs amx_tile /proc/cpuinfo && echo gcc libc6-dev)
-DEBIAN := $(UML) tshark can-utils postgresql systemd chromium prometheus $(shell command -v npm >/dev/null || echo nodejs npm)
+DEBIAN := $(UML) tshark can-utils postgresql systemd chromium prometheus curl $(shell command -v npm >/dev/null || echo nodejs npm)
 ENGINE := docker.io docker-compose
 BESIDE := $(UML) debootstrap e2fsprogs
 

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import ClassVar
 
 from loopwright.tuning.reasons import Failed, Reason, Refused
+
+_ALIKE = 0.8
+"""Ratio of difflib from which a tag is named as the one that may have been meant: one letter of five is wrong."""
 
 
 class UnknownLoop(Exception):
@@ -15,8 +19,9 @@ class UnknownLoop(Exception):
     """
 
     def __init__(self, tag: str, tags: Iterable[str] = ()) -> None:
-        alike = next((each for each in tags if _letters(each) == _letters(tag)), None)
-        super().__init__(f"there is no loop {tag}" + (f"; did you mean {alike}?" if alike else ""))
+        known = {_letters(each): each for each in tags}
+        alike = get_close_matches(_letters(tag), known, 1, _ALIKE)
+        super().__init__(f"there is no loop {tag}" + (f"; did you mean {known[alike[0]]}?" if alike else ""))
         self.tag = tag
 
 

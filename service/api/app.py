@@ -29,6 +29,7 @@ from loopwright.service.api import (
     sessions,
     sparklines,
     tunings,
+    webhooks,
 )
 from loopwright.service.api import live as live_api
 from loopwright.service.api.bodies import JsonRoute
@@ -150,6 +151,7 @@ def create_app(
     alarms = alarms or AlarmWatch(jobs, listening, others)
     operations.install(app, jobs, checks, {} if sdo_retries is None else sdo_retries, alarms)
     alarms_api.install(app, alarms)
+    webhooks.install(app, jobs.store)
 
     def views(rows: Sequence[Job]) -> list[JobView]:
         events = jobs.store.events_by_job([row.id for row in rows], limit=MAX_EVENTS)

@@ -16,6 +16,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.service.jobs.journal import temporary
 from loopwright.service.jobs.manager import Jobs
+from loopwright.service.live.messages import RETRY_MS
 from loopwright.service.live.snapshot import JobProgress
 from loopwright.service.security.principal import Principal
 from loopwright.service.security.sessions import BrowserSessions
@@ -23,8 +24,6 @@ from loopwright.service.states.job_state import ACTIVE, JobState
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.keyring import REVOKED_WITHIN_S, Keyring
 
-RETRY_MS = 2000
-"""Time after which a client whose stream was cut off connects again, ms."""
 _POLL_S = 0.2
 _AWAY_S = 1.0
 _EVENTS_AT_ONCE = 200

@@ -50,6 +50,7 @@ _TAGS = {
     "tunings": "Gains for a model, without a loop",
     "alarms": "What is abnormal now",
     "live": "Values as they are heard, as a stream",
+    "webhooks": "What the service calls by itself when a job awaits a decision or has ended",
     "operations": "The service itself: health, changes, keys and sessions",
 }
 
@@ -77,6 +78,8 @@ def _complete(document: Document) -> None:
         for method in _METHODS:
             if method in item:
                 _one(path, method, item[method])
+    for item in document.get("webhooks", {}).values():
+        item["post"]["responses"].pop("422", None)  # what the receiver answers is its own affair
 
 
 def _one(path: str, method: str, operation: Operation) -> None:

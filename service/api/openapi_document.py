@@ -80,6 +80,7 @@ class Document(TypedDict, total=False):
     servers: list[dict[str, str]]
     tags: list[TagObject]
     paths: dict[str, dict[str, Operation]]
+    webhooks: dict[str, dict[str, Operation]]
     components: Components
 
 

@@ -19,6 +19,10 @@ KEY_VARIABLE = "LOOPWRIGHT_KEY"
 """The key is in the environment, because every user of the machine can read a command line."""
 _PATIENCE_S = 30.0
 """Longest wait for the answer to a request whose connection broke, wall time, s."""
+_SILENT_S = 15.0
+"""Wall time after which a live stream that says nothing counts as cut off, s; it speaks about once a second."""
+_AGAIN_S = 2.0
+"""Wall time between two attempts to reach the live stream, s."""
 
 
 class ApiError(Exception):
@@ -109,21 +113,33 @@ class Client:
                 timeout = httpx.Timeout(10.0, read=60.0)
                 with self._http.stream("GET", f"{job_url}/events", headers=headers, timeout=timeout) as answer:
                     self._check(answer)
-                    fields: dict[str, str] = {}
-                    for line in answer.iter_lines():
-                        name, _, value = line.partition(": ")
-                        if line:
-                            fields[name] = value
-                        elif "event" in fields:
-                            last = fields.get("id", last)
-                            failures = 0
-                            yield fields["event"], json.loads(fields["data"])
-                            fields = {}
+                    for fields in _events_of(answer):
+                        last = fields.get("id", last)
+                        failures = 0
+                        yield fields["event"], json.loads(fields["data"])
                 return
             except httpx.TransportError as error:
                 failures += 1
                 if failures > 3:
                     raise ApiError(f"{self.url}: {error}") from error
+
+    def live(self, tag: str) -> Iterator[tuple[str, object]]:
+        """Yields the name and the JSON of each message of the live stream about a loop, for ever. While the service is
+        not reached, `lost` comes, with why, at each attempt to reach it."""
+        import httpx
+
+        while True:
+            try:
+                timeout = httpx.Timeout(10.0, read=_SILENT_S)
+                with self._http.stream("GET", "/live", params={"loops": tag, "back_s": "0"}, timeout=timeout) as answer:
+                    self._check(answer)
+                    for fields in _events_of(answer):
+                        yield fields["event"], json.loads(fields["data"])
+            except httpx.TransportError as error:
+                yield "lost", f"the service at {self.url} is not reached ({error}), it is tried again"
+            else:
+                yield "lost", f"the service at {self.url} has ended the stream, it is tried again"
+            time.sleep(_AGAIN_S)
 
     def _answer(
         self, method: str, path: str | httpx.URL, query: Mapping[str, str | float] | None = None
@@ -163,6 +179,19 @@ class Client:
             body["advice"] = f"Put an API key into the environment variable {KEY_VARIABLE}."
         lines = [body.get("detail") or body.get("title"), body.get("advice"), body.get("job")]
         raise ApiError("\n".join(line for line in lines if line))
+
+
+def _events_of(answer: httpx.Response) -> Iterator[dict[str, str]]:
+    """Yields the fields of each server-sent event that has a name; others are for browsers."""
+    fields: dict[str, str] = {}
+    for line in answer.iter_lines():
+        name, _, value = line.partition(": ")
+        if line:
+            fields[name] = value
+        else:
+            if "event" in fields:
+                yield fields
+            fields = {}
 
 
 def _json(answer: httpx.Response) -> object:

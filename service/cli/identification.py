@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -122,13 +123,13 @@ def _load(data: Path, options: ReadOptions, as_json: bool) -> Record:
         from loopwright.service.cli import record_tables
 
         record_tables.read(record)
-    if may_be_swapped(record) and not {"u", "y"} <= options.columns.keys():
+    if may_be_swapped(record):
         mv, pv = record.names["u"], record.names["y"]
-        die(
-            f"{data}: are the columns swapped? MV ({mv}) is smooth and PV ({pv}) jumps, as if PV had been moved and MV "
-            f'had followed. Say which is which: --u "{pv}" --y "{mv}", or --u "{mv}" --y "{pv}" if they are right',
-            2,
-        )
+        why = f"{data}: are the columns swapped? MV ({mv}) is smooth and PV ({pv}) jumps, as if PV had been moved and "
+        why += f'MV had followed. Say which is which: --u "{pv}" --y "{mv}"'
+        if not {"u", "y"} <= options.columns.keys():
+            die(f'{why}, or --u "{mv}" --y "{pv}" if they are right', 2)
+        print(f"note: {why}; it goes on with the columns that were named", file=sys.stderr)
     return record
 
 

@@ -69,12 +69,13 @@ def rehearsal_report(found: Rehearsal) -> None:
 
 def job_report(job: JobView, pv_unit: str = "PV unit") -> None:
     """Shows a job with all figures that a decision needs; of a job without a result, why it has none comes first."""
+    in_words = job.reason is not None or job.new_gains is None
+    if in_words:
+        _say(title(job))
     if job.reason:
-        terminal.console.print(title(job), markup=False, highlight=False, soft_wrap=True)
-        text = f"{job.reason}: {job.detail}\n{job.advice}"
-        terminal.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        _say(f"{job.reason}: {job.detail}\n{job.advice}")
     heading_new = {JobState.NO_GAIN: "designed", JobState.REHEARSED: "rehearsed"}.get(job.state, "after")
-    result_table(ShownResult.model_validate(job), None if job.reason else title(job), heading_new, pv_unit)
+    result_table(ShownResult.model_validate(job), None if in_words else title(job), heading_new, pv_unit)
     if job.comparison and not job.reason:
         terminal.console.print(job.comparison.verdict, markup=False, highlight=False)
     if on := job.rehearsed_on:
@@ -82,9 +83,29 @@ def job_report(job: JobView, pv_unit: str = "PV unit") -> None:
         terminal.console.print(text, markup=False, highlight=False)
     if job.watch is not None:
         for sentence in watch(job.watch):
-            terminal.console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+            _say(sentence)
+    _show_next_steps(job)
+
+
+def decision_report(job: JobView, pv_unit: str = "PV unit") -> None:
+    """Shows a job that was just decided about: the gains that the loop has now, and what can be done next."""
+    _say(title(job))
+    gains = job.new_gains if job.state is JobState.ACCEPTED else job.old_gains
+    if gains is not None:
+        terms = [f"Kp {cell(gains.Kp)} % per {pv_unit}", f"Ti {cell(gains.Ti)} s"]
+        terms += [f"Td {cell(gains.Td)} s"] if gains.Td else []
+        _say(f"{job.loop} has {', '.join(terms)}: {'the new' if job.state is JobState.ACCEPTED else 'its old'} gains")
+    _show_next_steps(job)
+
+
+def _show_next_steps(job: JobView) -> None:
     for step in next_steps(job):
-        terminal.console.print(step, markup=False, highlight=False, soft_wrap=True)
+        _say(step)
+
+
+def _say(text: str) -> None:
+    """Shows a text whose lines are not broken: it can be copied."""
+    terminal.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def next_steps(job: JobView) -> list[str]:

@@ -52,6 +52,15 @@ def path_of(client: Client, given: str) -> str:
     return f"/jobs/{found[0].id}"
 
 
+def unit_of(client: Client, tag: str) -> str:
+    """Returns the unit of PV of a loop, as configured; no controller is asked. The words of a table for a loop that is
+    not configured any more."""
+    from loopwright.service.api.job_views import LoopView
+
+    loops = map(LoopView.model_validate, client.pages("/loops"))
+    return next((loop.pv_unit for loop in loops if loop.tag == tag), "PV unit")
+
+
 @app.command("jobs")
 def list_jobs(
     loop: Annotated[str | None, typer.Option(help="Only jobs of this loop.")] = None,
@@ -122,7 +131,7 @@ def one_job(
     as_json: AsJson = False,
 ) -> None:
     """Show a job, or decide on it."""
-    from loopwright.service.api.job_views import JobView, LoopDetail
+    from loopwright.service.api.job_views import JobView
     from loopwright.service.cli import job_tables
 
     client = Client(url)
@@ -143,7 +152,7 @@ def one_job(
         from loopwright.service.cli.plots.job import NoPicture, job_picture
 
         check_plot(plot)
-        unit = LoopDetail.model_validate(client.get(f"/loops/{job.loop}")).pv_unit
+        unit = unit_of(client, job.loop)
         try:
             job_picture(plot, client.samples_of(job.url), job, unit)
         except NoPicture as error:
@@ -152,8 +161,10 @@ def one_job(
             die(f"{plot}: {error.strerror}", 2)
     if as_json:
         print_json(job.model_dump(mode="json"))
+    elif decisions and job.state in (JobState.ACCEPTED, JobState.ROLLED_BACK):
+        job_tables.decision_report(job, unit_of(client, job.loop))
     else:
-        job_tables.job_report(job)
+        job_tables.job_report(job, unit_of(client, job.loop))
 
 
 @app.command("report")

@@ -84,12 +84,26 @@ def probe(
 
 
 @app.command("loop")
-def one_loop(tag: Tag, url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
+def one_loop(
+    tag: Tag,
+    follow: Annotated[
+        bool, typer.Option("--follow", "-f", help="Show it as it is heard, about once a second, until Ctrl-C.")
+    ] = False,
+    url: Url = DEFAULT_URL,
+    as_json: AsJson = False,
+) -> None:
     """Show a loop and its present state."""
     from loopwright.service.api.job_views import LoopDetail
     from loopwright.service.cli import job_tables
 
-    found = Client(url).get(f"/loops/{quote(tag, safe='')}")
+    client = Client(url)
+    if follow:
+        from loopwright.service.cli import jobs, loop_live
+        from loopwright.service.cli.terminal import console
+
+        loop_live.follow(client, tag, jobs.unit_of(client, tag), console, as_json)
+        return
+    found = client.get(f"/loops/{quote(tag, safe='')}")
     if as_json:
         print_json(found)
     else:

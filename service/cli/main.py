@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from loopwright.service.cli import alarms, data, identification, jobs, keys, loops, rehearse, tuning
+from loopwright.service.cli import alarms, data, identification, jobs, keys, loops, rehearse, tuning, webhooks
 from loopwright.service.cli.client import DEFAULT_URL, ApiError, Client
 from loopwright.service.cli.output import AsJson, Url, die, on_terminal, print_json, shown_on_terminal
 
@@ -24,6 +24,7 @@ app.add_typer(data.app)
 app.add_typer(loops.app)
 app.add_typer(jobs.app)
 app.add_typer(alarms.app)
+app.add_typer(webhooks.app)
 _HAND_OVER: dict[str, object] = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
 
@@ -204,6 +205,7 @@ def serve(
         from loopwright.service.cli import site_table
         from loopwright.service.execution.computing.limits import ComputingLimits
         from loopwright.service.inputs.config import ConfigError, load_site
+        from loopwright.service.inputs.webhooks import BadSecret
         from loopwright.service.jobs.retention import RetentionPolicy
         from loopwright.service.server.serving import NotSafe, Setup
         from loopwright.service.server.serving import serve as run
@@ -243,7 +245,7 @@ def serve(
         if shown_on_terminal():
             site_table.show(list(load_site(loops).loops.values()))
         run(setup)
-    except (ConfigError, FolderInUse, ForeignLoop, BadDatabase, NotSafe) as error:
+    except (ConfigError, BadSecret, FolderInUse, ForeignLoop, BadDatabase, NotSafe) as error:
         die(str(error), 2)
     except SQLAlchemyError as error:
         die(f"the database cannot be used: {getattr(error, 'orig', None) or error}", 2)
@@ -408,7 +410,7 @@ def _one(client: Client, started: object, wait: bool, as_json: bool) -> int:
     if as_json:
         print_json(job.model_dump(mode="json"))
     else:
-        job_tables.job_report(job)
+        job_tables.job_report(job, jobs.unit_of(client, job.loop))
     return 3 if wait and job.state not in GOOD else 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import hypot
 
 from pydantic import BaseModel, ConfigDict
 from rich.table import Table
@@ -30,6 +31,9 @@ _PREDICTED = (
 )
 """Figures of a job of an earlier version, which has no comparison."""
 _NOTHING = ("", "-")
+_LAG_ERROR_MAX = 0.1
+"""Standard error of the lag, as a part of it, up to which a model of first order is shown as K, T and L."""
+_MS_SHOWN = 0.001
 
 
 class ShownResult(BaseModel):
@@ -66,15 +70,18 @@ def result_table(
     for label, before, after, unit in _figures(shown, pv_unit, mv_unit):
         if before not in _NOTHING or after not in _NOTHING:
             table.add_row(label, before, after, unit)
-    if table.row_count > 1 or title is not None:  # the plant time alone is no result
+    if table.row_count > 1:  # the plant time alone is no result
         terminal.console.print(table)
+        if shown.model_from is not None:
+            terminal.console.print(f"The model is from {shown.model_from}.", markup=False, highlight=False)
 
 
 def _figures(job: ShownResult, pv_unit: str, mv_unit: str) -> Iterator[tuple[str, str, str, str]]:
     """Yields lines of the table: label, before, after, unit."""
     per = f"{mv_unit} per {pv_unit}"
-    for name, unit in (("Kp", f"{per} (ISA)"), ("Ti", "s"), ("Td", "s")):
-        yield f"gain {name}", figure(job.old_gains, name), figure(job.new_gains, name), unit
+    if job.new_gains is not None:
+        for name, unit in (("Kp", f"{per} (ISA)"), ("Ti", "s"), ("Td", "s")):
+            yield f"gain {name}", figure(job.old_gains, name), figure(job.new_gains, name), unit
     if job.before or job.after:
         for label, name, unit in (
             ("measured IAE", "IAE", f"{pv_unit} s"),
@@ -124,9 +131,11 @@ def _model(
     """Yields lines of the table: label, value, unit."""
     if model is None:
         return
-    if not isinstance(model, TransferModelView):
-        values = ", ".join(figure(model, name) for name in ("K", "T_s", "L_s"))
-        yield "model K, T, L", values, f"{pv_unit} per {mv_unit}, s, s"
+    first_order = _first_order(model)
+    if first_order is not None:
+        for name, value, unit in zip("KTL", first_order, (f"{pv_unit} per {mv_unit}", "s", "s"), strict=True):
+            yield f"model {name}", value, unit
+    if first_order is not None or not isinstance(model, TransferModelView):
         return
     for label, coefficients, errors, unit in (
         ("model num", model.num, model.num_errors, f"{pv_unit} per {mv_unit}"),
@@ -137,21 +146,42 @@ def _model(
     yield "model dead time", _with_error(model.dead_time_s, model.dead_time_error_s), "s"
 
 
+def _first_order(model: ModelView | TransferModelView) -> tuple[str, ...] | None:
+    """Returns K, T and L of a model of first order whose lag the record determines; None for any other model."""
+    if not isinstance(model, TransferModelView):
+        return tuple(figure(model, name) for name in ("K", "T_s", "L_s"))
+    if len(model.num) != 1 or len(model.den) != 2 or model.den[1] <= 0.0:
+        return None
+    (b,), (_, a) = model.num, model.den
+    error = 0.0 if model.den_errors is None else model.den_errors[1] / a
+    if error > _LAG_ERROR_MAX:
+        return None
+    gain_error = 0.0 if model.num_errors is None else abs(model.num_errors[0] / b)
+    K, T = b / a, 1.0 / a
+    shown = (K, abs(K) * hypot(error, gain_error)), (T, T * error), (model.dead_time_s, model.dead_time_error_s)
+    return tuple(_with_error(*each) for each in shown)
+
+
 def _with_error(value: float, error: float | None) -> str:
     """Returns a value with its standard error, unless the error is negligible."""
     return cell(value) if not error or error < 1e-4 * abs(value) else f"{cell(value)}±{error:.1g}"
 
 
+def _of_ms(difference: float | None) -> str:
+    """Returns a difference of Ms as text, to a thousandth: nobody can tell less from a loop."""
+    if difference is None:
+        return cell(None)
+    return f"{difference:.3f}" if difference >= _MS_SHOWN else f"below {_MS_SHOWN}"
+
+
 def _certainty(job: ShownResult, mv_unit: str) -> Iterator[tuple[str, str, str]]:
     """Yields lines of the table on how certain the result of fast is: label, value, unit."""
     found, step = job.evidence, job.verification
-    if job.model_from is not None:
-        yield "model from", job.model_from, ""
     if job.tried is False:
         yield "tried on the loop", "never", ""
     if found is not None:
-        yield "uncertainty of Ms", cell(found.uncertainty), "(2 std. dev.)"
-        yield "Ms, other models", cell(found.ambiguity), "(max. diff.)"
+        yield "uncertainty of Ms", _of_ms(found.uncertainty), "(2 std. dev.)"
+        yield "Ms, other models", _of_ms(found.ambiguity), "(max. diff.)"
         if found.longest_delay_seen_s is not None:
             yield "second path seen up to", cell(found.longest_delay_seen_s), "s later (30 % of the effect)"
         for load in found.loads:

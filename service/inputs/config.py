@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from loopwright.service.inputs.plausible import Positive, Size, Time, Value, check_step
 from loopwright.service.inputs.validation import did_you_mean, listed, words
+from loopwright.service.inputs.webhooks import WebhookConfig, repeated_names
 
 if TYPE_CHECKING:
     from loopwright.service.inputs.yaml_file import Place
@@ -172,10 +173,11 @@ class BusConfig(BaseModel):
 
 @dataclass(frozen=True)
 class Site:
-    """The content of a configuration file: the loops by tag, and the settings of the buses that it names."""
+    """The content of a configuration file: the loops by tag, the settings of the buses that it names, and webhooks."""
 
     loops: dict[str, LoopConfig]
     buses: dict[str, BusConfig]
+    webhooks: tuple[WebhookConfig, ...] = ()
 
     def check_own_node(self, node: int, source: str) -> None:
         """Raises ConfigError when a device of the site has `node`, the node id of the service."""
@@ -207,7 +209,7 @@ def load_site(path: Path) -> Site:
 
 
 def parse_site(document: object, source: str, line_of: Callable[[Place], int] | None = None) -> Site:
-    """The site of a parsed document `{"loops": [...], "buses": {BUS: {"at_once": ...}}}`.
+    """The site of a parsed document `{"loops": [...], "buses": {BUS: {"at_once": ...}}, "webhooks": [...]}`.
 
     line_of: the line of the file that a place of the document is on; None for a document that was in no file.
     """
@@ -215,8 +217,8 @@ def parse_site(document: object, source: str, line_of: Callable[[Place], int] | 
         raise ConfigError(source, ["expected a list of loops under the key 'loops'"])
     problems = _Problems(line_of)
     for key in document:
-        if key not in ("loops", "buses"):
-            problems.add((key,), str(key), f"unknown name{did_you_mean(str(key), ('loops', 'buses'))}")
+        if key not in _KEYS:
+            problems.add((key,), str(key), f"unknown name{did_you_mean(str(key), _KEYS)}")
     loops: dict[int, LoopConfig] = {}
     for number, entry in enumerate(entries):
         try:
@@ -234,11 +236,13 @@ def parse_site(document: object, source: str, line_of: Callable[[Place], int] | 
     )
     named = {bus for entry in entries if isinstance(entry, dict) and isinstance(bus := entry.get("bus"), str)}
     buses = _buses(document.get("buses") or {}, named, problems)
+    webhooks = _webhooks(document.get("webhooks") or [], problems)
     if problems.found:
         raise ConfigError(source, problems.in_order())
-    return Site({loop.tag: loop for loop in loops.values()}, buses)
+    return Site({loop.tag: loop for loop in loops.values()}, buses, webhooks)
 
 
+_KEYS = ("loops", "buses", "webhooks")
 _LOOP_NAMES = sorted({name for kind in (LoopConfig, PermittedTest, Limits) for name in kind.model_fields})
 
 
@@ -292,6 +296,24 @@ def _buses(entries: object, known: set[str], problems: _Problems) -> dict[str, B
                 name = ".".join(["buses", str(bus), *map(str, each["loc"])])
                 problems.add(("buses", bus, *each["loc"]), name, words(each, sorted(BusConfig.model_fields)))
     return found
+
+
+def _webhooks(entries: object, problems: _Problems) -> tuple[WebhookConfig, ...]:
+    if not isinstance(entries, list):
+        problems.add(("webhooks",), "webhooks", "expected a list of webhooks")
+        return ()
+    found = []
+    for number, entry in enumerate(entries):
+        try:
+            found.append(WebhookConfig.model_validate(entry))
+        except ValidationError as error:
+            for each in error.errors(include_url=False, include_input=False):
+                name = ".".join([f"webhooks[{number}]", *map(str, each["loc"])])
+                place = ("webhooks", number, *each["loc"])
+                problems.add(place, name, words(each, sorted(WebhookConfig.model_fields)))
+    for name in repeated_names(found):
+        problems.add(("webhooks",), "webhooks", f"name {name!r} is used by several webhooks")
+    return tuple(found)
 
 
 def _tag(entry: object) -> str | None:

@@ -34,7 +34,7 @@ from loopwright.service.inputs.plausible import (
     check_option,
     check_step,
 )
-from loopwright.service.inputs.validation import branch, branch_of
+from loopwright.service.inputs.validation import branch, branch_of, did_you_mean
 from loopwright.tuning.experiments.primitives import Directions
 from loopwright.tuning.experiments.step_limits import not_kept
 from loopwright.tuning.fast.design_trial import trial_stages
@@ -170,8 +170,9 @@ class _Retune(Bounds):
             raise ValueError(f"{why}; its options are {', '.join(cls.model_fields)}")
         unknown = [str(name) for name in data if name not in cls.model_fields]
         if unknown:
-            known = ", ".join(cls.model_fields)
-            raise ValueError(f"{', '.join(unknown)}: no option of {data.get('method', FAST)}; its options are {known}")
+            known = list(cls.model_fields)
+            why = f"{', '.join(unknown)}: no option of {data.get('method', FAST)}{did_you_mean(unknown[0], known)}"
+            raise ValueError(f"{why}; its options are {', '.join(known)}")
         return data
 
     @model_validator(mode="after")
@@ -545,7 +546,10 @@ def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[s
     problems += refused
     deviation = request.sp_deviation or loop.sp_deviation
     if deviation > loop.sp_deviation:
-        problems.append(f"sp_deviation {deviation:g} is more than the configured {loop.sp_deviation:g} {loop.pv_unit}")
+        problems.append(
+            f"sp_deviation {deviation:g} is more than the configured {loop.sp_deviation:g} {loop.pv_unit}: a request "
+            "may narrow what loops.yaml permits, not widen it"
+        )
     if 2 * deviation > limits["pv_limits"].high - limits["pv_limits"].low and not problems:
         problems.append(f"sp_deviation {deviation:g} {loop.pv_unit} needs at least twice that between the PV limits")
     try:

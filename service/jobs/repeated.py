@@ -41,11 +41,19 @@ class Repeated:
     def start(self) -> None:
         self._thread.start()
 
+    def request_stop(self) -> None:
+        """Begins no other turn; returns at once."""
+        self._over.set()
+
     def close(self) -> None:
         """Begins no other turn, and waits for the present one."""
-        self._over.set()
+        self.request_stop()
+        self.join(_STOP_S)
+
+    def join(self, timeout_s: float) -> None:
+        """Waits for the end of the present turn after `request_stop`."""
         if self._thread.is_alive():
-            self._thread.join(_STOP_S)
+            self._thread.join(timeout_s)
 
     def _run(self) -> None:
         if not self._at_once:

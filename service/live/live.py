@@ -25,7 +25,7 @@ from loopwright.service.listening.listening import Listening
 from loopwright.service.listening.messages import NewSamples
 from loopwright.service.listening.process import ANSWER_S
 from loopwright.service.live.jobs import LookedUpJobs
-from loopwright.service.live.messages import Buses, Hello, Loops, event
+from loopwright.service.live.messages import RETRY_MS, Buses, Hello, Loops, event
 from loopwright.service.live.other_gateways import OtherGateways
 from loopwright.service.live.own_gateway import OwnGateway
 from loopwright.service.live.rows import LiveFacts, loop_row, samples_message, with_jobs
@@ -100,7 +100,7 @@ class Live:
         self._enter(viewer)
         asked, checking = time.monotonic(), None
         try:
-            yield event(
+            yield f"retry: {RETRY_MS}\n" + event(
                 "hello",
                 Hello(
                     host=self._jobs.store.host, version=version("loopwright"), now_s=round(time.time(), 3),

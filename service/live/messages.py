@@ -8,6 +8,9 @@ from pydantic import BaseModel, Field, JsonValue
 
 from loopwright.service.states.job_state import JobState
 
+RETRY_MS = 2000
+"""Time after which a client whose stream was cut off connects again, ms."""
+
 
 class Hello(BaseModel):
     """The first message."""

@@ -50,6 +50,7 @@ from loopwright.service.listening.listening import Listening
 from loopwright.service.live.live import Live
 from loopwright.service.live.other_gateways import OtherGateways
 from loopwright.service.live.own_gateway import Announcing, OwnGateway
+from loopwright.service.live.webhooks.webhooks import Webhooks
 from loopwright.service.loops.loop import Loop
 from loopwright.service.server.arenas import limit_arenas
 from loopwright.service.server.assembly import make_jobs
@@ -193,7 +194,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
     """Serves until SIGTERM or SIGINT; every loop is restored before it returns.
 
     tune: runs the procedure on a loop; by default it computes in a pool.
-    Raises ConfigError, FolderInUse, ForeignLoop, BadDatabase, NotSafe, OSError (the address cannot be used),
+    Raises ConfigError, BadSecret, FolderInUse, ForeignLoop, BadDatabase, NotSafe, OSError (the address cannot be used),
     SQLAlchemyError (the database cannot be reached).
     """
     limit_arenas()
@@ -216,6 +217,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
                 ComputationKind.LIVE, os.getpid
             )  # loads the fork server, so that the first computation of a loop does not wait
         store = stack.enter_context(closing(Store(setup.data, setup.database, setup.host or LOCAL)))
+        webhooks = Webhooks(site.webhooks, setup.loops_file.parent, store, setup.url)
         keyring = Keyring(store.engine) if setup.auth or not local else None
         if keyring is not None and not keyring.any_valid():
             where = f"--data {setup.data}" if setup.database is None else "with LOOPWRIGHT_DATABASE set"
@@ -238,6 +240,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
             resume=setup.resume,
             ended=figures.ended,
         )
+        stack.enter_context(closing(webhooks))
         stack.callback(jobs.stop)
         retention = stack.enter_context(closing(Retention(store, engine, setup.keep)))
         checks = {**operations.checks(jobs), "samples": retention.note}
@@ -274,6 +277,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
             retention.start()
             announcing.start()
             watching.start()
+            webhooks.start()
             if setup.listen:
                 looking.start()
             server.run(sockets=[listener])

@@ -38,12 +38,14 @@ from loopwright.service.store.tables import ChunkRow, EventRow, HostRow, JobRow,
 from loopwright.tuning.plan import Sample
 from loopwright.tuning.reasons import Reason
 
-__all__ = ["Busy", "FolderInUse", "ForeignLoop", "NoSuchJob", "Store", "WithJob", "Write", "now"]
+__all__ = ["Busy", "FolderInUse", "ForeignLoop", "NoSuchJob", "OnMove", "Store", "WithJob", "Write", "now"]
 
 Write = Callable[[Session], None]
 """A piece of a transaction, for the journal."""
 WithJob = Callable[[Session, JobRow], None]
 """A piece of the transaction that makes or moves a job."""
+OnMove = Callable[[Session, Job], None]
+"""A piece of the transaction in which a job has moved."""
 LOCAL = "local"
 DECISIONS = {JobState.ACCEPTED: "accept", JobState.ROLLED_BACK: "rollback"}
 """What the audit log calls the moves that somebody decides."""
@@ -86,6 +88,8 @@ class Store:
     def __init__(self, folder: Path, database: str | None = None, host: str = LOCAL) -> None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.host = host
+        self.on_move: OnMove | None = None
+        """Called in the transaction in which a job has moved; what it raises ends the transaction."""
         self.folder = folder
         self.folder_lock = FolderLock(folder)
         self.host_lock: HostLock | None = None
@@ -270,7 +274,7 @@ class Store:
             row = _move(session, _find(session, job_id, lock=True), wanted, by, columns)
             if also is not None:
                 also(session, row)
-            return Job.from_row(row)
+            return self._moved(session, row)
 
     def decline(self, job_id: str, by: str) -> Job | None:
         """Rolls back a proposal of which nothing was written to the controller; None when it is no such one."""
@@ -278,7 +282,13 @@ class Store:
             row = _find(session, job_id, lock=True)
             if row.state != JobState.PROPOSED or _last_begun(session, job_id) is not None:
                 return None
-            return Job.from_row(_move(session, row, JobState.ROLLED_BACK, by, {}))
+            return self._moved(session, _move(session, row, JobState.ROLLED_BACK, by, {}))
+
+    def _moved(self, session: Session, row: JobRow) -> Job:
+        job = Job.from_row(row)
+        if self.on_move is not None:
+            self.on_move(session, job)
+        return job
 
     def decision_begun(self, job_id: str) -> bool:
         """Whether any decision on the job may have written to the controller."""

@@ -338,6 +338,30 @@ class AlarmSignOffRow(Base):
     at: Mapped[str]
 
 
+class WebhookDeliveryRow(Base):
+    """What is to be delivered to a webhook, written in the transaction in which it happened.
+
+    id: the same at each attempt.  hook: its name in loops.yaml.  body: JSON, as it is signed and sent.
+    due_s: when the next attempt is made, seconds since 1970 UTC; when it ended once it did.
+    error: why the last attempt failed.
+    """
+
+    __tablename__ = "webhook_deliveries"
+    __table_args__ = (Index("webhook_deliveries_due", "host", "state", "due_s"),)
+
+    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    id: Mapped[str] = mapped_column(unique=True)
+    host: Mapped[str]
+    hook: Mapped[str]
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    body: Mapped[str] = mapped_column(Text)
+    at: Mapped[str]
+    state: Mapped[str]
+    attempts: Mapped[int]
+    due_s: Mapped[float] = mapped_column(Double)
+    error: Mapped[str | None]
+
+
 class RetuneRow(Base):
     """A retune of many loops. Its host begins their jobs, whatever hosts these are on."""
 

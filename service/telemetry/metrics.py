@@ -53,7 +53,15 @@ HISTORY_BLOCKS_LOST = Counter(
     "loopwright_history_blocks_lost", "Blocks of history that the database did not take in time", registry=None
 )
 
+WEBHOOK_ATTEMPTS = Counter(
+    "loopwright_webhook_attempts", "Attempts to deliver a message to a webhook", ["webhook", "outcome"], registry=None
+)
+WEBHOOKS_WAITING = Gauge(
+    "loopwright_webhook_messages_waiting", "Messages not yet delivered to the webhook", ["webhook"], registry=None
+)
+
 OF_THIS_PROCESS = (
     SAMPLES_LOST, STAGE_SECONDS, REQUESTS, REQUEST_SECONDS, IN_FLIGHT, LATE_SECONDS, LATEST_SECONDS, CLOCK_JUMPS,
     FRAMES_HEARD, LISTENING_UP, LISTENER_RESTARTS, HISTORY_BLOCKS_LOST,
+    WEBHOOK_ATTEMPTS, WEBHOOKS_WAITING,
 )  # fmt: skip

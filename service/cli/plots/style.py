@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -33,8 +34,10 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def write(figure: Figure, path: Path) -> None:
-    """Writes a figure to a file in the format of its suffix. Raises OSError."""
-    figure.savefig(path, dpi=DPI)
+    """Writes a figure to a file in the format of its suffix, the same bytes for the same figure. Raises OSError."""
+    undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+    with rc_context({"svg.hashsalt": "loopwright"}):
+        figure.savefig(path, dpi=DPI, metadata=undated.get(path.suffix.lower()))
 
 
 def plain(axes: Axes, y: str = "", x: str = "") -> None:

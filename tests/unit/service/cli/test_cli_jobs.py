@@ -39,6 +39,7 @@ class Through:
         return self._checked(self._client.get(path, params={k: v for k, v in query.items() if v is not None}))
 
     samples_of = Client.samples_of
+    pages = Client.pages
     file = Client.file
 
     def _answer(self, method: str, path: str) -> Any:

@@ -410,8 +410,10 @@ def test_identify_asks_whether_columns_are_swapped(record: Path) -> None:
     asked = run("identify", str(file))
     assert asked.exit_code == 2 and 'Say which is which: --u "y" --y "u"' in asked.stderr
     assert answer("identify", str(file), "--u", "y", "--y", "u")["model"] == answer("identify", str(record))["model"]
-    # who says it is not asked
-    assert run("identify", str(file), "--u", "u", "--y", "y").exit_code in (0, 3)
+    # who says it is not asked, and hears of it
+    said = run("identify", str(file), "--u", "u", "--y", "y")
+    assert said.exit_code in (0, 3) and "are the columns swapped?" in said.stderr
+    assert "swapped" not in run("identify", str(record), "--u", "u", "--y", "y").stderr
 
 
 @pytest.mark.parametrize(
