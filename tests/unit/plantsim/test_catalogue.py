@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loopwright.plantsim.catalogue import CATALOGUE, CatalogueModel, Entry, find
+from loopwright.plantsim.catalogue import CATALOGUE, CatalogueModel, Entry, find, own_plant
 
 LINEAR = [(entry, entry.model) for entry in CATALOGUE.values() if entry.model is not None]
 BY_NAME = pytest.mark.parametrize(("entry", "model"), LINEAR, ids=[entry.name for entry, _ in LINEAR])
@@ -60,3 +60,19 @@ def test_seeds_make_equal_runs() -> None:
 def test_an_unknown_name_is_told_what_there_is() -> None:
     with pytest.raises(KeyError, match="reactor"):
         find("model-51")
+
+
+def test_a_second_path_does_again_later_what_the_first_one_did() -> None:
+    once = own_plant('{"num": [2], "den": [3, 1], "dead_time_s": 1}').build(0.1)
+    twice = own_plant('{"num": [2], "den": [3, 1], "dead_time_s": 1, "second_path": {"share": 0.4, "later_s": 5}}')
+    both = twice.build(0.1)
+    first = [once.step(51.0) - 50.0 for _ in range(200)]
+    seen = [both.step(51.0) - 50.0 for _ in range(200)]
+    assert seen[:50] == pytest.approx(first[:50])
+    assert seen[50:] == pytest.approx([a + 0.4 * b for a, b in zip(first[50:], first, strict=False)])
+
+
+@pytest.mark.parametrize("path", ['{"share": 0.4}', "3", '{"share": 0.4, "later_s": -1}'])
+def test_a_second_path_that_is_none_is_refused(path: str) -> None:
+    with pytest.raises(ValueError, match=r"second_path is a JSON object|later_s is"):
+        own_plant(f'{{"num": [2], "den": [3, 1], "second_path": {path}}}')
