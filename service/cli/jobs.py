@@ -9,7 +9,7 @@ from urllib.parse import quote
 import typer
 
 from loopwright.service.cli.client import DEFAULT_URL, Client
-from loopwright.service.cli.output import AskedAim, AsJson, Url, die, print_json
+from loopwright.service.cli.output import AsJson, AskedAim, Url, die, print_json
 from loopwright.service.cli.tuning import check_plot
 from loopwright.service.states.job_state import JobState
 

@@ -13,7 +13,7 @@ import typer
 
 from loopwright.service.cli import alarms, data, identification, jobs, keys, loops, rehearse, tuning
 from loopwright.service.cli.client import DEFAULT_URL, ApiError, Client
-from loopwright.service.cli.output import AskedAim, AsJson, Url, die, on_terminal, print_json, shown_on_terminal
+from loopwright.service.cli.output import AsJson, AskedAim, Url, die, on_terminal, print_json, shown_on_terminal
 
 app = typer.Typer(
     no_args_is_help=True,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from loopwright.service.cli.output import AskedAim, AsJson, die, print_json, read_json_object
+from loopwright.service.cli.output import AsJson, AskedAim, die, print_json, read_json_object
 from loopwright.service.cli.tuning import Plot, check_plot
 
 if TYPE_CHECKING:

@@ -138,7 +138,13 @@ def test_a_bound_on_the_noise_gain_holds() -> None:
     assert margins(model, held).Ms <= 1.602
 
 
-@pytest.mark.parametrize("bad", [{"Ms": 1.0}, {"Ms": math.nan}, {"Mt": 0.9}, {"noise_gain": 0.0}, {"N": 1.0}])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"Ms": 1.0}, {"Ms": math.nan}, {"Mt": 0.9}, {"noise_gain": 0.0}, {"N": 1.0}, {"weights": (1.0, 0.5)},
+        {"weights": (-0.1, 1.0)}, {"weights": (0.0, math.inf)},
+    ],
+)  # fmt: skip
 def test_wishes_that_cannot_be_are_refused(bad: dict[str, float]) -> None:
     with pytest.raises(Refused) as refused:
         DesignSpec(**bad)  # type: ignore[arg-type]
