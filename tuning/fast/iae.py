@@ -35,8 +35,10 @@ STEPS_PER_PERIOD = 80
 PERIODS, INTEGRAL_TIMES = 20.0, 15.0
 MAX_STEPS = 40_000
 NEGLIGIBLE = 1e-9
-"""Size of Kp*y_load, as a fraction of a set-point step, below which the set-point weight has no effect at that
-time."""
+"""Size of the error and of Kp*y_load, as a fraction of a set-point step, that counts as zero."""
+ENOUGH = 2500
+"""Number of times from which the best set-point weight is found; of a longer response, which ends in a slow tail, every
+second, third .. time is taken."""
 _DIFFERENCE = np.array([1.0, -1.0])
 
 
@@ -93,7 +95,11 @@ class LoopCost:
         error = AF
         if Td > 0.0:
             error = _sum(AF, Kp * N * np.convolve(self._B, _DIFFERENCE))
-        return LoopResponses(h, Kp, np.convolve(error, common)[:steps], np.convolve(BF, common)[:steps])
+        after_step, after_load = np.convolve(error, common)[:steps], np.convolve(BF, common)[:steps]
+        # what has died away no longer counts, and its denormal numbers are slow to compute with
+        left = np.flatnonzero((np.abs(after_step) > NEGLIGIBLE) | (np.abs(after_load) > NEGLIGIBLE / Kp))
+        end = int(left[-1]) + 1 if len(left) else 1
+        return LoopResponses(h, Kp, after_step[:end], after_load[:end])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,16 +140,17 @@ class LoopResponses:
             most = min(most, float((-room[down] / by[down]).min(initial=math.inf)))
             if least > most:
                 return None
-        return 1.0 - _least_absolute(self.error, by, least, most)
+        every = slice(None, None, 1 + len(by) // ENOUGH)
+        return 1.0 - _least_absolute(self.error[every], by[every], least, most)
 
 
 def _least_absolute(y: Reals, by: Reals, low: float, high: float) -> float:
     """The x from low to high that minimises sum(|y + x*by|): the weighted median of -y/by, moved into the interval."""
     for end, upwards in ((low, 1.0), (high, -1.0)):
         left = y + end * by
-        if upwards * float(by @ np.sign(left)) + float(np.abs(by[left == 0.0]).sum()) >= 0.0:
+        if upwards * float((by * np.sign(left)).sum()) + float(np.abs(by[left == 0.0]).sum()) >= 0.0:
             return end  # the sum does not fall towards the inside
-    there = by != 0.0
+    there = np.abs(by) > NEGLIGIBLE
     at, weight = -y[there] / by[there], np.abs(by[there])
     order = np.argsort(at)
     summed = np.cumsum(weight[order])
