@@ -45,14 +45,16 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
 def with_later_fields(golden: dict[str, Any]) -> dict[str, Any]:
     """The golden job with what is shown of it since: nobody has decided, a live test knows how fast it sampled, in
     which mode it found the loop, and whether its gains were tried; it has no samples. How late a second path would have
-    shown is not known.
+    shown is not known. Gains were tried with b = 1.
     Its advice is not stored, but today's for its reason."""
     advice = None if golden["reason"] is None else ADVICE[Reason(golden["reason"])]
     sample_time_s = None if golden["dry_run"] else 0.1
     proposed_live = not golden["dry_run"] and golden["new_gains"] is not None
     tried = bool(golden["after"] or golden["verification"]) if proposed_live else None
+    verification = golden["verification"] and golden["verification"] | {"b": 1.0}
     return golden | {
         "advice": advice,
+        "verification": verification,
         "decided": None,
         "decision_request": None,
         "superseded_by": None,
