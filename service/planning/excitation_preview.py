@@ -99,7 +99,7 @@ def _moved(config: LoopConfig, state: LoopState, known: KnowledgeView | None) ->
     low, high = max(config.mv_limits.low, state.mv_low), min(config.mv_limits.high, state.mv_high)
     jump = config.test.mv_step_max or 2.0 * (high - low)
     room = min(high - state.mv, state.mv - low, 0.5 * jump)
-    new = (known.proposed.gains if known.proposed else known.gains).gains()
+    new = on_trial((known.proposed.gains if known.proposed else known.gains).gains())
     amplitude = FIRST_AMPLITUDE * max_amplitude(state.mv, low, high, jump)
     if not room > 0.0 or not amplitude > 0.0:  # MV may be no number
         return None

@@ -130,8 +130,7 @@ class RelayTest(Experiment):
         facts, point = self.facts, self.point
         output_range = self.experiment_record().output_range
         # with a set-point weight below one the integral moves MV as far a little later
-        kick = max(gains.b, 1.0) * gains.Kp
-        size = min(0.5 * output_range, self.amplitude / kick, facts.sp_deviation)
+        size = min(0.5 * output_range, self.amplitude / gains.Kp, facts.sp_deviation)
         self.excited = len(self.trace)
         self._commands = ()
         # A bumpless transfer from the relay would start the integral at the relay's output, which acts like a load
