@@ -12,6 +12,7 @@ from loopwright.service.results import KnowledgeView
 from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY
+from loopwright.tuning.fast.experiment import on_trial
 from loopwright.tuning.fast.information import Expected, Moved, expected
 from loopwright.tuning.fast.pulse_test import pulse_size
 from loopwright.tuning.fast.record import Excitation
