@@ -191,3 +191,16 @@ def test_an_aim_that_does_not_exist_is_refused() -> None:
     with pytest.raises(Refused) as refused:
         aim_of("comfort")
     assert refused.value.reason is Reason.BAD_INPUT and "no_overshoot" in refused.value.detail
+
+
+def test_a_slow_ripple_of_the_fitted_model_does_not_make_a_slow_loop() -> None:
+    """A pole pair of thirteen periods, nearly cancelled by zeros, as a record of a first-order plant once was fitted:
+    an overshoot of at most 1 % would ask for an integral time of 22 s."""
+    num, den = (0.5027072, 0.00459663, 0.00210141), (1.0, 0.258653402, 0.00467577, 0.00120749)
+    plant = TransferFunction(num, den, 2.04)
+    design = GainDesign(plant, DesignSpec(aim=Aim.NO_OVERSHOOT), 6.84)
+    found, free = design.best(), GainDesign(plant, DesignSpec(), 6.84).best()
+    assert found.gains.Ti < 2.0 * free.gains.Ti
+    assert found.cost.load < 1.5 * free.cost.load
+    exact = loop_performance(plant, found.gains)
+    assert exact.overshoot_pct is not None and exact.overshoot_pct < 5.5
