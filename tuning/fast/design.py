@@ -118,8 +118,8 @@ class DesignSpec:
         ):  # fmt: skip
             if value is not None and not low < value < high:
                 raise Refused(Reason.BAD_INPUT, f"{name} must be above {low:g} and below {high:g}, not {value!r}")
-        least, most = self.weights
-        if not 0.0 <= least <= most < math.inf:
+        low, high = self.weights
+        if not 0.0 <= low <= high < math.inf:
             raise Refused(Reason.BAD_INPUT, f"weights must be two rising numbers from 0 up, not {self.weights!r}")
 
 

@@ -130,21 +130,21 @@ class LoopResponses:
         Returns None where no weight from low to high keeps the overshoot.
         """
         by = self.Kp * self.load  # the error moves by this for each unit that b is below one
-        least, most = 1.0 - high, 1.0 - low
+        minimum, maximum = 1.0 - high, 1.0 - low
         if overshoot is not None:
             room = self.error + overshoot  # room + (1 - b)*by >= 0 at every time
             up, down = by > NEGLIGIBLE, by < -NEGLIGIBLE
             if float(room[~(up | down)].min(initial=0.0)) < 0.0:
                 return None
-            least = max(least, float((-room[up] / by[up]).max(initial=-math.inf)))
-            most = min(most, float((-room[down] / by[down]).min(initial=math.inf)))
-            if least > most:
+            minimum = max(minimum, float((-room[up] / by[up]).max(initial=-math.inf)))
+            maximum = min(maximum, float((-room[down] / by[down]).min(initial=math.inf)))
+            if minimum > maximum:
                 return None
         every = slice(None, None, 1 + len(by) // ENOUGH)
-        return 1.0 - _least_absolute(self.error[every], by[every], least, most)
+        return 1.0 - _minimise_absolutes(self.error[every], by[every], minimum, maximum)
 
 
-def _least_absolute(y: Reals, by: Reals, low: float, high: float) -> float:
+def _minimise_absolutes(y: Reals, by: Reals, low: float, high: float) -> float:
     """The x from low to high that minimises sum(|y + x*by|): the weighted median of -y/by, moved into the interval."""
     for end, upwards in ((low, 1.0), (high, -1.0)):
         left = y + end * by

@@ -313,10 +313,10 @@ def comparison_on(sampled: Model, best: OptimalGains, facts: Facts, spec: Design
     before, after = (loop_performance(sampled, gains, facts.sample_time_s) for gains in (facts.old_gains, best.gains))
     if not after.stable:
         raise Refused(Reason.NOT_ROBUST, "the gains designed are not stable on their own model")
-    aim, least = spec.aim, best.minimum
+    aim, minimum = spec.aim, best.minimum
     overshoot = None if aim.max_overshoot is None else 100.0 * aim.max_overshoot
     asked = RobustnessBounds(spec.Ms, Mt=spec.Mt, noise_gain=spec.noise_gain, overshoot_pct=overshoot)
-    J = tuple(weighted_IAE(each, least.setpoint, least.load, aim.share) for each in (before, after))
+    J = tuple(weighted_IAE(each, minimum.setpoint, minimum.load, aim.share) for each in (before, after))
     return compare(before, after, asked, CRITERION[aim], (J[0], J[1]), anyway, keep_setpoint=aim is not Aim.LOAD)
 
 
