@@ -241,8 +241,8 @@ def evaluated(ran: Ran, plant: Plant, gains: Gains, spec: DesignSpec = PI) -> Ra
 def cost_over_best(plant: Plant, gains: Gains, spec: DesignSpec = PI) -> float:
     """J of gains that are stable on the true plant, over that of the best PI (or PID) for it."""
     design, best, minimum = optimum(plant, spec)
-    cost = design.cost(gains.Kp, gains.Ti, gains.Td, design.spec.N)
-    return (0.5 * cost.setpoint / minimum[0] + 0.5 * cost.load / minimum[1]) / best
+    cost, share = design.cost(gains.Kp, gains.Ti, gains.Td, design.spec.N, gains.b), spec.aim.share
+    return (share * cost.setpoint / minimum[0] + (1.0 - share) * cost.load / minimum[1]) / best
 
 
 def line(name: str, runs: Sequence[Ran]) -> str:

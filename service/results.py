@@ -197,6 +197,7 @@ class VerificationView(Figures):
     Kp: float = Field(description="Proportional gain as tested, MV percent per PV unit")
     Ti: float = Field(description="Integral time as tested, s")
     Td: float = Field(description="Derivative time as tested, s")
+    b: float = Field(default=1.0, description="Set-point weight as tested")
     Ms: float = Field(description="Ms of the tested gains on the model of the whole record")
     step: float = Field(description="Size of the set-point step, PV units")
     duration_s: float

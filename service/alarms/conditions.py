@@ -346,7 +346,8 @@ def _tags(configs: Iterable[LoopConfig]) -> tuple[str, ...]:
 
 def _words(gains: Gains) -> str:
     td = f", Td {gains.Td:.4g} s" if gains.Td else ""
-    return f"Kp {gains.Kp:.4g}, Ti {gains.Ti:.4g} s{td}"
+    b = f", b {gains.b:.3g}" if gains.b != 1.0 else ""
+    return f"Kp {gains.Kp:.4g}, Ti {gains.Ti:.4g} s{td}{b}"
 
 
 def _seconds(at: str) -> float:

@@ -20,7 +20,7 @@ from loopwright.service.loops.shared_reading import SharedReading
 from loopwright.service.observing.hearing import question
 from loopwright.service.observing.observed import ObservationView, Question, observed
 from loopwright.service.states.loop_state import LoopState
-from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.design import Aim, DesignSpec
 
 
 def router(jobs: Jobs, readings: SharedReading[LoopState | None], listening: Listening, pool: Pool) -> APIRouter:
@@ -43,8 +43,9 @@ def router(jobs: Jobs, readings: SharedReading[LoopState | None], listening: Lis
             ),
         ] = 1.6,
         derivative: Annotated[bool, Query(description="Design a PID where a derivative improves the loop")] = False,
+        aim: Annotated[Aim, Query(description="What the gains are the best for, as in a retune")] = Aim.BALANCED,
     ) -> ObservationView:  # fmt: skip
-        asked = await run_in_threadpool(asked_of, tag, DesignSpec(ms, derivative))
+        asked = await run_in_threadpool(asked_of, tag, DesignSpec(ms, derivative, aim=aim))
         found = await computed(pool, partial(observed, asked), http, lambda: jobs.stopping)
         return await run_in_threadpool(kept, found, asked)
 

@@ -14,11 +14,12 @@ from loopwright.service.api.computed import computed
 from loopwright.service.api.routes import new_router
 from loopwright.service.api.tuning_views import AlternativesView, MethodView, TuningRequest, TuningsView
 from loopwright.service.execution.computing.pool import Pool
-from loopwright.service.jobs.alternatives import alternatives, redesigned
+from loopwright.service.jobs.alternatives import alternatives, asked_aim, redesigned
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.stored_record import record_columns, stored_record
 from loopwright.service.offline import tunings
 from loopwright.service.results import DESIGNED
+from loopwright.tuning.fast.design import Aim
 from loopwright.tuning.fast.procedure import FAST
 
 
@@ -64,16 +65,21 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
             bool | None,
             Query(description="Whether fast may design a PID; only with `ms`. The default is the option of the job"),
         ] = None,
+        aim: Annotated[
+            Aim | None,
+            Query(description="What the gains are the best for; only with `ms`. The default is the option of the job"),
+        ] = None,
     ) -> AlternativesView:  # fmt: skip
-        if ms is None and derivative is not None:
-            raise tunings.BadTuning("derivative needs ms: give ms too")
+        for name, given in (("derivative", derivative), ("aim", aim)):
+            if ms is None and given is not None:
+                raise tunings.BadTuning(f"{name} needs ms: give ms too")
         if ms is not None and method not in (None, FAST):
             raise tunings.BadTuning(f"ms is an option of fast, not of {method}: leave out ms or method")
-        work = await run_in_threadpool(computation, job_id, method, ms, derivative)
+        work = await run_in_threadpool(computation, job_id, method, ms, derivative, aim)
         return AlternativesView.model_validate(await computed(pool, work, http, lambda: jobs.stopping))
 
     def computation(
-        job_id: str, method: str | None, ms: float | None, derivative: bool | None
+        job_id: str, method: str | None, ms: float | None, derivative: bool | None, aim: Aim | None
     ) -> Callable[[], Mapping[str, object]]:
         """The computation, with everything that it needs from the store."""
         row, events = jobs.store.get(job_id), jobs.store.events(job_id)
@@ -82,6 +88,6 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
         wanted = bool(row.request.get("derivative")) if derivative is None else derivative
         fast = row.request.get("method") in DESIGNED  # other jobs are designed on the model that they found
         record = stored_record(record_columns(jobs.store.blocks(job_id))) if fast else None
-        return partial(redesigned, row, events, record, ms, wanted)
+        return partial(redesigned, row, events, record, ms, wanted, aim or asked_aim(row))
 
     return routes

@@ -133,7 +133,7 @@ def _table(loop: LoopDetail, live: LiveView, jobs: Sequence[JobView], plant: Tra
     table.add_row("plant time", "", *(f"{job.plant_time_s:.1f}" for job in jobs), "s")
     table.add_row("before any move", "", *(f"{_rest_s(job):.1f}" for job in jobs), "s")
     gains = [live.gains, *(job.new_gains for job in jobs)]
-    for name, of in (("Kp", f"% per {unit}"), ("Ti", "s")):
+    for name, of in (("Kp", f"% per {unit}"), ("Ti", "s"), ("b", "")):
         table.add_row(name, *(terminal.figure(each, name) for each in gains), of)
     if plant is None:
         return table

@@ -153,7 +153,7 @@ def loop_report(loop: LoopDetail) -> None:
         ("mode", figure(live, "mode"), ""),
         *(
             (f"gain {name}", figure(gains, name), of)
-            for name, of in (("Kp", f"% per {unit}"), ("Ti", "s"), ("Td", "s"))
+            for name, of in (("Kp", f"% per {unit}"), ("Ti", "s"), ("Td", "s"), ("b", ""))
         ),
         ("nodes", figure(live, "node_state"), ""),
         ("host", loop.host, ""),

@@ -9,7 +9,7 @@ from urllib.parse import quote
 import typer
 
 from loopwright.service.cli.client import DEFAULT_URL, Client
-from loopwright.service.cli.output import AsJson, Url, die, print_json
+from loopwright.service.cli.output import AsJson, AskedAim, Url, die, print_json
 from loopwright.service.cli.tuning import check_plot
 from loopwright.service.states.job_state import JobState
 
@@ -199,6 +199,7 @@ def alternatives_of_job(
     derivative: Annotated[
         bool | None, typer.Option(help="With --ms: design a PID where it is better than a PI.")
     ] = None,
+    aim: AskedAim = None,
     method: Annotated[str | None, typer.Option(help="Only this method.")] = None,
     url: Url = DEFAULT_URL,
     as_json: AsJson = False,
@@ -206,7 +207,7 @@ def alternatives_of_job(
     """Show other gains for the model that a job found, with their figures; no experiment is made."""
     wanted = None if derivative is None else str(derivative).lower()
     client = Client(url)
-    found = client.get(f"{path_of(client, job_id)}/alternatives", ms=ms, derivative=wanted, method=method)
+    found = client.get(f"{path_of(client, job_id)}/alternatives", ms=ms, derivative=wanted, aim=aim, method=method)
     if as_json:
         print_json(found)
         return

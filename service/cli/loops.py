@@ -9,7 +9,7 @@ from urllib.parse import quote
 import typer
 
 from loopwright.service.cli.client import DEFAULT_URL, Client
-from loopwright.service.cli.output import AsJson, Url, die, print_json, user
+from loopwright.service.cli.output import AsJson, AskedAim, Url, die, print_json, user
 
 app = typer.Typer()
 
@@ -117,6 +117,7 @@ def observe(
     derivative: Annotated[
         bool, typer.Option("--derivative", help="Design a PID where it is better than a PI.")
     ] = False,
+    aim: AskedAim = None,
     url: Url = DEFAULT_URL,
     as_json: AsJson = False,
 ) -> None:
@@ -127,7 +128,7 @@ def observe(
     from loopwright.service.observing.observed import ObservationState, ObservationView
 
     path = f"/loops/{quote(tag, safe='')}/observation"
-    found = Client(url).get(path, ms=ms, derivative=str(derivative).lower())
+    found = Client(url).get(path, ms=ms, derivative=str(derivative).lower(), aim=aim)
     shown = ObservationView.model_validate(found)
     if as_json:
         print_json(found)

@@ -13,7 +13,7 @@ import typer
 
 from loopwright.service.cli import alarms, data, identification, jobs, keys, loops, rehearse, tuning, webhooks
 from loopwright.service.cli.client import DEFAULT_URL, ApiError, Client
-from loopwright.service.cli.output import AsJson, Url, die, on_terminal, print_json, shown_on_terminal
+from loopwright.service.cli.output import AsJson, AskedAim, Url, die, on_terminal, print_json, shown_on_terminal
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -296,6 +296,7 @@ def retune(
     derivative: Annotated[
         bool, typer.Option("--derivative", help="Design a PID where it is better than a PI.")
     ] = False,
+    aim: AskedAim = None,
     amplitude: Annotated[float | None, typer.Option(help="Relay amplitude for fast, percent of MV.")] = None,
     excitations: Annotated[
         str | None, typer.Option(help="What fast moves the loop by, of what loops.yaml permits: setpoint,relay,manual.")
@@ -331,7 +332,7 @@ def retune(
     options: dict[str, object] = {
         "sp_deviation": sp_deviation, "mv_low": mv_low, "mv_high": mv_high, "dry_run": dry_run or None,
         "directions": directions, "sp_rate_max_per_s": sp_rate_max,
-        "method": method, "ms": ms, "derivative": derivative or None, "amplitude_pct": amplitude,
+        "method": method, "ms": ms, "derivative": derivative or None, "aim": aim, "amplitude_pct": amplitude,
         "excitations": excitations.split(",") if excitations else None,
         "careful": careful or None, "verify": None if verify else False, "propose_anyway": propose_anyway or None,
         "pattern": loop if many else None,
@@ -341,7 +342,8 @@ def retune(
     if from_job is not None:
         if many:
             die("--from takes one loop, not a pattern", 2)
-        body |= _other_gains(client, from_job, loop, method, 1.6 if ms is None and method is None else ms, derivative)
+        asked = 1.6 if ms is None and method is None else ms
+        body |= _other_gains(client, from_job, loop, method, asked, derivative, aim)
     if preview:
         raise typer.Exit(0 if _previewed(client, path, body, alone=True, as_json=as_json) else 3)
     if not (yes or dry_run):
@@ -355,14 +357,14 @@ def retune(
 
 
 def _other_gains(
-    client: Client, job: str, loop: str, method: str | None, ms: float | None, derivative: bool
+    client: Client, job: str, loop: str, method: str | None, ms: float | None, derivative: bool, aim: str | None
 ) -> dict[str, object]:
     """Returns the request that tries other gains for the model of a job. Ends the command where there are none."""
     from loopwright.service.api.tuning_views import AlternativesView
 
     wanted = str(derivative).lower() if ms is not None else None
     found = AlternativesView.model_validate(
-        client.get(f"{jobs.path_of(client, job)}/alternatives", ms=ms, derivative=wanted, method=method)
+        client.get(f"{jobs.path_of(client, job)}/alternatives", ms=ms, derivative=wanted, aim=aim, method=method)
     )
     if found.loop != loop:
         die(f"job {found.job} is of loop {found.loop}, not of {loop}", 2)

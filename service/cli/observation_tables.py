@@ -89,7 +89,7 @@ def gains_table(present: KnownGainsView, designed: KnownGainsView | None, unit_o
     table = Table()
     for heading in ("", "present", "designed", "unit"):
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
-    for name, unit in (("Kp", f"{unit_of_Kp} (ISA)"), ("Ti", "s"), ("Td", "s")):
+    for name, unit in (("Kp", f"{unit_of_Kp} (ISA)"), ("Ti", "s"), ("Td", "s"), ("b", "")):
         table.add_row(name, *(_gain(each, name) for each in (present, designed)), unit)
     table.add_row("Ms", _ms(present), _ms(designed), "")
     return table

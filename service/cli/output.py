@@ -14,6 +14,10 @@ from loopwright.service.api import strict_json
 
 Url = Annotated[str, typer.Option("--url", envvar="LOOPWRIGHT_URL", help="URL of the service.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
+AskedAim = Annotated[
+    str | None,
+    typer.Option("--aim", help="What gains of fast are best for: balanced (default), setpoint, load, no_overshoot."),
+]
 
 
 def user() -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from loopwright.service.cli.output import AsJson, die, print_json, read_json_object
+from loopwright.service.cli.output import AsJson, AskedAim, die, print_json, read_json_object
 from loopwright.service.cli.tuning import Plot, check_plot
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ def rehearse(
     derivative: Annotated[
         bool, typer.Option("--derivative", help="Design a PID where it is better than a PI.")
     ] = False,
+    aim: AskedAim = None,
     propose_anyway: Annotated[
         bool,
         typer.Option(
@@ -52,10 +53,10 @@ def rehearse(
         if text is not None:
             terminal.progress_console.print(f"  {text}", highlight=False, markup=False, soft_wrap=True)
 
-    given = {"Ms": ms, "derivative": derivative or None}
+    given = {"Ms": ms, "derivative": derivative or None, "aim": aim}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if options and method not in ("fast", "setpoint"):
-        die(f"--ms and --derivative are options of the methods fast and setpoint, not of {method}", 2)
+        die(f"--ms, --derivative and --aim are options of the methods fast and setpoint, not of {method}", 2)
     check_plot(plot)
     samples = RehearsedSamples()
 

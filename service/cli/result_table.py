@@ -76,12 +76,19 @@ def result_table(
             terminal.console.print(f"The model is from {shown.model_from}.", markup=False, highlight=False)
 
 
+def weighted(*gains: GainsView | None) -> bool:
+    """Returns whether any of these gains has a set-point weight b other than one, which is then shown."""
+    return any(each is not None and each.b != 1.0 for each in gains)
+
+
 def _figures(job: ShownResult, pv_unit: str, mv_unit: str) -> Iterator[tuple[str, str, str, str]]:
     """Yields lines of the table: label, before, after, unit."""
     per = f"{mv_unit} per {pv_unit}"
     if job.new_gains is not None:
         for name, unit in (("Kp", f"{per} (ISA)"), ("Ti", "s"), ("Td", "s")):
             yield f"gain {name}", figure(job.old_gains, name), figure(job.new_gains, name), unit
+        if weighted(job.old_gains, job.new_gains):
+            yield "set-point weight b", figure(job.old_gains, "b"), figure(job.new_gains, "b"), ""
     if job.before or job.after:
         for label, name, unit in (
             ("measured IAE", "IAE", f"{pv_unit} s"),

@@ -86,7 +86,8 @@ def _table(tuned: Sequence[TunedView], faceplate: Faceplate, recommended: str | 
     table = Table("method", box=None, padding=(0, 0, 0, 1), pad_edge=False)
     for name, unit in faceplate.columns:
         table.add_column(f"{name}\n{unit}", justify="right")
-    for heading, _, _ in _COLUMNS:
+    weighted = any(each.gains is not None and each.gains.b != 1.0 for each in tuned)
+    for heading in (*["b"] * weighted, *(heading for heading, _, _ in _COLUMNS)):
         table.add_column(heading, justify="right")
     for each in tuned:
         parts = {"margins": each.margins, "setpoint": each.setpoint, "load": each.load}
@@ -95,6 +96,8 @@ def _table(tuned: Sequence[TunedView], faceplate: Faceplate, recommended: str | 
             cells = ["unstable", *[""] * (len(cells) - 1)]
         numbers = None if each.gains is None else faceplate.numbers(each.gains.gains())
         gains = ["-"] * 3 if numbers is None else [short(value) for value in numbers]
+        if weighted:
+            gains.append("-" if each.gains is None else short(each.gains.b))
         mark = "* " if each.method == recommended else ""
         table.add_row(f"{mark}{each.method}", *gains, *cells, style="bold" if mark else None)
     return table
@@ -130,6 +133,8 @@ def to_try(found: AlternativesView) -> None:
     wanted = f"--ms {ms:g}" if isinstance(ms, int | float) else f"--method {found.methods[0].method}"
     if body.get("derivative"):
         wanted += " --derivative"
+    if isinstance(aim := body.get("aim"), str) and aim != "balanced":
+        wanted += f" --aim {aim}"
     console.print(
         f"\nTo try them on the loop: loopwright retune {found.loop} --from {found.job} {wanted}\n"
         f"or POST /loops/{found.loop}/retune with\n{json.dumps(body)}",

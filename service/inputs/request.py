@@ -37,6 +37,7 @@ from loopwright.service.inputs.plausible import (
 from loopwright.service.inputs.validation import branch, branch_of, did_you_mean
 from loopwright.tuning.experiments.primitives import Directions
 from loopwright.tuning.experiments.step_limits import not_kept
+from loopwright.tuning.fast.design import Aim
 from loopwright.tuning.fast.design_trial import trial_stages
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.procedure import FAST, FastOptions
@@ -192,6 +193,14 @@ class DesignRetune(_Retune):
         examples=[1.4],
     )
     derivative: bool = Field(default=False, description="Design a PID where a derivative improves the loop")
+    aim: Aim = Field(
+        default=Aim.BALANCED,
+        description="What the gains, with the set-point weight b, are the best for under the Ms asked for, by the "
+        "integral of the error (IAE). balanced: set-point steps and load disturbances alike; setpoint: set-point steps "
+        "nine times as much; load: load disturbances alone; no_overshoot: as balanced, and PV overshoots a set-point "
+        "step by at most 1 % on the model",
+        examples=["no_overshoot"],
+    )
 
     @property
     def options(self) -> DesignOptions:
@@ -263,6 +272,7 @@ class FastRetune(DesignRetune):
             self._options = FastOptions(
                 Ms=self.ms,
                 derivative=self.derivative,
+                aim=self.aim,
                 amplitude=self.amplitude_pct,
                 careful=self.careful,
                 verify=self.verify,
@@ -291,8 +301,9 @@ class SetpointRetune(DesignRetune):
             raise ValueError("model is for a dry run: the pulses find their own; fast takes one with start=design")
         try:
             self._options = DesignOptions(
-                Ms=self.ms, derivative=self.derivative, verify=self.verify, propose_anyway=self.propose_anyway
-            )
+                Ms=self.ms, derivative=self.derivative, aim=self.aim, verify=self.verify,
+                propose_anyway=self.propose_anyway,
+            )  # fmt: skip
         except Refused as refused:
             raise ValueError(refused.detail) from refused
         return self

@@ -16,7 +16,7 @@ from loopwright.service.states.job_state import ACTIVE
 from loopwright.service.states.loop_state import loop_state
 from loopwright.service.store.jobs import Job, JobEvent
 from loopwright.tuning.analysis.assessment import Assessment, assess
-from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.design import Aim, DesignSpec, aim_of
 from loopwright.tuning.fast.design_trial import designed_on
 from loopwright.tuning.fast.procedure import FAST, FastOptions
 from loopwright.tuning.fast.proposal import delayed
@@ -29,8 +29,8 @@ from loopwright.tuning.rules.registry import METHODS, Method
 from loopwright.tuning.rules.setting import Setting
 
 
-def _rule(model: Model, Ms: float = 1.6, derivative: bool = False) -> Setting:
-    return Setting(designed_on(model, FastOptions(Ms=Ms, derivative=derivative), 0.0).gains, {"Ms": Ms})
+def _rule(model: Model, Ms: float = 1.6, derivative: bool = False, aim: str = Aim.BALANCED) -> Setting:
+    return Setting(designed_on(model, FastOptions(Ms=Ms, derivative=derivative, aim=aim), 0.0).gains, {"Ms": Ms})
 
 
 ANYWAY = {"propose_anyway": True}
@@ -63,7 +63,7 @@ def alternatives(row: Job, events: Sequence[JobEvent], method: str | None = None
 
 
 def redesigned(
-    row: Job, events: Sequence[JobEvent], record: StoredRecord | None, ms: float, derivative: bool
+    row: Job, events: Sequence[JobEvent], record: StoredRecord | None, ms: float, derivative: bool, aim: Aim
 ) -> JsonObject:
     """Returns the same object with the gains of fast for another Ms, without a new experiment.
 
@@ -76,7 +76,7 @@ def redesigned(
     model = designable(row, events, evidence is not None)
     try:
         if evidence is not None:
-            evaluation = evaluate_again(evidence, DesignSpec(ms, derivative))
+            evaluation = evaluate_again(evidence, DesignSpec(ms, derivative, aim=aim))
             model, gains = evaluation.model, evaluation.best.gains
             doubt = {"uncertainty": evaluation.uncertainty, "ambiguity": evaluation.ambiguity}
             if evaluation.reason is not None:
@@ -85,7 +85,7 @@ def redesigned(
         else:
             Ts = loop_state(row.found).sample_time_s if row.found else 0.0
             sampled = delayed(model, 0.5 * Ts)
-            gains = designed_on(model, FastOptions(Ms=ms, derivative=derivative), Ts).gains
+            gains = designed_on(model, FastOptions(Ms=ms, derivative=derivative, aim=aim), Ts).gains
         result = _tuned(gains, ms, assess(sampled, gains))
     except Ended as refusal:
         result = MethodResult(FAST_DESIGN, refusal=refusal)
@@ -93,7 +93,7 @@ def redesigned(
     retune = None
     if result.gains is not None:
         asked = {"num": list(model.num), "den": list(model.den), "dead_time_s": model.L}
-        request = {"method": FAST, "start": "design", "ms": ms, "derivative": derivative, "model": asked}
+        request = {"method": FAST, "start": "design", "ms": ms, "derivative": derivative, "aim": aim, "model": asked}
         retune = json_object(request | ANYWAY)
     body["methods"][0] |= {"retune": retune, **doubt}
     return json_object({"job": row.id, "loop": row.loop, **body})
@@ -102,6 +102,11 @@ def redesigned(
 def _tuned(gains: Gains, ms: float, assessed: Assessment) -> MethodResult:
     notes = ("Margins and figures are of the model and half a sample's delay.",)
     return MethodResult(FAST_DESIGN, gains, {"Ms": ms}, notes, assessed)
+
+
+def asked_aim(row: Job) -> Aim:
+    """Returns the aim that the job asked for; balanced for a job of an older version or of another method."""
+    return aim_of(str(row.request.get("aim", Aim.BALANCED)))
 
 
 def job_model(row: Job, events: Sequence[JobEvent]) -> FoundModel:

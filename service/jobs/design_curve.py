@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 
 from pydantic import Field
 
+from loopwright.service.jobs.alternatives import asked_aim
 from loopwright.service.jsonable import json_object
 from loopwright.service.results import Figures, GainsView, WorthView
 from loopwright.service.states.loop_state import gains_of, loop_state
 from loopwright.service.store.jobs import Job
 from loopwright.tuning.analysis.comparison import loop_performance
-from loopwright.tuning.fast.design import DesignSpec, GainDesign
+from loopwright.tuning.fast.design import Aim, DesignSpec, GainDesign
 from loopwright.tuning.fast.design_trial import designed_on
 from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY, Evaluation
 from loopwright.tuning.fast.procedure import FastOptions
@@ -48,6 +49,7 @@ class DesignCurve(Figures):
         description="What the gains are designed on, in words", examples=["one fit to the job's record"]
     )
     derivative: bool = Field(description="Whether fast may design a PID, as the job asked")
+    aim: Aim = Field(default=Aim.BALANCED, description="What the gains are the best for, as the job asked")
     num: list[float] = Field(description="Numerator of the model, highest power of s first, PV units per MV percent")
     den: list[float] = Field(description="Denominator of the model, highest power of s first")
     dead_time_s: float = Field(description="Dead time of the model, s")
@@ -97,13 +99,13 @@ def design_curve(row: Job, model: Model, evaluation: Evaluation | None) -> Desig
     model: the job's model.
     evaluation: that of the job's record, whose model is then taken: one fit for all gains; None without a record.
     """
-    derivative = bool(row.request.get("derivative"))
+    derivative, aim = bool(row.request.get("derivative")), asked_aim(row)
     if evaluation is not None:
-        designing = _on_record(evaluation, derivative)
+        designing = _on_record(evaluation, derivative, aim)
         model, delay_s, words = evaluation.model, evaluation.design_delay, "one fit to the job's record"
     else:
         Ts = loop_state(row.found).sample_time_s if row.found else 0.0
-        designing = _on_model(model, Ts, derivative)
+        designing = _on_model(model, Ts, derivative, aim)
         delay_s, words = 0.5 * Ts, "the job's model"
     if evaluation is not None and evaluation.reason is not None:
         refusal = Refused(evaluation.reason, evaluation.detail)
@@ -115,6 +117,7 @@ def design_curve(row: Job, model: Model, evaluation: Evaluation | None) -> Desig
     return DesignCurve(
         designed_on=words,
         derivative=derivative,
+        aim=aim,
         num=list(model.num),
         den=list(model.den),
         dead_time_s=model.L,
@@ -125,12 +128,12 @@ def design_curve(row: Job, model: Model, evaluation: Evaluation | None) -> Desig
     )
 
 
-def _on_record(evaluation: Evaluation, derivative: bool) -> _Designing:
+def _on_record(evaluation: Evaluation, derivative: bool, aim: Aim) -> _Designing:
     record = evaluation.fit.record
     model = replace(evaluation.model, L=evaluation.model.L + evaluation.design_delay)
 
     def gains(Ms: float) -> Gains:
-        return GainDesign(model, DesignSpec(Ms, derivative), record.period * record.Ts).best().gains
+        return GainDesign(model, DesignSpec(Ms, derivative, aim=aim), record.period * record.Ts).best().gains
 
     def uncertainty(of: Gains) -> float | None:
         return known_Ms(evaluation, of).uncertainty
@@ -138,9 +141,9 @@ def _on_record(evaluation: Evaluation, derivative: bool) -> _Designing:
     return _Designing(model, record.Ts, gains, uncertainty, MAX_UNCERTAINTY[record.excitation])
 
 
-def _on_model(model: Model, Ts: float, derivative: bool) -> _Designing:
+def _on_model(model: Model, Ts: float, derivative: bool, aim: Aim) -> _Designing:
     def gains(Ms: float) -> Gains:
-        return designed_on(model, FastOptions(Ms=Ms, derivative=derivative), Ts).gains
+        return designed_on(model, FastOptions(Ms=Ms, derivative=derivative, aim=aim), Ts).gains
 
     return _Designing(delayed(model, 0.5 * Ts), Ts, gains, lambda _: None, 0.0)
 

@@ -339,4 +339,5 @@ def _range(columns: Sequence[np.ndarray[tuple[int], np.dtype[np.float64]]]) -> d
 def _trial(evaluation: Evaluation, spec: DesignSpec) -> dict[str, object]:
     model = evaluation.model
     given = {"num": list(model.num), "den": list(model.den), "dead_time_s": model.L}
-    return {"method": FAST, "start": "design", "ms": spec.Ms, "derivative": spec.derivative, "model": given}
+    asked = {"ms": spec.Ms, "derivative": spec.derivative, "aim": spec.aim}
+    return {"method": FAST, "start": "design", **asked, "model": given}

@@ -12,6 +12,7 @@ from loopwright.service.results import KnowledgeView
 from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY
+from loopwright.tuning.fast.experiment import on_trial
 from loopwright.tuning.fast.information import Expected, Moved, expected
 from loopwright.tuning.fast.pulse_test import pulse_size
 from loopwright.tuning.fast.record import Excitation
@@ -99,7 +100,7 @@ def _moved(config: LoopConfig, state: LoopState, known: KnowledgeView | None) ->
     low, high = max(config.mv_limits.low, state.mv_low), min(config.mv_limits.high, state.mv_high)
     jump = config.test.mv_step_max or 2.0 * (high - low)
     room = min(high - state.mv, state.mv - low, 0.5 * jump)
-    new = (known.proposed.gains if known.proposed else known.gains).gains()
+    new = on_trial((known.proposed.gains if known.proposed else known.gains).gains())
     amplitude = FIRST_AMPLITUDE * max_amplitude(state.mv, low, high, jump)
     if not room > 0.0 or not amplitude > 0.0:  # MV may be no number
         return None

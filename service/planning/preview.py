@@ -287,7 +287,8 @@ def _home(state: LoopState | None, unit: str) -> str:
 
 
 def _gains_text(gains: Gains) -> str:
-    return f"the gains it has now (Kp {gains.Kp:.4g}, Ti {gains.Ti:.4g} s)"
+    b = f", b {gains.b:.3g}" if gains.b != 1.0 else ""
+    return f"the gains it has now (Kp {gains.Kp:.4g}, Ti {gains.Ti:.4g} s{b})"
 
 
 def _known(config: LoopConfig, last: LastProposal | None) -> KnownPlant:

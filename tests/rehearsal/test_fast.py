@@ -9,7 +9,9 @@ import pytest
 from benchmarks.cases import ASKED, FURTHER
 from benchmarks.plants import plants
 from benchmarks.tuning import fast_run
+from loopwright.service.results import GainsView
 from loopwright.tuning.analysis.margins import margins, ultimate_point
+from loopwright.tuning.analysis.step_response import step_figures
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction
 from tests.rehearsed import rehearse
@@ -127,3 +129,22 @@ def test_what_can_be_allowed_for_does_not_hinder(case: str) -> None:
     assert result.value is not None, result.ended
     gains = result.value.gains
     assert abs(margins(plant.model(), gains).Ms - ASKED) < 0.05
+
+
+@pytest.mark.parametrize("method", ["fast", "setpoint"])
+def test_a_heater_without_overshoot(method: str) -> None:
+    """K 0.8, T 120 s, L 15 s overshot by 20 % under the gains of this design with b = 1."""
+    plant = {"num": [0.8], "den": [120.0, 1.0], "dead_time_s": 15.0, "sample_time_s": 1.0, "noise_std": 0.002,
+             "sp_deviation": 1.0}
+    found = {aim: rehearse(plant, method=method, aim=aim) for aim in ("balanced", "no_overshoot")}
+    model = TransferFunction((0.8,), (120.0, 1.0), 15.5)
+    overshoots, IAE = {}, {}
+    for aim, answer in found.items():
+        assert answer["outcome"] == "proposed", answer["detail"]
+        assert abs(true_Ms(plant, answer["new_gains"]) - 1.6) < 0.05
+        gains = GainsView.model_validate(answer["new_gains"]).gains()
+        figures = step_figures(model, gains)
+        overshoots[aim], IAE[aim] = figures.overshoot_pct, figures.IAE
+        assert gains.b < 1.0 and answer["verification"]["b"] < 1.0
+    assert overshoots["no_overshoot"] < 3.0 and overshoots["balanced"] < 10.0
+    assert max(IAE.values()) < 45.0  # 46.4 s with b = 1

@@ -21,6 +21,9 @@ MIN_GAIN = 0.05
 """Smallest relative improvement of a bound or of J that justifies a change of a loop that works."""
 BAND = 0.05
 """Settling band, as a fraction of the final change (after a load disturbance: of the peak)."""
+OVERSHOOT_UNIT_PCT = 20.0
+"""Overshoot beyond its bound, percent of the set-point step, that counts as much as a bound that is exceeded twofold:
+one percent as much as MIN_GAIN."""
 SAME = 0.005
 """Relative difference below which two figures are called the same."""
 
@@ -71,6 +74,7 @@ class RobustnessBounds:
     """The bounds of robustness that a design must keep; None is no bound.
 
     Ms, Mt, noise_gain: the largest permitted values.
+    overshoot_pct: the largest permitted overshoot after a set-point step, percent.
     GM: the smallest permitted gain margin.
     by: who asks for the bounds, in words.
     """
@@ -79,6 +83,7 @@ class RobustnessBounds:
     Mt: float | None = None
     GM: float | None = None
     noise_gain: float | None = None
+    overshoot_pct: float | None = None
     by: str = "asked for"
 
     def worst(self, found: LoopPerformance) -> tuple[float, str]:
@@ -96,6 +101,10 @@ class RobustnessBounds:
                 yield value / maximum, f"{name} {value:.2f} ({self.by}: at most {maximum:.2f})"
         if found.GM is not None and self.GM is not None:
             yield self.GM / found.GM, f"GM {found.GM:.2f} ({self.by}: at least {self.GM:.2f})"
+        if found.overshoot_pct is not None and self.overshoot_pct is not None:
+            # a bound near zero has no ratio that means anything
+            past = (found.overshoot_pct - self.overshoot_pct) / OVERSHOOT_UNIT_PCT
+            yield 1.0 + past, f"overshoot {found.overshoot_pct:.1f} % ({self.by}: at most {self.overshoot_pct:g} %)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,12 +183,12 @@ def loop_performance(model: Model, gains: Gains, sample_time_s: float = 0.0) -> 
     )
 
 
-def weighted_IAE(found: LoopPerformance, setpoint: float, load: float) -> float | None:
-    """Half of the IAE of the set-point step and half of that of the load disturbance, each divided by the value given;
-    None where there is no such IAE."""
+def weighted_IAE(found: LoopPerformance, setpoint: float, load: float, share: float = 0.5) -> float | None:
+    """A share of the IAE of the set-point step and the rest of that of the load disturbance, each divided by the value
+    given; None where there is no such IAE. share: half and half by default."""
     if found.setpoint is None or found.load is None or found.setpoint.IAE is None or found.load.IAE is None:
         return None
-    return 0.5 * found.setpoint.IAE / setpoint + 0.5 * found.load.IAE / load
+    return share * found.setpoint.IAE / setpoint + (1.0 - share) * found.load.IAE / load
 
 
 def IAE_over_present(before: LoopPerformance, after: LoopPerformance) -> tuple[float | None, float | None]:
@@ -199,6 +208,7 @@ def compare(
     criterion: str,
     J: tuple[float | None, float | None],
     anyway: bool = False,
+    keep_setpoint: bool = False,
 ) -> Comparison:
     """The comparison of the figures of old and new gains. The new gains are stable: no procedure hands over others.
 
@@ -206,8 +216,14 @@ def compare(
     criterion: the criterion J in words.
     J: the values of J of the old and of the new gains.
     anyway: a proposal is wanted even without an improvement; only the conclusion's words differ.
+    keep_setpoint: where the present gains keep all bounds, new gains with more than 5 % more IAE after a set-point step
+    are no improvement, whatever they bring after a load disturbance.
     """
     gain, words = _conclusion(before, after, asked, J)
+    if gain and keep_setpoint and (worse := _worse_setpoint(before, after, asked)) is not None:
+        end = "they are proposed because that was asked for" if anyway else "the present gains are kept"
+        words = f"The new gains would make a good answer to the set-point worse by {worse}, and {end}; {words}"
+        return Comparison(before, after, asked.Ms, criterion, *J, False, words)
     if not gain:
         end = "the new gains are proposed because that was asked for" if anyway else "the present gains are kept"
         words = f"Nothing asked for gets better by more than {100.0 * MIN_GAIN:.0f} %: {end}; {words}."
@@ -231,6 +247,17 @@ def _conclusion(
         falls = "" if now is None else f"; J falls by {100.0 * (1.0 - then / now):.0f} %"
         return True, f"{rest[0].upper()}{rest[1:]}{falls}."
     return False, rest
+
+
+def _worse_setpoint(before: LoopPerformance, after: LoopPerformance, asked: RobustnessBounds) -> str | None:
+    """By how much the new gains raise the IAE after a set-point step, in words, where the present gains keep all bounds
+    and that is more than 5 %; None elsewhere."""
+    if before.setpoint is None or after.setpoint is None or asked.worst(before)[0] > 1.0 + MIN_GAIN:
+        return None
+    now, then = before.setpoint.IAE, after.setpoint.IAE
+    if now is None or then is None or then <= now * (1.0 + MIN_GAIN):
+        return None
+    return f"{100.0 * (then / now - 1.0):.0f} % of IAE"
 
 
 def _errors(before: LoopPerformance, after: LoopPerformance) -> str:

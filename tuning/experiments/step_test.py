@@ -43,13 +43,13 @@ class StepResult:
     duration_s: float
 
 
-def allowed_step(facts: Facts, point: OperatingPoint, Kp: float, static_gain: float) -> float:
+def allowed_step(facts: Facts, point: OperatingPoint, kick: float, static_gain: float) -> float:
     """The largest permitted set-point step (PV units) that keeps the kick and the final value of MV within its room.
 
-    Kp: the gain in effect during the step.
+    kick: how far MV goes at once, MV units per PV unit of the step: the gain in effect, or a little more than that.
     static_gain: the static gain of the plant, nan where it is not known.
     """
-    step = min(facts.sp_deviation, KICK_OF_ROOM * point.room / Kp)
+    step = min(facts.sp_deviation, KICK_OF_ROOM * point.room / kick)
     if static_gain == static_gain and static_gain != 0:
         step = min(step, 0.6 * point.room * abs(static_gain))
     return step

@@ -24,7 +24,7 @@ def verification(
     Raises Refused: CONTROLLER_MISMATCH, NOT_CONFIRMED, MV_LIMIT.
     """
     step = min(
-        allowed_step(facts, point, gains.Kp, abs(static_gain)),
+        allowed_step(facts, point, max(gains.b, 1.0) * gains.Kp, abs(static_gain)),
         allowed_step(facts, point, facts.old_gains.Kp, math.nan),
     )
     commands = (SetGains(gains), SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp))

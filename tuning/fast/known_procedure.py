@@ -20,7 +20,7 @@ from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.agreement import Agreement, agreement
 from loopwright.tuning.fast.controller_effect import with_controller
 from loopwright.tuning.fast.evaluation import NEGLIGIBLE_RESIDUAL, Evaluation, evaluate
-from loopwright.tuning.fast.experiment import STEP_BACK_FRACTION, VERIFICATION_PERIODS, Experiment
+from loopwright.tuning.fast.experiment import STEP_BACK_FRACTION, VERIFICATION_PERIODS, Experiment, on_trial
 from loopwright.tuning.fast.known_plant import ObservedPlant
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.outcome import OPEN_REASONS, outcome_of
@@ -180,7 +180,7 @@ def _tried(
     facts: Facts, options: DesignOptions, known: ObservedPlant, test: KnownTrial, first: Evaluation
 ) -> Plan[tuple[Evaluation, VerifiedStep]]:
     """Tries the gains of the first evaluation. Raises ObservedPlantFails."""
-    tested = first.best.gains
+    tested = on_trial(first.best.gains)
     looked: _Look | None = None
     try:
         yield from test.step(tested, first.period)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.design import Aim, DesignSpec, aim_of
 
 
 @dataclass(frozen=True, slots=True)
 class DesignOptions:
     """The design specification that is asked for, and what is done with the new gains.
 
-    Ms, derivative, Mt, noise_gain: see `tuning.fast.design.DesignSpec`.
+    Ms, derivative, Mt, noise_gain, aim: see `tuning.fast.design.DesignSpec`.
     verify: the set-point step under the new gains is made.
     propose_anyway: the procedure goes on where the new gains improve nothing that was asked for.
     Raises Refused, BAD_INPUT.
@@ -23,10 +23,11 @@ class DesignOptions:
     noise_gain: float | None = None
     verify: bool = True
     propose_anyway: bool = False
+    aim: str = Aim.BALANCED
 
     def spec(self) -> DesignSpec:
         """The design specification of these options. Raises Refused, BAD_INPUT."""
-        return DesignSpec(self.Ms, self.derivative, self.Mt, self.noise_gain)
+        return DesignSpec(self.Ms, self.derivative, self.Mt, self.noise_gain, aim=aim_of(self.aim))
 
     def __post_init__(self) -> None:
         self.spec()

@@ -18,6 +18,7 @@ from loopwright.tuning.experiments.preflight import at_rest
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.ramp import ramped
 from loopwright.tuning.fast.evaluation import Evaluation
+from loopwright.tuning.fast.experiment import on_trial
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.outcome import OPEN_REASONS, evaluated
 from loopwright.tuning.fast.proposal import (
@@ -131,7 +132,7 @@ def by_relay(facts: Facts, options: FastOptions, experiment: RelayTest) -> Plan[
     if options.verify and (outcome.gain or options.propose_anyway):
         yield from experiment.report(*started("verify"))
         first = evaluation
-        tested = first.best.gains
+        tested = on_trial(first.best.gains)
         yield from experiment.step(tested, first.period)
         evaluating = partial(evaluated, facts, options, experiment.experiment_record(), first)
         evaluation, outcome = yield from experiment.computed(evaluating)

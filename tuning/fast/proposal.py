@@ -20,7 +20,7 @@ from loopwright.tuning.analysis.margins import Ultimate, margins, ultimate_point
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.step_test import StepResult
 from loopwright.tuning.fast.controller_effect import note_of
-from loopwright.tuning.fast.design import DesignSpec, OptimalGains
+from loopwright.tuning.fast.design import MAX_OVERSHOOT, Aim, DesignSpec, OptimalGains
 from loopwright.tuning.fast.evaluation import Evaluation
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.fast.robustness import KnownMs, known_Ms
@@ -31,8 +31,14 @@ from loopwright.tuning.identification.sensitivity import slopes_of
 from loopwright.tuning.models import Model, Reals, TransferFunction
 from loopwright.tuning.reasons import Ended, Reason, Refused
 
-CRITERION = "half of the set-point's and half of the load's IAE, each over the least under the bounds asked for"
-"""J in words, as the comparison of old and new gains shows it."""
+_HALVES = "half of the set-point's and half of the load's IAE, each over the least under the bounds asked for"
+CRITERION = {
+    Aim.BALANCED: _HALVES,
+    Aim.SETPOINT: _HALVES.replace("half", "nine tenths", 1).replace("half", "a tenth"),
+    Aim.LOAD: "the load's IAE over the least under the bounds asked for",
+    Aim.NO_OVERSHOOT: f"{_HALVES}, with an overshoot of at most {100.0 * MAX_OVERSHOOT:g} %",
+}
+"""J of each aim in words, as the comparison of old and new gains shows it."""
 
 NEVER_TRIED = "These gains were never tried on this loop, which stayed in manual. Watch it as it goes to automatic."
 
@@ -314,9 +320,11 @@ def comparison_on(sampled: Model, best: OptimalGains, facts: Facts, spec: Design
     before, after = (loop_performance(sampled, gains, facts.sample_time_s) for gains in (facts.old_gains, best.gains))
     if not after.stable:
         raise Refused(Reason.NOT_ROBUST, "the gains designed are not stable on their own model")
-    asked = RobustnessBounds(spec.Ms, Mt=spec.Mt, noise_gain=spec.noise_gain)
-    J = tuple(weighted_IAE(each, best.minimum.setpoint, best.minimum.load) for each in (before, after))
-    return compare(before, after, asked, CRITERION, (J[0], J[1]), anyway)
+    aim, minimum = spec.aim, best.minimum
+    overshoot = None if aim.max_overshoot is None else 100.0 * aim.max_overshoot
+    asked = RobustnessBounds(spec.Ms, Mt=spec.Mt, noise_gain=spec.noise_gain, overshoot_pct=overshoot)
+    J = tuple(weighted_IAE(each, minimum.setpoint, minimum.load, aim.share) for each in (before, after))
+    return compare(before, after, asked, CRITERION[aim], (J[0], J[1]), anyway, keep_setpoint=aim is not Aim.LOAD)
 
 
 def proposed(

@@ -129,6 +129,7 @@ class RelayTest(Experiment):
         self._follow_s = VERIFICATION_PERIODS * min(max(model_period, MIN_MODEL_PERIOD * relay_period), relay_period)
         facts, point = self.facts, self.point
         output_range = self.experiment_record().output_range
+        # with a set-point weight below one the integral moves MV as far a little later
         size = min(0.5 * output_range, self.amplitude / gains.Kp, facts.sp_deviation)
         self.excited = len(self.trace)
         self._gains_tried = gains

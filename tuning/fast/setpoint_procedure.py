@@ -14,6 +14,7 @@ from loopwright.tuning.experiments.preflight import at_rest
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.ramp import check_ramp, ramped, slow_words
 from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY
+from loopwright.tuning.fast.experiment import on_trial
 from loopwright.tuning.fast.look import Look, look_at, settled
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.outcome import OPEN_REASONS, evaluated
@@ -163,7 +164,7 @@ def by_pulses(
     if options.verify and (comparison.gain or options.propose_anyway):
         yield from test.report(*started("verify"))
         first = evaluation
-        tested = first.best.gains
+        tested = on_trial(first.best.gains)
         models = [first.fit.model(each) for each in (first.chosen.best, *first.chosen.rivals)][:MAX_MODELS]
         yield from test.approach(models, tested, first.period)
         yield from test.step(tested, first.period)

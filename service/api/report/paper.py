@@ -115,6 +115,7 @@ def paper(source: ReportSource) -> str:
         designs=_designs(source.designs),
         designed_on="" if source.designs is None else source.designs.designed_on,
         with_td=_with_td(source.designs),
+        with_b=_with_b(source.designs),
         with_error=_with_error(source.designs),
         asked=_asked(source),
         stages=[
@@ -220,6 +221,8 @@ def _afterwards(job: JobView, decimals: int, pv_unit: str) -> str:
     if isinstance(gains, dict) and isinstance(Kp := gains.get("Kp"), int | float):
         Ti = gains.get("Ti")
         text += f", Kp {n.significant(Kp)}" + (f", Ti {n.significant(Ti)} s" if isinstance(Ti, int | float) else "")
+        if isinstance(b := gains.get("b"), int | float) and b != 1.0:
+            text += f", b {n.significant(b, 3)}"
     return text + "."
 
 
@@ -360,6 +363,10 @@ def _with_td(curve: DesignCurve | None) -> bool:
     return curve is not None and any(each.gains is not None and each.gains.Td > 0.0 for each in curve.designs)
 
 
+def _with_b(curve: DesignCurve | None) -> bool:
+    return curve is not None and any(each.gains is not None and each.gains.b != 1.0 for each in curve.designs)
+
+
 def _with_error(curve: DesignCurve | None) -> bool:
     return curve is not None and any(each.uncertainty is not None for each in curve.designs)
 
@@ -378,6 +385,7 @@ def _designs(curve: DesignCurve | None) -> list[list[str]]:
                 n.significant(each.gains.Kp),
                 n.significant(each.gains.Ti),
                 *([n.significant(each.gains.Td)] if _with_td(curve) else []),
+                *([n.significant(each.gains.b, 3)] if _with_b(curve) else []),
                 *([n.Ms_error(each.uncertainty)] if _with_error(curve) else []),
                 n.fixed(worth.GM, 2),
                 n.fixed(worth.PM_deg, 0),

@@ -139,6 +139,8 @@ def stage_found(stage: str, result: Mapping[str, object] | None, pv_unit: str) -
     if stage != "verify" and isinstance(Kp := of.get("Kp"), int | float):
         Ti = of.get("Ti", of.get("Ti_s"))
         said.append(f"Kp {significant(Kp)}" + (f", Ti {significant(Ti)} s" if isinstance(Ti, int | float) else ""))
+        if isinstance(b := of.get("b"), int | float) and b != 1.0:
+            said.append(f"b {significant(b, 3)}")
     if (fit := value("fit_pct")) is not None:
         said.append(f"{fixed(fit, 1)} % of the step explained")
     if (overshoot := value("overshoot_pct")) is not None:

@@ -68,7 +68,7 @@ def before_after(figure: Figure | SubFigure, job: Shown, pv_unit: str) -> None:
     # method setpoint steps home, which is mostly down
     size = 1.0 if job.verification is None else abs(job.verification.step or 1.0)
     gains = {
-        label: Gains(shown.Kp, shown.Ti, shown.Td, shown.Tf)
+        label: shown.gains()
         for label, shown in (("before", job.old_gains), ("after", job.new_gains))
     }
     assessed = {label: assess(model, each) for label, each in gains.items()}
@@ -103,6 +103,8 @@ def _changes(gains: Mapping[str, Gains], assessed: Mapping[str, Assessment]) -> 
     parts = [f"Kp {old.Kp:.3g} → {new.Kp:.3g}, Ti {old.Ti:.3g} → {new.Ti:.3g} s"]
     if old.Td or new.Td:
         parts[0] += f", Td {old.Td:.3g} → {new.Td:.3g} s"
+    if old.b != 1.0 or new.b != 1.0:
+        parts[0] += f", b {old.b:.3g} → {new.b:.3g}"
     before, after = assessed["before"], assessed["after"]
     if before.margins.Ms and after.margins.Ms and before.stable:
         parts.append(f"Ms {before.margins.Ms:.2f} → {after.margins.Ms:.2f}")

@@ -16,6 +16,7 @@ from loopwright.service.offline.tunings import tunings
 from loopwright.service.planning.found_model import DISPROVED
 from loopwright.service.results import ModelView
 from loopwright.tuning.analysis.margins import margins
+from loopwright.tuning.fast.design import Aim
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
@@ -197,7 +198,7 @@ def test_gains_of_fast_for_another_Ms(service: Service, client: TestClient, Ms: 
     # the fake loop samples every 0.1 s
     assert margins(FOPDT(2.0, 3.0, 1.05), gains).Ms == pytest.approx(Ms, abs=0.01)
     assert fast["margins"]["Ms"] == pytest.approx(Ms, abs=0.01) and fast["setpoint"]["IAE"] > 0
-    assert (gains.Td > 0) == derivative
+    assert (gains.Td > 0) == derivative and fast["gains"]["b"] != 1.0
     asked = retune_request(**fast["retune"])
     assert (asked.method, asked.start, asked.ms, asked.derivative) == ("fast", "design", Ms, derivative)
     assert asked.model is not None
@@ -206,9 +207,32 @@ def test_gains_of_fast_for_another_Ms(service: Service, client: TestClient, Ms: 
     assert client.post(f"/loops/{job['loop']}/retune", json=fast["retune"]).status_code == 202
 
 
+def test_the_aim_of_other_gains_is_that_of_the_job_unless_another_is_asked_for(
+    service: Service, client: TestClient
+) -> None:
+    job = finished(service, client, aim="load")
+    answers = {}
+    for query in ("", *(f"&aim={aim}" for aim in Aim)):
+        found = client.get(f"{job['url']}/alternatives?ms=1.6{query}").json()
+        (answers[query],) = found["methods"]
+        asked = retune_request(**answers[query]["retune"])
+        assert asked.aim == (query.removeprefix("&aim=") or "load")
+    assert answers[""]["gains"] == answers["&aim=load"]["gains"]
+    loads = {query: each["load"]["IAE"] for query, each in answers.items()}
+    assert loads["&aim=load"] < loads["&aim=balanced"] < loads["&aim=setpoint"]
+    steps = {query: each["setpoint"]["IAE"] for query, each in answers.items()}
+    assert steps["&aim=setpoint"] < steps["&aim=balanced"] < steps["&aim=load"]
+    assert answers["&aim=no_overshoot"]["setpoint"]["overshoot_pct"] < 1.5
+    assert len({each["gains"]["b"] for each in answers.values()}) == len(Aim)
+
+
 @pytest.mark.parametrize(
-    "query", ["ms=1.1", "ms=2.5", "ms=nan", "ms=1.4&method=simc", "derivative=true", "ms=1.4&derivative=x"]
-)
+    "query",
+    [
+        "ms=1.1", "ms=2.5", "ms=nan", "ms=1.4&method=simc", "derivative=true", "ms=1.4&derivative=x", "aim=load",
+        "ms=1.4&aim=comfort",
+    ],
+)  # fmt: skip
 def test_bad_wishes_for_another_Ms(service: Service, client: TestClient, query: str) -> None:
     job = finished(service, client)
     assert assert_problem(client.get(f"{job['url']}/alternatives?{query}"), 422)["reason"] == "bad_input"

@@ -82,6 +82,8 @@ def test_the_options_of_fast_are_asked_for(service: Service, through: Through) -
         "--ms",
         "1.4",
         "--derivative",
+        "--aim",
+        "no_overshoot",
         "--amplitude",
         "10",
         "--careful",
@@ -94,11 +96,12 @@ def test_the_options_of_fast_are_asked_for(service: Service, through: Through) -
     assert result.exit_code == 0, result.output
     (body,) = through.posted
     assert body == {
-        "ms": 1.4, "derivative": True, "amplitude_pct": 10.0, "careful": True, "verify": False, "requested_by": "cli",
+        "ms": 1.4, "derivative": True, "aim": "no_overshoot", "amplitude_pct": 10.0, "careful": True, "verify": False,
+        "requested_by": "cli",
     }  # fmt: skip
     job = json.loads(result.stdout)
     service.wait(job["id"])
-    assert job["method"] == "fast" and job["request"]["ms"] == 1.4
+    assert job["method"] == "fast" and job["request"]["ms"] == 1.4 and job["request"]["aim"] == "no_overshoot"
 
 
 def test_to_where_and_how_fast_the_set_point_may_move_is_asked_for(service: Service, through: Through) -> None:

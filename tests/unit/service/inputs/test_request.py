@@ -11,6 +11,8 @@ from pydantic import ValidationError
 from loopwright.service.inputs.request import FastRetune, FiveStageRetune, RuleRetune, retune_request
 from loopwright.service.inputs.validation import lines, place
 from loopwright.service.jobs.fleet import FastRetunes, FiveStageRetunes, RuleRetunes, fleet_request
+from loopwright.tuning.fast.design import Aim, DesignSpec
+from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.procedure import FastOptions
 from loopwright.tuning.five_stage.procedure import Options
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating
@@ -38,8 +40,15 @@ def test_the_method_chooses_the_kind(method: str | None, kind: type, fleet: type
 
 
 def test_the_options_of_the_procedures_are_made_of_it() -> None:
-    fast = retune_request(ms=1.4, derivative=True, amplitude_pct=5, careful=True, verify=False, propose_anyway=True)
-    assert fast.options == FastOptions(1.4, True, amplitude=5.0, careful=True, verify=False, propose_anyway=True)
+    fast = retune_request(
+        ms=1.4, derivative=True, aim="load", amplitude_pct=5, careful=True, verify=False, propose_anyway=True
+    )
+    assert fast.options == FastOptions(
+        1.4, True, amplitude=5.0, careful=True, verify=False, propose_anyway=True, aim=Aim.LOAD
+    )
+    pulses = retune_request(method="setpoint", aim="no_overshoot")
+    assert pulses.options == DesignOptions(aim=Aim.NO_OVERSHOOT)
+    assert retune_request().options.spec() == DesignSpec(aim=Aim.BALANCED)
     rule = retune_request(
         method="simc", start="zn_pi", Ku=2, Pu_s=3, method_options={"tau_c_s": 4}, baseline=False, k_source="ke",
         kp_step_factor=1.5, overshoot_window_pct=[8, 40], model_from="record",
@@ -50,6 +59,15 @@ def test_the_options_of_the_procedures_are_made_of_it() -> None:
     )  # fmt: skip
     five = retune_request(method="five-stage", start="estimate", Kp=1, Ti_s=2, overshoot_pct=25, propose_anyway=True)
     assert five.options == Options("estimate", Kp=1.0, Ti_s=2.0, overshoot_pct=25.0, propose_anyway=True)
+
+
+@pytest.mark.parametrize(
+    ("method", "aim"), [("fast", "comfort"), ("fast", None), ("setpoint", 1), ("five-stage", "load")]
+)
+def test_an_aim_that_does_not_exist_or_is_not_of_the_method(method: str, aim: object) -> None:
+    with pytest.raises(ValidationError) as refused:
+        retune_request(method=method, aim=aim)
+    assert "aim" in str(refused.value)
 
 
 @pytest.mark.parametrize(

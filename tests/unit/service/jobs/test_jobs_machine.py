@@ -50,7 +50,7 @@ MAX_ATTEMPTS = 10
 WHICH = st.integers(0, 15)
 OPTIONS: tuple[dict[str, Any], ...] = (
     {},
-    {"ms": 1.4, "derivative": True, "amplitude_pct": 10.0, "careful": True, "verify": False},
+    {"ms": 1.4, "derivative": True, "aim": "no_overshoot", "amplitude_pct": 10.0, "careful": True, "verify": False},
     {"start": "design", "model": {"num": [1.0], "den": [3.0, 1.0], "dead_time_s": 1.0}},
     {"method": "five-stage", "overshoot_window_pct": (8.0, 50.0), "baseline": False},
     {"method": "simc", "method_options": {"tau_c_s": 2.0}},

@@ -45,7 +45,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
 def with_later_fields(golden: dict[str, Any]) -> dict[str, Any]:
     """The golden job with what is shown of it since: nobody has decided, a live test knows how fast it sampled, in
     which mode it found the loop, and whether its gains were tried; it has no samples. How late a second path would have
-    shown is not known.
+    shown is not known. Gains were tried with b = 1.
     Its advice is not stored, but today's for its reason."""
     advice = None if golden["reason"] is None else ADVICE[Reason(golden["reason"])]
     sample_time_s = None if golden["dry_run"] else 0.1
@@ -54,10 +54,12 @@ def with_later_fields(golden: dict[str, Any]) -> dict[str, Any]:
     model = golden["model"]
     if model is not None and "num" in model:
         model = model | {"covariance": None}
+    verification = golden["verification"] and golden["verification"] | {"b": 1.0}
     return golden | {
         "model": model,
         "watch": None,
         "advice": advice,
+        "verification": verification,
         "decided": None,
         "decision_request": None,
         "superseded_by": None,

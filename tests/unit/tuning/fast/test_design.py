@@ -111,7 +111,8 @@ def test_a_derivative_pays_on_lags_and_is_left_out_where_it_does_not() -> None:
     lags, delay = THREE_LAGS.model, TransferFunction((1.0,), (0.05, 1.0), 1.0)
     pi = GainDesign(lags, DesignSpec(1.6), period(lags)).best()
     pid = GainDesign(lags, DesignSpec(1.6, derivative=True), period(lags)).best()
-    assert pid.gains.Td > 0.0 and pid.J < 0.97 * pi.J
+    of_pi = 0.5 * pi.cost.setpoint / pid.minimum.setpoint + 0.5 * pi.cost.load / pid.minimum.load
+    assert pid.gains.Td > 0.0 and pid.J / of_pi < 0.97
     assert margins(lags, pid.gains).Ms == pytest.approx(1.6, abs=2e-3)
     assert GainDesign(delay, DesignSpec(1.6, derivative=True), period(delay)).best().gains.Td == 0.0
 
@@ -137,7 +138,13 @@ def test_a_bound_on_the_noise_gain_holds() -> None:
     assert margins(model, held).Ms <= 1.602
 
 
-@pytest.mark.parametrize("bad", [{"Ms": 1.0}, {"Ms": math.nan}, {"Mt": 0.9}, {"noise_gain": 0.0}, {"N": 1.0}])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"Ms": 1.0}, {"Ms": math.nan}, {"Mt": 0.9}, {"noise_gain": 0.0}, {"N": 1.0}, {"weights": (1.0, 0.5)},
+        {"weights": (-0.1, 1.0)}, {"weights": (0.0, math.inf)},
+    ],
+)  # fmt: skip
 def test_wishes_that_cannot_be_are_refused(bad: dict[str, float]) -> None:
     with pytest.raises(Refused) as refused:
         DesignSpec(**bad)  # type: ignore[arg-type]

@@ -51,11 +51,16 @@ export function stageFound(stage, pv) {
   if (known(r.Pu_s)) lines.push(`Pu ${withUnit(significant(r.Pu_s), "s")}`);
   const gains = r.gains ?? (stage.stage === "verify" ? {} : r);
   if (known(r.Ms) && stage.stage !== "verify") lines.push(`Ms ${ms(r.Ms)}${known(r.uncertainty) ? ` ± ${msError(r.uncertainty)}` : ""}`);
-  if (known(gains.Kp)) lines.push(`Kp ${significant(gains.Kp)}, Ti ${withUnit(significant(gains.Ti ?? gains.Ti_s), "s")}`);
+  if (known(gains.Kp)) lines.push(`Kp ${significant(gains.Kp)}, Ti ${withUnit(significant(gains.Ti ?? gains.Ti_s), "s")}${weight(gains)}`);
   if (known(r.fit_pct)) lines.push(`${fixed(r.fit_pct, 1)} % explained`);
   if (known(r.overshoot_pct)) lines.push(`overshoot ${fixed(r.overshoot_pct, 0)} %`);
   if (known(r.settling_s)) lines.push(`settled in ${duration(r.settling_s)}`);
   return lines.slice(0, 4);
+}
+
+/** The set-point weight b, where it is not one. @param {any} gains */
+export function weight(gains) {
+  return known(gains?.b) && gains.b !== 1 ? `, b ${significant(gains.b, 3)}` : "";
 }
 
 /** @type {Record<string, string>} */

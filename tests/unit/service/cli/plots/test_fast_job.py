@@ -12,11 +12,13 @@ from matplotlib.figure import Figure
 from loopwright.service.cli.plots.fast_job import before_after
 from loopwright.service.cli.plots.shown import Shown
 from loopwright.service.inputs.model_json import parse_model
+from loopwright.service.results import GainsView
+from loopwright.tuning.gains import Gains
 
 
 @pytest.mark.parametrize("step", [0.1, -0.1, None])
 def test_the_step_is_shown_whole_whichever_way_the_loop_was_stepped(step: float | None) -> None:
-    gains = SimpleNamespace(Kp=60.0, Ti=2.0, Td=0.0, Tf=0.0)
+    gains = GainsView.of(Gains(60.0, 2.0))
     model = SimpleNamespace(
         process_model=lambda: parse_model({"num": [0.03, 0.02], "den": [3, 4, 1], "dead_time_s": 1.0})
     )

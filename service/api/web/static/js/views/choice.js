@@ -7,7 +7,7 @@ import { designsOf, fillDesigns } from "../designs.js";
 import { html } from "../html.js";
 import { change, fixed, known, ms as msText, msError, pvDecimals, significant, unit, withUnit } from "../numbers.js";
 import { isSilent, may, refreshLoops, rowOf, sign, signature } from "../state.js";
-import { decisionRequestWords } from "../words.js";
+import { decisionRequestWords, weight } from "../words.js";
 import { Curve, NyquistPlot, StepPlot } from "./figures.js";
 
 const LOAD_PCT = 10;
@@ -49,7 +49,7 @@ export function Choice({ loop, detail, job, latest, quiet, onChanged }) {
     return Math.max(settle * 1.3, 6 * slowness(model, job.new_gains));
   }, [job.id]);
   const before = useMemo(() => (model && job.old_gains ? pictures(model, job.old_gains, size, horizon_s) : null), [job.id]);
-  const after = useMemo(() => (model ? pictures(model, gains, size, horizon_s) : null), [job.id, gains.Kp, gains.Ti, gains.Td]);
+  const after = useMemo(() => (model ? pictures(model, gains, size, horizon_s) : null), [job.id, gains.Kp, gains.Ti, gains.Td, gains.b]);
   const points = useMemo(() => (model ? designs.map((each) => ({ ms: each.ms, IAE: step(model, each.gains, { load: 1 }, horizon_s, 300).IAE })) : []), [job.id, grid.length]);
   const found = nameOf(job);
   const narrow = matchMedia("(max-width: 720px)").matches;
@@ -113,6 +113,7 @@ function Table(loop, job, gains, before, after, atTested, size) {
     [html`Gain Kp <small>%/${u}</small>`, "kp", old?.Kp, gains.Kp, significant],
     [html`Integral time Ti <small>s</small>`, "ti", old?.Ti, gains.Ti, significant],
     ...(old?.Td || gains.Td ? /** @type {any[]} */ ([[html`Derivative time Td <small>s</small>`, "td", old?.Td, gains.Td, significant]]) : []),
+    ...(weight(old) || weight(gains) ? /** @type {any[]} */ ([[html`Set-point weight b`, "b", old?.b, gains.b, (/** @type {any} */ v) => significant(v, 3)]]) : []),
     [html`Overshoot <small>%</small>`, "os", stable ? a.overshoot_pct : null, b.overshoot_pct, (v) => fixed(v, 0)],
     [html`Settled within 5 % <small>s</small>`, "settle", stable ? a.setpoint?.settling_s : null, b.setpoint?.settling_s, (v) => significant(v, 2)],
     [html`Load of 1 %, IAE <small>${u} s</small>`, "iae", stable ? a.load?.IAE : null, b.load?.IAE, (v) => significant(v, 3)],
@@ -185,7 +186,7 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
     });
   const dead = sending || isSilent.value;
   const gains = asking === "rollback" ? job.old_gains : job.new_gains;
-  const written = gains && `Kp ${significant(gains.Kp)} %/${unit(loop.pv_unit)}, Ti ${significant(gains.Ti)} s${gains.Td ? `, Td ${significant(gains.Td)} s` : ""}`;
+  const written = gains && `Kp ${significant(gains.Kp)} %/${unit(loop.pv_unit)}, Ti ${significant(gains.Ti)} s${gains.Td ? `, Td ${significant(gains.Td)} s` : ""}${weight(gains)}`;
   const where = `${loop.tag}, node ${loop.controller_node.toString(16)}h channel ${loop.channel}`;
   const Signed = (/** @type {string} */ action, /** @type {() => void} */ go) => html`<span class="ask" key="ask"><label key="by">Signed <input ref=${field} type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && signature.value.trim() && !dead) go(); }} /></label>
     <button key="cancel" onClick=${close}>Cancel</button><button key="go" class="main" disabled=${dead || !signature.value.trim()} onClick=${go}>${action}</button></span>`;
@@ -204,7 +205,7 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
   else if (asking === "try") inside = html`<span class="say">A trial listens, steps the set-point by <b>${withUnit(fixed(loop.sp_deviation, pvDecimals(loop.pv_limits)), loop.pv_unit)}</b> under the gains for Ms ${msText(ms)}, and ends as a proposal. No relay.</span>${Signed(`Try Ms ${msText(ms)} on ${loop.tag}`, tryIt)}`;
   else if (!atTested) inside = html`<span class="say">These gains have not been on the loop.</span>${backButton}<button key="try" class="main" disabled=${dead} data-opens="try" onClick=${() => open("try")}>Try Ms ${msText(ms)} on ${loop.tag}…</button>`;
   else if (job.state === "proposed" && latest) inside = html`<span class="say">The loop runs on its old gains until you accept.</span><button key="keep" disabled=${dead} data-opens="keep" onClick=${() => open("keep")}>Keep the old gains…</button><button key="accept" class="main" disabled=${dead} data-opens="accept" onClick=${() => open("accept")}>Accept the new gains…</button>`;
-  else if (job.state === "accepted" && latest) inside = html`<span class="say">Accepted by <b>${job.decided?.by ?? "–"}</b>${detail?.live ? html`; in effect now: Kp ${significant(detail.live.gains.Kp)}, Ti ${significant(detail.live.gains.Ti)} s` : ""}.</span><button key="rollback" disabled=${dead} data-opens="rollback" onClick=${() => open("rollback")}>Roll back to the old gains…</button>`;
+  else if (job.state === "accepted" && latest) inside = html`<span class="say">Accepted by <b>${job.decided?.by ?? "–"}</b>${detail?.live ? html`; in effect now: Kp ${significant(detail.live.gains.Kp)}, Ti ${significant(detail.live.gains.Ti)} s${weight(detail.live.gains)}` : ""}.</span><button key="rollback" disabled=${dead} data-opens="rollback" onClick=${() => open("rollback")}>Roll back to the old gains…</button>`;
   else if (job.state === "rolled_back") inside = html`<span class="say">The loop runs on its old gains${job.decided ? `; decided by ${job.decided.by}` : ""}.</span>`;
   else if (job.state === "proposed") inside = html`<span class="say">Not decided; a later test came.</span>`;
   else if (job.state === "accepted") inside = html`<span class="say">Accepted by <b>${job.decided?.by ?? "–"}</b>; a later test came.</span>`;

@@ -9,7 +9,7 @@ import { known, ms, period, pvDecimals, fixed, significant, unit, when } from ".
 import { jobPath } from "../router.js";
 import { isSilent, jobs, loops, loopsError, may, rowOf } from "../state.js";
 import { AlarmSymbol } from "../symbols.js";
-import { sentence, stateWords } from "../words.js";
+import { sentence, stateWords, weight } from "../words.js";
 import { Face } from "./face.js";
 import { dockLoop } from "./frame.js";
 import { Known } from "./known.js";
@@ -132,9 +132,10 @@ function Settings(loop, detail) {
     <h2 class="title" key="t1">Gains in effect</h2>
     ${gains ? html`<dl class="pairs" key="gains"><dt>Kp</dt><dd>${significant(gains.Kp)} <span class="quiet">%/${u}</span></dd><dt>Ti</dt><dd>${gains.Ti ? significant(gains.Ti) : "off"} <span class="quiet">s</span></dd>
       ${gains.Td > 0 && html`<dt key="td">Td</dt><dd key="tdv">${significant(gains.Td)} <span class="quiet">s</span></dd>`}
+      ${weight(gains) && html`<dt key="b">b</dt><dd key="bv">${significant(gains.b, 3)}</dd>`}
       <dt>action</dt><dd>${live.reverse_acting ? "reverse" : "direct"}</dd><dt>sampled</dt><dd>every ${period(live.sample_time_s)}</dd></dl>`
     : html`<p key="none" class="quiet">${detail?.live_error ? `${sentence(detail.live_error.detail)} ${detail.live_error.advice}` : detail ? "not known here" : "reading…"}</p>`}
-    ${loop.gains_differ && loop.accepted && html`<p class="note" key="differ">Accepted last: Kp ${significant(loop.accepted.gains.Kp)}, Ti ${significant(loop.accepted.gains.Ti)} s, by ${loop.accepted.by}, ${when(loop.accepted.at)}.</p>`}
+    ${loop.gains_differ && loop.accepted && html`<p class="note" key="differ">Accepted last: Kp ${significant(loop.accepted.gains.Kp)}, Ti ${significant(loop.accepted.gains.Ti)} s${weight(loop.accepted.gains)}, by ${loop.accepted.by}, ${when(loop.accepted.at)}.</p>`}
     <h2 class="title" key="t2">Permitted</h2>
     <dl class="pairs" key="limits"><dt>PV</dt><dd>${fixed(loop.pv_limits.low, decimals)} … ${fixed(loop.pv_limits.high, decimals)} <span class="quiet">${u}</span></dd>
       <dt>MV</dt><dd>${significant(loop.mv_limits.low, 3)} … ${significant(loop.mv_limits.high, 3)} <span class="quiet">%</span></dd>

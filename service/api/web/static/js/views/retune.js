@@ -100,6 +100,8 @@ export function RetuneForm({ loop, onClose, onStarted }) {
       ${Field("pv_low", "Abort below", u, loop.pv_limits.low, wish, set, problem)}${Field("pv_high", "Abort above", u, loop.pv_limits.high, wish, set, problem)}
       ${Field("sp_deviation", "SP step", u, loop.sp_deviation, wish, set, problem)}
       ${designed && html`<label class="check"><input type="checkbox" checked=${!!wish.derivative} onChange=${set("derivative")} /> derivative, where it pays</label>`}
+      ${designed && html`<label class="field"><span>The best for</span><select class="wide" value=${wish.aim ?? "balanced"} onChange=${set("aim")}>
+        <option value="balanced">set-point and load alike</option><option value="setpoint">set-point steps</option><option value="load">load disturbances</option><option value="no_overshoot">both, without overshoot</option></select></label>`}
       ${wish.method === "fast" && html`<label class="check"><input type="checkbox" checked=${!!wish.careful} onChange=${set("careful")} /> careful: six switches at least</label>`}
       <label class="check"><input type="checkbox" checked=${!!wish.dry_run} onChange=${set("dry_run")} /> rehearsal: computed in memory, nothing is moved</label>
     </div>`}
@@ -133,6 +135,7 @@ function bodyOf(wish) {
   if (wish.method === "fast" || wish.method === "setpoint") {
     body.ms = Number(wish.ms);
     if (wish.derivative) body.derivative = true;
+    if (wish.aim) body.aim = wish.aim;
   }
   if (wish.method === "fast" && wish.careful) body.careful = true;
   if (wish.dry_run) body.dry_run = true;
