@@ -88,6 +88,11 @@ class Chain:
     def pv(self) -> float:
         return self._pv
 
+    @property
+    def noise(self) -> float:
+        """The standard deviation of the noise of PV."""
+        return self._setting.noise
+
     def step(self, mv: float) -> float:
         value = mv
         for _ in range(self._setting.substeps):

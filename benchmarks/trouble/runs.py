@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,16 +21,28 @@ from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.rehearsal import RehearsedLoop
-from loopwright.service.execution.runner import run
+from loopwright.service.execution.runner import RunResult, run
+from loopwright.service.jobs.stored_record import stored_record
 from loopwright.tuning.experiments.preflight import PREFLIGHT, SETTLE
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.manual_procedure import MANUAL, by_manual
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.procedure import FAST, FastOptions, FastProposal, fast
+from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.fast.setpoint_procedure import setpoint
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.plan import Command, Mode, Plan, Sample, SetGains, SetMode, SetOutput, SetSetpoint
-from loopwright.tuning.reasons import Ended
+from loopwright.tuning.plan import (
+    Command,
+    Event,
+    Mode,
+    Plan,
+    Sample,
+    SetGains,
+    SetMode,
+    SetOutput,
+    SetSetpoint,
+    StageStarted,
+)
 
 PRESENT = "typical"
 """The gains in effect under pulses of the set-point: Ms 1.3 to 2 on the plant without trouble."""
@@ -70,11 +82,27 @@ class TroubledRun:
 
 
 class TroubledLoop(RehearsedLoop):
-    """Says to the plant when the test begins and when the new gains take over."""
+    """Says to the plant when the test begins and when the new gains take over; keeps the samples since the loop was
+    found at rest, with their stage."""
 
     def __init__(self, process: Chain, channel: Channel, sample_time_s: float) -> None:
         super().__init__(process, channel, sample_time_s)
-        self._process, self._begun = process, False
+        self.plant, self._begun, self._stage = process, False, ""
+        self.taken: list[tuple[str, Sample]] = []
+
+    def hear(self, event: Event) -> None:
+        """The last look at the loop is where its record begins."""
+        if isinstance(event, StageStarted):
+            self._stage = event.stage
+            if event.stage == PREFLIGHT:
+                self.taken.clear()
+
+    def record(self) -> ExperimentRecord | None:
+        """What was recorded; None where too little was."""
+        stages, samples = zip(*self.taken, strict=True)
+        columns = dict(zip(("t_s", "sp", "pv", "mv", "mode"), zip(*samples, strict=True), strict=True))
+        stored = stored_record({"stage": list(stages), **columns})
+        return stored.experiment_record() if stored else None
 
     def step(self, commands: Sequence[Command]) -> Sample:
         begins = any(
@@ -82,10 +110,12 @@ class TroubledLoop(RehearsedLoop):
         )
         if begins and not self._begun:
             self._begun = True
-            self._process.begin()
+            self.plant.begin()
         if any(isinstance(each, SetGains) for each in commands):
-            self._process.change()
-        return super().step(commands)
+            self.plant.change()
+        sample = super().step(commands)
+        self.taken.append((self._stage or PREFLIGHT, sample))
+        return sample
 
 
 def measure(given: Draw) -> TroubledRun:
@@ -94,21 +124,26 @@ def measure(given: Draw) -> TroubledRun:
     trouble = TROUBLES[case]
     plant = replace(trouble.of(plant), samples=trouble.samples)
     begun = time.process_time()
-    process, ran, ended, stages = _run(plant, method, trouble, seed)
+    result, loop = run_of(plant, method, trouble, seed)
     seconds = time.process_time() - begun
-    passed = sum(value for stage, value in stages.items() if stage not in (PREFLIGHT, SETTLE)) / plant.Pu
+    stages = result.plant_time_s.items()
+    passed = sum(value for stage, value in stages if stage not in (PREFLIGHT, SETTLE)) / plant.Pu
     found = TroubledRun(case, plant.name, method, seed, passed, seconds)
-    if ran is None:
-        assert ended is not None
-        return replace(found, reason=ended.reason.value, detail=ended.detail)
-    worst = process.worst(ran)
-    return replace(found, Ms=worst.Ms if worst.stable else None, Kp=ran.Kp, Ti=ran.Ti)
+    if result.value is None:
+        assert result.ended is not None
+        return replace(found, reason=result.ended.reason.value, detail=result.ended.detail)
+    gains = result.value.gains
+    worst = loop.plant.worst(gains)
+    return replace(found, Ms=worst.Ms if worst.stable else None, Kp=gains.Kp, Ti=gains.Ti)
 
 
-def _run(
-    plant: Plant, method: str, trouble: Trouble, seed: int
-) -> tuple[Chain, Gains | None, Ended | None, dict[str, float]]:
-    """The plant after the run, the gains proposed, why there are none, and the plant time of each stage, s."""
+def run_of(
+    plant: Plant, method: str, trouble: Trouble, seed: int, on_event: Callable[[Event], None] = lambda event: None
+) -> tuple[RunResult[FastProposal], TroubledLoop]:
+    """What the procedure came to, and the loop after it.
+
+    on_event: gets what the procedure reports.
+    """
     if method != FAST:
         step = 0.5 * trouble.amplitude
         random = np.random.default_rng([seed, len(plant.name), int(1e6 * plant.Pu)])
@@ -132,5 +167,9 @@ def _run(
     else:
         plan = by_manual(facts, options, MANUAL) if method == MANUAL else setpoint(facts, options)
     loop = TroubledLoop(process, channel, plant.Ts)
-    result = run(plan, loop, limits=RunLimits(max_time_s=100.0 * plant.Pu))
-    return process, result.value.gains if result.value else None, result.ended, result.plant_time_s
+
+    def heard(event: Event) -> None:
+        loop.hear(event)
+        on_event(event)
+
+    return run(plan, loop, limits=RunLimits(max_time_s=100.0 * plant.Pu), on_event=heard), loop

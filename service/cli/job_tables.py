@@ -94,6 +94,7 @@ def decision_report(job: JobView, pv_unit: str = "PV unit") -> None:
     if gains is not None:
         terms = [f"Kp {cell(gains.Kp)} % per {pv_unit}", f"Ti {cell(gains.Ti)} s"]
         terms += [f"Td {cell(gains.Td)} s"] if gains.Td else []
+        terms += [f"b {cell(gains.b)}"] if gains.b != 1.0 else []
         _say(f"{job.loop} has {', '.join(terms)}: {'the new' if job.state is JobState.ACCEPTED else 'its old'} gains")
     _show_next_steps(job)
 
