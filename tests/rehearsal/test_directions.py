@@ -105,7 +105,7 @@ def test_a_gain_that_differs_below_is_refused_where_MV_goes_there(below: float, 
 
 
 def test_where_MV_hardly_goes_there_the_gains_hold_for_the_side_that_was_tested() -> None:
-    found = of_two_sided(0.7, Directions.UP, 0.25, 10.0).value
+    found = of_two_sided(0.7, Directions.UP, 0.25, 12.0).value
     assert found is not None and any(UNSEEN in note for note in found.notes)
     above, below = (margins(FOPDT(K, 10.0, 2.0 + 0.05), found.gains).Ms for K in (2.0, 1.4))
     assert above == pytest.approx(1.6, abs=0.05)

@@ -140,7 +140,8 @@ def test_new_gains_take_over_without_a_bump() -> None:
     found = Retuned(LAG, PI, heard_of(LAG, PI))
     at = next(i for i in range(1, len(found.taken)) if found.taken[i].sp != found.taken[i - 1].sp)
     moved = found.taken[at].mv - found.taken[at - 1].mv
-    assert moved == pytest.approx(found.trials[0].tested.Kp * 1.0, abs=8.0 * NOISE * found.trials[0].tested.Kp)
+    tested = found.trials[0].tested
+    assert moved == pytest.approx(tested.b * tested.Kp * 1.0, abs=8.0 * NOISE * tested.Kp)
 
 
 @pytest.mark.parametrize(
