@@ -34,7 +34,8 @@ from loopwright.tuning.analysis.recursion import recursive
 from loopwright.tuning.fast.proposal import FastProposal
 from loopwright.tuning.models import Reals, TransferFunction, sign
 from loopwright.tuning.operation.accepted_model import AcceptedModel
-from loopwright.tuning.operation.compared_change import AFTER, ComparedChange, compare_change
+from loopwright.tuning.operation.change_findings import ComparedChange
+from loopwright.tuning.operation.compared_change import AFTER, compare_change
 from loopwright.tuning.operation.growing_oscillation import growing
 from loopwright.tuning.operation.history import Stretch
 from loopwright.tuning.operation.load_changes import load_changes

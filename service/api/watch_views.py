@@ -16,7 +16,7 @@ from loopwright.service.states.acceptance_watch import (
     instead_in_words,
 )
 from loopwright.service.states.job_state import JobState
-from loopwright.tuning.operation.compared_change import ChangeState, DifferenceKind, OtherPlant
+from loopwright.tuning.operation.change_findings import ChangeState, DifferenceKind, OtherPlant
 from loopwright.tuning.operation.model_conclusion import ModelState
 
 

@@ -7,7 +7,7 @@ from enum import StrEnum
 
 from pydantic import BaseModel, ConfigDict
 
-from loopwright.tuning.operation.compared_change import ChangeState, ComparedChange, DifferenceKind, OtherPlant
+from loopwright.tuning.operation.change_findings import ChangeState, ComparedChange, DifferenceKind, OtherPlant
 from loopwright.tuning.operation.model_conclusion import Conclusion, ModelState, conclusion_of
 
 CHANGES = 3

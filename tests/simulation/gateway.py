@@ -233,13 +233,18 @@ class SimEngine:
         self._run = None
 
 
+_EMPTIED = (
+    "webhook_deliveries", "watches", "sample_chunks", "events", "retune_loops", "retunes", "jobs", "loops", "audit",
+)  # fmt: skip
+
+
 class SimStore(Store):
-    """on_statement: before each call of the database.  on_move: after a job has got another state."""
+    """on_statement: before each call of the database.  after_move: after a job has got another state."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self.on_statement: Callable[[str], None] | None = None
-        self.on_move: Callable[[Job, JobState], None] | None = None
+        self.after_move: Callable[[Job, JobState], None] | None = None
         self._seen: list[Job] | None = None
         event.listen(self.engine, "before_cursor_execute", self._before_statement)
         event.listen(self.engine, "commit", self._before_commit)
@@ -264,9 +269,9 @@ class SimStore(Store):
         return self._seen
 
     def empty(self) -> None:
-        self.on_statement = self.on_move = None
+        self.on_statement = self.after_move = None
         with self.engine.begin() as connection:
-            for table in ("watches", "sample_chunks", "events", "retune_loops", "retunes", "jobs", "loops", "audit"):
+            for table in _EMPTIED:
                 if table in self._tables:
                     connection.execute(text(f"DELETE FROM {table}"))
 
@@ -278,8 +283,8 @@ class SimStore(Store):
         self, job_id: str, wanted: JobState, by: str = "service", also: WithJob | None = None, **columns: Any
     ) -> Job:
         row = super().move(job_id, wanted, by, also, **columns)
-        if self.on_move is not None:
-            self.on_move(row, wanted)
+        if self.after_move is not None:
+            self.after_move(row, wanted)
         return row
 
 

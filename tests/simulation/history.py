@@ -182,7 +182,7 @@ class World:
         gateway = Gateway(self.wire, name, number, node, {TAG: config}, self.tune_of, open_loop)
         self.gateways.append(gateway)
         self.simulation.after(0.2 + 0.1 * number, gateway.start)
-        gateway.store.on_move = lambda row, state: self._moved(gateway, row, state)
+        gateway.store.after_move = lambda row, state: self._moved(gateway, row, state)
         gateway.on_start = lambda process: process.on_death.append(lambda: self._died(gateway))
         return gateway
 
@@ -247,7 +247,7 @@ class World:
             simulation.end()
             simulation.keeps_log = kept
         for gateway in self.gateways:
-            gateway.store.on_statement = gateway.store.on_move = None
+            gateway.store.on_statement = gateway.store.after_move = None
             for row in gateway.rows():
                 ending.jobs.append((row.state, row.reason or ""))
         ending.bad = self.invariants.bad

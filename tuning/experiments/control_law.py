@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-from scipy.signal import lfilter
 
+from loopwright.tuning.analysis.recursion import recursive
 from loopwright.tuning.gains import Gains, Parallel, Series, of_parallel, of_series
 from loopwright.tuning.models import Reals
 from loopwright.tuning.reasons import Refused
@@ -44,7 +44,7 @@ class ControlLaw:
         if gains.Td > 0.0:
             decay, kick = gains.Tf / (gains.Tf + Ts), Kp * gains.Td / (gains.Tf + Ts)
             moved = np.diff(gains.c * sp - seen, prepend=gains.c * sp[0] - seen[0])
-            u += lfilter([kick], [1.0, -decay], moved)
+            u += recursive(np.array([1.0, -decay]), kick * moved)
         return np.asarray(u)
 
     def poles(self, Ts: float) -> tuple[float, ...]:
@@ -60,8 +60,7 @@ class ControlLaw:
         if not self.filter_s > 0.0:
             return pv
         pole = self.filter_s / (self.filter_s + Ts)
-        seen, _ = lfilter([1.0 - pole], [1.0, -pole], pv, zi=[pole * pv[0]])
-        return np.asarray(seen)
+        return np.asarray(pv[0] + recursive(np.array([1.0, -pole]), (1.0 - pole) * (pv - pv[0])))
 
 
 class LawDifference(StrEnum):

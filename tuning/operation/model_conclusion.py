@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from loopwright.tuning.operation.compared_change import ChangeState, ComparedChange, OtherPlant
+from loopwright.tuning.operation.change_findings import ChangeState, ComparedChange, OtherPlant
 
 ALIKE, ALIKE_DEVIATIONS = 0.5, 3.0
 """Largest difference of the sizes of an alternative in two changes that show the same one: a fraction of the larger

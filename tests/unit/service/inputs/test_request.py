@@ -103,7 +103,7 @@ def test_fast_designs_for_every_form() -> None:
         ({"method": "five-stage", "ms": 1.6}, 'ms: of "method": "fast", not of five-stage; its options are'),
         ({"method": "simc", "careful": False}, "method_options"),
         ({"method": "simc", "pattern": "*"}, "pattern: no option of simc; its options are"),
-        ({"ms_aim": 1.4}, "ms_aim: no option of fast; its options are"),
+        ({"ms_aim": 1.4}, "ms_aim: no option of fast; did you mean aim?; its options are"),
         # of the rule
         ({"method": "simc", "method_options": {"lambda_s": 1}}, "simc has no option 'lambda_s'; it has: controller"),
         ({"method": "five-stage", "method_options": {"tau_c_s": 1}}, "robust has no option 'tau_c_s'"),

@@ -9,13 +9,8 @@ import pytest
 
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.operation.accepted_model import AcceptedModel, driven
-from loopwright.tuning.operation.compared_change import (
-    AFTER,
-    ChangeState,
-    ComparedChange,
-    DifferenceKind,
-    compare_change,
-)
+from loopwright.tuning.operation.change_findings import ChangeState, ComparedChange, DifferenceKind
+from loopwright.tuning.operation.compared_change import AFTER, compare_change
 from loopwright.tuning.operation.load_changes import load_changes
 from loopwright.tuning.operation.model_conclusion import Conclusion, ModelState, conclusion_of
 from tests.unit.tuning.operation.simulated import GAINS, MODEL, PLANT, PU, TS, operated, periods
