@@ -48,7 +48,7 @@ HEAD = (
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What one record told. length: Pu.  error: of Ms.  bound: one standard deviation of Ms."""
+    """What one record shows. length: Pu.  error: of Ms.  bound: one standard deviation of Ms."""
 
     plant: str
     method: str
@@ -64,7 +64,7 @@ def bound(record: ExperimentRecord, plant: Plant, gains: Gains, noise: float) ->
     record: its PV serves as the scale alone.  noise: the standard deviation of white noise on PV.
     Source: the Cramer-Rao inequality, with the information of the parameters at the true plant, by the delta method.
     """
-    fit = Fit(replace(record, lengths=()))
+    fit = Fit(record)
     rates = plant.Ts / time_constants(plant.model())
     structure = FIRST if len(rates) == 1 else SECOND
     logs = np.log([float(np.sum(rates)), float(np.prod(rates))][: structure.lags])

@@ -22,7 +22,7 @@ LOWEST, HIGHEST = 1e-5, 1e3
 PER_DECADE, PER_TURN = 300, 48
 """Frequencies in a decade, and in a turn of the longest delay up to DELAYS ultimate frequencies."""
 DELAYS = 20.0
-MOST_TURNED = 0.5
+MAX_TURN = 0.5
 """Radians between two frequencies of the grid."""
 ROUNDS = 24
 AGREES = 0.1
@@ -128,7 +128,7 @@ def _followed(loop: Response, w: Reals) -> tuple[Reals, Complexes]:
     """The grid, finer where 1 + L turns fast, and 1 + L on it."""
     curve = 1.0 + loop.along(w)
     for _ in range(ROUNDS):
-        wide = np.flatnonzero(np.abs(np.angle(curve[1:] / curve[:-1])) > MOST_TURNED)
+        wide = np.flatnonzero(np.abs(np.angle(curve[1:] / curve[:-1])) > MAX_TURN)
         if not len(wide):
             return w, curve
         between = 0.5 * (w[wide] + w[wide + 1])

@@ -179,7 +179,8 @@ def _second_path(
     second = find_second_path(fit, found)
     if second is None or second.gain < -RIVAL_BIC:
         return reason, detail
-    what = f"{100.0 * second.share:.0f} % of MV's effect came {second.later_s:.3g} s later than the rest"
+    part = f"{100.0 * second.share:.0f} %" if second.share < 1.0 else "most"
+    what = f"{part} of MV's effect came {second.later_s:.3g} s later than the rest"
     if reason is None:
         return Reason.AMBIGUOUS, f"the record looks as if {what}, as much as if a load disturbance had come"
     explained = max(MAX_RESIDUAL * fit.record.noise / fit.record.output_range, NEGLIGIBLE_RESIDUAL)
