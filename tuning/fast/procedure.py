@@ -19,6 +19,7 @@ from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.ramp import ramped
 from loopwright.tuning.fast.evaluation import Evaluation
 from loopwright.tuning.fast.experiment import on_trial
+from loopwright.tuning.fast.look import or_a_pi
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.outcome import evaluated
 from loopwright.tuning.fast.proposal import (
@@ -132,7 +133,9 @@ def by_relay(facts: Facts, options: FastOptions, experiment: RelayTest) -> Plan[
     if evaluation is not None:
         yield from experiment.report(StageDone("design", evaluation_summary(evaluation)))
     if isinstance(outcome, Refused):
-        raise outcome
+        if evaluation is None:
+            raise outcome
+        raise (yield from experiment.computed(partial(or_a_pi, facts, options, evaluation, outcome)))
     assert evaluation is not None
 
     shown: VerifiedStep | None = None

@@ -11,7 +11,7 @@ import math
 from functools import partial
 
 from loopwright.tuning.experiments.ramp import slow_words
-from loopwright.tuning.fast.look import Look, look_at, settled
+from loopwright.tuning.fast.look import Look, look_at, or_a_pi, settled
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.pulse_levels import back_level, last_level, last_level_of_one_side, second_level
 from loopwright.tuning.fast.pulse_test import BACK, DOWN, UP, PulseTest
@@ -80,7 +80,10 @@ def pulsed(test: PulseTest, options: DesignOptions, relay_follows: bool) -> Plan
             yield from test.report(Note(words))
             return Look(own, look.evaluation, None)
         if samples >= longest:
-            return _at_the_end(test, look)
+            refusal = _refusal_at_the_end(test, look)
+            if look.evaluation is not None:
+                refusal = yield from test.computed(partial(or_a_pi, facts, options, look.evaluation, refusal))
+            return Look(own, look.evaluation, refusal)
         if look.refusal is not None:
             if relay_follows and _relay_is_shorter(look, samples):
                 raise TooLittleExcited(look.refusal, test)
@@ -142,16 +145,15 @@ def _trial_instead(test: PulseTest, look: Look, longest: float) -> str | None:
     return f"{known}; {takes}: the step under the new gains shall tell it"
 
 
-def _at_the_end(test: PulseTest, look: Look) -> Look:
-    """The last look with its refusal, where the record has lasted as long as it may."""
+def _refusal_at_the_end(test: PulseTest, look: Look) -> Refused:
+    """The refusal of the last look, where the record has lasted as long as it may."""
     refusal = look.refusal
     if refusal is None:
         text = f"after {test.elapsed} samples two successive evaluations still disagree on the gains"
-        return Look(look.period, look.evaluation, Refused(Reason.UNCERTAIN, text))
+        return Refused(Reason.UNCERTAIN, text)
     if math.isfinite(test.facts.sp_rate_max_per_s) and refusal.reason is Reason.UNCERTAIN:
-        text = f"{refusal.detail}; {slow_words(test.facts)}, which excites little"
-        return Look(look.period, look.evaluation, Refused(Reason.UNCERTAIN, text))
-    return look
+        return Refused(Reason.UNCERTAIN, f"{refusal.detail}; {slow_words(test.facts)}, which excites little")
+    return refusal
 
 
 def _relay_is_shorter(look: Look, samples: int) -> bool:

@@ -20,6 +20,7 @@ from loopwright.tuning.fast.setpoint_procedure import setpoint
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.plan import Event, Mode, Note, Sample, StageDone
+from loopwright.tuning.reasons import Reason
 
 STEP = 1.0
 SHALL_TELL = "the step under the new gains shall tell it"
@@ -37,7 +38,12 @@ class PulsedLoopTest:
 
 
 def rehearsed(
-    plant: TransferFunction, part_of_Ku: float, noise: float, verify: bool = True, one_sided: bool = False
+    plant: TransferFunction,
+    part_of_Ku: float,
+    noise: float,
+    verify: bool = True,
+    one_sided: bool = False,
+    derivative: bool = False,
 ) -> PulsedLoopTest:
     """A test on a loop of which Kp is this part of Ku, and Ti is Pu; noise in permitted steps."""
     Ku, Pu = ultimate_point(plant)
@@ -59,7 +65,7 @@ def rehearsed(
         elif isinstance(event, StageDone) and isinstance(event.result, PulseFigures):
             figures.append(event.result)
 
-    plan = setpoint(facts, DesignOptions(verify=verify, propose_anyway=True))
+    plan = setpoint(facts, DesignOptions(derivative=derivative, verify=verify, propose_anyway=True))
     result = run(plan, loop, limits=RunLimits(max_time_s=100.0 * Pu), on_event=hear, on_samples=taken.extend)
     passed = sum(value for stage, value in result.plant_time_s.items() if stage in ("pulses", "verify")) / Pu
     return PulsedLoopTest(result, notes, figures[0] if figures else None, taken, passed)
@@ -110,3 +116,10 @@ def test_further_pulses_to_one_side_go_back_to_rest_at_most() -> None:
     assert test.pulses is not None and test.pulses.turns > 2
     pulses = [each.sp for each in test.samples]
     assert min(pulses) >= 0.0 and max(pulses) <= STEP
+
+
+def test_a_PID_that_sluggish_gains_do_not_show_is_refused_with_the_PI_that_they_do() -> None:
+    refused = rehearsed(THREE_LAGS, part_of_Ku=0.02, noise=0.02, derivative=True)
+    assert refused.result.ended is not None and refused.result.ended.reason in (Reason.UNCERTAIN, Reason.AMBIGUOUS)
+    assert "Ms of a PI is known to +0." in refused.result.ended.detail
+    assert rehearsed(THREE_LAGS, part_of_Ku=0.02, noise=0.02).result.value is not None
