@@ -76,7 +76,7 @@ def pulsed(test: PulseTest, options: DesignOptions, relay_follows: bool) -> Plan
             MAX_PERIODS_IN_ALL * own,
             MAX_TURNS_IN_ALL * turned_at,
         )
-        if options.verify and (words := _trial_instead(test, look, longest)) is not None:
+        if options.verify and (words := _trial_instead(test, look, last, longest)) is not None:
             yield from test.report(Note(words))
             return Look(own, look.evaluation, None)
         if samples >= longest:
@@ -129,18 +129,22 @@ def _turn_up(test: PulseTest) -> Plan[None]:
     yield from test.turn_within_bounds(last_level_of_one_side if test.facts.one_sided else last_level, UP)
 
 
-def _trial_instead(test: PulseTest, look: Look, longest: float) -> str | None:
+def _trial_instead(test: PulseTest, look: Look, last: Look, longest: float) -> str | None:
     """Why the step under the new gains follows though Ms is not known well enough; None where it shall not.
 
+    last: the look before. Where that one knew Ms better, something else has moved PV since.
     longest: the length of the longest record, in samples.
     """
-    if look.evaluation is None or look.refusal is None or not trial_may_tell(look.evaluation, look.refusal):
+    now, before = look.evaluation, last.evaluation
+    if now is None or look.refusal is None or not trial_may_tell(now, look.refusal):
+        return None
+    if before is not None and open_by(now) > open_by(before):
         return None
     samples = test.elapsed
-    needed = min(samples_needed(look.evaluation, samples), longest) - samples
+    needed = min(samples_needed(now, samples), longest) - samples
     if needed <= TRIAL_PERIODS * look.period and samples < longest:
         return None
-    known = f"Ms of the new gains is known to +{open_by(look.evaluation):.2g}"
+    known = f"Ms of the new gains is known to +{open_by(now):.2g}"
     takes = f"further pulses would take {max(needed, 0.0) * test.facts.sample_time_s:.3g} s more to tell it better"
     return f"{known}; {takes}: the step under the new gains shall tell it"
 
