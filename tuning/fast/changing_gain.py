@@ -32,11 +32,13 @@ class ChangingGain:
     """A gain that changes with MV and explains a record without load disturbances.
 
     what: how the gain changes, in words.
+    size: the size of the change, see `ScoreTests.score`.
     bic_gain: by how much it lowers BIC below the model with load disturbances; negative where it raises BIC.
     rms: the rms of the residual that it leaves, as a fraction of the range of PV.
     """
 
     what: str
+    size: float
     bic_gain: float
     rms: float
 
@@ -76,4 +78,4 @@ def _fitted(fit: Fit[ExperimentRecord], best: Fitted, alternative: GainAlternati
     size = (changing / linear).real * fit.record.input_range / second.record.input_range if linear else math.inf
     if abs(size) < alternative.minimum:
         return None
-    return ChangingGain(alternative.words(size), found.bic_gain, found.rms)
+    return ChangingGain(alternative.words(size), size, found.bic_gain, found.rms)
