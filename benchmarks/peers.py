@@ -24,17 +24,17 @@ import numpy as np
 from benchmarks.cases import ASKED, CASES, PLAIN, Case
 from benchmarks.command import check_names
 from benchmarks.drawn_runs import kept, saved
-from benchmarks.plants import Plant, plants
+from benchmarks.plants import Plant
 from benchmarks.tuning import (
     T95_PERIODS,
     WRONG,
     Ran,
+    asked_for,
     evaluated,
     loads,
     loop_of,
     runs_of,
     runs_parser,
-    some,
     span_of,
     spread,
 )
@@ -161,7 +161,7 @@ def main() -> None:
 
 
 def _runs(given: argparse.Namespace) -> Iterator[Ran]:
-    chosen = some(plants(), given)
+    chosen = asked_for(given)
     done = {(ran.case, ran.plant, ran.seed): ran for ran in saved(Ran, given.save)}
     for seed in given.seeds:
         for plant in chosen:

@@ -32,6 +32,7 @@ from benchmarks.disturbances import Disturbance, Disturbed
 from benchmarks.drawn_runs import Draw, DrawNames, run_all, saved
 from benchmarks.operation import PRESENT, chosen, present_gains
 from benchmarks.plants import Plant, plants
+from benchmarks.random_plants import random_plants
 from benchmarks.tuning import T95_PERIODS, WRONG, Ran, evaluated, loads, some
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
@@ -236,6 +237,8 @@ def runs(given: argparse.Namespace) -> Iterator[Pulsed]:
     """The runs asked for: those that the file holds, and the others, on so many processes."""
     cases = given.cases.split(";")
     which = chosen("kept-apart", 1) if given.kept_apart else plants()
+    if given.random:
+        which = random_plants(given.random)
     if given.of_batch:
         apart = chosen("kept-apart", 1)
         which = [each for each in which if each not in apart]

@@ -3,6 +3,7 @@
     python -m benchmarks.tuning [--plants N] [--part I/N] [--seeds N] [--cases "PI 1 %;..."] [--save FILE] [--of FILE]
     python -m benchmarks.tuning --method setpoint ...       # pulses of the set-point: `benchmarks.pulses`
     python -m benchmarks.tuning --cases trouble [--method setpoint] ...      # plants in trouble: `benchmarks.trouble`
+    python -m benchmarks.tuning --random 1000-1099 [--method setpoint] ...   # plants drawn at random
 
 The plants are 70 of the Astrom-Hagglund batch, the 50 models of the five-stage paper and the linearised reactor (every
 n-th with --plants N). Each run is a rehearsal: listening, relay, fit, step, fit. Noise is white, its standard deviation
@@ -32,6 +33,7 @@ from benchmarks.command import check_names, parser_of
 from benchmarks.disturbances import Disturbed
 from benchmarks.drawn_runs import kept, saved
 from benchmarks.plants import REACTOR, SAMPLES_PER_PERIOD, Plant, plants
+from benchmarks.random_plants import random_plants
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim import reactor
@@ -279,6 +281,9 @@ def runs_parser(doc: str | None) -> argparse.ArgumentParser:
     parser.add_argument(
         "--part", type=_part, default="0/1", metavar="I/N", help="every N-th of these plants, from the I-th on"
     )
+    parser.add_argument(
+        "--random", type=_seeds, metavar="FIRST-LAST", help="plants drawn at random: `benchmarks.random_plants`"
+    )
     parser.add_argument("--seeds", type=_seeds, default="1", metavar="N", help="so many, or FIRST-LAST")
     parser.add_argument("--save", type=Path, help="a line of JSON for every run; what it holds is not run again")
     parser.add_argument("--of", type=Path, help="the table of such a file, nothing is run")
@@ -343,6 +348,11 @@ def main() -> None:
             print(f"{each.case}, {each.plant}, seed {each.seed}: Ms {each.Ms}")
 
 
+def asked_for(given: argparse.Namespace) -> list[Plant]:
+    """Of the list, or those drawn at random."""
+    return some(random_plants(given.random) if given.random else plants(), given)
+
+
 def some(everything: Sequence[Plant], given: argparse.Namespace) -> list[Plant]:
     """As many of these plants as were asked for, spread over the list."""
     step = len(everything) / min(given.plants or len(everything), len(everything))
@@ -352,7 +362,7 @@ def some(everything: Sequence[Plant], given: argparse.Namespace) -> list[Plant]:
 
 
 def _runs(given: argparse.Namespace) -> Iterator[Ran]:
-    chosen = some(plants(), given)
+    chosen = asked_for(given)
     cases = given.cases.split(";")
     done = {(ran.case, ran.plant, ran.seed): ran for ran in saved(Ran, given.save)}
     # a batch that is stopped leaves rows of the same plants, drawn at random

@@ -17,9 +17,9 @@ from loopwright.tuning.fast.manual_procedure import MAX_PERIODS as MAX_PERIODS_I
 from loopwright.tuning.fast.manual_procedure import MAX_T95 as MAX_T95_IN_MANUAL
 from loopwright.tuning.fast.manual_test import ANSWER_T95, BACK_PULSES, BACK_T95, LONGEST_PULSE_T95, MAX_RAISES
 from loopwright.tuning.fast.procedure import MIN_SAMPLES
+from loopwright.tuning.fast.pulses import MAX_PERIODS as MAX_PERIODS_OF_PULSES
+from loopwright.tuning.fast.pulses import MAX_T95
 from loopwright.tuning.fast.relay_test import MAX_PERIODS
-from loopwright.tuning.fast.setpoint_procedure import MAX_PERIODS as MAX_PERIODS_OF_PULSES
-from loopwright.tuning.fast.setpoint_procedure import MAX_T95
 
 PU_OF_T95 = (0.07, 0.95)
 """Ultimate period as a fraction of T95: the range of eight in ten of 116 self-regulating plants."""

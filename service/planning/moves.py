@@ -235,8 +235,8 @@ def _setpoint(stage: str, config: LoopConfig, before: Before) -> Moves:
     if stage == "pulses":
         pulses = f"{way}, back and {way} again" if one_sided else "up, down and up again"
         what = (
-            f"The set-point moves {pulses} by up to {step:.4g} {unit} under the present gains; the loop stays in "
-            f"automatic.{_ramp(config, step)}"
+            f"The set-point moves {pulses} by up to {step:.4g} {unit} under the present gains, and on so while the "
+            f"record is not conclusive; the loop stays in automatic.{_ramp(config, step)}"
         )
         if one_sided:
             what += " A gain that differs above and below where it begins is not seen."

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass, replace
 
 from loopwright.tuning.fast.design import DesignSpec, GainDesign, OptimalGains
+from loopwright.tuning.fast.instead_of_loads import instead_of_loads
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.fast.score_tests import ScoreTests
-from loopwright.tuning.fast.second_path import find_second_path
 from loopwright.tuning.fast.structure_choice import RIVAL_BIC, StructureChoice, choose_structure
 from loopwright.tuning.fast.uncertainty import difference_of_rivals, durbin_watson_ratio, peak, uncertainty_of_Ms
 from loopwright.tuning.fast.valve_faults import find_valve_fault
@@ -134,7 +134,7 @@ def evaluate(
         if reason is None:
             reason, detail = _load_with_the_step(fit, found, earlier, best.gains)
     if earlier is not None or not test_follows:
-        reason, detail = _second_path(fit, found, reason, detail)
+        reason, detail = _instead_of_loads(fit, found, reason, detail)
     return Evaluation(
         reason=reason,
         detail=detail,
@@ -168,24 +168,27 @@ def _nonlinearity(fit: Fit[ExperimentRecord], found: Fitted) -> tuple[Reason, st
     return None
 
 
-def _second_path(
+def _instead_of_loads(
     fit: Fit[ExperimentRecord], found: Fitted, reason: Reason | None, detail: str
 ) -> tuple[Reason | None, str]:
-    """The reason and the detail with what a second path in place of the load disturbances says to them.
+    """The reason and the detail with what a second path, or a gain that changes with MV, in place of the load
+    disturbances says to them.
 
-    Where it explains the record as well as the load disturbances do, the model is ambiguous: PV answers the next step
-    twice where there is a second path, and a load disturbance stays as it is.
+    Where one of them explains the record as well as the load disturbances do, the model is ambiguous: PV answers the
+    next step twice where there is a second path, and a load disturbance stays as it is. A gain that changes explains
+    the record better or not at all.
     """
-    second = find_second_path(fit, found)
-    if second is None or second.gain < -RIVAL_BIC:
+    instead = instead_of_loads(fit, found)
+    if instead is None or instead.bic_gain < -RIVAL_BIC:
         return reason, detail
-    part = f"{100.0 * second.share:.0f} %" if second.share < 1.0 else "most"
-    what = f"{part} of MV's effect came {second.later_s:.3g} s later than the rest"
+    what = f"the record looks as if {instead.what}"
+    if reason is None and instead.changing and instead.bic_gain > MIN_BIC_GAIN:
+        return Reason.UNEXPLAINED, f"{what}, more than as if a load disturbance had come"
     if reason is None:
-        return Reason.AMBIGUOUS, f"the record looks as if {what}, as much as if a load disturbance had come"
+        return Reason.AMBIGUOUS, f"{what}, as much as if a load disturbance had come"
     explained = max(MAX_RESIDUAL * fit.record.noise / fit.record.output_range, NEGLIGIBLE_RESIDUAL)
-    if second.share < 1.0 and second.gain > MIN_BIC_GAIN and second.rms <= explained:
-        detail = f"{detail}; the record looks as if {what}"
+    if instead.plausible and instead.bic_gain > MIN_BIC_GAIN and instead.rms <= explained:
+        detail = f"{detail}; {what}"
     return reason, detail
 
 

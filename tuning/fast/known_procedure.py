@@ -23,9 +23,10 @@ from loopwright.tuning.fast.evaluation import NEGLIGIBLE_RESIDUAL, Evaluation, e
 from loopwright.tuning.fast.experiment import STEP_BACK_FRACTION, VERIFICATION_PERIODS, Experiment, on_trial
 from loopwright.tuning.fast.known_plant import ObservedPlant
 from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.outcome import OPEN_REASONS, outcome_of
+from loopwright.tuning.fast.outcome import outcome_of
 from loopwright.tuning.fast.proposal import FastProposal, VerifiedStep, evaluation_summary, proposed, verified_step
 from loopwright.tuning.fast.record import MIN_LISTENED, ExperimentRecord
+from loopwright.tuning.fast.still_open import OPEN_REASONS
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Note, Plan, Sample, SetGains, SetSetpoint, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason, Refused

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.controller_effect import with_controller
@@ -12,6 +12,7 @@ from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.outcome import refusal_of
 from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.fast.record_evaluation import evaluate_excitation
+from loopwright.tuning.fast.still_open import OPEN_REASONS, open_by, trial_may_tell
 from loopwright.tuning.fast.uncertainty import peak
 from loopwright.tuning.reasons import Refused
 
@@ -42,6 +43,22 @@ def look_at(facts: Facts, options: DesignOptions, record: ExperimentRecord) -> L
     except Refused as refused:
         return Look(record.period, None, refused)
     return Look(evaluation.fit.period, evaluation, refusal_of(facts, evaluation))
+
+
+def or_a_pi(facts: Facts, options: DesignOptions, evaluation: Evaluation, refused: Refused) -> Refused:
+    """The refusal that follows from an evaluation, with what its record says of a PI where a PID was asked for.
+
+    A PID needs the plant at higher frequencies than a PI, which the record may not show.
+    """
+    if not options.derivative or refused.reason not in OPEN_REASONS:
+        return refused
+    look = look_at(facts, replace(options, derivative=False), evaluation.fit.record)
+    if look.evaluation is None:
+        return refused
+    if look.refusal is not None and not (options.verify and trial_may_tell(look.evaluation, look.refusal)):
+        return refused
+    known = f"Ms of a PI is known to +{open_by(look.evaluation):.2g}"
+    return Refused(refused.reason, f"{refused.detail}; {known}: ask for one, without derivative action")
 
 
 def settled(look: Look, last: Look, samples: int, asked: float, max_disagreement: float = MAX_DISAGREEMENT) -> bool:

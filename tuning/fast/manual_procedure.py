@@ -17,10 +17,10 @@ from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.look import Look, look_at, settled
 from loopwright.tuning.fast.manual_test import ManualTest
 from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.outcome import OPEN_REASONS
 from loopwright.tuning.fast.proposal import FastProposal, comparison_of, evaluation_summary, proposed
 from loopwright.tuning.fast.record import MIN_LISTENED
 from loopwright.tuning.fast.record_evaluation import first_period
+from loopwright.tuning.fast.still_open import OPEN_REASONS
 from loopwright.tuning.plan import Mode, Note, Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
 

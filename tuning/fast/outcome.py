@@ -13,9 +13,6 @@ from loopwright.tuning.fast.record_evaluation import evaluate_excitation
 from loopwright.tuning.models import sign
 from loopwright.tuning.reasons import Reason, Refused
 
-OPEN_REASONS = (Reason.UNCERTAIN, Reason.AMBIGUOUS)
-"""Reasons for a refusal that a longer record of the same kind may remove."""
-
 
 def outcome_of(facts: Facts, options: DesignOptions, evaluation: Evaluation) -> Refused | Comparison:
     """The refusal that follows from an evaluation, or else the comparison of the present and the new gains.

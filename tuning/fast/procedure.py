@@ -19,17 +19,20 @@ from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.ramp import ramped
 from loopwright.tuning.fast.evaluation import Evaluation
 from loopwright.tuning.fast.experiment import on_trial
+from loopwright.tuning.fast.look import or_a_pi
 from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.outcome import OPEN_REASONS, evaluated
+from loopwright.tuning.fast.outcome import evaluated
 from loopwright.tuning.fast.proposal import (
     FastProposal,
     VerifiedStep,
+    comparison_of,
     evaluation_summary,
     proposed,
     verified_step,
 )
 from loopwright.tuning.fast.record import MIN_LISTENED
 from loopwright.tuning.fast.relay_test import RelayTest
+from loopwright.tuning.fast.still_open import OPEN_REASONS, open_by, trial_may_tell
 from loopwright.tuning.plan import Note, Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -120,12 +123,19 @@ def by_relay(facts: Facts, options: FastOptions, experiment: RelayTest) -> Plan[
         if isinstance(outcome, Comparison) or not in_time or outcome.reason is Reason.CONTROLLER_MISMATCH:
             break
         yield from experiment.report(Note(f"after {switches} switches: {outcome.detail}"))
+    open_still = outcome if isinstance(outcome, Refused) else None
+    if options.verify and evaluation is not None and open_still and trial_may_tell(evaluation, open_still):
+        known = f"Ms of the new gains is known to +{open_by(evaluation):.2g}"
+        yield from experiment.report(Note(f"{known}: the step under the new gains shall tell"))
+        outcome = comparison_of(evaluation, facts, spec, options.propose_anyway)
     # the evaluation is reported even if the record is refused: its numbers say why
     yield from experiment.report(StageDone("relay", experiment.relay_figures()), *started("design"))
     if evaluation is not None:
         yield from experiment.report(StageDone("design", evaluation_summary(evaluation)))
     if isinstance(outcome, Refused):
-        raise outcome
+        if evaluation is None:
+            raise outcome
+        raise (yield from experiment.computed(partial(or_a_pi, facts, options, evaluation, outcome)))
     assert evaluation is not None
 
     shown: VerifiedStep | None = None

@@ -121,6 +121,11 @@ class PulseTest(Experiment):
             if passed > max(max_T95 * self.facts.T95_s, 40 * Ts) + self.facts.ramp_s(self._move):
                 raise self._not_followed(passed)
 
+    def followed_or_for(self, samples: int) -> Plan[None]:
+        """Goes on until PV has followed the last move of the set-point, or for this number of samples since then."""
+        while not self._followed() and len(self.trace) - self.turns[-1] < samples:
+            yield from self.sample()
+
     def lasting(self, samples: float) -> Plan[None]:
         """Goes on until the record has lasted this number of samples since the first pulse."""
         while self.elapsed < samples:

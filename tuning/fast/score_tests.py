@@ -91,10 +91,10 @@ class ScoreTests:
         """The clearest alternative to a linear plant, None where the record shows none of a size that matters for
         Ms."""
         shown = []
-        for changed, minimum, words in ALTERNATIVES:
-            size, deviation = self.score(changed)
-            if abs(size) > max(minimum, STANDARD_DEVIATIONS * deviation):
-                shown.append(Alternative(words(size), size, deviation))
+        for each in ALTERNATIVES:
+            size, deviation = self.score(each.changed)
+            if abs(size) > max(each.minimum, STANDARD_DEVIATIONS * deviation):
+                shown.append(Alternative(each.words(size), size, deviation))
         return max(shown, key=lambda each: abs(each.size) / each.deviation, default=None)
 
     def longest_delay_seen(self) -> float:
@@ -104,9 +104,11 @@ class ScoreTests:
         return max(seen, default=0) * self._fit.record.Ts
 
     def unknown_difference(self) -> float:
-        """By how much the gain may differ above and below rest without a trace in the record, as a fraction of the
-        gain: two standard deviations. Load disturbances in the model can stand for such a difference."""
-        return 2.0 * self.score(above_rest)[1]
+        """By how much the gain may differ above and below rest for all that the record tells, as a fraction of the
+        gain: two standard deviations, and the size itself where that is larger. Load disturbances in the model can
+        stand for such a difference."""
+        size, deviation = self.score(above_rest)
+        return 2.0 * deviation + (abs(size) if abs(size) > 2.0 * deviation else 0.0)
 
     def score(self, changed: Callable[[ExperimentRecord], Reals]) -> tuple[float, float]:
         """The size of an alternative, as a fraction of the plant's gain, and its standard deviation.
@@ -155,5 +157,19 @@ def _fading(size: float) -> str:
     return f"the plant's gain changes by {100.0 * size:+.0f} % in the course of the test"
 
 
-ALTERNATIVES = ((above_rest, 0.05, _sides), (squared, 0.03, _curve), (fading, 0.1, _fading))
-"""The further input of each alternative, the smallest size that matters, and the alternative in words."""
+@dataclass(frozen=True, slots=True)
+class GainAlternative:
+    """An alternative in which the plant's gain is not always the same.
+
+    changed: the further input, MV units, shape (N,), from the record.
+    minimum: the smallest size that matters.
+    words: the alternative of a size in words.
+    """
+
+    changed: Callable[[ExperimentRecord], Reals]
+    minimum: float
+    words: Callable[[float], str]
+
+
+CHANGING_WITH_MV = (GainAlternative(above_rest, 0.05, _sides), GainAlternative(squared, 0.03, _curve))
+ALTERNATIVES = (*CHANGING_WITH_MV, GainAlternative(fading, 0.1, _fading))

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.without_loads import WithoutLoads, at_the_ultimate_period, fit_without_loads
 from loopwright.tuning.identification.output_error import (
-    FLOOR,
     LOG_STEP,
     MAX_LOG_STEP,
     DisturbanceHypothesis,
@@ -22,13 +22,12 @@ from loopwright.tuning.identification.output_error import (
     Fitted,
     sums_of_squares_left,
 )
-from loopwright.tuning.identification.variable_projection import SearchBounds, descend, solve
+from loopwright.tuning.identification.variable_projection import SearchBounds
 from loopwright.tuning.models import Reals
 
 SPACING = 0.25
 """Spacing of the first guesses of how much later the second path acts, in periods."""
-STARTS, MAX_STEPS = 4, 12
-RELATIVE_DECREASE = 1e-5
+STARTS = 4
 MIN_SHARE = 0.05
 """Smallest effect of a second path, as a fraction of the first one at the ultimate period, that matters for Ms."""
 
@@ -39,13 +38,13 @@ class SecondPath:
 
     later_s: how much later it acts than the first one, s.
     share: its effect at the ultimate period, a fraction of that of the first one.
-    gain: by how much it lowers BIC below the model with load disturbances; negative where it raises BIC.
+    bic_gain: by how much it lowers BIC below the model with load disturbances; negative where it raises BIC.
     rms: the rms of the residual that it leaves, as a fraction of the range of PV.
     """
 
     later_s: float
     share: float
-    gain: float
+    bic_gain: float
     rms: float
 
 
@@ -83,27 +82,17 @@ def find_second_path(fit: Fit[ExperimentRecord], best: Fitted) -> SecondPath | N
         np.append(np.full(lags, MAX_LOG_STEP), np.full(2, 0.25 * fit.period)),
         np.append(np.full(lags, LOG_STEP), np.full(2, LOG_STEP * fit.period)),
     )
-    points, left = descend(columns, fit.y, begun, bounded, MAX_STEPS, RELATIVE_DECREASE)
-    found = points[int(np.argmin(left))]
-    regressors = columns(found[None])[0]
-    linear = solve(regressors, fit.y)
-    share = _share(fit, best, found, linear.coefficients)
+    found = fit_without_loads(fit, best, columns, begun, bounded, chosen_among_many=1)
+    share = _share(fit, best, found)
     if share < MIN_SHARE:
         return None
-    # the delay was chosen among many: it counts twice, as the time of a load disturbance does
-    parameters = len(found) + regressors.shape[1] + 1
-    bic = fit.samples * math.log(linear.rss / fit.samples + FLOOR**2) + parameters * math.log(fit.samples)
-    rms = math.sqrt(linear.rss / len(linear.residual))
-    return SecondPath(float(found[-1]) * record.Ts, share, best.bic - bic, rms)
+    return SecondPath(float(found.at[-1]) * record.Ts, share, found.bic_gain, found.rms)
 
 
-def _share(fit: Fit[ExperimentRecord], best: Fitted, found: Reals, coefficients: Reals) -> float:
+def _share(fit: Fit[ExperimentRecord], best: Fitted, found: WithoutLoads) -> float:
     """The effect of the second path over that of the first one at the ultimate period."""
-    structure, inputs = best.structure, best.structure.inputs
-    w = np.array([2.0 * math.pi / (fit.period * fit.record.Ts)])
-    theta = found[:-1]
+    inputs, theta, coefficients = best.structure.inputs, found.at[:-1], found.coefficients
     first, second = (
-        abs(complex(fit.transfer(structure, theta, each).frequency_response(w)[0]))
-        for each in (coefficients[:inputs], coefficients[-inputs:])
+        abs(at_the_ultimate_period(fit, best, theta, each)) for each in (coefficients[:inputs], coefficients[-inputs:])
     )
     return second / first if first > 0.0 else math.inf

@@ -2,22 +2,19 @@
 
     listen - pulses of the set-point under the present gains - fit and design - set-point step home under the new gains
 
-The pulses end when the gains that would be proposed are certain enough: see `look.settled`.
+When the pulses end is decided in `pulses`.
 """
 
 from __future__ import annotations
 
-import math
 from functools import partial
 
 from loopwright.tuning.experiments.preflight import at_rest
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.experiments.ramp import check_ramp, ramped, slow_words
-from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY
+from loopwright.tuning.experiments.ramp import check_ramp, ramped
 from loopwright.tuning.fast.experiment import on_trial
-from loopwright.tuning.fast.look import Look, look_at, settled
 from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.outcome import OPEN_REASONS, evaluated
+from loopwright.tuning.fast.outcome import evaluated
 from loopwright.tuning.fast.proposal import (
     FastProposal,
     VerifiedStep,
@@ -26,47 +23,20 @@ from loopwright.tuning.fast.proposal import (
     proposed,
     verified_step,
 )
-from loopwright.tuning.fast.pulse_levels import back_level, last_level, last_level_of_one_side, second_level
-from loopwright.tuning.fast.pulse_test import BACK, DOWN, UP, PulseTest
-from loopwright.tuning.fast.pulse_test import MAX_T95 as MAX_T95_TO_FOLLOW
-from loopwright.tuning.fast.record import MIN_LISTENED, Excitation
-from loopwright.tuning.fast.record_evaluation import first_period
+from loopwright.tuning.fast.pulse_test import PulseTest
+from loopwright.tuning.fast.pulses import TooLittleExcited, pulsed
+from loopwright.tuning.fast.record import MIN_LISTENED
+from loopwright.tuning.fast.still_open import OPEN_REASONS
 from loopwright.tuning.plan import Note, Plan, StageDone, StageStarted
-from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.reasons import Refused
 
 __all__ = ["SETPOINT", "SETPOINT_STAGES", "TooLittleExcited", "by_pulses", "setpoint"]
 
 SETPOINT = "setpoint"
 SETPOINT_STAGES = ("preflight", "pulses", "design", "verify", "redesign")
 MIN_SAMPLES = 2 * MIN_LISTENED
-FIRST_LOOK = 1.5
-"""Length of the record at the first look, in first periods."""
-NEXT_LOOK, NEXT_LOOK_PERIODS = 1.25, 0.35
-"""Growth of the record from one look to the next: this factor, and this number of periods more."""
-LOOKS_OFTEN, LATER_LOOK = 5, 1.6
-"""After so many looks the record has to grow by this factor from one to the next: each costs more than the last."""
 MAX_MODELS = 4
 """Number of models that are asked whether the step home fits into MV's limits."""
-MAX_PERIODS, MAX_T95, MAX_TURNS = 12.0, 1.5, 2.5
-"""Longest record: the longest of these numbers of ultimate periods, of T95, and of the time of the first two turns."""
-MAX_PERIODS_IN_ALL, MAX_TURNS_IN_ALL = 30.0, 12.0
-"""The record is never longer than these numbers of ultimate periods and of the time of the first two turns. A load
-disturbance can make the first of them far too long."""
-RELAY_PERIODS = 4.0
-"""Time that the relay's record takes, in ultimate periods of the model: where the relay may follow and the pulses would
-take longer than that, they end."""
-
-NOT_FOLLOWED = (Reason.NO_RESPONSE, Reason.STALLED)
-MAX_T95_BEFORE_RELAY = 1.0
-"""Longest time for PV to follow a pulse, in T95, where the relay may follow."""
-
-
-class TooLittleExcited(Refused):
-    """The pulses end early, because the relay may follow and tells more. `test` holds their record."""
-
-    def __init__(self, refused: Refused, test: PulseTest) -> None:
-        super().__init__(refused.reason, refused.detail)
-        self.test = test
 
 
 def setpoint_stages(verify: bool) -> tuple[str, ...]:
@@ -104,53 +74,7 @@ def by_pulses(
     yield from test.report(StageDone("preflight", point))
     check_ramp(facts, test.noise)
     yield from test.report(*started("pulses"))
-    yield from test.start()
-    longest_T95 = MAX_T95_BEFORE_RELAY if relay_follows else MAX_T95_TO_FOLLOW
-    try:
-        yield from test.until_followed(longest_T95)
-        second, wanted = (back_level, BACK) if facts.one_sided else (second_level, DOWN)
-        yield from test.turn_within_bounds(second, wanted)
-        yield from test.until_followed(longest_T95)
-    except Refused as refused:
-        if relay_follows and refused.reason in NOT_FOLLOWED:
-            raise TooLittleExcited(refused, test) from None
-        raise
-    yield from test.turn_within_bounds(last_level_of_one_side if facts.one_sided else last_level, UP)
-    test.period = yield from test.computed(partial(first_period, *test.columns(), facts.sample_time_s))
-    look = Look(test.period, None, Refused(Reason.STALLED, "the pulses came to nothing"))
-    turned_at, looks = test.elapsed, 0
-    at = FIRST_LOOK * test.period
-    while True:
-        yield from test.lasting(at)
-        looked_at = test.elapsed
-        record = test.experiment_record()
-        last, look = look, (yield from test.computed(partial(look_at, facts, options, record)))
-        test.period = look.period
-        if settled(look, last, looked_at, options.Ms):
-            break
-        if look.refusal is not None and look.refusal.reason is Reason.CONTROLLER_MISMATCH:
-            break
-        own = look.period
-        longest = min(
-            max(MAX_PERIODS * own, MAX_T95 * facts.T95_s / facts.sample_time_s, MAX_TURNS * turned_at),
-            MAX_PERIODS_IN_ALL * own,
-            MAX_TURNS_IN_ALL * turned_at,
-        )
-        if looked_at >= longest:
-            if look.refusal is None:
-                text = f"after {looked_at} samples two successive evaluations still disagree on the gains"
-                look = Look(look.period, look.evaluation, Refused(Reason.UNCERTAIN, text))
-            elif math.isfinite(facts.sp_rate_max_per_s) and look.refusal.reason is Reason.UNCERTAIN:
-                text = f"{look.refusal.detail}; {slow_words(facts)}, which excites little"
-                look = Look(look.period, look.evaluation, Refused(Reason.UNCERTAIN, text))
-            break
-        if look.refusal is not None:
-            if relay_follows and _relay_is_shorter(look, looked_at):
-                raise TooLittleExcited(look.refusal, test)
-            yield from test.report(Note(f"after {looked_at} samples: {look.refusal.detail}"))
-        looks += 1
-        growth = NEXT_LOOK if looks < LOOKS_OFTEN else LATER_LOOK
-        at = min(growth * looked_at + NEXT_LOOK_PERIODS * own, longest)
+    look = yield from pulsed(test, options, relay_follows)
     evaluation = look.evaluation
     yield from test.report(StageDone("pulses", test.figures()), *started("design"))
     if evaluation is not None:
@@ -186,15 +110,3 @@ def by_pulses(
     begun_at_s = test.trace.t[test.listened]
     return (yield from test.computed(partial(proposed, method, facts, spec, evaluation, comparison, shown, begun_at_s)))
 
-
-def _relay_is_shorter(look: Look, samples: int) -> bool:
-    """Whether a relay would take less time than the pulses still need.
-
-    The uncertainty of Ms falls at most with the root of the record's length, because the last level of the set-point
-    is held.
-    """
-    by_relay = samples + RELAY_PERIODS * look.period
-    if look.evaluation is None:
-        return samples > RELAY_PERIODS * look.period
-    open_by = max(look.evaluation.uncertainty, look.evaluation.ambiguity)
-    return samples * (open_by / MAX_UNCERTAINTY[Excitation.SETPOINT]) ** 2 > by_relay

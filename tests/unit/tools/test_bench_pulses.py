@@ -29,7 +29,7 @@ def test_a_run_that_is_cut_off_in_the_file_is_made_again_and_the_others_are_not(
     file.write_text("".join(json.dumps(asdict(each)) + "\n" for each in kept) + '{"case": "PI 1')
     given = argparse.Namespace(
         cases="PI 1 %", kept_apart=False, of_batch=False, plants=1, part=(0, 1), seeds=range(1, 2), save=file,
-        processes=1, method="setpoint",
+        processes=1, method="setpoint", random=None,
     )  # fmt: skip
     asked: list[tuple[str, str]] = []
 
