@@ -12,11 +12,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from benchmarks.command import parser_of
 from benchmarks.operation import Kind, operation
 from benchmarks.plants import Plant
+from loopwright.service.cli.plots import style
 from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.gains import Gains
@@ -26,6 +26,8 @@ from loopwright.tuning.operation.observation import Observation, observe
 
 CHANGES, SAMPLES, SEED = 8, 40, 6
 ASKED = 1.6
+LOWEST, HIGHEST = 1.44, 1.76
+"""The axis of Ms."""
 
 
 def plant() -> Plant:
@@ -51,30 +53,40 @@ def drawn(path: Path) -> None:
     history = operation(operated, gains, Kind(noise=0.02, loads=True, most_loads=2), random, CHANGES)
     every = len(history.sp) // (CHANGES + 1)
     found = evaluations(history, every)
-    figure = Figure(figsize=(8.0, 5.2), layout="constrained")
-    top, bottom = figure.subplots(2, 1, sharex=True)
+    figure = style.new_figure(9.0, 6.0)
+    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 4))
     t = np.arange(len(history.sp)) * history.Ts / operated.Pu
-    top.plot(t, history.pv, lw=0.7, label="PV")
-    top.plot(t, history.sp, lw=1.0, color="black", label="SP")
-    top.set_ylabel("permitted steps")
-    top.legend(loc="lower right", ncols=2, fontsize=8)
-    bottom.axhline(ASKED, color="black", lw=0.8, label="Ms asked for")
-    for number, each in enumerate(found, start=1):
-        if each.evaluation is None:
-            continue
+    style.measured(top, np.asarray(t, dtype=np.float64), history.pv)
+    top.step(t, history.sp, where="post", color=style.SETPOINT, linewidth=1.0, linestyle=":")
+    for i, (text, colour) in enumerate((("band: PV", style.MEASURED), ("dotted: set-point", style.SETPOINT))):
+        top.text(0.01, 0.97 - 0.09 * i, text, color=colour, fontsize=8.5, va="top", transform=top.transAxes)
+    bottom.axhline(ASKED, color=style.SETPOINT, linewidth=0.8, linestyle=":")
+    style.text_at(bottom, 0.0, ASKED, f"asked for: {ASKED:g}", style.SETPOINT)
+    shown = [(n, each, each.evaluation) for n, each in enumerate(found, start=1) if each.evaluation is not None]
+    for number, each, evaluation in shown:
         at = ((number + 1) * every - 2) * history.Ts / operated.Pu
-        spread = max(each.evaluation.uncertainty, each.evaluation.ambiguity)
-        colour = "tab:green" if each.reason is None else "tab:red"
-        bottom.errorbar(at, each.evaluation.Ms, spread, color=colour, marker="o", ms=4, capsize=4)
-        true = margins(operated.model(), each.evaluation.best.gains).Ms
-        bottom.plot(at, true, marker="x", color="black", ls="")
-        outcome = "proposed" if each.reason is None else each.reason.value
-        bottom.annotate(f"{len(each.used)} used\n{outcome}", (at, 1.31), ha="center", va="bottom", fontsize=7)
-    bottom.plot([], [], marker="o", color="tab:green", ls="", label="Ms on the model, with uncertainty")
-    bottom.plot([], [], marker="x", color="black", ls="", label="Ms of these gains on the true plant")
-    bottom.set(ylim=(1.3, 2.1), xlabel="time in ultimate periods", ylabel="Ms")
-    bottom.legend(loc="upper right", fontsize=8)
-    figure.savefig(path, dpi=100)
+        spread = max(evaluation.uncertainty, evaluation.ambiguity)
+        proposed = each.reason is None
+        bottom.errorbar(
+            at, evaluation.Ms, spread, color=style.AFTER if proposed else style.BEFORE, marker="o", markersize=5,
+            markerfacecolor=None if proposed else "white", capsize=4, linewidth=1.3,
+        )  # fmt: skip
+        true = margins(operated.model(), evaluation.best.gains).Ms
+        bottom.plot(at, true, marker="x", color=style.SETPOINT, markersize=6, linestyle="", zorder=3)
+        outcome = "proposed" if proposed else str(each.reason)
+        used = f"{len(each.used)} used\n{outcome}"
+        bottom.text(at, LOWEST, used, color="0.25", fontsize=8, ha="center", va="bottom")
+    words = (
+        ("dots: Ms on the model, with its uncertainty; open: not proposed", style.AFTER),
+        ("crosses: Ms of these gains on the true plant", style.SETPOINT),
+    )
+    for i, (text, colour) in enumerate(words):
+        bottom.text(0.01, 0.97 - 0.07 * i, text, color=colour, fontsize=8.5, va="top", transform=bottom.transAxes)
+    top.set_xlim(0.0, float(t[-1]) + 6.0)
+    bottom.set_ylim(LOWEST - 0.01, HIGHEST)
+    style.plain(top, "PV, permitted steps")
+    style.plain(bottom, "Ms", "time, ultimate periods")
+    style.write(figure, path)
 
 
 def main() -> None:

@@ -1,27 +1,32 @@
-"""Plots of the step responses behind the papers' figures and tables, one small PNG each."""
+"""Plots of the step responses behind the papers' figures and tables, one small PNG each, in the look of all plots."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from loopwright.service.cli.plots import style
 from loopwright.tuning.analysis.step_response import step_response
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.models import Model
+from loopwright.tuning.models import Model, Reals
 from loopwright.tuning.rules.registry import tune
 from loopwright.tuning.rules.robust_pi import optimise
 from validation import direct_synthesis, five_stage, imc, me_pso, reactor, s_plane
 from validation.loops import FIVE_LAGS, ideal_pid, of_numerator, plant, sopdt
 from validation.references import References
 
-SIZE_IN = (7.2, 3.4)
-DPI = 80
+SIZE_IN = (7.6, 3.5)
 POINTS = 1200
+NAMED, SHORT = 3, 16
+"""Largest number of curves, and of letters of their names, that have their names at the lines; others have them beside
+the panels."""
 
+Curves = list[tuple[str, Reals, Reals]]
+"""Name, times, s, and values of each."""
 Panel = tuple[str, Model, dict[str, Gains], float]
 """Title, plant, settings by label, length in s."""
 ME_PSO_SHOWN = ("ME-PSO-Error", "ME-PSO-Control", "ME-PSO-Duration", "Skogestad", "Ziegler-Nichols", "AMIGO")
@@ -35,8 +40,8 @@ def draw(references: References, folder: Path) -> None:
     """All of them, by the names that the papers' checks give."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, panels in _panels(references).items():
-        _save(_figure(panels), folder / f"{name}.png")
-    _save(_imc_case_1(references), folder / f"{IMC_CASE_1}.png")
+        style.write(_figure(panels), folder / f"{name}.png")
+    style.write(_imc_case_1(references), folder / f"{IMC_CASE_1}.png")
 
 
 def names(references: References) -> set[str]:
@@ -66,8 +71,8 @@ def _five_stage(references: References) -> dict[str, list[Panel]]:
     for m in tables["table4"]["models_settled"]:
         model = five_stage.table_4_model(tables["table4"], m["id"])
         settings = {
-            "ZN-2": Gains(0.9 * model.T / (model.K * model.L), 3.0 * model.L),
             "optimised": optimise(model, horizon_s=five_stage.TABLE_4_HORIZON_S).gains,
+            "ZN-2": Gains(0.9 * model.T / (model.K * model.L), 3.0 * model.L),
         }
         table_4.append((f"{m['id']}: tau = {model.L:g} s", model, settings, 40.0))
     return {
@@ -77,11 +82,16 @@ def _five_stage(references: References) -> dict[str, list[Panel]]:
             (
                 "Reactor, linearised; PV in mol/m3",
                 reactor.linear_reactor(),
-                reactor.controllers(tables["reactor"]),
+                _foremost("optimised", reactor.controllers(tables["reactor"])),
                 250.0,
             )
         ],
     }
+
+
+def _foremost(name: str, settings: dict[str, Gains]) -> dict[str, Gains]:
+    """The settings with this one first, which is drawn as what a paper is about."""
+    return {name: settings[name], **settings}
 
 
 def _direct_synthesis(references: References) -> dict[str, list[Panel]]:
@@ -103,8 +113,8 @@ def _imc_case_2(references: References) -> dict[str, list[Panel]]:
     model = imc.case_2(references)
     copied = references.more["imc"]["settings42"]
     settings = {
-        "(42) as printed": ideal_pid(copied["Kp"], copied["Ti"], copied["Td"]),
         "(36), psi = 50 s, lambda = 7.4 s": tune("imc-pid", model, psi_s=50.0, lambda_s=7.4, extrapolate=True).gains,
+        "(42) as printed": ideal_pid(copied["Kp"], copied["Ti"], copied["Td"]),
     }
     return {"imc-case-2": [("Case 2, 0.2 exp(-7.4 s)/s", model, settings, 600.0)]}
 
@@ -140,19 +150,18 @@ def _me_pso(references: References) -> dict[str, list[Panel]]:
 
 
 def _figure(panels: list[Panel]) -> Figure:
-    figure = Figure(figsize=SIZE_IN, dpi=DPI, layout="constrained")
+    figure = style.new_figure(*SIZE_IN)
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
-    for i, (ax, (title, model, settings, length_s)) in enumerate(zip(axes, panels, strict=True)):
-        ax.axhline(1.0, color="0.6", linewidth=0.8)
-        for label, gains in settings.items():
-            response = step_response(model, gains, horizon=length_s, dt=length_s / POINTS)
-            ax.plot(response.t, response.y, label=label, linewidth=1.4)
-        ax.set(title=title, xlabel="t, s", xlim=(0.0, length_s))
-        ax.title.set_fontsize(10)
-        ax.grid(alpha=0.3)
-        if i == 0:
-            ax.set_ylabel("PV, step of the set-point = 1")
-    axes[-1].legend(fontsize=8, loc="lower right")
+    for ax, (title, model, settings, length_s) in zip(axes, panels, strict=True):
+        ax.axhline(1.0, color=style.SETPOINT, linewidth=0.8, linestyle=":")
+        answers = {
+            name: step_response(model, gains, horizon=length_s, dt=length_s / POINTS)
+            for name, gains in settings.items()
+        }
+        curves = [(name, each.t, each.y) for name, each in answers.items()]
+        _curves(ax, title, curves, length_s, named=ax is axes[-1])
+    axes[0].set_ylabel("PV, step of the set-point = 1")
+    _legend(figure, axes[-1])
     return figure
 
 
@@ -163,21 +172,42 @@ def _imc_case_1(references: References) -> Figure:
         "IMC-PID": imc.setpoint_error(model, gains),
         "IMC, first-order filter": imc.ideal_imc_error(model, lambda_s),
     }
-    figure = Figure(figsize=SIZE_IN, dpi=DPI, layout="constrained")
+    figure = style.new_figure(*SIZE_IN)
     left, right = figure.subplots(1, 2)
-    for (label, (t, error)), style in zip(errors.items(), ("-", "--"), strict=True):
+    after_step: Curves = []
+    after_disturbance: Curves = []
+    for label, (t, error) in errors.items():
         every = np.arange(0, len(t), max(1, len(t) // POINTS))
-        left.plot(t[every], 1.0 - error[every], style, label=label)
-        right.plot(t[every], imc.disturbed(t, error)[every], style, label=label)
-    left.set(title="set-point step", xlabel="t, s", ylabel="PV", xlim=(0.0, 150.0))
-    right.set(title="disturbance 0.25/(30 s + 1)", xlabel="t, s", xlim=(0.0, 150.0))
-    for ax in (left, right):
-        ax.title.set_fontsize(10)
-        ax.grid(alpha=0.3)
-    right.legend(fontsize=8)
+        after_step.append((label, t[every], 1.0 - error[every]))
+        after_disturbance.append((label, t[every], imc.disturbed(t, error)[every]))
+    left.axhline(1.0, color=style.SETPOINT, linewidth=0.8, linestyle=":")
+    right.axhline(0.0, color=style.SETPOINT, linewidth=0.8, linestyle=":")
+    _curves(left, "set-point step", after_step, 150.0)
+    _curves(right, "disturbance 0.25/(30 s + 1)", after_disturbance, 150.0)
+    left.set_ylabel("PV")
+    _legend(figure, right)
     return figure
 
 
-def _save(figure: Figure, path: Path) -> None:
-    # no version of the library in the file: the same picture is the same bytes
-    FigureCanvasAgg(figure).print_figure(path, dpi=DPI, metadata={"Software": None})
+def _curves(axes: Axes, title: str, curves: Curves, length_s: float, named: bool = False) -> None:
+    """Draws the curves of a panel. named: with their names at the lines, where they are few."""
+    axes.set_xlim(0.0, length_s)
+    for (name, t, y), (colour, line) in zip(curves, style.CURVES, strict=False):
+        axes.plot(t, y, color=colour, linestyle=line, linewidth=1.5, label=name)
+    if named and _at_the_lines([name for name, _, _ in curves]):
+        style.name_curves(
+            axes, [(name, colour, t, y) for (name, t, y), (colour, _) in zip(curves, style.CURVES, strict=False)]
+        )
+    axes.set_title(title, fontsize=10)
+    style.plain(axes, "", "time, s")
+
+
+def _legend(figure: Figure, axes: Axes) -> None:
+    """Names the curves beside the panels, where they are many or have long names."""
+    lines, names = axes.get_legend_handles_labels()
+    if not _at_the_lines(names):
+        figure.legend(lines, names, loc="outside right upper", fontsize=8.5, frameon=False, handlelength=3.2)
+
+
+def _at_the_lines(names: Sequence[str]) -> bool:
+    return len(names) <= NAMED and all(len(name) <= SHORT for name in names)

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from loopwright.service.cli.automatic import (
+    AskedOfFile,
+    ask_for_gains,
+    identify_operation,
+    in_automatic_of,
+    show_tunings_of,
+    trusted,
+    tunings_of,
+)
 from loopwright.service.cli.output import AsJson, die, print_json
 from loopwright.service.cli.tuning import Plot, check_plot, one_thread, save
 
 if TYPE_CHECKING:
+    from loopwright.service.offline.automatic import InAutomatic
     from loopwright.service.offline.csv_record.record import ReadOptions, Record
-    from loopwright.tuning.identification.identify import Identified
 
-GainsInEffect = tuple[float, float, float, float]
-"""Kp, Ti, Td and b, ISA form; times in s."""
 _FILE, _CLOSED_LOOP = "How the file is to be read", "Normal operation in automatic"
 
 
@@ -59,13 +65,17 @@ def identify(
         ),
     ] = None,
     closed_loop: Annotated[
-        bool,
+        bool | None,
         typer.Option(
-            "--closed-loop", help="The file is of normal operation in automatic, with a column of SP; needs --kp.",
-            rich_help_panel=_CLOSED_LOOP,
+            "--closed-loop/--open-loop",
+            help="The loop was in automatic, or MV was moved by hand or by a test signal. Default: as the file shows.",
+            show_default=False, rich_help_panel=_CLOSED_LOOP,
         ),
-    ] = False,
-    kp: Annotated[float | None, typer.Option(help="Kp in effect, ISA form.", rich_help_panel=_CLOSED_LOOP)] = None,
+    ] = None,
+    kp: Annotated[
+        float | None,
+        typer.Option(help="Kp in effect, MV per PV, ISA form; the file needs SP.", rich_help_panel=_CLOSED_LOOP),
+    ] = None,
     ti: Annotated[
         float | None, typer.Option(help="Ti in effect, s; default: no integral action.", rich_help_panel=_CLOSED_LOOP)
     ] = None,
@@ -81,22 +91,31 @@ def identify(
 ) -> None:  # fmt: skip
     """Identifies a process model from a recorded test of any shape. Exit status 0: a model found, 3: none.
 
-    With --closed-loop: gains from the set-point changes of normal operation, as `loopwright observe`. Exit status 0:
-    gains are proposed, 3: none.
+    Normal operation in automatic: with the gains in effect (--kp, --ti, ...) gains are proposed from its set-point
+    changes, as by `loopwright observe`. Exit status 0: gains are proposed, 3: none. Without them the command says
+    what the file shows of the controller, and which options to add.
     """
     one_thread()
-    if closed_loop and (kp is None or mv_before is not None or plot is not None or tune):
-        die("--closed-loop needs --kp, and takes neither --mv-before nor --plot nor --tune: it answers with gains", 2)
-    if not closed_loop and any(each is not None for each in (kp, ti, td, b, ms)):
-        die("--kp, --ti, --td, --b and --ms need --closed-loop", 2)
+    given = {"--kp": kp, "--ti": ti, "--td": td, "--b": b, "--ms": ms}
+    named = [name for name, value in given.items() if value is not None]
+    if named and closed_loop is False:
+        die(f"{', '.join(named)} and --open-loop exclude each other: these gains are those in automatic", 2)
+    if kp is not None and (mv_before is not None or plot is not None):
+        die("--kp takes neither --mv-before nor --plot: it answers with gains from normal operation", 2)
     check_plot(plot)
     columns = {name: column for name, column in (("t", t), ("u", u), ("y", y), ("sp", sp)) if column is not None}
     record = _load(data, _read_options(columns, time_format, resample), as_json)
+    asked = AskedOfFile(data, columns, time_format, resample, tune, as_json, {**given, "--kp": None})
     if kp is not None:
         gains = (kp, ti or 0.0, td or 0.0, 1.0 if b is None else b)
-        _identify_operation(data, record, gains, 1.6 if ms is None else ms, as_json)
-    else:
-        _identify_test(data, record, mv_before, tune, plot, as_json)
+        identify_operation(data, record, gains, 1.6 if ms is None else ms, tune, as_json)
+        return
+    automatic = None if closed_loop is False else in_automatic_of(record)
+    if named or closed_loop:
+        ask_for_gains(asked, automatic, ", ".join(named) or "--closed-loop")
+    if automatic is not None and automatic.tells_nothing:
+        ask_for_gains(asked, automatic)
+    _identify_test(asked, record, automatic, mv_before, plot)
 
 
 def _read_options(columns: dict[str, str], time_format: str | None, resample: str | None) -> ReadOptions:
@@ -134,7 +153,7 @@ def _load(data: Path, options: ReadOptions, as_json: bool) -> Record:
 
 
 def _identify_test(
-    data: Path, record: Record, mv_before: float | None, tune: bool, plot: Path | None, as_json: bool
+    asked: AskedOfFile, record: Record, automatic: InAutomatic | None, mv_before: float | None, plot: Path | None
 ) -> None:
     from loopwright.service.offline.identification import identified, refused
     from loopwright.tuning.identification.identify import identify as fit
@@ -143,61 +162,28 @@ def _identify_test(
     try:
         found = fit(record.t, record.u, record.y, mv_before)
     except Refused as refusal:
+        if automatic is not None and automatic.control.certain:
+            ask_for_gains(asked, automatic)
         if refusal.reason is Reason.BAD_INPUT:
-            die(f"{data}: {refusal.detail}", 2)
-        if as_json:
+            die(f"{asked.data}: {refusal.detail}", 2)
+        if asked.as_json:
             print_json(refused(refusal, record))
         else:
             from loopwright.service.cli import tuning_tables
 
             tuning_tables.not_identified(refusal)
         raise typer.Exit(3) from None
+    if automatic is not None:
+        found = trusted(asked, automatic, found)
     if plot is not None:
         from loopwright.service.cli.plots.tunings import record_and_model
 
         save(plot, record_and_model, record, found)
-    if as_json:
-        print_json({**identified(found, record), **({"tunings": _tunings(found)} if tune else {})})
+    if asked.as_json:
+        print_json({**identified(found, record), **({"tunings": tunings_of(found.model)} if asked.tune else {})})
         return
     from loopwright.service.cli import tuning_tables
 
     tuning_tables.identified(found, len(record.t))
-    if tune:
-        from loopwright.service.api.tuning_views import TuningsView
-
-        tuning_tables.tunings(TuningsView.model_validate(_tunings(found)))
-
-
-def _tunings(found: Identified) -> dict[str, object]:
-    from loopwright.service.offline import tunings
-
-    return tunings.tunings(found.model)
-
-
-def _identify_operation(data: Path, record: Record, gains: GainsInEffect, ms: float, as_json: bool) -> None:
-    from loopwright.service.observing.exported import exported
-    from loopwright.service.observing.observed import ObservationState
-    from loopwright.tuning.fast.design import DesignSpec
-    from loopwright.tuning.gains import Gains
-    from loopwright.tuning.reasons import Reason, Refused
-
-    kp, ti, td, b = gains
-    if not (math.isfinite(kp) and kp > 0.0 and math.isfinite(b) and all(0.0 <= each < math.inf for each in (ti, td))):
-        die(f"--kp must be positive, --ti and --td at least 0, not {kp:g}, {ti:g}, {td:g}", 2)
-    try:
-        spec = DesignSpec(ms)
-    except Refused as refusal:
-        die(f"--ms: {refusal.detail}", 2)
-    try:
-        found = exported(record, Gains(kp, ti, td, td / 10.0, b), spec)
-    except Refused as refusal:
-        die(f"{data}: {refusal.detail}", 2 if refusal.reason is Reason.BAD_INPUT else 3)
-    if as_json:
-        print_json(found.model_dump(mode="json"))
-    else:
-        from loopwright.service.cli import observation_tables
-        from loopwright.service.cli.terminal import console
-
-        observation_tables.show_exported(found, console)
-    if found.state is not ObservationState.PROPOSAL:
-        raise typer.Exit(3)
+    if asked.tune:
+        show_tunings_of(found.model)

@@ -88,7 +88,7 @@ def test_gains_that_are_not_those_in_effect_are_noticed(gains: Gains, said: str)
 
 
 def test_a_file_without_set_point_or_with_few_samples_is_refused() -> None:
-    with pytest.raises(Refused, match="no column sp"):
+    with pytest.raises(Refused, match="no column of SP"):
         exported(replace(record(HEARD), sp=None), PI, ASKED)
     short = Record(*(column[:50] for column in (TS * np.arange(len(SP)), HEARD.mv, HEARD.pv, HEARD.sp)))
     with pytest.raises(Refused, match="at least 100"):

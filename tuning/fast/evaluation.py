@@ -58,7 +58,6 @@ class Evaluation:
     chosen, fit: the choice of the structure, and the fits of the record behind it.
     design_delay: the delay of the sampling, s.
     period: the ultimate period of the model, s.
-    longest_delay_seen_s: how much later a second path of 30 % of the plant's effect may act and still show, s.
     """
 
     reason: Reason | None
@@ -74,7 +73,10 @@ class Evaluation:
     fit: Fit[ExperimentRecord]
     design_delay: float
     period: float
-    longest_delay_seen_s: float
+
+    def longest_delay_seen(self) -> float:
+        """The longest delay, s, up to which the record would show a second path of 30 % of the plant's effect."""
+        return ScoreTests(self.fit, self.chosen.best).longest_delay_seen()
 
 
 def evaluate(
@@ -149,7 +151,6 @@ def evaluate(
         fit=fit,
         design_delay=delay,
         period=design.period,
-        longest_delay_seen_s=ScoreTests(fit, found).longest_delay_seen(),
     )
 
 

@@ -237,7 +237,7 @@ def evaluation_summary(evaluation: Evaluation) -> EvaluationSummary:
         period_s=record.period * record.Ts,
         reason=evaluation.reason,
         detail=evaluation.detail,
-        longest_delay_seen_s=evaluation.longest_delay_seen_s,
+        longest_delay_seen_s=evaluation.longest_delay_seen(),
     )
 
 

@@ -20,6 +20,11 @@ LOOKS: dict[str, tuple[str, str | tuple[int, tuple[int, int]]]] = {
     "before": (BEFORE, (0, (5, 2))), "after": (AFTER, "-")
 }  # fmt: skip
 """The colour and the line of what is compared: colours differ in lightness, and curves in their dashes."""
+CURVES: tuple[tuple[str, str | tuple[int, tuple[float, ...]]], ...] = (
+    (AFTER, "-"), (LOAD, (0, (6, 2))), (MV, (0, (2, 1.5))), ("#8d2f6d", (0, (6, 2, 1, 2))),
+    (SETPOINT, (0, (1, 1))), (BEFORE, (0, (10, 2))),
+)  # fmt: skip
+"""Colours and dashes of curves that stand side by side, the foremost first; more than four are hard to tell apart."""
 DPI = 110
 MAX_DOTS = 700
 """Number of samples above which an envelope is drawn in place of dots."""
@@ -35,7 +40,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 def write(figure: Figure, path: Path) -> None:
     """Writes a figure to a file in the format of its suffix, the same bytes for the same figure. Raises OSError."""
-    undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+    undated = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
     with rc_context({"svg.hashsalt": "loopwright"}):
         figure.savefig(path, dpi=DPI, metadata=undated.get(path.suffix.lower()))
 

@@ -18,7 +18,7 @@ from loopwright.tuning.analysis.step_response import Response, step_response
 from loopwright.tuning.identification.identify import Identified
 from loopwright.tuning.models import Model
 
-HIGHLIGHTED = (("#1f4e9e", "-"), ("#c77700", (0, (6, 2))), ("#2f6b3a", (0, (2, 1.5))), ("#8d2f6d", (0, (6, 2, 1, 2))))
+HIGHLIGHTED = style.CURVES[:4]
 """Colours and dashes of the methods that are highlighted, the recommended one first."""
 SHOWN_SETTLINGS = 2.0
 """Length of the time axis in median settling times, which cuts off the slow loops."""

@@ -15,11 +15,13 @@ from pathlib import Path
 import pytest
 
 from loopwright.service.cli.main import main
+from tests.unit.service.offline.exported_files import files_of, operated
 
 PAGE = Path(__file__).parents[4] / "docs" / "mistakes.md"
 BEGIN, END = "<!-- table -->\n", "<!-- end -->\n"
 MODEL = '\'{"K": 0.8, "T_s": 120, "L_s": 15}\''
 STEP = "".join(f"{5 * k},{35 if k < 9 else 41},{60 + max(0, k - 12) / 10}\n" for k in range(60))
+IN_AUTOMATIC = files_of(*operated(2.0))
 LOOP = """\
 loops:
   - tag: TIC-101
@@ -85,7 +87,27 @@ MISTAKES = [
     Mistake("The record is a few samples long.", "identify data.csv", csv("t,u,y\n0,35,60\n5,41,60\n10,41,61\n")),
     Mistake("`--resample` has no time.", "identify data.csv --resample often", csv("t,u,y\n" + STEP)),
     Mistake("Gains are given for a test in open loop.", "identify data.csv --kp 2", csv("t,u,y\n" + STEP)),
-    Mistake("Normal operation without the gains in effect.", "identify data.csv --closed-loop", csv("t,u,y\n" + STEP)),
+    Mistake("A test with steps of MV is called closed loop.", "identify data.csv --closed-loop", csv("t,u,y\n" + STEP)),
+    Mistake(
+        "The loop was in automatic, under a load.", "identify operation.csv --tune",
+        {"operation.csv": IN_AUTOMATIC["scada"].content},
+    ),
+    Mistake(
+        "The same without a column of SP.", "identify operation.csv --tune",
+        {"operation.csv": IN_AUTOMATIC["dcs"].content},
+    ),
+    Mistake(
+        "The same with gains that were not in effect.", "identify operation.csv --kp 8 --ti 100",
+        {"operation.csv": IN_AUTOMATIC["scada"].content},
+    ),
+    Mistake(
+        "The loop was in automatic, and nobody moved SP.", "identify operation.csv",
+        {"operation.csv": "".join(IN_AUTOMATIC["scada"].content.decode("utf-16").splitlines(True)[:180])},
+    ),
+    Mistake(
+        "Gains in effect are given, and the loop is called open.", "identify operation.csv --open-loop --kp 4",
+        {"operation.csv": IN_AUTOMATIC["scada"].content},
+    ),
     Mistake("A model is not complete.", "tune --model '{\"K\": 0.8}'"),
     Mistake("Names are without their units.", 'tune --model \'{"K": 0.8, "T": 120, "L": 15}\''),
     Mistake("A time is negative.", 'tune --model \'{"K": 0.8, "T_s": -120, "L_s": 15}\''),
