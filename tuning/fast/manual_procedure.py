@@ -76,7 +76,7 @@ def by_manual(facts: Facts, options: DesignOptions, method: str) -> Plan[FastPro
             record = test.experiment_record()
             last, look = look, (yield from test.computed(partial(look_at, facts, options, record)))
             test.period = look.period
-            if settled(look, last, looked_at, options.Ms, MAX_DISAGREEMENT):
+            if settled(look, last, looked_at, MAX_DISAGREEMENT):
                 break
             if look.refusal is not None:
                 yield from test.report(Note(f"after {looked_at} samples: {look.refusal.detail}"))

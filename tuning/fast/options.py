@@ -11,7 +11,7 @@ from loopwright.tuning.fast.design import Aim, DesignSpec, aim_of
 class DesignOptions:
     """The design specification that is asked for, and what is done with the new gains.
 
-    Ms, derivative, Mt, noise_gain, aim: see `tuning.fast.design.DesignSpec`.
+    Ms, derivative, Mt, noise_gain, aim, settling_s, mv_peak: see `tuning.fast.design.DesignSpec`.
     verify: the set-point step under the new gains is made.
     propose_anyway: the procedure goes on where the new gains improve nothing that was asked for.
     Raises Refused, BAD_INPUT.
@@ -24,10 +24,15 @@ class DesignOptions:
     verify: bool = True
     propose_anyway: bool = False
     aim: str = Aim.BALANCED
+    settling_s: float | None = None
+    mv_peak: float | None = None
 
     def spec(self) -> DesignSpec:
         """The design specification of these options. Raises Refused, BAD_INPUT."""
-        return DesignSpec(self.Ms, self.derivative, self.Mt, self.noise_gain, aim=aim_of(self.aim))
+        return DesignSpec(
+            self.Ms, self.derivative, self.Mt, self.noise_gain, aim=aim_of(self.aim), settling_s=self.settling_s,
+            mv_peak=self.mv_peak,
+        )  # fmt: skip
 
     def __post_init__(self) -> None:
         self.spec()

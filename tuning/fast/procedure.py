@@ -38,6 +38,8 @@ __all__ = ["FAST", "FAST_STAGES", "FastOptions", "FastProposal", "by_relay", "fa
 FAST = "fast"
 FAST_STAGES = ("preflight", "relay", "design", "verify", "redesign")
 SWITCHES = (4, 6, 8, 10)
+ENDING = (Reason.CONTROLLER_MISMATCH, Reason.NOT_POSSIBLE)
+"""Reasons for a refusal that a longer relay cannot remove."""
 MIN_SAMPLES = 2 * MIN_LISTENED
 """Smallest number of samples at rest, from which noise and offset are estimated."""
 
@@ -117,7 +119,7 @@ def by_relay(facts: Facts, options: FastOptions, experiment: RelayTest) -> Plan[
             evaluation, outcome = yield from experiment.computed(partial(evaluated, facts, options, record))
         except Refused as refused:
             outcome = refused
-        if isinstance(outcome, Comparison) or not in_time or outcome.reason is Reason.CONTROLLER_MISMATCH:
+        if isinstance(outcome, Comparison) or not in_time or outcome.reason in ENDING:
             break
         yield from experiment.report(Note(f"after {switches} switches: {outcome.detail}"))
     # the evaluation is reported even if the record is refused: its numbers say why

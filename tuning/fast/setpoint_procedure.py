@@ -126,7 +126,7 @@ def by_pulses(
         record = test.experiment_record()
         last, look = look, (yield from test.computed(partial(look_at, facts, options, record)))
         test.period = look.period
-        if settled(look, last, looked_at, options.Ms):
+        if settled(look, last, looked_at):
             break
         if look.refusal is not None and look.refusal.reason is Reason.CONTROLLER_MISMATCH:
             break
