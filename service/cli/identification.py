@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -78,6 +78,18 @@ def identify(
     ms: Annotated[
         float | None, typer.Option(help="Ms that gains are designed for; default: 1.6.", rich_help_panel=_CLOSED_LOOP)
     ] = None,
+    settling_s: Annotated[
+        float | None,
+        typer.Option(
+            help="Longest time from a set-point step until PV stays within 5 %, s.", rich_help_panel=_CLOSED_LOOP
+        ),
+    ] = None,
+    mv_peak: Annotated[
+        float | None,
+        typer.Option(
+            help="Largest change of MV after a set-point step, MV units per PV unit.", rich_help_panel=_CLOSED_LOOP
+        ),
+    ] = None,
 ) -> None:  # fmt: skip
     """Identifies a process model from a recorded test of any shape. Exit status 0: a model found, 3: none.
 
@@ -87,14 +99,15 @@ def identify(
     one_thread()
     if closed_loop and (kp is None or mv_before is not None or plot is not None or tune):
         die("--closed-loop needs --kp, and takes neither --mv-before nor --plot nor --tune: it answers with gains", 2)
-    if not closed_loop and any(each is not None for each in (kp, ti, td, b, ms)):
-        die("--kp, --ti, --td, --b and --ms need --closed-loop", 2)
+    if not closed_loop and any(each is not None for each in (kp, ti, td, b, ms, settling_s, mv_peak)):
+        die("--kp, --ti, --td, --b, --ms, --settling-s and --mv-peak need --closed-loop", 2)
     check_plot(plot)
     columns = {name: column for name, column in (("t", t), ("u", u), ("y", y), ("sp", sp)) if column is not None}
     record = _load(data, _read_options(columns, time_format, resample), as_json)
     if kp is not None:
         gains = (kp, ti or 0.0, td or 0.0, 1.0 if b is None else b)
-        _identify_operation(data, record, gains, 1.6 if ms is None else ms, as_json)
+        asked = _Asked(1.6 if ms is None else ms, settling_s, mv_peak)
+        _identify_operation(data, record, gains, asked, as_json)
     else:
         _identify_test(data, record, mv_before, tune, plot, as_json)
 
@@ -174,7 +187,15 @@ def _tunings(found: Identified) -> dict[str, object]:
     return tunings.tunings(found.model)
 
 
-def _identify_operation(data: Path, record: Record, gains: GainsInEffect, ms: float, as_json: bool) -> None:
+class _Asked(NamedTuple):
+    """What is asked of the gains, see `DesignSpec`."""
+
+    ms: float
+    settling_s: float | None
+    mv_peak: float | None
+
+
+def _identify_operation(data: Path, record: Record, gains: GainsInEffect, asked: _Asked, as_json: bool) -> None:
     from loopwright.service.observing.exported import exported
     from loopwright.service.observing.observed import ObservationState
     from loopwright.tuning.fast.design import DesignSpec
@@ -185,9 +206,9 @@ def _identify_operation(data: Path, record: Record, gains: GainsInEffect, ms: fl
     if not (math.isfinite(kp) and kp > 0.0 and math.isfinite(b) and all(0.0 <= each < math.inf for each in (ti, td))):
         die(f"--kp must be positive, --ti and --td at least 0, not {kp:g}, {ti:g}, {td:g}", 2)
     try:
-        spec = DesignSpec(ms)
+        spec = DesignSpec(asked.ms, settling_s=asked.settling_s, mv_peak=asked.mv_peak)
     except Refused as refusal:
-        die(f"--ms: {refusal.detail}", 2)
+        die(f"{'--ms: ' if refusal.detail.startswith('Ms') else ''}{refusal.detail}", 2)
     try:
         found = exported(record, Gains(kp, ti, td, td / 10.0, b), spec)
     except Refused as refusal:

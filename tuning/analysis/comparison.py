@@ -264,7 +264,7 @@ def _conclusion(
         return True, f"The present gains have {words}, the new ones {asked.worst(after)[1]}; {_errors(before, after)}."
     now, then = J
     if better and then is not None and (now is None or then * (1.0 + MIN_GAIN) < now):
-        falls = "" if now is None else f"; J falls by {100.0 * (1.0 - then / now):.0f} %"
+        falls = "" if now is None or asked.settling_s else f"; J falls by {100.0 * (1.0 - then / now):.0f} %"
         return True, f"{rest[0].upper()}{rest[1:]}{falls}."
     return False, rest
 

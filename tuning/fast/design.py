@@ -144,6 +144,12 @@ class DesignSpec:
         """Whether a settling time or a largest movement of MV is asked for."""
         return self.settling_s is not None or self.mv_peak is not None
 
+    @property
+    def requirements(self) -> dict[str, float]:
+        """What is asked for beside Ms and Mt: settling_s, mv_peak and noise_gain, as far as they are."""
+        asked = {"settling_s": self.settling_s, "mv_peak": self.mv_peak, "noise_gain": self.noise_gain}
+        return {name: value for name, value in asked.items() if value is not None}
+
 
 @dataclass(frozen=True, slots=True)
 class OptimalGains:

@@ -336,12 +336,7 @@ def comparison_on(sampled: Model, best: OptimalGains, facts: Facts, spec: Design
 def chosen_for(spec: DesignSpec, best: OptimalGains) -> dict[str, float]:
     """The design parameters in effect: Ms, which a settling time lowers, N where there is a derivative, and what else
     was asked for."""
-    asked = {"settling_s": spec.settling_s, "mv_peak": spec.mv_peak, "noise_gain": spec.noise_gain}
-    return {
-        "Ms": best.Ms,
-        **({"N": spec.N} if best.gains.Td else {}),
-        **{name: value for name, value in asked.items() if value is not None},
-    }
+    return {"Ms": best.Ms, **({"N": spec.N} if best.gains.Td else {}), **spec.requirements}
 
 
 def proposed(

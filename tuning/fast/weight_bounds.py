@@ -125,8 +125,13 @@ def _controlled(r: LoopResponses, error: Reals, y: Reals) -> Reals:
     u = r.Kp * error
     u[1:] += r.Kp * 0.5 * r.h / r.Ti * np.cumsum(error[1:] + error[:-1])
     if r.Td > 0.0:
-        rising = np.diff(y, prepend=0.0)
-        u -= r.Kp * r.N * recursive(np.array([1.0, -math.exp(-r.h * r.N / r.Td)]), rising)
+        # PV is straight between two steps: the staircase of the simulation would have its jumps here
+        steps = r.Td / r.N / r.h
+        decay = math.exp(-1.0 / steps)
+        now = 1.0 - steps * (1.0 - decay)
+        moved = now * y
+        moved[1:] += (1.0 - decay - now) * y[:-1]
+        u -= r.Kp * r.N * (y - recursive(np.array([1.0, -decay]), moved))
     return u
 
 

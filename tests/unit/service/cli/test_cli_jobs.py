@@ -84,6 +84,12 @@ def test_the_options_of_fast_are_asked_for(service: Service, through: Through) -
         "--derivative",
         "--aim",
         "no_overshoot",
+        "--settling-s",
+        "300",
+        "--mv-peak",
+        "4",
+        "--noise-gain",
+        "2",
         "--amplitude",
         "10",
         "--careful",
@@ -96,8 +102,8 @@ def test_the_options_of_fast_are_asked_for(service: Service, through: Through) -
     assert result.exit_code == 0, result.output
     (body,) = through.posted
     assert body == {
-        "ms": 1.4, "derivative": True, "aim": "no_overshoot", "amplitude_pct": 10.0, "careful": True, "verify": False,
-        "requested_by": "cli",
+        "ms": 1.4, "derivative": True, "aim": "no_overshoot", "settling_s": 300.0, "mv_peak": 4.0, "noise_gain": 2.0,
+        "amplitude_pct": 10.0, "careful": True, "verify": False, "requested_by": "cli",
     }  # fmt: skip
     job = json.loads(result.stdout)
     service.wait(job["id"])
