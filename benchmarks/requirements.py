@@ -85,7 +85,7 @@ def table(which: Sequence[Plant], derivative: bool) -> Iterator[str]:
             kept = [each for each, _ in answers if each is not None]
             again = [named for each, named in answers if each is None and named is not None]
             Ms = [each.Ms for each in kept]
-            over = 100.0 * max(0.0, *(each.ratio - 1.0 for each in kept))
+            over = 100.0 * max([0.0, *(each.ratio - 1.0 for each in kept)])
             load = [each.load for each in kept]
             yield (
                 f"| {name}, {part:g} of that | {len(kept)}/{len(answers)} | {spread(Ms)} | {over:.2f} % "

@@ -147,6 +147,8 @@ def test_a_heater_that_settles_in_time_and_moves_MV_no_further(method: str) -> N
     gains = GainsView.model_validate(answer["new_gains"]).gains()
     true = step_figures(TransferFunction((0.8,), (120.0, 1.0), 15.5), gains, band=0.05)
     assert true.settling_s is not None and true.settling_s < 112.0 and true.peak_u is not None and true.peak_u < 4.01
+    at_once = rehearse(plant, method=method, settling_s=0.5)
+    assert at_once["reason"] == "bad_input" and "sample time of 1 s" in at_once["detail"]
     refused = rehearse(plant, method=method, settling_s=20.0)
     assert (refused["outcome"], refused["reason"]) == ("refused", "not_possible")
     possible = float(re.findall(r"at least ([0-9.]+) s", refused["detail"])[0])

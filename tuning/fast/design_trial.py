@@ -52,6 +52,7 @@ def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal
     New gains that improve nothing that was asked for are tried only if the options contain `propose_anyway`.
     Raises Refused. The plan restores nothing: the runner restores the loop.
     """
+    options.check_sampling(facts)
     expected = {"preflight": facts.T95_s / 2, "design": 0.0, "verify": 6 * facts.T95_s}
     todo = trial_stages(options.verify)
     if broken := not_kept(facts.directions, facts.sp_rate_max_per_s, todo, mirrored=True):

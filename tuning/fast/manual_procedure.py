@@ -51,6 +51,7 @@ def by_manual(facts: Facts, options: DesignOptions, method: str) -> Plan[FastPro
     method: the name of the procedure in the proposal.
     Raises Refused. The plan restores nothing: the runner restores the loop.
     """
+    options.check_sampling(facts)
     T95, spec = facts.T95_s, options.spec()
     expected = {"preflight": T95 / 2, MANUAL: 1.5 * T95, "design": 0.0}
 

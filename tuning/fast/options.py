@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.design import Aim, DesignSpec, aim_of
+from loopwright.tuning.reasons import Reason, Refused
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +35,16 @@ class DesignOptions:
             self.Ms, self.derivative, self.Mt, self.noise_gain, aim=aim_of(self.aim), settling_s=self.settling_s,
             mv_peak=self.mv_peak,
         )  # fmt: skip
+
+    def check_sampling(self, facts: Facts) -> None:
+        """Raises Refused, BAD_INPUT, for a settling time that no controller of this loop can have: before a test moves
+        anything, and whatever the plant is."""
+        if self.settling_s is not None and self.settling_s <= facts.sample_time_s:
+            raise Refused(
+                Reason.BAD_INPUT,
+                f"settling_s must be longer than the loop's sample time of {facts.sample_time_s:g} s, not "
+                f"{self.settling_s:g} s",
+            )
 
     def __post_init__(self) -> None:
         self.spec()

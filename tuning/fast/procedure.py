@@ -86,6 +86,7 @@ def fast_by_relay(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
 
     Raises Refused, BAD_LIMITS where the loop may be moved to one side only: a relay moves PV to both.
     """
+    options.check_sampling(facts)
     if facts.one_sided:
         text = f"the loop may be moved {facts.directions} only, and a relay moves PV to both sides of its rest"
         raise Refused(Reason.BAD_LIMITS, text)
