@@ -130,8 +130,11 @@ def _predicted(job: ShownResult, pv_unit: str, mv_unit: str) -> Iterator[tuple[s
         ("MV travel, load", "load", "TV", f"{mv_unit} per {mv_unit}"),
         *((label, None, name, unit) for label, name, unit in _MARGINS),
     ):
-        if part == "setpoint" and (asked := _asked(compared, name)) is not None:
+        asked = _asked(compared, name) if part == "setpoint" else None
+        if asked is not None:
             label = f"{label}, at most {cell(asked)}"
+        elif name == "mv_peak":  # a row for who asked for it
+            continue
         shown = []
         for each in (compared.before, compared.after):
             of = getattr(each, part) if part else each

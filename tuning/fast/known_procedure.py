@@ -135,8 +135,9 @@ def by_known_plant(facts: Facts, options: DesignOptions, known: ObservedPlant, m
     """The plan of the procedure, for a loop in automatic and at rest.
 
     method: the name of the procedure in the proposal.
-    Raises Refused where the loop is not at rest, and where what was asked for is not possible, else ObservedPlantFails. The plan restores nothing but the present
-    gains and the set-point before ObservedPlantFails is raised: the runner restores the loop.
+    Raises Refused where the loop is not at rest, and where what was asked for is not possible, else ObservedPlantFails.
+    The plan restores nothing but the present gains and the set-point before ObservedPlantFails is raised: the runner
+    restores the loop.
     """
     why = known.not_for(facts)
     if why is None and not options.verify:

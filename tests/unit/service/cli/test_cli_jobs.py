@@ -348,6 +348,12 @@ def test_rehearse_is_fast_unless_told_otherwise(tmp_path: Path) -> None:
     assert answer["predicted_before"]["Ms"] < 1.4
     assert json.loads(run("rehearse", str(file), "--method", "five-stage", "--json").stdout)["method"] == "five-stage"
     assert run("rehearse", str(file), "--method", "five-stage", "--ms", "1.4").exit_code == 2
+    for name in ("--settling-s", "--mv-peak", "--noise-gain"):
+        assert run("rehearse", str(file), "--method", "five-stage", name, "4").exit_code == 2
+        wrong = run("rehearse", str(file), name, "nan", "--json")
+        assert json.loads(wrong.stdout)["reason"] == "bad_input" and wrong.exit_code == 2
+    limited = run("rehearse", str(file), "--mv-peak", "50")
+    assert "MV peak" in limited.stdout and "MV peak" not in run("rehearse", str(file)).stdout
 
 
 def test_rehearse_speaks_like_retune(tmp_path: Path) -> None:
