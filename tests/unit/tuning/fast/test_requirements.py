@@ -115,13 +115,12 @@ def test_a_settling_time_is_kept_with_the_smallest_Ms(name: str, part: float) ->
 
 def test_brute_force_finds_no_more_robust_gains_that_settle_in_time() -> None:
     spec = DesignSpec(settling_s=90.0)
-    best = required(design_of("heater", spec))
-    least = design_of("heater", DesignSpec(best.Ms)).best()
-    cost = LoopCost(HEATER, period(HEATER))
-    g, tried = best.gains, 0
-    for Kp in g.Kp * np.geomspace(0.5, 1.1, 9):
-        for Ti in g.Ti * np.geomspace(0.4, 3.0, 10):
-            if margins(HEATER, Gains(Kp, Ti)).Ms > best.Ms - 0.03:
+    g, lower = (best := required(design_of("heater", spec))).gains, best.Ms - 0.04
+    least = design_of("heater", DesignSpec(lower)).best()
+    cost, tried = LoopCost(HEATER, period(HEATER)), 0
+    for Kp in g.Kp * np.geomspace(0.6, 1.0, 9):
+        for Ti in g.Ti * np.geomspace(0.5, 2.0, 9):
+            if margins(HEATER, Gains(Kp, Ti)).Ms > lower:
                 continue
             for b in np.linspace(0.4, 2.0, 9):
                 each = cost(Kp, Ti, 0.0, 10.0, b)
@@ -131,7 +130,7 @@ def test_brute_force_finds_no_more_robust_gains_that_settle_in_time() -> None:
                 tried += 1
                 found = loop_performance(HEATER, Gains(Kp, Ti, b=b)).setpoint
                 assert found is not None and (found.settling_s is None or found.settling_s > 90.0)
-    assert tried > 20
+    assert tried > 10
 
 
 def test_a_longer_time_gives_a_more_robust_and_gentler_loop() -> None:
@@ -181,7 +180,7 @@ def test_the_settling_times_and_the_Ms_that_a_refusal_names_are_kept(name: str, 
     spec = DesignSpec(**asked)  # type: ignore[arg-type]
     settled = free(name, replace(spec, aim=Aim.BALANCED)).setpoint
     assert settled is not None and settled.settling_s is not None
-    spec = replace(spec, settling_s=0.45 * settled.settling_s)
+    spec = replace(spec, settling_s=0.3 * settled.settling_s)
     text = refusal(name, spec)
     numbers = re.search(r"ask for at least ([\d.e+]+) s(?:, or for Ms ([\d.]+))?", text)
     assert numbers is not None
