@@ -236,6 +236,10 @@ class StepWorthView(Figures):
         description="Settling time into 5 %, s; null: PV does not settle within the computed response"
     )
     TV: float = Field(description="Total variation of MV. Set-point: percent per PV unit. Load: 1 at least")
+    mv_peak: float | None = Field(
+        default=None,
+        description="Largest change of MV. Set-point: percent per PV unit. null: an earlier version has computed it",
+    )
 
 
 class WorthView(Figures):
@@ -258,6 +262,20 @@ class ComparisonView(Figures):
     before: WorthView = Field(description="Performance of the present gains")
     after: WorthView = Field(description="Performance of the new gains")
     Ms_asked: float = Field(description="Requested upper bound of Ms", examples=[1.6])
+    settling_s_asked: float | None = Field(
+        default=None,
+        description="Longest settling time asked for, after a set-point step into 5 %, s; null: none was. What the "
+        "gains reach is in `before` and `after`, setpoint.settling_s",
+        examples=[300.0],
+    )
+    mv_peak_asked: float | None = Field(
+        default=None,
+        description="Largest change of MV asked for, after a set-point step, percent per PV unit; null: none was. What "
+        "the gains reach is setpoint.mv_peak",
+    )
+    noise_gain_asked: float | None = Field(
+        default=None, description="Largest noise gain asked for, percent per PV unit; null: none was"
+    )
     criterion: str = Field(description="The criterion J that the method minimises", examples=["criterion (7)"])
     J_before: float | None = Field(
         description="J of the present gains; null: the loop is not stable, or an offset remains"

@@ -31,6 +31,7 @@ class Reason(StrEnum):
     NO_OVERSHOOT = "no_overshoot"
     NOT_SELF_REGULATING = "not_self_regulating"
     NOT_ROBUST = "not_robust"
+    NOT_POSSIBLE = "not_possible"
     NOT_CONFIRMED = "not_confirmed"
     BAD_LIMITS = "bad_limits"
     BAD_INPUT = "bad_input"
@@ -94,6 +95,8 @@ ADVICE: dict[Reason, str] = {
     Reason.NOT_SELF_REGULATING: "The plant integrates: use a rule for integrating plants; where the loop is in manual, "
     "put it in automatic, then retune.",
     Reason.NOT_ROBUST: "The best PI would not be robust; keep the present gains, or enter a model by hand.",
+    Reason.NOT_POSSIBLE: "Ask for what the message says is possible, or leave that requirement out; nothing else is "
+    "wrong with the loop.",
     Reason.NOT_CONFIRMED: "The loop did not behave as its model predicts: keep the present gains, and repeat.",
     Reason.BAD_LIMITS: "Correct the limits: low < present value < high, and enough room for the test on both sides.",
     Reason.BAD_INPUT: "Correct the value named in the message.",

@@ -14,6 +14,7 @@ from loopwright.service.api.computed import computed
 from loopwright.service.api.routes import new_router
 from loopwright.service.errors import Conflict
 from loopwright.service.execution.computing.pool import Pool
+from loopwright.service.inputs.plausible import Gain, Time
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.listening import Listening
 from loopwright.service.loops.shared_reading import SharedReading
@@ -44,8 +45,19 @@ def router(jobs: Jobs, readings: SharedReading[LoopState | None], listening: Lis
         ] = 1.6,
         derivative: Annotated[bool, Query(description="Design a PID where a derivative improves the loop")] = False,
         aim: Annotated[Aim, Query(description="What the gains are the best for, as in a retune")] = Aim.BALANCED,
+        settling_s: Annotated[
+            Time | None, Query(description="Longest settling time after a set-point step, s, as in a retune")
+        ] = None,
+        mv_peak: Annotated[
+            Gain | None,
+            Query(description="Largest change of MV after a set-point step, percent per PV unit, as in a retune"),
+        ] = None,
+        noise_gain: Annotated[
+            Gain | None, Query(description="Largest noise gain, percent per PV unit, as in a retune")
+        ] = None,
     ) -> ObservationView:  # fmt: skip
-        asked = await run_in_threadpool(asked_of, tag, DesignSpec(ms, derivative, aim=aim))
+        spec = DesignSpec(ms, derivative, noise_gain=noise_gain, aim=aim, settling_s=settling_s, mv_peak=mv_peak)
+        asked = await run_in_threadpool(asked_of, tag, spec)
         found = await computed(pool, partial(observed, asked), http, lambda: jobs.stopping)
         return await run_in_threadpool(kept, found, asked)
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request
 from fastapi.concurrency import run_in_threadpool
@@ -14,7 +15,8 @@ from loopwright.service.api.computed import computed
 from loopwright.service.api.routes import new_router
 from loopwright.service.api.tuning_views import AlternativesView, MethodView, TuningRequest, TuningsView
 from loopwright.service.execution.computing.pool import Pool
-from loopwright.service.jobs.alternatives import alternatives, asked_aim, redesigned
+from loopwright.service.inputs.plausible import Gain, Time
+from loopwright.service.jobs.alternatives import alternatives, asked_spec, redesigned
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.stored_record import record_columns, stored_record
 from loopwright.service.offline import tunings
@@ -69,25 +71,51 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
             Aim | None,
             Query(description="What the gains are the best for; only with `ms`. The default is the option of the job"),
         ] = None,
+        settling_s: Annotated[
+            Time | None,
+            Query(
+                description="Longest settling time after a set-point step, s, as in a retune: the gains are those for "
+                "the smallest Ms up to `ms` that permits it; only with `ms`. The default is none, even where the job "
+                "asked for one: it is another way to choose an Ms"
+            ),
+        ] = None,
+        mv_peak: Annotated[
+            Gain | None,
+            Query(
+                description="Largest change of MV after a set-point step, percent per PV unit; only with `ms`. The "
+                "default is the option of the job"
+            ),
+        ] = None,
+        noise_gain: Annotated[
+            Gain | None,
+            Query(
+                description="Largest noise gain, percent per PV unit; only with `ms`. The default is the option of the "
+                "job"
+            ),
+        ] = None,
     ) -> AlternativesView:  # fmt: skip
-        for name, given in (("derivative", derivative), ("aim", aim)):
+        own = {
+            "derivative": derivative, "aim": aim, "settling_s": settling_s, "mv_peak": mv_peak,
+            "noise_gain": noise_gain,
+        }  # fmt: skip
+        for name, given in own.items():
             if ms is None and given is not None:
                 raise tunings.BadTuning(f"{name} needs ms: give ms too")
         if ms is not None and method not in (None, FAST):
             raise tunings.BadTuning(f"ms is an option of fast, not of {method}: leave out ms or method")
-        work = await run_in_threadpool(computation, job_id, method, ms, derivative, aim)
+        options = {name: value for name, value in own.items() if value is not None}
+        work = await run_in_threadpool(computation, job_id, method, ms, options)
         return AlternativesView.model_validate(await computed(pool, work, http, lambda: jobs.stopping))
 
     def computation(
-        job_id: str, method: str | None, ms: float | None, derivative: bool | None, aim: Aim | None
+        job_id: str, method: str | None, ms: float | None, options: dict[str, Any]
     ) -> Callable[[], Mapping[str, object]]:
         """The computation, with everything that it needs from the store."""
         row, events = jobs.store.get(job_id), jobs.store.events(job_id)
         if ms is None:
             return partial(alternatives, row, events, method)
-        wanted = bool(row.request.get("derivative")) if derivative is None else derivative
         fast = row.request.get("method") in DESIGNED  # other jobs are designed on the model that they found
         record = stored_record(record_columns(jobs.store.blocks(job_id))) if fast else None
-        return partial(redesigned, row, events, record, ms, wanted, aim or asked_aim(row))
+        return partial(redesigned, row, events, record, replace(asked_spec(row, ms), **options))
 
     return routes

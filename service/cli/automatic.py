@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NamedTuple, NoReturn
 
 import typer
 
@@ -21,6 +21,14 @@ if TYPE_CHECKING:
 
 GainsInEffect = tuple[float, float, float, float]
 """Kp, Ti, Td and b, ISA form; times in s."""
+
+
+class AskedOfGains(NamedTuple):
+    """What is asked of the gains, see `DesignSpec`."""
+
+    ms: float
+    settling_s: float | None
+    mv_peak: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +107,9 @@ def ask_for_gains(asked: AskedOfFile, automatic: InAutomatic | None, option: str
     die(f"{why}. Compare with the gains in the controller, then: {command}", 2)
 
 
-def identify_operation(data: Path, record: Record, gains: GainsInEffect, ms: float, tune: bool, as_json: bool) -> None:
+def identify_operation(
+    data: Path, record: Record, gains: GainsInEffect, asked: AskedOfGains, tune: bool, as_json: bool
+) -> None:
     """Shows the gains that the set-point changes in a file propose; status 3 if there are none."""
     from loopwright.service.inputs.model_json import parse_model
     from loopwright.service.observing.exported import exported
@@ -112,9 +122,9 @@ def identify_operation(data: Path, record: Record, gains: GainsInEffect, ms: flo
     if not (math.isfinite(kp) and kp > 0.0 and math.isfinite(b) and all(0.0 <= each < math.inf for each in (ti, td))):
         die(f"--kp must be positive, --ti and --td at least 0, not {kp:g}, {ti:g}, {td:g}", 2)
     try:
-        spec = DesignSpec(ms)
+        spec = DesignSpec(asked.ms, settling_s=asked.settling_s, mv_peak=asked.mv_peak)
     except Refused as refusal:
-        die(f"--ms: {refusal.detail}", 2)
+        die(f"{'--ms: ' if refusal.detail.startswith('Ms') else ''}{refusal.detail}", 2)
     try:
         found = exported(record, Gains(kp, ti, td, td / 10.0, b), spec)
     except Refused as refusal:

@@ -10,6 +10,7 @@ import typer
 
 from loopwright.service.cli.automatic import (
     AskedOfFile,
+    AskedOfGains,
     ask_for_gains,
     identify_operation,
     in_automatic_of,
@@ -88,6 +89,18 @@ def identify(
     ms: Annotated[
         float | None, typer.Option(help="Ms that gains are designed for; default: 1.6.", rich_help_panel=_CLOSED_LOOP)
     ] = None,
+    settling_s: Annotated[
+        float | None,
+        typer.Option(
+            help="Longest time from a set-point step until PV stays within 5 %, s.", rich_help_panel=_CLOSED_LOOP
+        ),
+    ] = None,
+    mv_peak: Annotated[
+        float | None,
+        typer.Option(
+            help="Largest change of MV after a set-point step, MV units per PV unit.", rich_help_panel=_CLOSED_LOOP
+        ),
+    ] = None,
 ) -> None:  # fmt: skip
     """Identifies a process model from a recorded test of any shape. Exit status 0: a model found, 3: none.
 
@@ -96,7 +109,9 @@ def identify(
     what the file shows of the controller, and which options to add.
     """
     one_thread()
-    given = {"--kp": kp, "--ti": ti, "--td": td, "--b": b, "--ms": ms}
+    given = {
+        "--kp": kp, "--ti": ti, "--td": td, "--b": b, "--ms": ms, "--settling-s": settling_s, "--mv-peak": mv_peak
+    }  # fmt: skip
     named = [name for name, value in given.items() if value is not None]
     if named and closed_loop is False:
         die(f"{', '.join(named)} and --open-loop exclude each other: these gains are those in automatic", 2)
@@ -108,7 +123,8 @@ def identify(
     asked = AskedOfFile(data, columns, time_format, resample, tune, as_json, {**given, "--kp": None})
     if kp is not None:
         gains = (kp, ti or 0.0, td or 0.0, 1.0 if b is None else b)
-        identify_operation(data, record, gains, 1.6 if ms is None else ms, tune, as_json)
+        wanted = AskedOfGains(1.6 if ms is None else ms, settling_s, mv_peak)
+        identify_operation(data, record, gains, wanted, tune, as_json)
         return
     automatic = None if closed_loop is False else in_automatic_of(record)
     if named or closed_loop:

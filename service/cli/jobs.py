@@ -9,7 +9,16 @@ from urllib.parse import quote
 import typer
 
 from loopwright.service.cli.client import DEFAULT_URL, Client
-from loopwright.service.cli.output import AsJson, AskedAim, Url, die, print_json
+from loopwright.service.cli.output import (
+    AsJson,
+    AskedAim,
+    AskedMvPeak,
+    AskedNoiseGain,
+    AskedSettling,
+    Url,
+    die,
+    print_json,
+)
 from loopwright.service.cli.tuning import check_plot
 from loopwright.service.states.job_state import JobState
 
@@ -200,6 +209,9 @@ def alternatives_of_job(
         bool | None, typer.Option(help="With --ms: design a PID where it is better than a PI.")
     ] = None,
     aim: AskedAim = None,
+    settling_s: AskedSettling = None,
+    mv_peak: AskedMvPeak = None,
+    noise_gain: AskedNoiseGain = None,
     method: Annotated[str | None, typer.Option(help="Only this method.")] = None,
     url: Url = DEFAULT_URL,
     as_json: AsJson = False,
@@ -207,7 +219,10 @@ def alternatives_of_job(
     """Show other gains for the model that a job found, with their figures; no experiment is made."""
     wanted = None if derivative is None else str(derivative).lower()
     client = Client(url)
-    found = client.get(f"{path_of(client, job_id)}/alternatives", ms=ms, derivative=wanted, aim=aim, method=method)
+    found = client.get(
+        f"{path_of(client, job_id)}/alternatives", ms=ms, derivative=wanted, aim=aim, settling_s=settling_s,
+        mv_peak=mv_peak, noise_gain=noise_gain, method=method,
+    )  # fmt: skip
     if as_json:
         print_json(found)
         return

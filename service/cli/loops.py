@@ -9,7 +9,17 @@ from urllib.parse import quote
 import typer
 
 from loopwright.service.cli.client import DEFAULT_URL, Client
-from loopwright.service.cli.output import AsJson, AskedAim, Url, die, print_json, user
+from loopwright.service.cli.output import (
+    AsJson,
+    AskedAim,
+    AskedMvPeak,
+    AskedNoiseGain,
+    AskedSettling,
+    Url,
+    die,
+    print_json,
+    user,
+)
 
 app = typer.Typer()
 
@@ -118,6 +128,9 @@ def observe(
         bool, typer.Option("--derivative", help="Design a PID where it is better than a PI.")
     ] = False,
     aim: AskedAim = None,
+    settling_s: AskedSettling = None,
+    mv_peak: AskedMvPeak = None,
+    noise_gain: AskedNoiseGain = None,
     url: Url = DEFAULT_URL,
     as_json: AsJson = False,
 ) -> None:
@@ -128,7 +141,10 @@ def observe(
     from loopwright.service.observing.observed import ObservationState, ObservationView
 
     path = f"/loops/{quote(tag, safe='')}/observation"
-    found = Client(url).get(path, ms=ms, derivative=str(derivative).lower(), aim=aim)
+    found = Client(url).get(
+        path, ms=ms, derivative=str(derivative).lower(), aim=aim, settling_s=settling_s, mv_peak=mv_peak,
+        noise_gain=noise_gain,
+    )  # fmt: skip
     shown = ObservationView.model_validate(found)
     if as_json:
         print_json(found)

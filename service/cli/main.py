@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import re
 import sys
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,7 +14,18 @@ import typer
 
 from loopwright.service.cli import alarms, data, identification, jobs, keys, loops, rehearse, tuning, webhooks
 from loopwright.service.cli.client import DEFAULT_URL, ApiError, Client
-from loopwright.service.cli.output import AsJson, AskedAim, Url, die, on_terminal, print_json, shown_on_terminal
+from loopwright.service.cli.output import (
+    AsJson,
+    AskedAim,
+    AskedMvPeak,
+    AskedNoiseGain,
+    AskedSettling,
+    Url,
+    die,
+    on_terminal,
+    print_json,
+    shown_on_terminal,
+)
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -297,6 +309,9 @@ def retune(
         bool, typer.Option("--derivative", help="Design a PID where it is better than a PI.")
     ] = False,
     aim: AskedAim = None,
+    settling_s: AskedSettling = None,
+    mv_peak: AskedMvPeak = None,
+    noise_gain: AskedNoiseGain = None,
     amplitude: Annotated[float | None, typer.Option(help="Relay amplitude for fast, percent of MV.")] = None,
     excitations: Annotated[
         str | None, typer.Option(help="What fast moves the loop by, of what loops.yaml permits: setpoint,relay,manual.")
@@ -332,7 +347,8 @@ def retune(
     options: dict[str, object] = {
         "sp_deviation": sp_deviation, "mv_low": mv_low, "mv_high": mv_high, "dry_run": dry_run or None,
         "directions": directions, "sp_rate_max_per_s": sp_rate_max,
-        "method": method, "ms": ms, "derivative": derivative or None, "aim": aim, "amplitude_pct": amplitude,
+        "method": method, "ms": ms, "derivative": derivative or None, "aim": aim, "settling_s": settling_s,
+        "mv_peak": mv_peak, "noise_gain": noise_gain, "amplitude_pct": amplitude,
         "excitations": excitations.split(",") if excitations else None,
         "careful": careful or None, "verify": None if verify else False, "propose_anyway": propose_anyway or None,
         "pattern": loop if many else None,
@@ -343,7 +359,8 @@ def retune(
         if many:
             die("--from takes one loop, not a pattern", 2)
         asked = 1.6 if ms is None and method is None else ms
-        body |= _other_gains(client, from_job, loop, method, asked, derivative, aim)
+        wanted = {"aim": aim, "settling_s": settling_s, "mv_peak": mv_peak, "noise_gain": noise_gain}
+        body |= _other_gains(client, from_job, loop, method, asked, derivative, wanted)
     if preview:
         raise typer.Exit(0 if _previewed(client, path, body, alone=True, as_json=as_json) else 3)
     if not (yes or dry_run):
@@ -357,14 +374,20 @@ def retune(
 
 
 def _other_gains(
-    client: Client, job: str, loop: str, method: str | None, ms: float | None, derivative: bool, aim: str | None
+    client: Client,
+    job: str,
+    loop: str,
+    method: str | None,
+    ms: float | None,
+    derivative: bool,
+    options: Mapping[str, str | float | None],
 ) -> dict[str, object]:
     """Returns the request that tries other gains for the model of a job. Ends the command where there are none."""
     from loopwright.service.api.tuning_views import AlternativesView
 
     wanted = str(derivative).lower() if ms is not None else None
     found = AlternativesView.model_validate(
-        client.get(f"{jobs.path_of(client, job)}/alternatives", ms=ms, derivative=wanted, aim=aim, method=method)
+        client.get(f"{jobs.path_of(client, job)}/alternatives", ms=ms, derivative=wanted, method=method, **options)
     )
     if found.loop != loop:
         die(f"job {found.job} is of loop {found.loop}, not of {loop}", 2)

@@ -18,6 +18,18 @@ AskedAim = Annotated[
     str | None,
     typer.Option("--aim", help="What gains of fast are best for: balanced (default), setpoint, load, no_overshoot."),
 ]
+AskedSettling = Annotated[
+    float | None,
+    typer.Option("--settling-s", help="Longest time from a set-point step until PV stays within 5 %, s."),
+]
+AskedMvPeak = Annotated[
+    float | None,
+    typer.Option("--mv-peak", help="Largest change of MV after a set-point step, percent per PV unit."),
+]
+AskedNoiseGain = Annotated[
+    float | None,
+    typer.Option("--noise-gain", help="Largest immediate change of MV for a jump of PV, percent per PV unit."),
+]
 
 
 def user() -> str:
@@ -66,7 +78,7 @@ def json_object(text: str, source: str) -> dict[str, object]:
     try:
         found = strict_json.loads(text)
     except strict_json.BadJson as error:
-        curly = "; quotes in JSON are straight: \"" if any(quote in text for quote in "“”„‘’«»") else ""
+        curly = '; quotes in JSON are straight: "' if any(quote in text for quote in "“”„‘’«»") else ""
         die(f"{source}: {error}{curly}", 2)
     if not isinstance(found, dict):
         die(f"{source}: expected one JSON object", 2)

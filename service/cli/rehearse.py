@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from loopwright.service.cli.output import AsJson, AskedAim, die, print_json, read_json_object
+from loopwright.service.cli.output import (
+    AsJson,
+    AskedAim,
+    AskedMvPeak,
+    AskedNoiseGain,
+    AskedSettling,
+    die,
+    print_json,
+    read_json_object,
+)
 from loopwright.service.cli.tuning import Plot, check_plot
 
 if TYPE_CHECKING:
@@ -24,6 +33,9 @@ def rehearse(
         bool, typer.Option("--derivative", help="Design a PID where it is better than a PI.")
     ] = False,
     aim: AskedAim = None,
+    settling_s: AskedSettling = None,
+    mv_peak: AskedMvPeak = None,
+    noise_gain: AskedNoiseGain = None,
     propose_anyway: Annotated[
         bool,
         typer.Option(
@@ -53,10 +65,14 @@ def rehearse(
         if text is not None:
             terminal.progress_console.print(f"  {text}", highlight=False, markup=False, soft_wrap=True)
 
-    given = {"Ms": ms, "derivative": derivative or None, "aim": aim}
+    given = {
+        "Ms": ms, "derivative": derivative or None, "aim": aim, "settling_s": settling_s, "mv_peak": mv_peak,
+        "noise_gain": noise_gain,
+    }  # fmt: skip
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if options and method not in ("fast", "setpoint"):
-        die(f"--ms, --derivative and --aim are options of the methods fast and setpoint, not of {method}", 2)
+        names = "--ms, --derivative, --aim, --settling-s, --mv-peak and --noise-gain"
+        die(f"{names} are options of the methods fast and setpoint, not of {method}", 2)
     check_plot(plot)
     samples = RehearsedSamples()
 

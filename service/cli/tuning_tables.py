@@ -135,6 +135,9 @@ def to_try(found: AlternativesView) -> None:
         wanted += " --derivative"
     if isinstance(aim := body.get("aim"), str) and aim != "balanced":
         wanted += f" --aim {aim}"
+    for name in ("settling_s", "mv_peak", "noise_gain"):
+        if isinstance(value := body.get(name), int | float):
+            wanted += f" --{name.replace('_', '-')} {value:g}"
     console.print(
         f"\nTo try them on the loop: loopwright retune {found.loop} --from {found.job} {wanted}\n"
         f"or POST /loops/{found.loop}/retune with\n{json.dumps(body)}",

@@ -201,6 +201,28 @@ class DesignRetune(_Retune):
         "step by at most 1 % on the model",
         examples=["no_overshoot"],
     )
+    settling_s: Time | None = Field(
+        default=None,
+        description="Longest time from a set-point step until PV stays within 5 % of it, on the model, s. The gains "
+        "are those for the smallest Ms that permits it, at most `ms`; where none does, the job ends as not_possible "
+        "and says what would",
+        examples=[300.0],
+    )
+    mv_peak: Gain | None = Field(
+        default=None,
+        description="Largest change of MV after a set-point step, percent per PV unit of the step, on the model. Where "
+        "the loop needs more, the job ends as not_possible and says how much",
+        examples=[4.0],
+    )
+    noise_gain: Gain | None = Field(
+        default=None,
+        description="Largest immediate change of MV for a jump of PV, percent per PV unit: the gain of the controller "
+        "for noise",
+        examples=[2.0],
+    )
+
+    def _requirements(self) -> dict[str, float | None]:
+        return {"settling_s": self.settling_s, "mv_peak": self.mv_peak, "noise_gain": self.noise_gain}
 
     @property
     def options(self) -> DesignOptions:
@@ -277,6 +299,7 @@ class FastRetune(DesignRetune):
                 careful=self.careful,
                 verify=self.verify,
                 propose_anyway=self.propose_anyway,
+                **self._requirements(),
             )
         except Refused as refused:
             raise ValueError(refused.detail) from refused
@@ -302,7 +325,7 @@ class SetpointRetune(DesignRetune):
         try:
             self._options = DesignOptions(
                 Ms=self.ms, derivative=self.derivative, aim=self.aim, verify=self.verify,
-                propose_anyway=self.propose_anyway,
+                propose_anyway=self.propose_anyway, **self._requirements(),
             )  # fmt: skip
         except Refused as refused:
             raise ValueError(refused.detail) from refused

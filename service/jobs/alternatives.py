@@ -16,12 +16,11 @@ from loopwright.service.states.job_state import ACTIVE
 from loopwright.service.states.loop_state import loop_state
 from loopwright.service.store.jobs import Job, JobEvent
 from loopwright.tuning.analysis.assessment import Assessment, assess
-from loopwright.tuning.fast.design import Aim, DesignSpec, aim_of
+from loopwright.tuning.fast.design import Aim, DesignSpec, OptimalGains, aim_of
 from loopwright.tuning.fast.design_trial import designed_on
-from loopwright.tuning.fast.procedure import FAST, FastOptions
+from loopwright.tuning.fast.procedure import FAST
 from loopwright.tuning.fast.proposal import delayed
 from loopwright.tuning.fast.record_evaluation import evaluate_again
-from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 from loopwright.tuning.reasons import Ended, Reason, Refused
 from loopwright.tuning.rules.design import MIN_GM, MAX_Ms
@@ -30,7 +29,7 @@ from loopwright.tuning.rules.setting import Setting
 
 
 def _rule(model: Model, Ms: float = 1.6, derivative: bool = False, aim: str = Aim.BALANCED) -> Setting:
-    return Setting(designed_on(model, FastOptions(Ms=Ms, derivative=derivative, aim=aim), 0.0).gains, {"Ms": Ms})
+    return Setting(designed_on(model, DesignSpec(Ms, derivative, aim=aim_of(aim)), 0.0).gains, {"Ms": Ms})
 
 
 ANYWAY = {"propose_anyway": True}
@@ -62,10 +61,8 @@ def alternatives(row: Job, events: Sequence[JobEvent], method: str | None = None
     return json_object({"job": row.id, "loop": row.loop, **body})
 
 
-def redesigned(
-    row: Job, events: Sequence[JobEvent], record: StoredRecord | None, ms: float, derivative: bool, aim: Aim
-) -> JsonObject:
-    """Returns the same object with the gains of fast for another Ms, without a new experiment.
+def redesigned(row: Job, events: Sequence[JobEvent], record: StoredRecord | None, spec: DesignSpec) -> JsonObject:
+    """Returns the same object with the gains of fast for another specification, without a new experiment.
 
     record: the job's record, if it is stored; without it, and for a job of another method, the gains are designed for
     the job's model.
@@ -76,8 +73,8 @@ def redesigned(
     model = designable(row, events, evidence is not None)
     try:
         if evidence is not None:
-            evaluation = evaluate_again(evidence, DesignSpec(ms, derivative, aim=aim))
-            model, gains = evaluation.model, evaluation.best.gains
+            evaluation = evaluate_again(evidence, spec)
+            model, best = evaluation.model, evaluation.best
             doubt = {"uncertainty": evaluation.uncertainty, "ambiguity": evaluation.ambiguity}
             if evaluation.reason is not None:
                 raise Refused(evaluation.reason, evaluation.detail)
@@ -85,28 +82,40 @@ def redesigned(
         else:
             Ts = loop_state(row.found).sample_time_s if row.found else 0.0
             sampled = delayed(model, 0.5 * Ts)
-            gains = designed_on(model, FastOptions(Ms=ms, derivative=derivative, aim=aim), Ts).gains
-        result = _tuned(gains, ms, assess(sampled, gains))
+            best = designed_on(model, spec, Ts)
+        result = _tuned(best, spec, assess(sampled, best.gains))
     except Ended as refusal:
         result = MethodResult(FAST_DESIGN, refusal=refusal)
     body = answer(model, [result])
     retune = None
     if result.gains is not None:
         asked = {"num": list(model.num), "den": list(model.den), "dead_time_s": model.L}
-        request = {"method": FAST, "start": "design", "ms": ms, "derivative": derivative, "aim": aim, "model": asked}
-        retune = json_object(request | ANYWAY)
+        retune = json_object({"method": FAST, "start": "design", **options_of(spec), "model": asked} | ANYWAY)
     body["methods"][0] |= {"retune": retune, **doubt}
     return json_object({"job": row.id, "loop": row.loop, **body})
 
 
-def _tuned(gains: Gains, ms: float, assessed: Assessment) -> MethodResult:
+def options_of(spec: DesignSpec) -> dict[str, bool | float | str]:
+    """Returns the options of a request for gains of this specification."""
+    return {"ms": spec.Ms, "derivative": spec.derivative, "aim": spec.aim, **spec.requirements}
+
+
+def _tuned(best: OptimalGains, spec: DesignSpec, assessed: Assessment) -> MethodResult:
     notes = ("Margins and figures are of the model and half a sample's delay.",)
-    return MethodResult(FAST_DESIGN, gains, {"Ms": ms}, notes, assessed)
+    return MethodResult(FAST_DESIGN, best.gains, {"Ms": best.Ms, **spec.requirements}, notes, assessed)
 
 
-def asked_aim(row: Job) -> Aim:
-    """Returns the aim that the job asked for; balanced for a job of an older version or of another method."""
-    return aim_of(str(row.request.get("aim", Aim.BALANCED)))
+def asked_spec(row: Job, Ms: float) -> DesignSpec:
+    """Returns the specification that the job asked for, with another Ms; the defaults where a job of an older version
+    or of another method has asked for nothing. The settling time is left out: it is a way to choose an Ms."""
+
+    def number(name: str) -> float | None:
+        value = row.request.get(name)
+        return float(value) if isinstance(value, int | float) else None
+
+    aim = aim_of(str(row.request.get("aim", Aim.BALANCED)))
+    derivative = bool(row.request.get("derivative"))
+    return DesignSpec(Ms, derivative, noise_gain=number("noise_gain"), aim=aim, mv_peak=number("mv_peak"))
 
 
 def job_model(row: Job, events: Sequence[JobEvent]) -> FoundModel:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from pydantic import Field
 
-from loopwright.service.jobs.alternatives import asked_aim
+from loopwright.service.jobs.alternatives import asked_spec
 from loopwright.service.jsonable import json_object
 from loopwright.service.results import Figures, GainsView, WorthView
 from loopwright.service.states.loop_state import gains_of, loop_state
@@ -16,8 +16,8 @@ from loopwright.tuning.analysis.comparison import loop_performance
 from loopwright.tuning.fast.design import Aim, DesignSpec, GainDesign
 from loopwright.tuning.fast.design_trial import designed_on
 from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY, Evaluation
-from loopwright.tuning.fast.procedure import FastOptions
 from loopwright.tuning.fast.proposal import delayed
+from loopwright.tuning.fast.requirements import required
 from loopwright.tuning.fast.robustness import known_Ms
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Model
@@ -50,6 +50,13 @@ class DesignCurve(Figures):
     )
     derivative: bool = Field(description="Whether fast may design a PID, as the job asked")
     aim: Aim = Field(default=Aim.BALANCED, description="What the gains are the best for, as the job asked")
+    mv_peak: float | None = Field(
+        default=None, description="Largest change of MV after a set-point step, percent per PV unit, as the job asked; "
+        "null: no bound. A settling time that the job asked for is no bound here: it is one way to choose an Ms",
+    )  # fmt: skip
+    noise_gain: float | None = Field(
+        default=None, description="Largest noise gain, percent per PV unit, as the job asked; null: no bound"
+    )
     num: list[float] = Field(description="Numerator of the model, highest power of s first, PV units per MV percent")
     den: list[float] = Field(description="Denominator of the model, highest power of s first")
     dead_time_s: float = Field(description="Dead time of the model, s")
@@ -99,13 +106,13 @@ def design_curve(row: Job, model: Model, evaluation: Evaluation | None) -> Desig
     model: the job's model.
     evaluation: that of the job's record, whose model is then taken: one fit for all gains; None without a record.
     """
-    derivative, aim = bool(row.request.get("derivative")), asked_aim(row)
+    spec = asked_spec(row, DesignSpec().Ms)
     if evaluation is not None:
-        designing = _on_record(evaluation, derivative, aim)
+        designing = _on_record(evaluation, spec)
         model, delay_s, words = evaluation.model, evaluation.design_delay, "one fit to the job's record"
     else:
         Ts = loop_state(row.found).sample_time_s if row.found else 0.0
-        designing = _on_model(model, Ts, derivative, aim)
+        designing = _on_model(model, Ts, spec)
         delay_s, words = 0.5 * Ts, "the job's model"
     if evaluation is not None and evaluation.reason is not None:
         refusal = Refused(evaluation.reason, evaluation.detail)
@@ -116,8 +123,10 @@ def design_curve(row: Job, model: Model, evaluation: Evaluation | None) -> Desig
     new = None if row.result is None or row.result.new_gains is None else row.result.new_gains.gains()
     return DesignCurve(
         designed_on=words,
-        derivative=derivative,
-        aim=aim,
+        derivative=spec.derivative,
+        aim=spec.aim,
+        mv_peak=spec.mv_peak,
+        noise_gain=spec.noise_gain,
         num=list(model.num),
         den=list(model.den),
         dead_time_s=model.L,
@@ -128,12 +137,12 @@ def design_curve(row: Job, model: Model, evaluation: Evaluation | None) -> Desig
     )
 
 
-def _on_record(evaluation: Evaluation, derivative: bool, aim: Aim) -> _Designing:
+def _on_record(evaluation: Evaluation, spec: DesignSpec) -> _Designing:
     record = evaluation.fit.record
     model = replace(evaluation.model, L=evaluation.model.L + evaluation.design_delay)
 
     def gains(Ms: float) -> Gains:
-        return GainDesign(model, DesignSpec(Ms, derivative, aim=aim), record.period * record.Ts).best().gains
+        return required(GainDesign(model, replace(spec, Ms=Ms), record.period * record.Ts)).gains
 
     def uncertainty(of: Gains) -> float | None:
         return known_Ms(evaluation, of).uncertainty
@@ -141,9 +150,9 @@ def _on_record(evaluation: Evaluation, derivative: bool, aim: Aim) -> _Designing
     return _Designing(model, record.Ts, gains, uncertainty, MAX_UNCERTAINTY[record.excitation])
 
 
-def _on_model(model: Model, Ts: float, derivative: bool, aim: Aim) -> _Designing:
+def _on_model(model: Model, Ts: float, spec: DesignSpec) -> _Designing:
     def gains(Ms: float) -> Gains:
-        return designed_on(model, FastOptions(Ms=Ms, derivative=derivative, aim=aim), Ts).gains
+        return designed_on(model, replace(spec, Ms=Ms), Ts).gains
 
     return _Designing(delayed(model, 0.5 * Ts), Ts, gains, lambda _: None, 0.0)
 

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from loopwright.service.errors import Conflict
-from loopwright.service.jobs.alternatives import asked_aim, designable, job_model
+from loopwright.service.jobs.alternatives import asked_spec, designable, job_model
 from loopwright.service.jobs.design_curve import DesignCurve, design_curve
 from loopwright.service.jobs.job_record import FittedRecord, JobRecord, job_record, unpack
 from loopwright.service.jobs.stored_record import StoredRecord, last_attempt, record_columns, record_of
@@ -90,10 +90,9 @@ def _evaluated(row: Job, record: StoredRecord) -> Evaluation | None:
     if evidence is None:
         return None
     asked = row.request.get("ms")
-    derivative, aim = bool(row.request.get("derivative")), asked_aim(row)
     for Ms in (float(asked) if isinstance(asked, int | float) else DesignSpec().Ms, _HIGHEST_MS):
         try:
-            return evaluate_again(evidence, DesignSpec(Ms, derivative, aim=aim))
+            return evaluate_again(evidence, asked_spec(row, Ms))
         except Ended as ended:
             log.info("job %s has no model of its record for Ms %g: %s", row.id, Ms, ended.detail)
         except (ArithmeticError, ValueError):  # the record is shown all the same

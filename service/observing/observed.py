@@ -50,6 +50,7 @@ ADVICE = {
     Reason.DISTURBED: "Wait for set-point changes in steadier times, or retune by setpoint or fast.",
     Reason.UNEXPLAINED: "Look for a sticking valve, a limit of MV or another loop; then wait for further set-point "
     "changes, or retune by fast.",
+    Reason.NOT_POSSIBLE: "Ask for what the message says is possible.",
     Reason.NOT_ROBUST: "Keep the present gains, or retune by fast.",
 }
 TRUSTED = (None, Reason.UNCERTAIN, Reason.AMBIGUOUS)
@@ -339,5 +340,5 @@ def _range(columns: Sequence[np.ndarray[tuple[int], np.dtype[np.float64]]]) -> d
 def _trial(evaluation: Evaluation, spec: DesignSpec) -> dict[str, object]:
     model = evaluation.model
     given = {"num": list(model.num), "den": list(model.den), "dead_time_s": model.L}
-    asked = {"ms": spec.Ms, "derivative": spec.derivative, "aim": spec.aim}
+    asked = {"ms": spec.Ms, "derivative": spec.derivative, "aim": spec.aim, **spec.requirements}
     return {"method": FAST, "start": "design", **asked, "model": given}

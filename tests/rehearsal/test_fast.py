@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import pytest
@@ -129,6 +130,31 @@ def test_what_can_be_allowed_for_does_not_hinder(case: str) -> None:
     assert result.value is not None, result.ended
     gains = result.value.gains
     assert abs(margins(plant.model(), gains).Ms - ASKED) < 0.05
+
+
+@pytest.mark.parametrize("method", ["fast", "setpoint"])
+def test_a_heater_that_settles_in_time_and_moves_MV_no_further(method: str) -> None:
+    """On the true plant, which the model of a noisy record is near to."""
+    plant = {"num": [0.8], "den": [120.0, 1.0], "dead_time_s": 15.0, "sample_time_s": 1.0, "noise_std": 0.002,
+             "sp_deviation": 1.0}
+    answer = rehearse(plant, method=method, settling_s=100.0, mv_peak=4.0)
+    assert answer["outcome"] == "proposed", answer["detail"]
+    compared, chosen = answer["comparison"], answer["chosen"]
+    assert (compared["settling_s_asked"], compared["mv_peak_asked"], compared["Ms_asked"]) == (100.0, 4.0, 1.6)
+    assert (chosen["settling_s"], chosen["mv_peak"]) == (100.0, 4.0) and 1.15 < chosen["Ms"] < 1.35
+    assert compared["after"]["setpoint"]["settling_s"] <= 100.01 and compared["after"]["setpoint"]["mv_peak"] <= 4.0004
+    assert abs(true_Ms(plant, answer["new_gains"]) - chosen["Ms"]) < 0.03
+    gains = GainsView.model_validate(answer["new_gains"]).gains()
+    true = step_figures(TransferFunction((0.8,), (120.0, 1.0), 15.5), gains, band=0.05)
+    assert true.settling_s is not None and true.settling_s < 112.0 and true.peak_u is not None and true.peak_u < 4.01
+    at_once = rehearse(plant, method=method, settling_s=0.5)
+    assert at_once["reason"] == "bad_input" and "sample time of 1 s" in at_once["detail"]
+    refused = rehearse(plant, method=method, settling_s=20.0)
+    assert (refused["outcome"], refused["reason"]) == ("refused", "not_possible")
+    possible = float(re.findall(r"at least ([0-9.]+) s", refused["detail"])[0])
+    assert 48.0 < possible < 52.0  # 49.7 s on the true plant
+    # after the step under the new gains what is possible may have moved by what the noise leaves open
+    assert rehearse(plant, method=method, settling_s=1.03 * possible)["outcome"] == "proposed"
 
 
 @pytest.mark.parametrize("method", ["fast", "setpoint"])

@@ -17,6 +17,7 @@ from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.inputs.config import LoopConfig, parse_site
 from loopwright.service.inputs.request import retune_request
 from loopwright.service.jobs.stored_record import record_columns
+from loopwright.service.results import GainsView
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.tuning.analysis.margins import margins
@@ -104,3 +105,19 @@ def test_gains_for_another_Ms_are_tried_without_another_relay(tmp_path: Path) ->
     assert job["after"]["settled"] and job["after"]["overshoot_pct"] < 40
     assert job["predicted_before"] and job["evidence"] is None and job["before"] is None
     assert job["restored"]["gains"]["Kp"] == pytest.approx(0.2) and job["restored"]["on_trial"] is False
+
+
+def test_a_job_with_a_settling_time_and_a_movement_of_MV(tmp_path: Path) -> None:
+    """With what was asked for and what is reached in the job; what is refused names what is possible."""
+    asked = {"settling_s": 14.0, "mv_peak": 1.5}
+    job, _ = proposal(tmp_path, 0.0, 0.0, **asked)
+    assert job["state"] == "proposed" and job["request"]["settling_s"] == 14.0 and job["request"]["mv_peak"] == 1.5
+    compared, reached = job["comparison"], job["comparison"]["after"]["setpoint"]
+    assert (compared["settling_s_asked"], compared["mv_peak_asked"]) == (14.0, 1.5)
+    assert reached["settling_s"] <= 14.0014 and reached["mv_peak"] <= 1.50015
+    assert job["chosen"]["Ms"] < 1.55 and job["chosen"]["settling_s"] == 14.0
+    gains = GainsView.model_validate(job["new_gains"]).gains()
+    assert margins(FOPDT(K, T, L + 0.5 * TS), gains).Ms == pytest.approx(job["chosen"]["Ms"], abs=0.05)
+    never, _ = proposal(tmp_path / "never", 0.0, 0.0, settling_s=3.0)
+    assert (never["state"], never["reason"]) == ("refused", "not_possible")
+    assert "3 s was asked for: ask for at least" in never["detail"] and never["advice"]

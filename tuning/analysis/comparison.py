@@ -36,12 +36,14 @@ class StepPerformance:
     peak: the largest change of PV.
     settling_s: the time until PV stays within 5 %, s; None where the simulated response ends before that.
     TV: the total variation of MV.
+    mv_peak: the largest change of MV.
     """
 
     IAE: float | None
     peak: float
     settling_s: float | None
     TV: float
+    mv_peak: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +77,8 @@ class RobustnessBounds:
 
     Ms, Mt, noise_gain: the largest permitted values.
     overshoot_pct: the largest permitted overshoot after a set-point step, percent.
+    settling_s, mv_peak: the longest settling time (into 5 %, s) and the largest change of MV (MV units per PV unit)
+    after a set-point step.
     GM: the smallest permitted gain margin.
     by: who asks for the bounds, in words.
     """
@@ -84,6 +88,8 @@ class RobustnessBounds:
     GM: float | None = None
     noise_gain: float | None = None
     overshoot_pct: float | None = None
+    settling_s: float | None = None
+    mv_peak: float | None = None
     by: str = "asked for"
 
     def worst(self, found: LoopPerformance) -> tuple[float, str]:
@@ -99,6 +105,14 @@ class RobustnessBounds:
         ):
             if value is not None and maximum is not None:
                 yield value / maximum, f"{name} {value:.2f} ({self.by}: at most {maximum:.2f})"
+        if found.setpoint is not None and self.settling_s is not None:
+            settled = math.inf if found.setpoint.settling_s is None else found.setpoint.settling_s
+            words = "no end of settling" if settled == math.inf else f"a settling time of {settled:.3g} s"
+            yield settled / self.settling_s, f"{words} ({self.by}: at most {self.settling_s:.4g} s)"
+        if found.setpoint is not None and self.mv_peak is not None:
+            peak = found.setpoint.mv_peak
+            words = f"a movement of MV of {peak:.3g} for each PV unit"
+            yield peak / self.mv_peak, f"{words} ({self.by}: at most {self.mv_peak:.4g})"
         if found.GM is not None and self.GM is not None:
             yield self.GM / found.GM, f"GM {found.GM:.2f} ({self.by}: at least {self.GM:.2f})"
         if found.overshoot_pct is not None and self.overshoot_pct is not None:
@@ -113,6 +127,8 @@ class Comparison:
 
     before, after: the figures of the old and of the new gains on the same model.
     Ms_asked: the largest permitted Ms.
+    settling_s_asked, mv_peak_asked, noise_gain_asked: the largest permitted ones, see `RobustnessBounds`; None where
+    none was asked for.
     criterion: the criterion J in words.
     J_before, J_after: the values of J, the lower the better; None where the loop is not stable or leaves an offset.
     gain: True if what was asked for improves by more than 5 %.
@@ -127,6 +143,9 @@ class Comparison:
     J_after: float | None
     gain: bool
     verdict: str
+    settling_s_asked: float | None = None
+    mv_peak_asked: float | None = None
+    noise_gain_asked: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,11 +242,12 @@ def compare(
     if gain and keep_setpoint and (worse := _worse_setpoint(before, after, asked)) is not None:
         end = "they are proposed because that was asked for" if anyway else "the present gains are kept"
         words = f"The new gains would make a good answer to the set-point worse by {worse}, and {end}; {words}"
-        return Comparison(before, after, asked.Ms, criterion, *J, False, words)
-    if not gain:
+        gain = False
+    elif not gain:
         end = "the new gains are proposed because that was asked for" if anyway else "the present gains are kept"
         words = f"Nothing asked for gets better by more than {100.0 * MIN_GAIN:.0f} %: {end}; {words}."
-    return Comparison(before, after, asked.Ms, criterion, *J, gain, words)
+    also = asked.settling_s, asked.mv_peak, asked.noise_gain
+    return Comparison(before, after, asked.Ms, criterion, *J, gain, words, *also)
 
 
 def _conclusion(
@@ -244,7 +264,7 @@ def _conclusion(
         return True, f"The present gains have {words}, the new ones {asked.worst(after)[1]}; {_errors(before, after)}."
     now, then = J
     if better and then is not None and (now is None or then * (1.0 + MIN_GAIN) < now):
-        falls = "" if now is None else f"; J falls by {100.0 * (1.0 - then / now):.0f} %"
+        falls = "" if now is None or asked.settling_s else f"; J falls by {100.0 * (1.0 - then / now):.0f} %"
         return True, f"{rest[0].upper()}{rest[1:]}{falls}."
     return False, rest
 
@@ -293,8 +313,10 @@ def _figures(found: LoopPerformance) -> list[float]:
 
 
 def _step(figures: StepFigures, offset: bool) -> StepPerformance:
-    assert figures.TV is not None  # of a response with MV
-    return StepPerformance(None if offset else figures.IAE, figures.peak, figures.settling_s, figures.TV)
+    assert figures.TV is not None and figures.peak_u is not None  # of a response with MV
+    return StepPerformance(
+        None if offset else figures.IAE, figures.peak, figures.settling_s, figures.TV, figures.peak_u
+    )
 
 
 def predicted(found: LoopPerformance) -> Predicted:

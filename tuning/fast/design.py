@@ -5,7 +5,8 @@
 where IAE_r follows a unit set-point step and IAE_d a unit load disturbance; ° marks the minimum of each IAE alone under
 the same bounds. The share is that of the aim (`Aim`). The controller has two degrees of freedom: the set-point weight b
 moves IAE_r alone, none of the bounds. For each (Ti, Td) the largest gains are known in closed form (`gain_bounds`), and
-for each of these the best b (`iae`), so that the search runs over one number (PI) or two (PID).
+for each of these the best b (`iae`), so that the search runs over one number (PI) or two (PID). A settling time and a
+largest movement of MV that are asked for bound b too (`weight_bounds`), and Ms with it (`requirements`).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from scipy.optimize import minimize
 from loopwright.tuning.analysis.stability import is_stable
 from loopwright.tuning.fast.gain_bounds import does_not_encircle, largest_gains
 from loopwright.tuning.fast.iae import Cost, LoopCost
+from loopwright.tuning.fast.weight_bounds import KEPT, Bounds, Missed, weights
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Complexes, Model, Reals, TransferFunction, sign
 from loopwright.tuning.reasons import Reason, Refused
@@ -53,6 +55,14 @@ MAX_OVERSHOOT = 0.01
 """Largest overshoot of the aim no_overshoot on the model, as a fraction of the set-point step."""
 WIDER_OVERSHOOTS, MAX_PRICE = (0.02, 0.05), 1.5
 """Bounds on the overshoot that follow where one raises J by more than the factor MAX_PRICE."""
+MAX_WORTH = 1.2
+"""Factor by which a settling time may raise J beyond that of the best gains for the same Ms. More of it is bought with
+an integral time so long that PV reaches the band by b*Kp alone, and loads are corrected ten times as slowly."""
+MAX_SETTLING_S, MAX_MV_PEAK = 1e8, 1e9
+"""Largest values that may be asked for, s and MV units per PV unit."""
+_MISSED = 1e3
+"""J of gains that miss a requirement, for a search that follows one number; those that move MV too far have ten times
+as much."""
 
 
 class Aim(StrEnum):
@@ -101,6 +111,10 @@ class DesignSpec:
     N: the derivative filter has the time constant Td/N.
     aim: what the gains are the best for.
     weights: the smallest and the largest set-point weight b; equal where b is given.
+    settling_s: the longest time, s, from a set-point step until PV stays within 5 % of it; None for no bound. The gains
+    are then those for the smallest Ms that permits it, see `tuning.fast.requirements`.
+    mv_peak: the largest permitted change of MV after a set-point step, MV units per PV unit of the step, None for no
+    bound.
     """
 
     Ms: float = 1.6
@@ -110,17 +124,31 @@ class DesignSpec:
     N: float = 10.0
     aim: Aim = Aim.BALANCED
     weights: tuple[float, float] = WEIGHTS
+    settling_s: float | None = None
+    mv_peak: float | None = None
 
     def __post_init__(self) -> None:
         for name, value, low, high in (
             ("Ms", self.Ms, 1.1, 3.0), ("Mt", self.Mt, 1.0, 3.0), ("N", self.N, 2.0, 100.0),
-            ("noise_gain", self.noise_gain, 0.0, math.inf),
+            ("noise_gain", self.noise_gain, 0.0, math.inf), ("settling_s", self.settling_s, 0.0, MAX_SETTLING_S),
+            ("mv_peak", self.mv_peak, 0.0, MAX_MV_PEAK),
         ):  # fmt: skip
             if value is not None and not low < value < high:
                 raise Refused(Reason.BAD_INPUT, f"{name} must be above {low:g} and below {high:g}, not {value!r}")
         low, high = self.weights
         if not 0.0 <= low <= high < math.inf:
             raise Refused(Reason.BAD_INPUT, f"weights must be two rising numbers from 0 up, not {self.weights!r}")
+
+    @property
+    def has_requirements(self) -> bool:
+        """Whether a settling time or a largest movement of MV is asked for."""
+        return self.settling_s is not None or self.mv_peak is not None
+
+    @property
+    def requirements(self) -> dict[str, float]:
+        """What is asked for beside Ms and Mt: settling_s, mv_peak and noise_gain, as far as they are."""
+        asked = {"settling_s": self.settling_s, "mv_peak": self.mv_peak, "noise_gain": self.noise_gain}
+        return {name: value for name, value in asked.items() if value is not None}
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,12 +159,24 @@ class OptimalGains:
     J: the value of the criterion, without unit.
     cost: the two IAE of which J is made.
     minimum: the smallest IAE_r and IAE_d by which J is normalised.
+    Ms: the bound on Ms that they were designed for: the one asked for, or the smallest that permits the settling time.
+    missed: by how much the requirements are not kept in the simulation of the design.
     """
 
     gains: Gains
     J: float
     cost: Cost
     minimum: Cost
+    Ms: float
+    missed: Missed = KEPT
+
+    @property
+    def order(self) -> tuple[tuple[float, float], float]:
+        """What orders gains: by what they miss, then by J."""
+        return self.missed.order, self.J
+
+
+_Candidate = tuple[Gains, Cost, Missed]
 
 
 class GainDesign:
@@ -159,12 +199,15 @@ class GainDesign:
         self.tail = np.geomspace(start, TAIL_FACTOR * end, POINTS)
         self.G_tail = positive.frequency_response(self.tail)
         self.minimum: Cost | None = None
-        self.max_overshoot: float | None = None
-        """The bound on the overshoot that is in effect, a fraction of the set-point step."""
+        self.bounds = Bounds(spec.Ms)
+        """The bounds that are in effect."""
+        self.worth: OptimalGains | None = None
+        """The gains that others are measured by, see `best_within`."""
 
     def best(self) -> OptimalGains:
-        """The best PI, or the best PID where it is permitted and lowers J. Raises Refused, NOT_ROBUST: no gain meets
-        the bounds.
+        """The best PI, or the best PID where it is permitted and lowers J, under the bounds on Ms, Mt, the noise gain
+        and the overshoot; a settling time and a movement of MV are left to `tuning.fast.requirements`. Raises Refused,
+        NOT_ROBUST: no gain meets the bounds.
 
         A bound on the overshoot that would raise J by more than MAX_PRICE is widened: a fitted model may have a slow
         ripple of one percent that its record hardly shows, and no loop that is worth having is without it.
@@ -173,57 +216,92 @@ class GainDesign:
             return self._best()
         free = self._best()
         for overshoot in (self.spec.aim.max_overshoot, *WIDER_OVERSHOOTS):
-            self.max_overshoot, self.minimum = overshoot, None
+            self.bounds, self.minimum = Bounds(self.spec.Ms, overshoot), None
             try:
                 held = self._best()
             except Refused:  # not one PI keeps it
                 continue
             if self._J(held.cost, free.minimum) <= MAX_PRICE * free.J:
                 return held
-        self.max_overshoot, self.minimum = None, free.minimum
+        self.bounds, self.minimum = Bounds(self.spec.Ms), free.minimum
         return free
 
+    def best_within(self, bounds: Bounds, worth: OptimalGains | None = None) -> OptimalGains:
+        """The best PI or PID under these bounds in place of those of the specification; where none keeps the settling
+        time and the movement of MV, those that miss them least.
+
+        worth: the best gains without the settling time; gains with more than MAX_WORTH times their J are left out.
+        Raises Refused, NOT_ROBUST.
+        """
+        self.bounds, self.worth = bounds, worth
+        self.minimum = None if worth is None else worth.minimum
+        try:
+            return self._best()
+        finally:
+            self.bounds, self.worth = Bounds(self.spec.Ms), None
+
+    def J(self, best: OptimalGains, minimum: Cost) -> float:
+        """J of these gains over other smallest IAE."""
+        return self._J(best.cost, minimum)
+
     def _best(self) -> OptimalGains:
-        pi = self._pi()
+        try:
+            pi = self._pi()
+        except Refused:
+            pid = self._pid() if self.spec.derivative and self.worth is not None else None
+            if pid is None:
+                raise
+            return pid
         if not self.spec.derivative:
             return pi
         pid = self._pid()
-        pi = self._evaluated((pi.gains, pi.cost))  # the minimum is now that of all PID
+        pi = self._evaluated((pi.gains, pi.cost, pi.missed))  # the minimum is now that of all PID
+        if pid is not None and pid.missed != pi.missed:
+            return min(pi, pid, key=_order)
         return pid if pid is not None and pid.J < MAX_J_RATIO * pi.J else pi
 
     def candidates(self, Ti: float, Td: float = 0.0) -> list[tuple[Gains, Cost]]:
         """The stable ones of the largest permitted gains for this Ti and Td (s), each with its best set-point weight
         and its cost. Gains without a weight that keeps the overshoot are left out."""
+        return [(gains, cost) for gains, cost, _ in self._candidates(Ti, Td)]
+
+    def _candidates(self, Ti: float, Td: float = 0.0) -> list[_Candidate]:
         spec = self.spec
         g = self.G * controller(self.w, Ti, Td, spec.N)
         cap = math.inf
         if spec.noise_gain is not None:
             cap = spec.noise_gain / (1.0 + spec.N if Td > 0.0 else 1.0)
         size = float(np.max(np.abs(self.G_tail * controller(self.tail, Ti, Td, spec.N))))
-        cap = min(cap, (TAIL_MARGIN if Td > 0.0 else 1.0) * (1.0 - 1.0 / spec.Ms) / size)
+        cap = min(cap, (TAIL_MARGIN if Td > 0.0 else 1.0) * (1.0 - 1.0 / self.bounds.Ms) / size)
         found = []
-        for end in largest_gains(g, spec.Ms, spec.Mt, cap):
+        bounds = self.bounds
+        for end in largest_gains(g, bounds.Ms, spec.Mt, cap):
             if does_not_encircle(end * g):
                 responses = self.cost.responses(end, Ti, Td, spec.N)
-                b = responses.best_weight(*spec.weights, self.max_overshoot)
-                if b is not None:
-                    gains = Gains(float(end), float(Ti), float(Td), float(Td) / spec.N, b)
-                    found.append((gains, responses.cost(b)))
+                for b, missed in weights(responses, spec.weights, bounds):
+                    cost = responses.cost(b)
+                    if self._is_worth(cost):
+                        gains = Gains(float(end), float(Ti), float(Td), float(Td) / spec.N, b)
+                        found.append((gains, cost, missed))
+                        break
         return found
 
+    def _is_worth(self, cost: Cost) -> bool:
+        return self.worth is None or self._J(cost, self.worth.minimum) <= MAX_WORTH * self.worth.J
+
     def _pi(self) -> OptimalGains:
-        scanned = [self.candidates(Ti * self.period) for Ti in TI]
+        scanned = [self._candidates(Ti * self.period) for Ti in TI]
         everything = [each for candidates in scanned for each in candidates]
         if not everything:
-            raise Refused(Reason.NOT_ROBUST, f"no PI on the model has an Ms of at most {self.spec.Ms:g}")
+            raise Refused(Reason.NOT_ROBUST, f"no PI on the model has an Ms of at most {self.bounds.Ms:.4g}")
         self._lower_minimum(everything)
-        best = min((self._evaluated(each) for each in everything), key=_value)
+        best = min((self._evaluated(each) for each in everything), key=_order)
         step = math.log(TI[1] / TI[0])
         for _ in range(HALVINGS):
             step *= 0.5
             middle = best.gains.Ti
             for Ti in (middle * math.exp(-step), middle * math.exp(step)):
-                best = min((best, *map(self._evaluated, self.candidates(Ti))), key=_value)
+                best = min((best, *map(self._evaluated, self._candidates(Ti))), key=_order)
         self._require_stable(best)
         return best
 
@@ -235,8 +313,8 @@ class GainDesign:
             if (found := self._permitted(Ti, ratio * Ti))
         ]
         self._lower_minimum([each for found, _ in scanned for each in found])
-        grid = [(min(map(self._evaluated, found), key=_value), at) for found, at in scanned]
-        grid.sort(key=lambda found: found[0].J)
+        grid = [(min(map(self._evaluated, found), key=_order), at) for found, at in scanned]
+        grid.sort(key=lambda found: found[0].order)
         starts: list[tuple[float, float]] = []
         for _, at in grid:
             if all(abs(at[0] - other[0]) + abs(at[1] - other[1]) > 0.8 for other in starts):
@@ -251,9 +329,9 @@ class GainDesign:
                 found = self._at(math.exp(at[0]), math.exp(at[1]))
                 if found is None:
                     return 1e6
-                if best is None or found.J < best.J:
+                if best is None or found.order < best.order:
                     best = found
-                return found.J
+                return _value(found)
 
             simplex = np.array(start) + np.array([[0.0, 0.0], [0.25, 0.0], [0.0, 0.25]])
             minimize(
@@ -264,25 +342,29 @@ class GainDesign:
             self._require_stable(best)
         return best
 
-    def _permitted(self, Ti: float, Td: float) -> list[tuple[Gains, Cost]]:
+    def _permitted(self, Ti: float, Td: float) -> list[_Candidate]:
         """The candidates for this Ti and Td (s); none where the times are not permitted."""
         if Td < MIN_TD * self.period or Ti < MIN_TI * self.period or Td > MAX_TD * Ti or Ti > 40.0 * self.period:
             return []
-        return self.candidates(Ti, Td)
+        return self._candidates(Ti, Td)
 
     def _at(self, Ti: float, Td: float) -> OptimalGains | None:
         """The best gains for this Ti and Td (s); None where the times are not permitted or no gain meets the bounds."""
-        return min(map(self._evaluated, self._permitted(Ti, Td)), key=_value, default=None)
+        return min(map(self._evaluated, self._permitted(Ti, Td)), key=_order, default=None)
 
-    def _lower_minimum(self, found: list[tuple[Gains, Cost]]) -> None:
-        """Makes the minimum the smallest IAE of all that was found so far, each alone."""
-        costs = [cost for _, cost in found] + ([] if self.minimum is None else [self.minimum])
+    def _lower_minimum(self, found: list[_Candidate]) -> None:
+        """Makes the minimum the smallest IAE of all that was found so far, each alone. Gains that miss a requirement
+        count where none keeps it."""
+        if self.worth is not None:
+            return
+        kept = [each for each in found if each[2] == KEPT]
+        costs = [cost for _, cost, _ in kept or found] + ([] if self.minimum is None else [self.minimum])
         self.minimum = Cost(min(each.setpoint for each in costs), min(each.load for each in costs))
 
-    def _evaluated(self, each: tuple[Gains, Cost]) -> OptimalGains:
-        gains, cost = each
+    def _evaluated(self, each: _Candidate) -> OptimalGains:
+        gains, cost, missed = each
         assert self.minimum is not None  # the PI comes first
-        return OptimalGains(gains, self._J(cost, self.minimum), cost, self.minimum)
+        return OptimalGains(gains, self._J(cost, self.minimum), cost, self.minimum, self.bounds.Ms, missed)
 
     def _J(self, cost: Cost, minimum: Cost) -> float:
         share = self.spec.aim.share
@@ -329,5 +411,13 @@ def _numbers(coefficients: tuple[float, ...]) -> str:
     return ", ".join(f"{each:.4g}" for each in coefficients)
 
 
+def _order(best: OptimalGains) -> tuple[tuple[float, float], float]:
+    return best.order
+
+
 def _value(best: OptimalGains) -> float:
-    return best.J
+    """J, and more than J of any gains worth having where a requirement is missed."""
+    mv_peak, settling = best.missed.order
+    if mv_peak > 0.0:
+        return _MISSED * (10.0 + min(mv_peak, 100.0))
+    return _MISSED * (1.0 + min(settling, 8.0)) if settling > 0.0 else best.J

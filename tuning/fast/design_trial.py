@@ -11,10 +11,10 @@ from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.step_limits import not_kept
 from loopwright.tuning.experiments.step_test import StepResult
 from loopwright.tuning.experiments.verification import verification
-from loopwright.tuning.fast.design import GainDesign, OptimalGains
+from loopwright.tuning.fast.design import DesignSpec, GainDesign, OptimalGains
 from loopwright.tuning.fast.procedure import FAST, FastOptions
-from loopwright.tuning.fast.proposal import FastProposal, IdentifiedModel, comparison_on, delayed, ultimate
-from loopwright.tuning.gains import Gains
+from loopwright.tuning.fast.proposal import FastProposal, IdentifiedModel, chosen_for, comparison_on, delayed, ultimate
+from loopwright.tuning.fast.requirements import required
 from loopwright.tuning.models import Model, TransferFunction, sign, time_constants
 from loopwright.tuning.plan import Plan, StageDone, StageStarted, worked
 from loopwright.tuning.reasons import Reason, Refused
@@ -29,19 +29,20 @@ def trial_stages(verify: bool) -> tuple[str, ...]:
     return TRIAL_STAGES if verify else TRIAL_STAGES[:2]
 
 
-def designed_on(model: Model, options: FastOptions, sample_time_s: float) -> OptimalGains:
-    """The best gains on the model, for a controller of this sample time. Raises Refused, NOT_ROBUST."""
+def designed_on(model: Model, spec: DesignSpec, sample_time_s: float) -> OptimalGains:
+    """The best gains on the model, for a controller of this sample time. Raises Refused, NOT_ROBUST or NOT_POSSIBLE."""
     known = ultimate(model)
     # a model without an ultimate point is designed on the time scale of its lags and dead time
     period = known.Pu_s if known else 4.0 * (model.L + float(max(time_constants(model), default=0.0)))
-    return GainDesign(delayed(model, 0.5 * sample_time_s), options.spec(), period).best()
+    return required(GainDesign(delayed(model, 0.5 * sample_time_s), spec, period))
 
 
-def _considered(model: Model, options: FastOptions, facts: Facts) -> tuple[Gains, Comparison]:
-    """The best gains on the model and their comparison with the present gains. Raises Refused, NOT_ROBUST."""
-    best = designed_on(model, options, facts.sample_time_s)
+def _considered(model: Model, options: FastOptions, facts: Facts) -> tuple[OptimalGains, Comparison]:
+    """The best gains on the model and their comparison with the present gains. Raises Refused, NOT_ROBUST or
+    NOT_POSSIBLE."""
+    best = designed_on(model, options.spec(), facts.sample_time_s)
     sampled = delayed(model, 0.5 * facts.sample_time_s)
-    return best.gains, comparison_on(sampled, best, facts, options.spec(), options.propose_anyway)
+    return best, comparison_on(sampled, best, facts, options.spec(), options.propose_anyway)
 
 
 def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal]:
@@ -51,6 +52,7 @@ def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal
     New gains that improve nothing that was asked for are tried only if the options contain `propose_anyway`.
     Raises Refused. The plan restores nothing: the runner restores the loop.
     """
+    options.check_sampling(facts)
     expected = {"preflight": facts.T95_s / 2, "design": 0.0, "verify": 6 * facts.T95_s}
     todo = trial_stages(options.verify)
     if broken := not_kept(facts.directions, facts.sp_rate_max_per_s, todo, mirrored=True):
@@ -68,7 +70,8 @@ def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal
             f"the model's gain is {'positive' if sign(model) > 0.0 else 'negative'}; the controller acts "
             f"{'reverse' if facts.reverse else 'direct'}",
         )
-    gains, comparison = yield from worked(partial(_considered, model, options, facts))
+    best, comparison = yield from worked(partial(_considered, model, options, facts))
+    gains = best.gains
     promised = predicted(comparison.after)
     yield (StageDone("design", gains),)
     shown: StepResult | None = None
@@ -77,11 +80,10 @@ def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal
         gain = model.static_gain if math.isfinite(model.static_gain) else math.nan
         shown = yield from verification(facts, point, gains, promised, gain, model.L)
         yield (StageDone("verify", shown),)
-    spec = options.spec()
     given = TransferFunction(model.num, model.den, model.L)
     return FastProposal(
         method=FAST,
-        chosen={"Ms": spec.Ms, **({"N": spec.N} if gains.Td else {})},
+        chosen=chosen_for(options.spec(), best),
         model=IdentifiedModel("typed in", given.num, given.den, given.L),
         old_gains=facts.old_gains,
         gains=gains,

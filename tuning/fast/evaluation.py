@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from loopwright.tuning.fast.design import DesignSpec, GainDesign, OptimalGains
 from loopwright.tuning.fast.instead_of_loads import instead_of_loads
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
+from loopwright.tuning.fast.requirements import keeping, possible_instead
 from loopwright.tuning.fast.score_tests import ScoreTests
 from loopwright.tuning.fast.structure_choice import RIVAL_BIC, StructureChoice, choose_structure
 from loopwright.tuning.fast.uncertainty import difference_of_rivals, durbin_watson_ratio, peak, uncertainty_of_Ms
@@ -100,7 +101,8 @@ def evaluate(
     model = fit.model(found)
     delay = record.sampling_delay_s
     design = GainDesign(replace(model, L=model.L + delay), spec, record.period * record.Ts)
-    best = design.best()
+    kept = keeping(design)
+    best = design.best() if kept is None else kept  # the record is judged in any case
     spread = uncertainty_of_Ms(fit, found, best.gains, design.w, spec.N, delay)
     rivals = difference_of_rivals(fit, found, chosen.rivals, best.gains, design.w, delay)
     noise, rounding = record.noise / record.output_range, record.rounding / record.output_range
@@ -128,7 +130,7 @@ def evaluate(
     elif (not by_relay or (earlier is None and not test_follows)) and (shown := _nonlinearity(fit, found)) is not None:
         reason, detail = shown
     elif earlier is not None:
-        reason, detail = _model_mismatch(earlier, model, best.gains, spec, design, found.hypothesis.load_disturbances)
+        reason, detail = _model_mismatch(earlier, model, best, design, found.hypothesis.load_disturbances)
         if reason is None and (fault := find_valve_fault(fit, found)) is not None:
             reason, detail = Reason.UNEXPLAINED, f"{fault.fault} explains the record better, or the plant is not linear"
         if reason is None and by_relay:
@@ -137,6 +139,8 @@ def evaluate(
             reason, detail = _load_with_the_step(fit, found, earlier, best.gains)
     if earlier is not None or not test_follows:
         reason, detail = _instead_of_loads(fit, found, reason, detail)
+    if reason is None and kept is None:
+        reason, detail = Reason.NOT_POSSIBLE, possible_instead(design)
     return Evaluation(
         reason=reason,
         detail=detail,
@@ -245,20 +249,21 @@ def _loads(found: Fitted) -> list[float]:
 
 
 def _model_mismatch(
-    earlier: Evaluation, model: TransferFunction, gains: Gains, spec: DesignSpec, design: GainDesign, loads: int
+    earlier: Evaluation, model: TransferFunction, best: OptimalGains, design: GainDesign, loads: int
 ) -> tuple[Reason | None, str]:
     """The reason and the detail where the relay's model and that of the whole record disagree on a controller.
 
-    Both models must give both controllers about the Ms asked for. Otherwise a disturbance, or a change of the plant,
-    has entered one of the models.
+    Both models must give both controllers about the Ms that each was designed for. Otherwise a disturbance, or a change
+    of the plant, has entered one of the models.
     """
     maximum = MAX_MODEL_MISMATCH_OF_TWO_LOADS if loads > 1 else MAX_MODEL_MISMATCH
     tested = peak(model, earlier.best.gains, design.w, earlier.design_delay)
-    again = peak(earlier.model, gains, design.w, earlier.design_delay)
-    if abs(tested - spec.Ms) > maximum:
-        text = f"the controller that was tested has Ms {tested:.2f} on the model of the whole record, not {spec.Ms:g}"
+    again = peak(earlier.model, best.gains, design.w, earlier.design_delay)
+    if abs(tested - earlier.best.Ms) > maximum:
+        asked = f"{earlier.best.Ms:.4g}"
+        text = f"the controller that was tested has Ms {tested:.2f} on the model of the whole record, not {asked}"
         return Reason.MODEL_MISMATCH, text
-    if abs(again - spec.Ms) > maximum:
-        text = f"the controller designed on the whole record has Ms {again:.2f} on the relay's model, not {spec.Ms:g}"
+    if abs(again - best.Ms) > maximum:
+        text = f"the controller designed on the whole record has Ms {again:.2f} on the relay's model, not {best.Ms:.4g}"
         return Reason.MODEL_MISMATCH, text
     return None, ""

@@ -99,7 +99,7 @@ class LoopCost:
         # what has died away no longer counts, and its denormal numbers are slow to compute with
         left = np.flatnonzero((np.abs(after_step) > NEGLIGIBLE) | (np.abs(after_load) > NEGLIGIBLE / Kp))
         end = int(left[-1]) + 1 if len(left) else 1
-        return LoopResponses(h, Kp, after_step[:end], after_load[:end])
+        return LoopResponses(h, Kp, after_step[:end], after_load[:end], Ti, Td, N)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,14 +108,18 @@ class LoopResponses:
 
     h: the step of the simulation, s.
     Kp: the gain, MV units per PV unit.
-    error: the error after a unit set-point step with b = 1, shape (N,).
-    load: PV after a unit load disturbance at the plant's input, PV units per MV unit, shape (N,).
+    error: the error after a unit set-point step with b = 1, shape (samples,).
+    load: PV after a unit load disturbance at the plant's input, PV units per MV unit, shape (samples,).
+    Ti, Td, N: the times of the controller, s, and the filter Td/N of its derivative.
     """
 
     h: float
     Kp: float
     error: Reals
     load: Reals
+    Ti: float = math.inf
+    Td: float = 0.0
+    N: float = 10.0
 
     def cost(self, b: float) -> Cost:
         """The two IAE for this set-point weight."""
@@ -129,10 +133,16 @@ class LoopResponses:
         it form one interval, because the overshoot is convex in b too.
         Returns None where no weight from low to high keeps the overshoot.
         """
-        by = self.Kp * self.load  # the error moves by this for each unit that b is below one
+        room = self.overshoot_room(low, high, overshoot)
+        return None if room is None else self.least(*room)
+
+    def overshoot_room(self, low: float, high: float, overshoot: float | None) -> tuple[float, float] | None:
+        """The smallest and the largest x = 1 - b, for b from low to high, that keep the overshoot, see `best_weight`;
+        None where none does."""
         minimum, maximum = 1.0 - high, 1.0 - low
         if overshoot is not None:
-            room = self.error + overshoot  # room + (1 - b)*by >= 0 at every time
+            by = self.Kp * self.load  # the error moves by this for each unit that b is below one
+            room = self.error + overshoot  # room + x*by >= 0 at every time
             up, down = by > NEGLIGIBLE, by < -NEGLIGIBLE
             if float(room[~(up | down)].min(initial=0.0)) < 0.0:
                 return None
@@ -140,8 +150,12 @@ class LoopResponses:
             maximum = min(maximum, float((-room[down] / by[down]).min(initial=math.inf)))
             if minimum > maximum:
                 return None
-        every = slice(None, None, 1 + len(by) // ENOUGH)
-        return 1.0 - _minimise_absolutes(self.error[every], by[every], minimum, maximum)
+        return minimum, maximum
+
+    def least(self, minimum: float, maximum: float) -> float:
+        """The set-point weight b with the least IAE after a set-point step, for 1 - b from minimum to maximum."""
+        every = slice(None, None, 1 + len(self.load) // ENOUGH)
+        return 1.0 - _minimise_absolutes(self.error[every], self.Kp * self.load[every], minimum, maximum)
 
 
 def _minimise_absolutes(y: Reals, by: Reals, low: float, high: float) -> float:

@@ -136,8 +136,9 @@ def by_known_plant(facts: Facts, options: DesignOptions, known: ObservedPlant, m
     """The plan of the procedure, for a loop in automatic and at rest.
 
     method: the name of the procedure in the proposal.
-    Raises Refused where the loop is not at rest, else ObservedPlantFails. The plan restores nothing but the present
-    gains and the set-point before ObservedPlantFails is raised: the runner restores the loop.
+    Raises Refused where the loop is not at rest, and where what was asked for is not possible, else ObservedPlantFails.
+    The plan restores nothing but the present gains and the set-point before ObservedPlantFails is raised: the runner
+    restores the loop.
     """
     why = known.not_for(facts)
     if why is None and not options.verify:
@@ -158,6 +159,8 @@ def by_known_plant(facts: Facts, options: DesignOptions, known: ObservedPlant, m
     first, outcome = yield from test.computed(partial(_designed, facts, options, known))
     yield from test.report(StageDone("design", evaluation_summary(first)))
     if isinstance(outcome, Refused):
+        if outcome.reason is Reason.NOT_POSSIBLE:  # a test that moves the loop would only tell the same
+            raise outcome
         raise ObservedPlantFails(outcome.reason, outcome.detail)
     shown: VerifiedStep | None = None
     evaluation = first

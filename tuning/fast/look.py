@@ -14,12 +14,12 @@ from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.fast.record_evaluation import evaluate_excitation
 from loopwright.tuning.fast.still_open import OPEN_REASONS, open_by, trial_may_tell
 from loopwright.tuning.fast.uncertainty import peak
-from loopwright.tuning.reasons import Refused
+from loopwright.tuning.reasons import Reason, Refused
 
 MIN_OWN_PERIODS = 2.0
 """Smallest length of the record, in ultimate periods of its own model."""
 MAX_DISAGREEMENT = 0.08
-"""Largest difference of Ms from the Ms asked for, of the gains of two successive looks on each other's model."""
+"""Largest difference of Ms from the Ms of the design, of the gains of two successive looks on each other's model."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,17 +61,17 @@ def or_a_pi(facts: Facts, options: DesignOptions, evaluation: Evaluation, refuse
     return Refused(refused.reason, f"{refused.detail}; {known}: ask for one, without derivative action")
 
 
-def settled(look: Look, last: Look, samples: int, asked: float, max_disagreement: float = MAX_DISAGREEMENT) -> bool:
-    """Whether the pulses may end: the look has no objection, the record is long enough for its own model, and this
-    look and the one before agree on each other's gains."""
+def settled(look: Look, last: Look, samples: int, max_disagreement: float = MAX_DISAGREEMENT) -> bool:
+    """Whether the pulses may end: the look has no objection to the record, the record is long enough for its own model,
+    and this look and the one before agree on each other's gains."""
     now, before = look.evaluation, last.evaluation
-    if now is None or before is None or look.refusal is not None:
+    if now is None or before is None or (look.refusal and look.refusal.reason is not Reason.NOT_POSSIBLE):
         return False
     if samples < MIN_OWN_PERIODS * now.period / now.fit.record.Ts:
         return False
     w = frequencies(now.period)
     delay = now.design_delay
     return all(
-        abs(peak(model.model, gains.best.gains, w, delay) - asked) <= max_disagreement
+        abs(peak(model.model, gains.best.gains, w, delay) - gains.best.Ms) <= max_disagreement
         for model, gains in ((now, before), (before, now))
     )

@@ -51,6 +51,7 @@ def by_manual(facts: Facts, options: DesignOptions, method: str) -> Plan[FastPro
     method: the name of the procedure in the proposal.
     Raises Refused. The plan restores nothing: the runner restores the loop.
     """
+    options.check_sampling(facts)
     T95, spec = facts.T95_s, options.spec()
     expected = {"preflight": T95 / 2, MANUAL: 1.5 * T95, "design": 0.0}
 
@@ -76,7 +77,7 @@ def by_manual(facts: Facts, options: DesignOptions, method: str) -> Plan[FastPro
             record = test.experiment_record()
             last, look = look, (yield from test.computed(partial(look_at, facts, options, record)))
             test.period = look.period
-            if settled(look, last, looked_at, options.Ms, MAX_DISAGREEMENT):
+            if settled(look, last, looked_at, MAX_DISAGREEMENT):
                 break
             if look.refusal is not None:
                 yield from test.report(Note(f"after {looked_at} samples: {look.refusal.detail}"))

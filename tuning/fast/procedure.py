@@ -41,6 +41,8 @@ __all__ = ["FAST", "FAST_STAGES", "FastOptions", "FastProposal", "by_relay", "fa
 FAST = "fast"
 FAST_STAGES = ("preflight", "relay", "design", "verify", "redesign")
 SWITCHES = (4, 6, 8, 10)
+ENDING = (Reason.CONTROLLER_MISMATCH, Reason.NOT_POSSIBLE)
+"""Reasons for a refusal that a longer relay cannot remove."""
 MIN_SAMPLES = 2 * MIN_LISTENED
 """Smallest number of samples at rest, from which noise and offset are estimated."""
 
@@ -87,6 +89,7 @@ def fast_by_relay(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
 
     Raises Refused, BAD_LIMITS where the loop may be moved to one side only: a relay moves PV to both.
     """
+    options.check_sampling(facts)
     if facts.one_sided:
         text = f"the loop may be moved {facts.directions} only, and a relay moves PV to both sides of its rest"
         raise Refused(Reason.BAD_LIMITS, text)
@@ -120,7 +123,7 @@ def by_relay(facts: Facts, options: FastOptions, experiment: RelayTest) -> Plan[
             evaluation, outcome = yield from experiment.computed(partial(evaluated, facts, options, record))
         except Refused as refused:
             outcome = refused
-        if isinstance(outcome, Comparison) or not in_time or outcome.reason is Reason.CONTROLLER_MISMATCH:
+        if isinstance(outcome, Comparison) or not in_time or outcome.reason in ENDING:
             break
         yield from experiment.report(Note(f"after {switches} switches: {outcome.detail}"))
     open_still = outcome if isinstance(outcome, Refused) else None

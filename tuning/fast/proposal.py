@@ -322,9 +322,21 @@ def comparison_on(sampled: Model, best: OptimalGains, facts: Facts, spec: Design
         raise Refused(Reason.NOT_ROBUST, "the gains designed are not stable on their own model")
     aim, minimum = spec.aim, best.minimum
     overshoot = None if aim.max_overshoot is None else 100.0 * aim.max_overshoot
-    asked = RobustnessBounds(spec.Ms, Mt=spec.Mt, noise_gain=spec.noise_gain, overshoot_pct=overshoot)
+    asked = RobustnessBounds(
+        spec.Ms, Mt=spec.Mt, noise_gain=spec.noise_gain, overshoot_pct=overshoot, settling_s=spec.settling_s,
+        mv_peak=spec.mv_peak,
+    )  # fmt: skip
+    if spec.settling_s is not None:
+        criterion = f"Ms, the smallest that settles within {spec.settling_s:g} s after a set-point step"
+        return compare(before, after, asked, criterion, (before.Ms, after.Ms), anyway)
     J = tuple(weighted_IAE(each, minimum.setpoint, minimum.load, aim.share) for each in (before, after))
     return compare(before, after, asked, CRITERION[aim], (J[0], J[1]), anyway, keep_setpoint=aim is not Aim.LOAD)
+
+
+def chosen_for(spec: DesignSpec, best: OptimalGains) -> dict[str, float]:
+    """The design parameters in effect: Ms, which a settling time lowers, N where there is a derivative, and what else
+    was asked for."""
+    return {"Ms": best.Ms, **({"N": spec.N} if best.gains.Td else {}), **spec.requirements}
 
 
 def proposed(
@@ -371,7 +383,7 @@ def proposed(
         notes.append("PV drifted at a steady rate during the test; this was allowed for.")
     return FastProposal(
         method=method,
-        chosen={"Ms": spec.Ms, **({"N": spec.N} if gains.Td else {})},
+        chosen=chosen_for(spec, evaluation.best),
         model=identified_model(evaluation.fit, evaluation.chosen.best),
         old_gains=facts.old_gains,
         gains=gains,

@@ -67,7 +67,7 @@ def pulsed(test: PulseTest, options: DesignOptions, relay_follows: bool) -> Plan
         record = test.experiment_record()
         last, look = look, (yield from test.computed(partial(look_at, facts, options, record)))
         own = test.period = look.period
-        if settled(look, last, samples, options.Ms):
+        if settled(look, last, samples):
             return look
         if look.refusal is not None and look.refusal.reason is Reason.CONTROLLER_MISMATCH:
             return look

@@ -61,6 +61,7 @@ def by_pulses(
     relay_follows: TooLittleExcited is raised as soon as a relay would take less time than the pulses still need.
     Raises Refused. The plan restores nothing: the runner restores the loop.
     """
+    options.check_sampling(facts)
     T95, spec = facts.T95_s, options.spec()
     expected = {"preflight": T95 / 2, "pulses": T95, "design": 0.0, "verify": 1.5 * T95, "redesign": 0.0}
     todo = setpoint_stages(options.verify)

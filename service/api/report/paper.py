@@ -276,7 +276,12 @@ def _table(
         found = [getattr(each, name) if isinstance(each, StepWorthView) else None for each in values]
         return found[0], found[1]
 
-    row("Settling after a set-point step", "s, into 5 %", *figure_step("settling_s", "setpoint"))
+    compared = job.comparison
+    asked = _at_most(None if compared is None else compared.settling_s_asked)
+    row("Settling after a set-point step", f"s, into 5 %{asked}", *figure_step("settling_s", "setpoint"))
+    if compared is not None and compared.mv_peak_asked is not None:
+        asked = _at_most(compared.mv_peak_asked)
+        row("Change of MV after it, at most", f"% per {pv_unit}{asked}", *figure_step("mv_peak", "setpoint"))
     row("IAE of a unit set-point step", "s", *figure_step("IAE", "setpoint"))
     row("IAE of a load step of 1 %", f"{pv_unit} s", *figure_step("IAE", "load"))
     row("Largest deviation after it", pv_unit, *figure_step("peak", "load"))
@@ -291,6 +296,10 @@ def _table(
         row("Settling, measured", "s", *both("settling_s"))
         row("IAE, measured", f"{pv_unit} s", *both("IAE"))
     return rows
+
+
+def _at_most(asked: float | None) -> str:
+    return "" if asked is None else f"; asked for: at most {n.significant(asked)}"
 
 
 def _stable(worth: WorthView | None) -> str:

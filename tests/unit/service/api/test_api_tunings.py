@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import pytest
@@ -226,11 +227,34 @@ def test_the_aim_of_other_gains_is_that_of_the_job_unless_another_is_asked_for(
     assert len({each["gains"]["b"] for each in answers.values()}) == len(Aim)
 
 
+def test_other_gains_keep_the_movement_of_MV_that_the_job_asked_for_and_the_settling_time_that_the_query_does(
+    service: Service, client: TestClient
+) -> None:
+    job = finished(service, client, mv_peak=0.7, settling_s=60.0)
+    url = f"{job['url']}/alternatives?ms=1.6"
+
+    def found(query: str) -> dict[str, Any]:
+        (method,) = client.get(url + query).json()["methods"]
+        return dict(method)
+
+    own, wide, slow = found(""), found("&mv_peak=9"), found("&settling_s=20")
+    assert own["retune"]["mv_peak"] == 0.7 and "settling_s" not in own["retune"] and own["chosen"]["Ms"] == 1.6
+    assert wide["setpoint"]["peak_u"] > 0.7 >= own["setpoint"]["peak_u"] * 0.9998
+    assert slow["retune"]["settling_s"] == 20.0 and 1.1 <= slow["chosen"]["Ms"] < 1.55
+    assert slow["margins"]["Ms"] == pytest.approx(slow["chosen"]["Ms"], abs=0.01)
+    never = found("&settling_s=0.5")
+    assert (never["outcome"], never["reason"], never["retune"]) == ("refused", "not_possible", None)
+    again = found(f"&settling_s={re.findall(r'at least ([0-9.]+) s', never['detail'])[0]}")
+    assert again["outcome"] == "tuned"
+    assert client.post(f"/loops/{job['loop']}/retune", json=again["retune"]).status_code == 202
+
+
 @pytest.mark.parametrize(
     "query",
     [
-        "ms=1.1", "ms=2.5", "ms=nan", "ms=1.4&method=simc", "derivative=true", "ms=1.4&derivative=x", "aim=load",
-        "ms=1.4&aim=comfort",
+        "settling_s=5", "mv_peak=2", "noise_gain=2", "ms=1.4&settling_s=0", "ms=1.4&mv_peak=-1",
+        "ms=1.4&noise_gain=nan", "ms=1.1", "ms=2.5", "ms=nan", "ms=1.4&method=simc", "derivative=true",
+        "ms=1.4&derivative=x", "aim=load", "ms=1.4&aim=comfort",
     ],
 )  # fmt: skip
 def test_bad_wishes_for_another_Ms(service: Service, client: TestClient, query: str) -> None:

@@ -84,6 +84,12 @@ def test_the_options_of_fast_are_asked_for(service: Service, through: Through) -
         "--derivative",
         "--aim",
         "no_overshoot",
+        "--settling-s",
+        "300",
+        "--mv-peak",
+        "4",
+        "--noise-gain",
+        "2",
         "--amplitude",
         "10",
         "--careful",
@@ -96,8 +102,8 @@ def test_the_options_of_fast_are_asked_for(service: Service, through: Through) -
     assert result.exit_code == 0, result.output
     (body,) = through.posted
     assert body == {
-        "ms": 1.4, "derivative": True, "aim": "no_overshoot", "amplitude_pct": 10.0, "careful": True, "verify": False,
-        "requested_by": "cli",
+        "ms": 1.4, "derivative": True, "aim": "no_overshoot", "settling_s": 300.0, "mv_peak": 4.0, "noise_gain": 2.0,
+        "amplitude_pct": 10.0, "careful": True, "verify": False, "requested_by": "cli",
     }  # fmt: skip
     job = json.loads(result.stdout)
     service.wait(job["id"])
@@ -342,6 +348,12 @@ def test_rehearse_is_fast_unless_told_otherwise(tmp_path: Path) -> None:
     assert answer["predicted_before"]["Ms"] < 1.4
     assert json.loads(run("rehearse", str(file), "--method", "five-stage", "--json").stdout)["method"] == "five-stage"
     assert run("rehearse", str(file), "--method", "five-stage", "--ms", "1.4").exit_code == 2
+    for name in ("--settling-s", "--mv-peak", "--noise-gain"):
+        assert run("rehearse", str(file), "--method", "five-stage", name, "4").exit_code == 2
+        wrong = run("rehearse", str(file), name, "nan", "--json")
+        assert json.loads(wrong.stdout)["reason"] == "bad_input" and wrong.exit_code == 2
+    limited = run("rehearse", str(file), "--mv-peak", "50")
+    assert "MV peak" in limited.stdout and "MV peak" not in run("rehearse", str(file)).stdout
 
 
 def test_rehearse_speaks_like_retune(tmp_path: Path) -> None:

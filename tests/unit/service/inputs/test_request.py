@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 from typing import Any
 
@@ -49,6 +50,10 @@ def test_the_options_of_the_procedures_are_made_of_it() -> None:
     pulses = retune_request(method="setpoint", aim="no_overshoot")
     assert pulses.options == DesignOptions(aim=Aim.NO_OVERSHOOT)
     assert retune_request().options.spec() == DesignSpec(aim=Aim.BALANCED)
+    asked = {"settling_s": 300.0, "mv_peak": 4.0, "noise_gain": 2.0}
+    for method in ("fast", "setpoint"):
+        spec = retune_request(method=method, **asked).options.spec()
+        assert spec == DesignSpec(noise_gain=2.0, settling_s=300.0, mv_peak=4.0) and spec.requirements == asked
     rule = retune_request(
         method="simc", start="zn_pi", Ku=2, Pu_s=3, method_options={"tau_c_s": 4}, baseline=False, k_source="ke",
         kp_step_factor=1.5, overshoot_window_pct=[8, 40], model_from="record",
@@ -68,6 +73,21 @@ def test_an_aim_that_does_not_exist_or_is_not_of_the_method(method: str, aim: ob
     with pytest.raises(ValidationError) as refused:
         retune_request(method=method, aim=aim)
     assert "aim" in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["settling_s", "mv_peak", "noise_gain"])
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, 1e300, "soon"])
+@pytest.mark.parametrize("method", ["fast", "setpoint"])
+def test_a_requirement_that_no_loop_can_have(method: str, name: str, value: object) -> None:
+    with pytest.raises(ValidationError) as refused:
+        retune_request(method=method, **{name: value})
+    assert name in str(refused.value)
+
+
+def test_a_requirement_is_not_of_the_five_stages() -> None:
+    with pytest.raises(ValidationError) as refused:
+        retune_request(method="five-stage", settling_s=300.0)
+    assert "settling_s" in str(refused.value)
 
 
 @pytest.mark.parametrize(

@@ -51,6 +51,7 @@ WHICH = st.integers(0, 15)
 OPTIONS: tuple[dict[str, Any], ...] = (
     {},
     {"ms": 1.4, "derivative": True, "aim": "no_overshoot", "amplitude_pct": 10.0, "careful": True, "verify": False},
+    {"settling_s": 300.0, "mv_peak": 4.0, "noise_gain": 2.0},
     {"start": "design", "model": {"num": [1.0], "den": [3.0, 1.0], "dead_time_s": 1.0}},
     {"method": "five-stage", "overshoot_window_pct": (8.0, 50.0), "baseline": False},
     {"method": "simc", "method_options": {"tau_c_s": 2.0}},

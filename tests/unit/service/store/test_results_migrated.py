@@ -46,6 +46,7 @@ def with_later_fields(golden: dict[str, Any]) -> dict[str, Any]:
     """The golden job with what is shown of it since: nobody has decided, a live test knows how fast it sampled, in
     which mode it found the loop, and whether its gains were tried; it has no samples. How late a second path would have
     shown is not known. Gains were tried with b = 1.
+    No settling time and no movement of MV were asked for, nor was the latter computed.
     Its advice is not stored, but today's for its reason."""
     advice = None if golden["reason"] is None else ADVICE[Reason(golden["reason"])]
     sample_time_s = None if golden["dry_run"] else 0.1
@@ -56,6 +57,7 @@ def with_later_fields(golden: dict[str, Any]) -> dict[str, Any]:
         model = model | {"covariance": None}
     verification = golden["verification"] and golden["verification"] | {"b": 1.0}
     return golden | {
+        "comparison": golden["comparison"] and _compared(golden["comparison"]),
         "model": model,
         "watch": None,
         "advice": advice,
@@ -71,6 +73,14 @@ def with_later_fields(golden: dict[str, Any]) -> dict[str, Any]:
         "record": "none",
         "evidence": golden["evidence"] and {**golden["evidence"], "longest_delay_seen_s": None},
     }
+
+
+def _compared(comparison: dict[str, Any]) -> dict[str, Any]:
+    def loop(found: dict[str, Any]) -> dict[str, Any]:
+        return found | {step: found[step] and {**found[step], "mv_peak": None} for step in ("setpoint", "load")}
+
+    asked = {"settling_s_asked": None, "mv_peak_asked": None, "noise_gain_asked": None}
+    return comparison | asked | {"before": loop(comparison["before"]), "after": loop(comparison["after"])}
 
 
 def shown(store: Store, job_id: str) -> dict[str, Any]:

@@ -34,7 +34,7 @@ def by_fast(old: Gains, Ms: float = 1.6, plant: Model = PLANT, **options: bool) 
     """The design of fast on the model beside the old gains."""
     wished = FastOptions(Ms=Ms, **options)
     facts = Facts(SAMPLE_S, 20.0, 0.0, 100.0, 2.0, old)
-    best = designed_on(plant, wished, 0.0)
+    best = designed_on(plant, wished.spec(), 0.0)
     return comparison_on(plant, best, facts, wished.spec(), wished.propose_anyway)
 
 

@@ -97,6 +97,9 @@ function pictures(model, gains, size, horizon_s) {
   return { setpoint: step(model, gains, { setpoint: size }, horizon_s), load: step(model, gains, { load: LOAD_PCT }, horizon_s), freq: frequency(model, gains) };
 }
 
+/** What was asked for, beside the name of a figure. @param {number | null | undefined} value */
+const atMost = (value) => (known(value) ? `, asked: at most ${significant(Number(value), 3)}` : "");
+
 /** @param {any} loop @param {any} job @param {any} gains @param {any} before @param {any} after @param {boolean} atTested @param {number} size */
 function Table(loop, job, gains, before, after, atTested, size) {
   const u = unit(loop.pv_unit);
@@ -115,7 +118,8 @@ function Table(loop, job, gains, before, after, atTested, size) {
     ...(old?.Td || gains.Td ? /** @type {any[]} */ ([[html`Derivative time Td <small>s</small>`, "td", old?.Td, gains.Td, significant]]) : []),
     ...(weight(old) || weight(gains) ? /** @type {any[]} */ ([[html`Set-point weight b`, "b", old?.b, gains.b, (/** @type {any} */ v) => significant(v, 3)]]) : []),
     [html`Overshoot <small>%</small>`, "os", stable ? a.overshoot_pct : null, b.overshoot_pct, (v) => fixed(v, 0)],
-    [html`Settled within 5 % <small>s</small>`, "settle", stable ? a.setpoint?.settling_s : null, b.setpoint?.settling_s, (v) => significant(v, 2)],
+    [html`Settled within 5 % <small>s${atMost(job.comparison?.settling_s_asked)}</small>`, "settle", stable ? a.setpoint?.settling_s : null, b.setpoint?.settling_s, (v) => significant(v, 2)],
+    ...(known(job.comparison?.mv_peak_asked) && atTested ? /** @type {any[]} */ ([[html`MV moved after a step <small>%/${u}${atMost(job.comparison.mv_peak_asked)}</small>`, "mv", stable ? a.setpoint?.mv_peak : null, b.setpoint?.mv_peak, significant]]) : []),
     [html`Load of 1 %, IAE <small>${u} s</small>`, "iae", stable ? a.load?.IAE : null, b.load?.IAE, (v) => significant(v, 3)],
     [html`Largest sensitivity Ms ${known(uncertain) && html`<small>± ${msError(uncertain)}</small>`}`, "ms", stable ? a.Ms : null, b.Ms, msText],
     [html`The plant's gain may grow`, "gm", stable ? a.GM : null, b.GM, (v) => (known(v) ? `× ${fixed(v, 2)}` : "–")],

@@ -102,6 +102,8 @@ export function RetuneForm({ loop, onClose, onStarted }) {
       ${designed && html`<label class="check"><input type="checkbox" checked=${!!wish.derivative} onChange=${set("derivative")} /> derivative, where it pays</label>`}
       ${designed && html`<label class="field"><span>The best for</span><select class="wide" value=${wish.aim ?? "balanced"} onChange=${set("aim")}>
         <option value="balanced">set-point and load alike</option><option value="setpoint">set-point steps</option><option value="load">load disturbances</option><option value="no_overshoot">both, without overshoot</option></select></label>`}
+      ${designed && Field("settling_s", "Settled within 5 % in", "s", null, wish, set, problem)}
+      ${designed && Field("mv_peak", "MV moved at most by", `% per ${u}`, null, wish, set, problem)}
       ${wish.method === "fast" && html`<label class="check"><input type="checkbox" checked=${!!wish.careful} onChange=${set("careful")} /> careful: six switches at least</label>`}
       <label class="check"><input type="checkbox" checked=${!!wish.dry_run} onChange=${set("dry_run")} /> rehearsal: computed in memory, nothing is moved</label>
     </div>`}
@@ -120,19 +122,21 @@ function Field(name, label, u, usual, wish, set, problem) {
 }
 
 const NUMBERS = ["mv_low", "mv_high", "pv_low", "pv_high", "sp_deviation"];
+const REQUIREMENTS = ["settling_s", "mv_peak"];
 
 /** The body of a request, and what is wrong with the fields. @param {Record<string, any>} wish */
 function bodyOf(wish) {
   /** @type {Record<string, any>} */
   const body = { method: wish.method };
   let bad = "";
-  const names = wish.method === "fast" ? [...NUMBERS, "amplitude_pct"] : NUMBERS;
+  const designed = wish.method === "fast" || wish.method === "setpoint";
+  const names = [...NUMBERS, ...(designed ? REQUIREMENTS : []), ...(wish.method === "fast" ? ["amplitude_pct"] : [])];
   for (const name of names) {
     const value = entered(String(wish[name] ?? ""));
     if (Number.isNaN(value)) bad = "A field is not a number.";
     else if (value !== null) body[name] = value;
   }
-  if (wish.method === "fast" || wish.method === "setpoint") {
+  if (designed) {
     body.ms = Number(wish.ms);
     if (wish.derivative) body.derivative = true;
     if (wish.aim) body.aim = wish.aim;
