@@ -7,8 +7,9 @@ import os
 import sys
 from collections.abc import Sequence
 
-from loopwright.plantsim.catalogue import find, own_plant
+from loopwright.plantsim.catalogue import find
 from loopwright.plantsim.device import PlantChannel, PlantDevice
+from loopwright.plantsim.own_plant import own_plant
 from loopwright.protocol.device_process import DeviceConfigError, node_id, read_channels, run_device
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE
 
@@ -74,7 +75,10 @@ def _parser() -> argparse.ArgumentParser:
         metavar="MODEL",
         help="one channel each: a name such as model-4, or the plant itself as JSON, "
         '{"num": [0.8], "den": [120, 1], "dead_time_s": 15, "mv": 40, "pv": 65}, in PV units per percent of MV, with '
-        "MV and PV where it starts; `loopwright plant` takes K, T_s, L_s and a file.json too",
+        'MV and PV where it starts; with "second_path": {"share": 0.4, "later_s": 180} MV acts again, with "valve": '
+        '{"backlash_pct": 1} (or stiction_pct, equal_percentage, gain_below) its valve is no straight line, with '
+        '"sine": {"amplitude": 0.2, "period_s": 30} PV swings; `loopwright plant` takes K, T_s, L_s and a file.json '
+        "too",
     )
     parser.add_argument("--config", metavar="FILE", help="YAML list of channels: model, noise")
     parser.add_argument("--ts", type=_positive, default=0.1, metavar="S", help="sample time, process seconds")

@@ -10,11 +10,15 @@ gain on the bus is 100 times the gain of the model.
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.resources import files
 
+from loopwright.plantsim.imperfect import ImperfectPlant, Sine
 from loopwright.plantsim.plant import LinearPlant, Plant, TwoPaths
 from loopwright.plantsim.reactor import MV_NOMINAL, STEADY_STATE, Reactor
+from loopwright.plantsim.valves import Valve
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,18 +69,31 @@ class LaterPath:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One plant; `model` is None for plants that are not linear. second_path: of one on which MV acts twice."""
+    """One plant; `model` is None for plants that are not linear.
+
+    second_path: of one on which MV acts twice.  valve: makes its valve, with a seed; None for a straight line.
+    sine: on its PV.
+    """
 
     name: str
     facts: PlantFacts
     model: CatalogueModel | None
     second_path: LaterPath | None = None
+    valve: Callable[[int], Valve] | None = None
+    sine: Sine | None = None
 
     def build(self, sample_time_s: float, noise_std: float = 0.0, seed: int = 1) -> Plant:
         """Returns the plant, at rest, with this sample time (s), noise (PV units) and seed."""
         if self.model is None:
             return Reactor(sample_time_s, noise_std=noise_std, seed=seed)
-        num, dead_time_s = self.model.num, self.model.dead_time_s
+        plant = self._linear(self.model, sample_time_s, noise_std, seed)
+        if self.valve is None and self.sine is None:
+            return plant
+        valve = None if self.valve is None else self.valve(seed)
+        return ImperfectPlant(plant, self.facts.mv_nominal_pct, sample_time_s, valve, self.sine)
+
+    def _linear(self, model: CatalogueModel, sample_time_s: float, noise_std: float, seed: int) -> Plant:
+        num, dead_time_s = model.num, model.dead_time_s
         first = self._path(num, dead_time_s, sample_time_s, self.facts.pv_nominal, noise_std, seed)
         if self.second_path is None:
             return first
@@ -94,6 +111,7 @@ class Entry:
         seed: int,
     ) -> LinearPlant:
         assert self.model is not None
+        low, high = (0.0, 100.0) if self.valve is None else (-math.inf, math.inf)  # MV's are those of the valve
         return LinearPlant(
             num,
             self.model.den,
@@ -104,8 +122,8 @@ class Entry:
             mv_per_unit=self.facts.mv_per_unit,
             noise_std=noise_std,
             seed=seed,
-            mv_low=0.0,
-            mv_high=100.0,
+            mv_low=low,
+            mv_high=high,
         )
 
 
@@ -115,52 +133,6 @@ def find(name: str) -> Entry:
         others = ", ".join(other for other in CATALOGUE if not other.startswith("model-"))
         raise KeyError(f"no plant named {name!r}; there are model-1 to model-50, {others}")
     return CATALOGUE[name]
-
-
-def own_plant(text: str) -> Entry:
-    """Returns the entry of a plant that is in no catalogue, in PV units per percent of MV.
-
-    text: the JSON object {"num": [0.8], "den": [120, 1], "dead_time_s": 15, "mv": 40, "pv": 65}: coefficients from the
-    highest power down, and MV (percent) and PV where the plant starts, 50 where they are left out. With "second_path":
-    {"share": 0.4, "later_s": 180} MV acts again so much later, with this part of the gain.
-    Raises ValueError.
-    """
-    data = json.loads(text)
-    known = {"num", "den", "dead_time_s", "mv", "pv", "second_path"}
-    if not isinstance(data, dict) or not {"num", "den"} <= data.keys() <= known:
-        optional = "dead_time_s, mv, pv and second_path"
-        raise ValueError(f"a plant is a JSON object with num, den and perhaps {optional}, not {text}")
-    numbers = {name: float(data.get(name, other)) for name, other in (("dead_time_s", 0.0), ("mv", 50.0), ("pv", 50.0))}
-    if not 0.0 <= numbers["mv"] <= 100.0:
-        raise ValueError(f"mv is {numbers['mv']:g}: MV is in percent, 0 to 100")
-    num, den = (tuple(float(each) for each in data[name]) for name in ("num", "den"))
-    if not num or not any(den):
-        raise ValueError(f"num and den need coefficients, den one that is not 0, not {text}")
-    gain = num[-1] / den[-1] if den[-1] else None
-    facts = PlantFacts(
-        description="a user's own plant",
-        Ku=None,
-        Pu_s=None,
-        T95_s=None,
-        static_gain=gain,
-        reverse=num[-1] > 0.0,
-        mv_nominal_pct=numbers["mv"],
-        pv_nominal=numbers["pv"],
-        mv_per_unit=1.0,
-    )
-    return Entry("own", facts, CatalogueModel(num, den, numbers["dead_time_s"]), _second_path(data.get("second_path")))
-
-
-def _second_path(data: object) -> LaterPath | None:
-    """Raises ValueError."""
-    if data is None:
-        return None
-    if not isinstance(data, dict) or data.keys() != {"share", "later_s"}:
-        raise ValueError(f'second_path is a JSON object with share and later_s, not {data}')
-    path = LaterPath(float(data["share"]), float(data["later_s"]))
-    if not path.later_s >= 0.0:
-        raise ValueError(f"later_s is {path.later_s:g} s: a second path acts later than the first one")
-    return path
 
 
 def _printed_models() -> list[Entry]:

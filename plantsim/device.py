@@ -112,6 +112,7 @@ class PlantDevice:
         ]
         for at, plant in enumerate(self.plants):
             plant.disturbance = float(self.dictionary.get("plant_disturbance", at + 1))
+            plant.gain = float(self.dictionary.get("plant_gain", at + 1))
         self.mv = [channel.mv_nominal for channel in self._channels]
         self.number = 0
         self._sync_counter = 0
@@ -220,6 +221,7 @@ class PlantDevice:
             "plant_pace": self._write_pace,
             "plant_samples_to_run": self._write_run,
             "plant_disturbance": self._write_disturbance,
+            "plant_gain": self._write_gain,
             "plant_noise": self._write_noise,
             "plant_seed": self._only_held,
             "plant_initialise": self._write_initialise,
@@ -256,6 +258,9 @@ class PlantDevice:
 
     def _write_disturbance(self, sub: int, value: Value) -> None:
         self.plants[sub - 1].disturbance = float(value)
+
+    def _write_gain(self, sub: int, value: Value) -> None:
+        self.plants[sub - 1].gain = float(value)
 
     def _write_noise(self, sub: int, value: Value) -> None:
         self.plants[sub - 1].noise_std = float(value)

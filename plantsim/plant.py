@@ -1,6 +1,7 @@
 """A plant as the I/O device sees it: one MV in, one PV out, one sampling period at a time.
 
-Sticking valves, quantised sensors and drift are left out on purpose.
+What a plant can have besides: a valve that is no straight line (`loopwright.plantsim.valves`), a sine on PV, a gain
+that is changed while it runs.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ class Plant(SimulatedProcess, Protocol):
     """Load disturbance at the plant's input, added after the actuator's limits, MV units."""
     noise_std: float
     """Standard deviation of the white measurement noise, PV units."""
+    gain: float
+    """What its gain is multiplied by, for MV and for a load: 1 unless the plant changes."""
 
 
 class LinearPlant:
@@ -90,6 +93,7 @@ class LinearPlant:
         self._random = random.Random(seed)
         self.noise_std = noise_std
         self.disturbance = 0.0
+        self.gain = 1.0
         self._pv = pv_nominal + (self._random.gauss(0.0, noise_std) if noise_std else 0.0)
 
     @property
@@ -102,7 +106,7 @@ class LinearPlant:
         else:
             mv = self._mv
         line = self._line
-        line.append((mv + self.disturbance - self._mv_nominal) * self._scale)
+        line.append((mv + self.disturbance - self._mv_nominal) * self._scale * self.gain)
         state = self._state
         state[self._at_u] = line.popleft()
         following = self._matrix.dot(state, self._next)
@@ -144,6 +148,14 @@ class TwoPaths:
     @noise_std.setter
     def noise_std(self, value: float) -> None:
         self._first.noise_std = value
+
+    @property
+    def gain(self) -> float:
+        return self._first.gain
+
+    @gain.setter
+    def gain(self, value: float) -> None:
+        self._first.gain = self._second.gain = value
 
     def step(self, mv: float) -> float:
         return self._first.step(mv) + self._second.step(mv)

@@ -91,6 +91,7 @@ class Reactor:
     exact for any sample time; so `state` is the state that the sensor shows now.
     inlet_offset_K: a disturbance, added to the temperature of both feeds, K.
     disturbance: a load disturbance, percent, added after the limits of MV.
+    gain: so many times as large is what MV and the load move of the flow, from where the reactor is at rest.
     """
 
     def __init__(
@@ -116,6 +117,7 @@ class Reactor:
         self._random = random.Random(seed)
         self.state: State = STEADY_STATE
         self.disturbance = 0.0
+        self.gain = 1.0
         self.inlet_offset_K = 0.0
         self.noise_std = noise_std
         self._pv = self._measured()
@@ -127,7 +129,10 @@ class Reactor:
     def step(self, mv: float) -> float:
         if mv == mv:
             self._mv = self._mv_low if mv < self._mv_low else self._mv_high if mv > self._mv_high else mv
-        self._line.append((max(self._mv + self.disturbance, LEAK), INLET + self.inlet_offset_K))
+        opening = self._mv + self.disturbance
+        if self.gain != 1.0:
+            opening = MV_NOMINAL + self.gain * (opening - MV_NOMINAL)
+        self._line.append((max(opening, LEAK), INLET + self.inlet_offset_K))
         entering = self._line.popleft()
         if self._late_s:
             self._run(*self._before, self._late_s)

@@ -184,6 +184,8 @@ _PLANT = (
     Object("plant_seed", 0x2024, U32, "rw", "Random seed", PLANT, default=1),
     Object("plant_initialise", 0x2025, U8, "wo", "Initialise (1 = initial state, sample number 0)", PLANT,
            low=1, high=1),
+    Object("plant_gain", 0x2026, REAL32, "rw", "Gain of the plant, in multiples of its own", PLANT, CHANNELS,
+           default=1.0, low=0, high=1000),
     Object("plant_pv", 0x6130, REAL32, "ro", "AI input PV", PLANT, CHANNELS, pdo="T"),
     Object("plant_pv_unit", 0x6131, U32, "ro", "AI physical unit PV", PLANT, CHANNELS, default=DEGREE_CELSIUS),
     Object("plant_mv", 0x6300, REAL32, "rw", "AO output PV", PLANT, CHANNELS, pdo="R", low=0, high=100, unit="%"),

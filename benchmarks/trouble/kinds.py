@@ -109,13 +109,13 @@ def actuators() -> Iterator[Trouble]:
         made = build(before=partial(valves.RateLimit, stroke=stroke, dead_zone=zone))
         yield Trouble("motor valve", f"dead zone {zone:g} %, 15 % takes {stroke:g} Pu", made, substeps=FINE)
     for noise, slack in _each((NOISE, (0.2, 0.5, 1, 2)), (NOISY, (1, 2, 4))):
-        made = build(before=partial(valves.Backlash, slack=slack))
+        made = build(before=partial(valves.backlash, slack=slack))
         yield Trouble("backlash", _noisy(f"{slack:g} % of MV", noise), made, noise=noise)
     for slack in (1, 2, 4):
-        made = build(before=partial(valves.Backlash, slack=slack), sensor=_alone(Quantised, 100.0 / 256.0))
+        made = build(before=partial(valves.backlash, slack=slack), sensor=_alone(Quantised, 100.0 / 256.0))
         yield Trouble("backlash", f"{slack:g} % of MV, PV of 8 bits", made)
     for band in (0.2, 0.5, 1, 2):
-        yield Trouble("stiction", f"S = J = {band:g} % of MV", build(before=partial(valves.Stiction, band=band)))
+        yield Trouble("stiction", f"S = J = {band:g} % of MV", build(before=partial(valves.stiction, band=band)))
     for part in (0.3, 0.5, 0.7, 0.9):
         made = build(before=_alone(valves.ends, -100.0, 10.0 * part))
         yield Trouble("valve ends", f"{10.0 * part:g} % above rest", made)

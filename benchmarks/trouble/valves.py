@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 from benchmarks.trouble.chain import Part, Setting
 from benchmarks.trouble.response import Response, delayed, gain
+from loopwright.plantsim.valves import Backlash, EqualPercentage, Stiction, TwoGains, Valve
 
 STROKE = 15.0
 """The move that a speed is given by, percent."""
@@ -32,29 +33,23 @@ class RateLimit(Part):
         return self._position
 
 
-class Backlash(Part):
-    """Follows half of the slack behind; for moves that are large beside it, it is a straight line."""
+class Actuator(Part):
+    """A valve of the simulator's that is a straight line for moves large beside its slack or its friction."""
 
-    def __init__(self, setting: Setting, slack: float) -> None:
-        self._half = 0.5 * slack
-        self._position = self._half * float(setting.random(2).uniform(-1.0, 1.0))
-
-    def step(self, value: float) -> float:
-        away = value - self._position
-        self._position += math.copysign(max(abs(away) - self._half, 0.0), away)
-        return self._position
-
-
-class Stiction(Part):
-    """Stays until MV is off by `band`, then jumps there (Choudhury et al. 2005, S = J)."""
-
-    def __init__(self, setting: Setting, band: float) -> None:
-        self._band, self._position = band, 0.0
+    def __init__(self, valve: Valve) -> None:
+        self._valve = valve
 
     def step(self, value: float) -> float:
-        if abs(value - self._position) > self._band:
-            self._position = value
-        return self._position
+        return self._valve.step(value)
+
+
+def backlash(setting: Setting, slack: float) -> Actuator:
+    """It starts anywhere in its slack."""
+    return Actuator(Backlash(slack, float(setting.random(2).uniform(-1.0, 1.0))))
+
+
+def stiction(setting: Setting, band: float) -> Actuator:
+    return Actuator(Stiction(band))
 
 
 class Characteristic(Part):
@@ -92,7 +87,10 @@ def broken(at: float, below: float, above: float) -> Characteristic:
 
 def two_gains(below: float) -> Characteristic:
     """The gain below rest is so many times that above."""
-    return broken(0.0, below, 1.0)
+    return Characteristic(
+        TwoGains(below).step,
+        lambda low, high: [*([below] if low < 0.0 else []), *([1.0] if high > 0.0 else [])] or [below],
+    )
 
 
 def ends(low: float, high: float) -> Characteristic:
@@ -102,11 +100,8 @@ def ends(low: float, high: float) -> Characteristic:
 
 def equal_percentage(R: float) -> Characteristic:
     """Of this rangeability; its gain at rest is 1."""
-    rate = math.log(R) / 100.0
-    return Characteristic(
-        lambda value: math.expm1(rate * value) / rate,
-        lambda low, high: [math.exp(rate * low), math.exp(rate * high)],
-    )
+    valve = EqualPercentage(R)
+    return Characteristic(valve.step, lambda low, high: [valve.slope(low), valve.slope(high)])
 
 
 def root(opening: float) -> Characteristic:

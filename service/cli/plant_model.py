@@ -11,6 +11,8 @@ from loopwright.service.inputs.model_json import BadModel, parse_model
 
 OPERATING_POINT = ("mv", "pv")
 """Names of the operating point beside the model: MV in percent, PV in PV units."""
+MORE = ("second_path", "valve", "sine")
+"""Names of what else a plant can have, which the plant process checks."""
 _OPTION = "--model"
 
 
@@ -40,7 +42,7 @@ def _transfer_function(given: str) -> str:
         source, data = given, read_json_object(Path(given))
     else:
         return given
-    point = {name: data.pop(name) for name in OPERATING_POINT if name in data}
+    point = {name: data.pop(name) for name in (*OPERATING_POINT, *MORE) if name in data}
     try:
         model = parse_model(data)
     except BadModel as error:

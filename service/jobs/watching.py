@@ -9,6 +9,7 @@ watch from it: an alarm then says why.
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -25,6 +26,7 @@ from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.jobs.decisions import Decisions, new_gains
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.repeated import Repeated
+from loopwright.service.listening.bins import UNKNOWN_MODE
 from loopwright.service.listening.heard_loop import Heard
 from loopwright.service.listening.listening import Listening
 from loopwright.service.observing.accepted_operation import accepted_model, compared, oscillation
@@ -74,9 +76,13 @@ class _LoopSeen:
 
     due_s: when its history is looked at again. inside: whether PV was within its limits since the acceptance.
     outside_from_s: since when PV is outside of them; None: it is not.
+    mode, sp: the last that were heard. After a lost frame they are unknown until they are read, and where many are lost
+    nearly always; the controller is read in any case before gains are put back.
     """
 
     due_s: float = 0.0
+    mode: int = UNKNOWN_MODE
+    sp: float = math.nan
     inside: bool = False
     outside_from_s: float | None = None
 
@@ -127,12 +133,12 @@ class Watching:
     def _look(self, job_id: str, config: LoopConfig, watch: AcceptanceWatch) -> None:
         job, now_s = self._store.get(job_id), self._wall()
         if watch.trouble is not None and watch.trouble.put_back is None:  # this thread settles it before it looks again
-            self._not_put_back(job_id, "the service ended meanwhile: read the loop")
+            self._not_put_back(job_id, "the service ended, or could not write it down, meanwhile: read the loop")
         why = self._over(job, watch, now_s)
         if why is not None:
             self._end(job_id, why)
             return
-        known = self._loops.setdefault(job_id, _LoopSeen())
+        known = self._loops.setdefault(job_id, _LoopSeen(inside=watch.inside))
         heard = self._listening.heard.get(config.tag)
         not_heard = self._listening.why_not_heard(config.tag)
         if not_heard is None and (heard is None or heard.silent):
@@ -142,7 +148,10 @@ class Watching:
         if not_heard is not None or heard is None:
             known.outside_from_s = None
             return
-        if (text := self._outside(known, config, heard, now_s)) is not None:
+        text = self._outside(known, config, heard, now_s)
+        if known.inside and not watch.inside:  # a service that is started again need not see that for itself
+            watch = watches.change(self._store, job_id, partial(_with, inside=True)) or watch
+        if text is not None:
             self._trouble(job, watch, TroubleKind.PV_OUTSIDE_LIMITS, text)
         elif now_s >= known.due_s:
             self._look_back(job, config, watch, known, now_s)
@@ -163,8 +172,12 @@ class Watching:
     def _outside(known: _LoopSeen, config: LoopConfig, heard: Heard, now_s: float) -> str | None:
         """In words that PV has left its limits; None: it has not, or the set-point has."""
         limits = config.pv_limits
+        if heard.mode != UNKNOWN_MODE:
+            known.mode = heard.mode
+        if not math.isnan(heard.sp):
+            known.sp = heard.sp
         low, high = heard.pv < limits.low, heard.pv > limits.high
-        if heard.mode != Mode.AUTOMATIC or not limits.low <= heard.sp <= limits.high or not (low or high):
+        if known.mode != Mode.AUTOMATIC or not limits.low <= known.sp <= limits.high or not (low or high):
             known.inside = known.inside or (limits.low <= heard.pv <= limits.high)
             known.outside_from_s = None
             return None

@@ -66,6 +66,7 @@ class AcceptanceWatch(_Kept):
 
     since: when the gains were accepted: UTC, ISO 8601. by: who has accepted them.
     roll_back_by_itself: whether the old gains are to be put back where something goes wrong.
+    inside: whether PV was within its limits since then: one that never was does not leave them.
     disarmed: why they are not put back any more, in words; None: they are, if that was asked for.
     period_s: the ultimate period of the model, s.
     model: why the loop is compared with no model, in words; None: it is compared.
@@ -80,6 +81,7 @@ class AcceptanceWatch(_Kept):
     roll_back_by_itself: bool
     period_s: float
     model: str | None = None
+    inside: bool = False
     disarmed: str | None = None
     changes: tuple[WatchedChange, ...] = ()
     looked_to_s: float = 0.0

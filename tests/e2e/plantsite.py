@@ -267,6 +267,16 @@ class Plantsite:
     def finished(self, url: str, patience_s: float = 200.0) -> dict[str, Any]:
         return self.until(url, lambda job: job["state"] not in ("queued", "running"), patience_s)
 
+    def until_watched(
+        self, url: str, wanted: Callable[[dict[str, Any]], bool], patience_s: float = 200.0
+    ) -> dict[str, Any]:
+        """The watch of a job whose gains were accepted, once it is as wanted."""
+        deadline = time.monotonic() + patience_s
+        while not wanted(watch := self.job(url)["watch"]):
+            assert time.monotonic() < deadline, watch
+            time.sleep(0.1)
+        return dict(watch)
+
     def state(self) -> LoopState:
         """Read from the controller itself, not through the service."""
         loop = BusLoop(self.bus, 0x20, 0x10)

@@ -9,14 +9,17 @@ from datetime import UTC, datetime
 
 from tests.e2e.plantsite import STAGES
 from tests.faults import campaign, report
-from tests.faults.cases import BOTH, FAULTS
+from tests.faults.cases import BOTH
 from tests.faults.ending import Ending
+from tests.faults.watch_cases import ALL_FAULTS
+from tests.faults.watch_ending import MOMENTS
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
-    parser.add_argument("--faults", type=_some(FAULTS), default=list(FAULTS), metavar="A,B")
-    parser.add_argument("--stages", type=_some(STAGES), default=list(STAGES), metavar="X,Y")
+    stages = [*STAGES, *MOMENTS]
+    parser.add_argument("--faults", type=_some(list(ALL_FAULTS)), default=list(ALL_FAULTS), metavar="A,B")
+    parser.add_argument("--stages", type=_some(stages), default=stages, metavar="X,Y", help="and moments of the watch")
     parser.add_argument("--database", choices=BOTH, help="default: both, for the rows that are tried on both")
     parser.add_argument("--at-once", type=int, default=3, metavar="N", help="rows side by side (default: %(default)s)")
     asked = parser.parse_args(argv)
@@ -32,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 1 if bad else 0
 
 
-def _some(known: Sequence[str] | dict[str, object]) -> object:
+def _some(known: Sequence[str]) -> object:
     def chosen(text: str) -> list[str]:
         names = text.split(",")
         for name in names:

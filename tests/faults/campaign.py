@@ -18,10 +18,11 @@ from typing import Any
 
 from loopwright.protocol.real32 import nearest
 from tests.e2e.plantsite import STAGES, Stage
-from tests.faults.cases import FAULTS
 from tests.faults.ending import Ending, unsafe
 from tests.faults.faulty_hub import FaultyHub
 from tests.faults.stand import LOOP, Missing, Stand, StoredSample
+from tests.faults.watch_cases import ALL_FAULTS
+from tests.faults.watch_ending import MOMENTS, watch_ending
 
 HOME_WITHIN_S = 6.0
 """After the end of a job that could not restore its loop: heartbeat or lease runs out, the law brings MV to rest."""
@@ -38,7 +39,10 @@ RESULTS = Path(__file__).with_name("results.json")
 
 def ending(stand: Stand, name: str, stage: str, database: str = "sqlite") -> Ending:
     """One fault in one stage."""
-    fault, where = FAULTS[name], STAGES[stage]
+    fault = ALL_FAULTS[name]
+    if stage in MOMENTS:
+        return watch_ending(stand, name, fault.inject, stage, database)
+    where = STAGES[stage]
     began = time.monotonic()
     url = _brought_into(stand, where)
     struck_at, struck = stand.hub.answered, time.monotonic()
@@ -123,13 +127,13 @@ def _first_number(hub: FaultyHub, stored: Sequence[StoredSample]) -> int:
 def run(faults: Sequence[str], stages: Sequence[str], databases: Sequence[str], at_once: int) -> Iterator[list[Ending]]:
     """The rows (a fault on a database each), each on a stand of its own, a few at a time. Prints as it goes."""
     rows = [
-        (name, database, [stage for at, stage in FAULTS[name].runs() if at == database and stage in stages])
+        (name, database, [stage for at, stage in ALL_FAULTS[name].runs() if at == database and stage in stages])
         for database in databases
         for name in faults
-        if database in FAULTS[name].databases
+        if database in ALL_FAULTS[name].databases
     ]
     # The longest first: the last ones then end at about the same time.
-    rows.sort(key=lambda row: -len(row[2]) * (2 if FAULTS[row[0]].needs.small_disk or row[0] == "away" else 1))
+    rows.sort(key=lambda row: -len(row[2]) * (2 if ALL_FAULTS[row[0]].needs.small_disk or row[0] == "away" else 1))
     with ProcessPoolExecutor(at_once, multiprocessing.get_context("spawn")) as pool:
         for done in as_completed([pool.submit(_row, *row) for row in rows if row[2]]):
             yield done.result()
@@ -147,7 +151,7 @@ def _row(name: str, database: str, stages: Iterable[str]) -> list[Ending]:
         with ExitStack() as stack:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="loopwright-faults-")))
             try:
-                stand = Stand(stack, folder, database, FAULTS[name].needs)
+                stand = Stand(stack, folder, database, ALL_FAULTS[name].needs)
                 while waiting:
                     one = calm_ending(stand, name, waiting[0], database)
                     add(one)
@@ -184,8 +188,8 @@ def merge(found: Iterable[Ending], date: str) -> list[dict[str, Any]]:
     """Puts these in the place of what RESULTS had for the same fault, stage and database."""
     known = {tuple(entry[name] for name in ("database", "fault", "stage")): entry for entry in load()}
     known |= {one.key: asdict(one) | {"date": date} for one in found}
-    rank = {name: n for n, name in enumerate(FAULTS)}
-    stages = {name: n for n, name in enumerate(STAGES)}
+    rank = {name: n for n, name in enumerate(ALL_FAULTS)}
+    stages = {name: n for n, name in enumerate((*STAGES, *MOMENTS))}
     order = sorted(
         (entry for entry in known.values() if entry["fault"] in rank and entry["stage"] in stages),
         key=lambda entry: (entry["database"] != "sqlite", rank[entry["fault"]], stages[entry["stage"]]),

@@ -99,6 +99,16 @@ class Eye:
     def close(self) -> None:
         self._tuner.close()
 
+    def read(self, name: str) -> float:
+        """Past all faults of the bus. Raises TunerError."""
+        with self._turn:
+            return self._tuner.number(name)
+
+    def write(self, name: str, value: float) -> None:
+        """Past all faults of the bus. Raises TunerError."""
+        with self._turn:
+            self._tuner.write(name, value)
+
     def glance(self) -> Glance | None:
         """None when the controller does not answer."""
         number = self._tuner.number

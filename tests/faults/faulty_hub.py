@@ -69,6 +69,11 @@ class FaultyHub(Hub):
     def onlooker_url(self) -> str:
         return f"{self.url}/onlooker"
 
+    @property
+    def session_opened(self) -> bool:
+        """Since the last `new_job`."""
+        return self._held
+
     def new_job(self) -> None:
         """The next session that is opened is its."""
         self._held = False

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from tests.e2e.plantsite import STAGES
-from tests.faults.cases import BOTH, FAULTS
+from tests.faults.cases import BOTH, FAULTS, Fault
 from tests.faults.ending import Ending
 from tests.faults.stand import LOOP, PACE, SMALL_DISK_MIB
+from tests.faults.watch_cases import WATCH_FAULTS
+from tests.faults.watch_ending import MOMENTS
 
 TABLE = Path(__file__).parents[2] / "docs" / "faults.md"
 MARK = " †"
@@ -48,6 +50,19 @@ heartbeat time is 1.5 s, and `device_went_back` with no fault in sight is such a
 
 EARLIER = """
 †: kept from a run before the last corrections of the product and of this harness; the next run replaces it.
+"""
+
+WATCH = """## The watch after acceptance
+
+Gains are accepted, with "put the old gains back by itself" ([watch.md](watch.md)). A load that MV cannot balance then
+takes PV out of its limits, and the watch is to put the old gains back. A fault strikes
+
+{moments}
+
+The end is unsafe, too, where the loop has gains that nobody has decided on: those put back, those accepted, or those
+that another hand has set; and where job, watch and alarms do not say the same of it. Each cell: what came of it, and
+the wall time from the fault (in the first column with what goes wrong after it) until the watch had decided.
+
 """
 
 TAIL = """## What the faults are
@@ -100,21 +115,40 @@ def text(entries: Sequence[dict[str, Any]]) -> str:
     )
     if any(one.earlier for one in endings):
         head += EARLIER
-    tables = "\n".join(_table(database, endings) for database in BOTH)
-    return f"{head}\n{tables}\n{TAIL.format(disk=SMALL_DISK_MIB)}"
+    tables = "\n".join(_table(NAMES[database], FAULTS, tuple(STAGES), database, endings, _cell) for database in BOTH)
+    moments = ";\n".join(f"- *{name}*: {words}" for name, words in MOMENTS.items()) + "."
+    watch = _table("", WATCH_FAULTS, tuple(MOMENTS), BOTH[0], endings, _watch_cell)
+    return f"{head}\n{tables}\n{WATCH.format(moments=moments)}{watch}\n{TAIL.format(disk=SMALL_DISK_MIB)}"
 
 
-def _table(database: str, endings: Iterable[Ending]) -> str:
+def _table(
+    title: str,
+    faults: Mapping[str, Fault],
+    stages: Sequence[str],
+    database: str,
+    endings: Iterable[Ending],
+    cell: Callable[[Ending | None], str],
+) -> str:
     cells = {(one.fault, one.stage): one for one in endings if one.database == database}
-    columns = ("fault", "loop", *STAGES)
-    lines = [f"## {NAMES[database]}", "", f"| {' | '.join(columns)} |", "|" + " --- |" * len(columns)]
-    for name, fault in FAULTS.items():
-        row = [cells[name, stage] for stage in STAGES if (name, stage) in cells]
+    columns = ("fault", "loop", *stages)
+    lines = [f"## {title}", ""] if title else []
+    lines += [f"| {' | '.join(columns)} |", "|" + " --- |" * len(columns)]
+    for name, fault in faults.items():
+        row = [cells[name, stage] for stage in stages if (name, stage) in cells]
         if row:
             loop = " / ".join(dict.fromkeys("**unsafe**" if one.unsafe else one.loop for one in row))
-            shown = [_cell(cells.get((name, stage))) for stage in STAGES]
+            shown = [cell(cells.get((name, stage))) for stage in stages]
             lines.append(f"| {fault.words} | {loop} | {' | '.join(shown)} |")
     return "\n".join(lines) + "\n"
+
+
+def _watch_cell(one: Ending | None) -> str:
+    if one is None:
+        return ""
+    bad = "**BAD** " if one.bad else ""
+    if one.detail is not None:
+        return f"{bad}not put back: {one.detail.partition(';')[0]}; {one.safe_s:.0f} s"
+    return f"{bad}{(one.reason or one.state).replace('_', ' ')}; {one.safe_s:.0f} s"
 
 
 def _cell(one: Ending | None) -> str:

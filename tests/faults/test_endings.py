@@ -13,10 +13,11 @@ import pytest
 
 from loopwright.protocol.profile import Mode
 from tests.faults import campaign, report
-from tests.faults.cases import FAULTS
 from tests.faults.ending import Glance, unsafe
 from tests.faults.injections import senseless_frames
 from tests.faults.stand import HOME, PACE, Missing, Needs, Stand
+from tests.faults.watch_cases import ALL_FAULTS
+from tests.faults.watch_ending import OUTSIDE, WATCHED, WRITING
 
 pytestmark = pytest.mark.timeout(200)
 
@@ -88,13 +89,34 @@ class _Stands(dict[Needs, Stand]):
 
 @pytest.mark.parametrize(("fault", "stage"), EXPECTED)
 def test_the_loop_ends_safe_and_the_job_says_why(fault: str, stage: str, stands: dict[Needs, Stand]) -> None:
-    one = campaign.calm_ending(stands[FAULTS[fault].needs], fault, stage)
+    one = campaign.calm_ending(stands[ALL_FAULTS[fault].needs], fault, stage)
     assert not one.bad, one
     assert f"{one.state} {one.reason}" in EXPECTED[fault, stage], one
     assert one.kept > 0
     assert (one.attempts > 1) == (fault in ("service-killed", "killed-twice", "second-gateway"))
     if one.state == "proposed" and one.attempts == 1:
         assert one.lost == 0, one
+
+
+PUT_BACK, NOT_PUT_BACK = "rolled_back", "accepted"
+WATCHED_ENDS = {
+    ("watch-none", WATCHED): (PUT_BACK,),
+    ("watch-service-killed", OUTSIDE): (PUT_BACK,),
+    ("watch-service-killed", WRITING): (PUT_BACK, NOT_PUT_BACK),
+    ("watch-bus-down-10", WRITING): (NOT_PUT_BACK,),
+    ("watch-other-gains", OUTSIDE): (NOT_PUT_BACK,),
+    ("watch-mode-twice", WATCHED): (NOT_PUT_BACK,),
+}
+"""By fault and moment: the state of the job whose gains were accepted."""
+
+
+@pytest.mark.parametrize(("fault", "moment"), WATCHED_ENDS)
+def test_a_watched_loop_never_has_gains_that_nobody_decided_on(
+    fault: str, moment: str, stands: dict[Needs, Stand]
+) -> None:
+    one = campaign.calm_ending(stands[ALL_FAULTS[fault].needs], fault, moment)
+    assert not one.bad, one
+    assert one.state in WATCHED_ENDS[fault, moment], one
 
 
 def test_frames_that_make_no_sense_are_passed_over(stands: dict[Needs, Stand]) -> None:
@@ -139,6 +161,6 @@ def test_the_page_is_that_of_the_results() -> None:
     entries = campaign.load()
     assert report.TABLE.read_text(encoding="utf-8") == report.text(entries)
     assert {(entry["fault"], entry["stage"], entry["database"]) for entry in entries} == {
-        (name, stage, database) for name, fault in FAULTS.items() for database, stage in fault.runs()
+        (name, stage, database) for name, fault in ALL_FAULTS.items() for database, stage in fault.runs()
     }
     assert "0 unsafe endings" in report.text(entries)

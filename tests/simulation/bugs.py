@@ -10,6 +10,8 @@ from loopwright.controller.channel import Channel, Home
 from loopwright.protocol.objects import Value
 from loopwright.protocol.profile import Mode, Order, RelayState
 from loopwright.protocol.session import check_of as check_of_order
+from loopwright.service.jobs import decisions, watching
+from loopwright.service.loops import bus_loop, gain_change
 
 Replace = Callable[[Any, str, Any], None]
 
@@ -60,8 +62,19 @@ def manual_output_stays(replace: Replace) -> None:
     replace(Channel, "go_home", goes_home)
 
 
+def gains_are_not_compared(replace: Replace) -> None:
+    """The watch after acceptance puts the old gains back whatever the controller holds."""
+
+    def same(*gains: object) -> bool:
+        return True
+
+    for module in (gain_change, bus_loop, decisions, watching):
+        replace(module, "same_gains", same)
+
+
 BUGS: dict[str, Callable[[Replace], None]] = {
     "count-is-not-checked": count_is_not_checked,
     "set-point-stays": set_point_stays,
     "manual-output-stays": manual_output_stays,
+    "gains-are-not-compared": gains_are_not_compared,
 }

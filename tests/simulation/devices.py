@@ -261,6 +261,14 @@ class Pv:
     def noise_std(self, value: float) -> None:
         self._plant.noise_std = value
 
+    @property
+    def gain(self) -> float:
+        return self._plant.gain
+
+    @gain.setter
+    def gain(self, value: float) -> None:
+        self._plant.gain = value
+
 
 class Sensor:
     """shows: what a broken one shows; None: PV."""

@@ -14,9 +14,10 @@ from loopwright.protocol.profile import (
     channel_ids,
     sdo_request_id,
 )
+from loopwright.service.inputs.config import Limits
 from loopwright.service.inputs.model_json import FirstOrderModel
 from loopwright.service.inputs.request import RetuneRequest, retune_request
-from tests.simulation import manual_pulses, plans
+from tests.simulation import manual_pulses, plans, watched
 from tests.simulation.gateway import Gateway
 from tests.simulation.history import World
 from tests.simulation.people import Operator, Plc, Stranger
@@ -422,6 +423,41 @@ def decisions(world: World) -> None:
     elif what < 0.6:
         world.plan_s += 2.0
         restarts(world)
+
+
+def after_acceptance(world: World) -> None:
+    """Something goes wrong under gains that were accepted, and one of all that happens until the watch has decided."""
+    random = world.random
+    world.pv_limits = Limits(low=20.0, high=80.0)
+    world.time_constant, world.dead_time = 6.0, 8.0
+    world.actions = (plans.Action("setpoint", 0.1, 3),)
+    world.tune = plans.tunes(world.actions)
+    world.plan_s = 14.0
+    gateway = world.gateway()
+    load, gain = random.choice(((watched.LOAD_PCT, 1.0), (watched.LOAD_PCT, 1.0), (1.0, watched.GAIN)))
+    watched.watched(world, gateway, lambda: world.upset_plant(load, gain), until_s=14.0)
+    world.person(gateway, 0.5, decisions=random.choice((("accept",), ("accept",), ("accept", "rollback"))), tries=8)
+    what = random.choice(
+        (None, "kills", "killed", "killed", "frames", "away", "restarts", "power", "operator", "gains", "gains", "nmt")
+    )
+    if what == "kills":
+        killed(world, gateway, never=0.0)
+    elif what == "killed":
+        killed_at(world, gateway, random.uniform(4.0, 14.0), random.choice(RESTARTS_S))
+    elif what == "frames":
+        frames(world)
+    elif what == "away":
+        away(world)
+    elif what == "restarts":
+        restarts(world)
+    elif what == "power":
+        power(world)
+    elif what == "operator":
+        operator(world, random.randint(1, 3))
+    elif what == "gains":
+        Operator(world, sorted(random.uniform(3.0, 10.0) for _ in range(4)), random, ("gains",))
+    elif what == "nmt":
+        nmt(world)
 
 
 def power_cuts(world: World) -> None:

@@ -339,6 +339,8 @@ class Gateway:
         """Killed, and never started again."""
         self.restart_after: Callable[[], float | None] = lambda: None
         self.on_start: Callable[[Process], None] = lambda process: None
+        self.on_boot: Callable[[Jobs, Process], None] = lambda jobs, process: None
+        """What else runs in each process, from its boot on."""
         self.on_up: list[Callable[[], None]] = []
         self.died_at: list[float] = []
         self._wire = wire
@@ -368,6 +370,7 @@ class Gateway:
             )  # fmt: skip
             jobs.boot()
             self.jobs = jobs
+            self.on_boot(jobs, process)
             self.simulation.note(self.name, "is ready")
             waiting, self.on_up = self.on_up, []
             for call in waiting:

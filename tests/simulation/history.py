@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from random import Random
 from typing import Any
@@ -38,6 +39,8 @@ TIMES = (
 BLOCKS_WALL_S = 0.006
 _BLOCKS_FRAME_S = 0.002
 """A plant that runs as fast as the answers come keeps the simulation busy: there, the bus is a slow one."""
+EPOCH_S = 4e9
+"""Wall time at the simulation's zero, later than that of any machine, by which jobs note what they do."""
 _LOOK_S = 0.25
 _OVER_S = 1.9
 """The 1.5 s for which the heartbeat of a tuner may be missing, and a little."""
@@ -149,6 +152,26 @@ class World:
         self.quiet = True
         """Nothing but kills: a dead tuner's session then has its time."""
         self.readings: dict[str, deque[tuple[dict[str, Any], float]]] = {}
+        self.proposed = plans.PROPOSED
+        self.at_the_end: list[Callable[[], None]] = []
+        """What else is looked at then."""
+        self.closing: list[Callable[[], None]] = []
+        """What is put right again once the history is over."""
+
+    @property
+    def wall_s(self) -> float:
+        """The wall clock of what has one, s since 1970 UTC."""
+        return EPOCH_S + self.simulation.now
+
+    def upset_plant(self, load: float = 0.0, gain: float = 1.0) -> None:
+        """Another load and another gain of the plant, while it is on."""
+        if self.plant.is_on:
+            self.plant.device.plants[0].disturbance = load
+            self.plant.device.plants[0].gain = gain
+            self.simulation.note("plant", f"load {load:g} %, gain x {gain:g}")
+
+    def calm_plant(self) -> None:
+        self.upset_plant()
 
     def trouble(self, until_s: float) -> None:
         """Something goes wrong, or somebody acts, up to so many s after the start."""
@@ -246,6 +269,8 @@ class World:
             simulation.keeps_log, kept = False, simulation.keeps_log
             simulation.end()
             simulation.keeps_log = kept
+            for put_right in self.closing:
+                put_right()
         for gateway in self.gateways:
             gateway.store.on_statement = gateway.store.after_move = None
             for row in gateway.rows():
@@ -279,6 +304,8 @@ class World:
             if self.plant.is_on and self.controller.is_on and self.plant.mv == self.controller_mv:
                 break
             simulation.run(simulation.now + 0.0002)
+        for look in self.at_the_end:
+            look()
         self.invariants.at_the_end(clean and self._both_operational() and self.wire.state is State.UP)
 
     @property

@@ -48,6 +48,12 @@ KINDS: dict[str, Kind] = {
     ),
     "five_stage": Kind("the real five-stage procedure, with one of all that", 0, faults.real_five_stage, real=True),
     "trial": Kind("a real set-point trial, with one of all that", 1, faults.real_trial, real=True),
+    "watched": Kind(
+        "accepted gains under which PV leaves its limits or oscillates, the watch, and one of all that",
+        0,
+        faults.after_acceptance,
+        real=True,
+    ),
 }
 
 
@@ -77,12 +83,12 @@ def play(kind: str, seed: int, keeps_log: bool = False) -> Ending:
 def spread(count: int, kinds: Sequence[str]) -> Iterator[tuple[str, int]]:
     """So many histories over the kinds, as their weights have it; the first ones are the same whatever the count."""
     names = [name for name in kinds for _ in range(max(KINDS[name].weight, 1 if len(kinds) < len(KINDS) else 0))]
-    if len(kinds) == len(KINDS):
-        names = [name for name in names if name != "five_stage"]
     step = next(n for n in (37, 41, 43, 47, 53) if len(names) % n)
     order = [names[(at * step) % len(names)] for at in range(len(names))]
     for seed in range(count):
         kind = order[seed % len(order)]
         if kind == "trial" and len(kinds) == len(KINDS) and (seed // len(order)) % 4 == 0:
             kind = "five_stage"
+        if kind == "decisions" and len(kinds) == len(KINDS) and (seed // len(order)) % 2 == 0:
+            kind = "watched"
         yield kind, seed

@@ -6,15 +6,18 @@ import logging
 import os
 import sys
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 
 from loopwright.protocol.profile import Mode
+from loopwright.service.states.acceptance_watch import AcceptanceWatch, TroubleKind
+from loopwright.service.store import watches
 from tests.pulse_phases import Phase
 from tests.simulation.bugs import BUGS
 from tests.simulation.every_call import RESTARTS_S
 from tests.simulation.history import Loop, World
-from tests.simulation.kinds import KINDS, play, spread
+from tests.simulation.kinds import KINDS, play, spread, world
 from tests.simulation.manual_pulses import STRIKES, struck
 from tests.simulation.pool import every_call, run
 from tests.simulation.report import tell, words
@@ -57,6 +60,23 @@ def test_what_happens_in_a_pulse_ends_in_manual_at_the_output_found(name: str, p
     assert channel.manual_output == channel.mv == world.plant.mv == 50.0
 
 
+def test_a_watched_loop_gets_the_old_gains_back_or_a_reason_why_not() -> None:
+    """The histories of this kind come to every end that a watch can come to."""
+    ends = set()
+    for seed in range(30):
+        made = world("watched", seed)
+        found: list[AcceptanceWatch] = []
+        made.at_the_end.append(partial(_take_watches, made, found))
+        assert not made.run().bad
+        ends |= {(each.trouble and each.trouble.kind, each.trouble and each.trouble.put_back) for each in found}
+    assert ends >= {(kind, True) for kind in TroubleKind} | {(TroubleKind.PV_OUTSIDE_LIMITS, False), (None, None)}
+
+
+def _take_watches(made: World, found: list[AcceptanceWatch]) -> None:
+    store = made.gateways[0].store
+    found.extend(watches.of_jobs(store, [row.id for row in store.seen()]).values())
+
+
 def test_a_seed_is_one_history() -> None:
     for kind, seed in spread(20, list(KINDS)):
         one, other = (play(kind, seed, keeps_log=True) for _ in range(2))
@@ -69,6 +89,7 @@ FOUND_BY = {
     "count-is-not-checked": ("stranger", 5),
     "set-point-stays": ("stalls", 1),
     "manual-output-stays": ("manual", 767),
+    "gains-are-not-compared": ("watched", 27),
 }
 
 

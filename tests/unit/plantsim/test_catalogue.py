@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loopwright.plantsim.catalogue import CATALOGUE, CatalogueModel, Entry, find, own_plant
+from loopwright.plantsim.catalogue import CATALOGUE, CatalogueModel, Entry, find
+from loopwright.plantsim.own_plant import own_plant
 
 LINEAR = [(entry, entry.model) for entry in CATALOGUE.values() if entry.model is not None]
 BY_NAME = pytest.mark.parametrize(("entry", "model"), LINEAR, ids=[entry.name for entry, _ in LINEAR])

@@ -290,6 +290,7 @@ class TestPlant:
             "plant_noise": 0.25,
             "plant_seed": 9,
             "plant_mv": 33.0,
+            "plant_gain": 2.5,
         }
         fresh = [self.plant.dictionary.read(lookup(name).index, lookup(name).count(1)) for name in written]
         self.answer(rig, 2)
@@ -298,9 +299,11 @@ class TestPlant:
         self.write(rig, "plant_samples_to_run", 1)
         rig.wait(0.1)
         assert rig.read(0x2012, 0) == 1
+        assert [plant.gain for plant in self.plant.plants] == [2.5]
         rig.nmt(NmtCommand.STOP)
         rig.nmt(NmtCommand.RESET_NODE)
         assert rig.read(0x2012, 0) == 0
+        assert [plant.gain for plant in self.plant.plants] == [1.0]
         assert fresh == [self.plant.dictionary.read(lookup(name).index, lookup(name).count(1)) for name in written]
 
     def test_and_it_runs_as_it_did_then(self, rig: Rig) -> None:

@@ -22,6 +22,7 @@ from benchmarks.trouble.report import cases_of, is_trouble, table
 from benchmarks.trouble.response import Response, delayed, gain, judged, rational, series
 from benchmarks.trouble.runs import TroubledRun, measure
 from benchmarks.trouble.sensors import Held
+from loopwright.plantsim.valves import Backlash, Stiction
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction
@@ -140,9 +141,9 @@ def test_a_rate_limit_moves_evenly_and_a_dead_zone_keeps_the_valve_where_it_is()
 
 
 def test_backlash_follows_half_of_it_behind_and_stiction_jumps() -> None:
-    backlash = valves.Backlash(setting(), 1.0)
+    backlash = Backlash(1.0)
     assert [backlash.step(each) for each in (5.0, 4.5, 4.0, 3.0)] == pytest.approx([4.5, 4.5, 4.5, 3.5])
-    sticks = valves.Stiction(setting(), 0.5)
+    sticks = Stiction(0.5)
     assert [sticks.step(each) for each in (0.4, 0.6, 0.9, 1.2)] == [0.0, 0.6, 0.6, 1.2]
 
 

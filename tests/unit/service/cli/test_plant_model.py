@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from loopwright.plantsim.catalogue import own_plant
+from loopwright.plantsim.own_plant import own_plant
 from loopwright.service.cli.plant_model import with_own_plants
 
 HEATER = {"K": 0.8, "T_s": 120, "L_s": 15, "mv": 40, "pv": 65}
@@ -35,6 +35,13 @@ def test_a_model_of_any_form_runs_at_its_operating_point(tmp_path: Path) -> None
     assert [plant.step(40.0) for _ in range(50)][-1] == pytest.approx(65.0)
     answer = [plant.step(50.0) for _ in range(1500)]
     assert answer[13] == pytest.approx(65.0) and answer[-1] == pytest.approx(65.0 + 10 * 0.8, abs=1e-3)
+
+
+def test_what_a_plant_has_besides_reaches_the_plant_process() -> None:
+    more = {"second_path": {"share": 0.4, "later_s": 180}, "valve": {"backlash_pct": 2}}
+    plant = own_plant(model_of("--model", json.dumps(HEATER | more))).build(1.0)
+    answer = [plant.step(50.0) for _ in range(3000)]
+    assert answer[-1] == pytest.approx(65.0 + 1.4 * 9.0 * 0.8, abs=1e-3)
 
 
 @pytest.mark.parametrize("given", ['{"K": 0.8, "T": 120, "L_s": 15}', "{", "[]{}", '{"K": 0, "T_s": 1, "L_s": 1}'])

@@ -119,6 +119,51 @@ def test_pv_that_leaves_its_limits_is_a_reason_too(service: Service) -> None:
     assert trouble.put_back and service.controller.state.gains == OLD
 
 
+def _limited(service: Service) -> WatchedLoop:
+    """A loop with little room above its set-point, watched, with PV within its limits."""
+    limits = service.loops[TAG].pv_limits.model_copy(update={"high": 50.5})
+    service.loops[TAG] = service.loops[TAG].model_copy(update={"pv_limits": limits})
+    here = WatchedLoop(service)
+    here.accept()
+    here.goes_on(2.0)
+    return here
+
+
+def test_a_service_that_is_started_while_pv_is_outside_knows_that_it_was_inside(service: Service) -> None:
+    here = _limited(service)
+    here.plant.disturbance = 2.0
+    here.watching = here.another()
+    here.goes_on(3.0)
+    assert here.watch.trouble is not None and here.watch.trouble.put_back
+    assert service.controller.state.gains == OLD
+
+
+def test_pv_that_was_never_inside_does_not_leave_its_limits(service: Service) -> None:
+    limits = service.loops[TAG].pv_limits.model_copy(update={"high": 49.5})
+    service.loops[TAG] = service.loops[TAG].model_copy(update={"pv_limits": limits})
+    here = WatchedLoop(service)
+    here.accept()
+    here.goes_on(3.0)
+    assert here.watch.trouble is None and not here.watch.inside
+
+
+@pytest.mark.parametrize("mode", [Mode.AUTOMATIC, Mode.MANUAL])
+def test_where_frames_are_lost_the_mode_heard_last_counts_and_the_controller_is_read(
+    mode: Mode, service: Service
+) -> None:
+    here = _limited(service)
+    here.frames_lost = True
+    here.plant.disturbance = 2.0
+    here.goes_on(0.5)
+    service.controller.by_hand(mode=mode)  # which nobody hears
+    here.goes_on(3.0)
+    trouble = here.watch.trouble
+    assert trouble is not None and trouble.kind is TroubleKind.PV_OUTSIDE_LIMITS
+    assert trouble.put_back == (mode is Mode.AUTOMATIC)
+    assert service.controller.state.gains == (OLD if trouble.put_back else NEW)
+    assert trouble.put_back or "the mode was changed" in str(trouble.why_not) or "is in manual" in str(trouble.why_not)
+
+
 def _not_asked_for(here: WatchedLoop) -> None:
     pass
 
@@ -199,7 +244,8 @@ def test_what_a_service_has_left_half_done_is_not_tried_again(
     here.watching = here.another()
     here.goes_on(1.0)
     trouble = here.watch.trouble
-    assert trouble is not None and trouble.put_back is False and "the service ended meanwhile" in str(trouble.why_not)
+    assert trouble is not None and trouble.put_back is False
+    assert "the service ended, or could not write it down" in str(trouble.why_not)
     assert service.controller.state.gains == NEW
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, astuple
@@ -13,7 +14,7 @@ from loopwright.plantsim.catalogue import CatalogueModel, Entry, LaterPath, Plan
 from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.inputs.request import FastRetune
 from loopwright.service.jobs.watching import Watching
-from loopwright.service.listening.bins import GAP_BEFORE
+from loopwright.service.listening.bins import GAP_BEFORE, UNKNOWN_MODE
 from loopwright.service.listening.heard_loop import Heard
 from loopwright.service.listening.rings import Rings
 from loopwright.service.states.acceptance_watch import AcceptanceWatch
@@ -77,6 +78,8 @@ class WatchedLoop:
         self.pv = self.plant.pv
         self.gap = GAP_BEFORE
         self.heard_at_all = True
+        self.frames_lost = False
+        """So many that mode and set-point are never known for long."""
         jobs = service.jobs
         self.watching = self.another()
         self.job_id = jobs.start(TAG, FastRetune()).id
@@ -127,6 +130,8 @@ class WatchedLoop:
             self.pv = self.plant.step(50.0 + self.factor(self.n) * (mv - 50.0))
         if self.ears.gains_are_read:
             self.ears.read = controller.state.gains, self.now_s
+        sp = self.channel.setpoint
+        mode, sp = (UNKNOWN_MODE, math.nan) if self.frames_lost else (mode, sp)
         self.ears.heard = {} if not self.heard_at_all else {
-            TAG: Heard(self.now_s, False, self.pv, mv, self.channel.setpoint, mode, False, False)
+            TAG: Heard(self.now_s, False, self.pv, mv, sp, mode, False, False)
         }  # fmt: skip
