@@ -184,7 +184,9 @@ def _instead_of_loads(
     the record better or not at all.
     """
     instead = instead_of_loads(fit, found)
-    if instead is None or instead.bic_gain < -RIVAL_BIC:
+    # a record of one side hardly shows the other one, and its proposal says so
+    as_well = MIN_BIC_GAIN if instead is not None and instead.changing and fit.record.one_sided else -RIVAL_BIC
+    if instead is None or instead.bic_gain < as_well:
         return reason, detail
     what = f"the record looks as if {instead.what}"
     if reason is None and instead.changing and instead.bic_gain > MIN_BIC_GAIN:
