@@ -85,6 +85,7 @@ def test_every_transcript_is_run() -> None:
     ("proposed", "refused", False),
     ("Ms 1.60 ± 0.004", "Ms 1.61 ± 0.002", True),
     ("two lines\nof text", "two lines", False),
+    ("busy with job 1, waiting for its turn since 2", "busy with job 1, under way since 2", True),
 ])  # fmt: skip
 def test_what_counts_as_the_same(shown: str, answer: str, same: bool) -> None:
     assert alike(shown, answer, 0.2) is same

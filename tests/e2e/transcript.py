@@ -43,6 +43,9 @@ _STABLE_IDS = [f"{0x4F0C2A9BE113 * (2 * n + 1) % 2**48:012x}" for n in range(12)
 _PATIENCE_S = 120.0
 
 
+JUST_ASKED_FOR = ("waiting for its turn since", "under way since")
+
+
 @dataclass
 class Said:
     """A command of a transcript, and the answer that the document shows."""
@@ -91,11 +94,14 @@ def differences(shown: str, answer: str, within: float) -> list[str]:
     """Where two answers differ: in their words, or in numbers by more than that part of them, or more than 0.02 where
     the numbers are measured. Widths of columns, where lines are broken, and standard errors do not count: the last are
     left out where they are small, as is whether a difference of Ms is just below 0.001. So are the figures of one step
-    under noise: a step that settles at the edge of its band settles in one minute or in two.
+    under noise: a step that settles at the edge of its band settles in one minute or in two. A job that has just been
+    asked for waits for its turn or is under way.
 
     within: 0.02 at most where nothing is measured.
     """
-    one, other = (_BOX.sub(" ", _NOISY.sub("", _ERROR.sub("", text))).strip() for text in (shown, answer))
+    one, other = (
+        _BOX.sub(" ", _NOISY.sub("", _ERROR.sub("", text))).strip().replace(*JUST_ASKED_FOR) for text in (shown, answer)
+    )
     words, others = (_NUMBER.sub("#", text) for text in (one, other))
     if words != others:
         unlike = (i for i, (a, b) in enumerate(zip(words, others, strict=False)) if a != b)
