@@ -17,7 +17,7 @@ from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN
 from loopwright.tuning.identification.output_error import Fit, Fitted
 from loopwright.tuning.models import TransferFunction
-from loopwright.tuning.reasons import Reason
+from loopwright.tuning.reasons import Reason, Refused
 
 MAX_RESIDUAL, NEGLIGIBLE_RESIDUAL = 1.35, 0.004
 """Limits of the rms of the residual: the largest accepted, in standard deviations of the noise at rest; the fraction of
@@ -91,7 +91,8 @@ def evaluate(
     behind its load disturbances, which the test shows, and that of a relay is not asked whether the plant is linear: a
     load disturbance or backlash can look like a gain that differs above and below rest there, and the test tells them
     apart.
-    Raises Refused, NOT_ROBUST, where the model permits no such controller.
+    Raises Refused, where the model permits no such controller: UNEXPLAINED or DISTURBED where the model does not
+    explain the record, else NOT_ROBUST. With `earlier` a record that is not explained is evaluated with its gains.
     """
     fit = Fit(record)
     chosen = choose_structure(fit, earlier.chosen.fits if earlier else ())
@@ -101,24 +102,22 @@ def evaluate(
     model = fit.model(found)
     delay = record.sampling_delay_s
     design = GainDesign(replace(model, L=model.L + delay), spec, record.period * record.Ts)
-    kept = keeping(design)
-    best = design.best() if kept is None else kept  # the record is judged in any case
+    unexplained = _unexplained(record, found)
+    try:
+        kept = keeping(design)
+        best = design.best() if kept is None else kept  # the record is judged in any case
+    except Refused:
+        if unexplained is None:
+            raise
+        if earlier is None:
+            raise Refused(*unexplained) from None
+        kept = best = earlier.best
     spread = uncertainty_of_Ms(fit, found, best.gains, design.w, spec.N, delay)
     rivals = difference_of_rivals(fit, found, chosen.rivals, best.gains, design.w, delay)
-    noise, rounding = record.noise / record.output_range, record.rounding / record.output_range
-    ratio = durbin_watson_ratio(found.linear.residual)
     reason: Reason | None = None
     detail = ""
-    if found.rms > max(MAX_RESIDUAL * noise, NEGLIGIBLE_RESIDUAL):
-        reason = Reason.UNEXPLAINED
-        rms = 100.0 * found.rms
-        detail = f"the model leaves {rms:.2g} % of PV's range unexplained, the noise is {100.0 * noise:.2g} %"
-    elif found.rms > max(NEGLIGIBLE_RESIDUAL, MAX_ROUNDED * rounding) and ratio > MAX_DURBIN_WATSON_RATIO * max(
-        record.durbin_watson_ratio_at_rest, 1.0
-    ):
-        reason = Reason.DISTURBED
-        at_rest = f"{record.durbin_watson_ratio_at_rest:.2f} at rest"
-        detail = f"what the model leaves varies slowly: {ratio:.2f} times white noise, {at_rest}"
+    if unexplained is not None:
+        reason, detail = unexplained
     elif spread > max_uncertainty:
         reason = Reason.UNCERTAIN
         detail = f"Ms is known to +{spread:.2g} only"
@@ -150,12 +149,26 @@ def evaluate(
         Ms=peak(model, best.gains, design.w, delay),
         uncertainty=spread,
         ambiguity=rivals,
-        residual=found.rms / noise if noise > 0.0 else math.inf,
+        residual=found.rms * record.output_range / record.noise if record.noise > 0.0 else math.inf,
         chosen=chosen,
         fit=fit,
         design_delay=delay,
         period=design.period,
     )
+
+
+def _unexplained(record: ExperimentRecord, found: Fitted) -> tuple[Reason, str] | None:
+    """The reason and the detail where the residual is not the noise at rest."""
+    noise, rounding = record.noise / record.output_range, record.rounding / record.output_range
+    if found.rms > max(MAX_RESIDUAL * noise, NEGLIGIBLE_RESIDUAL):
+        text = f"the model leaves {100.0 * found.rms:.2g} % of PV's range unexplained"
+        return Reason.UNEXPLAINED, f"{text}, the noise is {100.0 * noise:.2g} %"
+    ratio = durbin_watson_ratio(found.linear.residual)
+    slow = MAX_DURBIN_WATSON_RATIO * max(record.durbin_watson_ratio_at_rest, 1.0)
+    if found.rms > max(NEGLIGIBLE_RESIDUAL, MAX_ROUNDED * rounding) and ratio > slow:
+        at_rest = f"{record.durbin_watson_ratio_at_rest:.2f} at rest"
+        return Reason.DISTURBED, f"what the model leaves varies slowly: {ratio:.2f} times white noise, {at_rest}"
+    return None
 
 
 def _nonlinearity(fit: Fit[ExperimentRecord], found: Fitted) -> tuple[Reason, str] | None:
